@@ -1,0 +1,1 @@
+"""The physics: coordinates, kinematics, energies, momenta and equations of motion of a described system."""

@@ -1,0 +1,255 @@
+"""Kinematics of the serial chain, (8)–(12), (16)–(22): frames, their twists, and the rates of these, for any set of rates.
+
+One recursion carries m columns of generalized speeds at once: the actual speeds (m = 1) give velocities, the identity
+(m = n_v) gives Jacobians. Every twist is stacked as linear over angular velocity in the axes of its own frame.
+
+Frames, from the base outwards: 0 is {0} with origin in joint 1; mount i is the frame that holds stator i; link i is {i};
+the last one is the end of the last link.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from sms_online.description.schema import FlexibleLink, Joint, RigidLink, System
+from sms_online.model import so3
+from sms_online.model.beam import LinearLink
+from sms_online.model.flexible import LinkKinematics, Shape, ShapeRate
+from sms_online.model.layout import Layout
+from sms_online.model.rod import ExactRod
+from sms_online.stream import Array
+
+
+@dataclass(frozen=True)
+class Frame:
+    """Pose of a frame: origin (B, 3) m, rotation to inertial axes (B, 3, 3)."""
+
+    origin: Array
+    rotation: Array
+
+
+class Chain:
+    """The constant geometry of a system; `configure` gives it a configuration."""
+
+    def __init__(self, system: System, layout: Layout) -> None:
+        self.layout = layout
+        self.joints: tuple[Joint, ...] = system.joints
+        self.axes = [np.array(joint.axis) for joint in system.joints]
+        self.mounts = [so3.exponential(np.array(joint.mount_rotation)) for joint in system.joints]
+        self.links = system.links
+        self.flexible: list[LinkKinematics | None] = []
+        for i, link in enumerate(system.links):
+            if isinstance(link, RigidLink):
+                self.flexible.append(None)
+            elif link.kinematics == "linear":
+                self.flexible.append(LinearLink(link))
+            else:
+                last = i == len(system.links) - 1
+                self.flexible.append(ExactRod(link, free_end=last and system.payload is None))
+        tracked = system.spacecraft.tracked_point if system.spacecraft is not None else (0.0, 0.0, 0.0)
+        self.joint_1_from_S = -np.array(tracked)
+        # Rates of the base, (3, n_v): rows pick v_S and ω_0 out of v.
+        self.select_linear = np.zeros((3, layout.n_v))
+        self.select_linear[list(layout.base_linear), range(len(layout.base_linear))] = 1.0
+        self.select_angular = np.zeros((3, layout.n_v))
+        start = len(layout.base_linear)
+        self.select_angular[list(layout.base_angular), range(start, start + len(layout.base_angular))] = 1.0
+
+    @property
+    def frame_names(self) -> tuple[str, ...]:
+        """Names of the frames in the order of `Configuration.frames`."""
+        names = ["base"]
+        for i in range(1, len(self.joints) + 1):
+            names += [f"mount_{i}", f"link_{i}"]
+        return (*names, "tip")
+
+    def configure(self, x: Array) -> Configuration:
+        """Configuration at positions x (B, n_x)."""
+        return Configuration(self, x)
+
+    def elastic(self, x: Array, i: int) -> Array:
+        """Elastic coordinates (B, n_f) of link i (from 0)."""
+        offset = self.layout.n_base_positions - self.layout.n_base_speeds
+        s = self.layout.q_f[i]
+        return x[:, s.start + offset : s.stop + offset]
+
+
+class Configuration:
+    """The chain at B positions: frames, and the maps from generalized speeds to twists."""
+
+    def __init__(self, chain: Chain, x: Array) -> None:
+        self.chain = chain
+        self.x = x
+        layout = chain.layout
+        self.size = x.shape[0]
+        r_S, T_0 = layout.base_pose(x)
+        self.shapes: list[Shape | None] = []
+        self.turns: list[Array] = []  # A_i(q_i), (B, 3, 3)
+        self.slides: list[Array | None] = []  # displacement of a prismatic joint in its mount frame, (B, 3)
+        frames = [Frame(r_S + T_0 @ chain.joint_1_from_S, T_0)]
+        end = frames[0]
+        offset = layout.n_base_positions - layout.n_base_speeds
+        for i, joint in enumerate(chain.joints):
+            q = x[:, layout.q[i] + offset]
+            mount = Frame(end.origin, end.rotation @ chain.mounts[i])
+            if joint.kind == "revolute":
+                turn = so3_about(chain.axes[i], q)
+                link = Frame(mount.origin, mount.rotation @ turn)
+                self.slides.append(None)
+            else:
+                turn = np.broadcast_to(np.eye(3), (self.size, 3, 3))
+                slide = q[:, None] * chain.axes[i]
+                link = Frame(mount.origin + (mount.rotation @ slide[..., None])[..., 0], mount.rotation)
+                self.slides.append(slide)
+            self.turns.append(turn)
+            frames += [mount, link]
+            kinematics, description = chain.flexible[i], chain.links[i]
+            if kinematics is None:
+                assert isinstance(description, RigidLink)
+                self.shapes.append(None)
+                end = Frame(link.origin + link.rotation @ np.array(description.tip), link.rotation)
+            else:
+                shape = kinematics.shape(chain.elastic(x, i))
+                self.shapes.append(shape)
+                end = Frame(
+                    link.origin + (link.rotation @ shape.tip[..., None])[..., 0], link.rotation @ shape.tip_rotation
+                )
+        self.frames = [*frames, end]
+
+    @cached_property
+    def jacobians(self) -> list[Array]:
+        """Twist Jacobians (B, 6, n_v) of all frames."""
+        return self.twists(np.eye(self.chain.layout.n_v)[None])
+
+    def twists(self, rates: Array) -> list[Array]:
+        """Twists (B, 6, m) of all frames for columns of generalized speeds `rates` (B or 1, n_v, m)."""
+        chain, layout = self.chain, self.chain.layout
+        T_0 = self.frames[0].rotation
+        base = np.concatenate((chain.select_linear @ rates, chain.select_angular @ rates), axis=1)
+        twist = _turn_back(T_0, base)
+        twist[:, :3] += _moment(twist[:, 3:], chain.joint_1_from_S)
+        out = [twist]
+        for i in range(len(chain.joints)):
+            mount = _turn_back(chain.mounts[i], twist)
+            slide = self.slides[i]
+            moved = mount if slide is None else _shift(mount, slide)
+            link = _turn_back(self.turns[i], moved)
+            rows = slice(3, 6) if slide is None else slice(0, 3)
+            link[:, rows] += chain.axes[i][:, None] * rates[:, layout.q[i], None, :]
+            out += [mount, link]
+            twist = self._unturned_end(i, link, rates)
+            shape = self.shapes[i]
+            if shape is not None:
+                twist = _turn_back(shape.tip_rotation, twist)
+        return [*out, twist]
+
+    def _unturned_end(self, i: int, link: Array, rates: Array) -> Array:
+        """Twists at the end of link i (from 0), still in the axes of {i}."""
+        shape, description = self.shapes[i], self.chain.links[i]
+        if shape is None:
+            assert isinstance(description, RigidLink)
+            return _shift(link, np.array(description.tip))
+        end = _shift(link, shape.tip)
+        elastic = rates[:, self.chain.layout.q_f[i]]
+        end[:, :3] += shape.tip_J @ elastic
+        end[:, 3:] += shape.tip_spin @ elastic
+        return end
+
+    def shape_rates(self, v: Array) -> list[ShapeRate | None]:
+        """Rates of every flexible link's shape for speeds v (B, n_v)."""
+        out: list[ShapeRate | None] = []
+        for i, kinematics in enumerate(self.chain.flexible):
+            shape = self.shapes[i]
+            if kinematics is None or shape is None:
+                out.append(None)
+            else:
+                q_f_dot = v[:, self.chain.layout.q_f[i]]
+                out.append(kinematics.shape_rate(self.chain.elastic(self.x, i), q_f_dot, shape))
+        return out
+
+    def twist_rates(
+        self, rates: Array, twists: list[Array], v: Array, shape_rates: list[ShapeRate | None]
+    ) -> list[Array]:
+        """Time derivatives, in the frames' own axes, of `twists` of constant `rates` while the chain moves with v (B, n_v).
+
+        With rates = v this is the acceleration at v̇ = 0; with the identity it is the Jacobians' rate.
+        """
+        chain, layout = self.chain, self.chain.layout
+        T_0 = self.frames[0].rotation
+        omega = (chain.select_angular @ v[..., None])[..., 0]
+        omega_body = (T_0.transpose(0, 2, 1) @ omega[..., None])[..., 0]
+        # Undo the shift to joint 1 to reach the twist at S, whose inertial components are constant.
+        at_S = twists[0].copy()
+        at_S[:, :3] -= _moment(at_S[:, 3:], chain.joint_1_from_S)
+        rate = -_spin(omega_body, at_S)
+        rate[:, :3] += _moment(rate[:, 3:], chain.joint_1_from_S)
+        out = [rate]
+        for i in range(len(chain.joints)):
+            mount_twist, link_twist = twists[2 * i + 1], twists[2 * i + 2]
+            mount = _turn_back(chain.mounts[i], rate)
+            slide = self.slides[i]
+            q_dot = v[:, layout.q[i]]
+            spin = q_dot[:, None] * chain.axes[i]
+            if slide is None:
+                moved = link_twist.copy()
+                moved[:, 3:] -= chain.axes[i][:, None] * rates[:, layout.q[i], None, :]
+                link = _turn_back(self.turns[i], mount) - _spin(spin, moved)
+            else:
+                link = _shift(mount, slide)
+                link[:, :3] += _moment(mount_twist[:, 3:], spin)
+            out += [mount, link]
+            rate = self._end_rate(i, link, link_twist, rates, shape_rates[i])
+        return [*out, rate]
+
+    def _end_rate(
+        self, i: int, link: Array, link_twist: Array, rates: Array, shape_rate: ShapeRate | None
+    ) -> Array:
+        """Rates of the twists at the end of link i (from 0), in the end's axes."""
+        shape, description = self.shapes[i], self.chain.links[i]
+        if shape is None or shape_rate is None:
+            assert isinstance(description, RigidLink)
+            return _shift(link, np.array(description.tip))
+        elastic = rates[:, self.chain.layout.q_f[i]]
+        end = _shift(link, shape.tip)
+        end[:, :3] += _moment(link_twist[:, 3:], shape_rate.tip) + shape_rate.tip_J @ elastic
+        end[:, 3:] += shape_rate.tip_spin @ elastic
+        end -= _spin(shape_rate.tip_angular, self._unturned_end(i, link_twist, rates))
+        return _turn_back(shape.tip_rotation, end)
+
+
+def so3_about(axis: Array, angle: Array) -> Array:
+    """Rotations (B, 3, 3) about a unit axis (3,) by angles (B,), rad."""
+    K = so3.skew(axis)
+    return np.asarray(
+        np.eye(3) + np.sin(angle)[:, None, None] * K + (1.0 - np.cos(angle))[:, None, None] * (K @ K)
+    )
+
+
+def _turn_back(R: Array, twist: Array) -> Array:
+    """Twists (B, 6, m) expressed in the axes of a frame turned by R (B, 3, 3) or (3, 3)."""
+    R_T = R.swapaxes(-1, -2)
+    m = twist.shape[2]
+    stacked = twist.reshape(-1, 2, 3, m)
+    turned = (R_T[:, None] if R.ndim == 3 else R_T) @ stacked
+    return turned.reshape(-1, 6, m)
+
+
+def _moment(angular: Array, arm: Array) -> Array:
+    """Columns angular (B, 3, m) × arm (B, 3) or (3,): the velocity that rotation gives at the arm's end."""
+    return -so3.skew(arm) @ angular
+
+
+def _shift(twist: Array, arm: Array) -> Array:
+    """Twists (B, 6, m) of the point displaced by `arm` in the same axes."""
+    out = twist.copy()
+    out[:, :3] += _moment(twist[:, 3:], arm)
+    return out
+
+
+def _spin(omega: Array, twist: Array) -> Array:
+    """ω × of the linear and of the angular part of twists (B, 6, m)."""
+    stacked = twist.reshape(twist.shape[0], 2, 3, twist.shape[2])
+    return (so3.skew(omega)[:, None] @ stacked).reshape(twist.shape)

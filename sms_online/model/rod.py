@@ -1,0 +1,175 @@
+"""Flexible link with `exact` kinematics: an inextensible, geometrically exact rod.
+
+Its coordinates are the coefficients of its strain fields, twist κ_x and curvatures κ_y, κ_z over the arc length s:
+R' = R κ×, r' = R e_x. A planar rod has the slope θ(s) = ∫ κ_z ds. Strain energy is quadratic with constant matrices.
+Source: the strain parametrisation of Boyer, Lebastard, Candelier, Renda, IEEE Trans. Robotics 37 (2021) 847.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.polynomial import Legendre, Polynomial
+
+from sms_online.description.schema import FlexibleLink
+from sms_online.model import so3
+from sms_online.model.flexible import Shape, ShapeRate
+from sms_online.model.layout import STRAIN, nodal_names, strain_names
+from sms_online.stream import Array
+
+# Gauss points along the rod. The integrands are smooth: at a slope of 1 rad the tip is then right to rounding.
+GAUSS_POINTS = 10
+# Picard iterations of R = 1 + ∫ R κ×: the error falls as (total angle)^k / k!, below 1e-15 for 1 rad.
+PICARD_ITERATIONS = 18
+# Newton steps from marker readings to strain coefficients; it converges quadratically and needs 4 for 1 rad.
+NEWTON_STEPS = 5
+
+RIGIDITY = {"twist": "torsional_rigidity", "curvature_y": "flexural_rigidity_y", "curvature_z": "flexural_rigidity_z"}
+
+
+class ExactRod:
+    """Strain coefficients as coordinates; as many a field as the markers determine.
+
+    free_end: the strain fields vanish at s = L (natural boundary condition of a last link without payload).
+    """
+
+    def __init__(self, link: FlexibleLink, free_end: bool) -> None:
+        self.length = link.length
+        names = strain_names(link)
+        self.n_f = len(names)
+        nodal = nodal_names(link)
+        self.marker_names = tuple(f"marker_{j}.{name}" for j in range(1, link.elements + 1) for name in nodal)
+        self._nodal_rows = [("u_x", "u_y", "u_z", "theta_x", "theta_y", "theta_z").index(name) for name in nodal]
+        nodes, weights = np.polynomial.legendre.leggauss(GAUSS_POINTS)
+        s = 0.5 * link.length * (nodes + 1.0)
+        self.weights = 0.5 * link.length * weights
+        marker_s = link.length * np.arange(1, link.elements + 1) / link.elements
+        # Stations: the Gauss points, where fields are sampled, then the markers; the last marker is the tip.
+        self._s = np.concatenate((s, marker_s))
+        self._integrate = _cumulative_integration(s, self._s)
+        self._axis = np.array([list(STRAIN).index(name.rsplit("_", 1)[0]) for name in names], dtype=int)
+        taper = Polynomial([1.0, -1.0 / link.length]) if free_end else Polynomial([1.0])
+        self._chi = np.zeros((GAUSS_POINTS, self.n_f))
+        for k, name in enumerate(names):
+            order = int(name.rsplit("_", 1)[1])
+            self._chi[:, k] = Legendre.basis(order, [0.0, link.length])(s) * taper(s)
+        self.stiffness = {}
+        for axis, field in enumerate(STRAIN):
+            chi = np.where(self._axis == axis, self._chi, 0.0)
+            if chi.any():
+                self.stiffness[RIGIDITY[field]] = (chi * self.weights[:, None]).T @ chi
+        # With one active field rotations commute and R is the exponential of the integrated strain.
+        self._commuting = len(set(self._axis)) == 1
+        self._fields = np.zeros((self.n_f, 3, GAUSS_POINTS))  # strain at the Gauss points per coordinate
+        self._fields[np.arange(self.n_f), self._axis] = self._chi.T
+        zero = np.zeros((1, self.n_f))
+        self._linear_map = self._marker_jacobian(self.shape_at_stations(zero))[0]
+
+    def _rotations(self, q_f: Array) -> Array:
+        """R (B, stations, 3, 3) of the sections."""
+        kappa = np.tensordot(q_f, self._fields, axes=(1, 0)).transpose(0, 2, 1)  # (B, G, 3)
+        R = so3.exponential(self._integrate @ kappa)
+        if self._commuting:
+            return R
+        K = so3.skew(kappa)
+        G = GAUSS_POINTS
+        for _ in range(PICARD_ITERATIONS):
+            R = np.eye(3) + _along(self._integrate, R[:, :G] @ K)
+        return R
+
+    def shape_at_stations(self, q_f: Array) -> tuple[Array, Array, Array, Array]:
+        """R (B, n, 3, 3), r (B, n, 3), spin Jacobian and position Jacobian (B, n, 3, n_f) at Gauss points and markers."""
+        G = GAUSS_POINTS
+        R = self._rotations(q_f)
+        spin = _along(self._integrate, R[:, :G][..., self._axis] * self._chi[:, None, :])
+        tangent = R[:, :G, :, 0]
+        r = _along(self._integrate, tangent)
+        J = _along(self._integrate, _cross_columns(spin[:, :G], tangent))
+        return R, r, spin, J
+
+    def shape(self, q_f: Array) -> Shape:
+        """Shape for strain coefficients q_f (B, n_f), 1/m."""
+        G = GAUSS_POINTS
+        R, r, spin, J = self.shape_at_stations(q_f)
+        return Shape(
+            points=r[:, :G],
+            J=J[:, :G],
+            tangent=R[:, :G, :, 0],
+            spin=spin[:, :G],
+            tip=r[:, -1],
+            tip_J=J[:, -1],
+            tip_rotation=R[:, -1],
+            tip_spin=spin[:, -1],
+        )
+
+    def shape_rate(self, q_f: Array, q_f_dot: Array, shape: Shape) -> ShapeRate:
+        """Rates of `shape` for q̇_f (B, n_f)."""
+        G = GAUSS_POINTS
+        R = self._rotations(q_f)[:, :G]
+        Omega = (shape.spin @ q_f_dot[:, None, :, None])[..., 0]
+        R_dot = so3.skew(Omega) @ R
+        spin_rate = _along(self._integrate, R_dot[..., self._axis] * self._chi[:, None, :])
+        tangent_rate = R_dot[..., 0]
+        J_rate = _along(
+            self._integrate,
+            _cross_columns(spin_rate[:, :G], shape.tangent) + _cross_columns(shape.spin, tangent_rate),
+        )
+        rates = q_f_dot[..., None]
+        return ShapeRate(
+            J=J_rate[:, :G],
+            spin=spin_rate[:, :G],
+            tip_J=J_rate[:, -1],
+            tip_spin=spin_rate[:, -1],
+            tip=(shape.tip_J @ rates)[..., 0],
+            tip_angular=(shape.tip_spin @ rates)[..., 0],
+        )
+
+    def _markers_of(self, stations: tuple[Array, Array, Array, Array]) -> Array:
+        R, r, _, _ = stations
+        G = GAUSS_POINTS
+        displacement = r[:, G:].copy()
+        displacement[..., 0] -= self._s[G:]
+        nodal = np.concatenate((displacement, so3.logarithm(R[:, G:])), axis=2)
+        return np.asarray(nodal[:, :, self._nodal_rows].reshape(R.shape[0], -1))
+
+    def _marker_jacobian(self, stations: tuple[Array, Array, Array, Array]) -> Array:
+        """∂ markers/∂ q_f (B, n_markers · per node, n_f)."""
+        R, _, spin, J = stations
+        G = GAUSS_POINTS
+        rotation = np.linalg.solve(so3.left_jacobian(so3.logarithm(R[:, G:])), spin[:, G:])
+        nodal = np.concatenate((J[:, G:], rotation), axis=2)[:, :, self._nodal_rows]
+        return np.asarray(nodal.reshape(nodal.shape[0], -1, self.n_f))
+
+    def markers(self, q_f: Array) -> Array:
+        """Displacements (m) and rotation vectors (rad) of the markers, (B, n_markers · per node), in {i}."""
+        return self._markers_of(self.shape_at_stations(q_f))
+
+    def coordinates(self, markers: Array) -> Array:
+        """Strain coefficients q_f (B, n_f) that reproduce the markers' readings, by Newton's method."""
+        q_f = np.linalg.solve(self._linear_map, markers.T).T
+        for _ in range(NEWTON_STEPS):
+            stations = self.shape_at_stations(q_f)
+            misfit = markers - self._markers_of(stations)
+            q_f = q_f + np.linalg.solve(self._marker_jacobian(stations), misfit[..., None])[..., 0]
+        return q_f
+
+
+def _cumulative_integration(nodes: Array, ends: Array) -> Array:
+    """D (ends, nodes): D f = ∫_0^end of the polynomial through samples f at the nodes."""
+    D = np.zeros((ends.size, nodes.size))
+    for k in range(nodes.size):
+        others = np.delete(nodes, k)
+        basis = Polynomial.fromroots(others)
+        primitive = (basis / basis(nodes[k])).integ()
+        D[:, k] = primitive(ends) - primitive(0.0)
+    return D
+
+
+def _along(D: Array, samples: Array) -> Array:
+    """Cumulative integral along axis 1 of samples (B, G, ...)."""
+    flat = samples.reshape(samples.shape[0], samples.shape[1], -1)
+    return np.asarray((D @ flat).reshape(samples.shape[0], D.shape[0], *samples.shape[2:]))
+
+
+def _cross_columns(columns: Array, vector: Array) -> Array:
+    """Each column of (B, G, 3, n) crossed with a vector (B, G, 3)."""
+    return -so3.skew(vector) @ columns

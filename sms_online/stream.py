@@ -1,0 +1,44 @@
+"""The unit that flows from a source into the pipeline: a block of consecutive samples in SI units."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Block:
+    """B consecutive samples of C channels.
+
+    t: (B,) seconds, not decreasing. values: (B, C) SI units, NaN where a channel was not sampled at that instant.
+    channels: C names, see the README's list of channels.
+    """
+
+    t: Array
+    channels: tuple[str, ...]
+    values: Array
+
+    def __post_init__(self) -> None:
+        if self.values.shape != (self.t.size, len(self.channels)):
+            raise ValueError(f"values {self.values.shape} do not fit {self.t.size} samples x {len(self.channels)} channels")
+
+
+class Source(Protocol):
+    """Anything that yields blocks in order of time: a capture file, a CAN log, a live bus."""
+
+    @property
+    def channels(self) -> tuple[str, ...]:
+        """Names of the channels of every block."""
+
+    @property
+    def warnings(self) -> list[str]:
+        """What was skipped or repaired so far, counted, one sentence each."""
+
+    def __iter__(self) -> Iterator[Block]:
+        """Yield the blocks, in order of time."""
