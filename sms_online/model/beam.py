@@ -106,7 +106,8 @@ class LinearLink:
         if self.first_order:
             rotation, tip_spin = np.eye(3) + so3.skew(theta), self._tip_theta[None]
         else:
-            rotation, tip_spin = so3.exponential(theta), so3.left_jacobian(theta) @ self._tip_theta
+            turn = so3.RotationVector(theta)
+            rotation, tip_spin = turn.matrix, turn.left_jacobian @ self._tip_theta
         G = self.weights.size
         return Shape(
             points=self._x + (q_f @ self._J[0].reshape(3 * G, self.n_f).T).reshape(-1, G, 3),
@@ -125,7 +126,7 @@ class LinearLink:
             spin_rate = self._no_tip_rate
         else:
             theta, theta_dot = q_f @ self._tip_theta.T, q_f_dot @ self._tip_theta.T
-            spin_rate = so3.left_jacobian_rate(theta, theta_dot) @ self._tip_theta
+            spin_rate = so3.RotationVector(theta).left_jacobian_rate(theta_dot) @ self._tip_theta
         return ShapeRate(
             J=self._no_J_rate,
             spin=self._no_J_rate,

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
+from numpy.typing import NDArray
 
 from sms_online.description.schema import FlexibleLink, Joint, RigidLink, System
 from sms_online.model import so3
@@ -38,7 +39,7 @@ class Chain:
         self.layout = layout
         self.joints: tuple[Joint, ...] = system.joints
         self.axes = [np.array(joint.axis) for joint in system.joints]
-        self.mounts = [so3.exponential(np.array(joint.mount_rotation)) for joint in system.joints]
+        self.mounts = [so3.RotationVector(np.array(joint.mount_rotation)).matrix for joint in system.joints]
         self.links = system.links
         self.flexible: list[LinkKinematics | None] = []
         for i, link in enumerate(system.links):
@@ -65,6 +66,17 @@ class Chain:
         for i in range(1, len(self.joints) + 1):
             names += [f"mount_{i}", f"link_{i}"]
         return (*names, "tip")
+
+    def moves(self, frame: int, own: slice) -> NDArray[np.bool_]:
+        """Which speeds (n_v,) move a body in a frame that has speeds of its own besides."""
+        mask = np.zeros(self.layout.n_v, dtype=bool)
+        mask[: self.layout.n_base_speeds] = True
+        mask[own] = True
+        for i in range(len(self.joints)):
+            mask[self.layout.q[i]] |= frame >= 2 * i + 2
+            if frame > 2 * i + 2:
+                mask[self.layout.q_f[i]] = True
+        return mask
 
     def configure(self, x: Array) -> Configuration:
         """Configuration at positions x (B, n_x)."""
@@ -96,7 +108,7 @@ class Configuration:
             q = x[:, layout.q[i] + offset]
             mount = Frame(end.origin, end.rotation @ chain.mounts[i])
             if joint.kind == "revolute":
-                turn = so3_about(chain.axes[i], q)
+                turn = so3.about(chain.axes[i], q)
                 link = Frame(mount.origin, mount.rotation @ turn)
                 self.slides.append(None)
             else:
@@ -218,14 +230,6 @@ class Configuration:
         end[:, 3:] += shape_rate.tip_spin @ elastic
         end -= _spin(shape_rate.tip_angular, self._unturned_end(i, link_twist, rates))
         return _turn_back(shape.tip_rotation, end)
-
-
-def so3_about(axis: Array, angle: Array) -> Array:
-    """Rotations (B, 3, 3) about a unit axis (3,) by angles (B,), rad."""
-    K = so3.skew(axis)
-    return np.asarray(
-        np.eye(3) + np.sin(angle)[:, None, None] * K + (1.0 - np.cos(angle))[:, None, None] * (K @ K)
-    )
 
 
 def _turn_back(R: Array, twist: Array) -> Array:

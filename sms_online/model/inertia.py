@@ -1,8 +1,8 @@
 """Kinetic terms of the model: bodies of constant inertia and flexible links, each linear in its parameters, (7), (15), (17).
 
 A term sees its local speeds ν (B, d): the twist of its frame, then the rates of d - 6 coordinates of its own. For each of its
-parameters it gives the local momentum p = ∂K/∂ν, the convective part g with force F = ṗ - g (Newton–Euler in body axes), and
-the force F at ν̇ = 0.
+n parameters it gives the local momentum p = ∂K/∂ν, the convective part g with force F = ṗ - g (Newton–Euler in body axes),
+and the force F at ν̇ = 0; all as columns (B, d, n).
 """
 
 from __future__ import annotations
@@ -31,7 +31,10 @@ class Term:
         own = rates[:, self.speeds]
         if own.shape[1] == 0:
             return twist
-        return np.concatenate((twist, np.broadcast_to(own, (twist.shape[0], *own.shape[1:]))), axis=1)
+        out = np.empty((twist.shape[0], 6 + own.shape[1], twist.shape[2]))
+        out[:, :6] = twist
+        out[:, 6:] = own
+        return out
 
 
 @dataclass(frozen=True)
@@ -41,22 +44,22 @@ class BodyTerm(Term):
     matrices: Array
 
     def momentum(self, nu: Array) -> Array:
-        """p (B, n, d) of each parameter."""
+        """p (B, d, n) of each parameter."""
         n, d, _ = self.matrices.shape
-        return (nu @ self.matrices.transpose(1, 0, 2).reshape(d, n * d)).reshape(-1, n, d)
+        return (nu @ self.matrices.transpose(2, 1, 0).reshape(d, d * n)).reshape(-1, d, n)
 
-    def convective(self, nu: Array, p: Array) -> Array:
-        """g (B, n, d) of each parameter for its momentum p."""
-        return convective(nu, p)
+    def energy(self, nu: Array) -> Array:
+        """K (B, n) of each parameter."""
+        return np.asarray(0.5 * (nu[:, None] @ self.momentum(nu))[:, 0])
 
 
 def convective(nu: Array, p: Array) -> Array:
-    """Convective part (B, n, d) of body-axes momenta p (B, n, d) that do not depend on the shape."""
-    v, omega = nu[:, None, :3], nu[:, None, 3:6]
+    """Convective part g (B, d, n) of body-axes momenta p (B, d, n) with a mass matrix that does not depend on the shape."""
+    turn = skew(nu[:, :6].reshape(-1, 2, 3))  # v×, ω×
     g = np.zeros_like(p)
-    g[..., :3] = -cross(omega, p[..., :3])
-    g[..., 3:6] = -cross(omega, p[..., 3:6]) - cross(v, p[..., :3])
-    return g
+    g[:, :6] = (turn[:, 1:] @ p[:, :6].reshape(-1, 2, 3, p.shape[2])).reshape(-1, 6, p.shape[2])
+    g[:, 3:6] += turn[:, 0] @ p[:, :3]
+    return -g
 
 
 @dataclass(frozen=True)
@@ -69,120 +72,128 @@ class LinkTerm(Term):
 
 
 class LinkMotion:
-    """Kinetic quantities of one flexible link at B configurations and, where given, local speeds."""
+    """Kinetic quantities of one flexible link at B configurations.
+
+    A point's velocity is A ν with A = [1, -r×, J]; a section's axial spin is S ν with S = tᵀ [0, 1, spin].
+    """
 
     def __init__(self, term: LinkTerm, configuration: Configuration) -> None:
         shape = configuration.shapes[term.link]
         assert shape is not None
         self.term = term
         self.shape: Shape = shape
-        B, G = configuration.size, term.weights.size
-        d = 6 + shape.J.shape[-1]
-        self.root = np.sqrt(term.weights)
-        # Velocities of the quadrature points are A ν, scaled by the root of the weights: K = ½ ρA |A ν|².
-        A = np.zeros((B, G, 3, d))
-        A[..., :3] = np.eye(3)
-        A[..., 3:6] = -skew(shape.points)
-        A[..., 6:] = shape.J
-        self.A = (A * self.root[:, None, None]).reshape(B, 3 * G, d)
-        if term.polar:
-            # Axial spin of the sections is S ν: K = ½ ρI_p |S ν|².
-            S = np.zeros((B, G, d))
-            S[..., 3:6] = shape.tangent
-            S[..., 6:] = _dot(shape.tangent, shape.spin)
-            self.S = S * self.root[:, None]
+        self.size = configuration.size
+
+    def _velocities(self, nu: Array) -> Array:
+        """A ν (B, G, 3) of the quadrature points, m/s, in {i}."""
+        turned = self.shape.points @ skew(nu[:, 3:6]).transpose(0, 2, 1)
+        return turned + nu[:, None, :3] + _columns(self.shape.J, nu[:, 6:])
+
+    def _collect(self, f: Array) -> Array:
+        """Aᵀ f (B, d) of forces f (B, G, 3) on the points."""
+        return np.concatenate(
+            (f.sum(axis=1), cross(self.shape.points, f).sum(axis=1), _columns_transposed(self.shape.J, f)), axis=1
+        )
+
+    def _spins(self, nu: Array) -> Array:
+        """S ν (B, G), rad/s."""
+        section = nu[:, None, 3:6] + _columns(self.shape.spin, nu[:, 6:])
+        return _dot(self.shape.tangent, section)
+
+    def _collect_moments(self, m: Array) -> Array:
+        """[0, 1, spin]ᵀ m (B, d) of moments m (B, G, 3) on the sections."""
+        return np.concatenate(
+            (np.zeros((self.size, 3)), m.sum(axis=1), _columns_transposed(self.shape.spin, m)), axis=1
+        )
 
     def energy(self, nu: Array) -> Array:
         """K (B, n) of each parameter."""
-        out = [_square(self.A, nu)]
+        u = self._velocities(nu)
+        out = [0.5 * ((u * u).sum(axis=2) @ self.term.weights)]
         if self.term.polar:
-            out.append(_square(self.S, nu))
+            out.append(0.5 * (self._spins(nu) ** 2 @ self.term.weights))
         return np.stack(out, axis=1)
 
     def momentum(self, nu: Array) -> Array:
-        """p (B, n, d) of each parameter."""
-        out = [_back(self.A, _apply(self.A, nu))]
+        """p (B, d, n) of each parameter."""
+        weights = self.term.weights[:, None]
+        out = [self._collect(self._velocities(nu) * weights)]
         if self.term.polar:
-            out.append(_back(self.S, _apply(self.S, nu)))
-        return np.stack(out, axis=1)
+            out.append(self._collect_moments(self._spins(nu)[..., None] * self.shape.tangent * weights))
+        return np.stack(out, axis=2)
 
     def mass_matrix(self, pi: Array) -> Array:
         """Local mass matrix (B, d, d) for the term's parameters."""
-        M = pi[0] * (self.A.transpose(0, 2, 1) @ self.A)
+        shape, G = self.shape, self.term.weights.size
+        root = np.sqrt(self.term.weights)
+        A = np.zeros((self.size, G, 3, 6 + shape.J.shape[-1]))
+        A[..., :3] = np.eye(3)
+        A[..., 3:6] = -skew(shape.points)
+        A[..., 6:] = shape.J
+        A = (A * root[:, None, None]).reshape(self.size, 3 * G, -1)
+        M = pi[0] * (A.transpose(0, 2, 1) @ A)
         if self.term.polar:
-            M = M + pi[1] * (self.S.transpose(0, 2, 1) @ self.S)
+            S = np.zeros((self.size, G, A.shape[2]))
+            S[..., 3:6] = shape.tangent
+            S[..., 6:] = (shape.tangent[..., None, :] @ shape.spin)[..., 0, :]
+            S *= root[:, None]
+            M += pi[1] * (S.transpose(0, 2, 1) @ S)
         return np.asarray(M)
 
-    def _rates(self, nu: Array, rate: ShapeRate) -> tuple[Array, Array]:
-        """Ȧ (B, G, 3, d) and the points' velocities u (B, G, 3), both scaled by the root of the weights."""
-        B, G = nu.shape[0], self.term.weights.size
-        q_f_dot = nu[:, None, 6:, None]
-        A_dot = np.zeros((B, G, 3, self.A.shape[2]))
-        A_dot[..., 3:6] = -skew((self.shape.J @ q_f_dot)[..., 0])
-        A_dot[..., 6:] = rate.J
-        return A_dot * self.root[:, None, None], _apply(self.A, nu).reshape(B, G, 3)
-
-    def _polar_rates(self, nu: Array, rate: ShapeRate) -> tuple[Array, Array]:
-        """Axial spin y (B, G), and ṫᵀ-free rate of S (B, G, d): t·Ḃ - (ω × t)·B, scaled by the root of the weights."""
-        omega = nu[:, None, 3:6]
-        turning = cross(omega, np.broadcast_to(self.shape.tangent, (nu.shape[0], *self.shape.tangent.shape[1:])))
-        g = np.zeros_like(self.S)
-        g[..., 3:6] = -turning
-        g[..., 6:] = _dot(self.shape.tangent, rate.spin) - _dot(turning, self.shape.spin)
-        return _apply(self.S, nu), g * self.root[:, None]
-
     def convective(self, nu: Array, rate: ShapeRate) -> Array:
-        """g (B, n, d) of each parameter: Ȧᵀ u - Aᵀ (ω × u)."""
-        A_dot, u = self._rates(nu, rate)
-        flat = u.reshape(u.shape[0], -1)
-        turning = cross(nu[:, None, 3:6], u).reshape(flat.shape)
-        out = [_back(A_dot.reshape(self.A.shape), flat) - _back(self.A, turning)]
+        """g (B, d, n) of each parameter: Ȧᵀ u - Aᵀ (ω × u), and for the axial spin y tᵀ [0, 1, spin] likewise."""
+        weights = self.term.weights[:, None]
+        u = self._velocities(nu) * weights
+        omega = nu[:, None, 3:6]
+        g = -self._collect(_turn(nu, u))
+        g[:, 3:6] += cross(_columns(self.shape.J, nu[:, 6:]), u).sum(axis=1)
+        g[:, 6:] += _columns_transposed(rate.J, u)
+        out = [g]
         if self.term.polar:
-            y, g = self._polar_rates(nu, rate)
-            out.append(_back(g, y))
-        return np.stack(out, axis=1)
+            momentum = self._spins(nu)[..., None] * self.shape.tangent * weights
+            g = -self._collect_moments(cross(np.broadcast_to(omega, momentum.shape), momentum))
+            g[:, 6:] += _columns_transposed(rate.spin, momentum)
+            out.append(g)
+        return np.stack(out, axis=2)
 
     def bias_force(self, nu: Array, rate: ShapeRate) -> Array:
-        """F (B, n, d) at ν̇ = 0 of each parameter: Aᵀ (Ȧ ν + ω × u)."""
-        A_dot, u = self._rates(nu, rate)
-        a = (A_dot @ nu[:, None, :, None])[..., 0] + cross(nu[:, None, 3:6], u)
-        out = [_back(self.A, a.reshape(nu.shape[0], -1))]
+        """F (B, d, n) at ν̇ = 0 of each parameter: Aᵀ (Ȧ ν + ω × u), and [0, 1, spin]ᵀ d/dt(y t)."""
+        weights = self.term.weights[:, None]
+        elastic = _columns(self.shape.J, nu[:, 6:])
+        a = _turn(nu, elastic + self._velocities(nu)) + _columns(rate.J, nu[:, 6:])
+        out = [self._collect(a * weights)]
         if self.term.polar:
-            out.append(self._polar_bias(nu, rate))
-        return np.stack(out, axis=1)
-
-    def _polar_bias(self, nu: Array, rate: ShapeRate) -> Array:
-        """F (B, d) at ν̇ = 0 of the spinning sections: Bᵀ d/dt(y t) with the tangent t carried by its section."""
-        q_f_dot = nu[:, None, 6:, None]
-        omega = nu[:, None, 3:6]
-        relative = (self.shape.spin @ q_f_dot)[..., 0]
-        acceleration = (rate.spin @ q_f_dot)[..., 0] + cross(np.broadcast_to(omega, relative.shape), relative)
-        y_dot = np.einsum("...i,...i->...", self.shape.tangent, acceleration)
-        y = _apply(self.S, nu) / self.root
-        tangent = np.broadcast_to(self.shape.tangent, relative.shape)
-        moment = self.term.weights[:, None] * (y_dot[..., None] * tangent + y[..., None] * cross(omega + relative, tangent))
-        F = np.zeros_like(nu)
-        F[:, 3:6] = moment.sum(axis=1)
-        F[:, 6:] = np.einsum("bgik,bgi->bk", np.broadcast_to(self.shape.spin, (*moment.shape, F.shape[1] - 6)), moment)
-        return F
+            relative = np.broadcast_to(_columns(self.shape.spin, nu[:, 6:]), (self.size, *self.shape.spin.shape[1:3]))
+            tangent = np.broadcast_to(self.shape.tangent, relative.shape)
+            y = self._spins(nu)[..., None]
+            y_dot = _dot(tangent, _turn(nu, relative) + _columns(rate.spin, nu[:, 6:]))[..., None]
+            # The tangent is carried by its section: dt/dt = (ω + relative spin) × t.
+            change = y_dot * tangent + y * (_turn(nu, tangent) + cross(relative, tangent))
+            out.append(self._collect_moments(change * weights))
+        return np.stack(out, axis=2)
 
 
-def _apply(A: Array, nu: Array) -> Array:
-    """A ν, (B, rows)."""
-    return np.asarray((A @ nu[..., None])[..., 0])
+def _turn(nu: Array, u: Array) -> Array:
+    """ω × u for vectors u (B, G, 3)."""
+    return np.asarray(u @ skew(nu[:, 3:6]).transpose(0, 2, 1))
 
 
-def _back(A: Array, u: Array) -> Array:
-    """Aᵀ u, (B, d)."""
-    return np.asarray((u[:, None, :] @ A)[:, 0])
+def _columns(J: Array, rates: Array) -> Array:
+    """J (B or 1, G, 3, n) times rates (B, n), as (B, G, 3)."""
+    n = J.shape[-1]
+    if J.shape[0] == 1:  # a constant Jacobian takes one matrix product for the whole block
+        return (rates @ J.reshape(-1, n).T).reshape(-1, *J.shape[1:3])
+    return (J.reshape(J.shape[0], -1, n) @ rates[..., None]).reshape(-1, *J.shape[1:3])
 
 
-def _square(A: Array, nu: Array) -> Array:
-    """½ |A ν|², (B,)."""
-    u = _apply(A, nu)
-    return np.asarray(0.5 * np.einsum("br,br->b", u, u))
+def _columns_transposed(J: Array, f: Array) -> Array:
+    """Jᵀ f (B, n) of f (B, G, 3)."""
+    n = J.shape[-1]
+    if J.shape[0] == 1:
+        return f.reshape(f.shape[0], -1) @ J.reshape(-1, n)
+    return np.asarray((f.reshape(f.shape[0], 1, -1) @ J.reshape(J.shape[0], -1, n))[:, 0])
 
 
-def _dot(t: Array, columns: Array) -> Array:
-    """tᵀ columns: (B, G, 3) with (B, G, 3, n) to (B, G, n)."""
-    return np.asarray((t[..., None, :] @ columns)[..., 0, :])
+def _dot(a: Array, b: Array) -> Array:
+    """Inner products along the last axis."""
+    return np.asarray((a * b).sum(axis=-1))

@@ -83,7 +83,7 @@ class Layout:
             T = np.zeros((B, 3, 3))
             T[:, 0, 0], T[:, 0, 1], T[:, 1, 0], T[:, 1, 1], T[:, 2, 2] = c, -s, s, c, 1.0
             return r_S, T
-        return r_S, so3.rotation_from_euler_parameters(x[:, 3:6], x[:, 6])
+        return r_S, so3.from_euler_parameters(x[:, 3:6], x[:, 6])
 
     def position_rate(self, x: Array, v: Array) -> Array:
         """ẋ (B, n_x) for speeds v (B, n_v): the identity but for Euler parameters."""

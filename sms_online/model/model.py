@@ -5,6 +5,7 @@ One set of kinetic terms serves the energy balance (43), (44), the weak form of 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -14,7 +15,7 @@ from sms_online.description.schema import FlexibleLink, RigidLink, System
 from sms_online.effects.catalogue import build_effects
 from sms_online.model.chain import Chain, Configuration
 from sms_online.model.flexible import ShapeRate
-from sms_online.model.inertia import BodyTerm, LinkMotion, LinkTerm, Term
+from sms_online.model.inertia import BodyTerm, LinkMotion, LinkTerm, Term, convective
 from sms_online.model.layout import Layout, build_layout
 from sms_online.model.parameters import InertialParameter, Parameter, motor, rigid_body, rigidity_parameter
 from sms_online.stream import Array
@@ -22,10 +23,20 @@ from sms_online.stream import Array
 
 @dataclass(frozen=True)
 class Spring:
-    """A quadratic potential ½ c zᵀ S z (or dissipation of the rates) on some speeds: parameter index, (n_v, n_v) matrix S."""
+    """A quadratic potential ½ c zᵀ S z of some coordinates z, or a damper of their rates: parameter, speeds, matrix S."""
 
     parameter: int
+    speeds: tuple[int, ...]
     matrix: Array
+
+    def energy(self, z: Array) -> Array:
+        """½ zᵀ S z (B,) for all coordinates in the order of the speeds (B, n_v)."""
+        own = z[:, self.speeds]
+        return np.asarray(0.5 * ((own @ self.matrix) * own).sum(axis=1))
+
+    def add_to(self, full: Array, factor: float) -> None:
+        """Add `factor` S to an (n_v, n_v) matrix."""
+        full[np.ix_(self.speeds, self.speeds)] += factor * self.matrix
 
 
 class Model:
@@ -70,14 +81,15 @@ class Model:
         motor_speed = {i: slice(self.layout.theta_m[i - 1], self.layout.theta_m[i - 1] + 1) for i in groups}
         for i, group in groups.items():
             add(group["rotor"], 2 * i - 1, motor_speed[i])
-        for i, group in groups.items():
-            add(group["stator"] + group["mass"], 2 * i - 1, motor_speed[i])
         for i, link in enumerate(system.links, start=1):
             if isinstance(link, RigidLink):
                 add(rigid_body(f"link_{i}", str(i), link, planar, spacecraft=False), 2 * i, none)
         if system.payload is not None:
             frame = 2 * len(system.joints) + 1
             add(rigid_body("payload", "p", system.payload, planar, spacecraft=False), frame, none)
+        # After the links: a motor that sits on a rigid link is lumped into that link, not the link into the motor.
+        for i, group in groups.items():
+            add(group["stator"] + group["mass"], 2 * i - 1, motor_speed[i])
 
     def _add_links(self, parameters: list[Parameter]) -> None:
         flexible = [(i, link) for i, link in enumerate(self.system.links, start=1) if isinstance(link, FlexibleLink)]
@@ -98,9 +110,8 @@ class Model:
             kinematics = self.chain.flexible[i - 1]
             assert kinematics is not None
             for rigidity, matrix in kinematics.stiffness.items():
-                full = np.zeros((self.layout.n_v, self.layout.n_v))
-                full[self.layout.q_f[i - 1], self.layout.q_f[i - 1]] = matrix
-                self.springs.append(Spring(len(parameters), full))
+                speeds = self.layout.q_f[i - 1]
+                self.springs.append(Spring(len(parameters), tuple(range(speeds.start, speeds.stop)), matrix))
                 parameters.append(rigidity_parameter(i, rigidity, link, self.layout.planar))
 
     def _add_springs(self, parameters: list[Parameter]) -> None:
@@ -110,9 +121,8 @@ class Model:
                 unit = ("N/m" if joint.kind == "prismatic" else "N m/rad") if kind == "stiffness" else (
                     "N s/m" if joint.kind == "prismatic" else "N m s/rad"
                 )
-                delta = np.zeros(self.layout.n_v)
-                delta[self.layout.theta_m[i - 1]], delta[self.layout.q[i - 1]] = 1.0, -1.0
-                springs.append(Spring(len(parameters), np.outer(delta, delta)))
+                ends = (self.layout.theta_m[i - 1], self.layout.q[i - 1])
+                springs.append(Spring(len(parameters), ends, np.array([[1.0, -1.0], [-1.0, 1.0]])))
                 parameters.append(Parameter(f"joint_{i}.{kind}", f"{symbol}_{i}", unit, getattr(joint, kind)))
 
     @property
@@ -138,7 +148,7 @@ class Model:
         twists = configuration.twists(rates)
         for body in self.bodies:
             nu = body.local(twists, rates)[..., 0]
-            Y[:, body.parameters] = 0.5 * np.einsum("bnd,bd->bn", body.momentum(nu), nu)
+            Y[:, body.parameters] = body.energy(nu)
         for link in self.links:
             nu = link.local(twists, rates)[..., 0]
             Y[:, link.parameters] = LinkMotion(link, configuration).energy(nu)
@@ -146,7 +156,7 @@ class Model:
             self._add_gravity_potential(Y, configuration)
         z = self._spring_coordinates(x)
         for spring in self.springs:
-            Y[:, spring.parameter] = 0.5 * np.einsum("bi,bi->b", z @ spring.matrix, z)
+            Y[:, spring.parameter] = spring.energy(z)
         return Y
 
     def _spring_coordinates(self, x: Array) -> Array:
@@ -176,47 +186,54 @@ class Model:
         """Columns (B, n_pi) of dissipated power, (24), and of the power that the effects take out, W per unit."""
         D = np.zeros((x.shape[0], self.n_pi))
         for damper in self.dampers:
-            D[:, damper.parameter] = np.einsum("bi,bi->b", v @ damper.matrix, v)
+            D[:, damper.parameter] = 2.0 * damper.energy(v)
         for effect, columns in zip(self.effects, self.effect_slices, strict=True):
             D[:, columns] = -np.einsum("bvn,bv->bn", effect.force(self.layout, x, v), v)
         return D
 
-    def momentum_columns(self, x: Array, v: Array) -> tuple[Array, Array]:
-        """P and G (B, n_v, n_pi) of the equations of motion d/dt(P π) - G π = Q, (33)–(38), without accelerations.
+    def momentum_columns(self, x: Array, v: Array, rows: Sequence[int] | None = None) -> tuple[Array, Array]:
+        """P and G (B, rows, n_pi) of the equations of motion d/dt(P π) - G π = Q, (33)–(38), without accelerations.
 
         P = ∂K/∂v. G collects ∂K/∂x, gravity, springs, dampers and effects. Rows of the base are those of S.
+        rows: the speeds whose equations are wanted; all of them by default.
         """
         B, n_v = x.shape[0], self.layout.n_v
-        P, G = np.zeros((B, n_v, self.n_pi)), np.zeros((B, n_v, self.n_pi))
+        rows = range(n_v) if rows is None else rows
+        P, G = np.zeros((B, len(rows), self.n_pi)), np.zeros((B, len(rows), self.n_pi))
         configuration = self.chain.configure(x)
         shape_rates = configuration.shape_rates(v)
-        eye, none = np.eye(n_v)[None], np.zeros((1, n_v, n_v))
-        J = configuration.jacobians
-        J_dot = configuration.twist_rates(eye, J, v, shape_rates)
+        rates, select, none = v[:, :, None], np.eye(n_v)[None, :, list(rows)], np.zeros((1, n_v, len(rows)))
+        twists = configuration.twists(rates)
+        if self.chain.moves(len(twists) - 1, slice(0, 0))[list(rows)].any():
+            W = configuration.twists(select)
+            W_dot = configuration.twist_rates(select, W, v, shape_rates)
+        else:  # motor sides of flexible joints alone: no frame moves with them
+            W = W_dot = [np.zeros((1, 6, len(rows)))] * len(twists)
 
         def add(term: Term, p: Array, g: Array) -> None:
-            W, W_dot = term.local(J, eye), term.local(J_dot, none)
-            P[:, :, term.parameters] = W.transpose(0, 2, 1) @ p.transpose(0, 2, 1)
-            G[:, :, term.parameters] = W_dot.transpose(0, 2, 1) @ p.transpose(0, 2, 1)
-            G[:, :, term.parameters] += W.transpose(0, 2, 1) @ g.transpose(0, 2, 1)
+            J, J_dot = term.local(W, select), term.local(W_dot, none)
+            P[:, :, term.parameters] = J.transpose(0, 2, 1) @ p
+            G[:, :, term.parameters] = J_dot.transpose(0, 2, 1) @ p + J.transpose(0, 2, 1) @ g
 
         for body in self.bodies:
-            nu = (body.local(J, eye) @ v[..., None])[..., 0]
-            p = body.momentum(nu)
-            g = body.convective(nu, p)
-            if self.gravity.any():
-                g += body.momentum(self._fall(configuration, body))
-            add(body, p, g)
+            if self.chain.moves(body.frame, body.speeds)[list(rows)].any():
+                nu = body.local(twists, rates)[..., 0]
+                p = body.momentum(nu)
+                g = convective(nu, p)
+                if self.gravity.any():
+                    g += body.momentum(self._fall(configuration, body))
+                add(body, p, g)
         for link in self.links:
-            nu = (link.local(J, eye) @ v[..., None])[..., 0]
-            motion = LinkMotion(link, configuration)
-            rate = shape_rates[link.link]
-            assert rate is not None
-            g = motion.convective(nu, rate)
-            if self.gravity.any():
-                g += motion.momentum(self._fall(configuration, link))
-            add(link, motion.momentum(nu), g)
-        self._add_forces(G, x, v)
+            if self.chain.moves(link.frame, link.speeds)[list(rows)].any():
+                nu = link.local(twists, rates)[..., 0]
+                motion = LinkMotion(link, configuration)
+                rate = shape_rates[link.link]
+                assert rate is not None
+                g = motion.convective(nu, rate)
+                if self.gravity.any():
+                    g += motion.momentum(self._fall(configuration, link))
+                add(link, motion.momentum(nu), g)
+        self._add_forces(G, x, v, rows)
         return P, G
 
     def _fall(self, configuration: Configuration, term: Term) -> Array:
@@ -226,14 +243,16 @@ class Model:
         fall[:, :3] = local
         return fall
 
-    def _add_forces(self, G: Array, x: Array, v: Array) -> None:
-        z = self._spring_coordinates(x)
-        for spring in self.springs:
-            G[:, :, spring.parameter] -= z @ spring.matrix
-        for damper in self.dampers:
-            G[:, :, damper.parameter] -= v @ damper.matrix
+    def _add_forces(self, G: Array, x: Array, v: Array, rows: Sequence[int]) -> None:
+        place = {speed: row for row, speed in enumerate(rows)}
+        for springs, deflection in ((self.springs, self._spring_coordinates(x)), (self.dampers, v)):
+            for spring in springs:
+                force = deflection[:, spring.speeds] @ spring.matrix
+                for k, speed in enumerate(spring.speeds):
+                    if speed in place:
+                        G[:, place[speed], spring.parameter] -= force[:, k]
         for effect, columns in zip(self.effects, self.effect_slices, strict=True):
-            G[:, :, columns] += effect.force(self.layout, x, v)
+            G[:, :, columns] += effect.force(self.layout, x, v)[:, list(rows)]
 
     def dynamics(self, pi: Array) -> Dynamics:
         """Equations of motion for parameter values π (n_pi,): the full dynamics that the paper reconstructs."""
@@ -246,23 +265,30 @@ class Dynamics:
     def __init__(self, model: Model, pi: Array) -> None:
         self.model = model
         self.pi = pi
-        self._bodies = [
-            BodyTerm(b.frame, b.speeds, (0,), np.tensordot(pi[list(b.parameters)], b.matrices, 1)[None])
-            for b in model.bodies
-        ]
+        merged: dict[int, BodyTerm] = {}
+        for body in model.bodies:
+            M = np.tensordot(pi[list(body.parameters)], body.matrices, 1)[None]
+            if body.frame in merged:
+                M = M + merged[body.frame].matrices
+            merged[body.frame] = BodyTerm(body.frame, body.speeds, (0,), M)
+        self._bodies = list(merged.values())
         self._eye = np.eye(model.layout.n_v)[None]
 
     @cached_property
     def stiffness(self) -> Array:
         """K_f (n_v, n_v): stiffness of links and joints."""
-        n_v = self.model.layout.n_v
-        return sum((self.pi[s.parameter] * s.matrix for s in self.model.springs), start=np.zeros((n_v, n_v)))
+        return self._assemble(self.model.springs)
 
     @cached_property
     def damping(self) -> Array:
         """Damping of the joints (n_v, n_v)."""
-        n_v = self.model.layout.n_v
-        return sum((self.pi[s.parameter] * s.matrix for s in self.model.dampers), start=np.zeros((n_v, n_v)))
+        return self._assemble(self.model.dampers)
+
+    def _assemble(self, springs: list[Spring]) -> Array:
+        full = np.zeros((self.model.layout.n_v, self.model.layout.n_v))
+        for spring in springs:
+            spring.add_to(full, self.pi[spring.parameter])
+        return full
 
     def mass_matrix(self, x: Array) -> Array:
         """H (B, n_v, n_v)."""
@@ -297,8 +323,8 @@ class Dynamics:
             nu = body.local(velocities, rates)[..., 0]
             M = body.matrices[0]
             H += W.transpose(0, 2, 1) @ (M @ W)
-            force = body.local(bias, none)[..., 0] @ M - body.convective(nu, (nu @ M)[:, None])[:, 0]
-            C += (force[:, None, :] @ W)[:, 0]
+            force = M @ body.local(bias, none) - convective(nu, (nu @ M)[..., None])
+            C += (W.transpose(0, 2, 1) @ force)[..., 0]
         for link in model.links:
             W = link.local(J, self._eye)
             nu = link.local(velocities, rates)[..., 0]
@@ -308,8 +334,8 @@ class Dynamics:
             H += W.transpose(0, 2, 1) @ (M @ W)
             rate = shape_rates[link.link]
             assert rate is not None
-            force = (M @ link.local(bias, none))[..., 0] + np.einsum("n,bnd->bd", pi, motion.bias_force(nu, rate))
-            C += (force[:, None, :] @ W)[:, 0]
+            force = M @ link.local(bias, none) + motion.bias_force(nu, rate) @ pi[:, None]
+            C += (W.transpose(0, 2, 1) @ force)[..., 0]
         for effect, columns in zip(model.effects, model.effect_slices, strict=True):
             C -= effect.force(model.layout, x, v) @ self.pi[columns]
         return H, C
@@ -329,5 +355,5 @@ class Dynamics:
 
     def base_momentum(self, x: Array, v: Array) -> Array:
         """Momentum of the whole system conjugate to the base's speeds (B, n_base): inertial, angular part about S."""
-        P, _ = self.model.momentum_columns(x, v)
-        return P[:, : self.model.layout.n_base_speeds] @ self.pi
+        P, _ = self.model.momentum_columns(x, v, range(self.model.layout.n_base_speeds))
+        return P @ self.pi

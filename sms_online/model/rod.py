@@ -67,7 +67,7 @@ class ExactRod:
     def _rotations(self, q_f: Array) -> Array:
         """R (B, stations, 3, 3) of the sections."""
         kappa = np.tensordot(q_f, self._fields, axes=(1, 0)).transpose(0, 2, 1)  # (B, G, 3)
-        R = so3.exponential(self._integrate @ kappa)
+        R = so3.RotationVector(self._integrate @ kappa).matrix
         if self._commuting:
             return R
         K = so3.skew(kappa)
@@ -135,7 +135,7 @@ class ExactRod:
         """∂ markers/∂ q_f (B, n_markers · per node, n_f)."""
         R, _, spin, J = stations
         G = GAUSS_POINTS
-        rotation = np.linalg.solve(so3.left_jacobian(so3.logarithm(R[:, G:])), spin[:, G:])
+        rotation = np.linalg.solve(so3.RotationVector(so3.logarithm(R[:, G:])).left_jacobian, spin[:, G:])
         nodal = np.concatenate((J[:, G:], rotation), axis=2)[:, :, self._nodal_rows]
         return np.asarray(nodal.reshape(nodal.shape[0], -1, self.n_f))
 

@@ -11,21 +11,31 @@ import numpy as np
 
 from sms_online.stream import Array
 
-# Terms of the power series in φ²: enough for full double precision below SERIES_LIMIT² (rad²).
-SERIES_TERMS = 10
-SERIES_LIMIT = 1.0
+# Terms of the power series in φ² below: full double precision for angles up to π.
+SERIES_TERMS = 14
+
+
+def _series_coefficients() -> Array:
+    """(SERIES_TERMS, 5): sin φ/φ, (1 - cos φ)/φ², (φ - sin φ)/φ³ as series in φ², and the φ²-derivatives of the last two."""
+    table = np.zeros((SERIES_TERMS, 5))
+    for k in range(SERIES_TERMS):
+        table[k, :3] = [(-1) ** k / math.factorial(2 * k + offset) for offset in (1, 2, 3)]
+        # The derivative's coefficient of (φ²)^k comes from the term k + 1.
+        table[k, 3:] = [(-1) ** (k + 1) * (k + 1) / math.factorial(2 * k + 2 + offset) for offset in (2, 3)]
+    return table
+
+
+_SERIES = _series_coefficients()
+
+# a @ _SKEW is a× row by row.
+_SKEW = np.zeros((3, 9))
+_SKEW[2, 1] = _SKEW[0, 5] = _SKEW[1, 6] = -1.0
+_SKEW[1, 2] = _SKEW[2, 3] = _SKEW[0, 7] = 1.0
 
 
 def skew(a: Array) -> Array:
     """Cross-product matrix a× of vectors (..., 3) as (..., 3, 3)."""
-    S = np.zeros((*a.shape[:-1], 3, 3))
-    S[..., 0, 1] = -a[..., 2]
-    S[..., 0, 2] = a[..., 1]
-    S[..., 1, 0] = a[..., 2]
-    S[..., 1, 2] = -a[..., 0]
-    S[..., 2, 0] = -a[..., 1]
-    S[..., 2, 1] = a[..., 0]
-    return S
+    return (a @ _SKEW).reshape(*a.shape[:-1], 3, 3)
 
 
 def cross(a: Array, b: Array) -> Array:
@@ -35,64 +45,41 @@ def cross(a: Array, b: Array) -> Array:
     return np.stack((a1 * b2 - a2 * b1, a2 * b0 - a0 * b2, a0 * b1 - a1 * b0), axis=-1)
 
 
-def _series(squared: Array, offset: int) -> Array:
-    """Σ_k (-φ²)^k / (2k + offset)!, with φ² = squared."""
-    total = np.zeros_like(squared)
-    for k in reversed(range(SERIES_TERMS)):
-        total = total * -squared + 1.0 / math.factorial(2 * k + offset)
-    return total
+class RotationVector:
+    """Rotations exp(θ×) of rotation vectors θ (..., 3), rad, of at most π."""
 
+    def __init__(self, theta: Array) -> None:
+        self.theta = theta
+        self._S = skew(theta)
+        self._S2 = self._S @ self._S
+        powers = np.empty((*theta.shape[:-1], SERIES_TERMS))
+        powers[..., 0] = 1.0
+        powers[..., 1:] = np.einsum("...i,...i->...", theta, theta)[..., None]
+        np.multiply.accumulate(powers, axis=-1, out=powers)
+        self._functions = (powers @ _SERIES)[..., None, None]
 
-def _series_derivative(squared: Array, offset: int) -> Array:
-    """Derivative of `_series` with respect to φ²."""
-    total = np.zeros_like(squared)
-    for k in reversed(range(1, SERIES_TERMS)):
-        total = total * -squared - k / math.factorial(2 * k + offset)
-    return total
+    @property
+    def matrix(self) -> Array:
+        """exp(θ×) (..., 3, 3)."""
+        f = self._functions
+        return np.asarray(np.eye(3) + f[..., 0, :, :] * self._S + f[..., 1, :, :] * self._S2)
 
+    @property
+    def left_jacobian(self) -> Array:
+        """J_l(θ) (..., 3, 3): the angular velocity of exp(θ×) in its fixed frame is J_l θ̇."""
+        f = self._functions
+        return np.asarray(np.eye(3) + f[..., 1, :, :] * self._S + f[..., 2, :, :] * self._S2)
 
-def _coefficients(squared: Array) -> tuple[Array, Array, Array]:
-    """sin φ/φ, (1 - cos φ)/φ², (φ - sin φ)/φ³ as functions of φ²."""
-    if not squared.size or squared.max() < SERIES_LIMIT**2:
-        return _series(squared, 1), _series(squared, 2), _series(squared, 3)
-    small = squared < SERIES_LIMIT**2
-    phi2 = np.where(small, SERIES_LIMIT**2, squared)
-    phi = np.sqrt(phi2)
-    inner = np.where(small, squared, 0.0)
-    sinc = np.where(small, _series(inner, 1), np.sin(phi) / phi)
-    versine = np.where(small, _series(inner, 2), (1.0 - np.cos(phi)) / phi2)
-    cubic = np.where(small, _series(inner, 3), (phi - np.sin(phi)) / (phi2 * phi))
-    return sinc, versine, cubic
-
-
-def exponential(theta: Array) -> Array:
-    """Rotation matrix exp(θ×) of rotation vectors θ (..., 3), rad, as (..., 3, 3)."""
-    sinc, versine, _ = _coefficients(np.einsum("...i,...i->...", theta, theta))
-    S = skew(theta)
-    return np.asarray(np.eye(3) + sinc[..., None, None] * S + versine[..., None, None] * (S @ S))
-
-
-def left_jacobian(theta: Array) -> Array:
-    """J_l(θ) (..., 3, 3): the angular velocity of exp(θ×) in its fixed frame is J_l θ̇."""
-    _, versine, cubic = _coefficients(np.einsum("...i,...i->...", theta, theta))
-    S = skew(theta)
-    return np.asarray(np.eye(3) + versine[..., None, None] * S + cubic[..., None, None] * (S @ S))
-
-
-def left_jacobian_rate(theta: Array, theta_dot: Array) -> Array:
-    """d/dt J_l(θ) (..., 3, 3), by the power series; θ (..., 3) rad is the rotation of an elastic section, below π."""
-    squared = np.einsum("...i,...i->...", theta, theta)
-    squared_dot = 2.0 * np.einsum("...i,...i->...", theta, theta_dot)
-    versine, cubic = _series(squared, 2), _series(squared, 3)
-    versine_dot = _series_derivative(squared, 2) * squared_dot
-    cubic_dot = _series_derivative(squared, 3) * squared_dot
-    S, S_dot = skew(theta), skew(theta_dot)
-    return np.asarray(
-        versine_dot[..., None, None] * S
-        + versine[..., None, None] * S_dot
-        + cubic_dot[..., None, None] * (S @ S)
-        + cubic[..., None, None] * (S_dot @ S + S @ S_dot)
-    )
+    def left_jacobian_rate(self, theta_dot: Array) -> Array:
+        """d/dt J_l(θ) (..., 3, 3) for θ̇ (..., 3)."""
+        f = self._functions
+        squared_dot = 2.0 * np.einsum("...i,...i->...", self.theta, theta_dot)[..., None, None]
+        S_dot = skew(theta_dot)
+        return np.asarray(
+            squared_dot * (f[..., 3, :, :] * self._S + f[..., 4, :, :] * self._S2)
+            + f[..., 1, :, :] * S_dot
+            + f[..., 2, :, :] * (S_dot @ self._S + self._S @ S_dot)
+        )
 
 
 def logarithm(R: Array) -> Array:
@@ -103,12 +90,19 @@ def logarithm(R: Array) -> Array:
     sine = np.sqrt(np.einsum("...i,...i->...", axis, axis))
     cosine = 0.5 * (np.trace(R, axis1=-2, axis2=-1) - 1.0)
     angle = np.arctan2(sine, cosine)
-    # Below the square root of the rounding unit φ/sin φ = 1 + φ²/6 is exact.
+    # Below the square root of the rounding unit φ/sin φ = 1 + φ²/6 is 1 exactly.
     ratio = np.where(sine > 1e-8, angle / np.where(sine > 1e-8, sine, 1.0), 1.0)
     return np.asarray(ratio[..., None] * axis)
 
 
-def rotation_from_euler_parameters(eps: Array, eta: Array) -> Array:
+def about(axis: Array, angle: Array) -> Array:
+    """Rotations (B, 3, 3) about a unit axis (3,) by angles (B,), rad."""
+    K = skew(axis)
+    trigonometric = np.stack((np.ones_like(angle), np.sin(angle), 1.0 - np.cos(angle)), axis=1)
+    return (trigonometric @ np.stack((np.eye(3), K, K @ K)).reshape(3, 9)).reshape(-1, 3, 3)
+
+
+def from_euler_parameters(eps: Array, eta: Array) -> Array:
     """T_0(ε, η) (..., 3, 3), body to inertial, of Euler parameters ε (..., 3), η (...), normalised here."""
     norm2 = np.einsum("...i,...i->...", eps, eps) + eta * eta
     S = skew(eps)

@@ -1,8 +1,8 @@
 """White measurement noise, estimated from the samples themselves on a uniform grid.
 
-Differencing d times multiplies white noise by √C(2d, d) and a component of frequency f by (2 sin(π f / f_s))^d. A signal well
-below f_s / 6 therefore dies out as d grows while noise does not, and what remains is the noise (Rice 1984; Gasser, Sroka and
-Jennen-Steinmetz 1986; for growing orders Seifert, Gasser and Wolf 1993).
+Differencing d times multiplies white noise by √C(2d, d) and a component of frequency f by (2 sin(π f / f_s))^d. A
+signal well below f_s / 6 therefore dies out as d grows while noise does not, and what remains is the noise (Rice
+1984; Gasser, Sroka and Jennen-Steinmetz 1986; for growing orders Seifert, Gasser and Wolf 1993).
 """
 
 from __future__ import annotations
@@ -15,25 +15,28 @@ from sms_online.stream import Array
 
 # 30 Hz at 1 kHz shrinks about tenfold an order, so sixteen orders bring it from 1 to rounding.
 MAX_ORDER = 16
-# The next order is tried while it lowers the estimate by more than this share: what is left of a signal that still falls at
-# least twofold an order is then below a quarter of the noise, 3 % of the estimate, less than its scatter over 1000 samples.
+# The next order is tried while it lowers the estimate by more than this share: what is left of a signal that still
+# falls at least twofold an order is then below a quarter of the noise, 3 % of the estimate, less than its scatter
+# over 1000 samples.
 STILL_FALLING = 0.97
 # Median absolute deviation of a unit normal distribution.
 NORMAL_MAD = 0.674489750196082
 # Fewer levels than this may be a switched command rather than a measured quantity on a grid of its sensor.
 LEAST_LEVELS = 8
-# Steps are multiples of one quantum when none is further than this share of it from one. A thousand steps of a continuous
-# signal do not pass by accident; steps whose rounding could exceed it are not judged.
+# Steps are multiples of one quantum when none is further than this share of it from one. A thousand steps of a
+# continuous signal do not pass by accident; steps whose rounding could exceed it are not judged.
 QUANTUM_TOLERANCE = 1e-2
 
 
 def noise_std(values: Array) -> Array:
     """1σ of the white noise of each channel, (C,), from consecutive samples on a uniform grid, values (B, C).
 
-    The spread is the median absolute deviation of the differences, so that a few jumps do not count; where more than half
-    of the differences vanish it is their root mean square. A channel whose values lie on a grid of width r has at least the
-    rounding noise r/√12. A constant channel has none. Scatter of the estimate about 5 % over 1000 samples.
-    Limitations: a signal above f_s / 6 counts as noise; noise that a sensor has low-passed is seen only by its level there.
+    The spread is the median absolute deviation of the differences, so that a few jumps do not count; where more
+    than half of the differences vanish it is their root mean square. A channel whose values lie on a grid of width
+    r has at least the rounding noise r/√12 (and up to twice that where it creeps from level to level). A constant
+    channel has none. Scatter of the estimate about 5 % over 1000 samples.
+    Limitations: a signal above f_s / 6 counts as noise; noise that a sensor has low-passed is seen only by its
+    level there.
     Raises ValueError with fewer than MAX_ORDER + 2 samples.
     """
     if values.shape[0] < MAX_ORDER + 2:
@@ -48,16 +51,18 @@ def noise_std(values: Array) -> Array:
         goes_on = spread < STILL_FALLING * sigma[falling]
         sigma[falling] = np.minimum(spread, sigma[falling])
         falling, difference = falling[goes_on], difference[:, goes_on]
-    return np.maximum(sigma, [_quantum(values[:, c]) / np.sqrt(12.0) for c in range(values.shape[1])])
+    rounding = np.array([_quantum(values[:, c]) for c in range(values.shape[1])]) / np.sqrt(12.0)
+    noise: Array = np.maximum(sigma, rounding)
+    return noise
 
 
 def _spread(difference: Array) -> Array:
     """1σ of each column about zero: differences of a smooth signal have no mean worth keeping."""
     magnitude = np.abs(difference)
-    robust = np.median(magnitude, axis=0) / NORMAL_MAD
+    robust: Array = np.median(magnitude, axis=0) / NORMAL_MAD
     still = robust == 0.0
     robust[still] = np.sqrt(np.mean(magnitude[:, still] ** 2, axis=0))
-    return np.asarray(robust)
+    return robust
 
 
 def _quantum(channel: Array) -> float:
@@ -68,8 +73,9 @@ def _quantum(channel: Array) -> float:
     rounding = 4.0 * float(np.spacing(np.max(np.abs(levels))))
     steps = np.diff(levels)
     remainder = steps[steps > rounding]
-    # Euclid's algorithm on all steps at once; without a grid the remainders sink into the rounding within a few rounds.
-    quantum = np.inf
+    # Euclid's algorithm on all steps at once; without a grid the remainders sink into the rounding within a few
+    # rounds.
+    quantum = 0.0
     while remainder.size:
         quantum = float(remainder.min())
         multiple = np.rint(steps / quantum)

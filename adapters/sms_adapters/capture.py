@@ -1,0 +1,257 @@
+"""Captures: CSV files `t,<channel>,…`, one row per sample in SI units, an empty cell for what was not sampled then."""
+
+from __future__ import annotations
+
+import difflib
+import math
+import re
+from collections import Counter
+from collections.abc import Callable, Collection, Iterator
+from pathlib import Path
+from types import TracebackType
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.csv
+
+from sms_adapters.lines import CHUNK, LineReader, sampled_line
+from sms_online.errors import InputError
+from sms_online.stream import Array, Block
+
+BLOCK = 16384  # rows: most that one block holds
+_NUMBER = re.compile(r"\s*-?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?\s*")
+
+
+class CaptureReader:
+    """A capture file, .csv or .csv.gz, as blocks in order of time; each iteration starts from its beginning.
+
+    start, stop: seconds after the capture's first sample; samples with start <= t - t[0] < stop are yielded, with the
+    capture's own t. block: most rows in a block. on_bytes: called with the bytes of the file consumed so far.
+    known: the channels that mean something to the caller; others are errors. One chunk of text is held at a time.
+
+    Empty and NaN cells are NaN in the block, a later sample with an equal time is skipped, and so is a last line that
+    does not end in a newline; each is counted in `warnings`.
+    Raises InputError, on construction for the file and its header, while iterating for a malformed line, an infinite
+    value, a time that is missing or goes back, or no sample at all. Rows of earlier chunks are out by then.
+    """
+
+    def __init__(
+        self,
+        path: Path,
+        start: float | None = None,
+        stop: float | None = None,
+        block: int = BLOCK,
+        on_bytes: Callable[[int], None] | None = None,
+        known: Collection[str] | None = None,
+    ) -> None:
+        self._path = path
+        self._start = -math.inf if start is None else start
+        self._stop = math.inf if stop is None else stop
+        self._block = block
+        self._lines = LineReader(path, on_bytes)
+        self._channels = _header(path, LineReader(path).first_line())
+        if known is not None:
+            check_channels(str(path), "line 1", self._channels, known)
+        self._reset()
+
+    @property
+    def channels(self) -> tuple[str, ...]:
+        """Names of the columns after t."""
+        return self._channels
+
+    @property
+    def warnings(self) -> list[str]:
+        """What the current iteration has skipped or left open so far."""
+        found = []
+        by_count: dict[int, list[str]] = {}
+        for channel, count in zip(self._channels, self._unsampled.tolist(), strict=True):
+            if count:
+                by_count.setdefault(count, []).append(channel)
+        for count, channels in by_count.items():
+            found.append(f"{self._path.name}: {count} of {self._rows} cells empty or NaN in {', '.join(channels)}")
+        if self._repeated:
+            found.append(f"{self._path.name}: {self._repeated} samples skipped, their time repeats the one before")
+        if self._lines.cut_line is not None:
+            found.append(
+                f"{self._path.name}: 1 line skipped, line {self._lines.cut_line} is cut (no newline at its end)"
+            )
+        return found
+
+    def __iter__(self) -> Iterator[Block]:
+        """Yield the blocks from the capture's beginning."""
+        self._reset()
+        first, last = math.nan, -math.inf
+        for line, chunk in self._lines:
+            body = chunk if line > 1 else chunk.partition(b"\n")[2]
+            rows = self._parse(line + (line == 1), body)
+            if not len(rows):
+                continue
+            t = rows[:, 0]
+            step = np.diff(t, prepend=last)
+            if not (step > 0).all():
+                self._check_times(line + (line == 1), body, t, step)
+                rows = rows[step > 0]
+                self._repeated += int(t.size - len(rows))
+                t = rows[:, 0]
+                if not t.size:
+                    continue
+            last = t[-1]
+            if math.isnan(first):
+                first = t[0]
+            inside = slice(*np.searchsorted(t - first, (self._start, self._stop)))
+            rows = rows[inside]
+            self._rows += len(rows)
+            self._unsampled += np.isnan(rows[:, 1:]).sum(axis=0)
+            for k in range(0, len(rows), self._block):
+                part = rows[k : k + self._block]
+                yield Block(part[:, 0], self._channels, part[:, 1:])
+            if last - first >= self._stop:
+                break
+        if not self._rows:
+            where = "" if math.isnan(first) else f" from {self._start:g} s to {self._stop:g} s"
+            raise InputError(str(self._path), "", f"no samples{where}", "at least one row below the header")
+
+    def _reset(self) -> None:
+        self._rows = 0
+        self._repeated = 0
+        self._unsampled = np.zeros(len(self._channels), dtype=np.int64)
+
+    def _parse(self, line: int, body: bytes) -> Array:
+        """(rows, 1 + C) of whole lines of text, t first; InputError names the first malformed line."""
+        names = ("t", *self._channels)
+        try:
+            rows = _parse(body, names)
+        except pa.ArrowInvalid:
+            lines = body.splitlines()
+            k = _first_malformed(lines, names)
+            raise self._malformed(line + k, lines[k].decode("utf-8", "replace").split(",")) from None
+        infinite = np.isinf(rows)
+        if infinite.any():
+            number, text = sampled_line(line, body, int(infinite.any(axis=1).argmax()))
+            raise self._malformed(number, text.split(","))
+        return rows
+
+    def _malformed(self, line: int, cells: list[str]) -> InputError:
+        names = ("t", *self._channels)
+        place = f"line {line}"
+        if len(cells) != len(names):
+            return InputError(str(self._path), place, f"{len(cells)} cells", f"{len(names)}, as in the header")
+        for name, cell in zip(names, cells, strict=True):
+            if cell and cell.strip().lower() != "nan" and not (_NUMBER.fullmatch(cell) and math.isfinite(float(cell))):
+                return InputError(
+                    str(self._path), f"{place}, column {name}", repr(cell[:40]), "a finite number or nothing"
+                )
+        return InputError(str(self._path), place, repr(",".join(cells)[:40]), "plain decimal numbers")
+
+    def _check_times(self, line: int, body: bytes, t: Array, step: Array) -> None:
+        """InputError where a time is missing or before the one above; equal times pass."""
+        wrong = ~(step >= 0)
+        if wrong.any():
+            number, text = sampled_line(line, body, int(wrong.argmax()))
+            cell = text.split(",", 1)[0]
+            found = "no time" if math.isnan(t[wrong.argmax()]) else f"time {cell} s, before that of the line above"
+            raise InputError(str(self._path), f"line {number}", found, "times that do not go back")
+
+
+class CaptureWriter:
+    """Writes blocks as a capture; the file appears under its name when the context ends without an error.
+
+    Floats are written as the shortest text that reads back to the same bits, NaN as an empty cell.
+    Raises InputError where the file cannot be made or is not named .csv.
+    """
+
+    def __init__(self, path: Path, channels: tuple[str, ...]) -> None:
+        if path.suffix != ".csv":
+            raise InputError(str(path), "", f"a capture named {path.name}", "a name ending in .csv")
+        self._path = path
+        self._part = path.with_name(path.name + ".part")
+        self._names = ("t", *channels)
+        try:
+            self._file = self._part.open("wb")
+        except OSError as error:
+            raise InputError(str(path), "", error.strerror or str(error), "a file that can be written") from None
+        self._file.write((",".join(self._names) + "\n").encode())
+        self._csv = pyarrow.csv.CSVWriter(
+            self._file,
+            pa.schema([(name, pa.float64()) for name in self._names]),
+            write_options=pyarrow.csv.WriteOptions(include_header=False, quoting_style="none"),
+        )
+
+    def __enter__(self) -> CaptureWriter:
+        return self
+
+    def write(self, block: Block) -> None:
+        """Append the rows of a block; ValueError where its channels are not the file's."""
+        if block.channels != self._names[1:]:
+            raise ValueError(f"block of {block.channels} for a capture of {self._names[1:]}")
+        columns = [pa.array(column, from_pandas=True) for column in (block.t, *block.values.T)]
+        self._csv.write(pa.table(columns, names=list(self._names)))
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._csv.close()
+        self._file.close()
+        if kind is None:
+            self._part.replace(self._path)
+        else:
+            self._part.unlink()
+
+
+def check_channels(source: str, place: str, channels: Collection[str], known: Collection[str]) -> None:
+    """InputError for the first channel that is not among the known ones, with the nearest name."""
+    for channel in channels:
+        if channel not in known:
+            near = difflib.get_close_matches(channel, known, n=1, cutoff=0.0)
+            expected = f"a channel of the system, such as {near[0]!r}" if near else "a system with channels"
+            raise InputError(source, place, f"unknown channel {channel!r}", expected)
+
+
+def _header(path: Path, line: str) -> tuple[str, ...]:
+    """The channels of a header line; InputError where it is none."""
+    names = [name.strip() for name in line.split(",")]
+    expected = "a header t,<channel>,…"
+    if all(_NUMBER.fullmatch(name) or name.lower() in ("", "nan") for name in names):
+        raise InputError(str(path), "line 1", f"no header but {line[:40]!r}", expected)
+    if names[0] != "t":
+        raise InputError(str(path), "line 1", f"first column {names[0]!r}", f"{expected}, with t in seconds")
+    if len(names) == 1:
+        raise InputError(str(path), "line 1", "no channel after t", expected)
+    repeated = [name for name, count in Counter(names).items() if count > 1]
+    if repeated:
+        raise InputError(str(path), "line 1", f"column {repeated[0]!r} twice", "each channel once")
+    if "" in names:
+        raise InputError(str(path), f"line 1, column {names.index('') + 1}", "a column without a name", expected)
+    return tuple(names[1:])
+
+
+def _parse(body: bytes, names: tuple[str, ...]) -> Array:
+    """(rows, columns) float64 of whole lines, NaN for empty cells; blank lines are passed over. Raises ArrowInvalid."""
+    if not body.strip():
+        return np.empty((0, len(names)))
+    table = pyarrow.csv.read_csv(
+        pa.py_buffer(body),
+        # A block that holds the whole text: it is parsed in one go and on this thread.
+        read_options=pyarrow.csv.ReadOptions(use_threads=False, column_names=names, block_size=max(len(body), CHUNK)),
+        parse_options=pyarrow.csv.ParseOptions(quote_char=False),
+        convert_options=pyarrow.csv.ConvertOptions(
+            column_types={name: pa.float64() for name in names}, null_values=[""]
+        ),
+    )
+    rows = np.empty((table.num_rows, len(names)))
+    for k, column in enumerate(table.columns):
+        rows[:, k] = column.to_numpy()
+    return rows
+
+
+def _first_malformed(lines: list[bytes], names: tuple[str, ...]) -> int:
+    """Index of the first line that does not parse, by halving: the parser itself says where, not a second grammar."""
+    good, bad = 0, len(lines)  # lines[:good] parse, lines[:bad] do not
+    while bad - good > 1:
+        middle = (good + bad) // 2
+        try:
+            _parse(b"\n".join(lines[good:middle]), names)
+            good = middle
+        except pa.ArrowInvalid:
+            bad = middle
+    return good

@@ -1,0 +1,31 @@
+"""System descriptions by name or by path."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from sms_online.description.explain import hint, nearest
+from sms_online.description.parse import parse_system, shipped_systems, shipped_text
+from sms_online.description.schema import System
+from sms_online.errors import InputError
+
+
+def load_system(path_or_name: str) -> System:
+    """System of a shipped name or of a `.toml` file; InputError where it is neither, or where its text is wrong."""
+    if path_or_name in shipped_systems():
+        return parse_system(shipped_text(path_or_name), path_or_name)
+    path = Path(path_or_name)
+    if path.suffix != ".toml":
+        names = shipped_systems()
+        suggestion = hint(nearest(path_or_name, names))
+        raise InputError(
+            path_or_name, "", "no shipped system of this name", f"a .toml file or one of {', '.join(names)}{suggestion}"
+        )
+    try:
+        text = path.read_bytes().decode("utf-8")
+    except UnicodeDecodeError as error:
+        raise InputError(path_or_name, f"byte {error.start}", "not UTF-8 text", "a TOML file in UTF-8") from None
+    except OSError as error:
+        reason = error.strerror or type(error).__name__
+        raise InputError(path_or_name, "", reason[0].lower() + reason[1:], "a readable system file") from None
+    return parse_system(text, path_or_name)

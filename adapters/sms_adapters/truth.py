@@ -1,0 +1,49 @@
+"""The truth of a simulated capture, in CAPTURE.truth.json beside it: for the report alone, never for the estimator."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+from sms_online.errors import InputError
+
+SCHEMA = "sms-online/truth/1"
+
+
+def truth_path(capture: Path) -> Path:
+    """Where the truth of a capture stands: its full name with .truth.json after it."""
+    return capture.with_name(capture.name + ".truth.json")
+
+
+def write_truth(capture: Path, parameters: dict[str, float], extra: dict[str, Any]) -> None:
+    """Write the parameters (name to value, SI units) and what else describes the simulation (JSON values) beside it.
+
+    Raises ValueError for an infinite value, NaN, or a key of extra that the document itself uses.
+    """
+    document = {"schema": SCHEMA, "parameters": parameters}
+    if taken := document.keys() & extra.keys():
+        raise ValueError(f"extra must not hold {sorted(taken)}")
+    text = json.dumps(document | extra, indent=2, allow_nan=False) + "\n"
+    path = truth_path(capture)
+    part = path.with_name(path.name + ".part")
+    part.write_text(text, encoding="utf-8")
+    part.replace(path)
+
+
+def read_truth(capture: Path) -> dict[str, Any] | None:
+    """The truth document beside a capture, None where there is none; InputError where it is not such a document."""
+    path = truth_path(capture)
+    try:
+        document = json.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        return None
+    except ValueError as error:
+        raise InputError(str(path), "", f"no JSON ({error})", f"a document of schema {SCHEMA}") from None
+    if not isinstance(document, dict) or document.get("schema") != SCHEMA:
+        found = document.get("schema") if isinstance(document, dict) else type(document).__name__
+        raise InputError(str(path), "schema", repr(found), SCHEMA)
+    parameters = document.get("parameters")
+    if not isinstance(parameters, dict) or not all(isinstance(value, float | int) for value in parameters.values()):
+        raise InputError(str(path), "parameters", repr(parameters)[:40], "a table of name to number")
+    return document

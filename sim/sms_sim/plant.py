@@ -1,0 +1,89 @@
+"""The testbed in closed loop: the model's equations of motion under its joint controller."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from sms_online.description.schema import System
+from sms_online.errors import InputError
+from sms_online.model.model import Model
+from sms_online.stream import Array
+from sms_sim.controller import JointPD
+from sms_sim.references import FourierReference
+
+
+class Plant:
+    """A described system with parameter values π and a controller; without one no torque acts.
+
+    The state y is positions x and speeds v in one array, (B, n_x + n_v). Euler parameters are integrated as plain states:
+    their norm is an invariant of the equations, which the adaptive integrator keeps to its own accuracy; only a run of
+    hours at a fixed step needs `normalised`.
+    Declared effects are part of the model's dynamics. Raises InputError where controller or trajectory do not fit the joints.
+    """
+
+    def __init__(self, system: System, parameters: Array | None = None) -> None:
+        self.system = system
+        self.model = Model(system)
+        self.parameters = self.model.nominal if parameters is None else parameters
+        self.dynamics = self.model.dynamics(self.parameters)
+        self.controller = _controller(system)
+        layout = self.model.layout
+        # Columns of a joint's link side and motor side, among the speeds and among the positions.
+        self._q_speed, self._motor_speed = list(layout.q), list(layout.theta_m)
+        self._q_position = [column + layout.n_x - layout.n_v for column in layout.q]
+
+    @property
+    def rest(self) -> Array:
+        """State (n_x + n_v,) at rest: undeformed, joints at zero, S at the origin, base unturned."""
+        layout = self.model.layout
+        y = np.zeros(layout.n_x + layout.n_v)
+        if "eta" in layout.position_names:
+            y[layout.position_names.index("eta")] = 1.0
+        return y
+
+    def normalised(self, y: Array) -> Array:
+        """States y (B, n_x + n_v) with Euler parameters, where there are any, of norm 1."""
+        names = self.model.layout.position_names
+        if "eta" not in names:
+            return y
+        attitude = slice(names.index("eps_x"), names.index("eta") + 1)
+        y = y.copy()
+        y[:, attitude] /= np.linalg.norm(y[:, attitude], axis=1, keepdims=True)
+        return y
+
+    def split(self, y: Array) -> tuple[Array, Array]:
+        """Positions x (B, n_x) and speeds v (B, n_v) of states y."""
+        n_x = self.model.layout.n_x
+        return y[:, :n_x], y[:, n_x:]
+
+    def torque(self, t: Array, y: Array) -> Array:
+        """Torque after the gear n τ (B, joints), N m (N), at instants t (B,), s."""
+        if self.controller is None:
+            return np.zeros((t.size, len(self.system.joints)))
+        x, v = self.split(y)
+        return self.controller(t, x[:, self._q_position], v[:, self._q_speed])
+
+    def rate(self, t: Array, y: Array) -> Array:
+        """ẏ (B, n_x + n_v) from H v̇ + C = Q, (40)."""
+        x, v = self.split(y)
+        Q = self.model.generalized_force(self.torque(t, y))
+        return np.concatenate((self.model.position_rate(x, v), self.dynamics.acceleration(x, v, Q)), axis=1)
+
+    def motor_power(self, t: Array, y: Array) -> Array:
+        """Power of each motor n τ θ̇_m (B, joints), W: its integral is the left side of (42)."""
+        _, v = self.split(y)
+        return np.asarray(self.torque(t, y) * v[:, self._motor_speed])
+
+
+def _controller(system: System) -> JointPD | None:
+    if system.controller is None or system.trajectory is None:
+        return None
+    joints = len(system.joints)
+    for place, given in (
+        ("controller.stiffness", len(system.controller.stiffness)),
+        ("controller.damping", len(system.controller.damping)),
+        ("trajectory.joints", len(system.trajectory.joints)),
+    ):
+        if given != joints:
+            raise InputError(system.name, place, f"{given} entries", f"{joints}, one for each joint")
+    return JointPD(system.controller, FourierReference(system.trajectory))

@@ -1,0 +1,84 @@
+"""What the sensors of a testbed make of exact values: rate, latency, white noise, resolution."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from sms_online.description.channels import drive_channel, sensed_channels
+from sms_online.description.schema import Sensor, System
+from sms_online.errors import InputError
+from sms_online.stream import Array
+
+
+@dataclass(frozen=True)
+class Grade:
+    """White noise per sample, 1σ: encoders and base angle rad, markers and base position m (slopes rad), joint torque n τ N m."""
+
+    encoder: float
+    marker: float
+    torque: float
+
+
+# DESIGN's noise grades at 1 kHz.
+GRADES = {
+    "0": Grade(encoder=0.0, marker=0.0, torque=0.0),
+    "A": Grade(encoder=1e-5, marker=1e-5, torque=0.1),
+    "B": Grade(encoder=1e-4, marker=1e-4, torque=0.5),
+    "C": Grade(encoder=1e-4, marker=1e-3, torque=0.5),
+}
+ENCODERS = ("q_", "theta_m_", "theta_0")
+EULER_PARAMETERS = ("eps_x", "eps_y", "eps_z", "eta")
+
+
+class Sensors:
+    """The sensors of a system on `channels` (C names): their own rates and errors, or all at the system's rate with a grade's noise.
+
+    measurable: channels that exact values exist for, drives first. Those that no sensor fills are left out; drives are
+    always there, for the torque is commanded; a system without sensors has them all, exact. Raises InputError on an
+    unknown grade.
+    """
+
+    def __init__(self, system: System, measurable: tuple[str, ...], grade: str | None, seed: int) -> None:
+        if grade is not None and grade not in GRADES:
+            raise InputError("simulation", "grade", repr(grade), f"one of {', '.join(GRADES)}")
+        drives = tuple(drive_channel(system, i) for i in range(1, len(system.joints) + 1))
+        filled = {channel: sensor for sensor in system.sensors for channel in sensed_channels(system, sensor)}
+        self.channels = tuple(c for c in measurable if c in drives or not system.sensors or c in filled)
+        ideal = Sensor(channels=("*",))
+        if grade is None:
+            used = [filled.get(channel, ideal) for channel in self.channels]
+        else:
+            used = [Sensor(channels=(c,), noise=_grade_noise(system, c, drives, GRADES[grade])) for c in self.channels]
+        self.sample_rate = system.sample_rate
+        self.latency = np.array([sensor.latency for sensor in used])
+        self._rate = np.array([min(sensor.rate or self.sample_rate, self.sample_rate) for sensor in used])
+        self._noise = np.array([sensor.noise for sensor in used])
+        self._resolution = np.array([sensor.resolution for sensor in used])
+        self._random = np.random.default_rng(seed)
+
+    def read(self, first: int, exact: Array) -> Array:
+        """Readings (B, C) of exact values (B, C) at samples first, first + 1, … of the system's rate; NaN where not sampled.
+
+        A sensor slower than the system fills the first sample of each of its own intervals. Samples have to be read in
+        order: noise is drawn for every channel of every sample, so that it depends on the seed alone.
+        """
+        values = exact + self._noise * self._random.standard_normal(exact.shape)
+        step = np.where(self._resolution > 0.0, self._resolution, 1.0)
+        values = np.where(self._resolution > 0.0, step * np.round(values / step), values)
+        # Number of a sensor's own interval, of each sample and of the one before it; rounding must not split an interval.
+        samples = first + np.arange(-1, exact.shape[0])
+        interval = np.floor(samples[:, None] * (self._rate / self.sample_rate) + 1e-9)
+        return np.where(np.diff(interval, axis=0) > 0, values, np.nan)
+
+
+def _grade_noise(system: System, channel: str, drives: tuple[str, ...], grade: Grade) -> float:
+    """σ of a channel in its own unit."""
+    if channel in drives:
+        gear = system.joints[drives.index(channel)].gear_ratio
+        return grade.torque / gear if channel.startswith("tau_") else grade.torque
+    if channel in EULER_PARAMETERS:
+        # Euler parameters turn by half the angle.
+        return 0.5 * grade.encoder
+    return grade.encoder if channel.startswith(ENCODERS) else grade.marker

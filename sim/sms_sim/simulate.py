@@ -1,0 +1,179 @@
+"""A simulated session: the exact motion of a testbed, its drift, and what its sensors record."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from sms_online.description.channels import drive_channel
+from sms_online.description.schema import System
+from sms_online.errors import InputError
+from sms_online.stream import Array, Block
+from sms_sim.integrate import Dense, solve
+from sms_sim.plant import Plant
+from sms_sim.sensors import Sensors
+
+# Bounds of the local error of a step. Positions are going to be differentiated: at 1 kHz an eighth-order difference turns
+# 1e-12 m into 1e-9 m/s, and these bounds leave 3e-9 of the speeds (measured), far below any sensor.
+POSITION_TOLERANCE = 1e-11  # m, rad
+SPEED_TOLERANCE = 1e-9  # m/s, rad/s
+# Samples of a block: enough to hide the cost of a call.
+BLOCK_SAMPLES = 1000
+
+
+@dataclass(frozen=True)
+class Drift:
+    """What the integrator lost, as the largest deviation over the session.
+
+    energy: of motor work - K - U - E_diss, relative to the largest energy (above that at rest). linear_momentum,
+    angular_momentum: of the whole system about the inertial origin, relative to what base and arm exchange; None where
+    momentum is not conserved (a fixed base, gravity).
+    """
+
+    energy: float
+    linear_momentum: float | None
+    angular_momentum: float | None
+
+
+@dataclass(frozen=True)
+class ExactStates:
+    """Exact values at B instants.
+
+    t (B,) s; x (B, n_x), v (B, n_v) in the order of the model's layout; torque (B, joints): n τ, N m (N); work (B, joints):
+    of each motor since the start, (42), J; dissipated (B,): since the start, (24), with what declared effects took out, J.
+    """
+
+    t: Array
+    x: Array
+    v: Array
+    torque: Array
+    work: Array
+    dissipated: Array
+
+
+@dataclass(frozen=True)
+class Simulation:
+    """The motion of a plant: solution holds its states at the integrator's steps and, as polynomials, between them."""
+
+    plant: Plant
+    solution: Dense
+
+    @property
+    def duration(self) -> float:
+        """Length of the session, s."""
+        return float(self.solution.t[-1])
+
+    @cached_property
+    def _powers(self) -> Array:
+        """Power of each motor and dissipated power, W, at all stages: (M, s, joints + 1)."""
+        plant, solution = self.plant, self.solution
+        shape = solution.stages.shape
+        t, y = solution.stage_times.ravel(), solution.stages.reshape(-1, shape[2])
+        parts = []
+        for start in range(0, t.size, BLOCK_SAMPLES):
+            rows = slice(start, start + BLOCK_SAMPLES)
+            dissipated = plant.dynamics.dissipation_power(*plant.split(y[rows]))
+            parts.append(np.column_stack((plant.motor_power(t[rows], y[rows]), dissipated)))
+        return np.concatenate(parts).reshape(shape[0], shape[1], -1)
+
+    @cached_property
+    def drift(self) -> Drift:
+        """Energy and momentum that the integrator lost."""
+        exact = exact_states(self, self.solution.t)
+        x, v, dynamics = exact.x, exact.v, self.plant.dynamics
+        energy = dynamics.energy(x, v)
+        lost = exact.work.sum(axis=1) - exact.dissipated - (energy - energy[0])
+        at_rest = dynamics.energy(*self.plant.split(self.plant.rest[None]))
+        energy_drift = _ratio(lost, energy - at_rest)
+        layout, system = self.plant.model.layout, self.plant.system
+        if not layout.free or any(system.gravity):
+            return Drift(energy_drift, None, None)
+        rows = dynamics.mass_matrix(x)[:, : layout.n_base_speeds]
+        # (B, n_base, n_v): momentum conjugate to the base's speeds, about S, by the speed that it comes from.
+        shares = rows * v[:, None, :]
+        n = len(layout.base_linear)
+        linear = shares[:, :n].sum(axis=2)
+        r_S, p = np.zeros((2, x.shape[0], 3))
+        r_S[:, list(layout.base_linear)] = x[:, :n]
+        p[:, list(layout.base_linear)] = linear
+        angular = shares[:, n:].sum(axis=2) + np.cross(r_S, p)[:, list(layout.base_angular)]
+        return Drift(
+            energy_drift,
+            _ratio(linear - linear[0], np.abs(shares[:, :n]).sum(axis=2)),
+            _ratio(angular - angular[0], np.abs(shares[:, n:]).sum(axis=2)),
+        )
+
+
+def _ratio(lost: Array, scale: Array) -> float:
+    """Largest |lost| over largest |scale|; 0 where nothing moved."""
+    largest = float(np.abs(scale).max())
+    return float(np.abs(lost).max()) / largest if largest > 0.0 else 0.0
+
+
+def simulate(
+    system: System,
+    duration: float | None = None,
+    parameters: Array | None = None,
+    initial: tuple[Array, Array] | None = None,
+) -> Simulation:
+    """Integrate a described system in closed loop, exact to the tolerances above.
+
+    duration: s, the reference's own by default. parameters: π (n_pi,) in place of the nominal ones. initial: x (n_x,) and
+    v (n_v,) in place of rest. Raises InputError where nothing states the duration, ArithmeticError where the motion cannot
+    be followed.
+    """
+    if duration is None:
+        if system.trajectory is None:
+            raise InputError(system.name, "trajectory", "no such table", "a trajectory, or a duration in seconds")
+        duration = system.trajectory.duration
+    plant = Plant(system, parameters)
+    layout = plant.model.layout
+    tolerance = np.concatenate((np.full(layout.n_x, POSITION_TOLERANCE), np.full(layout.n_v, SPEED_TOLERANCE)))
+    start = plant.rest if initial is None else np.concatenate(initial)
+    return Simulation(plant, solve(plant.rate, start, duration, tolerance))
+
+
+def exact_states(simulation: Simulation, t: Array) -> ExactStates:
+    """Exact states, torques and energies at instants t (B,) within the session, s."""
+    plant, solution = simulation.plant, simulation.solution
+    y = solution(t)
+    x, v = plant.split(y)
+    energies = solution.integral(simulation._powers, t)
+    return ExactStates(t, x, v, plant.torque(t, y), energies[:, :-1], energies[:, -1])
+
+
+def sampled_blocks(simulation: Simulation, grade: str | None = None, seed: int = 0) -> Iterator[Block]:
+    """What the sensors record at the system's rate, in blocks: drives and position channels, no rates.
+
+    grade: a noise grade (`sensors.GRADES`) in place of the described sensors. seed: of the noise. Raises InputError on an
+    unknown grade.
+    """
+    plant = simulation.plant
+    system, model = plant.system, plant.model
+    drives = tuple(drive_channel(system, i) for i in range(1, len(system.joints) + 1))
+    to_drive = np.array(
+        [1.0 / j.gear_ratio if d.startswith("tau_") else 1.0 for j, d in zip(system.joints, drives, strict=True)]
+    )
+    names = drives + model.channels
+    sensors = Sensors(system, names, grade, seed)
+    columns = [names.index(channel) for channel in sensors.channels]
+    # Half a sample of slack: duration times rate may fall short of a whole number by rounding.
+    samples = int(simulation.duration * system.sample_rate + 0.5) + 1
+
+    def exact(t: Array) -> Array:
+        """Exact values (B, C) at instants t (B,); before the start the system rests."""
+        inside = np.clip(t, 0.0, simulation.duration)
+        y = simulation.solution(inside)
+        torque = np.where(t[:, None] < 0.0, 0.0, plant.torque(inside, y))
+        return np.column_stack((torque * to_drive, model.measure(plant.split(y)[0])))[:, columns]
+
+    for first in range(0, samples, BLOCK_SAMPLES):
+        t = np.arange(first, min(first + BLOCK_SAMPLES, samples)) / system.sample_rate
+        values = np.empty((t.size, len(columns)))
+        for latency in np.unique(sensors.latency):
+            late = sensors.latency == latency
+            values[:, late] = exact(t - latency)[:, late]
+        yield Block(t, sensors.channels, sensors.read(first, values))

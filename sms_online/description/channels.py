@@ -1,0 +1,70 @@
+"""Names of the channels that a capture of a system may hold, and what a sensor's patterns select of them."""
+
+from __future__ import annotations
+
+from fnmatch import fnmatchcase
+
+from sms_online.description.schema import Deformation, FlexibleLink, Joint, Sensor, System
+
+AXES = ("x", "y", "z")
+# Nodal coordinates of a marker in the order of (32), with the deformation that moves each.
+NODAL: dict[str, Deformation] = {
+    "u_x": "traction",
+    "u_y": "bending_z",
+    "u_z": "bending_y",
+    "theta_x": "torsion",
+    "theta_y": "bending_y",
+    "theta_z": "bending_z",
+}
+
+
+def is_directly_driven(joint: Joint) -> bool:
+    """Whether the drive's force is measured on the axis itself: a prismatic axis, or no gear and no flexible transmission."""
+    return joint.kind == "prismatic" or (joint.transmission == "rigid" and joint.gear_ratio == 1.0)
+
+
+def drive_channel(system: System, i: int) -> str:
+    """Channel of the drive of joint i (from 1): `tau_i` at the motor shaft, N m, or `force_i` at the axis, N or N m."""
+    return f"force_{i}" if is_directly_driven(system.joints[i - 1]) else f"tau_{i}"
+
+
+def channels(system: System) -> tuple[str, ...]:
+    """Every channel that a capture of this system may hold: drives, joints, base, then markers and strain of each link."""
+    joints = range(1, len(system.joints) + 1)
+    names = [drive_channel(system, i) for i in joints]
+    names += [f"theta_m_{i}" for i in joints if system.joints[i - 1].transmission == "flexible"]
+    names += [f"q_{i}" for i in joints]
+    if system.spacecraft is not None:
+        names += _base_channels(planar=system.motion == "planar")
+    for i, link in enumerate(system.links, start=1):
+        if isinstance(link, FlexibleLink):
+            names += _link_channels(i, link, planar=system.motion == "planar")
+    return tuple(names)
+
+
+def _base_channels(planar: bool) -> list[str]:
+    """Pose and rates of S: inertial velocity and ω_0, and ω_0 in body axes as a gyro gives it."""
+    linear, angular = (AXES[:2], AXES[2:]) if planar else (AXES, AXES)
+    attitude = ["theta_0"] if planar else ["eps_x", "eps_y", "eps_z", "eta"]
+    return (
+        [f"r_S_{a}" for a in linear]
+        + attitude
+        + [f"v_S_{a}" for a in linear]
+        + [f"omega_0_{a}" for a in angular]
+        + [f"gyro_0_{a}" for a in angular]
+    )
+
+
+def _link_channels(i: int, link: FlexibleLink, planar: bool) -> list[str]:
+    """Markers in link frame {i} and in the laboratory's axes, and the root's strain; an exact link also shortens."""
+    exact = link.kinematics == "exact"
+    local = [name for name, moved_by in NODAL.items() if moved_by in link.deformations or (exact and name == "u_x")]
+    fields = local + list(AXES[:2] if planar else AXES)
+    return [f"link_{i}.marker_{j}.{field}" for j in range(1, link.elements + 1) for field in fields] + [
+        f"link_{i}.strain_angle"
+    ]
+
+
+def sensed_channels(system: System, sensor: Sensor) -> tuple[str, ...]:
+    """Channels of the system that a sensor's shell patterns select, in the order of `channels`."""
+    return tuple(c for c in channels(system) if any(fnmatchcase(c, pattern) for pattern in sensor.channels))

@@ -1,0 +1,186 @@
+"""What a single record cannot see: sizes that have to agree, names that have to exist, physics that has to be possible."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Iterable
+
+import numpy as np
+
+from sms_online.description.channels import channels, sensed_channels
+from sms_online.description.explain import hint, nearest, quoted
+from sms_online.description.schema import Deformation, FlexibleLink, Inertia, Joint, Motor, RigidLink, System
+from sms_online.errors import InputError
+
+# A direction that is typed with ten decimals is a unit vector to 1e-10.
+UNIT_TOLERANCE = 1e-9
+# Negative principal moment, relative to the largest, that rounding of typed inertias may leave.
+INERTIA_TOLERANCE = 1e-9
+
+RIGIDITY: dict[Deformation, str] = {
+    "traction": "axial_rigidity",
+    "torsion": "torsional_rigidity",
+    "bending_y": "flexural_rigidity_y",
+    "bending_z": "flexural_rigidity_z",
+}
+# kind@place.coefficient for a declared effect, or owner.quantity
+PARAMETER_NAME = re.compile(r"(?P<owner>[^\s@]+(@\S+)?)\.(?P<quantity>[a-z][a-z0-9_]*)")
+
+
+def check_system(system: System, source: str) -> None:
+    """Raise InputError at the first contradiction in a description."""
+    if not system.name:
+        raise InputError(source, "name", "an empty text", "a name")
+    for i, (joint, motor) in enumerate(zip(system.joints, system.motors, strict=True), start=1):
+        _check_joint(i, joint, motor, system.motion == "planar", source)
+    for i, link in enumerate(system.links, start=1):
+        if isinstance(link, FlexibleLink):
+            _check_flexible(f"link_{i}", link, system.motion == "planar", source)
+    for place, inertia in _inertias(system):
+        _check_inertia(place, inertia, source)
+    if system.motion == "planar" and system.gravity[2] != 0.0:
+        raise InputError(source, "gravity", f"{system.gravity[2]:g} m/s² along z", "gravity in the x-y plane, or motion = 'spatial'")
+    _check_simulation(system, source)
+    names = channels(system)
+    _check_sensors(system, names, source)
+    _check_source(system, names, source)
+    _check_effects(system, names, source)
+    _check_parameter_names(system, source)
+
+
+def _check_joint(i: int, joint: Joint, motor: Motor | None, planar: bool, source: str) -> None:
+    place = f"joint_{i}"
+    length = math.hypot(*joint.axis)
+    if abs(length - 1.0) > UNIT_TOLERANCE:
+        raise InputError(source, f"{place}.axis", f"{list(joint.axis)} of length {length:.10g}", "a unit vector")
+    if joint.transmission == "flexible":
+        if joint.stiffness == 0.0:
+            raise InputError(source, f"{place}.stiffness", "0", "a stiffness greater than 0, or transmission = 'rigid'")
+        if motor is None or motor.rotor_inertia == 0.0:
+            found = "no such table" if motor is None else "0"
+            raise InputError(
+                source, f"motor_{i}.rotor_inertia", found, f"a rotor inertia greater than 0, for {place} has a flexible transmission"
+            )
+    if not planar:
+        return
+    if joint.kind == "revolute" and abs(joint.axis[2]) != 1.0:
+        raise InputError(source, f"{place}.axis", f"{list(joint.axis)}", "[0, 0, 1] or [0, 0, -1] in planar motion")
+    if joint.kind == "prismatic" and joint.axis[2] != 0.0:
+        raise InputError(source, f"{place}.axis", f"{list(joint.axis)}", "an axis in the x-y plane in planar motion")
+    if joint.mount_rotation[:2] != (0.0, 0.0):
+        raise InputError(source, f"{place}.mount_rotation", f"{list(joint.mount_rotation)}", "a turn about z alone in planar motion")
+
+
+def _check_flexible(place: str, link: FlexibleLink, planar: bool, source: str) -> None:
+    if len(set(link.deformations)) < len(link.deformations):
+        raise InputError(source, f"{place}.deformations", f"{list(link.deformations)}", "each deformation once")
+    if planar and link.deformations != ("bending_z",):
+        raise InputError(source, f"{place}.deformations", f"{list(link.deformations)}", "['bending_z'] in planar motion")
+    if link.kinematics == "exact" and "traction" in link.deformations:
+        raise InputError(source, f"{place}.deformations", "'traction'", "no traction on an inextensible link (kinematics = 'exact')")
+    for deformation in link.deformations:
+        rigidity = RIGIDITY[deformation]
+        if getattr(link, rigidity) == 0.0:
+            raise InputError(source, f"{place}.{rigidity}", "0", f"a rigidity greater than 0, for {deformation} is active")
+    if "torsion" in link.deformations and link.polar_inertia_per_length == 0.0:
+        raise InputError(
+            source, f"{place}.polar_inertia_per_length", "0", "an inertia greater than 0, for without it torsion has no mass"
+        )
+
+
+def _inertias(system: System) -> Iterable[tuple[str, Inertia]]:
+    if system.spacecraft is not None:
+        yield "spacecraft.inertia", system.spacecraft.inertia
+    for i, motor in enumerate(system.motors, start=1):
+        if motor is not None:
+            yield f"motor_{i}.stator_inertia", motor.stator_inertia
+    for i, link in enumerate(system.links, start=1):
+        if isinstance(link, RigidLink):
+            yield f"link_{i}.inertia", link.inertia
+    if system.payload is not None:
+        yield "payload.inertia", system.payload.inertia
+
+
+def _check_inertia(place: str, inertia: Inertia, source: str) -> None:
+    i = inertia
+    moments = np.linalg.eigvalsh([[i.xx, i.xy, i.xz], [i.xy, i.yy, i.yz], [i.xz, i.yz, i.zz]])
+    if moments[0] < -INERTIA_TOLERANCE * moments[2]:
+        raise InputError(source, place, f"a negative principal moment, {moments[0]:.3g} kg m²", "a body's inertia: none below 0")
+
+
+def _check_simulation(system: System, source: str) -> None:
+    n = len(system.joints)
+    if system.controller is not None:
+        for key, gains in (("stiffness", system.controller.stiffness), ("damping", system.controller.damping)):
+            if len(gains) != n:
+                raise InputError(source, f"controller.{key}", f"{len(gains)} gains", f"{n}, one for each joint")
+
+
+def _check_sensors(system: System, names: tuple[str, ...], source: str) -> None:
+    filled: dict[str, int] = {}
+    for k, sensor in enumerate(system.sensors, start=1):
+        for pattern in sensor.channels:
+            if not sensed_channels(system, sensor.model_copy(update={"channels": (pattern,)})):
+                near = nearest(pattern, names)
+                expected = f"a channel of this system, such as {near or names[0]!r}"
+                raise InputError(source, f"sensor {k}.channels", f"{pattern!r} matches no channel", expected)
+        for channel in sensed_channels(system, sensor):
+            if channel in filled:
+                raise InputError(
+                    source, f"sensor {k}.channels", f"{channel!r} is filled by sensor {filled[channel]} too", "one sensor for a channel"
+                )
+            filled[channel] = k
+
+
+def _check_source(system: System, names: tuple[str, ...], source: str) -> None:
+    if system.source is None:
+        return
+    if not system.source.dbc.endswith(".dbc"):
+        raise InputError(source, "source.dbc", repr(system.source.dbc), "the name of a .dbc file")
+    if not system.source.signals:
+        raise InputError(source, "source.signals", "an empty table", '"MESSAGE.SIGNAL" = "channel", at least once')
+    for signal, channel in system.source.signals.items():
+        if not re.fullmatch(r"\w+\.\w+", signal):
+            raise InputError(source, "source.signals", repr(signal), '"MESSAGE.SIGNAL" in quotes')
+        if channel not in names:
+            near = nearest(channel, names)
+            raise InputError(
+                source, f"source.signals.{signal}", f"unknown channel {channel!r}", f"a channel of this system, such as {near or names[0]!r}"
+            )
+
+
+def _check_effects(system: System, names: tuple[str, ...], source: str) -> None:
+    """Places and repetitions; which effects there are and with what coefficients, the effects' catalogue says."""
+    numbered = [f"{kind}_{i}" for i in range(1, len(system.joints) + 1) for kind in ("joint", "link")]
+    places = ("base", *numbered, "tip")
+    seen: set[tuple[str, str]] = set()
+    for k, effect in enumerate(system.effects, start=1):
+        if effect.where not in (*places, *names):
+            near = nearest(effect.where, (*places, *names))
+            raise InputError(source, f"effect {k}.where", repr(effect.where), f"{', '.join(places)} or a channel{hint(near)}")
+        if (effect.name, effect.where) in seen:
+            raise InputError(source, f"effect {k}", f"{effect.name}@{effect.where} again", "each effect once at a place")
+        seen.add((effect.name, effect.where))
+
+
+def _check_parameter_names(system: System, source: str) -> None:
+    """`known` and `prior`: the owner exists; whether it has the quantity, the model says."""
+    n = len(system.joints)
+    owners = [] if system.spacecraft is None else ["spacecraft"]
+    owners += [f"{kind}_{i}" for i in range(1, n + 1) for kind in ("joint", "link")]
+    owners += [f"motor_{i}" for i in range(1, n + 1) if system.motors[i - 1] is not None]
+    owners += ["payload"] if system.payload is not None else []
+    owners += [f"{effect.name}@{effect.where}" for effect in system.effects]
+    for table, parameters in (("known", system.known), ("prior", system.priors)):
+        for name in parameters:
+            parts = PARAMETER_NAME.fullmatch(name)
+            if parts is None:
+                raise InputError(source, table, repr(name), "the name of a parameter, such as 'motor_1.mass'")
+            if parts["owner"] not in owners:
+                raise InputError(
+                    source, f'{table}."{name}"', f"{parts['owner']!r} is not in this system", quoted(owners, nearest(parts["owner"], owners))
+                )
+    for name in system.known:
+        if name in system.priors:
+            raise InputError(source, f'prior."{name}"', "a parameter that is in [known] too", "one of the two")

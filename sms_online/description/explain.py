@@ -1,0 +1,140 @@
+"""Validation errors in the words of the system file: one line with table.key, what was found and what was expected."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Sequence
+from typing import Any
+
+from pydantic import BaseModel, ValidationError
+from pydantic_core import ErrorDetails
+
+from sms_online.description import schema
+from sms_online.errors import InputError
+
+# Fields of `System` that are numbered tables, or lists of tables, in the file.
+TABLES = {"joints": "joint_{}", "motors": "motor_{}", "links": "link_{}", "sensors": "sensor {}", "effects": "effect {}"}
+RECORDS: dict[str, type[BaseModel]] = {
+    "spacecraft": schema.Spacecraft,
+    "payload": schema.RigidBody,
+    "joints": schema.Joint,
+    "motors": schema.Motor,
+    "sensors": schema.Sensor,
+    "effects": schema.Effect,
+    "source": schema.CanSource,
+    "priors": schema.Prior,
+    "controller": schema.Controller,
+    "trajectory": schema.Harmonic,
+    "windows": schema.Windows,
+}
+LINKS: dict[str, type[BaseModel]] = {"rigid": schema.RigidLink, "flexible": schema.FlexibleLink}
+INERTIAS = ("inertia", "stator_inertia")
+# Longest value that a message repeats; more would not fit a line.
+LONGEST_VALUE = 60
+
+
+def quoted(names: Sequence[str], near: str | None = None) -> str:
+    """'a', 'b' or 'c', and the one that was probably meant."""
+    words = [repr(name) for name in names]
+    text = words[0] if len(words) == 1 else f"{', '.join(words[:-1])} or {words[-1]}"
+    return text + hint(near)
+
+
+def hint(near: str | None) -> str:
+    """The question that suggests a name, if there is one to suggest."""
+    return f" (did you mean {near!r}?)" if near else ""
+
+
+def nearest(word: str, names: Sequence[str]) -> str | None:
+    """The name that looks most like a word, if one does."""
+    matches = difflib.get_close_matches(word, names, n=1)
+    return matches[0] if matches else None
+
+
+def unknown_key(source: str, place: str, key: str, known: Sequence[str], listed: Sequence[str] | None = None) -> InputError:
+    """Error for an unknown key; `known` are the keys that are compared with it, `listed` those that are printed."""
+    return InputError(source, place, f"unknown key {key!r}", quoted(listed or known, nearest(key, known)))
+
+
+def explain(error: ValidationError, source: str) -> InputError:
+    """The first error in a file's own words; unknown keys first, for a misspelt key also leaves one missing."""
+    details = error.errors(include_url=False)
+    first = next((d for d in details if d["type"] == "extra_forbidden"), details[0])
+    place = _place(first["loc"])
+    kind, value, context = first["type"], first["input"], first.get("ctx", {})
+    if kind == "extra_forbidden":
+        return unknown_key(source, place, str(first["loc"][-1]), _keys_beside(first["loc"]))
+    if kind == "missing":
+        in_list = isinstance(first["loc"][-1], int)
+        if in_list:
+            return InputError(source, place.rsplit("[", 1)[0], f"{_shown(value)}", "3 numbers")
+        return InputError(source, place, "missing", "a value, for this key has no default")
+    if kind in ("union_tag_not_found", "union_tag_invalid"):
+        tag = value.get("kind") if isinstance(value, dict) else None
+        near = nearest(str(tag), tuple(LINKS))
+        return InputError(source, f"{place}.kind", "missing" if tag is None else _shown(tag), quoted(tuple(LINKS), near))
+    if first["loc"][0] == "known" and isinstance(value, dict):
+        name = f"{first['loc'][1]}.{next(iter(value), 'parameter')}"
+        return InputError(source, place, "a table", f'a number; a name with a dot is quoted: "{name}" = value')
+    return InputError(source, place, _shown(value), _expected(kind, first, context))
+
+
+def _expected(kind: str, first: ErrorDetails, context: dict[str, Any]) -> str:
+    match kind:
+        case "greater_than":
+            return f"a number greater than {context['gt']:g}"
+        case "greater_than_equal":
+            return f"a number not less than {context['ge']:g}"
+        case "float_type" | "float_parsing":
+            return "a number"
+        case "int_type" | "int_from_float" | "int_parsing":
+            return "a whole number"
+        case "finite_number":
+            return "a finite number"
+        case "string_type":
+            return "a text in quotes"
+        case "literal_error":
+            allowed = context["expected"].replace(" or ", ", ").replace("'", "").split(", ")
+            return quoted(allowed, nearest(str(first["input"]), allowed))
+        case "too_short":
+            return f"at least {context['min_length']} of them"
+        case "too_long":
+            return f"{context['max_length']} numbers"
+        case "tuple_type" | "list_type":
+            return "a list"
+        case "model_type" | "model_attributes_type" | "dict_type":
+            return "a table"
+    return first["msg"]
+
+
+def _shown(value: Any) -> str:
+    """A value as a message repeats it, on one line."""
+    text = "a table" if isinstance(value, dict) else repr(value)
+    return text if len(text) <= LONGEST_VALUE else text[: LONGEST_VALUE - 1] + "…"
+
+
+def _place(loc: tuple[int | str, ...]) -> str:
+    """Place in the file, for instance link_2.length or gravity[0], for a place in `System`."""
+    parts = list(loc)
+    if parts[0] == "trajectory" and parts[1:2] == ["joints"]:
+        parts[1:3] = [f"joint_{int(parts[2]) + 1}"] if len(parts) > 2 else []
+    if parts[0] in TABLES and len(parts) > 1:
+        tag = 1 if parts[0] == "links" and parts[2:3] and parts[2] in LINKS else 0
+        parts[: 2 + tag] = [TABLES[str(parts[0])].format(int(parts[1]) + 1)]
+    elif parts[0] in ("priors", "sensors", "effects"):
+        parts[0] = str(parts[0]).removesuffix("s")
+    text = str(parts[0])
+    for part in parts[1:]:
+        text += f"[{part + 1}]" if isinstance(part, int) else f".{part}"
+    return text
+
+
+def _keys_beside(loc: tuple[int | str, ...]) -> tuple[str, ...]:
+    """Keys that are allowed where the unknown key `loc` stands."""
+    if loc[-2] in INERTIAS:
+        record: type[BaseModel] = schema.Inertia
+    elif loc[0] == "links":
+        record = LINKS[str(loc[2])]
+    else:
+        record = RECORDS[str(loc[0])]
+    return tuple(record.model_fields)

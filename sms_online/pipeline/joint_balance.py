@@ -1,0 +1,79 @@
+"""Momentum balance of the joints in weak form: the residual that each motor's torque leaves, over short windows.
+
+The rows that hold τ_i, (36) (on a rigid joint with (35) added), times φ(z) = (1 - z²)⁴ and integrated by parts, so that only
+positions and speeds appear: -∫ (φ̇ P + φ G) dt π = ∫ φ n τ dt.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sms_online.model.base_parameters import BaseParameters
+from sms_online.model.model import Model
+from sms_online.pipeline.energy_balance import BalanceRows
+from sms_online.stream import Array
+
+# Exponent of the test function: with its first three derivatives zero at the ends, sums over samples are integrals to rounding.
+EXPONENT = 4
+# A quarter of the data is enough for an rms, so short windows leave three times their width out; but windows follow each other at
+# least this often, s, and overlap by half at most.
+LARGEST_HOP = 0.4
+
+
+def test_function(width: int, sample_rate: float) -> tuple[Array, Array]:
+    """φ and φ̇ (1/s) at `width` + 1 samples across the window."""
+    z = np.linspace(-1.0, 1.0, width + 1)
+    phi = (1.0 - z**2) ** EXPONENT
+    phi_dot = -2.0 * EXPONENT * z * (1.0 - z**2) ** (EXPONENT - 1) * (2.0 * sample_rate / width)
+    return phi, phi_dot
+
+
+class JointBalance:
+    """Turns consecutive samples into weak-form rows of every joint, in N m s (N s)."""
+
+    def __init__(self, model: Model, base: BaseParameters, sample_rate: float) -> None:
+        self.model = model
+        self.base = base
+        seconds = model.system.windows.relative
+        self.width = 2 * max(1, round(0.5 * seconds * sample_rate))
+        self.hop = max(self.width // 2, min(4 * self.width, round(LARGEST_HOP * sample_rate)))
+        phi, phi_dot = test_function(self.width, sample_rate)
+        self._phi, self._phi_dot = phi / sample_rate, phi_dot / sample_rate
+        self.begin_segment()
+
+    def begin_segment(self) -> None:
+        """Forget the samples before a gap."""
+        layout = self.model.layout
+        self._samples = np.empty((0, layout.n_x + layout.n_v + len(layout.q)))
+        self._skip = 0  # samples to pass over before the next window
+
+    def push(self, index: NDArray[np.int64], x: Array, v: Array, joint_torque: Array) -> list[BalanceRows]:
+        """For each window that the samples complete, its rows: one a joint, in order."""
+        samples = np.concatenate((self._samples, np.concatenate((x, v, joint_torque), axis=1)))
+        grid_end = int(index[-1])
+        rows = []
+        start = self._skip
+        while start + self.width + 1 <= samples.shape[0]:
+            end = grid_end - (samples.shape[0] - 1) + start + self.width
+            rows.append(self._window(samples[start : start + self.width + 1], end))
+            start += self.hop
+        dropped = min(start, samples.shape[0])
+        self._samples, self._skip = samples[dropped:], start - dropped
+        return rows
+
+    def _window(self, samples: Array, end: int) -> BalanceRows:
+        layout = self.model.layout
+        x, v, torque = np.split(samples, [layout.n_x, layout.n_x + layout.n_v], axis=1)
+        P, G = self.model.momentum_columns(x, v, layout.theta_m)
+        columns = -(np.tensordot(self._phi_dot, P, 1) + np.tensordot(self._phi, G, 1))
+        b = self._phi @ torque - self.base.known_part(columns)
+        return BalanceRows(self.base.columns(columns), b, np.full(len(layout.q), end))
+
+    def state(self) -> dict[str, Array | int]:
+        """What `restore` needs to continue."""
+        return {"samples": self._samples, "skip": self._skip}
+
+    def restore(self, state: dict[str, Array]) -> None:
+        """Continue from a saved state."""
+        self._samples, self._skip = state["samples"], int(state["skip"])

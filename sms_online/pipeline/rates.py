@@ -1,0 +1,242 @@
+"""Values and first derivatives from noisy samples: one local polynomial, the same for every channel.
+
+A Savitzky-Golay filter fits a polynomial of degree 8 to the 2M + 1 samples around an instant and reads value and
+slope there. It is symmetric, so it has no phase error and the same lag of M samples in every channel; it is exact
+for polynomials up to its degree, so a derivative costs nothing where the signal is smooth; and M is its only knob.
+Its narrowest member, M = 4, goes through all nine samples: the value passes untouched and the rate is the
+eighth-order central difference. (Second-order differences are a larger error than good encoders' noise, and
+smoothing too widely before nonlinear products is a model error that no amount of data averages out; so the width
+follows from the noise, never from a constant.)
+
+References: Savitzky and Golay, Analytical Chemistry 36 (1964) 1627; Lepski, Theory of Probability and its
+Applications 35 (1990) 454; Goldenshluger and Nemirovski, Mathematical Methods of Statistics 6 (1997) 135.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import correlate1d
+
+from sms_online.pipeline.noise import noise_std
+from sms_online.pipeline.synchronise import GridSamples, StageState
+from sms_online.stream import Array
+
+DEGREE = 8
+# Half widths M in samples, each about √2 times the one before (noise of the rate down by 1.75 a step). All pass DC
+# to -3 dB at 0.26, 0.16, 0.11, 0.077, 0.052, 0.037 of the sample rate; the first passes everything.
+HALF_WIDTHS = (4, 6, 9, 13, 19, 28, 40)
+# Two windows agree while their difference is at most this much larger than noise alone makes it. Over a thousand
+# samples of white noise that ratio scatters by 3 to 10 % (neighbouring wide windows most), the error of the noise
+# estimate included.
+AGREEMENT = 1.4
+# Steps taken back from the widest window that agrees. There the error of smoothing may still reach the noise, yet a
+# fit averages noise over thousands of rows and this error over none; one step costs 1.75 in noise and divides the
+# error by 20.
+UNDERSMOOTHING = 1
+# A comparison needs several windows side by side: at least this many times M samples.
+SAMPLES_PER_HALF_WIDTH = 8
+# Noise below this many roundings of the largest value is rounding: nothing to smooth.
+ROUNDINGS = 64.0
+# Samples in which σ is estimated and M is chosen. Counted in samples, not seconds, as the accuracy of both is: σ to
+# 5 %.
+WARM_UP = 1000
+# Channels move in a window when one spans this many σ in each of its halves; noise alone spans 7.
+MOTION = 20.0
+NEVER = int(np.iinfo(np.int64).max)
+
+
+@dataclass(frozen=True)
+class RateSamples:
+    """B consecutive grid samples of one segment, smoothed, with their first derivatives.
+
+    index: (B,) grid index k, time t0 + k / sample_rate. values, rates: (B, C), SI units and SI units per second.
+    segment: number of the gap-free segment. half_width: M of the filter they passed, for the propagation of noise.
+    """
+
+    index: NDArray[np.int64]
+    values: Array
+    rates: Array
+    segment: int
+    half_width: int
+
+
+@lru_cache(maxsize=len(HALF_WIDTHS))
+def coefficients(half_width: int) -> tuple[Array, Array]:
+    """Weights of value and of slope per sample, each (2M + 1,), to be correlated with the samples.
+
+    By QR on the interval [-1, 1]. scipy.signal.savgol_coeffs works on sample numbers, where the condition number of
+    degree 8 passes 1e13: at M = 40 its weights are wrong by 8e-5.
+    """
+    z = np.arange(-half_width, half_width + 1) / half_width
+    q, r = np.linalg.qr(np.vander(z, DEGREE + 1, increasing=True))
+    value, slope = (q @ np.linalg.solve(r.T, np.eye(DEGREE + 1)[:, :2])).T
+    # Exactly symmetric and antisymmetric: no phase, not even of rounding.
+    return (value + value[::-1]) / 2.0, (slope - slope[::-1]) / (2.0 * half_width)
+
+
+def noise_gain(half_width: int, sample_rate: float) -> tuple[float, float]:
+    """1σ of value and of rate (1/s) that white noise of 1σ = 1 per sample leaves behind the filter: ‖h_0‖, ‖h_1‖."""
+    value, slope = coefficients(half_width)
+    value_gain = 1.0 if half_width == HALF_WIDTHS[0] else float(np.linalg.norm(value))
+    return value_gain, float(np.linalg.norm(slope)) * sample_rate
+
+
+def smooth_and_differentiate(values: Array, half_width: int, sample_rate: float) -> tuple[Array, Array]:
+    """Smoothed values and rates (B - 2M, C) of samples (B, C), for the centres that have M samples on either side.
+
+    scipy.ndimage.correlate1d sums every output in the same order wherever a block begins, so the bits do not depend
+    on how samples are split; a matrix product is up to four times faster at M = 40 and slower at M = 6, and its
+    bits follow its shape.
+    """
+    inner = slice(half_width, values.shape[0] - half_width)
+    value, slope = coefficients(half_width)
+    rates = correlate1d(values, slope * sample_rate, axis=0, mode="nearest")[inner]
+    if half_width == HALF_WIDTHS[0]:
+        return values[inner], rates
+    return correlate1d(values, value, axis=0, mode="nearest")[inner], rates
+
+
+def choose_half_width(values: Array, sigma: Array) -> int:
+    """Half width M for channels values (B, C) with white noise sigma (C,), by Lepski's rule, taken back one step.
+
+    The widest window whose value and slope still agree, in every channel, with those of each narrower window: the
+    rms of their difference is within AGREEMENT of what noise alone leaves of it, σ ‖h_M - h_M'‖. Channels that do
+    not move have no say. A moving channel without noise asks for the narrowest window. B limits the widest window
+    that is tried.
+    """
+    moving = np.ptp(values, axis=0) > 0.0
+    values, sigma = values[:, moving], sigma[moving]
+    if np.any(sigma <= ROUNDINGS * np.spacing(np.abs(values).max(axis=0))):
+        return HALF_WIDTHS[0]
+    accepted = 0
+    tried: list[tuple[Array, tuple[Array, Array]]] = []
+    for half_width in HALF_WIDTHS:
+        if half_width > HALF_WIDTHS[0] and values.shape[0] < SAMPLES_PER_HALF_WIDTH * half_width:
+            break
+        kernels = np.array(coefficients(half_width))
+        answers = smooth_and_differentiate(values, half_width, 1.0)
+        if not all(_agree(kernels, answers, *narrower, sigma) for narrower in tried):
+            break
+        tried.append((kernels, answers))
+        accepted = len(tried) - 1
+    return HALF_WIDTHS[max(accepted - UNDERSMOOTHING, 0)]
+
+
+def _agree(
+    wide: Array, wide_answers: tuple[Array, Array], narrow: Array, narrow_answers: tuple[Array, Array], sigma: Array
+) -> bool:
+    """Whether two windows (their kernels (2, 2M + 1) and answers) differ by no more than noise can explain."""
+    margin = (wide.shape[1] - narrow.shape[1]) // 2
+    leftover = wide - np.pad(narrow, ((0, 0), (margin, margin)))
+    expected = np.linalg.norm(leftover, axis=1)[:, None] * sigma
+    difference = [a - b[margin : b.shape[0] - margin] for a, b in zip(wide_answers, narrow_answers, strict=True)]
+    found = np.sqrt(np.mean(np.square(difference), axis=1))
+    return bool(np.all(found <= AGREEMENT * expected))
+
+
+class RatesStage:
+    """Smoothed values and rates of all columns, behind the same lag of M samples.
+
+    The first window of `warm_up` samples in which the channels move throughout fixes M for good. Windows before it,
+    at rest or with the onset of motion, get an M of their own: a choice made at rest would be blind to the motion
+    to come. Until M is fixed samples wait for their window to fill; none is lost, except the first and last M of a
+    segment, which have no full filter.
+    Limitation: motion much faster than that window's is smoothed by its M.
+
+    sample_rate: Hz. deciding: columns that have a say in M (positions, not torques). sigma: (C,) stated white
+    noise, 1σ per sample, NaN where it is to be estimated.
+    """
+
+    def __init__(self, sample_rate: float, deciding: Sequence[int], sigma: Array, warm_up: int = WARM_UP) -> None:
+        self.sample_rate = sample_rate
+        self.half_width = HALF_WIDTHS[0]
+        self.sigma = sigma.copy()
+        self._stated = sigma.copy()
+        self._deciding = np.array(deciding, dtype=np.int64)
+        self._warm_up = warm_up
+        self._fixed = False
+        self._segment = -1
+        self._buffer = np.empty((0, sigma.size))
+        self._start = 0  # grid index of the buffer's first row
+        self._next = 0  # grid index of the next sample to deliver
+        self._decided = 0  # grid index up to which half_width holds
+
+    @property
+    def fixed(self) -> bool:
+        """Whether M (half_width) and the noise (sigma) are fixed for the rest of the capture."""
+        return self._fixed
+
+    def push(self, samples: GridSamples) -> list[RateSamples]:
+        """Take consecutive grid samples and return those that have become final."""
+        pieces: list[RateSamples] = []
+        if samples.segment != self._segment:
+            pieces = self.flush()
+            self._segment = samples.segment
+            self._start = self._next = int(samples.index[0])
+            self._decided = NEVER if self._fixed else self._start
+        self._buffer = np.concatenate([self._buffer, samples.values])
+        return pieces + self._advance()
+
+    def flush(self) -> list[RateSamples]:
+        """End of a segment or of the capture: return what has a full filter."""
+        rest = self._buffer[max(self._decided - self._start, 0) :]
+        if not self._fixed and rest.shape[0] >= SAMPLES_PER_HALF_WIDTH * HALF_WIDTHS[1]:
+            self._choose(rest)
+        self._decided = NEVER
+        pieces = self._deliver()
+        self._buffer = self._buffer[:0]
+        self._segment = -1
+        return pieces
+
+    def state(self) -> StageState:
+        """Everything that the next push depends on, as arrays."""
+        numbers = [self.half_width, self._fixed, self._segment, self._start, self._next, self._decided]
+        return {"buffer": self._buffer.copy(), "sigma": self.sigma.copy(), "numbers": np.array(numbers, dtype=np.int64)}
+
+    def restore(self, state: Mapping[str, NDArray[Any]]) -> None:
+        """Continue from a saved state of a stage made with the same arguments."""
+        self._buffer, self.sigma = state["buffer"].copy(), state["sigma"].copy()
+        self.half_width, fixed, self._segment, self._start, self._next, self._decided = map(int, state["numbers"])
+        self._fixed = bool(fixed)
+
+    def _advance(self) -> list[RateSamples]:
+        pieces = self._deliver()
+        while not self._fixed and self._start + self._buffer.shape[0] >= self._decided + self._warm_up:
+            offset = self._decided - self._start
+            window = self._buffer[offset : offset + self._warm_up]
+            self._choose(window)
+            self._fixed = self._moves_throughout(window)
+            self._decided = NEVER if self._fixed else self._decided + self._warm_up
+            pieces += self._deliver()
+        return pieces
+
+    def _choose(self, window: Array) -> None:
+        estimate = np.isnan(self._stated)
+        self.sigma = self._stated.copy()
+        self.sigma[estimate] = noise_std(window[:, estimate])
+        self.half_width = choose_half_width(window[:, self._deciding], self.sigma[self._deciding])
+
+    def _moves_throughout(self, window: Array) -> bool:
+        halves = np.array_split(window[:, self._deciding], 2)
+        span = np.array([np.ptp(half, axis=0) for half in halves])
+        return bool(np.any(np.all(span > MOTION * self.sigma[self._deciding], axis=0)))
+
+    def _deliver(self) -> list[RateSamples]:
+        """Filter what half_width holds for and what has M samples on either side; drop what no later centre needs."""
+        first = max(self._next, self._start + self.half_width)
+        stop = min(self._decided, self._start + self._buffer.shape[0] - self.half_width)
+        if stop <= first:
+            return []
+        rows = self._buffer[first - self.half_width - self._start : stop + self.half_width - self._start]
+        values, rates = smooth_and_differentiate(rows, self.half_width, self.sample_rate)
+        self._next = stop
+        reach = self.half_width if self._fixed else HALF_WIDTHS[-1]
+        drop = max(stop - reach - self._start, 0)
+        self._buffer, self._start = self._buffer[drop:].copy(), self._start + drop
+        return [RateSamples(np.arange(first, stop), values, rates, self._segment, self.half_width)]

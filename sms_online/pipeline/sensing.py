@@ -1,0 +1,92 @@
+"""From channels to generalized coordinates and joint torques: what a session must measure, and how it is read."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from sms_online.errors import InputError
+from sms_online.model.model import Model
+from sms_online.stream import Array, Block
+
+EULER_PARAMETERS = ("eps_x", "eps_y", "eps_z", "eta")
+
+
+class Sensing:
+    """Which of a source's channels give each coordinate and torque of a model.
+
+    Raises InputError, naming the source, when a channel that the model needs is not there.
+    """
+
+    def __init__(self, model: Model, available: Sequence[str], source: str) -> None:
+        self.model = model
+        layout = model.layout
+        channels: list[str] = []
+
+        def need(*alternatives: str) -> int:
+            for name in alternatives:
+                if name in available:
+                    if name not in channels:
+                        channels.append(name)
+                    return channels.index(name)
+            raise InputError(source, "header", f"no channel {alternatives[0]!r}", f"{' or '.join(alternatives)}")
+
+        base = layout.position_names[: layout.n_base_positions]
+        self._base = [need(name) for name in base]
+        joints = range(1, len(model.system.joints) + 1)
+        self._q = [
+            need(f"q_{i}") if layout.q[i - 1] != layout.theta_m[i - 1] else need(f"q_{i}", f"theta_m_{i}") for i in joints
+        ]
+        self._theta_m = [need(f"theta_m_{i}") for i in joints if layout.q[i - 1] != layout.theta_m[i - 1]]
+        self._markers = [
+            [need(f"link_{i}.{name}") for name in kinematics.marker_names]
+            for i, kinematics in enumerate(model.chain.flexible, start=1)
+            if kinematics is not None
+        ]
+        self._flexible = [kinematics for kinematics in model.chain.flexible if kinematics is not None]
+        self._torque = [need(f"tau_{i}", f"force_{i}") for i in joints]
+        # tau_i is measured at the motor shaft, before the gear; force_i acts on the joint.
+        self._ratio = np.array(
+            [
+                joint.gear_ratio if channels[column].startswith("tau_") else 1.0
+                for joint, column in zip(model.system.joints, self._torque, strict=True)
+            ]
+        )
+        self.channels = tuple(channels)
+        self.unused = tuple(name for name in available if name not in channels)
+
+    def coordinates(self, values: Array) -> Array:
+        """Positions x (B, n_x) of samples (B, channels)."""
+        parts = [values[:, self._base], values[:, self._q], values[:, self._theta_m]]
+        for kinematics, columns in zip(self._flexible, self._markers, strict=True):
+            parts.append(kinematics.coordinates(values[:, columns]))
+        return np.concatenate(parts, axis=1)
+
+    def joint_torque(self, values: Array) -> Array:
+        """Torque after the gear n τ (B, joints), N m (N)."""
+        return np.asarray(values[:, self._torque] * self._ratio)
+
+
+class AttitudeContinuity:
+    """Turns the sign of Euler parameters, which is arbitrary, so that they change continuously from sample to sample."""
+
+    def __init__(self) -> None:
+        self.last = np.zeros(4)
+
+    def restore(self, block: Block) -> Block:
+        """The block with continuous Euler parameters; blocks without them pass as they are."""
+        if not set(EULER_PARAMETERS) <= set(block.channels):
+            return block
+        columns = [block.channels.index(name) for name in EULER_PARAMETERS]
+        rows = np.flatnonzero(np.isfinite(block.values[:, columns]).all(axis=1))
+        if rows.size == 0:
+            return block
+        attitude = block.values[np.ix_(rows, columns)]
+        before = np.concatenate((self.last[None], attitude[:-1]))
+        flips = np.where(np.einsum("bi,bi->b", attitude, before) < 0.0, -1.0, 1.0)
+        values = block.values.copy()
+        attitude *= np.cumprod(flips)[:, None]
+        values[np.ix_(rows, columns)] = attitude
+        self.last = attitude[-1]
+        return Block(block.t, block.channels, values)

@@ -1,0 +1,359 @@
+"""Samples of many channels, each with its own instants, onto one uniform grid."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, fields
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sms_online.stream import Array, Block
+
+Indices = NDArray[np.int64]
+Mask = NDArray[np.bool_]
+StageState = dict[str, NDArray[Any]]
+
+# A sample this close to a grid point, in grid periods, lies on it. At 1 kHz that is 0.1 µs, in which 1 rad/s moves a
+# hundredth of a good encoder's noise; measured captures round their stamps to 0.03 µs.
+ON_GRID = 1e-4
+# Nodes of an interpolation on either side: degree 5 is exact to 1e-5 for an eighth of a channel's sample rate.
+SIDE = 3
+# Longest interval between two samples of a channel that is bridged, in periods of the channel, rounded: four
+# samples lost. White noise of the nodes then reaches the middle of the hole 2.8 times; beyond that the hole ends
+# the segment.
+GAP_LIMIT = 5
+# First intervals of a channel whose median is its period: four of nine may be disturbed.
+PERIOD_INTERVALS = 9
+# A channel silent for longer than this, s, has a gap whatever its period; it bounds what is held back for a silent
+# channel.
+LONGEST_HOLE = 1.0
+
+
+@dataclass(frozen=True)
+class GridSamples:
+    """B consecutive grid points of one gap-free segment.
+
+    index: (B,) grid index k, time t0 + k / sample_rate. values: (B, C) SI units. segment: number of the segment,
+    from 0.
+    """
+
+    index: Indices
+    values: Array
+    segment: int
+
+
+@dataclass
+class SyncCounters:
+    """What happened to the samples so far.
+
+    samples: rows received. missing_cells: their cells without a value. duplicates: samples dropped because their
+    channel already had one at that instant. interpolated_cells: cells delivered by interpolation. gaps: breaks
+    between segments. lost_samples: grid points from the first sample to the last delivered one (after the flush: to
+    the last received) that were not delivered, in gaps or beside them.
+    """
+
+    samples: int = 0
+    missing_cells: int = 0
+    duplicates: int = 0
+    interpolated_cells: int = 0
+    gaps: int = 0
+    lost_samples: int = 0
+
+
+@dataclass(frozen=True)
+class _Group:
+    """Channels that were sampled at the same instants: `rows` of the buffer, at times `ts`.
+
+    last: (K,) position in `ts` of the last sample not after each grid point, -1 before the first. hit: (K,) that
+    sample lies on the grid point.
+    """
+
+    columns: Indices
+    rows: Indices
+    ts: Array
+    last: Indices
+    hit: Mask
+
+
+class Synchroniser:
+    """Uniform grid t0 + k / sample_rate from the first sample's time t0, the same for every channel.
+
+    A sample on a grid point passes bit for bit. Elsewhere a channel is interpolated from its own samples by the
+    polynomial of degree 5 through the six nearest, three on each side. Off-centre or lower-degree interpolation at
+    the borders of a segment would have another error and another noise there, unknown to whoever weighs the
+    samples, so grid points without a full stencil are not delivered. A channel's sample next to another on
+    neighbouring grid points needs no stencil. A segment is a run of grid points at which every channel has a value;
+    a hole in any channel ends it. Whatever the blocks, the values are the same bits. Limitation: a channel faster
+    than the grid is picked, not averaged.
+
+    channels: names, in the order of the columns. sample_rate: of the grid, Hz. gap_limit: longest interval between
+    two samples of a channel that is bridged, in periods of that channel (the median of its first intervals), at
+    most 1 s.
+    """
+
+    def __init__(self, channels: Sequence[str], sample_rate: float, gap_limit: int = GAP_LIMIT) -> None:
+        count = len(channels)
+        self.channels = tuple(channels)
+        self.sample_rate = sample_rate
+        self.gap_limit = gap_limit
+        self.counters = SyncCounters()
+        self._t0 = np.nan
+        self._time = np.empty(0)  # s after t0, of the rows still needed
+        self._values = np.empty((0, count))
+        self._last_time = np.full(count, -np.inf)  # of each channel's last sample
+        self._intervals = np.full((count, PERIOD_INTERVALS), np.nan)
+        self._period = np.full(count, np.nan)
+        self._next = 0  # first grid point not yet decided
+        self._delivered = -1  # last grid point delivered
+
+    @property
+    def start_time(self) -> float:
+        """t0, the time of grid index 0, s; NaN before the first sample."""
+        return float(self._t0)
+
+    def push(self, block: Block) -> list[GridSamples]:
+        """Take a block, in order of time, and return the grid points that it completes, a piece for each segment.
+
+        Raises ValueError when the block's channels are not those of the synchroniser.
+        """
+        if block.channels != self.channels:
+            raise ValueError(f"block with channels {block.channels} pushed into a synchroniser of {self.channels}")
+        if block.t.size == 0:
+            return []
+        if np.isnan(self._t0):
+            self._t0 = float(block.t[0])
+        time = block.t - self._t0
+        if self._continues_complete(time, block.values):
+            return self._pass(time, block.values)
+        values = self._admit(time, block.values)
+        self._time = np.concatenate([self._time, time])
+        self._values = np.concatenate([self._values, values])
+        return self._advance(final=False)
+
+    def flush(self) -> list[GridSamples]:
+        """End of the capture: return what can still be delivered."""
+        if self._time.size == 0:
+            return []
+        for channel in np.flatnonzero(np.isnan(self._period) & ~np.isnan(self._intervals[:, 0])):
+            self._period[channel] = np.nanmedian(self._intervals[channel])
+        pieces = self._advance(final=True)
+        self.counters.lost_samples += self._next - 1 - self._delivered
+        return pieces
+
+    def state(self) -> StageState:
+        """Everything that the next push depends on, as arrays."""
+        return {
+            "t0": np.array(self._t0),
+            "time": self._time.copy(),
+            "values": self._values.copy(),
+            "last_time": self._last_time.copy(),
+            "intervals": self._intervals.copy(),
+            "period": self._period.copy(),
+            "position": np.array([self._next, self._delivered]),
+            "counters": np.array([getattr(self.counters, field.name) for field in fields(SyncCounters)]),
+        }
+
+    def restore(self, state: Mapping[str, NDArray[Any]]) -> None:
+        """Continue from a saved state of a synchroniser with the same channels, rate and gap limit."""
+        self._t0 = float(state["t0"])
+        self._time, self._values = state["time"].copy(), state["values"].copy()
+        self._last_time, self._intervals = state["last_time"].copy(), state["intervals"].copy()
+        self._period = state["period"].copy()
+        self._next, self._delivered = (int(k) for k in state["position"])
+        self.counters = SyncCounters(*(int(count) for count in state["counters"]))
+
+    @property
+    def _tolerance(self) -> float:
+        """Distance within which two instants are one, s; epoch times are rounded to 0.2 µs."""
+        return ON_GRID / self.sample_rate + 4.0 * float(np.spacing(abs(self._t0)))
+
+    def _continues_complete(self, time: Array, values: Array) -> bool:
+        """Whether everything before is delivered and every row lies on the next grid point with all its cells."""
+        tail = self._values[-SIDE:]
+        return (
+            self._delivered == self._next - 1
+            and tail.shape[0] == SIDE
+            and abs(self._time[-1] - self._delivered / self.sample_rate) <= self._tolerance
+            and not np.isnan(self._period).any()
+            and not np.isnan(tail).any()
+            and not np.isnan(values).any()
+            and bool(np.all(np.abs(time - (self._next + np.arange(time.size)) / self.sample_rate) <= self._tolerance))
+        )
+
+    def _pass(self, time: Array, values: Array) -> list[GridSamples]:
+        """The common case of `_advance`, 0.03 instead of 0.8 µs a sample: each row is its own grid point."""
+        k = np.arange(self._next, self._next + time.size, dtype=np.int64)
+        self.counters.samples += time.size
+        self._last_time[:] = time[-1]
+        self._next += time.size
+        self._time = np.concatenate([self._time[-SIDE:], time[-SIDE:]])[-SIDE:]
+        self._values = np.concatenate([self._values[-SIDE:], values[-SIDE:]])[-SIDE:]
+        return self._deliver(k, values)
+
+    def _admit(self, time: Array, values: Array) -> Array:
+        """Count, drop duplicates (as NaN), and learn the period of each channel from its first intervals."""
+        missing = np.isnan(values)
+        self.counters.samples += time.size
+        self.counters.missing_cells += int(np.count_nonzero(missing))
+        before = self._time[-1] if self._time.size else -np.inf
+        close = bool(np.any(np.diff(time, prepend=before) <= self._tolerance))
+        if close or bool(np.any(np.isnan(self._period))):
+            values = values.copy()
+            for channel in range(len(self.channels)):
+                rows = np.flatnonzero(~missing[:, channel])
+                interval = np.diff(time[rows], prepend=self._last_time[channel])
+                duplicate = interval <= self._tolerance
+                self.counters.duplicates += int(np.count_nonzero(duplicate))
+                values[rows[duplicate], channel] = np.nan
+                self._learn_period(channel, interval[~duplicate & np.isfinite(interval)])
+        sampled = ~missing.all(axis=0)
+        last_row = time.size - 1 - np.argmin(missing[::-1], axis=0)
+        self._last_time[sampled] = time[last_row[sampled]]
+        return values
+
+    def _learn_period(self, channel: int, intervals: Array) -> None:
+        known = self._intervals[channel]
+        free = np.flatnonzero(np.isnan(known))[: intervals.size]
+        known[free] = intervals[: free.size]
+        if not np.isnan(known[-1]):
+            self._period[channel] = np.median(known)
+
+    def _advance(self, final: bool) -> list[GridSamples]:
+        """Decide grid points as far as the samples allow, deliver those with a value in every channel, drop old
+        rows."""
+        k = self._candidates()
+        decided = np.ones(k.size, dtype=bool)
+        complete = np.ones(k.size, dtype=bool)
+        # Integer grid index of the rows that lie on the grid; -2 is nobody's neighbour.
+        nearest = np.rint(self._time * self.sample_rate).astype(np.int64)
+        on_grid = np.abs(self._time - nearest / self.sample_rate) <= self._tolerance
+        row_index = np.where(on_grid, nearest, -2)
+        groups = []
+        for columns, rows in self._sampled_together():
+            group, sure, possible = self._judge(k, columns, rows, row_index[rows], final)
+            decided &= sure
+            complete &= possible
+            groups.append(group)
+        end = k.size if decided.all() else int(np.argmin(decided))
+        chosen = np.flatnonzero(complete[:end])
+        values = self._fill(k[chosen], chosen, groups)
+        if end:
+            self._next = int(k[end - 1]) + 1
+        self._forget(groups)
+        return self._deliver(k[chosen], values)
+
+    def _candidates(self) -> Indices:
+        """Undecided grid points up to the latest row, leaving out those in holes of all channels together."""
+        reach = self._tolerance
+        hole = np.flatnonzero(np.diff(self._time) > LONGEST_HOLE)
+        first = np.ceil((self._time[hole + 1] - reach) * self.sample_rate).astype(np.int64)
+        last = np.floor((self._time[[*hole, -1]] + reach) * self.sample_rate).astype(np.int64)
+        starts = np.maximum([self._next, *first], self._next)
+        return np.concatenate([np.arange(a, b + 1, dtype=np.int64) for a, b in zip(starts, last, strict=True)])
+
+    def _sampled_together(self) -> Iterable[tuple[Indices, Indices]]:
+        """Columns with samples in the same rows and with the same period, with those rows."""
+        present = ~np.isnan(self._values)
+        bits = np.packbits(present, axis=0)
+        members: dict[tuple[bytes, bytes], list[int]] = {}
+        for column in range(len(self.channels)):
+            members.setdefault((bits[:, column].tobytes(), self._period[column].tobytes()), []).append(column)
+        return [(np.array(columns), np.flatnonzero(present[:, columns[0]])) for columns in members.values()]
+
+    def _judge(
+        self, k: Indices, columns: Indices, rows: Indices, row_index: Indices, final: bool
+    ) -> tuple[_Group, Mask, Mask]:
+        """Which grid points k of a group are decided, and which of those have a value."""
+        ts, now = self._time[rows], self._time[-1]
+        grid = k / self.sample_rate
+        last = np.searchsorted(ts, grid + self._tolerance, side="right") - 1
+        padded = np.concatenate([[-2], row_index, [-2]])
+        hit = padded[last + 1] == k
+        passes = hit & ((padded[last] == k - 1) | (padded[np.minimum(last + 2, ts.size + 1)] == k + 1))
+        group = _Group(columns, rows, ts, last, hit)
+        rest = np.flatnonzero(~passes)
+        if rest.size == 0:
+            return group, passes, passes
+
+        # Six samples without a gap between them, as far as they have arrived.
+        begin, stop = last[rest] - (SIDE - 1), last[rest] + SIDE
+        gaps = np.concatenate([[0], np.cumsum(self._is_gap(np.diff(ts), columns[0]))])
+        inner = np.clip(np.stack([begin, stop]), 0, max(ts.size - 1, 0))
+        broken = gaps[inner[1]] > gaps[inner[0]]
+        arrived = stop < ts.size
+        stencil = (begin >= 0) & arrived & ~broken & ~np.isnan(self._period[columns[0]])
+        silent = final or (ts.size > 0 and bool(self._is_gap(now - ts[-1:], columns[0])[0]))
+        past = final | (now > grid[rest] + self._tolerance)
+        no_stencil = ((begin < 0) & past) | broken | (~arrived & silent)
+        past_next = final | (now > grid[rest] + 1.0 / self.sample_rate + self._tolerance)
+        no_neighbour = np.where(hit[rest], past_next, past)
+        sure, possible = np.ones_like(passes), np.ones_like(passes)
+        sure[rest] = stencil | (no_stencil & no_neighbour)
+        possible[rest] = stencil
+        return group, sure, possible
+
+    def _is_gap(self, interval: Array, channel: int) -> Mask:
+        """Intervals that are not bridged. Before the period is known only the absolute limit can tell."""
+        gap = interval > LONGEST_HOLE
+        period = self._period[channel]
+        return gap if np.isnan(period) else gap | (np.rint(interval / period) > self.gap_limit)
+
+    def _fill(self, k: Indices, chosen: Indices, groups: list[_Group]) -> Array:
+        """Values at the chosen candidates k: (len(k), C)."""
+        values = np.empty((k.size, len(self.channels)))
+        for group in groups:
+            if chosen.size == 0:
+                break
+            last, hit = group.last[chosen], group.hit[chosen]
+            if group.columns.size == values.shape[1]:
+                np.take(self._values, group.rows[last], axis=0, out=values)
+            else:
+                values[:, group.columns] = self._values[np.ix_(group.rows[last], group.columns)]
+            between = np.flatnonzero(~hit)
+            if between.size:
+                nodes = last[between, None] + np.arange(1 - SIDE, 1 + SIDE)
+                x = group.ts[nodes] - (k[between] / self.sample_rate)[:, None]
+                weight = _lagrange_weights_at_zero(x)
+                total = np.zeros((between.size, group.columns.size))
+                for node in range(2 * SIDE):  # one after the other: a matrix product's bits depend on its shape
+                    samples = self._values[np.ix_(group.rows[nodes[:, node]], group.columns)]
+                    total += weight[:, node, None] * samples
+                values[np.ix_(between, group.columns)] = total
+                self.counters.interpolated_cells += total.size
+        return values
+
+    def _forget(self, groups: list[_Group]) -> None:
+        """Drop the rows that no undecided grid point can need; the last row stays, it tells how late it is."""
+        needed = self._time.size - 1
+        reach = self._next / self.sample_rate + self._tolerance
+        for group in groups:
+            if group.ts.size and self._time[-1] - group.ts[-1] <= LONGEST_HOLE:
+                oldest = int(np.searchsorted(group.ts, reach, side="right")) - SIDE
+                needed = min(needed, int(group.rows[max(oldest, 0)]))
+        self._time, self._values = self._time[needed:].copy(), self._values[needed:].copy()
+
+    def _deliver(self, k: Indices, values: Array) -> list[GridSamples]:
+        """Cut into segments and number them."""
+        pieces = []
+        breaks = np.flatnonzero(np.diff(k, prepend=self._delivered) != 1)
+        bounds = sorted({0, k.size, *breaks.tolist()}) if k.size else []
+        for a, b in pairwise(bounds):
+            skipped = int(k[a]) - self._delivered - 1
+            self.counters.lost_samples += skipped
+            self.counters.gaps += int(skipped > 0 and self._delivered >= 0)
+            self._delivered = int(k[b - 1])
+            pieces.append(GridSamples(k[a:b], values[a:b], self.counters.gaps))
+        return pieces
+
+
+def _lagrange_weights_at_zero(x: Array) -> Array:
+    """Weights (K, n) of the polynomial through nodes x (K, n), read at 0."""
+    weight = np.ones_like(x)
+    for i in range(x.shape[1]):
+        for j in range(x.shape[1]):
+            if i != j:
+                weight[:, i] *= x[:, j] / (x[:, j] - x[:, i])
+    return weight

@@ -1,0 +1,235 @@
+"""Samples come onto one uniform grid: bits pass, holes are bridged or end a segment, and blocks do not matter."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from sms_online.pipeline.synchronise import GAP_LIMIT, GridSamples, Synchroniser
+from sms_online.stream import Array, Block
+
+RATE = 1000.0
+CHANNELS = ("theta_m_1", "q_1", "link_1.marker_1.u_y")
+
+
+def signal(t: Array) -> Array:
+    """Three smooth channels, (B, 3); at most 4 Hz."""
+    return np.column_stack([np.sin(2 * np.pi * f * t + f) for f in (1.0, 2.5, 4.0)])
+
+
+def run(
+    t: Array, values: Array, cuts: Iterable[int] = (), rate: float = RATE
+) -> tuple[list[GridSamples], Synchroniser]:
+    stage = Synchroniser(CHANNELS[: values.shape[1]], rate)
+    pieces = []
+    bounds = [0, *cuts, t.size]
+    for a, b in zip(bounds[:-1], bounds[1:], strict=True):
+        pieces += stage.push(Block(t[a:b], stage.channels, values[a:b]))
+    return pieces + stage.flush(), stage
+
+
+def joined(pieces: list[GridSamples]) -> tuple[NDArray[np.int64], Array, NDArray[np.int64]]:
+    """Index, values and segment number of every delivered grid point."""
+    return (
+        np.concatenate([p.index for p in pieces]),
+        np.concatenate([p.values for p in pieces]),
+        np.concatenate([np.full(p.index.size, p.segment) for p in pieces]),
+    )
+
+
+@pytest.mark.parametrize("start", [0.0, 12.345, 1.7e9])
+def test_a_clean_capture_passes_bit_for_bit(start: float) -> None:
+    t = start + np.arange(3000) / RATE
+    values = np.random.default_rng(1).standard_normal((3000, 3))
+    pieces, stage = run(t, values, cuts=(1, 5, 1700))
+    index, out, segment = joined(pieces)
+    assert np.array_equal(index, np.arange(3000))
+    assert np.array_equal(out, values)
+    assert not segment.any()
+    assert stage.start_time == start
+    assert vars(stage.counters) == {
+        "samples": 3000,
+        "missing_cells": 0,
+        "duplicates": 0,
+        "interpolated_cells": 0,
+        "gaps": 0,
+        "lost_samples": 0,
+    }
+
+
+def test_stamps_rounded_far_below_a_period_still_lie_on_the_grid() -> None:
+    t = np.arange(1000) / RATE
+    values = signal(t)
+    _, out, _ = joined(run(t + np.tile([0.0, 16e-9, 32e-9, 8e-9], 250), values)[0])
+    assert np.array_equal(out, values)
+
+
+def test_lone_missing_samples_are_interpolated_and_counted() -> None:
+    t = np.arange(2000) / RATE
+    values = signal(t)
+    values[100, 0] = values[700:702, 1] = values[1500] = np.nan
+    pieces, stage = run(t, values)
+    index, out, segment = joined(pieces)
+    assert np.array_equal(index, np.arange(2000))
+    assert not segment.any()
+    assert stage.counters.missing_cells == stage.counters.interpolated_cells == 6
+    # Six nodes at 1 ms and 4 Hz leave (2 pi f h)^6 (15 / 48)^2 or less.
+    np.testing.assert_allclose(out, signal(t), atol=1e-10)
+    kept = ~np.isnan(values)
+    assert np.array_equal(out[kept], values[kept])
+
+
+def test_polynomials_of_degree_five_are_exact_between_jittered_samples() -> None:
+    rng = np.random.default_rng(2)
+    t = np.arange(1000) / RATE
+    t[1:] += rng.uniform(-3e-4, 3e-4, 999)
+    coefficients = rng.standard_normal(6)
+
+    def polynomial(s: Array) -> Array:
+        return np.polynomial.polynomial.polyval(s, coefficients)[:, None]
+
+    pieces, stage = run(t, polynomial(t))
+    index, out, _ = joined(pieces)
+    np.testing.assert_allclose(out, polynomial(index / RATE), rtol=0, atol=1e-13 * np.abs(coefficients).sum())
+    # Three samples on either side of every point: the first two points and the last few have none.
+    assert index[0] == 2
+    assert index[-1] in (996, 997)
+    assert np.array_equal(np.diff(index), np.ones(index.size - 1))
+    assert stage.counters.interpolated_cells == index.size
+
+
+def test_a_channel_of_a_tenth_of_the_rate_is_interpolated_onto_the_grid() -> None:
+    t = np.arange(2000) / RATE
+    values = signal(t)
+    slow = np.arange(2000) % 10 != 3
+    values[slow, 0] = np.nan
+    index, out, segment = joined(run(t, values)[0])
+    # From the third slow sample (row 23) to just before the third from the end (row 1973).
+    assert (index[0], index[-1]) == (23, 1972)
+    assert not segment.any()
+    np.testing.assert_allclose(out, signal(index / RATE), atol=1e-5)
+    assert np.array_equal(out[:, 1:], values[index, 1:])
+
+
+@pytest.mark.parametrize("lost", [GAP_LIMIT - 1, GAP_LIMIT])
+def test_a_hole_beyond_the_gap_limit_ends_the_segment(lost: int) -> None:
+    t = np.arange(2000) / RATE
+    kept = np.ones(2000, dtype=bool)
+    kept[1000 : 1000 + lost] = False
+    pieces, stage = run(t[kept], signal(t[kept]))
+    index, out, segment = joined(pieces)
+    if lost < GAP_LIMIT:
+        assert np.array_equal(index, np.arange(2000))
+        assert not segment.any()
+        assert stage.counters.interpolated_cells == 3 * lost
+    else:
+        assert np.array_equal(index, np.flatnonzero(kept))
+        assert np.array_equal(segment, (index > 1000).astype(int))
+        assert (stage.counters.gaps, stage.counters.lost_samples) == (1, lost)
+    np.testing.assert_allclose(out, signal(index / RATE), atol=1e-8)
+
+
+def test_a_hole_in_one_channel_ends_the_segment_of_all() -> None:
+    t = np.arange(2000) / RATE
+    values = signal(t)
+    values[500:600, 1] = np.nan
+    index, out, segment = joined(run(t, values)[0])
+    assert np.array_equal(index, np.r_[0:500, 600:2000])
+    assert np.array_equal(segment, (index >= 600).astype(int))
+    assert np.array_equal(out, values[index])
+
+
+def test_no_grid_point_is_delivered_without_three_samples_on_either_side() -> None:
+    """A missing sample next to a gap cannot be interpolated from both sides, so it is left out with its neighbours."""
+    t = np.r_[0:1000, 1100:2000] / RATE
+    values = signal(t)
+    values[1001, 2] = np.nan
+    index, _, segment = joined(run(t, values)[0])
+    assert np.array_equal(index, np.r_[0:1000, 1102:2000])
+    assert segment[-1] == 1
+
+
+def test_a_jump_of_the_clock_costs_no_memory() -> None:
+    t = np.r_[0:1000, 10**12 : 10**12 + 1000] / RATE
+    pieces, stage = run(t, signal(np.arange(2000) / RATE))
+    index, _, segment = joined(pieces)
+    assert index.size == 2000
+    assert segment[-1] == 1
+    assert stage.counters.lost_samples == 10**12 - 1000
+
+
+def test_a_channel_that_falls_silent_holds_nothing_back_for_ever() -> None:
+    t = np.arange(50_000) / RATE
+    values = signal(t)
+    values[5000:, 0] = np.nan
+    stage = Synchroniser(CHANNELS, RATE)
+    delivered = 0
+    for a in range(0, t.size, 500):
+        delivered += sum(p.index.size for p in stage.push(Block(t[a : a + 500], CHANNELS, values[a : a + 500])))
+        assert stage.state()["time"].size <= 2000
+    assert delivered == 5000
+
+
+def test_one_row_per_sensor_at_the_same_instant_makes_one_grid_point() -> None:
+    """A CAN log has a row per frame, several with one stamp."""
+    t = np.repeat(np.arange(1000) / RATE, 3)
+    full = np.repeat(signal(np.arange(1000) / RATE), 3, axis=0)
+    values = np.where(np.arange(3000)[:, None] % 3 == np.arange(3), full, np.nan)
+    index, out, _ = joined(run(t, values, cuts=(1000, 1001, 2000))[0])
+    assert np.array_equal(index, np.arange(1000))
+    assert np.array_equal(out, signal(index / RATE))
+
+
+def test_a_second_sample_at_the_same_instant_is_dropped_and_counted() -> None:
+    t = np.insert(np.arange(1000) / RATE, 500, 499 / RATE)
+    values = signal(t)
+    values[500] = 1e6
+    for cuts in ((), (500,)):
+        pieces, stage = run(t, values, cuts)
+        assert stage.counters.duplicates == 3
+        assert np.array_equal(joined(pieces)[1], np.delete(values, 500, axis=0))
+
+
+def untidy_capture(seed: int) -> tuple[Array, Array]:
+    """Jittered stamps, a slow channel, lone losses, a gap, duplicates."""
+    rng = np.random.default_rng(seed)
+    t = np.arange(3000) / RATE
+    t[600:1500] += rng.uniform(-2e-4, 2e-4, 900)
+    keep = rng.random(3000) > 0.01
+    keep[2000:2050] = False
+    t = np.sort(np.r_[t[keep], t[700]])
+    values = signal(t)
+    values[np.arange(t.size) % 4 != 0, 2] = np.nan
+    values[rng.random(values.shape) < 0.01] = np.nan
+    return t, values
+
+
+@pytest.mark.parametrize("seed", [3, 4])
+def test_blocks_do_not_change_a_bit(seed: int) -> None:
+    t, values = untidy_capture(seed)
+    rng = np.random.default_rng(seed + 100)
+    pieces, whole = run(t, values)
+    reference = joined(pieces)
+    assert reference[0].size > 2000
+    for cuts in (range(1, t.size), np.sort(rng.integers(0, t.size, 40)).tolist(), range(64, t.size, 64)):
+        pieces, stage = run(t, values, cuts)
+        assert all(np.array_equal(a, b) for a, b in zip(joined(pieces), reference, strict=True))
+        assert stage.counters == whole.counters
+
+
+def test_a_restored_synchroniser_continues_identically() -> None:
+    t, values = untidy_capture(5)
+    reference = joined(run(t, values)[0])
+    first, second = Synchroniser(CHANNELS, RATE), Synchroniser(CHANNELS, RATE)
+    pieces = first.push(Block(t[:1234], CHANNELS, values[:1234]))
+    second.restore(first.state())
+    pieces += second.push(Block(t[1234:], CHANNELS, values[1234:])) + second.flush()
+    assert all(np.array_equal(a, b) for a, b in zip(joined(pieces), reference, strict=True))
+
+
+def test_blocks_of_other_channels_are_refused() -> None:
+    with pytest.raises(ValueError, match="pushed into"):
+        Synchroniser(CHANNELS, RATE).push(Block(np.zeros(1), ("q_1",), np.zeros((1, 1))))
