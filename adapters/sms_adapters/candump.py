@@ -92,28 +92,20 @@ class CandumpReader:
     @property
     def warnings(self) -> list[str]:
         """What the current iteration has skipped so far."""
-        found = []
+        name, found = self._path.name, []
         if self._unwanted:
             ids = [
                 f"{id_ & ~_EXTENDED:0{_EXTENDED_DIGITS if id_ & _EXTENDED else 3}X}"
                 for id_ in sorted(self._unwanted_ids)
             ]
             shown = ", ".join(ids[:_SHOWN_IDS]) + (", …" if len(ids) > _SHOWN_IDS else "")
-            found.append(
-                f"{self._path.name}: {self._unwanted} frames skipped, no channel comes from their ids ({shown})"
-            )
+            found.append(f"{name}: {self._unwanted} frames skipped, no channel comes from their ids ({shown})")
         if self._wrong_length:
-            found.append(
-                f"{self._path.name}: {self._wrong_length} frames skipped, their length is not the one in {self._dbc}"
-            )
+            found.append(f"{name}: {self._wrong_length} frames skipped, their length is not the one in {self._dbc}")
         if self._repeated:
-            found.append(
-                f"{self._path.name}: {self._repeated} frames skipped, their time repeats that of the frame before"
-            )
+            found.append(f"{name}: {self._repeated} frames skipped, their time repeats that of their message's last one")
         if self._lines.cut_line is not None:
-            found.append(
-                f"{self._path.name}: 1 line skipped, line {self._lines.cut_line} is cut (no newline at its end)"
-            )
+            found.append(f"{name}: 1 line skipped, line {self._lines.cut_line} is cut (no newline at its end)")
         return found
 
     def __iter__(self) -> Iterator[Block]:
@@ -148,9 +140,9 @@ class CandumpReader:
     def _frames(self, line: int, chunk: bytes, last: int) -> tuple[NDArray[np.int64], _Frames]:
         """Times (ns) and columns of the frames in a chunk; InputError for a malformed line or a time going back."""
         matches = _LINE.findall(chunk)
-        texts = chunk.splitlines()
-        if len(matches) != sum(map(bool, texts)):
-            k = next(k for k, text in enumerate(texts) if text and not _LINE.fullmatch(text))
+        texts = chunk.split(b"\n")
+        if len(matches) != sum(1 for text in texts if text.rstrip(b"\r")):
+            k = next(k for k, text in enumerate(texts) if text.rstrip(b"\r") and not _LINE.fullmatch(text))
             found = repr(texts[k][:60].decode("utf-8", "replace"))
             raise InputError(
                 str(self._path), f"line {line + k}", found, "(seconds) interface id#data, as candump -l writes"
@@ -174,10 +166,8 @@ class CandumpReader:
         ids = np.array([int(text, 16) | (_EXTENDED if len(text) == _EXTENDED_DIGITS else 0) for text in id_texts])
         used = np.zeros(stamps.size, dtype=np.bool_)
         values = np.full((stamps.size, len(self._channels)), np.nan)
-        wanted_count = 0
         for id_, wanted in self._wanted.items():
             rows = np.flatnonzero(ids == id_)
-            wanted_count += rows.size
             interface = self._interface.setdefault(id_, interfaces[rows[0]]) if rows.size else b""
             other = next((row for row in rows if interfaces[row] != interface), None)
             if other is not None:
@@ -196,7 +186,7 @@ class CandumpReader:
                     np.frombuffer(words, np.uint8).reshape(fresh.size, -1)
                 )
                 used[fresh] = True
-        if wanted_count < ids.size:
-            self._unwanted += ids.size - wanted_count
-            self._unwanted_ids |= set(np.unique(ids).tolist()) - self._wanted.keys()
+        unwanted = ids[~np.isin(ids, list(self._wanted))]
+        self._unwanted += unwanted.size
+        self._unwanted_ids.update(unwanted.tolist())
         return used, values

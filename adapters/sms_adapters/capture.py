@@ -19,7 +19,7 @@ from sms_online.errors import InputError
 from sms_online.stream import Array, Block
 
 BLOCK = 16384  # rows: most that one block holds
-_NUMBER = re.compile(r"\s*-?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?\s*")
+_NUMBER = re.compile(r"\s*[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?\s*")
 
 
 class CaptureReader:

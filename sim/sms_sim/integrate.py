@@ -1,8 +1,8 @@
 """Radau IIA collocation for stiff equations whose right-hand side is evaluated in batches.
 
-A model call costs nearly the same for one state as for fifty. So all stages of a step are evaluated in one call, and so is
-the whole finite-difference Jacobian; a method of many stages then costs no more a step than one of few. SciPy's Radau
-(3 stages, order 5, one state a call) needs minutes where this needs seconds.
+A model call costs nearly the same for one state as for fifty. So all stages of a step are evaluated in one call, and
+so is the whole finite-difference Jacobian; a method of many stages then costs no more a step than one of few. SciPy's
+Radau (3 stages, order 5, one state a call) needs minutes where this needs seconds.
 Source: Hairer, Wanner, Solving Ordinary Differential Equations II, 2nd ed. 1996, sections IV.5 and IV.8.
 """
 
@@ -29,7 +29,8 @@ KEEP_STEP = (1.0, 1.2)
 FIRST_STEP = 1e-6  # s
 # Stages of the exact simulation, order 17: of 3 to 11, the cheapest at a tolerance of 1e-11.
 STAGES = 9
-# Iteration stops when what is left is this part of the tolerance: well below the error that the step control lets through.
+# Iteration stops when what is left is this part of the tolerance: far below the error that the step control lets
+# through, for what Newton leaves is biased and adds up over the steps.
 NEWTON_PART = 1e-3
 # More iterations than this mean that a shorter step is cheaper.
 NEWTON_LIMIT = 10
@@ -45,10 +46,11 @@ SHORTEST_STEP = 1e-10
 class Radau:
     """Coefficients of the Radau IIA method with s stages (s odd), order 2s - 1.
 
-    c (s,): nodes, the last is 1. A (s, s); its last row are the weights b. A⁻¹ = T diag(eigenvalues) T⁻¹, complex, of which only
-    p = (s + 1) / 2 are kept: the real one first, then one of each conjugate pair; T (s, p) with the latter doubled, so that
-    the real part of T w is the whole product; T_inverse (p, s). gamma_0, error_weights (s,): the embedded estimate of IV.8, (8.17).
-    basis (s, s): powers θ … θ^s to the Lagrange polynomials on the nodes {0, c} that vanish at 0.
+    c (s,): nodes, the last is 1. A (s, s); its last row are the weights b. A⁻¹ = T diag(eigenvalues) T⁻¹, complex, of
+    which p = (s + 1) / 2 are kept: the real one first, then one of each conjugate pair; T (s, p) with the latter twice,
+    so that the real part of T w is the whole product; T_inverse (p, s). error_weights (s,): the embedded estimate of
+    IV.8, (8.17), with the left end's rate at weight 1. basis (s, s): from the powers θ … θ^s to the Lagrange
+    polynomials on the nodes {0, c} that vanish at 0.
     """
 
     c: Array
@@ -56,7 +58,6 @@ class Radau:
     T: NDArray[np.complex128]
     T_inverse: NDArray[np.complex128]
     eigenvalues: NDArray[np.complex128]
-    gamma_0: float
     error_weights: Array
     basis: Array
 
@@ -74,7 +75,7 @@ def radau(stages: int) -> Radau:
     powers = np.arange(1, stages + 1)
     # Collocation: Σ_j a_ij c_j^(k-1) = c_i^k / k.
     vandermonde = c[:, None] ** (powers - 1)
-    A = np.linalg.solve(vandermonde.T, (c[:, None] ** powers / powers).T).T
+    A = np.asarray(np.linalg.solve(vandermonde.T, (c[:, None] ** powers / powers).T).T, dtype=np.float64)
     eigenvalues, T = np.linalg.eig(np.linalg.inv(A).astype(complex))
     order = np.argsort(np.abs(eigenvalues.imag))
     kept = np.array([k for k in order if k == order[0] or eigenvalues[k].imag > 0])
@@ -89,7 +90,6 @@ def radau(stages: int) -> Radau:
         T=T[:, kept] * np.where(np.arange(kept.size) == 0, 1.0, 2.0),
         T_inverse=np.linalg.inv(T)[kept],
         eigenvalues=eigenvalues[kept],
-        gamma_0=gamma_0,
         error_weights=(b_hat - A[-1]) / gamma_0,
         basis=np.linalg.inv(c[:, None] ** powers),
     )
@@ -99,7 +99,7 @@ def radau(stages: int) -> Radau:
 class Dense:
     """A solution between its steps: the collocation polynomials.
 
-    t (M + 1,) s: step ends. y (M + 1, n): states there. stages (M, s, n): states at t_m + c_i h_m. method: its coefficients.
+    t (M + 1,) s: step ends. y (M + 1, n): states there. stages (M, s, n): states at t_m + c_i h_m.
     """
 
     method: Radau
@@ -164,7 +164,7 @@ class Collocation:
         if h == self._factored_step:
             return
         shifts = self.method.eigenvalues[:, None, None] / h
-        # Explicit inverses: the iteration corrects what rounding they bring, and products are faster than substitutions.
+        # Explicit inverses: the iteration corrects their rounding, and products are faster than substitutions.
         self._inverses = np.linalg.inv(shifts * np.eye(self.y.size) - self._jacobian)
         self._factored_step = h
 
@@ -190,15 +190,15 @@ class Collocation:
         """Embedded estimate (n,) of the local error, filtered as (8.19) so that stiff components do not dominate it."""
         return np.asarray(self._inverses[0].real @ (self.rate + self.method.error_weights @ F))
 
-    def advance(self, h: float, Z: Array, rate: Array) -> None:
-        """Accept a step."""
+    def advance(self, h: float, Z: Array, F: Array) -> None:
+        """Accept a step of h with increments Z and rates F at its stages."""
         self._previous = (h, Z)
         self.t += h
         self.y = self.y + Z[-1]
-        self.rate = rate
+        self.rate = F[-1]
 
     def iterate(self, h: float, tolerance: Array) -> tuple[Array, Array, float] | None:
-        """Solve a step to NEWTON_PART of `tolerance` (n,): increments, F and contraction; None where it does not converge."""
+        """Solve a step to NEWTON_PART of `tolerance` (n,): increments, F, contraction; None if it does not converge."""
         self._factor(h)
         Z = self._start(h)
         contraction, size_before = 0.0, np.inf
@@ -220,17 +220,17 @@ class Collocation:
 def solve(f: RightHandSide, y0: Array, duration: float, tolerance: Array, stages: int = STAGES) -> Dense:
     """Integrate ẏ = f(t, y) from y0 (n,) at t = 0 over `duration` (s) with step control.
 
-    tolerance (n,): bound of the local error of each state in its unit, at step ends and, to the same order, between them.
+    tolerance (n,): bound of the local error of each state in its unit, at step ends and, to the same order, between.
     Raises ArithmeticError where no step is short enough. Source: Hairer & Wanner IV.8.
     """
     collocation = Collocation(f, 0.0, y0, stages)
     t, y, increments = [0.0], [y0], []
     h = FIRST_STEP
     fresh = True
-    while collocation.t < duration:
-        # A last step of nearly nothing would cost digits: stretch or halve towards the end.
-        left = duration - collocation.t
-        h = left if left < 1.1 * h else min(h, 0.5 * left) if left < 2.0 * h else h
+    while t[-1] < duration:
+        left = duration - t[-1]
+        # Two equal steps to the end, so that the last one is not next to nothing.
+        h = left if left <= h else min(h, 0.5 * left)
         if h < SHORTEST_STEP:
             raise ArithmeticError(
                 f"the motion cannot be followed at t = {collocation.t:.6f} s: the step has shrunk to {h:.1e} s"
@@ -250,7 +250,7 @@ def solve(f: RightHandSide, y0: Array, duration: float, tolerance: Array, stages
         if error >= 1.0:
             h *= factor
             continue
-        collocation.advance(h, Z, F[-1])
+        collocation.advance(h, Z, F)
         t.append(duration if h == left else collocation.t)
         y.append(collocation.y)
         increments.append(y[-2] + Z)

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from functools import cached_property
+
 import numpy as np
 
+from sms_online.description.channels import drive_channel
 from sms_online.description.schema import System
-from sms_online.errors import InputError
 from sms_online.model.model import Model
 from sms_online.stream import Array
 from sms_sim.controller import JointPD
@@ -15,10 +17,9 @@ from sms_sim.references import FourierReference
 class Plant:
     """A described system with parameter values π and a controller; without one no torque acts.
 
-    The state y is positions x and speeds v in one array, (B, n_x + n_v). Euler parameters are integrated as plain states:
-    their norm is an invariant of the equations, which the adaptive integrator keeps to its own accuracy; only a run of
-    hours at a fixed step needs `normalised`.
-    Declared effects are part of the model's dynamics. Raises InputError where controller or trajectory do not fit the joints.
+    The state y is positions x and speeds v in one array, (B, n_x + n_v). Euler parameters are integrated as plain
+    states: their norm is an invariant of the equations, which the adaptive integrator keeps to its own accuracy; only a
+    run of hours at a fixed step needs `normalised`. Declared effects are part of the model's dynamics.
     """
 
     def __init__(self, system: System, parameters: Array | None = None) -> None:
@@ -26,7 +27,9 @@ class Plant:
         self.model = Model(system)
         self.parameters = self.model.nominal if parameters is None else parameters
         self.dynamics = self.model.dynamics(self.parameters)
-        self.controller = _controller(system)
+        self.controller: JointPD | None = None
+        if system.controller is not None and system.trajectory is not None:
+            self.controller = JointPD(system.controller, FourierReference(system.trajectory))
         layout = self.model.layout
         # Columns of a joint's link side and motor side, among the speeds and among the positions.
         self._q_speed, self._motor_speed = list(layout.q), list(layout.theta_m)
@@ -63,6 +66,31 @@ class Plant:
         x, v = self.split(y)
         return self.controller(t, x[:, self._q_position], v[:, self._q_speed])
 
+    @cached_property
+    def channels(self) -> tuple[str, ...]:
+        """Channels that the exact motion gives: drives, then positions of base, joints and markers."""
+        model, joints = self.model, range(1, len(self.system.joints) + 1)
+        rigid = len(model.layout.position_names) - sum(s.stop - s.start for s in model.layout.q_f)
+        markers = [
+            f"link_{i}.{name}"
+            for i, kinematics in enumerate(model.chain.flexible, start=1)
+            if kinematics is not None
+            for name in kinematics.marker_names
+        ]
+        return (*(drive_channel(self.system, i) for i in joints), *model.layout.position_names[:rigid], *markers)
+
+    def channel_values(self, torque: Array, x: Array) -> Array:
+        """Exact values (B, channels) at torques after the gear n τ (B, joints) and positions x (B, n_x)."""
+        model = self.model
+        gears = np.array([joint.gear_ratio for joint in self.system.joints])
+        at_shaft = np.array([channel.startswith("tau_") for channel in self.channels[: gears.size]])
+        parts = [torque / np.where(at_shaft, gears, 1.0)]
+        parts.append(x[:, : model.layout.n_x - sum(s.stop - s.start for s in model.layout.q_f)])
+        for i, kinematics in enumerate(model.chain.flexible):
+            if kinematics is not None:
+                parts.append(kinematics.markers(model.chain.elastic(x, i)))
+        return np.concatenate(parts, axis=1)
+
     def rate(self, t: Array, y: Array) -> Array:
         """ẏ (B, n_x + n_v) from H v̇ + C = Q, (40)."""
         x, v = self.split(y)
@@ -73,17 +101,3 @@ class Plant:
         """Power of each motor n τ θ̇_m (B, joints), W: its integral is the left side of (42)."""
         _, v = self.split(y)
         return np.asarray(self.torque(t, y) * v[:, self._motor_speed])
-
-
-def _controller(system: System) -> JointPD | None:
-    if system.controller is None or system.trajectory is None:
-        return None
-    joints = len(system.joints)
-    for place, given in (
-        ("controller.stiffness", len(system.controller.stiffness)),
-        ("controller.damping", len(system.controller.damping)),
-        ("trajectory.joints", len(system.trajectory.joints)),
-    ):
-        if given != joints:
-            raise InputError(system.name, place, f"{given} entries", f"{joints}, one for each joint")
-    return JointPD(system.controller, FourierReference(system.trajectory))

@@ -14,7 +14,7 @@ from sms_online.stream import Array
 
 @dataclass(frozen=True)
 class Grade:
-    """White noise per sample, 1σ: encoders and base angle rad, markers and base position m (slopes rad), joint torque n τ N m."""
+    """White noise per sample, 1σ: encoders and base angle rad, markers and base position m (slopes rad), n τ N m."""
 
     encoder: float
     marker: float
@@ -33,7 +33,7 @@ EULER_PARAMETERS = ("eps_x", "eps_y", "eps_z", "eta")
 
 
 class Sensors:
-    """The sensors of a system on `channels` (C names): their own rates and errors, or all at the system's rate with a grade's noise.
+    """The sensors on `channels` (C names), as described, or all of them at the system's rate with the noise of a grade.
 
     measurable: channels that exact values exist for, drives first. Those that no sensor fills are left out; drives are
     always there, for the torque is commanded; a system without sensors has them all, exact. Raises InputError on an
@@ -59,7 +59,7 @@ class Sensors:
         self._random = np.random.default_rng(seed)
 
     def read(self, first: int, exact: Array) -> Array:
-        """Readings (B, C) of exact values (B, C) at samples first, first + 1, … of the system's rate; NaN where not sampled.
+        """Readings (B, C) of exact values (B, C) at samples first, first + 1, … of the system's rate; NaN is no sample.
 
         A sensor slower than the system fills the first sample of each of its own intervals. Samples have to be read in
         order: noise is drawn for every channel of every sample, so that it depends on the seed alone.
@@ -67,7 +67,7 @@ class Sensors:
         values = exact + self._noise * self._random.standard_normal(exact.shape)
         step = np.where(self._resolution > 0.0, self._resolution, 1.0)
         values = np.where(self._resolution > 0.0, step * np.round(values / step), values)
-        # Number of a sensor's own interval, of each sample and of the one before it; rounding must not split an interval.
+        # The sensor's own interval that each sample, and the one before it, falls into; rounding must not split one.
         samples = first + np.arange(-1, exact.shape[0])
         interval = np.floor(samples[:, None] * (self._rate / self.sample_rate) + 1e-9)
         return np.where(np.diff(interval, axis=0) > 0, values, np.nan)

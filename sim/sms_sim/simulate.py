@@ -8,7 +8,6 @@ from functools import cached_property
 
 import numpy as np
 
-from sms_online.description.channels import drive_channel
 from sms_online.description.schema import System
 from sms_online.errors import InputError
 from sms_online.stream import Array, Block
@@ -16,8 +15,8 @@ from sms_sim.integrate import Dense, solve
 from sms_sim.plant import Plant
 from sms_sim.sensors import Sensors
 
-# Bounds of the local error of a step. Positions are going to be differentiated: at 1 kHz an eighth-order difference turns
-# 1e-12 m into 1e-9 m/s, and these bounds leave 3e-9 of the speeds (measured), far below any sensor.
+# Bounds of the local error of a step. Positions are going to be differentiated: with these bounds an eighth-order
+# difference of them at 1 kHz is within 3e-9 m/s or rad/s of the speeds (measured on the planar example).
 POSITION_TOLERANCE = 1e-11  # m, rad
 SPEED_TOLERANCE = 1e-9  # m/s, rad/s
 # Samples of a block: enough to hide the cost of a call.
@@ -42,8 +41,9 @@ class Drift:
 class ExactStates:
     """Exact values at B instants.
 
-    t (B,) s; x (B, n_x), v (B, n_v) in the order of the model's layout; torque (B, joints): n τ, N m (N); work (B, joints):
-    of each motor since the start, (42), J; dissipated (B,): since the start, (24), with what declared effects took out, J.
+    t (B,) s; x (B, n_x), v (B, n_v) in the order of the model's layout; torque (B, joints): n τ, N m (N); work
+    (B, joints): of each motor since the start, (42), J; dissipated (B,): since the start, (24), with what declared
+    effects took out, J.
     """
 
     t: Array
@@ -121,9 +121,9 @@ def simulate(
 ) -> Simulation:
     """Integrate a described system in closed loop, exact to the tolerances above.
 
-    duration: s, the reference's own by default. parameters: π (n_pi,) in place of the nominal ones. initial: x (n_x,) and
-    v (n_v,) in place of rest. Raises InputError where nothing states the duration, ArithmeticError where the motion cannot
-    be followed.
+    duration: s, the reference's own by default. parameters: π (n_pi,) in place of the nominal ones. initial: x (n_x,)
+    and v (n_v,) in place of rest. Raises InputError where nothing states the duration, ArithmeticError where the motion
+    cannot be followed.
     """
     if duration is None:
         if system.trajectory is None:
@@ -148,30 +148,25 @@ def exact_states(simulation: Simulation, t: Array) -> ExactStates:
 def sampled_blocks(simulation: Simulation, grade: str | None = None, seed: int = 0) -> Iterator[Block]:
     """What the sensors record at the system's rate, in blocks: drives and position channels, no rates.
 
-    grade: a noise grade (`sensors.GRADES`) in place of the described sensors. seed: of the noise. Raises InputError on an
-    unknown grade.
+    grade: a noise grade (`sensors.GRADES`) in place of the described sensors. seed: of the noise. Raises InputError on
+    an unknown grade.
     """
     plant = simulation.plant
-    system, model = plant.system, plant.model
-    drives = tuple(drive_channel(system, i) for i in range(1, len(system.joints) + 1))
-    to_drive = np.array(
-        [1.0 / j.gear_ratio if d.startswith("tau_") else 1.0 for j, d in zip(system.joints, drives, strict=True)]
-    )
-    names = drives + model.channels
-    sensors = Sensors(system, names, grade, seed)
-    columns = [names.index(channel) for channel in sensors.channels]
+    rate = plant.system.sample_rate
+    sensors = Sensors(plant.system, plant.channels, grade, seed)
+    columns = [plant.channels.index(channel) for channel in sensors.channels]
     # Half a sample of slack: duration times rate may fall short of a whole number by rounding.
-    samples = int(simulation.duration * system.sample_rate + 0.5) + 1
+    samples = int(simulation.duration * rate + 0.5) + 1
 
     def exact(t: Array) -> Array:
         """Exact values (B, C) at instants t (B,); before the start the system rests."""
         inside = np.clip(t, 0.0, simulation.duration)
         y = simulation.solution(inside)
         torque = np.where(t[:, None] < 0.0, 0.0, plant.torque(inside, y))
-        return np.column_stack((torque * to_drive, model.measure(plant.split(y)[0])))[:, columns]
+        return plant.channel_values(torque, plant.split(y)[0])[:, columns]
 
     for first in range(0, samples, BLOCK_SAMPLES):
-        t = np.arange(first, min(first + BLOCK_SAMPLES, samples)) / system.sample_rate
+        t = np.arange(first, min(first + BLOCK_SAMPLES, samples)) / rate
         values = np.empty((t.size, len(columns)))
         for latency in np.unique(sensors.latency):
             late = sensors.latency == latency

@@ -30,6 +30,8 @@ PERIOD_INTERVALS = 9
 # A channel silent for longer than this, s, has a gap whatever its period; it bounds what is held back for a silent
 # channel.
 LONGEST_HOLE = 1.0
+# Grid index of a row that lies on no grid point.
+NOWHERE = -2
 
 
 @dataclass(frozen=True)
@@ -84,10 +86,10 @@ class Synchroniser:
     A sample on a grid point passes bit for bit. Elsewhere a channel is interpolated from its own samples by the
     polynomial of degree 5 through the six nearest, three on each side. Off-centre or lower-degree interpolation at
     the borders of a segment would have another error and another noise there, unknown to whoever weighs the
-    samples, so grid points without a full stencil are not delivered. A channel's sample next to another on
-    neighbouring grid points needs no stencil. A segment is a run of grid points at which every channel has a value;
-    a hole in any channel ends it. Whatever the blocks, the values are the same bits. Limitation: a channel faster
-    than the grid is picked, not averaged.
+    samples, so grid points without a full stencil are not delivered. Runs of three and more samples on neighbouring
+    grid points pass up to the border, and what is interpolated beside them has its stencil in them.
+    A segment is a run of grid points at which every channel has a value; a hole in any channel ends it. Whatever the
+    blocks, the values are the same bits. Limitation: a channel faster than the grid is picked, not averaged.
 
     channels: names, in the order of the columns. sample_rate: of the grid, Hz. gap_limit: longest interval between
     two samples of a channel that is bridged, in periods of that channel (the median of its first intervals), at
@@ -137,8 +139,6 @@ class Synchroniser:
         """End of the capture: return what can still be delivered."""
         if self._time.size == 0:
             return []
-        for channel in np.flatnonzero(np.isnan(self._period) & ~np.isnan(self._intervals[:, 0])):
-            self._period[channel] = np.nanmedian(self._intervals[channel])
         pieces = self._advance(final=True)
         self.counters.lost_samples += self._next - 1 - self._delivered
         return pieces
@@ -176,12 +176,16 @@ class Synchroniser:
         return (
             self._delivered == self._next - 1
             and tail.shape[0] == SIDE
-            and abs(self._time[-1] - self._delivered / self.sample_rate) <= self._tolerance
+            and self._on_consecutive_points(self._time[-SIDE:], self._next - SIDE)
             and not np.isnan(self._period).any()
             and not np.isnan(tail).any()
             and not np.isnan(values).any()
-            and bool(np.all(np.abs(time - (self._next + np.arange(time.size)) / self.sample_rate) <= self._tolerance))
+            and self._on_consecutive_points(time, self._next)
         )
+
+    def _on_consecutive_points(self, time: Array, first: int) -> bool:
+        grid = np.arange(first, first + time.size) / self.sample_rate
+        return bool(np.all(np.abs(time - grid) <= self._tolerance))
 
     def _pass(self, time: Array, values: Array) -> list[GridSamples]:
         """The common case of `_advance`, 0.03 instead of 0.8 µs a sample: each row is its own grid point."""
@@ -215,22 +219,36 @@ class Synchroniser:
         return values
 
     def _learn_period(self, channel: int, intervals: Array) -> None:
+        """Take a channel's next intervals until nine are known, or a hole ends those that are."""
         known = self._intervals[channel]
-        free = np.flatnonzero(np.isnan(known))[: intervals.size]
-        known[free] = intervals[: free.size]
-        if not np.isnan(known[-1]):
-            self._period[channel] = np.median(known)
+        for interval in intervals:
+            if not np.isnan(self._period[channel]):
+                return
+            count = np.count_nonzero(~np.isnan(known))
+            if interval > LONGEST_HOLE:
+                self._settle_period(channel)
+            else:
+                known[count] = interval
+                if count + 1 == PERIOD_INTERVALS:
+                    self._settle_period(channel)
+
+    def _settle_period(self, channel: int) -> None:
+        known = self._intervals[channel]
+        if not np.isnan(known[0]):
+            self._period[channel] = np.nanmedian(known)
 
     def _advance(self, final: bool) -> list[GridSamples]:
         """Decide grid points as far as the samples allow, deliver those with a value in every channel, drop old
         rows."""
+        silent = self._time[-1] - self._last_time > LONGEST_HOLE
+        for channel in np.flatnonzero(np.isnan(self._period) & (silent | final)):
+            self._settle_period(channel)
         k = self._candidates()
         decided = np.ones(k.size, dtype=bool)
         complete = np.ones(k.size, dtype=bool)
-        # Integer grid index of the rows that lie on the grid; -2 is nobody's neighbour.
         nearest = np.rint(self._time * self.sample_rate).astype(np.int64)
         on_grid = np.abs(self._time - nearest / self.sample_rate) <= self._tolerance
-        row_index = np.where(on_grid, nearest, -2)
+        row_index = np.where(on_grid, nearest, NOWHERE)
         groups = []
         for columns, rows in self._sampled_together():
             group, sure, possible = self._judge(k, columns, rows, row_index[rows], final)
@@ -270,9 +288,9 @@ class Synchroniser:
         ts, now = self._time[rows], self._time[-1]
         grid = k / self.sample_rate
         last = np.searchsorted(ts, grid + self._tolerance, side="right") - 1
-        padded = np.concatenate([[-2], row_index, [-2]])
+        padded = np.concatenate([[NOWHERE], row_index])
         hit = padded[last + 1] == k
-        passes = hit & ((padded[last] == k - 1) | (padded[np.minimum(last + 2, ts.size + 1)] == k + 1))
+        passes = hit & (_run_length(padded)[last + 1] >= SIDE)
         group = _Group(columns, rows, ts, last, hit)
         rest = np.flatnonzero(~passes)
         if rest.size == 0:
@@ -288,10 +306,10 @@ class Synchroniser:
         silent = final or (ts.size > 0 and bool(self._is_gap(now - ts[-1:], columns[0])[0]))
         past = final | (now > grid[rest] + self._tolerance)
         no_stencil = ((begin < 0) & past) | broken | (~arrived & silent)
-        past_next = final | (now > grid[rest] + 1.0 / self.sample_rate + self._tolerance)
-        no_neighbour = np.where(hit[rest], past_next, past)
+        reach = np.where(hit[rest], (SIDE - 1) / self.sample_rate, 0.0)
+        no_run = final | (now > grid[rest] + reach + self._tolerance)
         sure, possible = np.ones_like(passes), np.ones_like(passes)
-        sure[rest] = stencil | (no_stencil & no_neighbour)
+        sure[rest] = stencil | (no_stencil & no_run)
         possible[rest] = stencil
         return group, sure, possible
 
@@ -330,7 +348,8 @@ class Synchroniser:
         needed = self._time.size - 1
         reach = self._next / self.sample_rate + self._tolerance
         for group in groups:
-            if group.ts.size and self._time[-1] - group.ts[-1] <= LONGEST_HOLE:
+            passed = group.ts.size == 0 or group.ts[-1] < reach - 2.0 * self._tolerance
+            if not (passed and self._time[-1] - self._last_time[group.columns[0]] > LONGEST_HOLE):
                 oldest = int(np.searchsorted(group.ts, reach, side="right")) - SIDE
                 needed = min(needed, int(group.rows[max(oldest, 0)]))
         self._time, self._values = self._time[needed:].copy(), self._values[needed:].copy()
@@ -347,6 +366,13 @@ class Synchroniser:
             self._delivered = int(k[b - 1])
             pieces.append(GridSamples(k[a:b], values[a:b], self.counters.gaps))
         return pieces
+
+
+def _run_length(row_index: Indices) -> Indices:
+    """Of each row: how many rows lie on consecutive grid points around it, itself included; 1 off the grid."""
+    run = np.cumsum(np.diff(row_index, prepend=NOWHERE) != 1)
+    length: Indices = np.bincount(run)[run]
+    return length
 
 
 def _lagrange_weights_at_zero(x: Array) -> Array:

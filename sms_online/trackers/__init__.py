@@ -1,0 +1,23 @@
+"""Trackers: recursive estimators of π from rows of the balances."""
+
+from sms_online.trackers.batch import batch_least_squares
+from sms_online.trackers.forgetting import Directional, Exponential, Forgetting, NoForgetting, SlidingWindow
+from sms_online.trackers.interface import Estimate, Prior, Rows, State, Tracker
+from sms_online.trackers.kalman import KalmanTracker
+from sms_online.trackers.square_root import RecursiveLeastSquares
+
+__all__ = [
+    "Directional",
+    "Estimate",
+    "Exponential",
+    "Forgetting",
+    "KalmanTracker",
+    "NoForgetting",
+    "Prior",
+    "RecursiveLeastSquares",
+    "Rows",
+    "SlidingWindow",
+    "State",
+    "Tracker",
+    "batch_least_squares",
+]

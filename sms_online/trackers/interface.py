@@ -1,0 +1,149 @@
+"""What goes into a tracker (rows), what comes out (an estimate), and what every tracker can do."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+
+from sms_online.stream import Array
+
+# What a tracker saves: arrays and numbers only, so that any array format can hold it.
+State = dict[str, Array | float]
+
+
+@dataclass(frozen=True)
+class Rows:
+    """M rows of a balance, Y π = b, in order of time.
+
+    Y: (M, n). b: (M,). std: (M,) standard deviation of each row's error, in the unit of b. t: (M,) seconds.
+    Raises ValueError naming the first row that is not finite or whose std is not positive, or the shapes that do not fit.
+    """
+
+    Y: Array
+    b: Array
+    std: Array
+    t: Array
+
+    def __post_init__(self) -> None:
+        if self.Y.ndim != 2 or not self.b.shape == self.std.shape == self.t.shape == self.Y.shape[:1]:
+            raise ValueError(
+                f"rows do not fit: Y {self.Y.shape}, b {self.b.shape}, std {self.std.shape}, t {self.t.shape}"
+            )
+        for name, values in (("Y", self.Y), ("b", self.b), ("std", self.std), ("t", self.t)):
+            finite = np.isfinite(values)
+            if not finite.all():
+                raise ValueError(f"row {np.argwhere(~finite)[0, 0]}: {name} is not finite")
+        if not (self.std > 0).all():
+            row = int(np.argmin(self.std > 0))
+            raise ValueError(f"row {row}: std is {self.std[row]:g}; expected a positive number")
+
+    def whitened(self, n: int) -> Array:
+        """[Y b] / std of n parameters, (M, n + 1); ValueError where the width differs or the quotient overflows."""
+        if self.Y.shape[1] != n:
+            raise ValueError(f"row 0: {self.Y.shape[1]} columns; expected {n}")
+        with np.errstate(over="ignore"):
+            out: Array = np.column_stack((self.Y, self.b)) / self.std[:, None]
+        finite = np.isfinite(out).all(axis=1)
+        if not finite.all():
+            raise ValueError(f"row {int(np.argmin(finite))}: overflows when divided by its std")
+        return out
+
+
+@dataclass(frozen=True)
+class Prior:
+    """What is known of the parameters beforehand, value ± std each.
+
+    value, std: (n,). A std of NaN says that nothing is known of that parameter; its value is then ignored.
+    """
+
+    value: Array
+    std: Array
+
+    def __post_init__(self) -> None:
+        if self.value.shape != self.std.shape or self.value.ndim != 1:
+            raise ValueError(f"prior values {self.value.shape} do not fit their std {self.std.shape}")
+        known = self.known
+        wrong = known & ~(np.isfinite(self.value) & np.isfinite(self.std) & (self.std > 0))
+        if wrong.any():
+            j = int(np.argmax(wrong))
+            raise ValueError(f"prior {j}: {self.value[j]:g} ± {self.std[j]:g}; expected finite and a positive std")
+
+    @property
+    def known(self) -> np.ndarray[tuple[int], np.dtype[np.bool_]]:
+        """(n,) where something is known."""
+        return ~np.isnan(self.std)
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """π as far as the rows determine it.
+
+    pi: (n,); where not determined, the minimum-norm solution in units of the columns' sizes: no number to trust.
+    covariance: (n, n) from the stated std of the rows. covariance_robust: the same from the residuals themselves, valid
+    for autocorrelated errors; None where it is not defined (see `robust`). A parameter that is not determined has an
+    infinite variance and zeros beside it. determined: (n,) bool. condition_number: of the column-scaled information
+    factor, inf where its rank is not full. rows: number of rows, less where old ones count less.
+    rss: residual sum of squares of the whitened rows, priors included. dof: its degrees of freedom.
+    """
+
+    pi: Array
+    covariance: Array
+    covariance_robust: Array | None
+    determined: np.ndarray[tuple[int], np.dtype[np.bool_]]
+    condition_number: float
+    rows: float
+    rss: float
+    dof: float
+
+    @property
+    def std(self) -> Array:
+        """(n,) standard deviations from the stated noise, inf where not determined."""
+        return np.sqrt(np.diag(self.covariance))
+
+    @property
+    def std_robust(self) -> Array | None:
+        """(n,) standard deviations valid for autocorrelated errors, where defined."""
+        return None if self.covariance_robust is None else np.sqrt(np.diag(self.covariance_robust))
+
+
+class Tracker(Protocol):
+    """A recursive estimator of π. The result depends on the rows alone, never on how they were split into calls."""
+
+    enabled: bool
+    """While False, rows are ignored and the estimate stands still."""
+
+    def update(self, rows: Rows) -> None:
+        """Take in rows; ValueError where their width is not n."""
+
+    def estimate(self) -> Estimate:
+        """The estimate from all rows taken in so far; leaves the state as it is."""
+
+    def reset(self) -> None:
+        """Forget all rows; priors stay."""
+
+    def state(self) -> State:
+        """Everything needed to continue bit for bit, as copies."""
+
+    def restore(self, state: Mapping[str, Array | float]) -> None:
+        """Continue from a state saved by a tracker built with the same arguments; ValueError where it does not fit."""
+
+
+def saved_array(state: Mapping[str, Array | float], key: str, shape: tuple[int | None, ...]) -> Array:
+    """Copy of an array out of a saved state; None in `shape` stands for any length. ValueError where it does not fit."""
+    if key not in state:
+        raise ValueError(f"saved tracker state: no {key!r}; expected the state of a tracker of this kind")
+    value = np.array(state[key], dtype=np.float64)
+    fits = value.ndim == len(shape) and all(want in (None, have) for want, have in zip(shape, value.shape, strict=True))
+    if not fits or not np.isfinite(value).all():
+        raise ValueError(
+            f"saved tracker state: {key!r} has shape {value.shape}; expected finite values of shape {shape}"
+        )
+    return value
+
+
+def saved_number(state: Mapping[str, Array | float], key: str) -> float:
+    """A number out of a saved state; ValueError where it is missing or not finite."""
+    return float(saved_array(state, key, ()))

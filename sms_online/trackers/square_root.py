@@ -1,0 +1,92 @@
+"""Recursive least squares in square-root information form, by QR of blocks of rows."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from sms_online.stream import Array
+from sms_online.trackers.factor import prior_factor, solve, triangular_factor
+from sms_online.trackers.forgetting import Forgetting, NoForgetting
+from sms_online.trackers.interface import Estimate, Prior, Rows, State, saved_array, saved_number
+from sms_online.trackers.memory import BLOCK_ROWS, memory_for
+from sms_online.trackers.robust import cluster_covariance
+
+
+class RecursiveLeastSquares:
+    """Recursive solution of Y π = b, weighted by the rows' std; without forgetting it equals the batch solution (45).
+
+    Rows are gathered into blocks of fixed size before they are absorbed, so that no bit of the result depends on how they
+    were split into calls; an estimate counts the pending rows too and leaves them pending.
+    A prior is not measured by the rows and does not age: it is added at each estimate and never forgotten.
+    Source: Bierman, Factorization Methods for Discrete Sequential Estimation, 1977, chapter IV (SRIF data processing).
+    """
+
+    def __init__(self, n: int, forgetting: Forgetting | None = None, prior: Prior | None = None) -> None:
+        self.enabled = True
+        self._n = n
+        self._forgetting = forgetting if forgetting is not None else NoForgetting()
+        self._prior = prior_factor(prior, n)
+        self._pending = np.zeros((BLOCK_ROWS, n + 1))
+        self._fill = 0
+        self._memory = memory_for(self._forgetting, n)
+
+    def update(self, rows: Rows) -> None:
+        """Take in rows; ValueError where their width is not n."""
+        if not self.enabled:
+            return
+        whitened = rows.whitened(self._n)
+        start = 0
+        while start < len(whitened):
+            count = min(BLOCK_ROWS - self._fill, len(whitened) - start)
+            self._pending[self._fill : self._fill + count] = whitened[start : start + count]
+            self._fill += count
+            start += count
+            if self._fill == BLOCK_ROWS:
+                self._memory.absorb(self._pending)
+                self._fill = 0
+
+    def estimate(self) -> Estimate:
+        """The estimate from all rows so far and the prior; leaves the state as it is."""
+        content = self._memory.with_pending(self._pending[: self._fill])
+        solution = solve(triangular_factor(self._prior, content.factor))
+        robust = None
+        if content.clusters is not None:
+            robust = cluster_covariance(solution, content.clusters, self._prior, content.rows)
+        return Estimate(
+            pi=solution.pi,
+            covariance=solution.covariance(),
+            covariance_robust=robust,
+            determined=solution.determined,
+            condition_number=solution.condition_number,
+            rows=content.rows,
+            rss=solution.rss,
+            dof=max(content.rows + len(self._prior) - solution.rank, 0.0),
+        )
+
+    def reset(self) -> None:
+        """Forget all rows; the prior stays."""
+        self._fill = 0
+        self._memory = memory_for(self._forgetting, self._n)
+
+    def state(self) -> State:
+        """Everything needed to continue bit for bit, pending rows included."""
+        return {
+            "enabled": float(self.enabled),
+            "pending": self._pending[: self._fill].copy(),
+            **self._memory.state(),
+        }
+
+    def restore(self, state: Mapping[str, Array | float]) -> None:
+        """Continue from a state saved by a tracker built with the same arguments; ValueError where it does not fit."""
+        pending = saved_array(state, "pending", (None, self._n + 1))
+        if len(pending) >= BLOCK_ROWS:
+            raise ValueError(f"saved tracker state: {len(pending)} pending rows; expected fewer than {BLOCK_ROWS}")
+        enabled = bool(saved_number(state, "enabled"))
+        memory = memory_for(self._forgetting, self._n)
+        memory.restore(state)
+        self._memory = memory
+        self._fill = len(pending)
+        self._pending[: self._fill] = pending
+        self.enabled = enabled
