@@ -216,6 +216,20 @@ def untidy_capture(seed: int) -> tuple[Array, Array]:
     return t, values
 
 
+def test_a_hole_before_the_period_is_known_is_the_same_in_any_blocks() -> None:
+    """Seven samples of a slow channel, then everything is silent for longer than any period."""
+    t = np.arange(400) / RATE
+    t[80:] += 1.5
+    t[1:60:7] += 1e-4
+    values = signal(t)
+    values[np.arange(400) % 11 != 0, 2] = np.nan
+    reference = joined(run(t, values)[0])
+    assert reference[0][0] == 22
+    assert reference[2].max() == 1
+    found = joined(run(t, values, range(1, 400))[0])
+    assert all(np.array_equal(a, b) for a, b in zip(found, reference, strict=True))
+
+
 @pytest.mark.parametrize("seed", [3, 4])
 def test_blocks_do_not_change_a_bit(seed: int) -> None:
     t, values = untidy_capture(seed)
@@ -223,7 +237,7 @@ def test_blocks_do_not_change_a_bit(seed: int) -> None:
     pieces, whole = run(t, values)
     reference = joined(pieces)
     assert reference[0].size > 2000
-    for cuts in (range(1, t.size), np.sort(rng.integers(0, t.size, 40)).tolist(), range(64, t.size, 64)):
+    for cuts in (range(2, t.size, 3), np.sort(rng.integers(0, t.size, 40)).tolist(), range(64, t.size, 64)):
         pieces, stage = run(t, values, cuts)
         assert all(np.array_equal(a, b) for a, b in zip(joined(pieces), reference, strict=True))
         assert stage.counters == whole.counters

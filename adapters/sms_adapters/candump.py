@@ -103,7 +103,9 @@ class CandumpReader:
         if self._wrong_length:
             found.append(f"{name}: {self._wrong_length} frames skipped, their length is not the one in {self._dbc}")
         if self._repeated:
-            found.append(f"{name}: {self._repeated} frames skipped, their time repeats that of their message's last one")
+            found.append(
+                f"{name}: {self._repeated} frames skipped, their time repeats that of their message's last one"
+            )
         if self._lines.cut_line is not None:
             found.append(f"{name}: 1 line skipped, line {self._lines.cut_line} is cut (no newline at its end)")
         return found

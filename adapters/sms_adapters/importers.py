@@ -66,7 +66,8 @@ def import_quanser(source: Path, capture: Path) -> int:
 
 def _load(source: Path) -> Mapping[str, Any]:
     try:
-        return loadmat(source, squeeze_me=True, appendmat=False)
+        with source.open("rb") as file:
+            return loadmat(file, squeeze_me=True)  # type: ignore[arg-type]  # its stubs know names only
     except OSError as error:
         raise InputError(str(source), "", error.strerror or str(error), "a readable .mat file") from None
     except (MatReadError, ValueError, TypeError, NotImplementedError, zlib.error) as error:

@@ -19,7 +19,7 @@ NODAL: dict[str, Deformation] = {
 
 
 def is_directly_driven(joint: Joint) -> bool:
-    """Whether the drive's force is measured on the axis itself: a prismatic axis, or no gear and no flexible transmission."""
+    """Whether the drive's force is measured at the axis: a prismatic axis, or neither gear nor flexible transmission."""
     return joint.kind == "prismatic" or (joint.transmission == "rigid" and joint.gear_ratio == 1.0)
 
 
@@ -29,7 +29,7 @@ def drive_channel(system: System, i: int) -> str:
 
 
 def channels(system: System) -> tuple[str, ...]:
-    """Every channel that a capture of this system may hold: drives, joints, base, then markers and strain of each link."""
+    """Every channel that a capture of this system may hold: drives, joints, base, then the markers of each link."""
     joints = range(1, len(system.joints) + 1)
     names = [drive_channel(system, i) for i in joints]
     names += [f"theta_m_{i}" for i in joints if system.joints[i - 1].transmission == "flexible"]

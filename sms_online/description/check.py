@@ -1,4 +1,4 @@
-"""What a single record cannot see: sizes that have to agree, names that have to exist, physics that has to be possible."""
+"""What no single record can see: sizes that have to agree, names that have to exist, physics that has to be possible."""
 
 from __future__ import annotations
 
@@ -40,7 +40,9 @@ def check_system(system: System, source: str) -> None:
     for place, inertia in _inertias(system):
         _check_inertia(place, inertia, source)
     if system.motion == "planar" and system.gravity[2] != 0.0:
-        raise InputError(source, "gravity", f"{system.gravity[2]:g} m/s² along z", "gravity in the x-y plane, or motion = 'spatial'")
+        raise InputError(
+            source, "gravity", f"{system.gravity[2]:g} m/s² along z", "gravity in the x-y plane, or motion = 'spatial'"
+        )
     _check_simulation(system, source)
     names = channels(system)
     _check_sensors(system, names, source)
@@ -60,7 +62,10 @@ def _check_joint(i: int, joint: Joint, motor: Motor | None, planar: bool, source
         if motor is None or motor.rotor_inertia == 0.0:
             found = "no such table" if motor is None else "0"
             raise InputError(
-                source, f"motor_{i}.rotor_inertia", found, f"a rotor inertia greater than 0, for {place} has a flexible transmission"
+                source,
+                f"motor_{i}.rotor_inertia",
+                found,
+                f"a rotor inertia greater than 0, for {place} has a flexible transmission",
             )
     if not planar:
         return
@@ -69,23 +74,34 @@ def _check_joint(i: int, joint: Joint, motor: Motor | None, planar: bool, source
     if joint.kind == "prismatic" and joint.axis[2] != 0.0:
         raise InputError(source, f"{place}.axis", f"{list(joint.axis)}", "an axis in the x-y plane in planar motion")
     if joint.mount_rotation[:2] != (0.0, 0.0):
-        raise InputError(source, f"{place}.mount_rotation", f"{list(joint.mount_rotation)}", "a turn about z alone in planar motion")
+        raise InputError(
+            source, f"{place}.mount_rotation", f"{list(joint.mount_rotation)}", "a turn about z alone in planar motion"
+        )
 
 
 def _check_flexible(place: str, link: FlexibleLink, planar: bool, source: str) -> None:
     if len(set(link.deformations)) < len(link.deformations):
         raise InputError(source, f"{place}.deformations", f"{list(link.deformations)}", "each deformation once")
     if planar and link.deformations != ("bending_z",):
-        raise InputError(source, f"{place}.deformations", f"{list(link.deformations)}", "['bending_z'] in planar motion")
+        raise InputError(
+            source, f"{place}.deformations", f"{list(link.deformations)}", "['bending_z'] in planar motion"
+        )
     if link.kinematics == "exact" and "traction" in link.deformations:
-        raise InputError(source, f"{place}.deformations", "'traction'", "no traction on an inextensible link (kinematics = 'exact')")
+        raise InputError(
+            source, f"{place}.deformations", "'traction'", "no traction on an inextensible link (kinematics = 'exact')"
+        )
     for deformation in link.deformations:
         rigidity = RIGIDITY[deformation]
         if getattr(link, rigidity) == 0.0:
-            raise InputError(source, f"{place}.{rigidity}", "0", f"a rigidity greater than 0, for {deformation} is active")
+            raise InputError(
+                source, f"{place}.{rigidity}", "0", f"a rigidity greater than 0, for {deformation} is active"
+            )
     if "torsion" in link.deformations and link.polar_inertia_per_length == 0.0:
         raise InputError(
-            source, f"{place}.polar_inertia_per_length", "0", "an inertia greater than 0, for without it torsion has no mass"
+            source,
+            f"{place}.polar_inertia_per_length",
+            "0",
+            "an inertia greater than 0, for without it torsion has no mass",
         )
 
 
@@ -106,7 +122,9 @@ def _check_inertia(place: str, inertia: Inertia, source: str) -> None:
     i = inertia
     moments = np.linalg.eigvalsh([[i.xx, i.xy, i.xz], [i.xy, i.yy, i.yz], [i.xz, i.yz, i.zz]])
     if moments[0] < -INERTIA_TOLERANCE * moments[2]:
-        raise InputError(source, place, f"a negative principal moment, {moments[0]:.3g} kg m²", "a body's inertia: none below 0")
+        raise InputError(
+            source, place, f"a negative principal moment, {moments[0]:.3g} kg m²", "a body's inertia: none below 0"
+        )
 
 
 def _check_simulation(system: System, source: str) -> None:
@@ -128,7 +146,10 @@ def _check_sensors(system: System, names: tuple[str, ...], source: str) -> None:
         for channel in sensed_channels(system, sensor):
             if channel in filled:
                 raise InputError(
-                    source, f"sensor {k}.channels", f"{channel!r} is filled by sensor {filled[channel]} too", "one sensor for a channel"
+                    source,
+                    f"sensor {k}.channels",
+                    f"{channel!r} is filled by sensor {filled[channel]} too",
+                    "one sensor for a channel",
                 )
             filled[channel] = k
 
@@ -146,7 +167,10 @@ def _check_source(system: System, names: tuple[str, ...], source: str) -> None:
         if channel not in names:
             near = nearest(channel, names)
             raise InputError(
-                source, f"source.signals.{signal}", f"unknown channel {channel!r}", f"a channel of this system, such as {near or names[0]!r}"
+                source,
+                f"source.signals.{signal}",
+                f"unknown channel {channel!r}",
+                f"a channel of this system, such as {near or names[0]!r}",
             )
 
 
@@ -158,9 +182,13 @@ def _check_effects(system: System, names: tuple[str, ...], source: str) -> None:
     for k, effect in enumerate(system.effects, start=1):
         if effect.where not in (*places, *names):
             near = nearest(effect.where, (*places, *names))
-            raise InputError(source, f"effect {k}.where", repr(effect.where), f"{', '.join(places)} or a channel{hint(near)}")
+            raise InputError(
+                source, f"effect {k}.where", repr(effect.where), f"{', '.join(places)} or a channel{hint(near)}"
+            )
         if (effect.name, effect.where) in seen:
-            raise InputError(source, f"effect {k}", f"{effect.name}@{effect.where} again", "each effect once at a place")
+            raise InputError(
+                source, f"effect {k}", f"{effect.name}@{effect.where} again", "each effect once at a place"
+            )
         seen.add((effect.name, effect.where))
 
 
@@ -179,7 +207,10 @@ def _check_parameter_names(system: System, source: str) -> None:
                 raise InputError(source, table, repr(name), "the name of a parameter, such as 'motor_1.mass'")
             if parts["owner"] not in owners:
                 raise InputError(
-                    source, f'{table}."{name}"', f"{parts['owner']!r} is not in this system", quoted(owners, nearest(parts["owner"], owners))
+                    source,
+                    f'{table}."{name}"',
+                    f"{parts['owner']!r} is not in this system",
+                    quoted(owners, nearest(parts["owner"], owners)),
                 )
     for name in system.known:
         if name in system.priors:

@@ -13,7 +13,13 @@ from sms_online.description import schema
 from sms_online.errors import InputError
 
 # Fields of `System` that are numbered tables, or lists of tables, in the file.
-TABLES = {"joints": "joint_{}", "motors": "motor_{}", "links": "link_{}", "sensors": "sensor {}", "effects": "effect {}"}
+TABLES = {
+    "joints": "joint_{}",
+    "motors": "motor_{}",
+    "links": "link_{}",
+    "sensors": "sensor {}",
+    "effects": "effect {}",
+}
 RECORDS: dict[str, type[BaseModel]] = {
     "spacecraft": schema.Spacecraft,
     "payload": schema.RigidBody,
@@ -51,7 +57,9 @@ def nearest(word: str, names: Sequence[str]) -> str | None:
     return matches[0] if matches else None
 
 
-def unknown_key(source: str, place: str, key: str, known: Sequence[str], listed: Sequence[str] | None = None) -> InputError:
+def unknown_key(
+    source: str, place: str, key: str, known: Sequence[str], listed: Sequence[str] | None = None
+) -> InputError:
     """Error for an unknown key; `known` are the keys that are compared with it, `listed` those that are printed."""
     return InputError(source, place, f"unknown key {key!r}", quoted(listed or known, nearest(key, known)))
 
@@ -72,7 +80,9 @@ def explain(error: ValidationError, source: str) -> InputError:
     if kind in ("union_tag_not_found", "union_tag_invalid"):
         tag = value.get("kind") if isinstance(value, dict) else None
         near = nearest(str(tag), tuple(LINKS))
-        return InputError(source, f"{place}.kind", "missing" if tag is None else _shown(tag), quoted(tuple(LINKS), near))
+        return InputError(
+            source, f"{place}.kind", "missing" if tag is None else _shown(tag), quoted(tuple(LINKS), near)
+        )
     if first["loc"][0] == "known" and isinstance(value, dict):
         name = f"{first['loc'][1]}.{next(iter(value), 'parameter')}"
         return InputError(source, place, "a table", f'a number; a name with a dot is quoted: "{name}" = value')

@@ -1,7 +1,7 @@
 """From the text of a system file (TOML) to a checked `System`, and the texts that are shipped with the package.
 
-Tables of a file: [spacecraft], then [joint_i], [motor_i] (optional) and [link_i] for i = 1..N, [payload], [[sensor]], [source],
-[[effect]], [known], [prior], [controller], [trajectory], [windows]; the README has an annotated example.
+Tables of a file: [spacecraft], then [joint_i], [motor_i] (optional) and [link_i] for i = 1..N, [payload], [[sensor]],
+[source], [[effect]], [known], [prior], [controller], [trajectory], [windows]; keys are the fields of `schema`.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ def parse_system(text: str, source: str) -> System:
         raise InputError(source, place, " ".join(what.split()), "valid TOML") from None
     record = _arrange(document, source)
     try:
-        # By way of JSON, for in Python's own strict mode lists are no tuples; strict, so that "5" and true are no numbers.
+        # Strict, so that "5" and true are no numbers; by way of JSON, for in Python's strict mode lists are no tuples.
         system = System.model_validate_json(json.dumps(record, default=str), strict=True)
     except ValidationError as error:
         raise explain(error, source) from None
@@ -58,14 +58,18 @@ def _arrange(document: Mapping[str, Any], source: str) -> dict[str, Any]:
             counts[numbered[1]] = max(counts[numbered[1]], int(numbered[2]))
         elif key not in WITHOUT_NUMBERS:
             known = [f"{kind}_{i}" for kind in counts for i in range(1, max(counts.values()) + 2)]
-            raise unknown_key(source, key, key, (*WITHOUT_NUMBERS, *known), listed=(*WITHOUT_NUMBERS, "joint_i", "motor_i", "link_i"))
+            raise unknown_key(
+                source, key, key, (*WITHOUT_NUMBERS, *known), listed=(*WITHOUT_NUMBERS, "joint_i", "motor_i", "link_i")
+            )
     n = max(counts.values())
     if n == 0:
         raise InputError(source, "joint_1", "no such table", "at least one joint: tables [joint_1] and [link_1]")
     for kind in ("joint", "link"):
         for i in range(1, n + 1):
             if f"{kind}_{i}" not in document:
-                last = max((key for key in document if NUMBERED.fullmatch(key)), key=lambda key: int(key.rsplit("_", 1)[1]))
+                last = max(
+                    (key for key in document if NUMBERED.fullmatch(key)), key=lambda key: int(key.rsplit("_", 1)[1])
+                )
                 raise InputError(
                     source,
                     f"{kind}_{i}",

@@ -53,8 +53,8 @@ class Spacecraft(RigidBody):
 class Motor(Record):
     """Motor of a joint: stator on the link before it, rotor spinning about the joint's axis, (17).
 
-    mass: m_m, kg, rotor and stator. rotor_inertia: axial I_r before the gear, kg m². stator_inertia: I_s, kg m², with the
-    rotor's transverse inertia in it (for a rotor of revolution the two cannot be told apart).
+    mass: m_m, kg, rotor and stator. rotor_inertia: axial I_r before the gear, kg m². stator_inertia: I_s, kg m², with
+    the rotor's transverse inertia in it (for a rotor of revolution the two cannot be told apart).
     """
 
     mass: NonNegative = 0.0
@@ -63,9 +63,9 @@ class Motor(Record):
 
 
 class Joint(Record):
-    """A joint: its mount turned by the rotation vector `mount_rotation` (rad) from the frame at the end of the link before.
+    """A joint: its mount is turned by the rotation vector `mount_rotation` (rad) from the end of the link before.
 
-    axis: unit vector in the mount frame. gear_ratio: n (rad/m on a prismatic joint). transmission `rigid` means q = θ_m.
+    axis: unit vector in the mount frame. gear_ratio: n (rad/m on a prismatic joint). transmission `rigid`: q = θ_m.
     stiffness: k, N m/rad (N/m). damping: b, N m s/rad (N s/m).
     """
 
@@ -113,8 +113,10 @@ Link = Annotated[RigidLink | FlexibleLink, Field(discriminator="kind")]
 
 
 class Sensor(Record):
-    """One sensor: the channels it fills (shell patterns allowed), rate Hz, resolution and noise (1σ, white per sample) in the
-    channel's unit, latency s."""
+    """One sensor: the channels it fills (shell patterns allowed), rate Hz, latency s, resolution and noise in their unit.
+
+    Noise is 1σ, white per sample. No rate means the system's sample_rate.
+    """
 
     channels: Annotated[tuple[str, ...], Field(min_length=1)]
     rate: Positive | None = None
@@ -124,7 +126,7 @@ class Sensor(Record):
 
 
 class CanSource(Record):
-    """A CAN source: dbc names a file beside the system file or a shipped one; signals maps `MESSAGE.SIGNAL` to a channel."""
+    """A CAN source: dbc is a file beside the system file or a shipped one; signals maps `MESSAGE.SIGNAL` to a channel."""
 
     kind: Literal["can"]
     dbc: str
@@ -132,7 +134,7 @@ class CanSource(Record):
 
 
 class Effect(Record):
-    """An effect declared from the start and identified with π; coefficients are nominal (used by the simulator alone)."""
+    """An effect declared from the start and identified with π; its nominal coefficients serve the simulator alone."""
 
     name: str
     where: str
@@ -175,7 +177,7 @@ class Windows(Record):
 
 
 class System(Record):
-    """A whole testbed. No spacecraft means a fixed base. joints, motors and links are in order from the base outwards."""
+    """A whole testbed. No spacecraft means a fixed base. joints, motors, links are in order from the base outwards."""
 
     name: str
     title: str = ""

@@ -52,12 +52,17 @@ class Chain:
                 self.flexible.append(ExactRod(link, free_end=last and system.payload is None))
         tracked = system.spacecraft.tracked_point if system.spacecraft is not None else (0.0, 0.0, 0.0)
         self.joint_1_from_S = -np.array(tracked)
-        # Rates of the base, (3, n_v): rows pick v_S and ω_0 out of v.
-        self.select_linear = np.zeros((3, layout.n_v))
-        self.select_linear[list(layout.base_linear), range(len(layout.base_linear))] = 1.0
-        self.select_angular = np.zeros((3, layout.n_v))
-        start = len(layout.base_linear)
-        self.select_angular[list(layout.base_angular), range(start, start + len(layout.base_angular))] = 1.0
+        # Twist of the base in inertial axes out of v, (6, n_v).
+        self.select_base = np.zeros((6, layout.n_v))
+        rows = [*layout.base_linear, *(3 + axis for axis in layout.base_angular)]
+        self.select_base[rows, range(len(rows))] = 1.0
+        # Arms that never change, as the matrices that add their moment to a linear velocity, v + ω × arm.
+        self.base_arm = -so3.skew(self.joint_1_from_S)
+        self.rigid_arms = [
+            -so3.skew(np.array(link.tip)) if isinstance(link, RigidLink) else None for link in system.links
+        ]
+        # A_i(q) is a combination of these by (1, sin q, 1 - cos q).
+        self.turn_basis = [so3.turn_basis(axis) for axis in self.axes]
 
     @property
     def frame_names(self) -> tuple[str, ...]:
@@ -108,7 +113,7 @@ class Configuration:
             q = x[:, layout.q[i] + offset]
             mount = Frame(end.origin, end.rotation @ chain.mounts[i])
             if joint.kind == "revolute":
-                turn = so3.about(chain.axes[i], q)
+                turn = so3.about(chain.turn_basis[i], q)
                 link = Frame(mount.origin, mount.rotation @ turn)
                 self.slides.append(None)
             else:
@@ -140,14 +145,13 @@ class Configuration:
         """Twists (B, 6, m) of all frames for columns of generalized speeds `rates` (B or 1, n_v, m)."""
         chain, layout = self.chain, self.chain.layout
         T_0 = self.frames[0].rotation
-        base = np.concatenate((chain.select_linear @ rates, chain.select_angular @ rates), axis=1)
-        twist = _turn_back(T_0, base)
-        twist[:, :3] += _moment(twist[:, 3:], chain.joint_1_from_S)
+        twist = _turn_back(T_0, chain.select_base @ rates)
+        twist[:, :3] += chain.base_arm @ twist[:, 3:]
         out = [twist]
         for i in range(len(chain.joints)):
             mount = _turn_back(chain.mounts[i], twist)
             slide = self.slides[i]
-            moved = mount if slide is None else _shift(mount, slide)
+            moved = mount if slide is None else _shift(mount, -so3.skew(slide))
             link = _turn_back(self.turns[i], moved)
             rows = slice(3, 6) if slide is None else slice(0, 3)
             link[:, rows] += chain.axes[i][:, None] * rates[:, layout.q[i], None, :]
@@ -160,11 +164,10 @@ class Configuration:
 
     def _unturned_end(self, i: int, link: Array, rates: Array) -> Array:
         """Twists at the end of link i (from 0), still in the axes of {i}."""
-        shape, description = self.shapes[i], self.chain.links[i]
-        if shape is None:
-            assert isinstance(description, RigidLink)
-            return _shift(link, np.array(description.tip))
-        end = _shift(link, shape.tip)
+        shape, arm = self.shapes[i], self.chain.rigid_arms[i]
+        if shape is None or arm is not None:
+            return _shift(link, arm)
+        end = _shift(link, -so3.skew(shape.tip))
         elastic = rates[:, self.chain.layout.q_f[i]]
         end[:, :3] += shape.tip_J @ elastic
         end[:, 3:] += shape.tip_spin @ elastic
@@ -191,13 +194,13 @@ class Configuration:
         """
         chain, layout = self.chain, self.chain.layout
         T_0 = self.frames[0].rotation
-        omega = (chain.select_angular @ v[..., None])[..., 0]
-        omega_body = (T_0.transpose(0, 2, 1) @ omega[..., None])[..., 0]
+        omega = v @ chain.select_base[3:].T
+        omega_body = (omega[:, None] @ T_0)[:, 0]
         # Undo the shift to joint 1 to reach the twist at S, whose inertial components are constant.
         at_S = twists[0].copy()
-        at_S[:, :3] -= _moment(at_S[:, 3:], chain.joint_1_from_S)
+        at_S[:, :3] -= chain.base_arm @ at_S[:, 3:]
         rate = -_spin(omega_body, at_S)
-        rate[:, :3] += _moment(rate[:, 3:], chain.joint_1_from_S)
+        rate[:, :3] += chain.base_arm @ rate[:, 3:]
         out = [rate]
         for i in range(len(chain.joints)):
             mount_twist, link_twist = twists[2 * i + 1], twists[2 * i + 2]
@@ -210,8 +213,8 @@ class Configuration:
                 moved[:, 3:] -= chain.axes[i][:, None] * rates[:, layout.q[i], None, :]
                 link = _turn_back(self.turns[i], mount) - _spin(spin, moved)
             else:
-                link = _shift(mount, slide)
-                link[:, :3] += _moment(mount_twist[:, 3:], spin)
+                link = _shift(mount, -so3.skew(slide))
+                link[:, :3] -= so3.skew(spin) @ mount_twist[:, 3:]
             out += [mount, link]
             rate = self._end_rate(i, link, link_twist, rates, shape_rates[i])
         return [*out, rate]
@@ -220,13 +223,12 @@ class Configuration:
         self, i: int, link: Array, link_twist: Array, rates: Array, shape_rate: ShapeRate | None
     ) -> Array:
         """Rates of the twists at the end of link i (from 0), in the end's axes."""
-        shape, description = self.shapes[i], self.chain.links[i]
-        if shape is None or shape_rate is None:
-            assert isinstance(description, RigidLink)
-            return _shift(link, np.array(description.tip))
+        shape, arm = self.shapes[i], self.chain.rigid_arms[i]
+        if shape is None or shape_rate is None or arm is not None:
+            return _shift(link, arm)
         elastic = rates[:, self.chain.layout.q_f[i]]
-        end = _shift(link, shape.tip)
-        end[:, :3] += _moment(link_twist[:, 3:], shape_rate.tip) + shape_rate.tip_J @ elastic
+        end = _shift(link, -so3.skew(shape.tip))
+        end[:, :3] += shape_rate.tip_J @ elastic - so3.skew(shape_rate.tip) @ link_twist[:, 3:]
         end[:, 3:] += shape_rate.tip_spin @ elastic
         end -= _spin(shape_rate.tip_angular, self._unturned_end(i, link_twist, rates))
         return _turn_back(shape.tip_rotation, end)
@@ -241,15 +243,11 @@ def _turn_back(R: Array, twist: Array) -> Array:
     return turned.reshape(-1, 6, m)
 
 
-def _moment(angular: Array, arm: Array) -> Array:
-    """Columns angular (B, 3, m) × arm (B, 3) or (3,): the velocity that rotation gives at the arm's end."""
-    return -so3.skew(arm) @ angular
-
-
-def _shift(twist: Array, arm: Array) -> Array:
-    """Twists (B, 6, m) of the point displaced by `arm` in the same axes."""
+def _shift(twist: Array, arm: Array | None) -> Array:
+    """Twists (B, 6, m) of a point displaced in the same axes; arm is minus the displacement's cross-product matrix."""
+    assert arm is not None
     out = twist.copy()
-    out[:, :3] += _moment(twist[:, 3:], arm)
+    out[:, :3] += arm @ twist[:, 3:]
     return out
 
 

@@ -10,17 +10,18 @@ import numpy as np
 from scipy.optimize import brentq
 
 from sms_online.description.schema import FlexibleLink, RigidBody, System
+from sms_online.stream import Array
 
 Bending = Literal["bending_y", "bending_z"]
 
-# Step of βL at which the frequency equation is searched for changes of sign. Roots of a beam are about π apart; only its
-# two lowest come closer, under loads far heavier than the beam, and then they are a large part of themselves apart.
+# Step of βL at which the frequency equation is searched for changes of sign. Roots of a beam are about π apart; only the
+# two lowest come closer, under loads far heavier than the beam, and even those by no less than a good part of themselves.
 SEARCH_STEP = 0.01
 
 
 @dataclass(frozen=True)
 class TipLoad:
-    """What a link carries at its end: mass kg; first moment along the link's x, kg m; inertia kg m², both about that end."""
+    """What a link carries: mass kg; first moment along the link's x, kg m, and inertia, kg m², about the link's end."""
 
     mass: float = 0.0
     first_moment: float = 0.0
@@ -38,7 +39,7 @@ class Mode:
 
 @dataclass(frozen=True)
 class LinkMarkers:
-    """Markers that a link needs: f_max, 1/m, over its bending planes; f_s = 2 f_max, (5); N_s = f_s L rounded up, (6)."""
+    """Markers that a link needs: f_max, 1/m, over its bending planes; f_s = 2 f_max, (5); markers see `markers`."""
 
     link: int
     modes: dict[Bending, tuple[Mode, ...]]
@@ -96,7 +97,7 @@ def _frequency_equation(lam: float, mass: float, moment: float, inertia: float) 
 
 
 def tip_load(system: System, i: int, plane: Bending) -> TipLoad:
-    """Load on link i (from 1) by the motors, links and payload after it, the arm straight: mounts unturned, angles zero.
+    """Load on link i (from 1) by the motors, links and payload after it; arm straight: mounts unturned, angles zero.
 
     Rotors turn with their stators, for the joints are held.
     """
@@ -105,19 +106,19 @@ def tip_load(system: System, i: int, plane: Bending) -> TipLoad:
     end = np.zeros(3)
     mass = first_moment = inertia = 0.0
 
-    def add(m: float, center: np.ndarray, about_center: float) -> None:
+    def add(m: float, center: Array, about_center: float) -> None:
         nonlocal mass, first_moment, inertia
         mass += m
-        first_moment += m * center[0]
-        inertia += about_center + m * (center[0] ** 2 + center[across] ** 2)
+        first_moment += m * float(center[0])
+        inertia += about_center + m * float(center[0] ** 2 + center[across] ** 2)
 
     def add_body(body: RigidBody) -> None:
         add(body.mass, end + np.array(body.center_of_mass), getattr(body.inertia, axis))
 
     for joint, motor, link in list(zip(system.joints, system.motors, system.links, strict=True))[i:]:
         if motor is not None:
-            about_axis = abs(joint.axis["xyz".index(axis[0])]) ** 2 * motor.rotor_inertia
-            add(motor.mass, end, getattr(motor.stator_inertia, axis) + about_axis)
+            rotor = joint.axis["xyz".index(axis[0])] ** 2 * motor.rotor_inertia
+            add(motor.mass, end, getattr(motor.stator_inertia, axis) + rotor)
         if isinstance(link, FlexibleLink):
             m = link.mass_per_length * link.length
             add(m, end + np.array([0.5 * link.length, 0.0, 0.0]), m * link.length**2 / 12.0)
@@ -131,9 +132,10 @@ def tip_load(system: System, i: int, plane: Bending) -> TipLoad:
 
 
 def markers(system: System, modes: int = 2) -> tuple[LinkMarkers, ...]:
-    """Markers of every flexible link that bends, (5), (6), from its lowest `modes` clamped-loaded modes in each plane.
+    """Markers of every flexible link that bends, from its lowest `modes` clamped-loaded modes in each plane.
 
-    The spatial frequency of a mode is f = β/2π. Source: section III.
+    N_s = f_s L rounded up, (6), with the spatial frequency f = β/2π of a mode, but no fewer than `modes`: a heavy load
+    bends its link into a fraction of a wave, and displacements at fewer points cannot tell that many modes apart.
     """
     out = []
     for i, link in enumerate(system.links, start=1):
@@ -148,5 +150,5 @@ def markers(system: System, modes: int = 2) -> tuple[LinkMarkers, ...]:
         if found:
             f_max = max(mode.spatial_frequency for series in found.values() for mode in series)
             f_s = 2.0 * f_max
-            out.append(LinkMarkers(i, found, f_max, f_s, math.ceil(f_s * link.length)))
+            out.append(LinkMarkers(i, found, f_max, f_s, max(modes, math.ceil(f_s * link.length))))
     return tuple(out)

@@ -50,7 +50,9 @@ class BodyTerm(Term):
 
     def energy(self, nu: Array) -> Array:
         """K (B, n) of each parameter."""
-        return np.asarray(0.5 * (nu[:, None] @ self.momentum(nu))[:, 0])
+        n, d, _ = self.matrices.shape
+        products = (nu[:, :, None] * nu[:, None]).reshape(-1, d * d)
+        return products @ (0.5 * self.matrices.reshape(n, d * d).T)
 
 
 def convective(nu: Array, p: Array) -> Array:

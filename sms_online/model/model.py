@@ -26,7 +26,7 @@ class Spring:
     """A quadratic potential ½ c zᵀ S z of some coordinates z, or a damper of their rates: parameter, speeds, matrix S."""
 
     parameter: int
-    speeds: tuple[int, ...]
+    speeds: slice | list[int]
     matrix: Array
 
     def energy(self, z: Array) -> Array:
@@ -36,7 +36,8 @@ class Spring:
 
     def add_to(self, full: Array, factor: float) -> None:
         """Add `factor` S to an (n_v, n_v) matrix."""
-        full[np.ix_(self.speeds, self.speeds)] += factor * self.matrix
+        columns = np.arange(full.shape[0])[self.speeds]
+        full[np.ix_(columns, columns)] += factor * self.matrix
 
 
 class Model:
@@ -70,17 +71,20 @@ class Model:
         def add(inertial: list[InertialParameter], frame: int, speeds: slice) -> None:
             indices = tuple(range(len(parameters), len(parameters) + len(inertial)))
             parameters.extend(p.parameter for p in inertial)
-            self.bodies.append(BodyTerm(frame, speeds, indices, np.stack([p.matrix for p in inertial])))
+            matrices = np.stack([p.matrix for p in inertial])
+            for k, body in enumerate(self.bodies):
+                if body.frame == frame:  # a motor's stator joins its rotor: one term a frame
+                    joined = np.concatenate((body.matrices, matrices))
+                    self.bodies[k] = BodyTerm(frame, speeds, body.parameters + indices, joined)
+                    return
+            self.bodies.append(BodyTerm(frame, speeds, indices, matrices))
 
         if system.spacecraft is not None:
             add(rigid_body("spacecraft", "0", system.spacecraft, planar, spacecraft=True), 0, none)
-        groups: dict[int, dict[str, list[InertialParameter]]] = {}
-        for i in range(1, len(system.joints) + 1):
-            for group, inertial in motor(i, system):
-                groups.setdefault(i, {}).setdefault(group, []).append(inertial)
-        motor_speed = {i: slice(self.layout.theta_m[i - 1], self.layout.theta_m[i - 1] + 1) for i in groups}
-        for i, group in groups.items():
-            add(group["rotor"], 2 * i - 1, motor_speed[i])
+        motors = {i: motor(i, system) for i in range(1, len(system.joints) + 1) if system.motors[i - 1] is not None}
+        speeds = {i: slice(self.layout.theta_m[i - 1], self.layout.theta_m[i - 1] + 1) for i in motors}
+        for i, (rotor, _) in motors.items():
+            add([rotor], 2 * i - 1, speeds[i])
         for i, link in enumerate(system.links, start=1):
             if isinstance(link, RigidLink):
                 add(rigid_body(f"link_{i}", str(i), link, planar, spacecraft=False), 2 * i, none)
@@ -88,8 +92,8 @@ class Model:
             frame = 2 * len(system.joints) + 1
             add(rigid_body("payload", "p", system.payload, planar, spacecraft=False), frame, none)
         # After the links: a motor that sits on a rigid link is lumped into that link, not the link into the motor.
-        for i, group in groups.items():
-            add(group["stator"] + group["mass"], 2 * i - 1, motor_speed[i])
+        for i, (_, stator) in motors.items():
+            add(stator, 2 * i - 1, speeds[i])
 
     def _add_links(self, parameters: list[Parameter]) -> None:
         flexible = [(i, link) for i, link in enumerate(self.system.links, start=1) if isinstance(link, FlexibleLink)]
@@ -110,8 +114,7 @@ class Model:
             kinematics = self.chain.flexible[i - 1]
             assert kinematics is not None
             for rigidity, matrix in kinematics.stiffness.items():
-                speeds = self.layout.q_f[i - 1]
-                self.springs.append(Spring(len(parameters), tuple(range(speeds.start, speeds.stop)), matrix))
+                self.springs.append(Spring(len(parameters), self.layout.q_f[i - 1], matrix))
                 parameters.append(rigidity_parameter(i, rigidity, link, self.layout.planar))
 
     def _add_springs(self, parameters: list[Parameter]) -> None:
@@ -121,7 +124,7 @@ class Model:
                 unit = ("N/m" if joint.kind == "prismatic" else "N m/rad") if kind == "stiffness" else (
                     "N s/m" if joint.kind == "prismatic" else "N m s/rad"
                 )
-                ends = (self.layout.theta_m[i - 1], self.layout.q[i - 1])
+                ends = [self.layout.theta_m[i - 1], self.layout.q[i - 1]]
                 springs.append(Spring(len(parameters), ends, np.array([[1.0, -1.0], [-1.0, 1.0]])))
                 parameters.append(Parameter(f"joint_{i}.{kind}", f"{symbol}_{i}", unit, getattr(joint, kind)))
 
@@ -201,19 +204,23 @@ class Model:
         rows = range(n_v) if rows is None else rows
         P, G = np.zeros((B, len(rows), self.n_pi)), np.zeros((B, len(rows), self.n_pi))
         configuration = self.chain.configure(x)
-        shape_rates = configuration.shape_rates(v)
         rates, select, none = v[:, :, None], np.eye(n_v)[None, :, list(rows)], np.zeros((1, n_v, len(rows)))
         twists = configuration.twists(rates)
-        if self.chain.moves(len(twists) - 1, slice(0, 0))[list(rows)].any():
-            W = configuration.twists(select)
-            W_dot = configuration.twist_rates(select, W, v, shape_rates)
-        else:  # motor sides of flexible joints alone: no frame moves with them
-            W = W_dot = [np.zeros((1, 6, len(rows)))] * len(twists)
+        self._add_forces(G, x, v, rows)
+        if not self.chain.moves(len(twists) - 1, slice(0, 0))[list(rows)].any():
+            # Motor sides of flexible joints alone: no frame moves with them, their momentum is all there is.
+            for body in self.bodies:
+                for row in np.flatnonzero(np.isin(rows, range(*body.speeds.indices(n_v)))):
+                    P[:, row, body.parameters] = body.momentum(body.local(twists, rates)[..., 0])[:, 6]
+            return P, G
+        shape_rates = configuration.shape_rates(v)
+        W = configuration.twists(select)
+        W_dot = configuration.twist_rates(select, W, v, shape_rates)
 
         def add(term: Term, p: Array, g: Array) -> None:
             J, J_dot = term.local(W, select), term.local(W_dot, none)
             P[:, :, term.parameters] = J.transpose(0, 2, 1) @ p
-            G[:, :, term.parameters] = J_dot.transpose(0, 2, 1) @ p + J.transpose(0, 2, 1) @ g
+            G[:, :, term.parameters] += J_dot.transpose(0, 2, 1) @ p + J.transpose(0, 2, 1) @ g
 
         for body in self.bodies:
             if self.chain.moves(body.frame, body.speeds)[list(rows)].any():
@@ -233,7 +240,6 @@ class Model:
                 if self.gravity.any():
                     g += motion.momentum(self._fall(configuration, link))
                 add(link, motion.momentum(nu), g)
-        self._add_forces(G, x, v, rows)
         return P, G
 
     def _fall(self, configuration: Configuration, term: Term) -> Array:
@@ -248,7 +254,7 @@ class Model:
         for springs, deflection in ((self.springs, self._spring_coordinates(x)), (self.dampers, v)):
             for spring in springs:
                 force = deflection[:, spring.speeds] @ spring.matrix
-                for k, speed in enumerate(spring.speeds):
+                for k, speed in enumerate(np.arange(self.layout.n_v)[spring.speeds]):
                     if speed in place:
                         G[:, place[speed], spring.parameter] -= force[:, k]
         for effect, columns in zip(self.effects, self.effect_slices, strict=True):
@@ -265,13 +271,10 @@ class Dynamics:
     def __init__(self, model: Model, pi: Array) -> None:
         self.model = model
         self.pi = pi
-        merged: dict[int, BodyTerm] = {}
-        for body in model.bodies:
-            M = np.tensordot(pi[list(body.parameters)], body.matrices, 1)[None]
-            if body.frame in merged:
-                M = M + merged[body.frame].matrices
-            merged[body.frame] = BodyTerm(body.frame, body.speeds, (0,), M)
-        self._bodies = list(merged.values())
+        self._bodies = [
+            BodyTerm(b.frame, b.speeds, (0,), np.tensordot(pi[list(b.parameters)], b.matrices, 1)[None])
+            for b in model.bodies
+        ]
         self._eye = np.eye(model.layout.n_v)[None]
 
     @cached_property

@@ -5,7 +5,6 @@ The order is that of the paper's Table V, which is also the order of preference 
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -102,23 +101,20 @@ def rigid_body(owner: str, index: str, body: RigidBody, planar: bool, spacecraft
     return out
 
 
-def motor(i: int, system: System) -> Iterator[tuple[str, InertialParameter]]:
-    """(group, parameter) of motor i (from 1), (17): rotor_inertia, stator_inertia (planar: about z), mass."""
-    described = system.motors[i - 1]
-    if described is None:
-        return
-    joint = system.joints[i - 1]
+def motor(i: int, system: System) -> tuple[InertialParameter, list[InertialParameter]]:
+    """Rotor inertia, then stator inertia (planar: about z) and mass of motor i (from 1), (17)."""
+    described, joint = system.motors[i - 1], system.joints[i - 1]
+    assert described is not None
     c = np.concatenate((np.zeros(3), joint.axis, [joint.gear_ratio]))
     rotor = Parameter(f"motor_{i}.rotor_inertia", f"I_r{i}", "kg m²", described.rotor_inertia)
-    yield "rotor", InertialParameter(rotor, np.outer(c, c))
+    stator = []
     for key in ("zz",) if system.motion == "planar" else tuple(SYMMETRIC):
         suffix = "" if system.motion == "planar" else f"_{key}"
-        stator = Parameter(
-            f"motor_{i}.stator_inertia{suffix}", f"I_s{i}{suffix}", "kg m²", getattr(described.stator_inertia, key)
-        )
-        yield "stator", InertialParameter(stator, _with_motor_rate(_rotational(key)))
+        value = getattr(described.stator_inertia, key)
+        parameter = Parameter(f"motor_{i}.stator_inertia{suffix}", f"I_s{i}{suffix}", "kg m²", value)
+        stator.append(InertialParameter(parameter, _with_motor_rate(_rotational(key))))
     mass = Parameter(f"motor_{i}.mass", f"m_m{i}", "kg", described.mass)
-    yield "mass", InertialParameter(mass, _with_motor_rate(_translational()))
+    return InertialParameter(rotor, np.outer(c, c)), [*stator, InertialParameter(mass, _with_motor_rate(_translational()))]
 
 
 def _with_motor_rate(E: Array) -> Array:

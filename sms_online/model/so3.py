@@ -95,11 +95,18 @@ def logarithm(R: Array) -> Array:
     return np.asarray(ratio[..., None] * axis)
 
 
-def about(axis: Array, angle: Array) -> Array:
-    """Rotations (B, 3, 3) about a unit axis (3,) by angles (B,), rad."""
+def turn_basis(axis: Array) -> Array:
+    """(3, 9): rotations about a unit axis (3,) are combinations of 1, a×, (a×)² by (1, sin, 1 - cos), see `about`."""
     K = skew(axis)
-    trigonometric = np.stack((np.ones_like(angle), np.sin(angle), 1.0 - np.cos(angle)), axis=1)
-    return (trigonometric @ np.stack((np.eye(3), K, K @ K)).reshape(3, 9)).reshape(-1, 3, 3)
+    return np.stack((np.eye(3), K, K @ K)).reshape(3, 9)
+
+
+def about(basis: Array, angle: Array) -> Array:
+    """Rotations (B, 3, 3) by angles (B,), rad, about the axis of a `turn_basis`."""
+    trigonometric = np.ones((angle.size, 3))
+    trigonometric[:, 1] = np.sin(angle)
+    trigonometric[:, 2] -= np.cos(angle)
+    return (trigonometric @ basis).reshape(-1, 3, 3)
 
 
 def from_euler_parameters(eps: Array, eta: Array) -> Array:

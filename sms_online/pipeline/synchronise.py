@@ -346,11 +346,13 @@ class Synchroniser:
     def _forget(self, groups: list[_Group]) -> None:
         """Drop the rows that no undecided grid point can need; the last row stays, it tells how late it is."""
         needed = self._time.size - 1
-        reach = self._next / self.sample_rate + self._tolerance
+        due = self._next / self.sample_rate
         for group in groups:
-            passed = group.ts.size == 0 or group.ts[-1] < reach - 2.0 * self._tolerance
-            if not (passed and self._time[-1] - self._last_time[group.columns[0]] > LONGEST_HOLE):
-                oldest = int(np.searchsorted(group.ts, reach, side="right")) - SIDE
+            if group.ts.size == 0:
+                continue
+            gone = group.ts[-1] < due - self._tolerance and self._time[-1] - group.ts[-1] > LONGEST_HOLE
+            if not gone:
+                oldest = int(np.searchsorted(group.ts, due + self._tolerance, side="right")) - SIDE
                 needed = min(needed, int(group.rows[max(oldest, 0)]))
         self._time, self._values = self._time[needed:].copy(), self._values[needed:].copy()
 

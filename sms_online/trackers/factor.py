@@ -66,17 +66,19 @@ class Solution:
     @property
     def rank(self) -> int:
         """Number of directions that the rows determine."""
-        return self.root.shape[1]
+        return int(self.root.shape[1])
 
     def covariance(self, meat: Array | None = None) -> Array:
         """Covariance (n, n) of π, root·meat·rootᵀ; without `meat` (rank, rank) that of rows with their stated std."""
         C = self.root @ self.root.T if meat is None else self.root @ meat @ self.root.T
-        C = 0.5 * (C + C.T)
-        lost = ~self.determined
-        C[lost, :] = 0.0
-        C[:, lost] = 0.0
-        C[lost, lost] = np.inf
-        return C
+        return masked_covariance(C, self.determined)
+
+
+def masked_covariance(C: Array, determined: np.ndarray[tuple[int], np.dtype[np.bool_]]) -> Array:
+    """C (n, n), symmetric to the bit, with infinite variance and zeros beside it where not determined (n,)."""
+    out = np.where(np.outer(determined, determined), 0.5 * (C + C.T), 0.0)
+    out[~determined, ~determined] = np.inf
+    return out
 
 
 def solve(rows: Array) -> Solution:

@@ -2,7 +2,7 @@
 
 With plain exponential forgetting the information of a direction that the motion stopped exciting decays to nothing, the
 covariance overflows and the first noise that follows throws the estimate off. All kinds here act on the square-root
-factor from the left, [R z] ← W [R z], which changes how sure the estimate is but never the estimate itself.
+factor from the left, [R z] ← W [R z], which changes how sure the estimate is, never a determined estimate itself.
 """
 
 from __future__ import annotations
@@ -23,7 +23,9 @@ INFORMATION_FLOOR = 1e-6
 class FadingForgetting(Protocol):
     """A forgetting that fades all older rows together, by a factor of information per row."""
 
-    factor: float
+    @property
+    def factor(self) -> float:
+        """Information that is left of a row when the next one has come, between 0 and 1."""
 
     def row_weights(self, rows: int) -> Array:
         """Square roots (M,) of the weights of M rows that arrive together, as seen after the last of them."""
@@ -50,9 +52,9 @@ class NoForgetting:
 class SlidingWindow:
     """The last `rows` rows count the same, older ones not at all.
 
-    The window is kept in whole blocks, so that it covers between `rows` and one block more (two where `rows` is no multiple
-    of a block). Old blocks leave by building the factor anew from those that stay, not by downdating: a downdate subtracts
-    nearly equal numbers and loses up to the square of the condition number (Stewart, J. Inst. Maths Applics 23 (1979) 203).
+    The window is kept in whole blocks: it is rounded up to whole blocks, and the rows of the unfinished block come on top.
+    Old blocks leave by building the factor anew from those that stay, not by downdating: a downdate subtracts nearly equal
+    numbers and loses up to the square of the condition number (Stewart, J. Inst. Maths Applics 23 (1979) 203–213).
     Without excitation the window empties and its parameters become undetermined; nothing grows.
     """
 
@@ -68,8 +70,8 @@ class Exponential:
     """Each row counts `factor` times the next one, down to a floor: selective forgetting on the singular values of R.
 
     In coordinates scaled by the peak column norms, R = U s Vᵀ, a singular value becomes max(√weight·s, min(s, floor)).
-    So information is at least min(what there was, floor²) and, for rows of bounded size, at most the geometric sum: bounded
-    on both sides whatever the excitation. Source: Parkum, Poulsen and Holst, Int. J. Control 55 (1992) 109–128.
+    So information is at least the lesser of what there was and floor², and for rows of bounded size at most the geometric
+    sum: bounded on both sides whatever the excitation. Source: Parkum, Poulsen and Holst, Int. J. Control 55 (1992) 109.
     Limitation: a single gross outlier in Y raises the peak, and with it the floor, until reset.
     """
 
@@ -85,7 +87,7 @@ class Exponential:
     def fade(self, factor: Array, peak: Array, block: Array, weight: float) -> Array:
         """See FadingForgetting; the block does not matter here."""
         n = peak.size
-        root = np.sqrt(weight)
+        root = float(np.sqrt(weight))
         U, s, _ = np.linalg.svd(factor[:n, :n] / peak)
         faded = root * factor
         if root * s[-1] >= INFORMATION_FLOOR:
@@ -117,7 +119,7 @@ class Directional:
     def fade(self, factor: Array, peak: Array, block: Array, weight: float) -> Array:
         """See FadingForgetting."""
         n = peak.size
-        root = np.sqrt(weight)
+        root = float(np.sqrt(weight))
         faded = factor.copy()
         faded[n] *= root
         _, strength, Vt = np.linalg.svd(block[:, :n] / peak, full_matrices=False)

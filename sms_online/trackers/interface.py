@@ -19,7 +19,7 @@ class Rows:
     """M rows of a balance, Y π = b, in order of time.
 
     Y: (M, n). b: (M,). std: (M,) standard deviation of each row's error, in the unit of b. t: (M,) seconds.
-    Raises ValueError naming the first row that is not finite or whose std is not positive, or the shapes that do not fit.
+    Raises ValueError naming the first row that is not finite or whose std is not positive, or shapes that do not fit.
     """
 
     Y: Array
@@ -132,7 +132,7 @@ class Tracker(Protocol):
 
 
 def saved_array(state: Mapping[str, Array | float], key: str, shape: tuple[int | None, ...]) -> Array:
-    """Copy of an array out of a saved state; None in `shape` stands for any length. ValueError where it does not fit."""
+    """Copy of an array out of a saved state; None in `shape` stands for any length. ValueError if it does not fit."""
     if key not in state:
         raise ValueError(f"saved tracker state: no {key!r}; expected the state of a tracker of this kind")
     value = np.array(state[key], dtype=np.float64)

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from sms_online.stream import Array
+from sms_online.trackers.factor import RANK_TOLERANCE, masked_covariance
 from sms_online.trackers.interface import Estimate, Prior, Rows, State, saved_array, saved_number
 
 if TYPE_CHECKING:
@@ -23,10 +24,10 @@ class KalmanTracker:
 
     process_std: (n,) how far each parameter wanders in one second, in its unit per √s. initial: value and std of every
     parameter (all stds must be given). State and covariance are kept in units of the initial std, so that parameters of
-    very different size do not spoil the covariance. A variance never exceeds its initial one: without excitation the walk
-    stops there instead of growing for ever.
-    Rows not newer than the newest so far add no process noise. rss is the sum of squared normalised innovations, about one
-    a row. Source: filterpy.kalman.KalmanFilter, which updates the covariance in Joseph's form.
+    very different size do not spoil the covariance. A variance never exceeds its initial one: without excitation the
+    walk stops there instead of growing for ever. `determined` is judged by what the rows add to the initial std.
+    Rows not newer than the newest so far add no process noise. rss is the sum of squared normalised innovations, about
+    one a row. Source: filterpy.kalman.KalmanFilter, which updates the covariance in Joseph's form.
     """
 
     def __init__(self, n: int, process_std: Array, initial: Prior) -> None:
@@ -72,20 +73,13 @@ class KalmanTracker:
         """The filtered π; leaves the state as it is."""
         P = self._filter.P
         std = self._initial.std
-        information = np.linalg.inv(P)
-        scale = 1.0 / np.sqrt(np.diag(information))
-        eigenvalues = np.linalg.eigvalsh(information * np.outer(scale, scale))
         determined = np.diag(P) < INFORMED_VARIANCE
-        covariance = P * np.outer(std, std)
-        covariance[~determined, :] = 0.0
-        covariance[:, ~determined] = 0.0
-        covariance[~determined, ~determined] = np.inf
         return Estimate(
             pi=self._initial.value + std * self._filter.x[:, 0],
-            covariance=covariance,
+            covariance=masked_covariance(P * np.outer(std, std), determined),
             covariance_robust=None,
             determined=determined,
-            condition_number=float(np.sqrt(eigenvalues[-1] / eigenvalues[0])) if eigenvalues[0] > 0 else np.inf,
+            condition_number=_condition_number(P),
             rows=self._rows,
             rss=self._nis,
             dof=self._rows,
@@ -127,3 +121,15 @@ def _scaled_filter(n: int) -> KalmanFilter:
     out.P = np.eye(n)
     out.F = np.eye(n)
     return out
+
+
+def _condition_number(P: Array) -> float:
+    """Condition number of the column-scaled square root of P⁻¹; inf where P is singular to rounding."""
+    std = np.sqrt(np.diag(P))
+    eigenvalues, V = np.linalg.eigh(P / np.outer(std, std))
+    if eigenvalues[0] <= RANK_TOLERANCE * eigenvalues[-1]:
+        return np.inf
+    information = (V / eigenvalues) @ V.T
+    size = np.sqrt(np.diag(information))
+    spectrum = np.linalg.eigvalsh(information / np.outer(size, size))
+    return float(np.sqrt(spectrum[-1] / spectrum[0])) if spectrum[0] > 0 else np.inf

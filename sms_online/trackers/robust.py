@@ -29,7 +29,7 @@ MAX_CLUSTERS = 256
 
 
 class ClusterFactors:
-    """Factors of consecutive clusters of blocks; when there are too many, neighbours merge and clusters are twice as long."""
+    """Factors of consecutive clusters of blocks; when they become too many, neighbours merge and the length doubles."""
 
     def __init__(self, n: int) -> None:
         self._closed = np.zeros((MAX_CLUSTERS, n + 1, n + 1))
@@ -91,8 +91,8 @@ def merge_neighbours(factors: Array, group: int) -> Array:
 def cluster_covariance(solution: Solution, clusters: Array, prior: Array, rows: float) -> Array | None:
     """Cluster-robust covariance (n, n) of a least-squares solution; None while clusters are too few to span it.
 
-    clusters: (C, n + 1, n + 1) factors of all measured rows. prior: (k, n + 1) information rows, which keep their stated
-    std. rows: number of measured rows. Small-sample factor C/(C − 1)·(M − 1)/(M − rank), as in Cameron and Miller,
+    clusters: (C, n + 1, n + 1) factors of all measured rows. prior: (k, n + 1) information rows, which keep their
+    stated std. rows: number of measured rows. Small-sample factor C/(C − 1)·(M − 1)/(M − rank), as in Cameron and Miller,
     J. Human Resources 50 (2015) 317–372, section II.
     """
     clusters = clusters[clusters.any(axis=(1, 2))]

@@ -17,8 +17,8 @@ from sms_online.trackers.robust import cluster_covariance
 class RecursiveLeastSquares:
     """Recursive solution of Y π = b, weighted by the rows' std; without forgetting it equals the batch solution (45).
 
-    Rows are gathered into blocks of fixed size before they are absorbed, so that no bit of the result depends on how they
-    were split into calls; an estimate counts the pending rows too and leaves them pending.
+    Rows are gathered into blocks of fixed size before they are absorbed, so that no bit of the result depends on how
+    they were split into calls; an estimate counts the pending rows too and leaves them pending.
     A prior is not measured by the rows and does not age: it is added at each estimate and never forgotten.
     Source: Bierman, Factorization Methods for Discrete Sequential Estimation, 1977, chapter IV (SRIF data processing).
     """
