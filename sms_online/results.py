@@ -5,9 +5,11 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from sms_online.description.parse import describe
 from sms_online.pipeline.estimator import Estimator
+from sms_online.stream import Array
 from sms_online.trackers.interface import Estimate
 
 SCHEMA = "sms-online/results/1"
@@ -17,11 +19,21 @@ NORMAL_95 = 1.959963984540054
 LARGEST_RELATIVE_STD = 0.5
 
 
-def identifiable(estimate: Estimate) -> Any:
+def standard_deviation(estimate: Estimate) -> Array:
+    """1σ of each parameter (n,): the larger of two answers from the residual, inf where the data determine nothing.
+
+    One takes the rows' errors as independent with the residual's variance, the other allows errors that last within
+    clusters of rows, as those of an integrated balance do.
+    """
+    if estimate.dof <= 0.0:
+        return np.full(estimate.pi.shape, np.inf)
+    std = estimate.std * np.sqrt(estimate.rss / estimate.dof)
+    return std if estimate.std_robust is None else np.maximum(std, estimate.std_robust)
+
+
+def identifiable(estimate: Estimate) -> NDArray[np.bool_]:
     """Which parameters (n,) the data determine: in the span of the rows, and with an error below half the estimate."""
-    with np.errstate(invalid="ignore"):
-        small = estimate.std <= LARGEST_RELATIVE_STD * np.abs(estimate.pi)
-    return estimate.determined & small
+    return estimate.determined & (standard_deviation(estimate) <= LARGEST_RELATIVE_STD * np.abs(estimate.pi))
 
 
 def results_document(
@@ -37,10 +49,10 @@ def results_document(
     true = None
     if truth is not None:
         true = base.values(np.array([truth[p.name] for p in base.physical]))
-    flags = identifiable(estimate)
+    flags, deviations = identifiable(estimate), standard_deviation(estimate)
     parameters = []
     for k, p in enumerate(base.parameters):
-        value, std = float(estimate.pi[k]), float(estimate.std[k])
+        value, std = float(estimate.pi[k]), float(deviations[k])
         finite = bool(np.isfinite(std))
         parameters.append(
             {

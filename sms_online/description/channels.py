@@ -19,7 +19,7 @@ NODAL: dict[str, Deformation] = {
 
 
 def is_directly_driven(joint: Joint) -> bool:
-    """Whether the drive's force is measured at the axis: a prismatic axis, or neither gear nor flexible transmission."""
+    """Whether the drive's force is measured at the axis: a prismatic axis, or no gear and a rigid transmission."""
     return joint.kind == "prismatic" or (joint.transmission == "rigid" and joint.gear_ratio == 1.0)
 
 

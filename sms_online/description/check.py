@@ -1,4 +1,4 @@
-"""What no single record can see: sizes that have to agree, names that have to exist, physics that has to be possible."""
+"""What no record sees alone: sizes that have to agree, names that have to exist, physics that has to be possible."""
 
 from __future__ import annotations
 
@@ -132,7 +132,12 @@ def _check_simulation(system: System, source: str) -> None:
     if system.controller is not None:
         for key, gains in (("stiffness", system.controller.stiffness), ("damping", system.controller.damping)):
             if len(gains) != n:
-                raise InputError(source, f"controller.{key}", f"{len(gains)} gains", f"{n}, one for each joint")
+                raise InputError(
+                    source,
+                    f"controller.{key}",
+                    f"{len(gains)} value{'s' * (len(gains) != 1)}",
+                    f"{n}, one for each joint",
+                )
 
 
 def _check_sensors(system: System, names: tuple[str, ...], source: str) -> None:

@@ -119,6 +119,8 @@ def _expected(kind: str, first: ErrorDetails, context: dict[str, Any]) -> str:
 
 def _shown(value: Any) -> str:
     """A value as a message repeats it, on one line."""
+    if isinstance(value, bool):
+        return str(value).lower()
     text = "a table" if isinstance(value, dict) else repr(value)
     return text if len(text) <= LONGEST_VALUE else text[: LONGEST_VALUE - 1] + "…"
 

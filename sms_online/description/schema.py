@@ -113,7 +113,7 @@ Link = Annotated[RigidLink | FlexibleLink, Field(discriminator="kind")]
 
 
 class Sensor(Record):
-    """One sensor: the channels it fills (shell patterns allowed), rate Hz, latency s, resolution and noise in their unit.
+    """One sensor: channels it fills (shell patterns allowed), rate Hz, latency s, resolution and noise in their unit.
 
     Noise is 1σ, white per sample. No rate means the system's sample_rate.
     """
@@ -126,7 +126,7 @@ class Sensor(Record):
 
 
 class CanSource(Record):
-    """A CAN source: dbc is a file beside the system file or a shipped one; signals maps `MESSAGE.SIGNAL` to a channel."""
+    """A CAN source: dbc is a file beside the system file or a shipped one; signals: `MESSAGE.SIGNAL` to channel."""
 
     kind: Literal["can"]
     dbc: str

@@ -14,8 +14,8 @@ from sms_online.stream import Array
 
 Bending = Literal["bending_y", "bending_z"]
 
-# Step of βL at which the frequency equation is searched for changes of sign. Roots of a beam are about π apart; only the
-# two lowest come closer, under loads far heavier than the beam, and even those by no less than a good part of themselves.
+# Step of βL at which the frequency equation is searched for changes of sign. A beam's roots are about π apart; only the
+# two lowest come closer, under loads far heavier than the beam, and even then they differ by a good part of themselves.
 SEARCH_STEP = 0.01
 
 

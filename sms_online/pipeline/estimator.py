@@ -6,16 +6,15 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sms_online.description.schema import System
 from sms_online.model.base_parameters import BaseParameters, find_base_parameters
 from sms_online.model.model import Model
 from sms_online.pipeline.energy_balance import BalanceRows, EnergyBalance
 from sms_online.pipeline.joint_balance import JointBalance
-from sms_online.pipeline.rates import RatesStage
+from sms_online.pipeline.rates import RateSamples, RatesStage
 from sms_online.pipeline.sensing import AttitudeContinuity, Sensing
-from sms_online.pipeline.synchronise import GridSamples, Synchroniser
+from sms_online.pipeline.synchronise import GridSamples, SyncCounters, Synchroniser
 from sms_online.stream import Array, Block
 from sms_online.trackers.interface import Estimate, Rows, Tracker
 from sms_online.trackers.square_root import RecursiveLeastSquares
@@ -25,7 +24,8 @@ from sms_online.trackers.square_root import RecursiveLeastSquares
 # cost of a NumPy call is shared by many samples.
 BLOCK = 128
 
-State = dict[str, Any]
+# What a session saves: arrays and numbers, by stage.
+SessionState = dict[str, dict[str, Any]]
 
 
 @dataclass
@@ -84,7 +84,7 @@ class Estimator:
         return self._rates.half_width
 
     @property
-    def counters(self) -> Any:
+    def counters(self) -> SyncCounters:
         """Counts of the synchroniser: missing and interpolated cells, gaps, lost samples."""
         return self._synchroniser.counters
 
@@ -125,7 +125,7 @@ class Estimator:
         for rates in self._rates.push(GridSamples(piece.index, signals, piece.segment)):
             self._balance(rates)
 
-    def _balance(self, rates: Any) -> None:
+    def _balance(self, rates: RateSamples) -> None:
         if rates.segment != self._segment:
             self._segment = rates.segment
             self._energy.begin_segment()
@@ -147,3 +147,39 @@ class Estimator:
     def estimate(self) -> Estimate:
         """The base parameters as they are known now."""
         return self.tracker.estimate()
+
+    def state(self) -> SessionState:
+        """Everything that a new estimator of the same system and channels needs to continue to the same bits."""
+        return {
+            "session": {
+                "samples": self.samples,
+                "duration": self.duration,
+                "first_time": self._first_time,
+                "segment": self._segment,
+                "attitude": self._attitude.last,
+                "pending_t": self._pending_t,
+                "pending": self._pending,
+                "joint_gram": np.stack([residual.gram for residual in self.joint_residuals]),
+                "joint_rows": np.array([residual.rows for residual in self.joint_residuals]),
+            },
+            "synchroniser": dict(self._synchroniser.state()),
+            "rates": dict(self._rates.state()),
+            "energy": dict(self._energy.state()),
+            "joints": dict(self._joints.state()),
+            "tracker": dict(self.tracker.state()),
+        }
+
+    def restore(self, state: SessionState) -> None:
+        """Continue from a saved state."""
+        session = state["session"]
+        self.samples, self.duration = int(session["samples"]), float(session["duration"])
+        self._first_time, self._segment = float(session["first_time"]), int(session["segment"])
+        self._attitude.last = np.array(session["attitude"])
+        self._pending_t, self._pending = np.array(session["pending_t"]), np.array(session["pending"])
+        grams, rows = np.array(session["joint_gram"]), np.array(session["joint_rows"])
+        self.joint_residuals = [SquaredResidual(gram, int(n)) for gram, n in zip(grams, rows, strict=True)]
+        self._synchroniser.restore(state["synchroniser"])
+        self._rates.restore(state["rates"])
+        self._energy.restore(state["energy"])
+        self._joints.restore(state["joints"])
+        self.tracker.restore(state["tracker"])

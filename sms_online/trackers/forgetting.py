@@ -52,9 +52,9 @@ class NoForgetting:
 class SlidingWindow:
     """The last `rows` rows count the same, older ones not at all.
 
-    The window is kept in whole blocks: it is rounded up to whole blocks, and the rows of the unfinished block come on top.
-    Old blocks leave by building the factor anew from those that stay, not by downdating: a downdate subtracts nearly equal
-    numbers and loses up to the square of the condition number (Stewart, J. Inst. Maths Applics 23 (1979) 203–213).
+    The window is rounded up to whole blocks, and the rows of the unfinished block come on top. Old blocks leave by
+    building the factor anew from those that stay, not by downdating: a downdate subtracts nearly equal numbers and loses
+    up to the square of the condition number (Stewart, J. Inst. Maths Applics 23 (1979) 203–213).
     Without excitation the window empties and its parameters become undetermined; nothing grows.
     """
 
@@ -70,8 +70,9 @@ class Exponential:
     """Each row counts `factor` times the next one, down to a floor: selective forgetting on the singular values of R.
 
     In coordinates scaled by the peak column norms, R = U s Vᵀ, a singular value becomes max(√weight·s, min(s, floor)).
-    So information is at least the lesser of what there was and floor², and for rows of bounded size at most the geometric
-    sum: bounded on both sides whatever the excitation. Source: Parkum, Poulsen and Holst, Int. J. Control 55 (1992) 109.
+    So information is at least the lesser of what there was and floor², and for rows of bounded size at most the
+    geometric sum: bounded on both sides whatever the excitation.
+    Source: Parkum, Poulsen and Holst, Int. J. Control 55 (1992) 109–128.
     Limitation: a single gross outlier in Y raises the peak, and with it the floor, until reset.
     """
 

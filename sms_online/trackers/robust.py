@@ -92,7 +92,7 @@ def cluster_covariance(solution: Solution, clusters: Array, prior: Array, rows: 
     """Cluster-robust covariance (n, n) of a least-squares solution; None while clusters are too few to span it.
 
     clusters: (C, n + 1, n + 1) factors of all measured rows. prior: (k, n + 1) information rows, which keep their
-    stated std. rows: number of measured rows. Small-sample factor C/(C − 1)·(M − 1)/(M − rank), as in Cameron and Miller,
+    stated std. rows: number of measured rows. Small-sample factor C/(C − 1)·(M − 1)/(M − rank): Cameron and Miller,
     J. Human Resources 50 (2015) 317–372, section II.
     """
     clusters = clusters[clusters.any(axis=(1, 2))]

@@ -1,0 +1,489 @@
+"""Trackers: the recursive answer is the batch answer, bit for bit the same however rows arrive, and never winds up."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+
+import numpy as np
+import pytest
+
+from sms_online.stream import Array
+from sms_online.trackers import (
+    Directional,
+    Exponential,
+    Forgetting,
+    KalmanTracker,
+    NoForgetting,
+    Prior,
+    RecursiveLeastSquares,
+    Rows,
+    SlidingWindow,
+    Tracker,
+    batch_least_squares,
+)
+
+ALL_FORGETTING: tuple[Forgetting, ...] = (NoForgetting(), Exponential(0.999), SlidingWindow(1000), Directional(0.999))
+N = 6
+PI_TRUE = np.array([2.0, -1.0, 0.5, 3.0, -0.25, 1.5])
+
+
+def kalman(n: int = N, process_std: float = 0.01, initial_std: float = 10.0) -> KalmanTracker:
+    return KalmanTracker(n, np.full(n, process_std), Prior(np.zeros(n), np.full(n, initial_std)))
+
+
+TRACKERS: dict[str, Callable[[], Tracker]] = {
+    **{type(kind).__name__: lambda kind=kind: RecursiveLeastSquares(N, kind) for kind in ALL_FORGETTING},
+    "KalmanTracker": kalman,
+}
+
+
+def rows_of(Y: Array, b: Array, std: float | Array = 1.0, dt: float = 1e-3) -> Rows:
+    return Rows(Y, b, np.broadcast_to(np.asarray(std, dtype=float), b.shape).copy(), dt * np.arange(b.size))
+
+
+def exciting_rows(seed: int, count: int, pi: Array = PI_TRUE, noise: float = 0.1) -> Rows:
+    rng = np.random.default_rng(seed)
+    Y = rng.normal(size=(count, pi.size))
+    return rows_of(Y, Y @ pi + noise * rng.normal(size=count), noise)
+
+
+def ill_conditioned_rows(seed: int, count: int, n: int, condition: float) -> tuple[Rows, Array]:
+    """Rows of a given scaled condition number, in columns whose units differ by twelve decades."""
+    rng = np.random.default_rng(seed)
+    U, _ = np.linalg.qr(rng.normal(size=(count, n)))
+    V, _ = np.linalg.qr(rng.normal(size=(n, n)))
+    unit = 10.0 ** np.linspace(-6, 6, n)
+    Y = np.sqrt(count) * (U * np.geomspace(1, 1 / condition, n)) @ V.T * unit
+    pi = rng.normal(size=n) / unit
+    std = rng.uniform(0.5, 2.0, size=count) * 1e-6
+    return rows_of(Y, Y @ pi + std * rng.normal(size=count), std), pi
+
+
+def split(rows: Rows, seed: int, longest: int) -> Iterator[Rows]:
+    """The same rows in calls of random length, none included."""
+    rng = np.random.default_rng(seed)
+    start = 0
+    while start < rows.b.size:
+        part = slice(start, start + int(rng.integers(0, longest + 1)))
+        yield Rows(rows.Y[part], rows.b[part], rows.std[part], rows.t[part])
+        start = part.stop
+
+
+def assert_same_bits(one: Tracker, other: Tracker) -> None:
+    a, b = one.estimate(), other.estimate()
+    assert np.array_equal(a.pi, b.pi)
+    assert np.array_equal(a.covariance, b.covariance)
+    assert (a.covariance_robust is None) == (b.covariance_robust is None)
+    if a.covariance_robust is not None and b.covariance_robust is not None:
+        assert np.array_equal(a.covariance_robust, b.covariance_robust)
+    assert np.array_equal(a.determined, b.determined)
+    assert (a.condition_number, a.rows, a.rss, a.dof) == (b.condition_number, b.rows, b.rss, b.dof)
+
+
+@pytest.mark.parametrize("condition", [1e2, 1e5])
+def test_recursive_equals_lstsq_on_ill_conditioned_columns_of_any_unit(condition: float) -> None:
+    rows, _ = ill_conditioned_rows(seed=1, count=5003, n=16, condition=condition)
+    tracker = RecursiveLeastSquares(16)
+    for part in split(rows, seed=2, longest=300):
+        tracker.update(part)
+    estimate = tracker.estimate()
+
+    A, c = rows.Y / rows.std[:, None], rows.b / rows.std
+    scale = np.linalg.norm(A, axis=0)
+    expected, rss, _, s = np.linalg.lstsq(A / scale, c, rcond=None)
+    np.testing.assert_allclose(estimate.pi, expected / scale, rtol=1e-8)
+    np.testing.assert_allclose(estimate.rss, rss[0], rtol=1e-6)
+    np.testing.assert_allclose(estimate.condition_number, s[0] / s[-1], rtol=1e-8)
+    _, R = np.linalg.qr(A / scale)
+    inverse = np.linalg.inv(R) / scale[:, None]
+    np.testing.assert_allclose(estimate.std, np.linalg.norm(inverse, axis=1), rtol=1e-6)
+    assert estimate.determined.all()
+    assert (estimate.rows, estimate.dof) == (5003, 5003 - 16)
+
+
+def test_batch_solution_is_lstsq_and_the_recursive_solution() -> None:
+    rows, _ = ill_conditioned_rows(seed=3, count=700, n=16, condition=1e4)
+    batch = batch_least_squares(rows.Y, rows.b, rows.std)
+    tracker = RecursiveLeastSquares(16)
+    tracker.update(rows)
+    recursive = tracker.estimate()
+    np.testing.assert_allclose(batch.pi, recursive.pi, rtol=1e-8)
+    np.testing.assert_allclose(batch.covariance, recursive.covariance, rtol=1e-6)
+
+
+def test_batch_without_std_takes_the_level_of_its_covariance_from_the_residual() -> None:
+    rows = exciting_rows(seed=4, count=4000, noise=0.3)
+    unweighted = batch_least_squares(rows.Y, rows.b)
+    weighted = batch_least_squares(rows.Y, rows.b, rows.std)
+    np.testing.assert_allclose(unweighted.pi, weighted.pi, rtol=1e-10)
+    np.testing.assert_allclose(unweighted.std, weighted.std, rtol=0.05)
+
+
+def test_batch_with_as_many_rows_as_parameters_has_no_error_bar_without_std() -> None:
+    rows = exciting_rows(seed=5, count=N)
+    assert np.isinf(batch_least_squares(rows.Y, rows.b).std).all()
+    assert np.isfinite(batch_least_squares(rows.Y, rows.b, rows.std).std).all()
+
+
+@pytest.mark.parametrize("name", TRACKERS)
+def test_how_rows_are_split_never_changes_a_bit(name: str) -> None:
+    rows = exciting_rows(seed=6, count=1501)
+    whole = TRACKERS[name]()
+    whole.update(rows)
+    for seed, longest in ((7, 1), (8, 50), (9, 200), (10, 1500)):
+        parts = TRACKERS[name]()
+        for part in split(rows, seed, longest):
+            parts.update(part)
+            if longest > 100:
+                parts.estimate()  # looking must not touch
+        assert_same_bits(whole, parts)
+
+
+def test_partition_changes_no_bit_while_clusters_merge() -> None:
+    rng = np.random.default_rng(11)
+    Y = rng.normal(size=(40_000, 2))
+    rows = rows_of(Y, Y @ [1.0, 2.0] + rng.normal(size=40_000))
+    whole, parts = RecursiveLeastSquares(2), RecursiveLeastSquares(2)
+    whole.update(rows)
+    for part in split(rows, seed=12, longest=999):
+        parts.update(part)
+    assert_same_bits(whole, parts)
+
+
+@pytest.mark.parametrize("name", TRACKERS)
+def test_a_restored_tracker_continues_bit_for_bit(name: str, tmp_path) -> None:  # type: ignore[no-untyped-def]
+    rows = exciting_rows(seed=13, count=1777)
+    first = Rows(rows.Y[:1000], rows.b[:1000], rows.std[:1000], rows.t[:1000])
+    rest = Rows(rows.Y[1000:], rows.b[1000:], rows.std[1000:], rows.t[1000:])
+    original = TRACKERS[name]()
+    original.update(first)
+    np.savez(tmp_path / "state.npz", **original.state())  # type: ignore[arg-type]
+    with np.load(tmp_path / "state.npz") as file:
+        restored = TRACKERS[name]()
+        restored.restore(dict(file))
+    assert_same_bits(original, restored)
+    original.update(rest)
+    restored.update(rest)
+    assert_same_bits(original, restored)
+
+
+def test_a_state_that_does_not_fit_is_refused_and_leaves_the_tracker_as_it_was() -> None:
+    saved = RecursiveLeastSquares(4, Exponential(0.99)).state()
+    tracker = RecursiveLeastSquares(N)
+    tracker.update(exciting_rows(seed=14, count=100))
+    before = tracker.estimate().pi
+    with pytest.raises(ValueError, match="saved tracker state"):
+        tracker.restore(saved)
+    with pytest.raises(ValueError, match="saved tracker state"):
+        tracker.restore(RecursiveLeastSquares(N, SlidingWindow(100)).state())
+    assert np.array_equal(tracker.estimate().pi, before)
+
+
+@pytest.mark.parametrize("name", TRACKERS)
+def test_reset_starts_afresh_and_disabled_stands_still(name: str) -> None:
+    tracker, fresh = TRACKERS[name](), TRACKERS[name]()
+    rows = exciting_rows(seed=15, count=333)
+    tracker.update(exciting_rows(seed=16, count=500, pi=-PI_TRUE))
+    tracker.reset()
+    assert not tracker.estimate().determined.any()
+    tracker.update(rows)
+    fresh.update(rows)
+    assert_same_bits(tracker, fresh)
+
+    tracker.enabled = False
+    tracker.update(exciting_rows(seed=17, count=333, pi=-PI_TRUE))
+    assert_same_bits(tracker, fresh)
+    tracker.enabled = True
+    tracker.update(rows)
+    assert tracker.estimate().rows > fresh.estimate().rows or name == "SlidingWindow"
+
+
+def test_exponential_forgetting_is_least_squares_with_geometric_weights() -> None:
+    rows, _ = ill_conditioned_rows(seed=18, count=3000, n=8, condition=1e4)
+    tracker = RecursiveLeastSquares(8, Exponential(0.998))
+    tracker.update(rows)
+    weight = 0.998 ** (0.5 * np.arange(2999, -1, -1))
+    expected = batch_least_squares(rows.Y, rows.b, rows.std / weight)
+    estimate = tracker.estimate()
+    np.testing.assert_allclose(estimate.pi, expected.pi, rtol=1e-8)
+    np.testing.assert_allclose(estimate.covariance, expected.covariance, rtol=1e-6)
+    np.testing.assert_allclose(estimate.rss, expected.rss, rtol=1e-6)
+    np.testing.assert_allclose(estimate.rows, (weight**2).sum(), rtol=1e-12)
+
+
+@pytest.mark.parametrize("count", [500, 1024, 5003])
+def test_sliding_window_equals_lstsq_over_its_last_rows(count: int) -> None:
+    rows, _ = ill_conditioned_rows(seed=19, count=count, n=8, condition=1e4)
+    tracker = RecursiveLeastSquares(8, SlidingWindow(1024))
+    tracker.update(rows)
+    estimate = tracker.estimate()
+    last = int(estimate.rows)
+    assert min(count, 1024) <= last < 1024 + 64
+    expected = batch_least_squares(rows.Y[-last:], rows.b[-last:], rows.std[-last:])
+    np.testing.assert_allclose(estimate.pi, expected.pi, rtol=1e-8)
+    np.testing.assert_allclose(estimate.covariance, expected.covariance, rtol=1e-6)
+
+
+@pytest.mark.parametrize("name", ["Exponential", "SlidingWindow", "Directional", "KalmanTracker"])
+def test_forgetting_follows_a_change_of_the_parameters(name: str) -> None:
+    tracker = TRACKERS[name]()
+    tracker.update(exciting_rows(seed=20, count=3000))
+    changed = PI_TRUE * 1.2
+    later = exciting_rows(seed=21, count=12_000 if name != "KalmanTracker" else 3000, pi=changed)
+    tracker.update(Rows(later.Y, later.b, later.std, later.t + 3.0))
+    estimate = tracker.estimate()
+    assert (np.abs(estimate.pi - changed) < 5 * estimate.std).all()
+    # A five-sigma bar much wider than the change would prove nothing.
+    assert (5 * estimate.std < 0.2 * np.abs(PI_TRUE)).sum() >= N - 1
+
+
+def test_directional_forgetting_keeps_what_is_no_longer_excited() -> None:
+    tracker = RecursiveLeastSquares(N, Directional(0.99))
+    tracker.update(exciting_rows(seed=22, count=2000))
+    before = tracker.estimate()
+    rng = np.random.default_rng(23)
+    Y = np.zeros((20_000, N))
+    Y[:, :2] = rng.normal(size=(20_000, 2))
+    changed = PI_TRUE + [1.0, 1.0, 0, 0, 0, 0]
+    tracker.update(rows_of(Y, Y @ changed + 0.1 * rng.normal(size=20_000), 0.1))
+    after = tracker.estimate()
+    assert (np.abs(after.pi[:2] - changed[:2]) < 5 * after.std[:2]).all()
+    # What changed shifts the others through their correlation, within their error bars, and their std hardly grows.
+    assert (np.abs(after.pi[2:] - PI_TRUE[2:]) < 5 * before.std[2:]).all()
+    assert (after.std[2:] < 1.2 * before.std[2:]).all()
+
+
+def check_no_wind_up(kind: Forgetting, count: int, quiet: Callable[[np.random.Generator, int], Array]) -> None:
+    """Excitation, then `count` rows without, then excitation again with other parameters."""
+    tracker = RecursiveLeastSquares(N, kind)
+    rng = np.random.default_rng(24)
+    tracker.update(exciting_rows(seed=25, count=2000))
+    best_std = tracker.estimate().std
+    chunk = 100_000
+    for _ in range(count // chunk):
+        Y = quiet(rng, chunk)
+        tracker.update(rows_of(Y, Y @ PI_TRUE + 0.1 * rng.normal(size=chunk), 0.1))
+        estimate = tracker.estimate()
+        assert np.isfinite(estimate.pi).all()
+        # Undetermined parameters have an honest infinite std, and no others.
+        assert np.isfinite(estimate.std[estimate.determined]).all()
+        assert np.isinf(estimate.std[~estimate.determined]).all()
+        assert np.isfinite(estimate.rss)
+        if not isinstance(kind, SlidingWindow):
+            assert estimate.determined.all()
+            assert (estimate.std <= 2e6 * best_std).all()
+    pi = PI_TRUE if isinstance(kind, NoForgetting) else -PI_TRUE
+    tracker.update(exciting_rows(seed=26, count=20_000, pi=pi))
+    again = tracker.estimate()
+    assert (np.abs(again.pi - pi) < 5 * again.std).all()
+    assert (again.std <= 1.5 * best_std).all()
+
+
+QUIET: dict[str, Callable[[np.random.Generator, int], Array]] = {
+    "zero": lambda rng, count: np.zeros((count, N)),
+    "constant": lambda rng, count: np.tile([1.0, 2.0, 3.0, 0.0, 0.0, 1e-3], (count, 1)),
+}
+SELECTED = [NoForgetting(), Exponential(0.999), SlidingWindow(2000), Directional(0.999)]
+
+
+@pytest.mark.parametrize("quiet", QUIET)
+@pytest.mark.parametrize("kind", SELECTED, ids=lambda kind: type(kind).__name__)
+def test_no_wind_up_without_excitation(kind: Forgetting, quiet: str) -> None:
+    check_no_wind_up(kind, 100_000, QUIET[quiet])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("quiet", QUIET)
+@pytest.mark.parametrize("kind", SELECTED, ids=lambda kind: type(kind).__name__)
+def test_no_wind_up_in_ten_million_rows_without_excitation(kind: Forgetting, quiet: str) -> None:
+    check_no_wind_up(kind, 10_000_000, QUIET[quiet])
+
+
+def test_directional_forgetting_does_not_widen_error_bars_without_excitation() -> None:
+    tracker = RecursiveLeastSquares(N, Directional(0.99))
+    tracker.update(exciting_rows(seed=27, count=2000))
+    before = tracker.estimate()
+    tracker.update(rows_of(np.zeros((100_000, N)), np.zeros(100_000)))
+    after = tracker.estimate()
+    np.testing.assert_allclose(after.pi, before.pi, rtol=1e-12)
+    # The pending rows of `before` fade once more when their block is absorbed, by at most 0.99^64.
+    np.testing.assert_allclose(after.std, before.std, rtol=0.2)
+
+
+def test_the_walk_of_a_kalman_tracker_stops_at_its_initial_std() -> None:
+    tracker = kalman(initial_std=3.0, process_std=1.0)
+    tracker.update(exciting_rows(seed=28, count=300))
+    assert tracker.estimate().determined.all()
+    quiet = Rows(np.zeros((2000, N)), np.zeros(2000), np.ones(2000), 1.0 + 10.0 * np.arange(2000))
+    tracker.update(quiet)
+    lost = tracker.estimate()
+    assert not lost.determined.any()
+    np.testing.assert_allclose(np.diag(tracker.state()["P"]), 1.0, rtol=1e-12)
+    again = exciting_rows(seed=29, count=300, pi=-PI_TRUE)
+    tracker.update(Rows(again.Y, again.b, again.std, again.t + 30_000.0))
+    estimate = tracker.estimate()
+    assert (np.abs(estimate.pi + PI_TRUE) < 5 * estimate.std).all()
+
+
+def test_kalman_without_process_noise_is_recursive_least_squares_with_the_same_prior() -> None:
+    rows, pi = ill_conditioned_rows(seed=30, count=400, n=5, condition=1e2)
+    prior = Prior(0.5 * pi, np.abs(pi))
+    rls = RecursiveLeastSquares(5, prior=prior)
+    kalman_tracker = KalmanTracker(5, np.zeros(5), prior)
+    noisy = Rows(rows.Y, rows.b, 1e4 * rows.std, rows.t)  # so that the prior counts
+    rls.update(noisy)
+    kalman_tracker.update(noisy)
+    one, other = rls.estimate(), kalman_tracker.estimate()
+    np.testing.assert_allclose(other.pi, one.pi, rtol=1e-6)
+    np.testing.assert_allclose(other.std[other.determined], one.std[other.determined], rtol=1e-6)
+    np.testing.assert_allclose(other.condition_number, one.condition_number, rtol=1e-6)
+    # The sum of squared normalised innovations is the least-squares minimum, prior included.
+    np.testing.assert_allclose(other.rss, one.rss, rtol=1e-6)
+
+
+@pytest.mark.parametrize("kind", ALL_FORGETTING, ids=lambda kind: type(kind).__name__)
+def test_a_prior_decides_where_the_rows_say_nothing_and_never_ages(kind: Forgetting) -> None:
+    value, std = np.full(N, np.nan), np.full(N, np.nan)
+    value[5], std[5] = 1.6, 0.2
+    tracker = RecursiveLeastSquares(N, kind, Prior(value, std))
+    rng = np.random.default_rng(31)
+    Y = rng.normal(size=(20_000, N))
+    Y[:, 4:] = 0.0
+    tracker.update(rows_of(Y, Y @ PI_TRUE + 0.1 * rng.normal(size=20_000), 0.1))
+    estimate = tracker.estimate()
+    np.testing.assert_allclose([estimate.pi[5], estimate.std[5]], [1.6, 0.2], rtol=1e-9)
+    assert list(estimate.determined) == [True, True, True, True, False, True]
+
+
+def test_what_the_rows_cannot_tell_apart_is_flagged_and_nothing_else() -> None:
+    rng = np.random.default_rng(32)
+    Y = rng.normal(size=(500, N)) * 10.0 ** np.linspace(-6, 6, N)
+    Y[:, 3] = 1e5 * Y[:, 1]  # only π_1 + 1e5 π_3 acts
+    Y[:, 4] = 0.0
+    pi = PI_TRUE / 10.0 ** np.linspace(-6, 6, N)
+    tracker = RecursiveLeastSquares(N)
+    tracker.update(rows_of(Y, Y @ pi))
+    estimate = tracker.estimate()
+    assert list(estimate.determined) == [True, False, True, False, False, True]
+    assert list(np.isinf(estimate.std)) == [False, True, False, True, True, False]
+    determined = estimate.determined
+    np.testing.assert_allclose(estimate.pi[determined], pi[determined], rtol=1e-9)
+    np.testing.assert_allclose(estimate.pi[1] + 1e5 * estimate.pi[3], pi[1] + 1e5 * pi[3], rtol=1e-9)
+    assert estimate.pi[4] == 0.0
+    assert np.isinf(estimate.condition_number)
+    # The pseudo-inverse's error bars equal those of the model without the surplus columns.
+    reduced = batch_least_squares(Y[:, [0, 1, 2, 5]], Y @ pi, np.ones(500))
+    np.testing.assert_allclose(estimate.std[[0, 2, 5]], reduced.std[[0, 2, 3]], rtol=1e-9)
+
+
+def test_before_any_row_nothing_is_determined() -> None:
+    for build in TRACKERS.values():
+        estimate = build().estimate()
+        assert not estimate.determined.any()
+        assert np.isinf(estimate.std).all()
+        assert np.array_equal(estimate.pi, np.zeros(N))
+        assert (estimate.rows, estimate.rss, estimate.dof) == (0, 0, 0)
+
+
+def test_wrong_rows_are_refused_by_number_and_leave_no_trace() -> None:
+    good = exciting_rows(seed=33, count=10)
+    for name in ("Y", "b", "std", "t"):
+        arrays = {"Y": good.Y.copy(), "b": good.b.copy(), "std": good.std.copy(), "t": good.t.copy()}
+        arrays[name][7] = np.nan
+        with pytest.raises(ValueError, match=f"row 7: {name} is not finite"):
+            Rows(**arrays)
+    with pytest.raises(ValueError, match="row 3: std"):
+        Rows(good.Y, good.b, np.where(np.arange(10) == 3, 0.0, good.std), good.t)
+    with pytest.raises(ValueError, match="rows do not fit"):
+        Rows(good.Y, good.b[:9], good.std, good.t)
+    huge = Rows(np.full((2, N), 1e300), np.ones(2), np.array([1.0, 1e-20]), np.zeros(2))
+    for build in TRACKERS.values():
+        tracker, untouched = build(), build()
+        for wrong in (Rows(good.Y[:, :4], good.b, good.std, good.t), huge):
+            with pytest.raises(ValueError, match="row [01]"):
+                tracker.update(wrong)
+        tracker.update(good)
+        untouched.update(good)
+        assert_same_bits(tracker, untouched)
+
+
+@pytest.mark.parametrize("factor", [0.0, 1.0, 1.5, np.nan])
+def test_forgetting_factors_and_windows_out_of_range_are_refused(factor: float) -> None:
+    with pytest.raises(ValueError, match="forgetting factor"):
+        Exponential(factor)
+    with pytest.raises(ValueError, match="forgetting factor"):
+        Directional(factor)
+    with pytest.raises(ValueError, match="window"):
+        SlidingWindow(0)
+
+
+def autoregressive(rng: np.random.Generator, count: int, width: int, coefficient: float) -> Array:
+    """Stationary AR(1) series of unit variance, (count, width)."""
+    from scipy.signal import lfilter
+
+    drive = rng.normal(size=(count, width)) * np.sqrt(1 - coefficient**2)
+    drive[0] = rng.normal(size=width)
+    return np.asarray(lfilter([1.0], [1.0, -coefficient], drive, axis=0))
+
+
+@pytest.mark.parametrize("kind", [NoForgetting(), SlidingWindow(8192)], ids=lambda kind: type(kind).__name__)
+def test_robust_intervals_cover_the_truth_where_errors_are_autocorrelated(kind: Forgetting) -> None:
+    rng = np.random.default_rng(34)
+    pi = np.array([1.0, -2.0, 0.5])
+    hits, classic_hits, intervals = 0, 0, 0
+    for _ in range(250):
+        Y = autoregressive(rng, 8192, 3, 0.9)
+        b = Y @ pi + 0.1 * autoregressive(rng, 8192, 1, 0.9)[:, 0]
+        tracker = RecursiveLeastSquares(3, kind)
+        tracker.update(rows_of(Y, b, 0.1))
+        estimate = tracker.estimate()
+        error = np.abs(estimate.pi - pi)
+        assert estimate.std_robust is not None
+        hits += int((error < 1.96 * estimate.std_robust).sum())
+        classic_hits += int((error < 1.96 * estimate.std).sum())
+        intervals += 3
+    # 750 intervals: the coverage itself is known to ±0.8 %.
+    assert 0.925 < hits / intervals < 0.975
+    assert classic_hits / intervals < 0.6
+
+
+def test_robust_covariance_equals_the_stated_one_where_errors_are_white() -> None:
+    rng = np.random.default_rng(35)
+    Y = rng.normal(size=(60_000, 4)) * [1e-6, 1.0, 1e3, 1e6]
+    pi = np.array([1e6, 1.0, -1e-3, 2e-6])
+    tracker = RecursiveLeastSquares(4)
+    tracker.update(rows_of(Y, Y @ pi + 0.1 * rng.normal(size=60_000), 0.1))
+    estimate = tracker.estimate()
+    np.testing.assert_allclose(estimate.std_robust, estimate.std, rtol=0.2)
+
+
+def test_robust_covariance_equals_its_formula_written_out() -> None:
+    rng = np.random.default_rng(36)
+    count = 64 * 100
+    Y = rng.normal(size=(count, 3)) + np.sin(np.arange(count) / 200.0)[:, None]
+    b = Y @ [1.0, 2.0, 3.0] + autoregressive(rng, count, 1, 0.99)[:, 0]
+    prior = Prior(np.array([0.9, 0.0, 0.0]), np.array([0.01, np.nan, np.nan]))
+    tracker = RecursiveLeastSquares(3, prior=prior)
+    tracker.update(rows_of(Y, b, 0.5))
+    estimate = tracker.estimate()
+
+    A, c = Y / 0.5, b / 0.5
+    information = A.T @ A
+    information[0, 0] += 1 / 0.01**2
+    meat = np.zeros((3, 3))
+    for cluster in np.split(np.arange(count), 100):
+        score = A[cluster].T @ (c[cluster] - A[cluster] @ estimate.pi)
+        meat += np.outer(score, score)
+    meat *= 100 / 99 * (count - 1) / (count - 3)
+    meat[0, 0] += 1 / 0.01**2
+    inverse = np.linalg.inv(information)
+    np.testing.assert_allclose(estimate.covariance_robust, inverse @ meat @ inverse, rtol=1e-8)
+
+
+def test_robust_covariance_is_withheld_while_clusters_are_too_few_and_where_rows_fade() -> None:
+    for kind in ALL_FORGETTING:
+        tracker = RecursiveLeastSquares(N, kind)
+        tracker.update(exciting_rows(seed=37, count=64 * N - 1))
+        assert tracker.estimate().std_robust is None
+        tracker.update(exciting_rows(seed=38, count=64 * N))
+        assert (tracker.estimate().std_robust is None) == isinstance(kind, Exponential | Directional)
