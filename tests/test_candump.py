@@ -148,7 +148,7 @@ def test_python_can_and_candump_variants_read_alike(tmp_path: Path) -> None:
 def test_gzip_blocks_progress_and_window(tmp_path: Path) -> None:
     text = "".join(frame(1000 * k, ENCODERS, f"{k:06X}0000000000") for k in range(60_000))  # three chunks of text
     path = tmp_path / "run.log.gz"
-    path.write_bytes(gzip.compress(text.encode()))
+    path.write_bytes(gzip.compress(text.encode(), compresslevel=1))
     consumed: list[int] = []
     source = open_source(path, rig(tmp_path), 10.0, 50.0, consumed.append, directory=tmp_path)
     for _ in range(2):

@@ -194,7 +194,7 @@ def test_the_samples_before_a_malformed_chunk_are_out_already(tmp_path: Path) ->
         ("t,q_1\n", "no samples"),
         ("t,q_1\n0,1", "no samples"),
         ("\xff\xfe", "first column"),
-        ("t,q_1\n" + "1" * 3_000_000, "bytes in a line"),
+        ("t,q_1\n" + "1" * 3_000_000, "line 2: 1048576 bytes without an end"),
     ],
 )
 def test_a_file_that_is_no_capture_is_refused(tmp_path: Path, text: str, found: str) -> None:

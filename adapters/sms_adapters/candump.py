@@ -115,7 +115,8 @@ class CandumpReader:
         self._reset()
         first: int | None = None
         last = rows = 0
-        for line, chunk in self._lines:
+        for line, text in self._lines:
+            chunk = bytes(text)
             stamps, frames = self._frames(line, chunk, last)
             if not stamps.size:
                 continue
@@ -155,7 +156,7 @@ class CandumpReader:
         stamps = np.array([int(s + f.ljust(9, b"0")) for s, f in zip(seconds, fractions, strict=True)], np.int64)
         back = np.diff(stamps, prepend=last) < 0
         if back.any():
-            number, _ = sampled_line(line, chunk, int(back.argmax()))
+            number, _ = sampled_line(line, memoryview(chunk), int(back.argmax()))
             expected = "times that do not go back"
             raise InputError(str(self._path), f"line {number}", "a time before that of the line above", expected)
         return stamps, (frames[0], frames[1], frames[2])
@@ -173,7 +174,7 @@ class CandumpReader:
             interface = self._interface.setdefault(id_, interfaces[rows[0]]) if rows.size else b""
             other = next((row for row in rows if interfaces[row] != interface), None)
             if other is not None:
-                number, _ = sampled_line(line, chunk, int(other))
+                number, _ = sampled_line(line, memoryview(chunk), int(other))
                 found = f"{wanted.message.name} on {interfaces[other].decode()} after {interface.decode()}"
                 raise InputError(str(self._path), f"line {number}", found, "a message on one interface")
             digits = 2 * wanted.message.length

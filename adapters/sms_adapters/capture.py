@@ -82,14 +82,15 @@ class CaptureReader:
         self._reset()
         first, last = math.nan, -math.inf
         for line, chunk in self._lines:
-            body = chunk if line > 1 else chunk.partition(b"\n")[2]
-            rows = self._parse(line + (line == 1), body)
+            if line == 1:
+                line, chunk = 2, chunk[bytes(chunk).index(b"\n") + 1 :]
+            rows = self._parse(line, chunk)
             if not len(rows):
                 continue
             t = rows[:, 0]
             step = np.diff(t, prepend=last)
             if not (step > 0).all():
-                self._check_times(line + (line == 1), body, t, step)
+                self._check_times(line, chunk, t, step)
                 rows = rows[step > 0]
                 self._repeated += int(t.size - len(rows))
                 t = rows[:, 0]
@@ -116,18 +117,18 @@ class CaptureReader:
         self._repeated = 0
         self._unsampled = np.zeros(len(self._channels), dtype=np.int64)
 
-    def _parse(self, line: int, body: bytes) -> Array:
+    def _parse(self, line: int, chunk: memoryview) -> Array:
         """(rows, 1 + C) of whole lines of text, t first; InputError names the first malformed line."""
         names = ("t", *self._channels)
         try:
-            rows = _parse(body, names)
+            rows = _parse(chunk, names)
         except pa.ArrowInvalid:
-            lines = body.splitlines()
+            lines = bytes(chunk).splitlines()
             k = _first_malformed(lines, names)
             raise self._malformed(line + k, lines[k].decode("utf-8", "replace").split(",")) from None
         infinite = np.isinf(rows)
         if infinite.any():
-            number, text = sampled_line(line, body, int(infinite.any(axis=1).argmax()))
+            number, text = sampled_line(line, chunk, int(infinite.any(axis=1).argmax()))
             raise self._malformed(number, text.split(","))
         return rows
 
@@ -143,11 +144,11 @@ class CaptureReader:
                 )
         return InputError(str(self._path), place, repr(",".join(cells)[:40]), "plain decimal numbers")
 
-    def _check_times(self, line: int, body: bytes, t: Array, step: Array) -> None:
+    def _check_times(self, line: int, chunk: memoryview, t: Array, step: Array) -> None:
         """InputError where a time is missing or before the one above; equal times pass."""
         wrong = ~(step >= 0)
         if wrong.any():
-            number, text = sampled_line(line, body, int(wrong.argmax()))
+            number, text = sampled_line(line, chunk, int(wrong.argmax()))
             cell = text.split(",", 1)[0]
             found = "no time" if math.isnan(t[wrong.argmax()]) else f"time {cell} s, before that of the line above"
             raise InputError(str(self._path), f"line {number}", found, "times that do not go back")
@@ -225,14 +226,14 @@ def _header(path: Path, line: str) -> tuple[str, ...]:
     return tuple(names[1:])
 
 
-def _parse(body: bytes, names: tuple[str, ...]) -> Array:
+def _parse(text: memoryview, names: tuple[str, ...]) -> Array:
     """(rows, columns) float64 of whole lines, NaN for empty cells; blank lines are passed over. Raises ArrowInvalid."""
-    if not body.strip():
+    if not text:
         return np.empty((0, len(names)))
     table = pyarrow.csv.read_csv(
-        pa.py_buffer(body),
+        pa.py_buffer(text),
         # A block that holds the whole text: it is parsed in one go and on this thread.
-        read_options=pyarrow.csv.ReadOptions(use_threads=False, column_names=names, block_size=max(len(body), CHUNK)),
+        read_options=pyarrow.csv.ReadOptions(use_threads=False, column_names=names, block_size=CHUNK),
         parse_options=pyarrow.csv.ParseOptions(quote_char=False),
         convert_options=pyarrow.csv.ConvertOptions(
             column_types={name: pa.float64() for name in names}, null_values=[""]
@@ -250,7 +251,7 @@ def _first_malformed(lines: list[bytes], names: tuple[str, ...]) -> int:
     while bad - good > 1:
         middle = (good + bad) // 2
         try:
-            _parse(b"\n".join(lines[good:middle]), names)
+            _parse(memoryview(b"\n".join([*lines[good:middle], b""])), names)
             good = middle
         except pa.ArrowInvalid:
             bad = middle

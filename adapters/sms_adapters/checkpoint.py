@@ -38,4 +38,6 @@ def load_checkpoint(path: Path, estimator: Estimator) -> None:
                 state.setdefault(stage, {})[key] = archive[name]
         estimator.restore(state)
     except (OSError, ValueError, KeyError, zipfile.BadZipFile) as error:
-        raise InputError(str(path), "", f"no usable checkpoint ({error})", "a file saved by a session of this system") from error
+        raise InputError(
+            str(path), "", f"no usable checkpoint ({error})", "a file saved by a session of this system"
+        ) from error

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection
+from collections.abc import Callable
 from pathlib import Path
 
 from sms_adapters.candump import CandumpReader
 from sms_adapters.capture import CaptureReader
+from sms_online.description.channels import channels
 from sms_online.description.schema import System
 from sms_online.errors import InputError
 from sms_online.stream import Source
@@ -18,18 +19,17 @@ def open_source(
     start: float | None = None,
     stop: float | None = None,
     on_bytes: Callable[[int], None] | None = None,
-    known: Collection[str] | None = None,
     directory: Path | None = None,
 ) -> Source:
     """The reader of a capture (.csv, .csv.gz) or of a candump log (.log, .log.gz).
 
     start, stop: seconds after the file's first sample or frame. on_bytes: called with the bytes of the file consumed so
-    far. known: the channels of the system. directory: where the system file stands, to find its DBC.
-    Raises InputError for another ending, and as the readers do.
+    far. directory: where the system file stands, to find its DBC.
+    Raises InputError for another ending, a channel that the system does not have, and as the readers do.
     """
     name = path.name.removesuffix(".gz")
     if name.endswith(".csv"):
-        return CaptureReader(path, start, stop, on_bytes=on_bytes, known=known)
+        return CaptureReader(path, start, stop, on_bytes=on_bytes, known=channels(system))
     if name.endswith(".log"):
-        return CandumpReader(path, system, start, stop, on_bytes=on_bytes, known=known, directory=directory)
+        return CandumpReader(path, system, start, stop, on_bytes=on_bytes, known=channels(system), directory=directory)
     raise InputError(str(path), "", f"a file named {path.name}", "a name ending in .csv, .csv.gz, .log or .log.gz")

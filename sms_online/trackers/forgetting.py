@@ -53,8 +53,8 @@ class SlidingWindow:
     """The last `rows` rows count the same, older ones not at all.
 
     The window is rounded up to whole blocks, and the rows of the unfinished block come on top. Old blocks leave by
-    building the factor anew from those that stay, not by downdating: a downdate subtracts nearly equal numbers and loses
-    up to the square of the condition number (Stewart, J. Inst. Maths Applics 23 (1979) 203–213).
+    building the factor anew from those that stay, not by downdating: a downdate subtracts nearly equal numbers and
+    loses up to the square of the condition number (Stewart, J. Inst. Maths Applics 23 (1979) 203–213).
     Without excitation the window empties and its parameters become undetermined; nothing grows.
     """
 

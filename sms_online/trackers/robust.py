@@ -99,9 +99,9 @@ def cluster_covariance(solution: Solution, clusters: Array, prior: Array, rows: 
     count, n = len(clusters), solution.pi.size
     if count <= solution.rank or rows <= solution.rank:
         return None
-    bread = clusters[:, :, :n] @ solution.root  # (C, n + 1, rank)
-    residual = clusters[:, :, n] - clusters[:, :, :n] @ solution.pi
-    score = np.einsum("cik,ci->ck", bread, residual)
+    R = clusters[:, :, :n]
+    residual = clusters[:, :, n] - R @ solution.pi
+    score = (residual[:, None, :] @ R)[:, 0, :] @ solution.root  # (C, rank)
     weighted_prior = prior[:, :n] @ solution.root
     factor = count / (count - 1) * (rows - 1) / (rows - solution.rank)
     return solution.covariance(factor * (score.T @ score) + weighted_prior.T @ weighted_prior)
