@@ -15,8 +15,8 @@ from sms_online.trackers.interface import Estimate
 SCHEMA = "sms-online/results/1"
 # Half width of a 95 % interval in standard deviations.
 NORMAL_95 = 1.959963984540054
-# A parameter whose standard deviation reaches this share of its estimate is not determined by the data.
-LARGEST_RELATIVE_STD = 0.5
+# An estimate within three standard deviations of zero is not determined by the data: not even its sign is certain.
+LARGEST_RELATIVE_STD = 1.0 / 3.0
 
 
 def standard_deviation(estimate: Estimate) -> Array:
@@ -32,7 +32,7 @@ def standard_deviation(estimate: Estimate) -> Array:
 
 
 def identifiable(estimate: Estimate) -> NDArray[np.bool_]:
-    """Which parameters (n,) the data determine: in the span of the rows, and with an error below half the estimate."""
+    """Which parameters (n,) the data determine: in the span of the rows, and three standard deviations away from zero."""
     return estimate.determined & (standard_deviation(estimate) <= LARGEST_RELATIVE_STD * np.abs(estimate.pi))
 
 

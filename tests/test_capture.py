@@ -211,8 +211,8 @@ def test_files_that_cannot_be_read_are_refused(tmp_path: Path) -> None:
 
 def test_an_unknown_channel_is_refused_with_the_nearest_name(tmp_path: Path) -> None:
     path = write(tmp_path / "run.csv", "t,q_1,thetam_1\n0,1,1\n")
-    assert "'thetam_1'; expected a channel of the system, such as 'theta_m_1'" in refusal(
-        path, known={"q_1", "theta_m_1", "tau_1"}
+    assert "'thetam_1'; expected a channel of this system, such as 'theta_m_1'" in refusal(
+        path, known=("q_1", "theta_m_1", "tau_1")
     )
 
 

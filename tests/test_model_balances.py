@@ -92,7 +92,7 @@ def test_acceleration_solves_the_equations_of_motion(system: System) -> None:
     Q = model.generalized_force(np.random.default_rng(9).normal(size=(5, len(system.joints))))
     dynamics = model.dynamics(model.nominal)
     H, C = dynamics.mass_and_bias(x, v)
-    close((H @ dynamics.acceleration(x, v, Q)[..., None])[..., 0] + C, Q + C - C, 1e-9 * np.abs(C).max())
+    close((H @ dynamics.acceleration(x, v, Q)[..., None])[..., 0], Q - C, 1e-10)
 
 
 @all_systems
@@ -150,16 +150,20 @@ def test_rotor_row_holds_only_its_own_joint() -> None:
     }
 
 
-def free_motion(system: System, torque: Callable[[float], Array], duration: float) -> tuple[Model, Array, Array, Array, Array]:
-    """Motion from a random state: times' states x, v, and work of the motors and dissipated energy so far, (42), (24)."""
-    model = Model(system)
+def soften(model: Model) -> Array:
+    """Nominal parameters but for springs and dampers a hundred times weaker, which an explicit integrator copes with."""
+    weak = {"stiffness", "damping", "flexural_rigidity"} | {f"{r}_rigidity" for r in ("axial", "torsional")}
+    weak |= {"flexural_rigidity_y", "flexural_rigidity_z"}
+    return np.array([0.01 * p.nominal if p.quantity in weak else p.nominal for p in model.parameters])
+
+
+def free_motion(
+    model: Model, pi: Array, torque: Callable[[float], Array], duration: float
+) -> tuple[Array, Array, Array, Array]:
+    """States x, v along a motion, work of the motors (42) and dissipated energy (24) since its start; seed 14."""
     layout = model.layout
-    dynamics = model.dynamics(model.nominal)
-    x, v = random_states(layout, 1, seed=14, elastic=0.02)
-    # A joint in rest: its spring is stretched by little.
-    x[:, [i + layout.n_base_positions - layout.n_base_speeds for i in layout.theta_m]] = x[
-        :, [i + layout.n_base_positions - layout.n_base_speeds for i in layout.q]
-    ]
+    dynamics = model.dynamics(pi)
+    x, v = random_states(layout, 1, seed=14, elastic=0.05)
     v *= 0.3
 
     def rate(t: float, y: Array) -> Array:
@@ -169,31 +173,38 @@ def free_motion(system: System, torque: Callable[[float], Array], duration: floa
         return np.concatenate((model.position_rate(x, v)[0], dynamics.acceleration(x, v, Q)[0], power))
 
     start = np.concatenate((x[0], v[0], [0.0, 0.0]))
-    y = solve_ivp(rate, (0.0, duration), start, method="DOP853", rtol=1e-11, atol=1e-12, dense_output=False).y.T
-    return model, y[:, : layout.n_x], y[:, layout.n_x : -2], y[:, -2], y[:, -1]
+    y = solve_ivp(rate, (0.0, duration), start, method="DOP853", rtol=1e-9, atol=1e-10).y.T
+    return y[:, : layout.n_x], y[:, layout.n_x : -2], y[:, -2], y[:, -1]
 
 
 @pytest.mark.parametrize("kinematics", ["linear", "exact"])
 def test_work_of_the_motors_is_the_change_of_energy_along_a_motion(kinematics: str) -> None:
-    """(43) along a simulated motion of the paper's example: work = change of K + U, plus what the dampers take."""
-    model, x, v, work, dissipated = free_motion(paper(kinematics), lambda t: 40.0 * np.cos([9.0 * t, 7.0 * t]), 0.3)
-    E = model.energy_columns(x, v) @ model.nominal
+    """(43): work = change of K + U, plus what the dampers take."""
+    model = Model(paper(kinematics))
+    pi = soften(model)
+    x, v, work, dissipated = free_motion(model, pi, lambda t: 40.0 * np.cos([9.0 * t, 7.0 * t]), 0.3)
+    E = model.energy_columns(x, v) @ pi
     assert dissipated[-1] > 0.01 * np.ptp(E)
-    close(work - dissipated, E - E[0], 1e-8)
+    np.testing.assert_allclose(work - dissipated, E - E[0], rtol=0.0, atol=1e-7 * np.ptp(E))
 
 
-@pytest.mark.parametrize("system", [paper("exact"), spatial("linear").model_copy(update={"gravity": (0.0, 0.0, 0.0)})])
+FREE_FLOATERS = (paper("exact"), spatial("linear").model_copy(update={"gravity": (0.0, 0.0, 0.0), "effects": ()}))
+
+
+@pytest.mark.parametrize("system", FREE_FLOATERS, ids=("planar", "spatial"))
 def test_momentum_of_a_free_floating_system_is_conserved(system: System) -> None:
     """Motors move the arm; linear momentum and angular momentum about the origin stay."""
+    model = Model(system)
+    pi = soften(model)
     torque = np.linspace(30.0, -20.0, len(system.joints))
-    model, x, v, _, _ = free_motion(system, lambda t: torque * np.cos(20.0 * t), 0.05)
+    x, v, _, _ = free_motion(model, pi, lambda t: torque * np.cos(20.0 * t), 0.1)
     layout = model.layout
-    momentum = model.dynamics(model.nominal).base_momentum(x, v)
+    momentum = model.dynamics(pi).base_momentum(x, v)
     n = len(layout.base_linear)
     linear, about_S = momentum[:, :n], momentum[:, n:]
-    moved = np.cross(layout.base_pose(x)[0], np.pad(linear, ((0, 0), (0, 3 - n))))
-    angular = about_S + moved[:, list(layout.base_angular)]
+    lever = np.cross(layout.base_pose(x)[0], np.pad(linear, ((0, 0), (0, 3 - n))))
+    angular = about_S + lever[:, list(layout.base_angular)]
     size = np.abs(momentum).max()
-    assert np.ptp(about_S, axis=0).max() > 1e-4 * size
-    np.testing.assert_allclose(linear, np.broadcast_to(linear[0], linear.shape), rtol=0.0, atol=1e-9 * size)
-    np.testing.assert_allclose(angular, np.broadcast_to(angular[0], angular.shape), rtol=0.0, atol=1e-9 * size)
+    assert np.ptp(about_S) > 0.01 * size
+    np.testing.assert_allclose(linear, np.broadcast_to(linear[0], linear.shape), rtol=0.0, atol=1e-8 * size)
+    np.testing.assert_allclose(angular, np.broadcast_to(angular[0], angular.shape), rtol=0.0, atol=1e-8 * size)

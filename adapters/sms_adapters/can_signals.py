@@ -6,8 +6,7 @@ decoder at a fraction of its 1.7 µs a frame.
 
 from __future__ import annotations
 
-import difflib
-from collections.abc import Collection
+from collections.abc import Sequence
 from dataclasses import dataclass
 from importlib import resources
 from pathlib import Path
@@ -17,6 +16,7 @@ import numpy as np
 from cantools.database.can import Message, Signal
 from numpy.typing import NDArray
 
+from sms_online.description.explain import nearest
 from sms_online.description.schema import CanSource, System
 from sms_online.errors import InputError
 from sms_online.stream import Array
@@ -45,8 +45,6 @@ def wanted_messages(system: System, source: CanSource, directory: Path | None) -
     """
     place = f"system {system.name}, [source]"
     database = _read_dbc(place, source.dbc, directory)
-    if not source.signals:
-        raise InputError(place, "signals", "no signal", 'MESSAGE.SIGNAL = "channel" at least once')
     if len(set(source.signals.values())) < len(source.signals):
         raise InputError(place, "signals", "two signals for one channel", "each channel once")
     messages = {message.name: message for message in database.messages}
@@ -132,11 +130,6 @@ def _read_dbc(place: str, name: str, directory: Path | None) -> cantools.databas
     return database
 
 
-def _unknown(place: str, name: str, names: Collection[str]) -> InputError:
-    near = difflib.get_close_matches(name, names, n=1, cutoff=0.0)
-    return InputError(
-        place,
-        "signals",
-        f"{name!r}, which the DBC does not hold",
-        f"a signal of it, such as {near[0]!r}" if near else "a DBC with signals",
-    )
+def _unknown(place: str, name: str, names: Sequence[str]) -> InputError:
+    expected = f"a signal of it, such as {nearest(name, names) or names[0]!r}" if names else "a DBC with signals"
+    return InputError(place, "signals", f"{name!r}, which the DBC does not hold", expected)

@@ -9,14 +9,14 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from sms_adapters.can_signals import wanted_messages
-from sms_adapters.capture import BLOCK, check_channels
+from sms_adapters.capture import BLOCK
 from sms_adapters.lines import LineReader, sampled_line
 from sms_online.description.schema import System
 from sms_online.errors import InputError
@@ -43,7 +43,7 @@ class CandumpReader:
 
     Each frame of a message of system.source gives one sample: its signals as the DBC scales them, NaN in the channels
     of other messages. t: seconds since the log's first frame of any kind, from the log's integer times.
-    start, stop, block, on_bytes, known: as for CaptureReader. directory: where the system file stands; its DBC is
+    start, stop, block, on_bytes: as for CaptureReader. directory: where the system file stands; its DBC is
     looked for there, then among those shipped in sms_adapters/dbc.
 
     Frames that no channel comes from, wanted frames of another length than the DBC says (remote frames among them),
@@ -62,7 +62,6 @@ class CandumpReader:
         stop: float | None = None,
         block: int = BLOCK,
         on_bytes: Callable[[int], None] | None = None,
-        known: Collection[str] | None = None,
         directory: Path | None = None,
     ) -> None:
         if system.source is None:
@@ -74,8 +73,6 @@ class CandumpReader:
         self._block = block
         self._dbc = system.source.dbc
         self._channels = tuple(system.source.signals.values())
-        if known is not None:
-            check_channels(f"system {system.name}, [source]", "signals", self._channels, known)
         self._wanted = {
             wanted.message.frame_id | (_EXTENDED if wanted.message.is_extended_frame else 0): wanted
             for wanted in wanted_messages(system, system.source, directory)

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import difflib
 import math
 import re
 from collections import Counter
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from types import TracebackType
 
@@ -15,6 +14,7 @@ import pyarrow as pa
 import pyarrow.csv
 
 from sms_adapters.lines import CHUNK, LineReader, sampled_line
+from sms_online.description.explain import nearest
 from sms_online.errors import InputError
 from sms_online.stream import Array, Block
 
@@ -42,7 +42,7 @@ class CaptureReader:
         stop: float | None = None,
         block: int = BLOCK,
         on_bytes: Callable[[int], None] | None = None,
-        known: Collection[str] | None = None,
+        known: Sequence[str] | None = None,
     ) -> None:
         self._path = path
         self._start = -math.inf if start is None else start
@@ -51,7 +51,10 @@ class CaptureReader:
         self._lines = LineReader(path, on_bytes)
         self._channels = _header(path, LineReader(path).first_line())
         if known is not None:
-            check_channels(str(path), "line 1", self._channels, known)
+            for channel in self._channels:
+                if channel not in known:
+                    expected = f"a channel of this system, such as {nearest(channel, known) or known[0]!r}"
+                    raise InputError(str(path), "line 1", f"unknown channel {channel!r}", expected)
         self._reset()
 
     @property
@@ -197,15 +200,6 @@ class CaptureWriter:
             self._part.replace(self._path)
         else:
             self._part.unlink()
-
-
-def check_channels(source: str, place: str, channels: Collection[str], known: Collection[str]) -> None:
-    """InputError for the first channel that is not among the known ones, with the nearest name."""
-    for channel in channels:
-        if channel not in known:
-            near = difflib.get_close_matches(channel, known, n=1, cutoff=0.0)
-            expected = f"a channel of the system, such as {near[0]!r}" if near else "a system with channels"
-            raise InputError(source, place, f"unknown channel {channel!r}", expected)
 
 
 def _header(path: Path, line: str) -> tuple[str, ...]:

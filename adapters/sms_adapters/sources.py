@@ -31,5 +31,5 @@ def open_source(
     if name.endswith(".csv"):
         return CaptureReader(path, start, stop, on_bytes=on_bytes, known=channels(system))
     if name.endswith(".log"):
-        return CandumpReader(path, system, start, stop, on_bytes=on_bytes, known=channels(system), directory=directory)
+        return CandumpReader(path, system, start, stop, on_bytes=on_bytes, directory=directory)
     raise InputError(str(path), "", f"a file named {path.name}", "a name ending in .csv, .csv.gz, .log or .log.gz")

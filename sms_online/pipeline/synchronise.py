@@ -19,7 +19,8 @@ StageState = dict[str, NDArray[Any]]
 # A sample this close to a grid point, in grid periods, lies on it. At 1 kHz that is 0.1 µs, in which 1 rad/s moves a
 # hundredth of a good encoder's noise; measured captures round their stamps to 0.03 µs.
 ON_GRID = 1e-4
-# Nodes of an interpolation on either side: degree 5 is exact to 1e-5 for an eighth of a channel's sample rate.
+# Nodes of an interpolation on either side: degree 5 errs by at most 1e-5 of an oscillation that is sampled 18 times a
+# period.
 SIDE = 3
 # Longest interval between two samples of a channel that is bridged, in periods of the channel, rounded: four
 # samples lost. White noise of the nodes then reaches the middle of the hole 2.8 times; beyond that the hole ends
@@ -238,10 +239,9 @@ class Synchroniser:
             self._period[channel] = np.nanmedian(known)
 
     def _advance(self, final: bool) -> list[GridSamples]:
-        """Decide grid points as far as the samples allow, deliver those with a value in every channel, drop old
-        rows."""
+        """Decide grid points as far as the samples allow; deliver those that every channel has."""
         silent = self._time[-1] - self._last_time > LONGEST_HOLE
-        for channel in np.flatnonzero(np.isnan(self._period) & (silent | final)):
+        for channel in np.flatnonzero(np.isnan(self._period) & (silent | final)).tolist():
             self._settle_period(channel)
         k = self._candidates()
         decided = np.ones(k.size, dtype=bool)

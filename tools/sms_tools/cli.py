@@ -1,0 +1,180 @@
+"""The command line `sms-online`: one parser, one module a verb, one place for exit codes.
+
+Nothing here imports NumPy, so that help and usage errors come at once.
+"""
+
+from __future__ import annotations
+
+import argparse
+import importlib
+import io
+import math
+import os
+import sys
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any, NoReturn
+
+from sms_online.errors import InputError
+from sms_tools.exit_codes import BAD_INPUT, INTERRUPTED, OK
+
+PROGRAM = "sms-online"
+# A sum that BLAS splits over threads is rounded differently for every number of threads, and the same samples must give
+# the same bits on every machine. The matrices are small; threads would not make them faster. Read when NumPy is imported.
+for _variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
+    os.environ.setdefault(_variable, "1")
+
+
+class Parser(argparse.ArgumentParser):
+    """Says in one line what is wrong with the arguments; options are spelt out."""
+
+    def __init__(self, **options: Any) -> None:
+        super().__init__(allow_abbrev=False, **options)
+
+    def error(self, message: str) -> NoReturn:
+        """Exit with code 2 after one line."""
+        self.exit(BAD_INPUT, f"{self.prog}: {message}\n")
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run one verb and return its exit code: 0, 2 bad input, 3 nothing determined, 130 interrupted."""
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="replace")  # a terminal without Greek letters shows ? for ρ
+    try:
+        args = _parser().parse_args(arguments)
+        code: int = importlib.import_module(f"sms_tools.verbs.{args.module}").run(args)
+        sys.stdout.flush()
+    except InputError as error:
+        print(f"{PROGRAM}: {error}", file=sys.stderr)
+        return BAD_INPUT
+    except SystemExit as exit_:  # argparse, after help or an error
+        return int(exit_.code or OK)
+    except KeyboardInterrupt:
+        print(f"{PROGRAM}: interrupted", file=sys.stderr)
+        return INTERRUPTED
+    except BrokenPipeError:
+        # The reader of the output has left (| head); results are in their files by then. What is still in the buffer
+        # must not be written at exit.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return OK
+    return code
+
+
+def _parser() -> Parser:
+    parser = Parser(
+        prog=PROGRAM,
+        description="Online parameter estimation for flexible space manipulators.",
+        epilog="Exit codes: 0 done, 2 bad input, 3 nothing is determined (results are written), 130 interrupted.",
+    )
+    verbs = parser.add_subparsers(metavar="VERB", required=True)
+    for add in (_add_demo, _add_simulate, _add_replay, _add_import, _add_markers):
+        add(verbs)
+    return parser
+
+
+Verbs = Any  # argparse's action of add_subparsers is private
+
+
+def _add_verb(verbs: Verbs, name: str, module: str, description: str) -> Parser:
+    """A verb with the option that all have."""
+    parser: Parser = verbs.add_parser(name, help=description, description=description)
+    parser.add_argument("--json", action="store_true", help="the result as JSON on stdout, all else on stderr")
+    parser.set_defaults(module=module)
+    return parser
+
+
+def _add_system(parser: Parser, default: str | None = None) -> None:
+    text = "a system file (.toml) or the name of a shipped system" + (f", {default} by default" if default else "")
+    parser.add_argument("--system", metavar="FILE|NAME", required=default is None, default=default, help=text)
+
+
+def _add_out(parser: Parser) -> None:
+    parser.add_argument("--out", metavar="DIR", type=Path, help="where results.json goes, runs/<time> by default")
+
+
+def _add_noise(parser: Parser) -> None:
+    text = "noise of all sensors in place of the described one: 0 none, A, B, C ever more"
+    parser.add_argument("--grade", choices=("0", "A", "B", "C"), help=text)
+    parser.add_argument("--seed", metavar="N", type=_whole(0), default=0, help="of the noise, 0 by default")
+
+
+def _add_capture(parser: Parser) -> None:
+    parser.add_argument("--capture", metavar="FILE.csv", type=Path, required=True, help="the capture to write")
+
+
+def _add_demo(verbs: Verbs) -> None:
+    parser = _add_verb(verbs, "demo", "demo", "Simulate the paper's example and watch its parameters converge.")
+    _add_system(parser, default="paper-planar")
+    _add_noise(parser)
+    _add_out(parser)
+
+
+def _add_simulate(verbs: Verbs) -> None:
+    parser = _add_verb(verbs, "simulate", "simulate", "Simulate a system; write a capture, and its truth beside it.")
+    _add_system(parser)
+    _add_capture(parser)
+    text = "length of the session, the described trajectory's by default"
+    parser.add_argument("--duration", metavar="SECONDS", type=_seconds(positive=True), help=text)
+    _add_noise(parser)
+
+
+def _add_replay(verbs: Verbs) -> None:
+    parser = _add_verb(verbs, "replay", "replay", "Estimate the parameters of a system from a recorded session.")
+    parser.add_argument("capture", metavar="CAPTURE", type=Path, help="a capture (.csv) or a candump log (.log), or .gz")
+    _add_system(parser)
+    _add_out(parser)
+    parser.add_argument("-ss", dest="start", metavar="SECONDS", type=_seconds(), help="leave out what is before")
+    parser.add_argument("-to", dest="stop", metavar="SECONDS", type=_seconds(positive=True), help="and what is after")
+    text = (
+        "start from the system file's nominal values, each ± 100 %% (those of 0 stay unknown); "
+        "priors that the file itself states hold with and without it"
+    )
+    parser.add_argument("--prior", action="store_true", help=text)
+    text = "as fast as it goes, or in step with the recorded time"
+    parser.add_argument("--speed", choices=("max", "1"), default="max", help=text)
+
+
+def _add_import(verbs: Verbs) -> None:
+    parser = _add_verb(verbs, "import", "import_data", "Turn a published measurement (.mat) into a capture.")
+    parser.add_argument("kind", metavar="KIND", choices=("quanser", "emps"), help="quanser or emps")
+    parser.add_argument("source", metavar="SOURCE", type=Path, help="the file as its owners published it")
+    _add_capture(parser)
+
+
+def _add_markers(verbs: Verbs) -> None:
+    parser = _add_verb(verbs, "markers", "markers", "Eigenmodes of each flexible link and the markers that they need.")
+    _add_system(parser)
+    text = "how many modes the markers have to tell apart, 2 by default"
+    parser.add_argument("--modes", metavar="N", type=_whole(1), default=2, help=text)
+
+
+def _seconds(positive: bool = False) -> Callable[[str], float]:
+    """Reader of a time that is not negative, or positive."""
+
+    def read(text: str) -> float:
+        value = _number(text)
+        if not (math.isfinite(value) and (value > 0 if positive else value >= 0)):
+            expected = "greater than 0" if positive else "0 or more"
+            raise argparse.ArgumentTypeError(f"{text!r}; expected a number of seconds, {expected}")
+        return value
+
+    return read
+
+
+def _number(text: str) -> float:
+    try:
+        return float(text)
+    except ValueError:
+        return math.nan
+
+
+def _whole(least: int) -> Callable[[str], int]:
+    """Reader of a whole number of at least `least`."""
+
+    def read(text: str) -> int:
+        if not (text.isdecimal() and int(text) >= least):
+            raise argparse.ArgumentTypeError(f"{text!r}; expected a whole number, {least} or more")
+        return int(text)
+
+    return read

@@ -1,0 +1,40 @@
+"""What is known of the base parameters before a session, from what a system file says about the physical ones."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from sms_online.description.explain import hint, nearest
+from sms_online.description.schema import System
+from sms_online.errors import InputError
+from sms_online.model.base_parameters import BaseParameters
+from sms_online.trackers.interface import Prior
+
+# --prior trusts a nominal value's size, not its digits.
+NOMINAL_RELATIVE_STD = 1.0
+
+
+def base_prior(system: System, base: BaseParameters, nominal: bool) -> Prior | None:
+    """Prior of the base parameters β = π_independent + mixture π_dependent, None where nothing is known.
+
+    Physical parameters have the priors that the system file states; with `nominal`, the others their nominal value
+    ± 100 %, unless that is 0, which only says that it is not described. A combination has a prior where every parameter
+    in it has one; their errors count as independent. Raises InputError for a prior of a parameter that there is not.
+    """
+    names = [parameter.name for parameter in base.physical]
+    value, std = np.full((2, len(names)), np.nan)
+    if nominal:
+        value[:] = [parameter.nominal for parameter in base.physical]
+        std = np.where(value != 0.0, NOMINAL_RELATIVE_STD * np.abs(value), np.nan)
+    for name, prior in system.priors.items():
+        if name not in names:
+            expected = f"the name of a parameter of this system{hint(nearest(name, names))}"
+            raise InputError(system.name, f'prior."{name}"', "no such parameter", expected)
+        value[names.index(name)], std[names.index(name)] = prior.value, prior.std
+    value[np.isnan(std)] = 0.0
+    mixing = np.zeros((base.n, len(names)))
+    mixing[np.arange(base.n), list(base.independent)] = 1.0
+    mixing[:, list(base.dependent)] = base.mixture
+    variance = np.where(mixing != 0.0, mixing**2 * std**2, 0.0).sum(axis=1)
+    prior = Prior(mixing @ value, np.sqrt(variance))
+    return prior if prior.known.any() else None

@@ -1,0 +1,64 @@
+"""DIR/results.json: where it goes, and that it is there as a whole or not at all."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+from datetime import datetime
+from pathlib import Path
+from typing import Any
+
+from sms_online.errors import InputError
+
+NAME = "results.json"
+RUNS = Path("runs")
+
+
+def results_directory(out: Path | None) -> Path:
+    """The directory asked for, or a new name in runs/; it is made when results are written.
+
+    Raises InputError where it cannot be made, before a long session has run for nothing.
+    """
+    directory = _new_run() if out is None else out
+    existing = next(path for path in (directory, *directory.absolute().parents) if path.exists())
+    if not existing.is_dir():
+        raise InputError(str(directory), "", f"{existing} is no directory", "a directory that can be made")
+    if not os.access(existing, os.W_OK | os.X_OK):
+        raise InputError(str(directory), "", f"no permission to write in {existing}", "a directory that can be made")
+    return directory
+
+
+def _new_run() -> Path:
+    name = f"{datetime.now():%Y-%m-%d-%H%M%S}"
+    run, count = RUNS / name, 1
+    while run.exists():
+        count += 1
+        run = RUNS / f"{name}-{count}"
+    return run
+
+
+def to_json(document: dict[str, Any]) -> str:
+    """The document as text. JSON knows no infinity (a condition number without full rank): it becomes null."""
+    return json.dumps(_finite(document), indent=2, ensure_ascii=False, allow_nan=False)
+
+
+def _finite(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {key: _finite(item) for key, item in value.items()}
+    if isinstance(value, list):
+        return [_finite(item) for item in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def write_results(directory: Path, document: dict[str, Any]) -> Path:
+    """Write results.json into the directory, which is made; InputError where that fails."""
+    path = directory / NAME
+    part = directory / (NAME + ".part")
+    try:
+        directory.mkdir(parents=True, exist_ok=True)
+        part.write_text(to_json(document) + "\n", encoding="utf-8")
+        part.replace(path)
+    except OSError as error:
+        raise InputError(str(path), "", error.strerror or str(error), "a file that can be written") from None
+    return path
