@@ -28,7 +28,7 @@ def standard_deviation(estimate: Estimate) -> Array:
     if estimate.dof <= 0.0:
         return np.full(estimate.pi.shape, np.inf)
     std = estimate.std * np.sqrt(estimate.rss / estimate.dof)
-    return std if estimate.std_robust is None else np.maximum(std, estimate.std_robust)
+    return np.asarray(std if estimate.std_robust is None else np.maximum(std, estimate.std_robust))
 
 
 def identifiable(estimate: Estimate) -> NDArray[np.bool_]:

@@ -26,7 +26,9 @@ class Block:
 
     def __post_init__(self) -> None:
         if self.values.shape != (self.t.size, len(self.channels)):
-            raise ValueError(f"values {self.values.shape} do not fit {self.t.size} samples x {len(self.channels)} channels")
+            raise ValueError(
+                f"values {self.values.shape} do not fit {self.t.size} samples x {len(self.channels)} channels"
+            )
 
 
 class Source(Protocol):

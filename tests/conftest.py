@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from sms_adapters.system_file import load_system
-from sms_sim.simulate import Simulation, exact_states, simulate
 
+from sms_adapters.system_file import load_system
 from sms_online.description.schema import System
 from sms_online.stream import Block
+from sms_sim.simulate import Simulation, exact_states, simulate
 
 
 @pytest.fixture(scope="session")

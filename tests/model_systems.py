@@ -44,7 +44,9 @@ def planar_link(elements: int = 2, kinematics: str = "linear", flexural_rigidity
     )
 
 
-def paper(kinematics: str = "linear", motion: str = "planar", free: bool = True, effects: Sequence[Effect] = ()) -> System:
+def paper(
+    kinematics: str = "linear", motion: str = "planar", free: bool = True, effects: Sequence[Effect] = ()
+) -> System:
     """The paper's example, Tables I to III; as `spatial` motion the same bodies, or the arm alone on a fixed base."""
     motor = Motor(mass=3, rotor_inertia=0.0075, stator_inertia=Inertia(zz=0.0075))
     joint = Joint(gear_ratio=50, stiffness=1000, damping=75.85)
@@ -152,7 +154,8 @@ def rigid_chain(joints: int, free: bool, prismatic: int | None = None, motors: b
             for i in range(1, joints + 1)
         ),
         motors=tuple(
-            Motor(mass=1.5, rotor_inertia=0.002, stator_inertia=inertia(0.01)) if motors else None for _ in range(joints)
+            Motor(mass=1.5, rotor_inertia=0.002, stator_inertia=inertia(0.01)) if motors else None
+            for _ in range(joints)
         ),
         links=tuple(
             RigidLink(kind="rigid", mass=float(m), center_of_mass=vector(0.4), inertia=inertia(0.3), tip=vector(0.7))

@@ -13,10 +13,10 @@ import numpy as np
 import pytest
 from cantools.database.can import Database, Message
 from numpy.typing import NDArray
+
 from sms_adapters.can_signals import decode_signal
 from sms_adapters.candump import CandumpReader
 from sms_adapters.sources import open_source
-
 from sms_online.description.schema import CanSource, Joint, System
 from sms_online.errors import InputError
 from sms_online.stream import Array

@@ -9,10 +9,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+
 from sms_adapters.capture import CaptureReader, CaptureWriter
 from sms_adapters.sources import open_source
 from sms_adapters.truth import read_truth, truth_path, write_truth
-
 from sms_online.description.schema import Joint, System
 from sms_online.errors import InputError
 from sms_online.stream import Array, Block

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from scipy.linalg import eigh
-from sms_adapters.system_file import load_system
 
+from sms_adapters.system_file import load_system
 from sms_online.description.schema import FlexibleLink
 from sms_online.model.eigenmodes import Bending, TipLoad, clamped_loaded_modes, markers, tip_load
 

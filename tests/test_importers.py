@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 import pytest
 from scipy.io import loadmat, savemat
+
 from sms_adapters.capture import CaptureReader
 from sms_adapters.importers import import_emps, import_quanser
-
 from sms_online.errors import InputError
 from sms_online.stream import Array
 

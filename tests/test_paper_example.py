@@ -6,10 +6,9 @@ import json
 
 import numpy as np
 import pytest
+
 from sms_adapters.checkpoint import load_checkpoint, save_checkpoint
 from sms_adapters.system_file import load_system
-from sms_sim.simulate import Simulation, exact_states, simulate
-
 from sms_online.description.schema import Harmonic, Trajectory
 from sms_online.model.base_parameters import find_base_parameters
 from sms_online.pipeline.estimator import Estimator
@@ -18,6 +17,7 @@ from sms_online.results import results_document, standard_deviation
 from sms_online.stream import Array, Block
 from sms_online.trackers.batch import batch_least_squares
 from sms_online.trackers.interface import Rows
+from sms_sim.simulate import Simulation, exact_states, simulate
 
 NAMES = (
     "spacecraft.inertia_about_joint_1",

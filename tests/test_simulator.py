@@ -5,6 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
+
+from sms_online.description.parse import parse_system, shipped_text
+from sms_online.description.schema import Controller, Harmonic, Sensor, System, Trajectory
+from sms_online.errors import InputError
+from sms_online.stream import Array
 from sms_sim.controller import JointPD
 from sms_sim.integrate import Collocation, solve
 from sms_sim.plant import Plant
@@ -12,11 +17,6 @@ from sms_sim.realtime import STEP, RealTimeStepper
 from sms_sim.references import FourierReference
 from sms_sim.sensors import Sensors
 from sms_sim.simulate import Simulation, exact_states, sampled_blocks, simulate
-
-from sms_online.description.parse import parse_system, shipped_text
-from sms_online.description.schema import Controller, Harmonic, Sensor, System, Trajectory
-from sms_online.errors import InputError
-from sms_online.stream import Array
 
 EIGHTH_ORDER = np.array([1 / 280, -4 / 105, 1 / 5, -4 / 5, 0, 4 / 5, -1 / 5, 4 / 105, -1 / 280])
 

@@ -114,7 +114,9 @@ def find_base_parameters(model: Model) -> BaseParameters:
     ones = np.abs(np.abs(mixture) - 1.0) < COEFFICIENT_ROUNDING
     mixture[ones] = np.sign(mixture[ones])
     parameters = tuple(
-        _combine(model.parameters[k], [(mixture[row, column], model.parameters[d]) for column, d in enumerate(dependent)])
+        _combine(
+            model.parameters[k], [(mixture[row, column], model.parameters[d]) for column, d in enumerate(dependent)]
+        )
         for row, k in enumerate(independent)
     )
     return BaseParameters(model.parameters, parameters, independent, dependent, absent, mixture, known)

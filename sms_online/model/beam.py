@@ -55,7 +55,9 @@ class LinearLink:
         self.weights = np.tile(0.5 * element_length * weights, link.elements)
         self._x = np.zeros((1, G, 3))
         self._J = np.zeros((1, G, 3, self.n_f))
-        self._twist = np.zeros((1, G, 3, self.n_f))  # of the sections, axial part only: rotary inertia of bending is left out
+        self._twist = np.zeros(
+            (1, G, 3, self.n_f)
+        )  # of the sections, axial part only: rotary inertia of bending is left out
         stiffness = {
             "axial_rigidity": np.zeros((self.n_f, self.n_f)),
             "flexural_rigidity_y": np.zeros((self.n_f, self.n_f)),

@@ -15,7 +15,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from sms_online.description.schema import FlexibleLink, Joint, RigidLink, System
+from sms_online.description.schema import Joint, RigidLink, System
 from sms_online.model import so3
 from sms_online.model.beam import LinearLink
 from sms_online.model.flexible import LinkKinematics, Shape, ShapeRate
@@ -219,9 +219,7 @@ class Configuration:
             rate = self._end_rate(i, link, link_twist, rates, shape_rates[i])
         return [*out, rate]
 
-    def _end_rate(
-        self, i: int, link: Array, link_twist: Array, rates: Array, shape_rate: ShapeRate | None
-    ) -> Array:
+    def _end_rate(self, i: int, link: Array, link_twist: Array, rates: Array, shape_rate: ShapeRate | None) -> Array:
         """Rates of the twists at the end of link i (from 0), in the end's axes."""
         shape, arm = self.shapes[i], self.chain.rigid_arms[i]
         if shape is None or shape_rate is None or arm is not None:

@@ -15,7 +15,14 @@ from sms_online.model import so3
 from sms_online.stream import Array
 
 # Nodal coordinates of one node in the paper's order (31), by deformation.
-NODAL = {"u_x": "traction", "u_y": "bending_z", "u_z": "bending_y", "theta_x": "torsion", "theta_y": "bending_y", "theta_z": "bending_z"}
+NODAL = {
+    "u_x": "traction",
+    "u_y": "bending_z",
+    "u_z": "bending_y",
+    "theta_x": "torsion",
+    "theta_y": "bending_y",
+    "theta_z": "bending_z",
+}
 # Strain fields of a geometrically exact link, by deformation.
 STRAIN = {"twist": "torsion", "curvature_y": "bending_y", "curvature_z": "bending_z"}
 AXES = ("x", "y", "z")
@@ -89,9 +96,7 @@ class Layout:
         """ẋ (B, n_x) for speeds v (B, n_v): the identity but for Euler parameters."""
         if self.planar or not self.free:
             return v
-        return np.concatenate(
-            (v[:, :3], so3.euler_parameter_rate(x[:, 3:6], x[:, 6], v[:, 3:6]), v[:, 6:]), axis=1
-        )
+        return np.concatenate((v[:, :3], so3.euler_parameter_rate(x[:, 3:6], x[:, 6], v[:, 3:6]), v[:, 6:]), axis=1)
 
     def speeds(self, x: Array, x_dot: Array) -> Array:
         """Speeds v (B, n_v) for position rates ẋ (B, n_x): inverse of `position_rate`."""
@@ -126,7 +131,9 @@ def build_layout(system: System) -> Layout:
             if link.kinematics == "exact":
                 names += [f"link_{i}.{name}" for name in strain_names(link)]
             else:
-                names += [f"link_{i}.marker_{j}.{name}" for j in range(1, link.elements + 1) for name in nodal_names(link)]
+                names += [
+                    f"link_{i}.marker_{j}.{name}" for j in range(1, link.elements + 1) for name in nodal_names(link)
+                ]
         q_f.append(slice(start, len(base_speeds) + len(names)))
     return Layout(
         planar=planar,

@@ -118,11 +118,15 @@ class Model:
                 parameters.append(rigidity_parameter(i, rigidity, link, self.layout.planar))
 
     def _add_springs(self, parameters: list[Parameter]) -> None:
-        flexible = [(i, joint) for i, joint in enumerate(self.system.joints, start=1) if joint.transmission == "flexible"]
+        flexible = [
+            (i, joint) for i, joint in enumerate(self.system.joints, start=1) if joint.transmission == "flexible"
+        ]
         for kind, symbol, springs in (("stiffness", "k", self.springs), ("damping", "b", self.dampers)):
             for i, joint in flexible:
-                unit = ("N/m" if joint.kind == "prismatic" else "N m/rad") if kind == "stiffness" else (
-                    "N s/m" if joint.kind == "prismatic" else "N m s/rad"
+                unit = (
+                    ("N/m" if joint.kind == "prismatic" else "N m/rad")
+                    if kind == "stiffness"
+                    else ("N s/m" if joint.kind == "prismatic" else "N m s/rad")
                 )
                 ends = [self.layout.theta_m[i - 1], self.layout.q[i - 1]]
                 springs.append(Spring(len(parameters), ends, np.array([[1.0, -1.0], [-1.0, 1.0]])))

@@ -90,7 +90,9 @@ def rigid_body(owner: str, index: str, body: RigidBody, planar: bool, spacecraft
         suffix = "" if planar else f"_{key}"
         name = f"{owner}.{what}{suffix}"
         symbol = f"I_{index}{suffix}" + (f"+m_{index} r_{index}²" if spacecraft and planar else "")
-        out.append(InertialParameter(Parameter(name, symbol, "kg m²", float(I_origin[SYMMETRIC[key]])), _rotational(key)))
+        out.append(
+            InertialParameter(Parameter(name, symbol, "kg m²", float(I_origin[SYMMETRIC[key]])), _rotational(key))
+        )
     arm = "r" if spacecraft else "c"
     for axis in axes:
         letter = "xyz"[axis]
@@ -114,7 +116,10 @@ def motor(i: int, system: System) -> tuple[InertialParameter, list[InertialParam
         parameter = Parameter(f"motor_{i}.stator_inertia{suffix}", f"I_s{i}{suffix}", "kg m²", value)
         stator.append(InertialParameter(parameter, _with_motor_rate(_rotational(key))))
     mass = Parameter(f"motor_{i}.mass", f"m_m{i}", "kg", described.mass)
-    return InertialParameter(rotor, np.outer(c, c)), [*stator, InertialParameter(mass, _with_motor_rate(_translational()))]
+    return InertialParameter(rotor, np.outer(c, c)), [
+        *stator,
+        InertialParameter(mass, _with_motor_rate(_translational())),
+    ]
 
 
 def _with_motor_rate(E: Array) -> Array:

@@ -36,7 +36,8 @@ class Sensing:
         self._base = [need(name) for name in base]
         joints = range(1, len(model.system.joints) + 1)
         self._q = [
-            need(f"q_{i}") if layout.q[i - 1] != layout.theta_m[i - 1] else need(f"q_{i}", f"theta_m_{i}") for i in joints
+            need(f"q_{i}") if layout.q[i - 1] != layout.theta_m[i - 1] else need(f"q_{i}", f"theta_m_{i}")
+            for i in joints
         ]
         self._theta_m = [need(f"theta_m_{i}") for i in joints if layout.q[i - 1] != layout.theta_m[i - 1]]
         self._markers = [

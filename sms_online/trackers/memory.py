@@ -15,9 +15,9 @@ from sms_online.trackers.forgetting import FadingForgetting, Forgetting, NoForge
 from sms_online.trackers.interface import State, saved_array, saved_number
 from sms_online.trackers.robust import MAX_CLUSTERS, ClusterFactors, merge_neighbours
 
-# Rows of one internal block: the QR of 64 x 17 costs about as much as that of 17 x 17, so below it the overhead of the
+# Rows of one internal block: the QR of 32 x 17 costs about as much as that of 17 x 17, so below it the overhead of the
 # call dominates; above it an estimate has more pending rows to factor again.
-BLOCK_ROWS = 64
+BLOCK_ROWS = 32
 
 
 @dataclass(frozen=True)

@@ -121,7 +121,9 @@ def _add_simulate(verbs: Verbs) -> None:
 
 def _add_replay(verbs: Verbs) -> None:
     parser = _add_verb(verbs, "replay", "replay", "Estimate the parameters of a system from a recorded session.")
-    parser.add_argument("capture", metavar="CAPTURE", type=Path, help="a capture (.csv) or a candump log (.log), or .gz")
+    parser.add_argument(
+        "capture", metavar="CAPTURE", type=Path, help="a capture (.csv) or a candump log (.log), or .gz"
+    )
     _add_system(parser)
     _add_out(parser)
     parser.add_argument("-ss", dest="start", metavar="SECONDS", type=_seconds(), help="leave out what is before")

@@ -14,8 +14,8 @@ from sms_online.trackers.interface import Prior
 NOMINAL_RELATIVE_STD = 1.0
 
 
-def base_prior(system: System, base: BaseParameters, nominal: bool) -> Prior | None:
-    """Prior of the base parameters β = π_independent + mixture π_dependent, None where nothing is known.
+def base_prior(system: System, base: BaseParameters, nominal: bool) -> Prior:
+    """Prior of the base parameters β = π_independent + mixture π_dependent, NaN where nothing is known.
 
     Physical parameters have the priors that the system file states; with `nominal`, the others their nominal value
     ± 100 %, unless that is 0, which only says that it is not described. A combination has a prior where every parameter
@@ -36,5 +36,4 @@ def base_prior(system: System, base: BaseParameters, nominal: bool) -> Prior | N
     mixing[np.arange(base.n), list(base.independent)] = 1.0
     mixing[:, list(base.dependent)] = base.mixture
     variance = np.where(mixing != 0.0, mixing**2 * std**2, 0.0).sum(axis=1)
-    prior = Prior(mixing @ value, np.sqrt(variance))
-    return prior if prior.known.any() else None
+    return Prior(mixing @ value, np.sqrt(variance))

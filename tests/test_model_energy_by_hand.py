@@ -1,0 +1,202 @@
+"""The model's energy against a second, slow computation that knows positions alone.
+
+Every body and every slice of a link is a point and a frame; their velocities are differences of their positions R(x(t)),
+(8)–(12), (16)–(20), and integrals over links are quadratures of their own.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from model_systems import DIFFERENCE, SYSTEMS, random_states
+from numpy.polynomial import Legendre
+from scipy.integrate import simpson
+from scipy.interpolate import CubicHermiteSpline
+from scipy.spatial.transform import Rotation
+
+from sms_online.description.schema import FlexibleLink, Inertia, RigidBody, RigidLink, System
+from sms_online.model.layout import Layout
+from sms_online.model.model import Model
+from sms_online.stream import Array
+
+# Instants of the differences, s. The step leaves 1e-16/STEP of rounding and STEP⁸ of truncation.
+STEP = 2e-3
+TIMES = STEP * np.arange(-4, 5)
+NOW = 4
+ROD_STEPS = 240
+RELATIVE = 1e-10
+
+
+def turned(vectors: Array) -> Array:
+    """Rotation matrices (T, 3, 3) of rotation vectors (T, 3)."""
+    return np.asarray(Rotation.from_rotvec(vectors).as_matrix())
+
+
+def rate(samples: Array) -> Array:
+    """Derivative at NOW of samples (9, ...)."""
+    return sum(w * (samples[NOW + k] - samples[NOW - k]) / STEP for k, w in enumerate(DIFFERENCE, start=1))
+
+
+def angular_velocity(R: Array) -> Array:
+    """Inertial ω (..., 3) at NOW of frames (9, ..., 3, 3)."""
+    W = rate(R) @ np.swapaxes(R[NOW], -1, -2)
+    return 0.5 * np.stack(
+        (W[..., 2, 1] - W[..., 1, 2], W[..., 0, 2] - W[..., 2, 0], W[..., 1, 0] - W[..., 0, 1]), axis=-1
+    )
+
+
+def tensor(i: Inertia) -> Array:
+    return np.array([[i.xx, i.xy, i.xz], [i.xy, i.yy, i.yz], [i.xz, i.yz, i.zz]])
+
+
+class Bodies:
+    """Kinetic and potential energy, added up body by body."""
+
+    def __init__(self, gravity: Array) -> None:
+        self.gravity = gravity
+        self.kinetic = self.potential = 0.0
+
+    def point(self, mass: float, r: Array) -> None:
+        """A point mass at positions r (9, 3)."""
+        self.kinetic += 0.5 * mass * float(rate(r) @ rate(r))
+        self.potential -= mass * float(self.gravity @ r[NOW])
+
+    def tumble(self, inertia: Array, R: Array) -> None:
+        """A body that turns with frames R (9, 3, 3), its inertia (3, 3) given in them."""
+        omega = R[NOW].T @ angular_velocity(R)
+        self.kinetic += 0.5 * float(omega @ inertia @ omega)
+
+    def body(self, body: RigidBody, origin: Array, R: Array) -> None:
+        """A rigid body in a frame."""
+        self.point(body.mass, origin + R @ np.array(body.center_of_mass))
+        self.tumble(tensor(body.inertia), R)
+
+
+def linear_link(link: FlexibleLink, q_f: Array) -> tuple[Array, Array, Array, Array, Array, float]:
+    """Points (9, n, 3), section frames (9, n, 3, 3), weights (n,), tip, its frame, strain energy: (1)–(4), (11), (14)."""
+    names = ("u_x", "u_y", "u_z", "theta_x", "theta_y", "theta_z")
+    nodal = np.zeros((len(TIMES), link.elements + 1, 6))
+    active = {"traction": "u_x", "bending_z": "u_y theta_z", "bending_y": "u_z theta_y", "torsion": "theta_x"}
+    kept = sorted(names.index(name) for d in link.deformations for name in active[d].split())
+    nodal[:, 1:, kept] = q_f.reshape(len(TIMES), link.elements, len(kept))
+    nodes = np.linspace(0.0, link.length, link.elements + 1)
+    xi, w = np.polynomial.legendre.leggauss(9)
+    half = 0.5 * link.length / link.elements
+    x = np.concatenate([node + half * (1.0 + xi) for node in nodes[:-1]])
+    weights = np.tile(half * w, link.elements)
+    u_y = CubicHermiteSpline(nodes, nodal[..., 1], nodal[..., 5], axis=1)
+    u_z = CubicHermiteSpline(nodes, nodal[..., 2], -nodal[..., 4], axis=1)
+    u_x = np.stack([np.interp(x, nodes, u) for u in nodal[..., 0]])
+    theta_x = np.stack([np.interp(x, nodes, u) for u in nodal[..., 3]])
+    points = np.stack((x + u_x, u_y(x), u_z(x)), axis=2)
+    sections = turned(np.stack((theta_x, 0.0 * theta_x, 0.0 * theta_x), axis=2).reshape(-1, 3)).reshape(
+        *theta_x.shape, 3, 3
+    )
+    stretch, twist = (np.diff(nodal[NOW, :, k]) / np.diff(nodes) for k in (0, 3))
+    length = np.diff(nodes)
+    strain = 0.5 * (
+        link.axial_rigidity * stretch**2 @ length
+        + link.torsional_rigidity * twist**2 @ length
+        + link.flexural_rigidity_z * u_y(x, 2)[NOW] ** 2 @ weights
+        + link.flexural_rigidity_y * u_z(x, 2)[NOW] ** 2 @ weights
+    )
+    tip = np.array([link.length, 0.0, 0.0]) + nodal[:, -1, :3]
+    return points, sections, weights, tip, turned(nodal[:, -1, 3:]), float(strain)
+
+
+def exact_rod(link: FlexibleLink, q_f: Array, free_end: bool) -> tuple[Array, Array, Array, Array, Array, float]:
+    """The same for R' = R κ×, r' = R e_x, integrated by Runge–Kutta over ROD_STEPS steps."""
+    h = link.length / ROD_STEPS
+    fine = np.linspace(0.0, link.length, 2 * ROD_STEPS + 1)
+    fields = {"torsion": (0, 1), "bending_y": (1, 2), "bending_z": (2, 2)}
+    kappa = np.zeros((len(TIMES), len(fine), 3))
+    column = 0
+    for deformation, (axis, per_marker) in fields.items():
+        if deformation in link.deformations:
+            for k in range(per_marker * link.elements):
+                kappa[..., axis] += np.multiply.outer(q_f[:, column], Legendre.basis(k, [0.0, link.length])(fine))
+                column += 1
+    if free_end:
+        kappa *= (1.0 - fine / link.length)[:, None]
+    K = np.zeros((*kappa.shape, 3))
+    K[..., 2, 1], K[..., 0, 2], K[..., 1, 0] = np.moveaxis(kappa, -1, 0)
+    K -= np.swapaxes(K, -1, -2)
+    R = [np.broadcast_to(np.eye(3), (len(TIMES), 3, 3))]
+    r = [np.zeros((len(TIMES), 3))]
+    for k in range(ROD_STEPS):
+        start, middle, end = K[:, 2 * k], K[:, 2 * k + 1], K[:, 2 * k + 2]
+        k1 = R[-1] @ start
+        R2 = R[-1] + 0.5 * h * k1
+        k2 = R2 @ middle
+        R3 = R[-1] + 0.5 * h * k2
+        k3 = R3 @ middle
+        R4 = R[-1] + h * k3
+        r.append(r[-1] + h / 6.0 * (R[-1] + 2.0 * R2 + 2.0 * R3 + R4)[..., 0])
+        R.append(R[-1] + h / 6.0 * (k1 + 2.0 * k2 + 2.0 * k3 + R4 @ end))
+    rigidity = np.array([link.torsional_rigidity, link.flexural_rigidity_y, link.flexural_rigidity_z])
+    strain = 0.5 * simpson(kappa[NOW] ** 2 @ rigidity, x=fine)
+    weights = simpson(np.eye(ROD_STEPS + 1), dx=h)
+    return np.stack(r, axis=1), np.stack(R, axis=1), weights, r[-1], R[-1], float(strain)
+
+
+def energy(system: System, layout: Layout, x: Array, v: Array) -> tuple[float, float]:
+    """K and U of one state."""
+    out = Bodies(np.array(system.gravity))
+    moved = x[layout.n_base_positions :] + TIMES[:, None] * v[layout.n_base_speeds :]
+    n = layout.n_base_speeds
+    r_S, T_0 = (a[0] for a in layout.base_pose(x[None]))
+    v_S, omega = np.zeros(3), np.zeros(3)
+    v_S[list(layout.base_linear)] = v[: len(layout.base_linear)]
+    omega[list(layout.base_angular)] = v[len(layout.base_linear) : n]
+    R = turned(TIMES[:, None] * omega) @ T_0
+    r = r_S + TIMES[:, None] * v_S
+    if system.spacecraft is not None:
+        r = r - R @ np.array(system.spacecraft.tracked_point)
+        out.body(system.spacecraft, r, R)
+    for i, (joint, motor, link) in enumerate(zip(system.joints, system.motors, system.links, strict=True)):
+        R = R @ turned(np.array(joint.mount_rotation))
+        axis = np.array(joint.axis)
+        q, theta_m = moved[:, layout.q[i] - n], moved[:, layout.theta_m[i] - n]
+        if motor is not None:
+            out.point(motor.mass, r)
+            out.tumble(tensor(motor.stator_inertia), R)
+            spin = (R[NOW] @ axis) @ angular_velocity(R) + joint.gear_ratio * rate(theta_m)
+            out.kinetic += 0.5 * motor.rotor_inertia * float(spin) ** 2
+        out.potential += 0.5 * joint.stiffness * float(theta_m[NOW] - q[NOW]) ** 2
+        if joint.kind == "prismatic":
+            r = r + q[:, None] * (R @ axis)
+        else:
+            R = R @ turned(q[:, None] * axis)
+        if isinstance(link, RigidLink):
+            out.body(link, r, R)
+            r = r + R @ np.array(link.tip)
+            continue
+        q_f = moved[:, layout.q_f[i].start - n : layout.q_f[i].stop - n]
+        if link.kinematics == "linear":
+            points, sections, weights, tip, tip_turn, strain = linear_link(link, q_f)
+        else:
+            last = i == len(system.links) - 1 and system.payload is None
+            points, sections, weights, tip, tip_turn, strain = exact_rod(link, q_f, free_end=last)
+        out.potential += strain
+        inertial = r[:, None] + points @ np.swapaxes(R, 1, 2)
+        frames = R[:, None] @ sections
+        axial = np.einsum("ni,ni->n", frames[NOW, :, :, 0], angular_velocity(frames))
+        out.kinetic += 0.5 * link.mass_per_length * float((rate(inertial) ** 2).sum(axis=1) @ weights)
+        out.kinetic += 0.5 * link.polar_inertia_per_length * float(axial**2 @ weights)
+        out.potential -= link.mass_per_length * float(weights @ inertial[NOW] @ out.gravity)
+        r, R = r + (R @ tip[..., None])[..., 0], R @ tip_turn
+    if system.payload is not None:
+        out.body(system.payload, r, R)
+    return out.kinetic, out.potential
+
+
+@pytest.mark.parametrize("system", SYSTEMS.values(), ids=SYSTEMS.keys())
+def test_energy_is_that_of_all_points_and_slices(system: System) -> None:
+    model = Model(system)
+    x, v = random_states(model.layout, 3, seed=30)
+    moving = model.energy_columns(x, v) @ model.nominal
+    at_rest = model.energy_columns(x, 0.0 * v) @ model.nominal
+    for b in range(len(x)):
+        K, U = energy(system, model.layout, x[b], v[b])
+        np.testing.assert_allclose(moving[b] - at_rest[b], K, rtol=RELATIVE)
+        np.testing.assert_allclose(at_rest[b], U, rtol=RELATIVE)

@@ -1,0 +1,94 @@
+"""What replay and demo share: a session streamed through the estimator, and what is made of its end."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable, Iterable
+from pathlib import Path
+from time import perf_counter
+
+from sms_adapters.system_file import load_system
+from sms_online.description.schema import System
+from sms_online.model.base_parameters import find_base_parameters
+from sms_online.model.model import Model
+from sms_online.pipeline.estimator import Estimator
+from sms_online.results import results_document
+from sms_online.stream import Block
+from sms_online.trackers.square_root import RecursiveLeastSquares
+from sms_tools.exit_codes import INTERRUPTED, NOTHING_DETERMINED, OK
+from sms_tools.interruption import Interruption
+from sms_tools.priors import base_prior
+from sms_tools.report import Document, parameter_table, report_console, show, trust_lines
+from sms_tools.results_file import to_json, write_results
+
+
+def described_system(args: argparse.Namespace) -> tuple[System, Path | None]:
+    """The system asked for, and the directory of its file, where its DBC stands too; None for a shipped one."""
+    system = load_system(args.system)
+    path = Path(args.system)
+    return system, path.parent if path.suffix == ".toml" else None
+
+
+def new_estimator(system: System, channels: tuple[str, ...], source: str, nominal_prior: bool = False) -> Estimator:
+    """The estimator of a session, with the system file's priors; nominal_prior: see `base_prior`."""
+    if not (nominal_prior or system.priors):
+        return Estimator(system, channels, source)
+    base = find_base_parameters(Model(system))
+    prior = base_prior(system, base, nominal_prior)
+    return Estimator(system, channels, source, RecursiveLeastSquares(base.n, prior=prior))
+
+
+def stream(
+    estimator: Estimator, blocks: Iterable[Block], interruption: Interruption, after: Callable[[], None] | None = None
+) -> float:
+    """Push the blocks until they or the person's patience end, then finish; seconds spent in the estimator.
+
+    after: called when a block is through.
+    """
+    busy = 0.0
+    for block in blocks:
+        start = perf_counter()
+        estimator.push(block)
+        busy += perf_counter() - start
+        if after is not None:
+            after()
+        if interruption.requested:
+            break
+    start = perf_counter()
+    estimator.finish()
+    estimator.estimate()
+    return busy + perf_counter() - start
+
+
+def conclude(args: argparse.Namespace, document: Document, directory: Path, interrupted: bool) -> int:
+    """Write results.json, print it for people or programs, and say how the session ended."""
+    path = write_results(directory, document)
+    closing = f"results: {path}"
+    if interrupted:
+        closing = f"interrupted: this is what the samples until then say\n{closing}"
+    show(report_console(args.json), parameter_table(document), "", *trust_lines(document), closing)
+    if args.json:
+        print(to_json(document))
+    if interrupted:
+        return INTERRUPTED
+    return OK if any(p["identifiable"] for p in document["parameters"]) else NOTHING_DETERMINED
+
+
+def document_of(
+    estimator: Estimator, throughput: float, warnings: list[str], truth: dict[str, float] | None
+) -> Document:
+    """results.json of a session, with what the synchroniser and the sensing noticed among its warnings."""
+    counters = estimator.counters
+    noticed = []
+    if counters.gaps:
+        noticed.append(f"{counters.gaps} gaps too long to bridge; each begins a new window of the balance")
+    if counters.interpolated_cells:
+        noticed.append(f"{counters.interpolated_cells} cells interpolated")
+    if estimator.sensing.unused:
+        noticed.append(f"channels not used: {', '.join(estimator.sensing.unused)}")
+    names = [parameter.name for parameter in estimator.base.physical]
+    if truth is not None and not truth.keys() >= set(names):
+        missing = next(name for name in names if name not in truth)
+        noticed.append(f"no comparison with the truth: it does not hold {missing}")
+        truth = None
+    return results_document(estimator, throughput, [*warnings, *noticed], truth)

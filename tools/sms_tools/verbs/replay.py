@@ -1,0 +1,85 @@
+"""replay: a recorded session through the estimator, as fast as it goes or in step with its clock."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Iterable, Iterator
+from contextlib import nullcontext
+from pathlib import Path
+from time import perf_counter
+
+from rich.console import Console
+from rich.progress import BarColumn, DownloadColumn, Progress, TextColumn, TimeRemainingColumn
+
+from sms_adapters.sources import open_source
+from sms_adapters.truth import read_truth
+from sms_online.description.channels import channels
+from sms_online.errors import InputError
+from sms_online.stream import Block
+from sms_tools.interruption import Interruption
+from sms_tools.results_file import results_directory
+from sms_tools.session import conclude, described_system, document_of, new_estimator, stream
+
+# A progress bar appears from this size on, bytes: a second of work.
+LONG_FILE = 20_000_000
+# Samples pushed at a time: few enough to answer Ctrl-C soon, many enough that a push costs nothing beside its samples.
+PIECE = 1024
+# In step with the clock, a push holds so much of the session, s.
+PACE = 0.05
+
+
+def run(args: argparse.Namespace) -> int:
+    """Replay a capture; 0, 3 where nothing is determined, 130 where interrupted."""
+    if args.stop is not None and args.start is not None and args.stop <= args.start:
+        raise InputError("-to", "", f"{args.stop:g} s", f"a time after -ss {args.start:g} s")
+    system, folder = described_system(args)
+    directory = results_directory(args.out)
+    capture: Path = args.capture
+    truth = read_truth(capture)
+    opened = perf_counter()
+    progress = _progress(capture, always=args.speed == "1")
+    with progress or nullcontext(), Interruption() as interruption:
+        on_bytes = None
+        if progress is not None:
+            task = progress.add_task(capture.name, total=capture.stat().st_size)
+
+            def on_bytes(consumed: int) -> None:
+                progress.update(task, completed=consumed)
+
+        source = open_source(capture, system, args.start, args.stop, on_bytes, set(channels(system)), folder)
+        estimator = new_estimator(system, source.channels, str(capture), args.prior)
+        if args.speed == "1":
+            blocks = _paced(_pieces(source, max(1, round(PACE * system.sample_rate))), interruption)
+        else:
+            blocks = _pieces(source, PIECE)
+        stream(estimator, blocks, interruption)
+        wall = perf_counter() - opened
+    parameters = None if truth is None else truth["parameters"]
+    document = document_of(estimator, estimator.samples / wall, source.warnings, parameters)
+    return conclude(args, document, directory, interruption.requested)
+
+
+def _progress(capture: Path, always: bool) -> Progress | None:
+    """A bar by bytes, for a person at a terminal and where there is time to watch it."""
+    console = Console(stderr=True)
+    if not console.is_terminal or not capture.is_file() or not (always or capture.stat().st_size >= LONG_FILE):
+        return None
+    text = TextColumn("{task.description}")
+    return Progress(text, BarColumn(), DownloadColumn(), TimeRemainingColumn(), console=console, transient=True)
+
+
+def _pieces(blocks: Iterable[Block], rows: int) -> Iterator[Block]:
+    """The same samples in blocks of at most so many rows; the estimator's result does not depend on it."""
+    for block in blocks:
+        for k in range(0, block.t.size, rows):
+            yield Block(block.t[k : k + rows], block.channels, block.values[k : k + rows])
+
+
+def _paced(blocks: Iterable[Block], interruption: Interruption) -> Iterator[Block]:
+    """Each block when its last sample is due, counted from the first."""
+    start = perf_counter()
+    first: float | None = None
+    for block in blocks:
+        first = float(block.t[0]) if first is None else first
+        interruption.sleep(start + float(block.t[-1]) - first - perf_counter())
+        yield block
