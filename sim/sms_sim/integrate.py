@@ -49,8 +49,8 @@ class Radau:
     c (s,): nodes, the last is 1. A (s, s); its last row are the weights b. A⁻¹ = T diag(eigenvalues) T⁻¹, complex, of
     which p = (s + 1) / 2 are kept: the real one first, then one of each conjugate pair. T (s, p) has the columns of the
     latter doubled, so that the real part of T w is the whole product; T_inverse (p, s). error_weights (s,): the
-    embedded estimate of IV.8, (8.17), with the left end's rate at weight 1. basis (s, s): from the powers θ … θ^s to the
-    Lagrange polynomials on the nodes {0, c} that vanish at 0.
+    embedded estimate of IV.8, (8.17), with the left end's rate at weight 1. basis (s, s): from the powers θ … θ^s to
+    the Lagrange polynomials on the nodes {0, c} that vanish at 0.
     """
 
     c: Array

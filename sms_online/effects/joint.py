@@ -14,7 +14,7 @@ class _MotorSide:
 
     def __init__(self, i: int, parameter: Parameter) -> None:
         self.i = i
-        self.parameters = (parameter,)
+        self.parameters: tuple[Parameter, ...] = (parameter,)
 
     def along(self, rate: Array) -> Array:
         """Force (B,) of one unit of the coefficient at motor rates θ̇_m (B,)."""

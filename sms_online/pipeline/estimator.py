@@ -68,8 +68,8 @@ class Estimator:
         self._attitude = AttitudeContinuity()
         self._synchroniser = Synchroniser(self.sensing.channels, system.sample_rate)
         layout = self.model.layout
-        columns = layout.n_x + len(layout.q)
-        self._rates = RatesStage(system.sample_rate, range(layout.n_x), np.full(columns, np.nan))
+        # Positions choose the filter's width; torques pass the same filter for the sake of the lag.
+        self._rates = RatesStage(system.sample_rate, range(layout.n_x), self.sensing.noise)
         self._energy = EnergyBalance(self.model, self.base, system.sample_rate)
         self._joints = JointBalance(self.model, self.base, system.sample_rate)
         self.joint_residuals = [SquaredResidual(np.zeros((self.base.n + 1, self.base.n + 1))) for _ in layout.q]

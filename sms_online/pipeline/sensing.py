@@ -6,7 +6,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from sms_online.description.channels import sensed_channels
 from sms_online.errors import InputError
+from sms_online.model.beam import LinearLink
 from sms_online.model.model import Model
 from sms_online.stream import Array, Block
 
@@ -57,6 +59,24 @@ class Sensing:
         self.channels = tuple(channels)
         self.unused = tuple(name for name in available if name not in channels)
 
+    @property
+    def noise(self) -> Array:
+        """Stated white noise, 1σ per sample, of positions and joint torques (n_x + joints,); NaN where nothing is stated.
+
+        Strain coefficients of exact links mix several markers, so nothing is stated of them.
+        """
+        stated = np.full(len(self.channels), np.nan)
+        for sensor in self.model.system.sensors:
+            for name in sensed_channels(self.model.system, sensor):
+                if name in self.channels and sensor.noise > 0.0:
+                    stated[self.channels.index(name)] = sensor.noise
+        markers = [
+            stated[columns] if isinstance(kinematics, LinearLink) else np.full(kinematics.n_f, np.nan)
+            for kinematics, columns in zip(self._flexible, self._markers, strict=True)
+        ]
+        joints = stated[self._torque] * self._ratio
+        return np.concatenate((stated[self._base], stated[self._q], stated[self._theta_m], *markers, joints))
+
     def coordinates(self, values: Array) -> Array:
         """Positions x (B, n_x) of samples (B, channels)."""
         parts = [values[:, self._base], values[:, self._q], values[:, self._theta_m]]
@@ -79,7 +99,7 @@ class AttitudeContinuity:
         """The block with continuous Euler parameters; blocks without them pass as they are."""
         if not set(EULER_PARAMETERS) <= set(block.channels):
             return block
-        columns = [block.channels.index(name) for name in EULER_PARAMETERS]
+        columns = np.array([block.channels.index(name) for name in EULER_PARAMETERS])
         rows = np.flatnonzero(np.isfinite(block.values[:, columns]).all(axis=1))
         if rows.size == 0:
             return block

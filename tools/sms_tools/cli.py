@@ -20,7 +20,7 @@ from sms_tools.exit_codes import BAD_INPUT, INTERRUPTED, OK
 
 PROGRAM = "sms-online"
 # A sum that BLAS splits over threads is rounded differently for every number of threads, and the same samples must give
-# the same bits on every machine. The matrices are small; threads would not make them faster. Read when NumPy is imported.
+# the same bits. The matrices are small; threads would not make them faster. Both are read when NumPy is imported.
 for _variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
     os.environ.setdefault(_variable, "1")
 

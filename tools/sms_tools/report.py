@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import sys
+from collections.abc import Callable
 from typing import Any
 
 from rich.console import Console
@@ -11,8 +12,12 @@ from rich.table import Table
 
 # Width of a table that goes to a file or a pipe, where there is no terminal to ask.
 FILE_WIDTH = 140
-# Digits of an estimate: two of its standard deviation are meant to be seen, no fewer and no more than these in all.
+# A terminal narrower than this has no room for the intervals, which ± std tells too.
+WIDTH_WITH_INTERVAL = 112
+# Significant digits of an estimate: as many as show two of its standard deviation, within these bounds.
 LEAST_DIGITS, MOST_DIGITS = 2, 7
+# Powers of ten below this one are written as such.
+SMALLEST_PLAIN = -4
 NOT_DETERMINED = "not determined"
 
 Document = dict[str, Any]
@@ -32,25 +37,24 @@ def show(console: Console, *parts: Table | str) -> None:
     console.file.write(capture.get())
 
 
-def parameter_table(document: Document, title: str | None = None) -> Table:
-    """Parameter, unit, estimate ± std, 95 % interval, and the truth and the error where it is known."""
+def parameter_table(document: Document, width: int, title: str | None = None) -> Table:
+    """Parameter, unit, estimate ± std, 95 % interval where `width` allows it, truth and error where it is known."""
     parameters = document["parameters"]
     simulated = any(p["true"] is not None for p in parameters)
     table = Table(title=title, title_justify="left", box=None, header_style="bold", pad_edge=False)
     table.add_column("parameter", overflow="fold")
     table.add_column("unit")
-    for heading in ("estimate", "± std", "95 % interval"):
-        table.add_column(heading, justify="right")
-    if simulated:
-        table.add_column("true", justify="right")
-        table.add_column("error %", justify="right")
+    wide = width >= WIDTH_WITH_INTERVAL
+    headings = ["estimate", "± std"] + ["95 % interval"] * wide + ["true", "error %"] * simulated
+    for heading in headings:
+        table.add_column(heading, justify="right", no_wrap=True)
     for p in parameters:
-        cells = [p["name"], p["unit"], NOT_DETERMINED, "", ""]
-        digits = MOST_DIGITS
+        cells = [p["name"], p["unit"], NOT_DETERMINED, ""] + [""] * wide
         if p["identifiable"]:
-            digits = _digits(p["estimate"], p["std"])
-            interval = f"{_number(p['lower95'], digits)} … {_number(p['upper95'], digits)}"
-            cells[2:] = _number(p["estimate"], digits), f"{p['std']:.2g}", interval
+            shown = _formatter(p["estimate"], p["std"])
+            cells[2:4] = shown(p["estimate"]), f"{p['std']:.2g}"
+            if wide:
+                cells[4] = f"{shown(p['lower95'])} … {shown(p['upper95'])}"
         if simulated:
             cells.append("" if p["true"] is None else f"{p['true']:.6g}")
             cells.append(_error(p))
@@ -58,17 +62,14 @@ def parameter_table(document: Document, title: str | None = None) -> Table:
     return table
 
 
-def _digits(estimate: float, std: float) -> int:
-    """Significant digits that end with the second one of the standard deviation."""
-    if estimate == 0.0 or std == 0.0:
-        return MOST_DIGITS
-    digits = math.floor(math.log10(abs(estimate))) - math.floor(math.log10(std)) + 2
-    return min(MOST_DIGITS, max(LEAST_DIGITS, digits))
-
-
-def _number(value: float, digits: int) -> str:
-    """With trailing zeros, which say how well it is known."""
-    return f"{value:#.{digits}g}".rstrip(".")
+def _formatter(estimate: float, std: float) -> Callable[[float], str]:
+    """Formats an estimate and its interval down to the second digit of the standard deviation."""
+    magnitude = math.floor(math.log10(abs(estimate))) if estimate else 0
+    second = math.floor(math.log10(std)) - 1 if std else -math.inf
+    digits = int(min(MOST_DIGITS, max(LEAST_DIGITS, magnitude - second + 1)))
+    if magnitude < SMALLEST_PLAIN:
+        return lambda value: f"{value:.{digits - 1}e}"
+    return lambda value: f"{value:.{max(0, digits - 1 - magnitude)}f}"
 
 
 def _error(p: Document) -> str:

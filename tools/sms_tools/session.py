@@ -66,7 +66,8 @@ def conclude(args: argparse.Namespace, document: Document, directory: Path, inte
     closing = f"results: {path}"
     if interrupted:
         closing = f"interrupted: this is what the samples until then say\n{closing}"
-    show(report_console(args.json), parameter_table(document), "", *trust_lines(document), closing)
+    console = report_console(args.json)
+    show(console, parameter_table(document, console.width), "", *trust_lines(document), closing)
     if args.json:
         print(to_json(document))
     if interrupted:

@@ -55,7 +55,7 @@ def _draw(live: Live, document: Callable[[float], Document], duration: float) ->
         if perf_counter() - drawn >= TABLE_INTERVAL:
             now = document(0.0)
             title = f"{now['system']['title']}: {now['duration_s']:.1f} of {duration:g} s"
-            live.update(parameter_table(now, title), refresh=True)
+            live.update(parameter_table(now, live.console.width, title), refresh=True)
             drawn = perf_counter()
 
     return draw

@@ -13,7 +13,6 @@ from rich.progress import BarColumn, DownloadColumn, Progress, TextColumn, TimeR
 
 from sms_adapters.sources import open_source
 from sms_adapters.truth import read_truth
-from sms_online.description.channels import channels
 from sms_online.errors import InputError
 from sms_online.stream import Block
 from sms_tools.interruption import Interruption
@@ -46,7 +45,7 @@ def run(args: argparse.Namespace) -> int:
             def on_bytes(consumed: int) -> None:
                 progress.update(task, completed=consumed)
 
-        source = open_source(capture, system, args.start, args.stop, on_bytes, set(channels(system)), folder)
+        source = open_source(capture, system, args.start, args.stop, on_bytes, folder)
         estimator = new_estimator(system, source.channels, str(capture), args.prior)
         if args.speed == "1":
             blocks = _paced(_pieces(source, max(1, round(PACE * system.sample_rate))), interruption)
