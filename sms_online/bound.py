@@ -1,4 +1,4 @@
-"""Cramér–Rao bound of π: the least standard deviation that an unbiased estimator can reach with given sensors and motion.
+"""Cramér–Rao bound of π: the least standard deviation that an unbiased estimator can reach with given sensors.
 
 All positions and the joint torques are measured with white noise. The measured torque is the input of the equations of
 motion, so its noise drives the state; controller and initial state are unknown. Linearised about the true motion, with
@@ -26,7 +26,7 @@ from sms_online.stream import Array
 # Step of the central differences, rad, m (and s along the motion): truncation and rounding both near 1e-10 relative.
 DIFFERENCE = 1e-5
 # States evaluated in one call of the model: enough to hide the cost of a call, little memory.
-STATES_PER_CALL = 4000
+STATES_PER_CALL = 2000
 # Initial standard deviations, rad or m and rad/s or m/s, that leave the initial state free: ten thousand times what
 # sensors of the coarsest grade resolve.
 FREE_POSITION = 10.0
@@ -67,14 +67,14 @@ def cramer_rao_bound(
 ) -> Array:
     """Least standard deviation (n,) of every base parameter, in its unit; inf where the motion does not determine it.
 
-    t (B,) s, uniform; x (B, n_x), v (B, n_v), n τ (B, joints) on the true motion under `dynamics`; the last instant only
-    ends the last step. sigma_x (n_x,): noise of the positions, markers in the place of elastic coordinates; sigma_tau
-    (joints,): of n τ, N m (N). Both 1σ, white per sample at the system's sample rate, positive.
+    t (B,) s, uniform; x (B, n_x), v (B, n_v), n τ (B, joints) on the true motion under `dynamics`; the last instant
+    only ends the last step. sigma_x (n_x,): noise of the positions, markers in the place of elastic coordinates;
+    sigma_tau (joints,): of n τ, N m (N). Both 1σ, white per sample at the system's sample rate, positive.
 
-    t may be coarser than that rate, a whole session at 1 kHz is seldom needed: of white noise only the density σ² T_s
-    matters where the step is short against what an estimator averages over, so that fewer samples with less noise say
-    the same. The step has to follow the motion, though. Planar example, grade B, 20 s: 2 and 1 ms agree to 0.5 %, but
-    for joint_2.damping to 4 %; 10 ms gives that one, which lives in the jolt at the start, 28 % too low.
+    t may be coarser than that rate: of white noise only the density σ² T_s matters where the step is short against what
+    an estimator averages over, so that fewer samples with less noise say the same. The step has to follow the motion,
+    though. Planar example, grade B, 20 s: 1 and 2 ms agree to 0.5 %, but for joint_2.damping to 4 %; at 10 ms that one,
+    which lives in the jolt at the start, comes out 28 % too low.
     Raises ValueError where t is not uniform.
     """
     step = (t[-1] - t[0]) / (t.size - 1)
@@ -86,7 +86,7 @@ def cramer_rao_bound(
     sensors = sigma_x / shrink
     drive = sigma_tau / shrink
     information = Information(model.layout.n_v, base.n)
-    B = max(1, STATES_PER_CALL // (2 * model.layout.n_v))
+    B = max(1, STATES_PER_CALL // model.layout.n_v)
     for start in range(0, t.size - 1, B):
         rows = slice(start, start + B + 1)
         linear = linearise(dynamics, base, x[rows], v[rows], joint_torque[rows])
@@ -104,7 +104,8 @@ def linearise(dynamics: Dynamics, base: BaseParameters, x: Array, v: Array, join
     model, layout = dynamics.model, dynamics.model.layout
     (B, n_v), joints = v.shape, joint_torque.shape[1]
     H, bias = dynamics.mass_and_bias(x, v)
-    a: Array = np.linalg.solve(H, (model.generalized_force(joint_torque) - bias)[..., None])[..., 0]
+    Q = model.generalized_force(joint_torque)
+    a = np.asarray(np.linalg.solve(H, (Q - bias)[..., None])[..., 0], dtype=np.float64)
     # Every instant n_v times, moved along one coordinate or rate each.
     x_n, v_n, a_n = (np.repeat(values, n_v, axis=0) for values in (x, v, a))
     dv = DIFFERENCE * np.tile(np.eye(n_v), (B, 1))

@@ -1,0 +1,252 @@
+"""Bad input: one line that says what is wrong and where, the right exit code, and nothing half-written."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from sms_adapters.truth import truth_path
+from sms_tools.cli import main
+
+INERTIA, DAMPING = 0.3, 0.1  # kg m², N m s/rad
+AXIS = f"""
+name = "axis"
+motion = "planar"
+sample_rate = 200.0
+[joint_1]
+transmission = "rigid"
+[link_1]
+kind = "rigid"
+inertia = {{ zz = {INERTIA} }}
+[[effect]]
+name = "viscous_friction"
+where = "joint_1"
+coefficients = {{ damping = {DAMPING} }}
+"""
+FLEXIBLE_LINK = """
+[link_1]
+kind = "flexible"
+length = 0.0
+elements = 1
+mass_per_length = 1.0
+flexural_rigidity_z = 10.0
+deformations = ["bending_z"]
+"""
+
+
+def rows(seconds: float = 6.0) -> list[str]:
+    """An axis that is moved: header and 200 rows a second, the torque by inverse dynamics."""
+    t = np.arange(round(200 * seconds)) / 200.0
+    q = np.sin(2 * t) + 0.3 * np.sin(5 * t)
+    rate, acceleration = 2 * np.cos(2 * t) + 1.5 * np.cos(5 * t), -4 * np.sin(2 * t) - 7.5 * np.sin(5 * t)
+    torque = INERTIA * acceleration + DAMPING * rate
+    return ["t,force_1,q_1", *(f"{a},{b},{c}" for a, b, c in zip(t.tolist(), torque.tolist(), q.tolist(), strict=True))]
+
+
+@pytest.fixture
+def bench(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A working directory with a good system and a good capture."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "axis.toml").write_text(AXIS)
+    (tmp_path / "run.csv").write_text("\n".join(rows()) + "\n")
+    return tmp_path
+
+
+def refusal(bench: Path, capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
+    """The one line on stderr of a run that ends with 2 and leaves the directory as it was."""
+    before = {path: path.stat().st_mtime_ns for path in bench.rglob("*")}
+    assert main(arguments) == 2
+    out, err = capsys.readouterr()
+    assert out == ""
+    assert err.startswith("sms-online")
+    assert err.count("\n") == 1
+    assert {path: path.stat().st_mtime_ns for path in bench.rglob("*")} == before
+    return err
+
+
+def replayed(bench: Path, capsys: pytest.CaptureFixture[str], *options: str) -> tuple[int, dict[str, Any]]:
+    """Exit code and results of replaying run.csv."""
+    code = main(["replay", "run.csv", "--system", "axis.toml", "--out", "done", "--json", *options])
+    capsys.readouterr()
+    return code, json.loads((bench / "done" / "results.json").read_text())
+
+
+def assert_right(document: dict[str, Any]) -> None:
+    estimates = {p["name"]: p["estimate"] for p in document["parameters"]}
+    assert estimates["link_1.inertia"] == pytest.approx(INERTIA, rel=1e-4)
+    assert estimates["viscous_friction@joint_1.damping"] == pytest.approx(DAMPING, rel=1e-4)
+
+
+def test_the_bench_itself_is_in_order(bench: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    code, document = replayed(bench, capsys)
+    assert code == 0
+    assert document["warnings"] == []
+    assert_right(document)
+
+
+@pytest.mark.parametrize(
+    ("text", "place", "found"),
+    [
+        (None, "run.csv", "No such file"),
+        ("", "run.csv", "an empty file"),
+        ("t,force_1,q_1\n", "run.csv", "no samples"),
+        ("0,1,2\n1,1,2\n", "run.csv, line 1", "no header"),
+        (
+            "t,force_1,q1\n0,1,2\n",
+            "run.csv, line 1",
+            "unknown channel 'q1'; expected a channel of this system",
+        ),
+        ("t,q_1\n0,1\n", "run.csv, header", "force_1"),
+    ],
+)
+def test_a_capture_that_is_none(
+    bench: Path, capsys: pytest.CaptureFixture[str], text: str | None, place: str, found: str
+) -> None:
+    (bench / "run.csv").unlink()
+    if text is not None:
+        (bench / "run.csv").write_text(text)
+    line = refusal(bench, capsys, "replay", "run.csv", "--system", "axis.toml", "--out", "done")
+    assert place in line
+    assert found in line
+
+
+@pytest.mark.parametrize(
+    ("row", "found"),
+    [
+        ("3.0,1", "run.csv, line 602: 2 cells; expected 3"),
+        ("3.0,one,1", "run.csv, line 602, column force_1: 'one'"),
+        ("2.9,1,1", "run.csv, line 602: time 2.9 s, before that of the line above"),
+    ],
+)
+def test_a_malformed_line_in_the_middle(bench: Path, capsys: pytest.CaptureFixture[str], row: str, found: str) -> None:
+    lines = rows()
+    (bench / "run.csv").write_text("\n".join([*lines[:601], row, *lines[602:]]) + "\n")
+    assert found in refusal(bench, capsys, "replay", "run.csv", "--system", "axis.toml", "--out", "done")
+
+
+@pytest.mark.parametrize(
+    ("text", "found"),
+    [
+        (AXIS.replace("sample_rate", "sampel_rate"), "unknown key 'sampel_rate'"),
+        (AXIS[: AXIS.index("[link_1]")] + FLEXIBLE_LINK, "link_1.length: 0.0; expected a number greater than 0"),
+        (AXIS.replace("viscous_friction", "vicious_friction"), "'vicious_friction'"),
+        (AXIS + '[prior."link_1.inertai"]\nvalue = 1.0\nstd = 0.1\n', "'link_1.inertia'"),
+        (AXIS + '[known]\n"link_1.inertai" = 1.0\n', "link_1.inertai"),
+        ("name = ", "expected valid TOML"),
+        (None, "axis.toml: no such file or directory"),
+    ],
+)
+def test_a_system_file_that_is_wrong(
+    bench: Path, capsys: pytest.CaptureFixture[str], text: str | None, found: str
+) -> None:
+    (bench / "axis.toml").unlink()
+    if text is not None:
+        (bench / "axis.toml").write_text(text)
+    assert found in refusal(bench, capsys, "replay", "run.csv", "--system", "axis.toml", "--out", "done")
+
+
+@pytest.mark.parametrize("verb", [("replay", "run.csv"), ("demo",), ("markers",), ("simulate", "--capture", "new.csv")])
+def test_a_system_that_is_not_shipped(bench: Path, capsys: pytest.CaptureFixture[str], verb: tuple[str, ...]) -> None:
+    assert "'paper-planar'" in refusal(bench, capsys, *verb, "--system", "paper-plana")
+
+
+def test_a_can_log_needs_its_dbc(bench: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (bench / "run.log").write_text("(0.000000) can0 001#0102030405060708\n")
+    line = refusal(bench, capsys, "replay", "run.log", "--system", "axis.toml", "--out", "done")
+    assert "a CAN log without a DBC" in line
+    (bench / "axis.toml").write_text(AXIS + '[source]\nkind = "can"\ndbc = "drive.dbc"\nsignals = { "A.B" = "q_1" }\n')
+    assert "drive.dbc" in refusal(bench, capsys, "replay", "run.log", "--system", "axis.toml", "--out", "done")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "found"),
+    [
+        ((), "VERB"),
+        (("reply", "run.csv"), "invalid choice: 'reply'"),
+        (("replay", "--system", "axis.toml"), "required: CAPTURE"),
+        (("replay", "run.csv"), "required: --system"),
+        (("replay", "run.csv", "--sys", "axis.toml"), "--sys"),
+        (
+            ("replay", "run.csv", "--system", "axis.toml", "-ss", "-1"),
+            "-ss: '-1'; expected a number of seconds",
+        ),
+        (("replay", "run.csv", "--system", "axis.toml", "-to", "later"), "-to: 'later'"),
+        (("replay", "run.csv", "--system", "axis.toml", "-ss", "3", "-to", "2"), "-to: 2 s; expected a time after"),
+        (("replay", "run.csv", "--system", "axis.toml", "-ss", "60"), "no samples from 60 s"),
+        (("replay", "run.mf4", "--system", "axis.toml"), "a name ending in .csv"),
+        (("replay", "run.csv", "--system", "axis.toml", "--out", "axis.toml/x"), "axis.toml is no directory"),
+        (("simulate", "--system", "paper-planar", "--capture", "new.csv", "--duration", "0"), "greater than 0"),
+        (("simulate", "--system", "paper-planar", "--capture", "new.csv", "--grade", "D"), "'D'"),
+        (("simulate", "--system", "paper-planar", "--capture", "new.csv", "--seed", "-1"), "a whole number, 0 or more"),
+        (("simulate", "--system", "paper-planar", "--capture", "new.txt"), "ending in .csv"),
+        (("simulate", "--system", "paper-planar", "--capture", "absent/new.csv"), "No such file"),
+        (("simulate", "--system", "axis.toml", "--capture", "new.csv"), "trajectory"),
+        (("demo", "--system", "axis.toml"), "expected a controller and a trajectory"),
+        (("import", "pumps", "x.mat", "--capture", "new.csv"), "'pumps'"),
+        (("import", "emps", "x.mat", "--capture", "new.csv"), "No such file"),
+        (("markers", "--system", "paper-planar", "--modes", "0"), "a whole number, 1 or more"),
+    ],
+)
+def test_arguments_that_make_no_sense(
+    bench: Path, capsys: pytest.CaptureFixture[str], arguments: tuple[str, ...], found: str
+) -> None:
+    assert found in refusal(bench, capsys, *arguments)
+
+
+def test_a_truth_that_is_none(bench: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    truth_path(bench / "run.csv").write_text("{")
+    line = refusal(bench, capsys, "replay", "run.csv", "--system", "axis.toml", "--out", "done")
+    assert "run.csv.truth.json" in line
+
+
+def test_without_motion_nothing_is_determined_and_that_is_written(
+    bench: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    still = [f"{k / 200},0.0,0.5" for k in range(1200)]
+    (bench / "run.csv").write_text("\n".join(["t,force_1,q_1", *still]) + "\n")
+    code, document = replayed(bench, capsys)
+    assert code == 3
+    assert document["samples"] == 1200
+    assert not any(p["identifiable"] for p in document["parameters"])
+    assert main(["replay", "run.csv", "--system", "axis.toml", "--out", "again"]) == 3
+    out, err = capsys.readouterr()
+    assert out.count("not determined") == len(document["parameters"])
+    assert err == ""
+
+
+def test_a_cut_last_line_is_left_out_and_told(bench: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    lines = rows()
+    (bench / "run.csv").write_text("\n".join(lines)[:-4])
+    code, document = replayed(bench, capsys)
+    assert code == 0
+    assert document["samples"] == len(lines) - 2
+    assert document["warnings"] == [f"run.csv: 1 line skipped, line {len(lines)} is cut (no newline at its end)"]
+    assert_right(document)
+
+
+def test_empty_and_nan_cells_are_counted_and_bridged(bench: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    lines = rows()
+    for k in (300, 500, 501):
+        t, torque, _ = lines[k].split(",")
+        lines[k] = f"{t},{torque},{'nan' if k == 300 else ''}"
+    (bench / "run.csv").write_text("\n".join(lines) + "\n")
+    code, document = replayed(bench, capsys)
+    assert code == 0
+    assert "run.csv: 3 of 1200 cells empty or NaN in q_1" in document["warnings"]
+    assert document["lost_samples"] == 0
+    assert_right(document)
+
+
+def test_a_long_hole_is_lost_and_begins_a_new_window(bench: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    lines = rows()
+    del lines[500:700]
+    (bench / "run.csv").write_text("\n".join(lines) + "\n")
+    code, document = replayed(bench, capsys)
+    assert code == 0
+    assert document["lost_samples"] >= 200
+    assert any("too long to bridge" in warning for warning in document["warnings"])
+    assert_right(document)
