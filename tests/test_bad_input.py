@@ -6,27 +6,12 @@ import json
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
+from axis import AXIS, DAMPING, INERTIA, capture_lines
 
 from sms_adapters.truth import truth_path
 from sms_tools.cli import main
 
-INERTIA, DAMPING = 0.3, 0.1  # kg m², N m s/rad
-AXIS = f"""
-name = "axis"
-motion = "planar"
-sample_rate = 200.0
-[joint_1]
-transmission = "rigid"
-[link_1]
-kind = "rigid"
-inertia = {{ zz = {INERTIA} }}
-[[effect]]
-name = "viscous_friction"
-where = "joint_1"
-coefficients = {{ damping = {DAMPING} }}
-"""
 FLEXIBLE_LINK = """
 [link_1]
 kind = "flexible"
@@ -38,21 +23,12 @@ deformations = ["bending_z"]
 """
 
 
-def rows(seconds: float = 6.0) -> list[str]:
-    """An axis that is moved: header and 200 rows a second, the torque by inverse dynamics."""
-    t = np.arange(round(200 * seconds)) / 200.0
-    q = np.sin(2 * t) + 0.3 * np.sin(5 * t)
-    rate, acceleration = 2 * np.cos(2 * t) + 1.5 * np.cos(5 * t), -4 * np.sin(2 * t) - 7.5 * np.sin(5 * t)
-    torque = INERTIA * acceleration + DAMPING * rate
-    return ["t,force_1,q_1", *(f"{a},{b},{c}" for a, b, c in zip(t.tolist(), torque.tolist(), q.tolist(), strict=True))]
-
-
 @pytest.fixture
 def bench(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A working directory with a good system and a good capture."""
     monkeypatch.chdir(tmp_path)
     (tmp_path / "axis.toml").write_text(AXIS)
-    (tmp_path / "run.csv").write_text("\n".join(rows()) + "\n")
+    (tmp_path / "run.csv").write_text("\n".join(capture_lines()) + "\n")
     return tmp_path
 
 
@@ -123,7 +99,7 @@ def test_a_capture_that_is_none(
     ],
 )
 def test_a_malformed_line_in_the_middle(bench: Path, capsys: pytest.CaptureFixture[str], row: str, found: str) -> None:
-    lines = rows()
+    lines = capture_lines()
     (bench / "run.csv").write_text("\n".join([*lines[:601], row, *lines[602:]]) + "\n")
     assert found in refusal(bench, capsys, "replay", "run.csv", "--system", "axis.toml", "--out", "done")
 
@@ -177,6 +153,7 @@ def test_a_can_log_needs_its_dbc(bench: Path, capsys: pytest.CaptureFixture[str]
         (("replay", "run.csv", "--system", "axis.toml", "-to", "later"), "-to: 'later'"),
         (("replay", "run.csv", "--system", "axis.toml", "-ss", "3", "-to", "2"), "-to: 2 s; expected a time after"),
         (("replay", "run.csv", "--system", "axis.toml", "-ss", "60"), "no samples from 60 s"),
+        (("replay", "axis.toml/run.csv", "--system", "axis.toml"), "Not a directory"),
         (("replay", "run.mf4", "--system", "axis.toml"), "a name ending in .csv"),
         (("replay", "run.csv", "--system", "axis.toml", "--out", "axis.toml/x"), "axis.toml is no directory"),
         (("simulate", "--system", "paper-planar", "--capture", "new.csv", "--duration", "0"), "greater than 0"),
@@ -219,7 +196,7 @@ def test_without_motion_nothing_is_determined_and_that_is_written(
 
 
 def test_a_cut_last_line_is_left_out_and_told(bench: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    lines = rows()
+    lines = capture_lines()
     (bench / "run.csv").write_text("\n".join(lines)[:-4])
     code, document = replayed(bench, capsys)
     assert code == 0
@@ -229,7 +206,7 @@ def test_a_cut_last_line_is_left_out_and_told(bench: Path, capsys: pytest.Captur
 
 
 def test_empty_and_nan_cells_are_counted_and_bridged(bench: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    lines = rows()
+    lines = capture_lines()
     for k in (300, 500, 501):
         t, torque, _ = lines[k].split(",")
         lines[k] = f"{t},{torque},{'nan' if k == 300 else ''}"
@@ -242,7 +219,7 @@ def test_empty_and_nan_cells_are_counted_and_bridged(bench: Path, capsys: pytest
 
 
 def test_a_long_hole_is_lost_and_begins_a_new_window(bench: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    lines = rows()
+    lines = capture_lines()
     del lines[500:700]
     (bench / "run.csv").write_text("\n".join(lines) + "\n")
     code, document = replayed(bench, capsys)

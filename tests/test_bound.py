@@ -12,6 +12,7 @@ from sms_online.model.base_parameters import BaseParameters, find_base_parameter
 from sms_online.model.model import Model
 from sms_online.model.so3 import from_euler_parameters, logarithm
 from sms_online.stream import Array
+from sms_sim.plant import Plant
 from sms_sim.simulate import ExactStates, exact_states, simulate
 
 TURNTABLE = """
@@ -56,9 +57,8 @@ def test_a_turntable_meets_the_closed_form_of_its_double_integral() -> None:
     sensitivity = -(q[:, 0] - q[0] - v[0] * t) / INERTIA
     unknowns = np.column_stack((np.ones(t.size), t, sensitivity))
     information = unknowns.T @ np.linalg.solve(covariance, unknowns)
-    assert_allclose(
-        bound_of_turntable(np.linspace(0.0, 2.0, 1001)), np.sqrt(np.linalg.inv(information)[2, 2]), rtol=1e-5
-    )
+    bound = bound_of_turntable(np.linspace(0.0, 2.0, 1001))
+    assert_allclose(bound, np.sqrt(np.linalg.inv(information)[2, 2]), rtol=1e-5)
 
 
 def test_coarser_steps_state_the_same_bound() -> None:
@@ -193,3 +193,17 @@ def test_a_step_of_a_stiff_system_is_its_matrix_exponential() -> None:
     position = (poles[1] * np.exp(poles[0] * h) - poles[0] * np.exp(poles[1] * h)) / (poles[1] - poles[0])
     assert_allclose(Phi[0, 0, 0], position, rtol=1e-9)
     assert_allclose(D[0, 0, 0], (1.0 - position) / stiffness, rtol=1e-9)
+
+
+def test_readings_of_an_exact_link_are_its_markers() -> None:
+    plant = Plant(parse_system(shipped_text("paper-planar-exact"), "paper-planar-exact"))
+    model = plant.model
+    rng = np.random.default_rng(11)
+    x, v = random_states(model, 3, rng)
+    none = np.zeros((3, 2))
+    linear = linearise(model.dynamics(model.nominal), find_base_parameters(model), x, v, none)
+    dx = 1e-6 * rng.standard_normal(v.shape)
+    readings = [plant.channel_values(none, moved(model, x, sign * dx))[:, 2:] for sign in (1.0, -1.0)]
+    expected = 0.5 * (readings[0] - readings[1])
+    s = np.concatenate((dx, np.zeros_like(v)), axis=1)
+    assert_allclose((linear.C @ s[..., None])[..., 0], expected, rtol=0, atol=1e-12)

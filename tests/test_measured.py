@@ -57,7 +57,8 @@ def test_emps_energy_fit_agrees_with_the_published_force_fit(emps_capture: Path)
     # The published values of mass and friction lie in our own 95 % intervals.
     std = standard_deviation(estimator.estimate())
     assert (np.abs(estimator.estimate().pi - PUBLISHED) < 1.96 * std)[:3].all()
-    # The force that the published fit leaves unexplained is 4.08 % of the signal; ours, of another balance, is as large.
+    # The force that the published fit leaves unexplained is 4.08 % of the signal; ours, of another balance, is as
+    # large.
     relative = results_document(estimator, 0.0, [])["residual"]["joint_1"]["relative"]
     assert 0.03 < relative < 0.05
 

@@ -1,7 +1,7 @@
 """The model's energy against a second, slow computation that knows positions alone.
 
-Every body and every slice of a link is a point and a frame; their velocities are differences of their positions R(x(t)),
-(8)–(12), (16)–(20), and integrals over links are quadratures of their own.
+Every body and every slice of a link is a point and a frame; their velocities are differences of their positions
+R(x(t)), (8)–(12), (16)–(20), and integrals over links are quadratures of their own.
 """
 
 from __future__ import annotations
@@ -34,7 +34,8 @@ def turned(vectors: Array) -> Array:
 
 def rate(samples: Array) -> Array:
     """Derivative at NOW of samples (9, ...)."""
-    return sum(w * (samples[NOW + k] - samples[NOW - k]) / STEP for k, w in enumerate(DIFFERENCE, start=1))
+    terms = [w * (samples[NOW + k] - samples[NOW - k]) / STEP for k, w in enumerate(DIFFERENCE, start=1)]
+    return np.asarray(np.sum(terms, axis=0))
 
 
 def angular_velocity(R: Array) -> Array:
@@ -73,7 +74,7 @@ class Bodies:
 
 
 def linear_link(link: FlexibleLink, q_f: Array) -> tuple[Array, Array, Array, Array, Array, float]:
-    """Points (9, n, 3), section frames (9, n, 3, 3), weights (n,), tip, its frame, strain energy: (1)–(4), (11), (14)."""
+    """Points (9, n, 3), section frames, weights (n,), tip, its frame, strain energy: (1)–(4), (11), (14)."""
     names = ("u_x", "u_y", "u_z", "theta_x", "theta_y", "theta_z")
     nodal = np.zeros((len(TIMES), link.elements + 1, 6))
     active = {"traction": "u_x", "bending_z": "u_y theta_z", "bending_y": "u_z theta_y", "torsion": "theta_x"}

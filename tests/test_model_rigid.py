@@ -123,7 +123,7 @@ DRIVEN = {
 
 @pytest.mark.parametrize("system", DRIVEN.values(), ids=DRIVEN.keys())
 def test_dynamics_are_pinocchios(system: System) -> None:
-    """M, nonlinear effects, inverse dynamics, kinetic energy and potential of gravity; rotors as bodies that spin n q̇."""
+    """M, nonlinear effects, inverse dynamics, kinetic energy and potential of gravity; rotors as bodies at n q̇."""
     model, yardstick = Model(system), Yardstick(system)
     layout = model.layout
     x, v = random_states(layout, 5, seed=20)

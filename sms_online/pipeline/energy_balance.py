@@ -14,8 +14,9 @@ from sms_online.stream import Array
 
 # Rows a second: the balance's own frequencies stay below some 20 Hz; denser rows repeat each other's noise.
 ROW_RATE = 50.0
-# Rows are differences to the first instant of a window, the paper's form. Integrated noise grows without bound, so a new window
-# begins after this time, s; it holds several periods of an exciting trajectory, and the whole of the paper's.
+# Rows are differences to the first instant of a window, the paper's form. Integrated noise grows without bound, so a
+# new window begins after this time, s; it holds several periods of an exciting trajectory, and the whole of the
+# paper's.
 WINDOW = 30.0
 # Samples on each side in the interpolation that is integrated: degree 7, no worse than the eighth-order rates.
 SIDE = 4

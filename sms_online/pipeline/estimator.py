@@ -19,9 +19,9 @@ from sms_online.stream import Array, Block
 from sms_online.trackers.interface import Estimate, Rows, Tracker
 from sms_online.trackers.square_root import RecursiveLeastSquares
 
-# Rows that pass through the pipeline together. Everything behind sees the same blocks however the samples arrive, so the
-# result is the same to the last bit. At 1 kHz it is 0.13 s: with the filter's lag still below 0.15 s, and long enough that the
-# cost of a NumPy call is shared by many samples.
+# Samples that pass through the pipeline together. Everything behind sees the same blocks however the samples arrive, so
+# the result is the same to the last bit. At 1 kHz it is 0.13 s: with the filter's lag still below 0.15 s, and long
+# enough that the cost of a NumPy call is shared by many samples.
 BLOCK = 128
 
 # What a session saves: arrays and numbers, by stage.
@@ -52,8 +52,8 @@ class SquaredResidual:
 class Estimator:
     """Streams one session of a described system.
 
-    channels: what the source's blocks hold. source: its name, for messages. tracker: square-root RLS by default, fed with the
-    rows of the energy balance. Raises InputError when a channel is missing that the model needs.
+    channels: what the source's blocks hold. source: its name, for messages. tracker: square-root RLS by default, fed with
+    the rows of the energy balance. Raises InputError when a channel is missing that the model needs.
     """
 
     def __init__(self, system: System, channels: tuple[str, ...], source: str, tracker: Tracker | None = None) -> None:

@@ -1,7 +1,7 @@
 """Momentum balance of the joints in weak form: the residual that each motor's torque leaves, over short windows.
 
-The rows that hold τ_i, (36) (on a rigid joint with (35) added), times φ(z) = (1 - z²)⁴ and integrated by parts, so that only
-positions and speeds appear: -∫ (φ̇ P + φ G) dt π = ∫ φ n τ dt.
+The rows that hold τ_i, (36) (on a rigid joint with (35) added), times φ(z) = (1 - z²)⁴ and integrated by parts, so that
+only positions and speeds appear: -∫ (φ̇ P + φ G) dt π = ∫ φ n τ dt.
 """
 
 from __future__ import annotations
@@ -14,10 +14,10 @@ from sms_online.model.model import Model
 from sms_online.pipeline.energy_balance import BalanceRows
 from sms_online.stream import Array
 
-# Exponent of the test function: with its first three derivatives zero at the ends, sums over samples are integrals to rounding.
+# Exponent of the test function: with its first three derivatives zero at the ends, sums over samples are integrals.
 EXPONENT = 4
-# A quarter of the data is enough for an rms, so short windows leave three times their width out; but windows follow each other at
-# least this often, s, and overlap by half at most.
+# A quarter of the data is enough for an rms, so short windows leave three times their width out; but windows follow
+# each other at least this often, s, and overlap by half at most.
 LARGEST_HOP = 0.4
 
 

@@ -20,6 +20,7 @@ from functools import lru_cache
 from typing import Any
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 from scipy.ndimage import correlate1d
 
@@ -39,6 +40,8 @@ AGREEMENT = 1.4
 # fit averages noise over thousands of rows and this error over none; one step costs 1.75 in noise and divides the
 # error by 20.
 UNDERSMOOTHING = 1
+# Answers are compared at every fourth sample: closer ones share most of the samples behind them.
+COMPARED = 4
 # A comparison needs several windows side by side: at least this many times M samples.
 SAMPLES_PER_HALF_WIDTH = 8
 # Noise below this many roundings of the largest value is rounding: nothing to smooth.
@@ -46,6 +49,11 @@ ROUNDINGS = 64.0
 # Samples in which σ is estimated and M is chosen. Counted in samples, not seconds, as the accuracy of both is: σ to
 # 5 %.
 WARM_UP = 1000
+# Work that one push may do, in samples filtered for each sample pushed. What waited for M is worked off at this pace,
+# so that no push takes much longer than the others; estimating the noise or choosing M counts as the samples that it
+# costs.
+PACE = 2
+DECISION_COST = 256
 # Channels move in a window when one spans this many σ in each of its halves; noise alone spans 7.
 MOTION = 20.0
 NEVER = int(np.iinfo(np.int64).max)
@@ -114,29 +122,24 @@ def choose_half_width(values: Array, sigma: Array) -> int:
     values, sigma = values[:, moving], sigma[moving]
     if np.any(sigma <= ROUNDINGS * np.spacing(np.abs(values).max(axis=0))):
         return HALF_WIDTHS[0]
-    accepted = 0
-    tried: list[tuple[Array, tuple[Array, Array]]] = []
-    for half_width in HALF_WIDTHS:
-        if half_width > HALF_WIDTHS[0] and values.shape[0] < SAMPLES_PER_HALF_WIDTH * half_width:
-            break
+    widths = [M for M in HALF_WIDTHS if HALF_WIDTHS[0] == M or values.shape[0] >= SAMPLES_PER_HALF_WIDTH * M]
+    windows = sliding_window_view(values, 2 * widths[-1] + 1, axis=0)[::COMPARED]  # (n, C, 2 M_max + 1)
+    tried: list[tuple[Array, Array]] = []
+    for half_width in widths:
+        margin = widths[-1] - half_width
         kernels = np.array(coefficients(half_width))
-        answers = smooth_and_differentiate(values, half_width, 1.0)
-        if not all(_agree(kernels, answers, *narrower, sigma) for narrower in tried):
+        answers = windows[:, :, margin : windows.shape[2] - margin] @ kernels.T
+        kernels = np.pad(kernels, ((0, 0), (margin, margin)))
+        if not all(_agree(kernels - narrower, answers - theirs, sigma) for narrower, theirs in tried):
             break
         tried.append((kernels, answers))
-        accepted = len(tried) - 1
-    return HALF_WIDTHS[max(accepted - UNDERSMOOTHING, 0)]
+    return HALF_WIDTHS[max(len(tried) - 1 - UNDERSMOOTHING, 0)]
 
 
-def _agree(
-    wide: Array, wide_answers: tuple[Array, Array], narrow: Array, narrow_answers: tuple[Array, Array], sigma: Array
-) -> bool:
-    """Whether two windows (their kernels (2, 2M + 1) and answers) differ by no more than noise can explain."""
-    margin = (wide.shape[1] - narrow.shape[1]) // 2
-    leftover = wide - np.pad(narrow, ((0, 0), (margin, margin)))
-    expected = np.linalg.norm(leftover, axis=1)[:, None] * sigma
-    difference = [a - b[margin : b.shape[0] - margin] for a, b in zip(wide_answers, narrow_answers, strict=True)]
-    found = np.sqrt(np.mean(np.square(difference), axis=1))
+def _agree(leftover: Array, difference: Array, sigma: Array) -> bool:
+    """Whether noise can explain the difference (n, C, 2) of two windows whose kernels differ by leftover (2, ·)."""
+    expected = np.linalg.norm(leftover, axis=1) * sigma[:, None]
+    found = np.sqrt(np.mean(np.square(difference), axis=0))
     return bool(np.all(found <= AGREEMENT * expected))
 
 
@@ -166,6 +169,7 @@ class RatesStage:
         self._start = 0  # grid index of the buffer's first row
         self._next = 0  # grid index of the next sample to deliver
         self._decided = 0  # grid index up to which half_width holds
+        self._noise_known = False  # of the window that is being decided
 
     @property
     def fixed(self) -> bool:
@@ -181,45 +185,68 @@ class RatesStage:
             self._start = self._next = int(samples.index[0])
             self._decided = NEVER if self._fixed else self._start
         self._buffer = np.concatenate([self._buffer, samples.values])
-        return pieces + self._advance()
+        return pieces + self._advance(PACE * samples.index.size)
 
     def flush(self) -> list[RateSamples]:
         """End of a segment or of the capture: return what has a full filter."""
+        pieces = self._advance(NEVER)
         rest = self._buffer[max(self._decided - self._start, 0) :]
         if not self._fixed and rest.shape[0] >= SAMPLES_PER_HALF_WIDTH * HALF_WIDTHS[1]:
+            self._estimate_noise(rest)
             self._choose(rest)
-        self._decided = NEVER
-        pieces = self._deliver()
+        self._decided, self._noise_known = NEVER, False
+        pieces += self._deliver(NEVER)
         self._buffer = self._buffer[:0]
         self._segment = -1
         return pieces
 
     def state(self) -> StageState:
         """Everything that the next push depends on, as arrays."""
-        numbers = [self.half_width, self._fixed, self._segment, self._start, self._next, self._decided]
+        numbers = [
+            self.half_width, self._fixed, self._segment, self._start, self._next, self._decided, self._noise_known
+        ]  # fmt: skip
         return {"buffer": self._buffer.copy(), "sigma": self.sigma.copy(), "numbers": np.array(numbers, dtype=np.int64)}
 
     def restore(self, state: Mapping[str, NDArray[Any]]) -> None:
         """Continue from a saved state of a stage made with the same arguments."""
         self._buffer, self.sigma = state["buffer"].copy(), state["sigma"].copy()
-        self.half_width, fixed, self._segment, self._start, self._next, self._decided = map(int, state["numbers"])
-        self._fixed = bool(fixed)
+        numbers = [int(number) for number in state["numbers"]]
+        self.half_width, fixed, self._segment, self._start, self._next, self._decided, noise_known = numbers
+        self._fixed, self._noise_known = bool(fixed), bool(noise_known)
 
-    def _advance(self) -> list[RateSamples]:
-        pieces = self._deliver()
-        while not self._fixed and self._start + self._buffer.shape[0] >= self._decided + self._warm_up:
-            offset = self._decided - self._start
-            window = self._buffer[offset : offset + self._warm_up]
-            self._choose(window)
-            self._fixed = self._moves_throughout(window)
-            self._decided = NEVER if self._fixed else self._decided + self._warm_up
-            pieces += self._deliver()
+    def _advance(self, budget: int) -> list[RateSamples]:
+        """Deliver and decide, as far as the samples reach and the budget lasts."""
+        pieces: list[RateSamples] = []
+        while budget > 0:
+            delivered = self._deliver(budget)
+            if delivered:
+                pieces += delivered
+                budget -= delivered[0].index.size
+            elif not self._fixed and self._start + self._buffer.shape[0] - self._warm_up >= self._decided:
+                offset = self._decided - self._start
+                self._decide(self._buffer[offset : offset + self._warm_up])
+                budget -= DECISION_COST
+            else:
+                break
         return pieces
 
-    def _choose(self, window: Array) -> None:
+    def _decide(self, window: Array) -> None:
+        """One step towards M for a full window: first its noise, then M."""
+        if not self._noise_known:
+            self._estimate_noise(window)
+            self._noise_known = True
+            return
+        self._choose(window)
+        self._noise_known = False
+        self._fixed = self._moves_throughout(window)
+        self._decided = NEVER if self._fixed else self._decided + self._warm_up
+
+    def _estimate_noise(self, window: Array) -> None:
         estimate = np.isnan(self._stated)
         self.sigma = self._stated.copy()
         self.sigma[estimate] = noise_std(window[:, estimate])
+
+    def _choose(self, window: Array) -> None:
         self.half_width = choose_half_width(window[:, self._deciding], self.sigma[self._deciding])
 
     def _moves_throughout(self, window: Array) -> bool:
@@ -227,10 +254,11 @@ class RatesStage:
         span = np.array([np.ptp(half, axis=0) for half in halves])
         return bool(np.any(np.all(span > MOTION * self.sigma[self._deciding], axis=0)))
 
-    def _deliver(self) -> list[RateSamples]:
-        """Filter what half_width holds for and what has M samples on either side; drop what no later centre needs."""
+    def _deliver(self, most: int) -> list[RateSamples]:
+        """Filter what half_width holds for and has M samples on either side, at most `most`; drop what is done with."""
         first = max(self._next, self._start + self.half_width)
         stop = min(self._decided, self._start + self._buffer.shape[0] - self.half_width)
+        stop = min(stop, first + most) if most < NEVER else stop
         if stop <= first:
             return []
         rows = self._buffer[first - self.half_width - self._start : stop + self.half_width - self._start]

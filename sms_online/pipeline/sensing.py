@@ -61,7 +61,7 @@ class Sensing:
 
     @property
     def noise(self) -> Array:
-        """Stated white noise, 1σ per sample, of positions and joint torques (n_x + joints,); NaN where nothing is stated.
+        """Stated white noise, 1σ per sample, of positions and joint torques (n_x + joints,); NaN where none is stated.
 
         Strain coefficients of exact links mix several markers, so nothing is stated of them.
         """
@@ -90,7 +90,7 @@ class Sensing:
 
 
 class AttitudeContinuity:
-    """Turns the sign of Euler parameters, which is arbitrary, so that they change continuously from sample to sample."""
+    """Turns the sign of Euler parameters, which is arbitrary, so that they are continuous from sample to sample."""
 
     def __init__(self) -> None:
         self.last = np.zeros(4)

@@ -58,6 +58,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         # must not be written at exit.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return OK
+    except OSError as error:  # a full disk, a file without permission
+        print(f"{PROGRAM}: {error}", file=sys.stderr)
+        return BAD_INPUT
     return code
 
 

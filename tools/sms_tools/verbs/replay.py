@@ -34,7 +34,6 @@ def run(args: argparse.Namespace) -> int:
     system, folder = described_system(args)
     directory = results_directory(args.out)
     capture: Path = args.capture
-    truth = read_truth(capture)
     opened = perf_counter()
     progress = _progress(capture, always=args.speed == "1")
     with progress or nullcontext(), Interruption() as interruption:
@@ -46,6 +45,7 @@ def run(args: argparse.Namespace) -> int:
                 progress.update(task, completed=consumed)
 
         source = open_source(capture, system, args.start, args.stop, on_bytes, folder)
+        truth = read_truth(capture)
         estimator = new_estimator(system, source.channels, str(capture), args.prior)
         if args.speed == "1":
             blocks = _paced(_pieces(source, max(1, round(PACE * system.sample_rate))), interruption)

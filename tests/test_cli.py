@@ -1,0 +1,360 @@
+"""The command line: what each verb prints, writes and returns."""
+
+from __future__ import annotations
+
+import csv
+import json
+import math
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+from time import perf_counter
+from typing import Any
+
+import numpy as np
+import pytest
+from axis import AXIS, DAMPING, INERTIA, MOTION, capture_lines
+from scipy.io import savemat
+
+from sms_adapters.system_file import load_system
+from sms_adapters.truth import truth_path, write_truth
+from sms_online.description.parse import parse_system, shipped_text
+from sms_online.description.schema import Sensor
+from sms_online.model.base_parameters import find_base_parameters
+from sms_online.model.model import Model
+from sms_online.pipeline.estimator import Estimator
+from sms_online.stream import Block
+from sms_sim.simulate import sampled_blocks, simulate
+from sms_tools.cli import main
+from sms_tools.live_plant import LivePlant
+from sms_tools.priors import base_prior
+
+MOVED = AXIS + MOTION
+TRUTH = {"link_1.inertia": INERTIA, "viscous_friction@joint_1.damping": DAMPING}
+
+
+@pytest.fixture
+def bench(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A working directory with an axis, one that a controller moves, and a capture of it."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "axis.toml").write_text(AXIS)
+    (tmp_path / "moved.toml").write_text(MOVED)
+    (tmp_path / "run.csv").write_text("\n".join(capture_lines()) + "\n")
+    return tmp_path
+
+
+def document(directory: Path) -> dict[str, Any]:
+    found: dict[str, Any] = json.loads((directory / "results.json").read_text())
+    return found
+
+
+def estimates(found: dict[str, Any]) -> dict[str, float]:
+    return {p["name"]: p["estimate"] for p in found["parameters"]}
+
+
+def python(*arguments: str, **options: Any) -> subprocess.CompletedProcess[str]:
+    return subprocess.run([sys.executable, *arguments], capture_output=True, text=True, timeout=60, **options)
+
+
+# replay
+
+
+def test_replay_prints_a_table_and_writes_the_document(bench: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["replay", "run.csv", "--system", "axis.toml", "--out", "done"]) == 0
+    found = document(bench / "done")
+    assert [path.name for path in (bench / "done").iterdir()] == ["results.json"]
+    assert list(found) == [
+        "schema", "system", "samples", "duration_s", "parameters", "residual", "condition_number",
+        "throughput_samples_per_s", "lost_samples", "warnings",
+    ]  # fmt: skip
+    assert found["schema"] == "sms-online/results/1"
+    assert found["samples"] == 1200
+    assert found["duration_s"] == pytest.approx(1199 / 200)
+    assert estimates(found)["link_1.inertia"] == pytest.approx(INERTIA, rel=1e-4)
+    assert found["residual"]["joint_1"]["relative"] < 1e-3
+    out, err = capsys.readouterr()
+    assert err == ""
+    row = next(line for line in out.splitlines() if line.startswith("link_1.inertia"))
+    assert "kg m²" in row
+    assert "0.300" in row
+    for line in ("residual joint_1: ", "condition number: ", "samples: 1200 in 5.995 s, 0 lost", "throughput: "):
+        assert line in out
+    assert "true" not in out.splitlines()[0]
+
+
+def test_with_json_stdout_is_the_document_alone(bench: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["replay", "run.csv", "--system", "axis.toml", "--out", "done", "--json"]) == 0
+    out, err = capsys.readouterr()
+    assert json.loads(out) == document(bench / "done")
+    assert "link_1.inertia" in err
+
+
+def test_results_go_to_a_new_directory_for_each_run(bench: Path) -> None:
+    for _ in range(3):  # within one second, which names the directory
+        assert main(["replay", "run.csv", "--system", "axis.toml"]) == 0
+    assert len(list((bench / "runs").glob("*/results.json"))) == 3
+
+
+def test_the_truth_reaches_the_report_and_never_the_estimate(bench: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["replay", "run.csv", "--system", "axis.toml", "--out", "without"]) == 0
+    names = [parameter.name for parameter in Model(load_system("axis.toml")).parameters]
+    wrong = {name: 2.0 * TRUTH.get(name, 0.0) for name in names}
+    write_truth(bench / "run.csv", wrong, {})
+    capsys.readouterr()
+    assert main(["replay", "run.csv", "--system", "axis.toml", "--out", "with"]) == 0
+    without, with_truth = document(bench / "without"), document(bench / "with")
+    assert estimates(without) == estimates(with_truth)
+    assert all(p["true"] is None for p in without["parameters"])
+    assert {p["name"]: p["true"] for p in with_truth["parameters"]} == {name: wrong[name] for name in TRUTH}
+    row = next(line for line in capsys.readouterr().out.splitlines() if line.startswith("link_1.inertia"))
+    assert row.endswith("-50")
+
+
+def test_a_truth_of_other_parameters_is_told_and_not_compared(bench: Path) -> None:
+    write_truth(bench / "run.csv", {"link_1.inertia": INERTIA}, {})
+    assert main(["replay", "run.csv", "--system", "axis.toml", "--out", "done"]) == 0
+    found = document(bench / "done")
+    assert all(p["true"] is None for p in found["parameters"])
+    assert any(warning.startswith("no comparison with the truth") for warning in found["warnings"])
+
+
+def test_start_and_stop_choose_the_samples(bench: Path) -> None:
+    assert main(["replay", "run.csv", "--system", "axis.toml", "--out", "done", "-ss", "1", "-to", "4.5"]) == 0
+    found = document(bench / "done")
+    assert found["samples"] == 700
+    assert found["duration_s"] == pytest.approx(699 / 200)
+    assert estimates(found)["link_1.inertia"] == pytest.approx(INERTIA, rel=1e-4)
+
+
+def test_in_step_with_the_clock_takes_its_time_and_changes_no_bit(bench: Path) -> None:
+    short = ["replay", "run.csv", "--system", "axis.toml", "-to", "1.5"]
+    assert main([*short, "--out", "fast"]) == 0
+    start = perf_counter()
+    assert main([*short, "--out", "paced", "--speed", "1"]) == 0
+    assert perf_counter() - start > 1.49
+    assert document(bench / "fast")["parameters"] == document(bench / "paced")["parameters"]
+
+
+def test_channels_that_the_model_does_not_use_are_named(bench: Path) -> None:
+    (bench / "free.toml").write_text(AXIS + "[spacecraft]\nmass = 5.0\ninertia = { zz = 1.0 }\n")
+    header, *lines = capture_lines(2.0)
+    extra = [",".join(f"{math.sin(0.01 * j * k)}" for j in (1, 2, 3, 4)) for k in range(len(lines))]
+    rows = [f"{line},{cells}" for line, cells in zip(lines, extra, strict=True)]
+    (bench / "run.csv").write_text("\n".join([f"{header},r_S_x,r_S_y,theta_0,gyro_0_z", *rows]) + "\n")
+    assert main(["replay", "run.csv", "--system", "free.toml", "--out", "done"]) in (0, 3)
+    assert "channels not used: gyro_0_z" in document(bench / "done")["warnings"]
+
+
+def test_a_terminal_shows_the_progress_of_a_long_file(
+    bench: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    replay = ["replay", "run.csv", "--system", "axis.toml", "--out", "done"]
+    assert main(replay) == 0
+    assert capsys.readouterr().err == ""
+    monkeypatch.setenv("FORCE_COLOR", "1")  # rich takes it for a terminal
+    assert main(replay) == 0
+    assert capsys.readouterr().err == ""
+    monkeypatch.setattr("sms_tools.verbs.replay.LONG_FILE", 1000)
+    assert main(replay) == 0
+    assert "run.csv" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(("presses", "written"), [(1, True), (2, False)])
+def test_ctrl_c_finishes_with_what_has_been_read(
+    bench: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], presses: int, written: bool
+) -> None:
+    push, pushed = Estimator.push, 0
+
+    def press(self: Estimator, block: Block) -> None:
+        nonlocal pushed
+        push(self, block)
+        pushed += block.t.size
+        if pushed >= 500:
+            for _ in range(presses):
+                signal.raise_signal(signal.SIGINT)
+
+    monkeypatch.setattr(Estimator, "push", press)
+    monkeypatch.setattr("sms_tools.verbs.replay.PIECE", 100)
+    before = signal.getsignal(signal.SIGINT)
+    assert main(["replay", "run.csv", "--system", "axis.toml", "--out", "done"]) == 130
+    assert signal.getsignal(signal.SIGINT) is before
+    assert "interrupted" in "".join(capsys.readouterr())
+    assert (bench / "done").exists() == written
+    if written:
+        assert document(bench / "done")["samples"] == 500
+
+
+# priors
+
+
+def test_a_stated_prior_holds_without_being_asked_for_nominal_values_only_with() -> None:
+    system = parse_system(AXIS + '[prior."link_1.inertia"]\nvalue = 0.5\nstd = 0.05\n', "axis.toml")
+    base = find_base_parameters(Model(system))
+    names = [parameter.name for parameter in base.parameters]
+    inertia, damping = names.index("link_1.inertia"), names.index("viscous_friction@joint_1.damping")
+    stated, nominal = base_prior(system, base, nominal=False), base_prior(system, base, nominal=True)
+    for prior in (stated, nominal):
+        assert (prior.value[inertia], prior.std[inertia]) == (0.5, 0.05)
+    assert math.isnan(stated.std[damping])
+    assert (nominal.value[damping], nominal.std[damping]) == (DAMPING, DAMPING)
+
+
+def test_a_combination_has_a_prior_when_all_of_it_has() -> None:
+    text = shipped_text("paper-planar")
+    half = text + '[prior]\n"spacecraft.mass" = { value = 400.0, std = 3.0 }\n'
+    whole = half + '"motor_1.mass" = { value = 3.0, std = 4.0 }\n'
+    for description, std in ((half, math.nan), (whole, 5.0)):
+        system = parse_system(description, "paper.toml")
+        base = find_base_parameters(Model(system))
+        prior = base_prior(system, base, nominal=False)
+        k = [parameter.name for parameter in base.parameters].index("spacecraft.mass_with_motor_1")
+        assert prior.std[k] == pytest.approx(std, nan_ok=True)
+        assert prior.known.sum() == (0 if math.isnan(std) else 1)
+    assert prior.value[k] == 403.0
+
+
+def test_a_prior_decides_what_the_motion_does_not(bench: Path) -> None:
+    # At constant speed friction alone takes work; the kinetic energy never changes.
+    rows = [f"{k / 200},{DAMPING * 0.5},{0.5 * k / 200}" for k in range(1200)]
+    (bench / "run.csv").write_text("\n".join(["t,force_1,q_1", *rows]) + "\n")
+    (bench / "prior.toml").write_text(AXIS + '[prior."link_1.inertia"]\nvalue = 0.31\nstd = 0.01\n')
+    assert main(["replay", "run.csv", "--system", "axis.toml", "--out", "without"]) == 0
+    assert main(["replay", "run.csv", "--system", "prior.toml", "--out", "with"]) == 0
+    flags = {p["name"]: p["identifiable"] for p in document(bench / "without")["parameters"]}
+    assert flags == {"link_1.inertia": False, "viscous_friction@joint_1.damping": True}
+    assert estimates(document(bench / "with"))["link_1.inertia"] == pytest.approx(0.31, abs=1e-3)
+
+
+# simulate, demo
+
+
+def test_a_simulation_is_replayed_to_its_truth(bench: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    simulated = ["simulate", "--system", "moved.toml", "--capture", "sim.csv", "--duration", "4", "--grade", "A"]
+    assert main([*simulated, "--seed", "3", "--json"]) == 0
+    out, err = capsys.readouterr()
+    said = json.loads(out)
+    assert said["samples"] == 801
+    assert said["drift"]["energy"] < 1e-8
+    assert said["drift"]["linear_momentum"] is None
+    assert "energy drift" in err
+    truth = json.loads(truth_path(bench / "sim.csv").read_text())
+    assert (truth["system"], truth["grade"], truth["seed"], truth["duration_s"]) == ("axis", "A", 3, 4.0)
+    assert truth["parameters"].items() >= TRUTH.items()
+    assert main(["replay", "sim.csv", "--system", "moved.toml", "--out", "done"]) == 0
+    for p in document(bench / "done")["parameters"]:
+        assert p["estimate"] == pytest.approx(p["true"], rel=0.02)
+
+
+def test_the_seed_decides_the_capture(bench: Path) -> None:
+    def capture(seed: str) -> bytes:
+        arguments = ["simulate", "--system", "moved.toml", "--capture", "sim.csv", "--duration", "1", "--grade", "B"]
+        assert main([*arguments, "--seed", seed]) == 0
+        return (bench / "sim.csv").read_bytes()
+
+    assert capture("1") == capture("1")
+    assert capture("1") != capture("2")
+
+
+def test_the_live_plant_moves_as_the_exact_one_with_its_sensors_rates_and_latencies() -> None:
+    sensors = (Sensor(channels=("q_1",), latency=0.013), Sensor(channels=("force_1",), rate=50.0))
+    system = parse_system(MOVED.replace("duration = 6.0", "duration = 1.0"), "moved.toml")
+    system = system.model_copy(update={"sensors": sensors})
+    live = list(LivePlant(system, None, 0))
+    exact = list(sampled_blocks(simulate(system)))
+    assert np.concatenate([block.t for block in live]).tolist() == np.concatenate([block.t for block in exact]).tolist()
+    values, expected = (np.concatenate([block.values for block in blocks]) for blocks in (live, exact))
+    assert np.isnan(values[:, live[0].channels.index("force_1")]).sum() == 150
+    np.testing.assert_allclose(values, expected, rtol=0, atol=1e-6)
+
+
+def test_the_demo_shows_the_papers_parameters_converge(bench: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (bench / "paper.toml").write_text(shipped_text("paper-planar").replace("duration = 20.0", "duration = 3.0"))
+    assert main(["demo", "--system", "paper.toml", "--out", "done"]) == 0
+    out, err = capsys.readouterr()
+    assert err == ""
+    assert " of 16 parameters determined" in out.splitlines()[0]
+    parameters = document(bench / "done")["parameters"]
+    assert [p["name"] for p in parameters] == [
+        "spacecraft.inertia_about_joint_1", "spacecraft.first_moment_x", "spacecraft.first_moment_y",
+        "spacecraft.mass_with_motor_1", "motor_1.rotor_inertia", "motor_2.rotor_inertia", "motor_2.stator_inertia",
+        "motor_2.mass", "link_1.mass_per_length", "link_2.mass_per_length", "link_1.flexural_rigidity",
+        "link_2.flexural_rigidity", "joint_1.stiffness", "joint_2.stiffness", "joint_1.damping", "joint_2.damping",
+    ]  # fmt: skip
+    for p in parameters:
+        # The stator's inertia is a millionth of the arm's.
+        assert p["estimate"] == pytest.approx(p["true"], rel=0.2 if p["name"] == "motor_2.stator_inertia" else 1e-3)
+
+
+def test_at_a_terminal_the_demo_draws_its_table_again_and_again(
+    bench: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (bench / "moved.toml").write_text(MOVED.replace("duration = 6.0", "duration = 1.0"))
+    monkeypatch.setenv("FORCE_COLOR", "1")
+    monkeypatch.setattr("sms_tools.verbs.demo.TABLE_INTERVAL", 0.0)
+    assert main(["demo", "--system", "moved.toml", "--out", "done"]) == 0
+    out = capsys.readouterr().out
+    assert "0.1 of 1 s" in out
+    assert "1.0 of 1 s" in out
+    assert out.count("link_1.inertia") >= 10
+    assert out.rstrip().endswith(str(Path("done") / "results.json"))
+
+
+# import, markers
+
+
+def test_import_writes_a_capture_and_clears_a_truth_of_another(bench: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    t = np.arange(50) / 1000.0
+    savemat(bench / "emps.mat", {"t": t, "qm": np.sin(t), "qg": np.sin(t), "vir": np.cos(t), "gtau": 35.15})
+    write_truth(bench / "emps.csv", {}, {})
+    assert main(["import", "emps", "emps.mat", "--capture", "emps.csv", "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["samples"] == 50
+    with (bench / "emps.csv").open() as file:
+        assert next(csv.reader(file)) == ["t", "force_1", "q_1"]
+    assert not truth_path(bench / "emps.csv").exists()
+
+
+def test_markers_of_the_papers_links(bench: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["markers", "--system", "paper-planar", "--json"]) == 0
+    out, err = capsys.readouterr()
+    for link in json.loads(out)["links"]:
+        assert (link["markers_required"], link["markers_described"]) == (2, 2)
+        assert link["f_s"] == 2 * max(mode["spatial_frequency"] for mode in link["modes"])
+        assert len(link["modes"]) == 2
+    assert "link_2  bending_z" in err
+    assert main(["markers", "--system", "paper-planar", "--modes", "4"]) == 0
+    assert capsys.readouterr().out.count("bending_z") == 8
+    assert main(["markers", "--system", "axis.toml"]) == 0
+    assert capsys.readouterr().out == "axis: no flexible link that bends\n"
+
+
+# the program as a process
+
+
+def test_the_program_runs_as_a_module_and_helps(bench: Path) -> None:
+    said = python("-m", "sms_tools", "--help")
+    assert said.returncode == 0
+    for verb in ("demo", "simulate", "replay", "import", "markers"):
+        assert f"\n    {verb} " in said.stdout
+    assert python("-m", "sms_tools", "replay", "--help").returncode == 0
+    wrong = python("-m", "sms_tools", "replay", "run.csv", "--system", "axis.tom")
+    assert (wrong.returncode, wrong.stdout) == (2, "")
+
+
+def test_blas_is_told_to_use_one_thread_before_numpy_comes() -> None:
+    code = "import sys, os, sms_tools.cli; print('numpy' in sys.modules, os.environ['OPENBLAS_NUM_THREADS'])"
+    environment = {key: value for key, value in os.environ.items() if not key.endswith("_NUM_THREADS")}
+    assert python("-c", code, env=environment).stdout == "False 1\n"
+
+
+def test_a_reader_that_leaves_early_is_no_error(bench: Path) -> None:
+    command = [sys.executable, "-m", "sms_tools", "replay", "run.csv", "--system", "axis.toml", "--out", "done"]
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
+    assert process.stdout is not None
+    assert process.stderr is not None
+    process.stdout.close()
+    assert process.stderr.read() == b""
+    process.stderr.close()
+    assert process.wait(timeout=60) == 0
+    assert (bench / "done" / "results.json").exists()
