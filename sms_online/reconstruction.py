@@ -1,4 +1,4 @@
-"""From a results document back to the full dynamics: H, C and K_f of (40) without any other knowledge of the testbed."""
+"""From a results document back to the full dynamics: H, C and K_f of (40), with no other knowledge of the testbed."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ from sms_online.stream import Array
 def reconstruct(document: dict[str, Any], source: str) -> tuple[Model, Array]:
     """Model and physical parameter values π (n_pi,) with the identified dynamics, from a parsed results.json.
 
-    The description's nominal values play no part. Parameters that only act in combinations are zero but for the one that
-    carries the combination, so `Model.dynamics(π)` is the identified system though single masses are not.
-    Raises InputError, naming `source`, where the document is of another kind or its parameters do not fit its system.
+    The description's nominal values play no part. Parameters that only act in combinations are zero but for the one
+    that carries the combination, so `Model.dynamics(π)` is the identified system though single masses are not. Raises
+    InputError, naming `source`, where the document is of another kind or its parameters do not fit its system.
     """
     if document.get("schema") != SCHEMA:
         raise InputError(source, "schema", repr(document.get("schema")), SCHEMA)

@@ -32,7 +32,7 @@ def standard_deviation(estimate: Estimate) -> Array:
 
 
 def identifiable(estimate: Estimate) -> NDArray[np.bool_]:
-    """Which parameters (n,) the data determine: in the span of the rows, and three standard deviations away from zero."""
+    """Which parameters (n,) the data determine: in the span of the rows, and three standard deviations from zero."""
     return estimate.determined & (standard_deviation(estimate) <= LARGEST_RELATIVE_STD * np.abs(estimate.pi))
 
 
@@ -41,8 +41,8 @@ def results_document(
 ) -> dict[str, Any]:
     """results.json of a finished session.
 
-    throughput: samples/s. truth: true values of physical parameters by name, of a simulated capture; they enter this report
-    alone. Numbers that do not exist (the std of an undetermined parameter) are None.
+    throughput: samples/s. truth: true values of physical parameters by name, of a simulated capture; they enter this
+    report alone. Numbers that do not exist (the std of an undetermined parameter) are None.
     """
     estimate = estimator.estimate()
     base = estimator.base

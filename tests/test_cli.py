@@ -283,7 +283,7 @@ def test_the_demo_shows_the_papers_parameters_converge(bench: Path, capsys: pyte
         "link_2.flexural_rigidity", "joint_1.stiffness", "joint_2.stiffness", "joint_1.damping", "joint_2.damping",
     ]  # fmt: skip
     for p in parameters:
-        # The stator's inertia is a millionth of the arm's.
+        # The stator's inertia is a hundred-thousandth of what turns with it.
         assert p["estimate"] == pytest.approx(p["true"], rel=0.2 if p["name"] == "motor_2.stator_inertia" else 1e-3)
 
 

@@ -6,10 +6,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+
 from sms_adapters.importers import import_emps, import_quanser
 from sms_adapters.sources import open_source
 from sms_adapters.system_file import load_system
-
 from sms_online.pipeline.estimator import Estimator
 from sms_online.pipeline.rates import smooth_and_differentiate
 from sms_online.results import results_document, standard_deviation
@@ -50,7 +50,7 @@ def emps_capture(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_emps_energy_fit_agrees_with_the_published_force_fit(emps_capture: Path) -> None:
     estimator = replayed("emps", emps_capture)
-    mass, viscous, coulomb, offset = estimator.estimate().pi
+    mass, viscous, coulomb, _ = estimator.estimate().pi
     assert abs(mass / PUBLISHED[0] - 1.0) < 0.02
     assert abs(viscous / PUBLISHED[1] - 1.0) < 0.08
     assert abs(coulomb / PUBLISHED[2] - 1.0) < 0.08
@@ -78,9 +78,9 @@ def emps_signals(capture: Path) -> tuple[Array, Array, Array]:
 def test_why_the_energy_fit_of_emps_differs(emps_capture: Path) -> None:
     """The energy balance is the force balance times the speed, so it weighs what the model misses by the speed.
 
-    On the same signals the force balance reproduces the published numbers, and multiplying its rows by the speed, nothing
-    else, moves mass down and offset beyond -3.8 N as in the energy fit. Friction that depends on the direction of travel, which
-    the model lacks, is what there is to be weighed: allowing it lowers the residual by a fifth.
+    On the same signals the force balance reproduces the published numbers, and multiplying its rows by the speed,
+    nothing else, moves mass down and offset beyond -3.8 N as in the energy fit. Friction that depends on the direction
+    of travel, which the model lacks, is what there is to be weighed: allowing it lowers the residual by a fifth.
     """
     v, a, force = emps_signals(emps_capture)
     columns = np.stack((a, v, np.sign(v), np.ones_like(v)), axis=1)
@@ -90,7 +90,8 @@ def test_why_the_energy_fit_of_emps_differs(emps_capture: Path) -> None:
     energy = replayed("emps", emps_capture).estimate().pi
     assert by_power[0] < by_force[0]
     np.testing.assert_allclose(by_power, energy, rtol=0.04)
-    split = np.concatenate((columns[:, :1], columns[:, 1:3] * (v > 0)[:, None], columns[:, 1:3] * (v < 0)[:, None]), axis=1)
+    forward, backward = (v > 0)[:, None], (v < 0)[:, None]
+    split = np.concatenate((columns[:, :1], columns[:, 1:3] * forward, columns[:, 1:3] * backward), axis=1)
 
     def left(Y: Array) -> float:
         return float(np.linalg.norm(force - Y @ np.linalg.lstsq(Y, force, rcond=None)[0]))

@@ -1,4 +1,4 @@
-"""What an effect is: a generalized force, linear in its coefficients, from which rows, energy column and injection follow."""
+"""What an effect is: a generalized force, linear in its coefficients; rows and energy column follow from it."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Effects that act on a motor shaft against the stator: viscous and Coulomb friction, torque offset (DESIGN's vocabulary)."""
+"""Effects that act on a motor shaft against the stator: viscous and Coulomb friction, torque offset."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ class CoulombFriction(_MotorSide):
 
 
 class TorqueOffset(_MotorSide):
-    """The measured torque reads c too much at the motor shaft (N m; N on a directly driven axis), so the arm feels -n c.
+    """The measured torque reads c too much at the motor shaft (N m; N on a direct drive), so the arm feels -n c.
 
     Limitations: constant over the session; a drifting amplifier needs a slower model.
     """

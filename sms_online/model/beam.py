@@ -1,4 +1,4 @@
-"""Flexible link with `linear` kinematics: Euler–Bernoulli finite elements on a straight reference, (1)–(4), (11), (13), (14)."""
+"""Flexible link with `linear` kinematics: Euler–Bernoulli elements on a straight line, (1)–(4), (11), (13), (14)."""
 
 from __future__ import annotations
 

@@ -1,10 +1,10 @@
-"""Kinematics of the serial chain, (8)–(12), (16)–(22): frames, their twists, and the rates of these, for any set of rates.
+"""Kinematics of the serial chain, (8)–(12), (16)–(22): frames, their twists, and the rates of these.
 
 One recursion carries m columns of generalized speeds at once: the actual speeds (m = 1) give velocities, the identity
 (m = n_v) gives Jacobians. Every twist is stacked as linear over angular velocity in the axes of its own frame.
 
-Frames, from the base outwards: 0 is {0} with origin in joint 1; mount i is the frame that holds stator i; link i is {i};
-the last one is the end of the last link.
+Frames, from the base outwards: 0 is {0} with origin in joint 1; mount i is the frame that holds stator i; link i is
+{i}; the last one is the end of the last link.
 """
 
 from __future__ import annotations
@@ -188,7 +188,7 @@ class Configuration:
     def twist_rates(
         self, rates: Array, twists: list[Array], v: Array, shape_rates: list[ShapeRate | None]
     ) -> list[Array]:
-        """Time derivatives, in the frames' own axes, of `twists` of constant `rates` while the chain moves with v (B, n_v).
+        """Time derivatives, in the frames' axes, of `twists` of constant `rates` while the chain moves with v (B, n_v).
 
         With rates = v this is the acceleration at v̇ = 0; with the identity it is the Jacobians' rate.
         """

@@ -13,8 +13,8 @@ class Shape:
     """A link's shape at B configurations in its frame {i}; Jacobians are with respect to its n_f elastic coordinates.
 
     points (B, G, 3) m: quadrature points. J (B or 1, G, 3, n_f). tangent (B or 1, G, 3): unit axis of each section.
-    spin (B or 1, G, 3, n_f): angular velocity of the sections. tip (B, 3), tip_J (B or 1, 3, n_f), tip_rotation (B, 3, 3),
-    tip_spin (B or 1, 3, n_f): the same at x = L.
+    spin (B or 1, G, 3, n_f): angular velocity of the sections. tip (B, 3), tip_J (B or 1, 3, n_f), tip_rotation (B, 3,
+    3), tip_spin (B or 1, 3, n_f): the same at x = L.
     """
 
     points: Array
@@ -42,8 +42,9 @@ class ShapeRate:
 class LinkKinematics(Protocol):
     """Kinematics of one flexible link.
 
-    n_f: number of elastic coordinates. weights (G,) m: quadrature weights along the link. stiffness: for each rigidity, the
-    matrix (n_f, n_f) that makes its strain energy ½ EI q_fᵀ S q_f, (14). marker_names: what `markers` returns.
+    n_f: number of elastic coordinates. weights (G,) m: quadrature weights along the link. stiffness: for each
+    rigidity, the matrix (n_f, n_f) that makes its strain energy ½ EI q_fᵀ S q_f, (14). marker_names: what `markers`
+    returns.
     """
 
     n_f: int

@@ -1,8 +1,8 @@
-"""Kinetic terms of the model: bodies of constant inertia and flexible links, each linear in its parameters, (7), (15), (17).
+"""Kinetic terms of the model: bodies of constant inertia and flexible links, linear in π, (7), (15), (17).
 
-A term sees its local speeds ν (B, d): the twist of its frame, then the rates of d - 6 coordinates of its own. For each of its
-n parameters it gives the local momentum p = ∂K/∂ν, the convective part g with force F = ṗ - g (Newton–Euler in body axes),
-and the force F at ν̇ = 0; all as columns (B, d, n).
+A term sees its local speeds ν (B, d): the twist of its frame, then the rates of d - 6 coordinates of its own. For each
+of its n parameters it gives the local momentum p = ∂K/∂ν, the convective part g with force F = ṗ - g (Newton–Euler in
+body axes), and the force F at ν̇ = 0; all as columns (B, d, n).
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ class BodyTerm(Term):
 
 
 def convective(nu: Array, p: Array) -> Array:
-    """Convective part g (B, d, n) of body-axes momenta p (B, d, n) with a mass matrix that does not depend on the shape."""
+    """Convective part g (B, d, n) of body-axes momenta p (B, d, n) whose mass matrix is constant."""
     turn = skew(nu[:, :6].reshape(-1, 2, 3))  # v×, ω×
     g = np.zeros_like(p)
     g[:, :6] = (turn[:, 1:] @ p[:, :6].reshape(-1, 2, 3, p.shape[2])).reshape(-1, 6, p.shape[2])

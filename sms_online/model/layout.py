@@ -1,7 +1,8 @@
 """Active generalized coordinates and speeds of a system, (29)–(32): names, indices, kinematic map.
 
 Positions x: S and attitude of a free base (planar: x, y, angle), q, θ_m of flexible joints, elastic coordinates.
-Speeds v: inertial velocity of S and inertial ω_0 (planar: x, y, z), then the rates of the other positions in the same order.
+Speeds v: inertial velocity of S and inertial ω_0 (planar: x, y, z), then the rates of the other positions in the same
+order.
 """
 
 from __future__ import annotations
@@ -46,7 +47,7 @@ def strain_names(link: FlexibleLink) -> tuple[str, ...]:
 
 @dataclass(frozen=True)
 class Layout:
-    """Where each coordinate sits. base_linear, base_angular: (axis, speed) pairs; theta_m[i] is q[i] on a rigid joint."""
+    """Where each coordinate sits; theta_m[i] is q[i] on a rigid joint."""
 
     planar: bool
     free: bool
@@ -75,11 +76,11 @@ class Layout:
         return len(self.base_linear) + len(self.base_angular)
 
     def joint_positions(self, x: Array) -> Array:
-        """Positions (B, ·) whose rates are speeds: all but the base's, so that speed index i is column i - n_base_speeds."""
+        """Positions (B, ·) whose rates are speeds: all but the base's; speed i is column i - n_base_speeds."""
         return x[:, self.n_base_positions :]
 
     def base_pose(self, x: Array) -> tuple[Array, Array]:
-        """Position of S (B, 3), m, and T_0 (B, 3, 3) of positions x (B, n_x); a fixed base is at the origin, unturned."""
+        """Position of S (B, 3), m, and T_0 (B, 3, 3) at positions x (B, n_x); a fixed base is at the origin, unturned."""
         B = x.shape[0]
         r_S = np.zeros((B, 3))
         if not self.free:

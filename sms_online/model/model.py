@@ -1,6 +1,7 @@
 """The model of a described system: energies, powers, momenta and forces as columns, one for each parameter of π.
 
-One set of kinetic terms serves the energy balance (43), (44), the weak form of (33)–(37) and the equations of motion (40).
+One set of kinetic terms serves the energy balance (43), (44), the weak form of (33)–(37) and the equations of motion
+(40).
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ from sms_online.stream import Array
 
 @dataclass(frozen=True)
 class Spring:
-    """A quadratic potential ½ c zᵀ S z of some coordinates z, or a damper of their rates: parameter, speeds, matrix S."""
+    """A quadratic potential ½ c zᵀ S z of some coordinates z, or a damper of their rates."""
 
     parameter: int
     speeds: slice | list[int]

@@ -1,6 +1,7 @@
 """Physical parameters of a system: names, symbols, units, nominal values, and which body or spring each belongs to.
 
-The order is that of the paper's Table V, which is also the order of preference when identifiable combinations are formed.
+The order is that of the paper's Table V, which is also the order of preference when identifiable combinations are
+formed.
 """
 
 from __future__ import annotations
@@ -78,7 +79,8 @@ def _coupling(axis: int, sign: float) -> Array:
 def rigid_body(owner: str, index: str, body: RigidBody, planar: bool, spacecraft: bool) -> list[InertialParameter]:
     """Ten inertial parameters (planar: four) of a body about its frame's origin.
 
-    The spacecraft follows the paper: inertia about joint 1, first moment m_0 r_0 with r_0 from the centre of mass to joint 1.
+    The spacecraft follows the paper: inertia about joint 1, first moment m_0 r_0 with r_0 from the centre of mass to
+    joint 1.
     """
     moments = ("zz",) if planar else tuple(SYMMETRIC)
     axes = (0, 1) if planar else (0, 1, 2)

@@ -77,7 +77,7 @@ class ExactRod:
         return R
 
     def shape_at_stations(self, q_f: Array) -> tuple[Array, Array, Array, Array]:
-        """R (B, n, 3, 3), r (B, n, 3), spin Jacobian and position Jacobian (B, n, 3, n_f) at Gauss points and markers."""
+        """R (B, n, 3, 3), r (B, n, 3), Jacobians of spin and position (B, n, 3, n_f) at Gauss points and markers."""
         G = GAUSS_POINTS
         R = self._rotations(q_f)
         spin = _along(self._integrate, R[:, :G][..., self._axis] * self._chi[:, None, :])

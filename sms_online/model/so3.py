@@ -16,7 +16,7 @@ SERIES_TERMS = 14
 
 
 def _series_coefficients() -> Array:
-    """(SERIES_TERMS, 5): sin φ/φ, (1 - cos φ)/φ², (φ - sin φ)/φ³ as series in φ², and the φ²-derivatives of the last two."""
+    """(SERIES_TERMS, 5): sin φ/φ, (1 - cos φ)/φ², (φ - sin φ)/φ³ and the last two's derivatives, as series in φ²."""
     table = np.zeros((SERIES_TERMS, 5))
     for k in range(SERIES_TERMS):
         table[k, :3] = [(-1) ** k / math.factorial(2 * k + offset) for offset in (1, 2, 3)]

@@ -52,8 +52,8 @@ class SquaredResidual:
 class Estimator:
     """Streams one session of a described system.
 
-    channels: what the source's blocks hold. source: its name, for messages. tracker: square-root RLS by default, fed with
-    the rows of the energy balance. Raises InputError when a channel is missing that the model needs.
+    channels: what the source's blocks hold. source: its name, for messages. tracker: square-root RLS by default, fed
+    with the rows of the energy balance. Raises InputError when a channel is missing that the model needs.
     """
 
     def __init__(self, system: System, channels: tuple[str, ...], source: str, tracker: Tracker | None = None) -> None:
