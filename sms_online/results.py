@@ -27,8 +27,10 @@ def standard_deviation(estimate: Estimate) -> Array:
     """
     if estimate.dof <= 0.0:
         return np.full(estimate.pi.shape, np.inf)
-    std = estimate.std * np.sqrt(estimate.rss / estimate.dof)
-    return np.asarray(std if estimate.std_robust is None else np.maximum(std, estimate.std_robust))
+    std = np.full(estimate.pi.shape, np.inf)
+    known = estimate.determined
+    std[known] = estimate.std[known] * np.sqrt(estimate.rss / estimate.dof)
+    return std if estimate.std_robust is None else np.maximum(std, estimate.std_robust)
 
 
 def identifiable(estimate: Estimate) -> NDArray[np.bool_]:
@@ -47,7 +49,7 @@ def results_document(
     estimate = estimator.estimate()
     base = estimator.base
     true = None
-    if truth is not None:
+    if truth is not None and all(p.name in truth for p in base.physical):
         true = base.values(np.array([truth[p.name] for p in base.physical]))
     flags, deviations = identifiable(estimate), standard_deviation(estimate)
     parameters = []
@@ -77,7 +79,7 @@ def results_document(
         "duration_s": estimator.duration,
         "parameters": parameters,
         "residual": residual,
-        "condition_number": estimate.condition_number,
+        "condition_number": estimate.condition_number if np.isfinite(estimate.condition_number) else None,
         "throughput_samples_per_s": throughput,
         "lost_samples": estimator.counters.lost_samples,
         "warnings": warnings,

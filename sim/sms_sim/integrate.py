@@ -8,7 +8,7 @@ Source: Hairer, Wanner, Solving Ordinary Differential Equations II, 2nd ed. 1996
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cache
 
@@ -219,19 +219,28 @@ class Collocation:
         return None
 
 
-def solve(f: RightHandSide, y0: Array, duration: float, tolerance: Array, stages: int = STAGES) -> Dense:
-    """Integrate ẏ = f(t, y) from y0 (n,) at t = 0 over `duration` (s) with step control.
+@dataclass(frozen=True)
+class Step:
+    """One accepted step: its end t s, the state there y (n,), and the states at its stages (s, n)."""
+
+    t: float
+    y: Array
+    stages: Array
+
+
+def march(f: RightHandSide, y0: Array, duration: float, tolerance: Array, stages: int = STAGES) -> Iterator[Step]:
+    """Integrate ẏ = f(t, y) from y0 (n,) at t = 0 over `duration` (s) with step control, a step at a time.
 
     tolerance (n,): bound of the estimated local error of each state in its unit. The estimate is of the order of the
     polynomial between steps, and step ends are better; it does not see what a state that only follows a fast pole loses
     between steps. Raises ArithmeticError where no step is short enough. Source: Hairer & Wanner IV.8.
     """
     collocation = Collocation(f, 0.0, y0, stages)
-    t, y, increments = [0.0], [y0], []
+    t, y = 0.0, y0
     h = FIRST_STEP
     fresh = True
-    while t[-1] < duration:
-        left = duration - t[-1]
+    while t < duration:
+        left = duration - t
         # Two equal steps to the end, so that the last one is not next to nothing.
         h = left if left <= h else min(h, 0.5 * left)
         if h < SHORTEST_STEP:
@@ -254,13 +263,25 @@ def solve(f: RightHandSide, y0: Array, duration: float, tolerance: Array, stages
             h *= factor
             continue
         collocation.advance(h, Z, F)
-        t.append(duration if h == left else collocation.t)
-        y.append(collocation.y)
-        increments.append(y[-2] + Z)
+        t = duration if h == left else collocation.t
+        yield Step(t, collocation.y, y + Z)
+        y = collocation.y
         fresh = False
         if contraction > KEEP_CONTRACTION:
             collocation.refresh()
             fresh = True
         if not KEEP_STEP[0] < factor < KEEP_STEP[1]:
             h *= factor
-    return Dense(radau(stages), np.array(t), np.array(y), np.array(increments))
+
+
+def solve(f: RightHandSide, y0: Array, duration: float, tolerance: Array, stages: int = STAGES) -> Dense:
+    """All of `march` as one solution."""
+    return dense(stages, 0.0, y0, list(march(f, y0, duration, tolerance, stages)))
+
+
+def dense(stages: int, t0: float, y0: Array, steps: Sequence[Step]) -> Dense:
+    """Consecutive steps from the state y0 (n,) at t0 as one solution."""
+    t = np.array([t0, *(step.t for step in steps)])
+    return Dense(
+        radau(stages), t, np.array([y0, *(step.y for step in steps)]), np.array([step.stages for step in steps])
+    )

@@ -8,6 +8,9 @@ from sms_online.model.layout import Layout
 from sms_online.model.parameters import Parameter
 from sms_online.stream import Array
 
+# Speed below which an axis stands still, rad/s (m/s): an integrator cannot follow a jump, and encoders resolve no less.
+STANDSTILL = 1e-4
+
 
 class _MotorSide:
     """A generalized force along θ_m of joint i (from 1), one coefficient."""
@@ -46,6 +49,7 @@ class ViscousFriction(_MotorSide):
 class CoulombFriction(_MotorSide):
     """f = -c sign(θ̇_m), c in N m at the output side (N on a prismatic joint); power -c |θ̇_m|.
 
+    The sign is tanh(θ̇_m / STANDSTILL), so that one definition serves rows and integration.
     Limitations: no stiction and no presliding; around standstill the sign of a noisy rate is noise.
     """
 
@@ -55,7 +59,7 @@ class CoulombFriction(_MotorSide):
 
     def along(self, rate: Array) -> Array:
         """-sign(θ̇_m)."""
-        return -np.sign(rate)
+        return -np.tanh(rate / STANDSTILL)
 
 
 class TorqueOffset(_MotorSide):

@@ -6,11 +6,13 @@ pivoting, then independent columns chosen in the order of preference. Source: Ga
 
 from __future__ import annotations
 
+import difflib
 from dataclasses import dataclass, replace
 
 import numpy as np
 import scipy.linalg
 
+from sms_online.errors import InputError
 from sms_online.model.model import Model
 from sms_online.model.parameters import Parameter
 from sms_online.stream import Array
@@ -88,8 +90,13 @@ def random_states(model: Model, count: int, rng: np.random.Generator) -> tuple[A
 
 
 def find_base_parameters(model: Model) -> BaseParameters:
-    """Base parameters of a system; parameters declared known leave the unknowns."""
+    """Base parameters of a system; parameters declared known leave the unknowns. InputError on an unknown name."""
     names = [p.name for p in model.parameters]
+    for name in model.system.known:
+        if name not in names:
+            near = difflib.get_close_matches(name, names, n=1)
+            expected = "the name of a parameter of this system" + (f", perhaps {near[0]!r}" if near else "")
+            raise InputError(model.system.name, f'known."{name}"', "no such parameter", expected)
     known = tuple((names.index(name), value) for name, value in model.system.known.items())
     rng = np.random.default_rng(RANDOM_SEED)
     x, v = random_states(model, STATES_PER_PARAMETER * model.n_pi, rng)

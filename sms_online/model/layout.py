@@ -11,22 +11,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from sms_online.description.channels import AXES, NODAL
 from sms_online.description.schema import FlexibleLink, System
 from sms_online.model import so3
 from sms_online.stream import Array
 
-# Nodal coordinates of one node in the paper's order (31), by deformation.
-NODAL = {
-    "u_x": "traction",
-    "u_y": "bending_z",
-    "u_z": "bending_y",
-    "theta_x": "torsion",
-    "theta_y": "bending_y",
-    "theta_z": "bending_z",
-}
 # Strain fields of a geometrically exact link, by deformation.
 STRAIN = {"twist": "torsion", "curvature_y": "bending_y", "curvature_z": "bending_z"}
-AXES = ("x", "y", "z")
 
 
 def nodal_names(link: FlexibleLink) -> tuple[str, ...]:
@@ -80,7 +71,7 @@ class Layout:
         return x[:, self.n_base_positions :]
 
     def base_pose(self, x: Array) -> tuple[Array, Array]:
-        """Position of S (B, 3), m, and T_0 (B, 3, 3) at positions x (B, n_x); a fixed base is at the origin, unturned."""
+        """Position of S (B, 3), m, and T_0 (B, 3, 3) at positions x (B, n_x); a fixed base stays at the origin."""
         B = x.shape[0]
         r_S = np.zeros((B, 3))
         if not self.free:

@@ -11,8 +11,8 @@ from time import perf_counter
 from rich.console import Console
 from rich.live import Live
 
+from sms_sim.live import LivePlant
 from sms_tools.interruption import Interruption
-from sms_tools.live_plant import LivePlant
 from sms_tools.report import Document, parameter_table, report_console, show
 from sms_tools.results_file import results_directory
 from sms_tools.session import conclude, described_system, document_of, new_estimator, stream
