@@ -96,8 +96,9 @@ def test_some_rows_are_those_rows_of_all(system: System) -> None:
     layout = model.layout
     x, v = random_states(layout, 6, seed=10)
     P, G = model.momentum_columns(x, v)
-    base = list(range(layout.n_base_speeds))
-    for rows in (layout.theta_m, (layout.theta_m[0],), base, [layout.n_v - 1, layout.q[1], layout.theta_m[1]]):
+    base, link_1 = range(layout.n_base_speeds), range(layout.q_f[0].start, layout.q_f[0].stop)
+    mixed = (layout.n_v - 1, layout.q[1], layout.theta_m[1])
+    for rows in (layout.theta_m, layout.theta_m[:1], layout.q[:1], list(base), list(link_1), mixed):
         if rows:
             P_rows, G_rows = model.momentum_columns(x, v, rows)
             close(P_rows, P[:, rows], 1e-13)

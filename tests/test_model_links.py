@@ -19,10 +19,10 @@ from sms_online.stream import Array
 LENGTH = 1.2
 # Rounding over the step of the differences.
 DIFFERENCING = 1e-11
-# A rod in space meets R' = R κ× at its ten Gauss points alone: sections that turn by 0.3 rad are good to this.
-COLLOCATION = 2e-6
-# The integration matrix of the rod loses four of sixteen digits.
-INTEGRATION = 1e-11
+# A rod in space meets R' = R κ× at its Gauss points alone: sections that turn by up to 1 rad are good to this.
+COLLOCATION = 1e-9
+# Rounding of the integration along the rod.
+INTEGRATION = 1e-13
 
 
 def rods() -> dict[str, LinkKinematics]:

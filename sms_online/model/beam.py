@@ -20,7 +20,7 @@ FIELDS = ("u_x", "u_y", "u_z", "theta_x", "theta_y", "theta_z")
 def element_shape_functions(length: float) -> dict[tuple[str, str, int], Polynomial]:
     """S_j of (3) as polynomials in x_j: (field, nodal coordinate, node 1 or 2) to polynomial.
 
-    Bending is cubic (Hermite), traction and torsion linear; θ_y = -u_z', θ_z = u_y'. Source: the paper's [11].
+    Bending is cubic (Hermite), traction and torsion linear; θ_y = -u_z', θ_z = u_y' at the nodes. Source: the paper's [11].
     """
     s = Polynomial([0.0, 1.0 / length])
     linear = {1: 1 - s, 2: s}
@@ -33,8 +33,6 @@ def element_shape_functions(length: float) -> dict[tuple[str, str, int], Polynom
         for u, theta, sign in (("u_y", "theta_z", 1.0), ("u_z", "theta_y", -1.0)):
             functions[u, u, node] = displacement[node]
             functions[u, theta, node] = sign * slope[node]
-            functions[theta, u, node] = sign * displacement[node].deriv()
-            functions[theta, theta, node] = slope[node].deriv()
     return functions
 
 
