@@ -23,7 +23,7 @@ from sms_online.stream import Array
 STEP = 2e-3
 TIMES = STEP * np.arange(-4, 5)
 NOW = 4
-ROD_STEPS = 240
+ROD_STEPS = 512
 RELATIVE = 1e-10
 
 

@@ -38,9 +38,9 @@ NEWTON_LIMIT = 10
 KEEP_CONTRACTION = 0.02
 # Relative increment of forward differences: half the digits of a double.
 JACOBIAN_INCREMENT = float(np.sqrt(np.finfo(float).eps))
-# Longest step, s. Rounding of the stages grows with what changes in a step, and samples between its ends are differentiated:
-# at 0.2 s rates were off by 5e-10 rad/s, here they are off by a tenth of that.
-LONGEST_STEP = 0.02
+# Longest step, s. Rounding of the stages grows with what changes in a step, and samples between its ends are going to
+# be differentiated: at 0.2 s their rates are off by 5e-10 rad/s, here by a twentieth of that.
+LONGEST_STEP = 0.01
 # A step shorter than this (s) is not a stiff problem any more but a singular one.
 SHORTEST_STEP = 1e-10
 

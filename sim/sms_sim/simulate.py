@@ -18,7 +18,8 @@ from sms_sim.sensors import Sensors
 # Bounds of the local error of a step. Positions are going to be differentiated: with these bounds an eighth-order
 # difference of them at 1 kHz is within 3e-9 m/s or rad/s of the speeds (measured on the planar example).
 POSITION_TOLERANCE = 1e-11  # m, rad
-SPEED_TOLERANCE = 1e-9  # m/s, rad/s
+# Speeds change that much faster than positions, 1/s.
+SPEED_FACTOR = 100.0
 # Samples of a block: enough to hide the cost of a call.
 BLOCK_SAMPLES = 1000
 
@@ -118,8 +119,9 @@ def simulate(
     duration: float | None = None,
     parameters: Array | None = None,
     initial: tuple[Array, Array] | None = None,
+    position_tolerance: float = POSITION_TOLERANCE,
 ) -> Simulation:
-    """Integrate a described system in closed loop, exact to the tolerances above.
+    """Integrate a described system in closed loop, to `position_tolerance` (m, rad) a step.
 
     duration: s, the reference's own by default. parameters: π (n_pi,) in place of the nominal ones. initial: x (n_x,)
     and v (n_v,) in place of rest. Raises InputError where nothing states the duration, ArithmeticError where the motion
@@ -131,13 +133,13 @@ def simulate(
         duration = system.trajectory.duration
     plant = Plant(system, parameters)
     start = plant.rest if initial is None else np.concatenate(initial)
-    return Simulation(plant, solve(plant.rate, start, duration, tolerance(plant)))
+    return Simulation(plant, solve(plant.rate, start, duration, tolerance(plant, position_tolerance)))
 
 
-def tolerance(plant: Plant) -> Array:
+def tolerance(plant: Plant, position: float = POSITION_TOLERANCE) -> Array:
     """Bounds of the local error of each state, (n_x + n_v,)."""
     layout = plant.model.layout
-    return np.concatenate((np.full(layout.n_x, POSITION_TOLERANCE), np.full(layout.n_v, SPEED_TOLERANCE)))
+    return np.concatenate((np.full(layout.n_x, position), np.full(layout.n_v, SPEED_FACTOR * position)))
 
 
 def exact_states(simulation: Simulation, t: Array) -> ExactStates:

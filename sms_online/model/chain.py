@@ -39,7 +39,11 @@ class Chain:
         self.layout = layout
         self.joints: tuple[Joint, ...] = system.joints
         self.axes = [np.array(joint.axis) for joint in system.joints]
-        self.mounts = [so3.RotationVector(np.array(joint.mount_rotation)).matrix for joint in system.joints]
+        # None where a mount is not turned at all.
+        self.mounts = [
+            so3.RotationVector(np.array(joint.mount_rotation)).matrix if any(joint.mount_rotation) else None
+            for joint in system.joints
+        ]
         self.links = system.links
         self.flexible: list[LinkKinematics | None] = []
         for i, link in enumerate(system.links):
@@ -102,39 +106,41 @@ class Configuration:
         self.x = x
         layout = chain.layout
         self.size = x.shape[0]
-        r_S, T_0 = layout.base_pose(x)
+        self.r_S, self.T_0 = layout.base_pose(x)
+        offset = layout.n_base_positions - layout.n_base_speeds
         self.shapes: list[Shape | None] = []
         self.turns: list[Array] = []  # A_i(q_i), (B, 3, 3)
         self.slides: list[Array | None] = []  # displacement of a prismatic joint in its mount frame, (B, 3)
-        frames = [Frame(r_S + T_0 @ chain.joint_1_from_S, T_0)]
-        end = frames[0]
-        offset = layout.n_base_positions - layout.n_base_speeds
         for i, joint in enumerate(chain.joints):
             q = x[:, layout.q[i] + offset]
-            mount = Frame(end.origin, end.rotation @ chain.mounts[i])
             if joint.kind == "revolute":
-                turn = so3.about(chain.turn_basis[i], q)
-                link = Frame(mount.origin, mount.rotation @ turn)
+                self.turns.append(so3.about(chain.turn_basis[i], q))
                 self.slides.append(None)
             else:
-                turn = np.broadcast_to(np.eye(3), (self.size, 3, 3))
-                slide = q[:, None] * chain.axes[i]
-                link = Frame(mount.origin + (mount.rotation @ slide[..., None])[..., 0], mount.rotation)
-                self.slides.append(slide)
-            self.turns.append(turn)
-            frames += [mount, link]
-            kinematics, description = chain.flexible[i], chain.links[i]
-            if kinematics is None:
-                assert isinstance(description, RigidLink)
-                self.shapes.append(None)
-                end = Frame(link.origin + link.rotation @ np.array(description.tip), link.rotation)
+                self.turns.append(np.broadcast_to(np.eye(3), (self.size, 3, 3)))
+                self.slides.append(q[:, None] * chain.axes[i])
+            kinematics = chain.flexible[i]
+            self.shapes.append(None if kinematics is None else kinematics.shape(chain.elastic(x, i)))
+
+    @cached_property
+    def frames(self) -> list[Frame]:
+        """Poses of all frames; velocities do not need them, gravity and pictures do."""
+        chain = self.chain
+        end = Frame(self.r_S + self.T_0 @ chain.joint_1_from_S, self.T_0)
+        frames = [end]
+        for i, (turn, slide, shape) in enumerate(zip(self.turns, self.slides, self.shapes, strict=True)):
+            C, description = chain.mounts[i], chain.links[i]
+            mount = end if C is None else Frame(end.origin, end.rotation @ C)
+            origin = mount.origin if slide is None else mount.origin + (mount.rotation @ slide[..., None])[..., 0]
+            link = Frame(origin, mount.rotation @ turn)
+            if shape is not None:
+                tip, rotation = shape.tip, link.rotation @ shape.tip_rotation
             else:
-                shape = kinematics.shape(chain.elastic(x, i))
-                self.shapes.append(shape)
-                end = Frame(
-                    link.origin + (link.rotation @ shape.tip[..., None])[..., 0], link.rotation @ shape.tip_rotation
-                )
-        self.frames = [*frames, end]
+                assert isinstance(description, RigidLink)
+                tip, rotation = np.array(description.tip), link.rotation
+            end = Frame(link.origin + (link.rotation @ tip[..., None])[..., 0], rotation)
+            frames += [mount, link]
+        return [*frames, end]
 
     @cached_property
     def jacobians(self) -> list[Array]:
@@ -144,12 +150,12 @@ class Configuration:
     def twists(self, rates: Array) -> list[Array]:
         """Twists (B, 6, m) of all frames for columns of generalized speeds `rates` (B or 1, n_v, m)."""
         chain, layout = self.chain, self.chain.layout
-        T_0 = self.frames[0].rotation
-        twist = _turn_back(T_0, chain.select_base @ rates)
+        twist = _turn_back(self.T_0, chain.select_base @ rates)
         twist[:, :3] += chain.base_arm @ twist[:, 3:]
         out = [twist]
         for i in range(len(chain.joints)):
-            mount = _turn_back(chain.mounts[i], twist)
+            C = chain.mounts[i]
+            mount = twist if C is None else _turn_back(C, twist)
             slide = self.slides[i]
             moved = mount if slide is None else _shift(mount, -so3.skew(slide))
             link = _turn_back(self.turns[i], moved)
@@ -193,9 +199,8 @@ class Configuration:
         With rates = v this is the acceleration at v̇ = 0; with the identity it is the Jacobians' rate.
         """
         chain, layout = self.chain, self.chain.layout
-        T_0 = self.frames[0].rotation
         omega = v @ chain.select_base[3:].T
-        omega_body = (omega[:, None] @ T_0)[:, 0]
+        omega_body = (omega[:, None] @ self.T_0)[:, 0]
         # Undo the shift to joint 1 to reach the twist at S, whose inertial components are constant.
         at_S = twists[0].copy()
         at_S[:, :3] -= chain.base_arm @ at_S[:, 3:]
@@ -204,7 +209,8 @@ class Configuration:
         out = [rate]
         for i in range(len(chain.joints)):
             mount_twist, link_twist = twists[2 * i + 1], twists[2 * i + 2]
-            mount = _turn_back(chain.mounts[i], rate)
+            C = chain.mounts[i]
+            mount = rate if C is None else _turn_back(C, rate)
             slide = self.slides[i]
             q_dot = v[:, layout.q[i]]
             spin = q_dot[:, None] * chain.axes[i]

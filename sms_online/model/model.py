@@ -320,8 +320,11 @@ class Dynamics:
         velocities = [W @ rates for W in J]
         bias = configuration.twist_rates(rates, velocities, v, shape_rates)
         if model.gravity.any():
-            for acceleration, frame in zip(bias, configuration.frames, strict=True):
-                acceleration[:, :3, 0] -= model.gravity @ frame.rotation
+            # Frames that coincide share their arrays, so none is changed in place.
+            for k, frame in enumerate(configuration.frames):
+                fall = np.zeros_like(bias[k])
+                fall[:, :3, 0] = model.gravity @ frame.rotation
+                bias[k] = bias[k] - fall
         none = np.zeros_like(rates)
         H = np.zeros((x.shape[0], model.layout.n_v, model.layout.n_v))
         z = model._spring_coordinates(x)

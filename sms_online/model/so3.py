@@ -15,17 +15,19 @@ from sms_online.stream import Array
 SERIES_TERMS = 14
 
 
-def _series_coefficients() -> Array:
-    """(SERIES_TERMS, 5): sin φ/φ, (1 - cos φ)/φ², (φ - sin φ)/φ³ and the last two's derivatives, as series in φ²."""
-    table = np.zeros((SERIES_TERMS, 5))
-    for k in range(SERIES_TERMS):
-        table[k, :3] = [(-1) ** k / math.factorial(2 * k + offset) for offset in (1, 2, 3)]
-        # The derivative's coefficient of (φ²)^k comes from the term k + 1.
-        table[k, 3:] = [(-1) ** (k + 1) * (k + 1) / math.factorial(2 * k + 2 + offset) for offset in (2, 3)]
-    return table
+def _series(offset: int) -> list[float]:
+    """Coefficients of Σ_k (-φ²)^k / (2k + offset)!: sin φ/φ, (1 - cos φ)/φ², (φ - sin φ)/φ³ for offsets 1, 2, 3."""
+    return [(-1) ** k / math.factorial(2 * k + offset) for k in range(SERIES_TERMS)]
 
 
-_SERIES = _series_coefficients()
+def _derivative(offset: int) -> list[float]:
+    """Coefficients of the derivative of `_series` with respect to φ²."""
+    return [(-1) ** (k + 1) * (k + 1) / math.factorial(2 * k + 2 + offset) for k in range(SERIES_TERMS)]
+
+
+# What multiplies θ× and (θ×)² in exp(θ×), then in J_l, (SERIES_TERMS, 4); and in the φ²-derivative of J_l, (SERIES_TERMS, 2).
+_FACTORS = np.array([_series(1), _series(2), _series(2), _series(3)]).T
+_FACTOR_RATES = np.array([_derivative(2), _derivative(3)]).T
 
 # a @ _SKEW is a× row by row.
 _SKEW = np.zeros((3, 9))
@@ -50,36 +52,35 @@ class RotationVector:
 
     def __init__(self, theta: Array) -> None:
         self.theta = theta
-        self._S = skew(theta)
-        self._S2 = self._S @ self._S
-        powers = np.empty((*theta.shape[:-1], SERIES_TERMS))
-        powers[..., 0] = 1.0
-        powers[..., 1:] = np.einsum("...i,...i->...", theta, theta)[..., None]
-        np.multiply.accumulate(powers, axis=-1, out=powers)
-        self._functions = (powers @ _SERIES)[..., None, None]
+        self._powers = np.ones((*theta.shape[:-1], SERIES_TERMS))
+        self._powers[..., 1:] = np.einsum("...i,...i->...", theta, theta)[..., None]
+        np.multiply.accumulate(self._powers, axis=-1, out=self._powers)
+        # θ× and (θ×)², each as nine numbers: combinations of the two are one small matrix product.
+        self._basis = np.empty((*theta.shape[:-1], 2, 9))
+        self._basis[..., 0, :] = theta @ _SKEW
+        S = self._basis[..., 0, :].reshape(*theta.shape, 3)
+        self._basis[..., 1, :] = (S @ S).reshape(*theta.shape[:-1], 9)
+        factors = (self._powers @ _FACTORS).reshape(*theta.shape[:-1], 2, 2)
+        self._pair = (factors @ self._basis + np.eye(3).ravel()).reshape(*theta.shape[:-1], 2, 3, 3)
 
     @property
     def matrix(self) -> Array:
         """exp(θ×) (..., 3, 3)."""
-        f = self._functions
-        return np.asarray(np.eye(3) + f[..., 0, :, :] * self._S + f[..., 1, :, :] * self._S2)
+        return np.asarray(self._pair[..., 0, :, :])
 
     @property
     def left_jacobian(self) -> Array:
         """J_l(θ) (..., 3, 3): the angular velocity of exp(θ×) in its fixed frame is J_l θ̇."""
-        f = self._functions
-        return np.asarray(np.eye(3) + f[..., 1, :, :] * self._S + f[..., 2, :, :] * self._S2)
+        return np.asarray(self._pair[..., 1, :, :])
 
     def left_jacobian_rate(self, theta_dot: Array) -> Array:
         """d/dt J_l(θ) (..., 3, 3) for θ̇ (..., 3)."""
-        f = self._functions
-        squared_dot = 2.0 * np.einsum("...i,...i->...", self.theta, theta_dot)[..., None, None]
-        S_dot = skew(theta_dot)
-        return np.asarray(
-            squared_dot * (f[..., 3, :, :] * self._S + f[..., 4, :, :] * self._S2)
-            + f[..., 1, :, :] * S_dot
-            + f[..., 2, :, :] * (S_dot @ self._S + self._S @ S_dot)
-        )
+        squared_dot = 2.0 * np.einsum("...i,...i->...", self.theta, theta_dot)[..., None]
+        factors = np.stack((squared_dot * (self._powers @ _FACTOR_RATES), self._powers @ _FACTORS[:, 2:]), axis=-2)
+        S, S_dot = self._basis[..., 0, :].reshape(*self.theta.shape, 3), skew(theta_dot)
+        basis_dot = np.stack((S_dot, S_dot @ S + S @ S_dot), axis=-3).reshape(self._basis.shape)
+        rate = factors[..., :1, :] @ self._basis + factors[..., 1:, :] @ basis_dot
+        return np.asarray(rate.reshape(*self.theta.shape, 3))
 
 
 def logarithm(R: Array) -> Array:
