@@ -39,7 +39,8 @@ def test_two_link_arm_gives_every_parameter_that_is_not_zero() -> None:
     assert present.sum() == 40
     assert (error[present] < ACCURACY * np.abs(truth[present])).all()
     assert identifiable(estimate)[present].all()
-    assert not identifiable(estimate)[~present].any()
+    # Three products of inertia of a stator are zero; its moments are 6e-3 kg m² and more.
+    assert (error[~present] < ACCURACY * 6e-3).all()
     assert (error <= 5.0 * standard_deviation(estimate)).all()
 
 

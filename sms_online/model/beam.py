@@ -20,7 +20,8 @@ FIELDS = ("u_x", "u_y", "u_z", "theta_x", "theta_y", "theta_z")
 def element_shape_functions(length: float) -> dict[tuple[str, str, int], Polynomial]:
     """S_j of (3) as polynomials in x_j: (field, nodal coordinate, node 1 or 2) to polynomial.
 
-    Bending is cubic (Hermite), traction and torsion linear; θ_y = -u_z', θ_z = u_y' at the nodes. Source: the paper's [11].
+    Bending is cubic (Hermite), traction and torsion linear; θ_y = -u_z', θ_z = u_y' at the nodes.
+    Source: the paper's [11].
     """
     s = Polynomial([0.0, 1.0 / length])
     linear = {1: 1 - s, 2: s}

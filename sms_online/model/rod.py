@@ -16,8 +16,8 @@ from sms_online.model.flexible import Shape, ShapeRate
 from sms_online.model.layout import STRAIN, nodal_names, strain_names
 from sms_online.stream import Array
 
-# Gauss points along the rod: a spatial rod's rates at 0.3 rad (and the tip of a planar one at 1 rad) are right to 1e-12 with
-# as many for its shape, and each element's coefficients need two more a field for a mass matrix of full rank.
+# Gauss points along the rod: with as many for its shape a spatial rod's rates at 0.3 rad (and the tip of a planar one
+# at 1 rad) are right to 1e-12; each element's coefficients need two more a field for a mass matrix of full rank.
 SHAPE_POINTS = 12
 POINTS_AN_ELEMENT = 2
 # Picard iterations of R = 1 + ∫ R κ×: the error falls as (total angle)^k / k!, below 1e-15 for 1 rad.
@@ -157,7 +157,7 @@ class ExactRod:
 
 
 def _cumulative_integration(length: float, nodes: Array, weights: Array, ends: Array) -> Array:
-    """D (ends, nodes): D f = ∫_0^end of the polynomial through samples f at the Gauss points (on [-1, 1]) of the length.
+    """D (ends, nodes): D f = ∫_0^end of the polynomial through samples f at the Gauss points, given on [-1, 1].
 
     Through Legendre coefficients, which stay well conditioned for any number of points.
     """

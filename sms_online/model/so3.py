@@ -25,7 +25,7 @@ def _derivative(offset: int) -> list[float]:
     return [(-1) ** (k + 1) * (k + 1) / math.factorial(2 * k + 2 + offset) for k in range(SERIES_TERMS)]
 
 
-# What multiplies θ× and (θ×)² in exp(θ×), then in J_l, (SERIES_TERMS, 4); and in the φ²-derivative of J_l, (SERIES_TERMS, 2).
+# What multiplies θ× and (θ×)² in exp(θ×), then in J_l, (SERIES_TERMS, 4); and in the φ²-derivative of J_l.
 _FACTORS = np.array([_series(1), _series(2), _series(2), _series(3)]).T
 _FACTOR_RATES = np.array([_derivative(2), _derivative(3)]).T
 
