@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 from sms_online.description.parse import describe
 from sms_online.pipeline.estimator import Estimator
 from sms_online.stream import Array
-from sms_online.trackers.interface import Estimate
 
 SCHEMA = "sms-online/results/1"
 # Half width of a 95 % interval in standard deviations.
@@ -19,23 +18,31 @@ NORMAL_95 = 1.959963984540054
 LARGEST_RELATIVE_STD = 1.0 / 3.0
 
 
-def standard_deviation(estimate: Estimate) -> Array:
-    """1σ of each parameter (n,): the larger of two answers from the residual, inf where the data determine nothing.
+def standard_deviation(estimator: Estimator) -> Array:
+    """1σ of each parameter (n,) as known now, inf where the data determine nothing.
 
-    One takes the rows' errors as independent with the residual's variance, the other allows errors that last within
-    clusters of rows, as those of an integrated balance do.
+    The larger of two answers from the residual: one takes the rows' errors as independent with the residual's variance,
+    the other allows errors that last within clusters of rows, as those of an integrated balance do. To it comes what
+    the error of each window's first instant adds, which no residual shows.
     """
-    if estimate.dof <= 0.0:
-        return np.full(estimate.pi.shape, np.inf)
+    estimate = estimator.estimate()
     std = np.full(estimate.pi.shape, np.inf)
+    if estimate.dof <= 0.0:
+        return std
     known = estimate.determined
-    std[known] = estimate.std[known] * np.sqrt(estimate.rss / estimate.dof)
-    return std if estimate.std_robust is None else np.maximum(std, estimate.std_robust)
+    row_variance = estimate.rss / estimate.dof
+    variance = np.diag(estimate.covariance)[known] * row_variance
+    if estimate.covariance_robust is not None:
+        variance = np.maximum(variance, np.diag(estimate.covariance_robust)[known])
+    inverse = np.where(np.outer(known, known), estimate.covariance, 0.0)
+    std[known] = np.sqrt(variance + row_variance * estimator.starts.variance(inverse)[known])
+    return std
 
 
-def identifiable(estimate: Estimate) -> NDArray[np.bool_]:
+def identifiable(estimator: Estimator) -> NDArray[np.bool_]:
     """Which parameters (n,) the data determine: in the span of the rows, and three standard deviations from zero."""
-    return estimate.determined & (standard_deviation(estimate) <= LARGEST_RELATIVE_STD * np.abs(estimate.pi))
+    estimate = estimator.estimate()
+    return estimate.determined & (standard_deviation(estimator) <= LARGEST_RELATIVE_STD * np.abs(estimate.pi))
 
 
 def results_document(
@@ -51,7 +58,7 @@ def results_document(
     true = None
     if truth is not None and all(p.name in truth for p in base.physical):
         true = base.values(np.array([truth[p.name] for p in base.physical]))
-    flags, deviations = identifiable(estimate), standard_deviation(estimate)
+    flags, deviations = identifiable(estimator), standard_deviation(estimator)
     parameters = []
     for k, p in enumerate(base.parameters):
         value, std = float(estimate.pi[k]), float(deviations[k])

@@ -26,9 +26,9 @@ from sms_online.model.base_parameters import find_base_parameters
 from sms_online.model.model import Model
 from sms_online.pipeline.estimator import Estimator
 from sms_online.stream import Block
+from sms_sim.live import LivePlant
 from sms_sim.simulate import sampled_blocks, simulate
 from sms_tools.cli import main
-from sms_tools.live_plant import LivePlant
 from sms_tools.priors import base_prior
 
 MOVED = AXIS + MOTION

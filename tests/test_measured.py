@@ -55,7 +55,7 @@ def test_emps_energy_fit_agrees_with_the_published_force_fit(emps_capture: Path)
     assert abs(viscous / PUBLISHED[1] - 1.0) < 0.08
     assert abs(coulomb / PUBLISHED[2] - 1.0) < 0.08
     # The published values of mass and friction lie in our own 95 % intervals.
-    std = standard_deviation(estimator.estimate())
+    std = standard_deviation(estimator)
     assert (np.abs(estimator.estimate().pi - PUBLISHED) < 1.96 * std)[:3].all()
     # The force that the published fit leaves unexplained is 4.08 % of the signal; ours, of another balance, is as
     # large.

@@ -77,7 +77,7 @@ def test_streamed_positions_and_torques_give_all_but_one_to_a_hundredth_percent(
     error = np.abs(estimate.pi / truth - 1.0)
     weak = NAMES.index("motor_2.stator_inertia")
     assert np.delete(error, weak).max() < 1e-4
-    assert abs(estimate.pi[weak] - truth[weak]) < 4.0 * standard_deviation(estimate)[weak]
+    assert abs(estimate.pi[weak] - truth[weak]) < 4.0 * standard_deviation(estimator)[weak]
 
 
 def test_recursive_equals_batch(planar_block: Block) -> None:

@@ -38,10 +38,10 @@ def test_two_link_arm_gives_every_parameter_that_is_not_zero() -> None:
     present = truth != 0.0
     assert present.sum() == 40
     assert (error[present] < ACCURACY * np.abs(truth[present])).all()
-    assert identifiable(estimate)[present].all()
+    assert identifiable(estimator)[present].all()
     # Three products of inertia of a stator are zero; its moments are 6e-3 kg m² and more.
     assert (error[~present] < ACCURACY * 6e-3).all()
-    assert (error <= 5.0 * standard_deviation(estimate)).all()
+    assert (error <= 5.0 * standard_deviation(estimator)).all()
 
 
 def relative_bound(simulation: Simulation, step: float) -> Array:
@@ -65,7 +65,7 @@ def test_seven_joint_arm_gives_what_the_motion_excites() -> None:
     # Some parameters move the energy by parts in 1e9, so the simulation has to be exact beyond that.
     simulation = simulate(load_system("seven-joint"), position_tolerance=1e-13)
     estimator, truth = streamed(simulation)
-    estimate, std = estimator.estimate(), standard_deviation(estimator.estimate())
+    estimate, std = estimator.estimate(), standard_deviation(estimator)
     bound = relative_bound(simulation, 0.02)
     error = np.abs(estimate.pi - truth)
     excited = bound < EXCITED
@@ -76,4 +76,4 @@ def test_seven_joint_arm_gives_what_the_motion_excites() -> None:
     assert excited.sum() >= 50
     assert (error[excited] < ACCURACY * np.abs(truth[excited])).all()
     # The others are flagged, or come with an error bar that holds.
-    assert (~identifiable(estimate) | (error < 5.0 * std))[~excited].all()
+    assert (~identifiable(estimator) | (error < 5.0 * std))[~excited].all()

@@ -24,6 +24,7 @@ from sms_online.trackers import (
     Tracker,
     batch_least_squares,
 )
+from sms_online.trackers.memory import BLOCK_ROWS
 
 ALL_FORGETTING: tuple[Forgetting, ...] = (NoForgetting(), Exponential(0.999), SlidingWindow(1000), Directional(0.999))
 N = 6
@@ -221,7 +222,7 @@ def test_sliding_window_equals_lstsq_over_its_last_rows(count: int) -> None:
     tracker.update(rows)
     estimate = tracker.estimate()
     last = int(estimate.rows)
-    assert min(count, 1024) <= last < 1024 + 64
+    assert min(count, 1024) <= last < 1024 + BLOCK_ROWS
     expected = batch_least_squares(rows.Y[-last:], rows.b[-last:], rows.std[-last:])
     np.testing.assert_allclose(estimate.pi, expected.pi, rtol=1e-8)
     np.testing.assert_allclose(estimate.covariance, expected.covariance, rtol=1e-6)
@@ -460,7 +461,7 @@ def test_robust_covariance_equals_the_stated_one_where_errors_are_white() -> Non
 
 def test_robust_covariance_equals_its_formula_written_out() -> None:
     rng = np.random.default_rng(36)
-    count = 64 * 100
+    count = BLOCK_ROWS * 100
     Y = rng.normal(size=(count, 3)) + np.sin(np.arange(count) / 200.0)[:, None]
     b = Y @ [1.0, 2.0, 3.0] + autoregressive(rng, count, 1, 0.99)[:, 0]
     prior = Prior(np.array([0.9, 0.0, 0.0]), np.array([0.01, np.nan, np.nan]))
@@ -485,7 +486,7 @@ def test_robust_covariance_equals_its_formula_written_out() -> None:
 def test_robust_covariance_is_withheld_while_clusters_are_too_few_and_where_rows_fade() -> None:
     for kind in ALL_FORGETTING:
         tracker = RecursiveLeastSquares(N, kind)
-        tracker.update(exciting_rows(seed=37, count=64 * N - 1))
+        tracker.update(exciting_rows(seed=37, count=BLOCK_ROWS * N - 1))
         assert tracker.estimate().std_robust is None
-        tracker.update(exciting_rows(seed=38, count=64 * N))
+        tracker.update(exciting_rows(seed=38, count=BLOCK_ROWS * N))
         assert (tracker.estimate().std_robust is None) == isinstance(kind, Exponential | Directional)

@@ -38,9 +38,6 @@ NEWTON_LIMIT = 10
 KEEP_CONTRACTION = 0.02
 # Relative increment of forward differences: half the digits of a double.
 JACOBIAN_INCREMENT = float(np.sqrt(np.finfo(float).eps))
-# Longest step, s. Rounding of the stages grows with what changes in a step, and samples between its ends are going to
-# be differentiated: at 0.2 s their rates are off by 5e-10 rad/s, here by a twentieth of that.
-LONGEST_STEP = 0.01
 # A step shorter than this (s) is not a stiff problem any more but a singular one.
 SHORTEST_STEP = 1e-10
 
@@ -231,12 +228,14 @@ class Step:
     stages: Array
 
 
-def march(f: RightHandSide, y0: Array, duration: float, tolerance: Array, stages: int = STAGES) -> Iterator[Step]:
+def march(
+    f: RightHandSide, y0: Array, duration: float, tolerance: Array, stages: int = STAGES, longest: float = np.inf
+) -> Iterator[Step]:
     """Integrate ẏ = f(t, y) from y0 (n,) at t = 0 over `duration` (s) with step control, a step at a time.
 
-    tolerance (n,): bound of the estimated local error of each state in its unit. The estimate is of the order of the
-    polynomial between steps, and step ends are better; it does not see what a state that only follows a fast pole loses
-    between steps. Raises ArithmeticError where no step is short enough. Source: Hairer & Wanner IV.8.
+    tolerance (n,): bound of the estimated local error of each state in its unit. longest: step, s. The estimate is of
+    the order of the polynomial between steps, and step ends are better; it does not see what a state that only follows
+    a fast pole loses between steps. Raises ArithmeticError where no step is short enough. Source: Hairer & Wanner IV.8.
     """
     collocation = Collocation(f, 0.0, y0, stages)
     t, y = 0.0, y0
@@ -245,7 +244,7 @@ def march(f: RightHandSide, y0: Array, duration: float, tolerance: Array, stages
     while t < duration:
         left = duration - t
         # Two equal steps to the end, so that the last one is not next to nothing.
-        h = left if left <= h else min(h, 0.5 * left, LONGEST_STEP)
+        h = left if left <= h else min(h, 0.5 * left, longest)
         if h < SHORTEST_STEP:
             raise ArithmeticError(
                 f"the motion cannot be followed at t = {collocation.t:.6f} s: the step has shrunk to {h:.1e} s"
@@ -277,9 +276,11 @@ def march(f: RightHandSide, y0: Array, duration: float, tolerance: Array, stages
             h *= factor
 
 
-def solve(f: RightHandSide, y0: Array, duration: float, tolerance: Array, stages: int = STAGES) -> Dense:
+def solve(
+    f: RightHandSide, y0: Array, duration: float, tolerance: Array, stages: int = STAGES, longest: float = np.inf
+) -> Dense:
     """All of `march` as one solution."""
-    return dense(stages, 0.0, y0, list(march(f, y0, duration, tolerance, stages)))
+    return dense(stages, 0.0, y0, list(march(f, y0, duration, tolerance, stages, longest)))
 
 
 def dense(stages: int, t0: float, y0: Array, steps: Sequence[Step]) -> Dense:

@@ -10,7 +10,7 @@ from sms_online.stream import Block
 from sms_sim.integrate import STAGES, Dense, Step, dense, march
 from sms_sim.plant import Plant
 from sms_sim.sensors import Sensors
-from sms_sim.simulate import read_blocks, tolerance
+from sms_sim.simulate import LONGEST_STEP, read_blocks, tolerance
 
 # Motion in a block, s: ten a second look continuous.
 BLOCK_SECONDS = 0.1
@@ -37,7 +37,7 @@ class LivePlant:
         """Yield the blocks from the start of the motion; noise goes on from where an earlier iteration left it."""
         plant, sensors = self._plant, self._sensors
         at_once = max(1, round(BLOCK_SECONDS * plant.system.sample_rate))
-        steps = march(plant.rate, plant.rest, self.duration, tolerance(plant))
+        steps = march(plant.rate, plant.rest, self.duration, tolerance(plant), longest=LONGEST_STEP)
         # The steps that samples may still be taken from, and the state before them.
         before, start, kept = 0.0, plant.rest, list[Step]()
         reach = float(sensors.latency.max()) + BLOCK_SECONDS

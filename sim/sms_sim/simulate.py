@@ -18,6 +18,9 @@ from sms_sim.sensors import Sensors
 # Bounds of the local error of a step. Positions are going to be differentiated: with these bounds an eighth-order
 # difference of them at 1 kHz is within 3e-9 m/s or rad/s of the speeds (measured on the planar example).
 POSITION_TOLERANCE = 1e-11  # m, rad
+# Longest step, s. Rounding of the stages grows with what changes in a step, and samples between its ends are going to
+# be differentiated: at 0.2 s their rates are off by 5e-10 rad/s, here by a twentieth of that.
+LONGEST_STEP = 0.01
 # Speeds change that much faster than positions, 1/s.
 SPEED_FACTOR = 100.0
 # Samples of a block: enough to hide the cost of a call.
@@ -133,7 +136,8 @@ def simulate(
         duration = system.trajectory.duration
     plant = Plant(system, parameters)
     start = plant.rest if initial is None else np.concatenate(initial)
-    return Simulation(plant, solve(plant.rate, start, duration, tolerance(plant, position_tolerance)))
+    bounds = tolerance(plant, position_tolerance)
+    return Simulation(plant, solve(plant.rate, start, duration, bounds, longest=LONGEST_STEP))
 
 
 def tolerance(plant: Plant, position: float = POSITION_TOLERANCE) -> Array:

@@ -42,6 +42,33 @@ class BalanceRows:
     index: NDArray[np.int64]
 
 
+class SharedStarts:
+    """What the error of each window's first instant does to an estimate.
+
+    All rows of a window are differences to one instant, whose error they share: the rows' errors have covariance
+    σ² (1 + 1 1ᵀ) in a window. Least squares takes them for independent; the shared part adds σ² (Λ⁻¹ g)(Λ⁻¹ g)ᵀ to its
+    covariance, Λ = YᵀY, with g the sum of the window's rows.
+    """
+
+    def __init__(self, n: int) -> None:
+        self.closed = np.zeros((n, n))  # Σ g gᵀ over finished windows
+        self.sum = np.zeros(n)  # g of the window that is open
+
+    def add(self, Y: Array) -> None:
+        """Rows (M, n) of the open window."""
+        self.sum = self.sum + Y.sum(axis=0)
+
+    def close(self) -> None:
+        """The next rows belong to another window."""
+        self.closed = self.closed + np.outer(self.sum, self.sum)
+        self.sum = np.zeros_like(self.sum)
+
+    def variance(self, inverse: Array) -> Array:
+        """Variance (n,) of each parameter for σ = 1, from Λ⁻¹ (n, n)."""
+        spread = inverse @ (self.closed + np.outer(self.sum, self.sum)) @ inverse
+        return np.asarray(np.diag(spread))
+
+
 class EnergyBalance:
     """Turns consecutive samples of positions, speeds and torques into rows of (44), in J."""
 
@@ -51,6 +78,7 @@ class EnergyBalance:
         self.stride = max(1, round(sample_rate / ROW_RATE))
         self.window = self.stride * round(WINDOW * sample_rate / self.stride)
         self._weights = interval_weights() / sample_rate
+        self.starts = SharedStarts(base.n)
         self.begin_segment()
 
     def begin_segment(self) -> None:
@@ -62,6 +90,7 @@ class EnergyBalance:
         self._integral = np.zeros(self.model.n_pi + 1)
         self._instant = 0  # number of that instant in its segment
         self._window_start: Array | None = None  # balance at the window's first instant
+        self.starts.close()
 
     def push(self, index: NDArray[np.int64], x: Array, v: Array, joint_torque: Array) -> BalanceRows:
         """Rows that B consecutive samples complete: grid index (B,), x (B, n_x), v (B, n_v), n τ (B, joints)."""
@@ -88,10 +117,13 @@ class EnergyBalance:
         differences, ends = [], []
         for row, instant, k in zip(balance, instants[chosen], grid, strict=True):
             if self._window_start is not None:
-                differences.append(row - self._window_start)
+                difference = row - self._window_start
+                differences.append(difference)
                 ends.append(k)
+                self.starts.add(self.base.columns(difference[None, :-1]))
             if instant % self.window == 0:
                 self._window_start = row
+                self.starts.close()
         return self._rows(differences, ends)
 
     def _rows(self, differences: list[Array], ends: list[int]) -> BalanceRows:
@@ -106,6 +138,7 @@ class EnergyBalance:
         return {
             "x": self._x, "v": self._v, "power": self._power, "integral": self._integral,
             "instant": self._instant, "window_start": start,
+            "closed": self.starts.closed, "sum": self.starts.sum,
         }  # fmt: skip
 
     def restore(self, state: dict[str, Array]) -> None:
@@ -113,3 +146,4 @@ class EnergyBalance:
         self._x, self._v, self._power = state["x"], state["v"], state["power"]
         self._integral, self._instant = state["integral"], int(state["instant"])
         self._window_start = state["window_start"] if state["window_start"].size else None
+        self.starts.closed, self.starts.sum = state["closed"], state["sum"]

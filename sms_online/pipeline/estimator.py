@@ -10,7 +10,7 @@ import numpy as np
 from sms_online.description.schema import System
 from sms_online.model.base_parameters import BaseParameters, find_base_parameters
 from sms_online.model.model import Model
-from sms_online.pipeline.energy_balance import BalanceRows, EnergyBalance
+from sms_online.pipeline.energy_balance import BalanceRows, EnergyBalance, SharedStarts
 from sms_online.pipeline.joint_balance import JointBalance
 from sms_online.pipeline.rates import RateSamples, RatesStage
 from sms_online.pipeline.sensing import AttitudeContinuity, Sensing
@@ -82,6 +82,11 @@ class Estimator:
     def half_width(self) -> int:
         """Half width M of the rates' filter, samples."""
         return self._rates.half_width
+
+    @property
+    def starts(self) -> SharedStarts:
+        """What the error of each energy window's first instant does to the estimate."""
+        return self._energy.starts
 
     @property
     def counters(self) -> SyncCounters:
