@@ -35,7 +35,8 @@ def standard_deviation(estimator: Estimator) -> Array:
     if estimate.covariance_robust is not None:
         variance = np.maximum(variance, np.diag(estimate.covariance_robust)[known])
     inverse = np.where(np.outer(known, known), estimate.covariance, 0.0)
-    std[known] = np.sqrt(variance + row_variance * estimator.starts.variance(inverse)[known])
+    shared = row_variance * estimate.scale**2 * estimator.starts.variance(inverse / estimate.scale**2)
+    std[known] = np.sqrt(variance + shared[known])
     return std
 
 

@@ -32,7 +32,9 @@ def replayed(name: str, capture: Path, prior: float | None = None) -> Estimator:
     if prior is not None:
         nominal = estimator.base.values(estimator.model.nominal)
         spread = np.where(nominal == 0.0, np.nan, prior * np.abs(nominal))
-        estimator.tracker = RecursiveLeastSquares(estimator.base.n, prior=Prior(nominal, spread))
+        estimator.tracker = RecursiveLeastSquares(
+            estimator.base.n, prior=Prior(nominal, spread), scaled_by_residual=True
+        )
     for block in source:
         estimator.push(block)
     estimator.finish()

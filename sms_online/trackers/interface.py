@@ -86,7 +86,8 @@ class Estimate:
     for autocorrelated errors; None where it is not defined (see `robust`). A parameter that is not determined has an
     infinite variance and zeros beside it. determined: (n,) bool. condition_number: of the column-scaled information
     factor, inf where its rank is not full. rows: number of rows, less where old ones count less.
-    rss: residual sum of squares of the whitened rows, priors included. dof: its degrees of freedom.
+    rss: residual sum of squares of the whitened rows, priors included. dof: its degrees of freedom. scale: what the
+    rows' stated std were multiplied with.
     """
 
     pi: Array
@@ -97,6 +98,7 @@ class Estimate:
     rows: float
     rss: float
     dof: float
+    scale: float = 1.0
 
     @property
     def std(self) -> Array:

@@ -10,8 +10,11 @@ from sms_online.stream import Array
 from sms_online.trackers.factor import prior_factor, solve, triangular_factor
 from sms_online.trackers.forgetting import Forgetting, NoForgetting
 from sms_online.trackers.interface import Estimate, Prior, Rows, State, saved_array, saved_number
-from sms_online.trackers.memory import BLOCK_ROWS, memory_for
+from sms_online.trackers.memory import BLOCK_ROWS, Content, memory_for
 from sms_online.trackers.robust import cluster_covariance
+
+# No row is taken for better than this part of the rows' size: below it columns hold rounding, which is no information.
+FINEST_ROWS = 1e-9
 
 
 class RecursiveLeastSquares:
@@ -20,11 +23,20 @@ class RecursiveLeastSquares:
     Rows are gathered into blocks of fixed size before they are absorbed, so that no bit of the result depends on how
     they were split into calls; an estimate counts the pending rows too and leaves them pending.
     A prior is not measured by the rows and does not age: it is added at each estimate and never forgotten.
+    scaled_by_residual: the rows' std are right up to a common factor; it is taken from what the rows leave among
+    themselves, so that they can be weighed against a prior and covariances need no scaling afterwards.
     Source: Bierman, Factorization Methods for Discrete Sequential Estimation, 1977, chapter IV (SRIF data processing).
     """
 
-    def __init__(self, n: int, forgetting: Forgetting | None = None, prior: Prior | None = None) -> None:
+    def __init__(
+        self,
+        n: int,
+        forgetting: Forgetting | None = None,
+        prior: Prior | None = None,
+        scaled_by_residual: bool = False,
+    ) -> None:
         self.enabled = True
+        self._scaled = scaled_by_residual
         self._n = n
         self._forgetting = forgetting if forgetting is not None else NoForgetting()
         self._prior = prior_factor(prior, n)
@@ -50,10 +62,11 @@ class RecursiveLeastSquares:
     def estimate(self) -> Estimate:
         """The estimate from all rows so far and the prior; leaves the state as it is."""
         content = self._memory.with_pending(self._pending[: self._fill])
-        solution = solve(triangular_factor(self._prior, content.factor))
+        scale = _residual_std(content) if self._scaled else 1.0
+        solution = solve(triangular_factor(self._prior, content.factor / scale))
         robust = None
         if content.clusters is not None:
-            robust = cluster_covariance(solution, content.clusters, self._prior, content.rows)
+            robust = cluster_covariance(solution, content.clusters / scale, self._prior, content.rows)
         return Estimate(
             pi=solution.pi,
             covariance=solution.covariance(),
@@ -63,6 +76,7 @@ class RecursiveLeastSquares:
             rows=content.rows,
             rss=solution.rss,
             dof=max(content.rows + len(self._prior) - solution.rank, 0.0),
+            scale=scale,
         )
 
     def reset(self) -> None:
@@ -90,3 +104,13 @@ class RecursiveLeastSquares:
         self._fill = len(pending)
         self._pending[: self._fill] = pending
         self.enabled = enabled
+
+
+def _residual_std(content: Content) -> float:
+    """Standard deviation of the whitened rows about their own solution; 1 where there are too few to tell."""
+    alone = solve(content.factor)
+    freedom = content.rows - alone.rank
+    size = float(np.linalg.norm(content.factor[:, -1]))
+    if freedom <= 0 or size == 0.0:
+        return 1.0
+    return max(float(np.sqrt(alone.rss / freedom)), FINEST_ROWS * size / float(np.sqrt(content.rows)))

@@ -132,7 +132,7 @@ def _add_replay(verbs: Verbs) -> None:
     parser.add_argument("-ss", dest="start", metavar="SECONDS", type=_seconds(), help="leave out what is before")
     parser.add_argument("-to", dest="stop", metavar="SECONDS", type=_seconds(positive=True), help="and what is after")
     text = (
-        "start from the system file's nominal values, each ± 100 %% (those of 0 stay unknown); "
+        "start from the system file's nominal values, each ± 10 %% (those of 0 stay unknown); "
         "priors that the file itself states hold with and without it"
     )
     parser.add_argument("--prior", action="store_true", help=text)

@@ -49,7 +49,7 @@ def parameter_table(document: Document, width: int, title: str | None = None) ->
     for heading in headings:
         table.add_column(heading, justify="right", no_wrap=True)
     for p in parameters:
-        cells = [p["name"], p["unit"], NOT_DETERMINED, ""] + [""] * wide
+        cells = [p["name"], p["unit"], NOT_DETERMINED, _in_doubt(p)] + [""] * wide
         if p["identifiable"]:
             shown = _formatter(p["estimate"], p["std"])
             cells[2:4] = shown(p["estimate"]), f"{p['std']:.2g}"
@@ -70,6 +70,11 @@ def _formatter(estimate: float, std: float) -> Callable[[float], str]:
     if magnitude < SMALLEST_PLAIN:
         return lambda value: f"{value:.{digits - 1}e}"
     return lambda value: f"{value:.{max(0, digits - 1 - magnitude)}f}"
+
+
+def _in_doubt(p: Document) -> str:
+    """What the data say of a parameter that they do not determine: enough to see why, too little to copy down."""
+    return "" if p["std"] is None else f"({p['estimate']:.2g} ± {p['std']:.1g})"
 
 
 def _error(p: Document) -> str:

@@ -35,7 +35,7 @@ def new_estimator(system: System, channels: tuple[str, ...], source: str, nomina
         return Estimator(system, channels, source)
     base = find_base_parameters(Model(system))
     prior = base_prior(system, base, nominal_prior)
-    return Estimator(system, channels, source, RecursiveLeastSquares(base.n, prior=prior))
+    return Estimator(system, channels, source, RecursiveLeastSquares(base.n, prior=prior, scaled_by_residual=True))
 
 
 def stream(
