@@ -108,7 +108,7 @@ class Configuration:
         self.size = x.shape[0]
         self.r_S, self.T_0 = layout.base_pose(x)
         offset = layout.n_base_positions - layout.n_base_speeds
-        self.shapes: list[Shape | None] = []
+        self._shapes: dict[int, Shape] = {}
         self.turns: list[Array] = []  # A_i(q_i), (B, 3, 3)
         self.slides: list[Array | None] = []  # displacement of a prismatic joint in its mount frame, (B, 3)
         for i, joint in enumerate(chain.joints):
@@ -119,8 +119,13 @@ class Configuration:
             else:
                 self.turns.append(np.broadcast_to(np.eye(3), (self.size, 3, 3)))
                 self.slides.append(q[:, None] * chain.axes[i])
-            kinematics = chain.flexible[i]
-            self.shapes.append(None if kinematics is None else kinematics.shape(chain.elastic(x, i)))
+
+    def shape(self, i: int) -> Shape | None:
+        """Shape of link i (from 0), made when it is first asked for; None of a rigid link."""
+        kinematics = self.chain.flexible[i]
+        if kinematics is not None and i not in self._shapes:
+            self._shapes[i] = kinematics.shape(self.chain.elastic(self.x, i))
+        return self._shapes.get(i)
 
     @cached_property
     def frames(self) -> list[Frame]:
@@ -128,8 +133,8 @@ class Configuration:
         chain = self.chain
         end = Frame(self.r_S + self.T_0 @ chain.joint_1_from_S, self.T_0)
         frames = [end]
-        for i, (turn, slide, shape) in enumerate(zip(self.turns, self.slides, self.shapes, strict=True)):
-            C, description = chain.mounts[i], chain.links[i]
+        for i, (turn, slide) in enumerate(zip(self.turns, self.slides, strict=True)):
+            C, description, shape = chain.mounts[i], chain.links[i], self.shape(i)
             mount = end if C is None else Frame(end.origin, end.rotation @ C)
             origin = mount.origin if slide is None else mount.origin + (mount.rotation @ slide[..., None])[..., 0]
             link = Frame(origin, mount.rotation @ turn)
@@ -147,8 +152,8 @@ class Configuration:
         """Twist Jacobians (B, 6, n_v) of all frames."""
         return self.twists(np.eye(self.chain.layout.n_v)[None])
 
-    def twists(self, rates: Array) -> list[Array]:
-        """Twists (B, 6, m) of all frames for columns of generalized speeds `rates` (B or 1, n_v, m)."""
+    def twists(self, rates: Array, frames: int | None = None) -> list[Array]:
+        """Twists (B, 6, m) of all frames, or of the first few, for columns of speeds `rates` (B or 1, n_v, m)."""
         chain, layout = self.chain, self.chain.layout
         twist = _turn_back(self.T_0, chain.select_base @ rates)
         twist[:, :3] += chain.base_arm @ twist[:, 3:]
@@ -162,15 +167,17 @@ class Configuration:
             rows = slice(3, 6) if slide is None else slice(0, 3)
             link[:, rows] += chain.axes[i][:, None] * rates[:, layout.q[i], None, :]
             out += [mount, link]
+            if frames is not None and len(out) >= frames:
+                return out
             twist = self._unturned_end(i, link, rates)
-            shape = self.shapes[i]
+            shape = self.shape(i)
             if shape is not None:
                 twist = _turn_back(shape.tip_rotation, twist)
         return [*out, twist]
 
     def _unturned_end(self, i: int, link: Array, rates: Array) -> Array:
         """Twists at the end of link i (from 0), still in the axes of {i}."""
-        shape, arm = self.shapes[i], self.chain.rigid_arms[i]
+        shape, arm = self.shape(i), self.chain.rigid_arms[i]
         if shape is None or arm is not None:
             return _shift(link, arm)
         end = _shift(link, -so3.skew(shape.tip))
@@ -183,7 +190,7 @@ class Configuration:
         """Rates of every flexible link's shape for speeds v (B, n_v)."""
         out: list[ShapeRate | None] = []
         for i, kinematics in enumerate(self.chain.flexible):
-            shape = self.shapes[i]
+            shape = self.shape(i)
             if kinematics is None or shape is None:
                 out.append(None)
             else:
@@ -227,7 +234,7 @@ class Configuration:
 
     def _end_rate(self, i: int, link: Array, link_twist: Array, rates: Array, shape_rate: ShapeRate | None) -> Array:
         """Rates of the twists at the end of link i (from 0), in the end's axes."""
-        shape, arm = self.shapes[i], self.chain.rigid_arms[i]
+        shape, arm = self.shape(i), self.chain.rigid_arms[i]
         if shape is None or shape_rate is None or arm is not None:
             return _shift(link, arm)
         elastic = rates[:, self.chain.layout.q_f[i]]

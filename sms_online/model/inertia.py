@@ -80,7 +80,7 @@ class LinkMotion:
     """
 
     def __init__(self, term: LinkTerm, configuration: Configuration) -> None:
-        shape = configuration.shapes[term.link]
+        shape = configuration.shape(term.link)
         assert shape is not None
         self.term = term
         self.shape: Shape = shape

@@ -30,15 +30,27 @@ class Spring:
     speeds: slice | list[int]
     matrix: Array
 
-    def energy(self, z: Array) -> Array:
-        """½ zᵀ S z (B,) for all coordinates in the order of the speeds (B, n_v)."""
-        own = z[:, self.speeds]
-        return np.asarray(0.5 * ((own @ self.matrix) * own).sum(axis=1))
-
     def add_to(self, full: Array, factor: float) -> None:
         """Add `factor` S to an (n_v, n_v) matrix."""
         columns = np.arange(full.shape[0])[self.speeds]
         full[np.ix_(columns, columns)] += factor * self.matrix
+
+
+class QuadraticForms:
+    """Several springs (or dampers) at once: ½ zᵀ S z of each is linear in the products of coordinates."""
+
+    def __init__(self, springs: list[Spring], n_v: int) -> None:
+        self.parameters = [spring.parameter for spring in springs]
+        full = np.zeros((len(springs), n_v, n_v))
+        for matrix, spring in zip(full, springs, strict=True):
+            spring.add_to(matrix, 0.5)
+        # Products that occur in none of them are left out.
+        self._first, self._second = np.nonzero(np.any(full != 0.0, axis=0))
+        self._weights = full[:, self._first, self._second].T
+
+    def energies(self, z: Array) -> Array:
+        """½ zᵀ S z (B, springs) for all coordinates in the order of the speeds (B, n_v)."""
+        return np.asarray((z[:, self._first] * z[:, self._second]) @ self._weights)
 
 
 class Model:
@@ -58,6 +70,10 @@ class Model:
         self._add_bodies(parameters)
         self._add_links(parameters)
         self._add_springs(parameters)
+        self._stiffness = QuadraticForms(self.springs, self.layout.n_v)
+        self._damping = QuadraticForms(self.dampers, self.layout.n_v)
+        # Frames that something sits in: the last one, the end of the last link, holds the payload alone.
+        self._frames = 1 + max(term.frame for term in (*self.bodies, *self.links))
         self.effect_slices: list[slice] = []
         for effect in self.effects:
             self.effect_slices.append(slice(len(parameters), len(parameters) + len(effect.parameters)))
@@ -134,6 +150,12 @@ class Model:
                 parameters.append(Parameter(f"joint_{i}.{kind}", f"{symbol}_{i}", unit, getattr(joint, kind)))
 
     @property
+    def dissipative(self) -> list[int]:
+        """Parameters that take power out: indices whose column in `power_columns` is not always zero."""
+        effects = [k for columns in self.effect_slices for k in range(columns.start, columns.stop)]
+        return self._damping.parameters + effects
+
+    @property
     def n_pi(self) -> int:
         """Number of physical parameters, effects included."""
         return len(self.parameters)
@@ -153,7 +175,7 @@ class Model:
         Y = np.zeros((x.shape[0], self.n_pi))
         configuration = self.chain.configure(x)
         rates = v[:, :, None]
-        twists = configuration.twists(rates)
+        twists = configuration.twists(rates, self._frames)
         for body in self.bodies:
             nu = body.local(twists, rates)[..., 0]
             Y[:, body.parameters] = body.energy(nu)
@@ -162,9 +184,7 @@ class Model:
             Y[:, link.parameters] = LinkMotion(link, configuration).energy(nu)
         if self.gravity.any():
             self._add_gravity_potential(Y, configuration)
-        z = self._spring_coordinates(x)
-        for spring in self.springs:
-            Y[:, spring.parameter] = spring.energy(z)
+        Y[:, self._stiffness.parameters] = self._stiffness.energies(self._spring_coordinates(x))
         return Y
 
     def _spring_coordinates(self, x: Array) -> Array:
@@ -184,7 +204,7 @@ class Model:
             Y[:, body.parameters] -= (frame.origin @ g)[:, None] * mass + local @ first.T
         for link in self.links:
             frame = configuration.frames[link.frame]
-            shape = configuration.shapes[link.link]
+            shape = configuration.shape(link.link)
             assert shape is not None
             center = np.einsum("g,bgi->bi", link.weights, shape.points)
             weight = link.weights.sum() * (frame.origin @ g) + np.einsum("bi,bi->b", center, g @ frame.rotation)
@@ -193,8 +213,7 @@ class Model:
     def power_columns(self, x: Array, v: Array) -> Array:
         """Columns (B, n_pi) of dissipated power, (24), and of the power that the effects take out, W per unit."""
         D = np.zeros((x.shape[0], self.n_pi))
-        for damper in self.dampers:
-            D[:, damper.parameter] = 2.0 * damper.energy(v)
+        D[:, self._damping.parameters] = 2.0 * self._damping.energies(v)
         for effect, columns in zip(self.effects, self.effect_slices, strict=True):
             D[:, columns] = -np.einsum("bvn,bv->bn", effect.force(self.layout, x, v), v)
         return D
@@ -210,9 +229,9 @@ class Model:
         P, G = np.zeros((B, len(rows), self.n_pi)), np.zeros((B, len(rows), self.n_pi))
         configuration = self.chain.configure(x)
         rates, select, none = v[:, :, None], np.eye(n_v)[None, :, list(rows)], np.zeros((1, n_v, len(rows)))
-        twists = configuration.twists(rates)
+        twists = configuration.twists(rates, self._frames)
         self._add_forces(G, x, v, rows)
-        if not self.chain.moves(len(twists) - 1, slice(0, 0))[list(rows)].any():
+        if not self.chain.moves(self._frames - 1, slice(0, 0))[list(rows)].any():
             # Motor sides of flexible joints alone: no frame moves with them, their momentum is all there is.
             for body in self.bodies:
                 for row in np.flatnonzero(np.isin(rows, range(*body.speeds.indices(n_v)))):

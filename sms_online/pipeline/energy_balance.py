@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 from numpy.polynomial import Polynomial
 from numpy.typing import NDArray
 
@@ -78,6 +79,8 @@ class EnergyBalance:
         self.stride = max(1, round(sample_rate / ROW_RATE))
         self.window = self.stride * round(WINDOW * sample_rate / self.stride)
         self._weights = interval_weights() / sample_rate
+        # What is integrated: the columns that dissipate, then the work of the motors.
+        self._columns = [*model.dissipative, model.n_pi]
         self.starts = SharedStarts(base.n)
         self.begin_segment()
 
@@ -86,8 +89,8 @@ class EnergyBalance:
         layout = self.model.layout
         # The last 2 SIDE - 1 samples; the instant up to which the integral is known is number SIDE - 1 of them.
         self._x, self._v = np.empty((0, layout.n_x)), np.empty((0, layout.n_v))
-        self._power = np.empty((0, self.model.n_pi + 1))
-        self._integral = np.zeros(self.model.n_pi + 1)
+        self._power = np.empty((0, len(self._columns)))
+        self._integral = np.zeros(len(self._columns))
         self._instant = 0  # number of that instant in its segment
         self._window_start: Array | None = None  # balance at the window's first instant
         self.starts.close()
@@ -95,7 +98,7 @@ class EnergyBalance:
     def push(self, index: NDArray[np.int64], x: Array, v: Array, joint_torque: Array) -> BalanceRows:
         """Rows that B consecutive samples complete: grid index (B,), x (B, n_x), v (B, n_v), n τ (B, joints)."""
         work = np.einsum("bj,bj->b", joint_torque, v[:, list(self.model.layout.theta_m)])
-        power = np.concatenate((self.model.power_columns(x, v), work[:, None]), axis=1)
+        power = np.concatenate((self.model.power_columns(x, v)[:, self._columns[:-1]], work[:, None]), axis=1)
         x, v = np.concatenate((self._x, x)), np.concatenate((self._v, v))
         power = np.concatenate((self._power, power))
         kept = 2 * SIDE - 1
@@ -103,15 +106,15 @@ class EnergyBalance:
         self._x, self._v, self._power = x[-kept:], v[-kept:], power[-kept:]
         if intervals == 0:
             return self._rows([], [])
-        steps = np.zeros((intervals, power.shape[1]))
-        for k, weight in enumerate(self._weights):
-            steps += weight * power[k : k + intervals]
+        steps = sliding_window_view(power, 2 * SIDE, axis=0) @ self._weights
         integral = np.cumsum(np.concatenate((self._integral[None], steps)), axis=0)
         instants = self._instant + np.arange(intervals + 1)
         fresh = instants >= (0 if self._window_start is None else self._instant + 1)
         chosen = np.flatnonzero(fresh & (instants % self.stride == 0))
-        balance = integral[chosen]
-        balance[:, :-1] += self.model.energy_columns(x[SIDE - 1 + chosen], v[SIDE - 1 + chosen])
+        balance = np.zeros((chosen.size, self.model.n_pi + 1))
+        if chosen.size:
+            balance[:, :-1] = self.model.energy_columns(x[SIDE - 1 + chosen], v[SIDE - 1 + chosen])
+        balance[:, self._columns] += integral[chosen]
         self._integral, self._instant = integral[-1], int(instants[-1])
         grid = index[-1] - SIDE - intervals + chosen
         differences, ends = [], []
