@@ -105,7 +105,7 @@ class EnergyBalance:
         intervals = max(0, power.shape[0] - kept)
         self._x, self._v, self._power = x[-kept:], v[-kept:], power[-kept:]
         if intervals == 0:
-            return self._rows([], [])
+            return self._rows(np.empty((0, self.model.n_pi + 1)), index[:0])
         steps = sliding_window_view(power, 2 * SIDE, axis=0) @ self._weights
         integral = np.cumsum(np.concatenate((self._integral[None], steps)), axis=0)
         instants = self._instant + np.arange(intervals + 1)
@@ -117,23 +117,25 @@ class EnergyBalance:
         balance[:, self._columns] += integral[chosen]
         self._integral, self._instant = integral[-1], int(instants[-1])
         grid = index[-1] - SIDE - intervals + chosen
-        differences, ends = [], []
-        for row, instant, k in zip(balance, instants[chosen], grid, strict=True):
-            if self._window_start is not None:
-                difference = row - self._window_start
-                differences.append(difference)
-                ends.append(k)
-                self.starts.add(self.base.columns(difference[None, :-1]))
-            if instant % self.window == 0:
-                self._window_start = row
-                self.starts.close()
-        return self._rows(differences, ends)
+        differences = np.empty_like(balance)
+        reported = slice(1 if self._window_start is None else 0, None)
+        start = balance[0] if self._window_start is None and chosen.size else self._window_start
+        closes = instants[chosen] % self.window == 0
+        for rows in np.split(np.arange(chosen.size), np.flatnonzero(closes) + 1):
+            if rows.size and start is not None:
+                differences[rows] = balance[rows] - start
+                self.starts.add(self.base.columns(differences[rows, :-1]))
+                if closes[rows[-1]]:
+                    # The last instant of a window is the first of the next.
+                    start = balance[rows[-1]]
+                    self.starts.close()
+        self._window_start = start
+        return self._rows(differences[reported], grid[reported])
 
-    def _rows(self, differences: list[Array], ends: list[int]) -> BalanceRows:
-        balance = np.array(differences).reshape(len(differences), self.model.n_pi + 1)
-        columns = balance[:, :-1]
-        b = balance[:, -1] - self.base.known_part(columns)
-        return BalanceRows(self.base.columns(columns), b, np.array(ends, dtype=np.int64))
+    def _rows(self, differences: Array, ends: NDArray[np.int64]) -> BalanceRows:
+        columns = differences[:, :-1]
+        b = differences[:, -1] - self.base.known_part(columns)
+        return BalanceRows(self.base.columns(columns), b, ends)
 
     def state(self) -> dict[str, Array | int]:
         """What `restore` needs to continue."""
