@@ -56,6 +56,9 @@ PACE = 2
 DECISION_COST = 256
 # Channels move in a window when one spans this many σ in each of its halves; noise alone spans 7.
 MOTION = 20.0
+# Windows that move before M is fixed: the first motion after rest begins with a jolt, which asks for a narrower filter
+# than anything after it.
+MOVING_WINDOWS = 3
 NEVER = int(np.iinfo(np.int64).max)
 
 
@@ -146,10 +149,10 @@ def _agree(leftover: Array, difference: Array, sigma: Array) -> bool:
 class RatesStage:
     """Smoothed values and rates of all columns, behind the same lag of M samples.
 
-    The first window of `warm_up` samples in which the channels move throughout fixes M for good. Windows before it,
-    at rest or with the onset of motion, get an M of their own: a choice made at rest would be blind to the motion
-    to come. Until M is fixed samples wait for their window to fill; none is lost, except the first and last M of a
-    segment, which have no full filter.
+    The third window of `warm_up` samples in which the channels move throughout fixes M for good. Windows before it, at
+    rest, with the onset of motion or its first jolt, get an M of their own: a choice made at rest would be blind to the
+    motion to come. Until M is fixed samples wait for their window to fill; none is lost, except the first and last M of
+    a segment, which have no full filter.
     Limitation: motion much faster than that window's is smoothed by its M.
 
     sample_rate: Hz. deciding: columns that have a say in M (positions, not torques). sigma: (C,) stated white
@@ -163,18 +166,18 @@ class RatesStage:
         self._stated = sigma.copy()
         self._deciding = np.array(deciding, dtype=np.int64)
         self._warm_up = warm_up
-        self._fixed = False
         self._segment = -1
         self._buffer = np.empty((0, sigma.size))
         self._start = 0  # grid index of the buffer's first row
         self._next = 0  # grid index of the next sample to deliver
         self._decided = 0  # grid index up to which half_width holds
         self._noise_known = False  # of the window that is being decided
+        self._moved = 0  # windows that moved throughout
 
     @property
     def fixed(self) -> bool:
         """Whether M (half_width) and the noise (sigma) are fixed for the rest of the capture."""
-        return self._fixed
+        return self._moved >= MOVING_WINDOWS
 
     def push(self, samples: GridSamples) -> list[RateSamples]:
         """Take consecutive grid samples and return those that have become final."""
@@ -183,7 +186,7 @@ class RatesStage:
             pieces = self.flush()
             self._segment = samples.segment
             self._start = self._next = int(samples.index[0])
-            self._decided = NEVER if self._fixed else self._start
+            self._decided = NEVER if self.fixed else self._start
         self._buffer = np.concatenate([self._buffer, samples.values])
         return pieces + self._advance(PACE * samples.index.size)
 
@@ -191,7 +194,7 @@ class RatesStage:
         """End of a segment or of the capture: return what has a full filter."""
         pieces = self._advance(NEVER)
         rest = self._buffer[max(self._decided - self._start, 0) :]
-        if not self._fixed and rest.shape[0] >= SAMPLES_PER_HALF_WIDTH * HALF_WIDTHS[1]:
+        if not self.fixed and rest.shape[0] >= SAMPLES_PER_HALF_WIDTH * HALF_WIDTHS[1]:
             self._estimate_noise(rest)
             self._choose(rest)
         self._decided, self._noise_known = NEVER, False
@@ -203,7 +206,7 @@ class RatesStage:
     def state(self) -> StageState:
         """Everything that the next push depends on, as arrays."""
         numbers = [
-            self.half_width, self._fixed, self._segment, self._start, self._next, self._decided, self._noise_known
+            self.half_width, self._moved, self._segment, self._start, self._next, self._decided, self._noise_known
         ]  # fmt: skip
         return {"buffer": self._buffer.copy(), "sigma": self.sigma.copy(), "numbers": np.array(numbers, dtype=np.int64)}
 
@@ -211,8 +214,8 @@ class RatesStage:
         """Continue from a saved state of a stage made with the same arguments."""
         self._buffer, self.sigma = state["buffer"].copy(), state["sigma"].copy()
         numbers = [int(number) for number in state["numbers"]]
-        self.half_width, fixed, self._segment, self._start, self._next, self._decided, noise_known = numbers
-        self._fixed, self._noise_known = bool(fixed), bool(noise_known)
+        self.half_width, self._moved, self._segment, self._start, self._next, self._decided, noise_known = numbers
+        self._noise_known = bool(noise_known)
 
     def _advance(self, budget: int) -> list[RateSamples]:
         """Deliver and decide, as far as the samples reach and the budget lasts."""
@@ -222,7 +225,7 @@ class RatesStage:
             if delivered:
                 pieces += delivered
                 budget -= delivered[0].index.size
-            elif not self._fixed and self._start + self._buffer.shape[0] - self._warm_up >= self._decided:
+            elif not self.fixed and self._start + self._buffer.shape[0] - self._warm_up >= self._decided:
                 offset = self._decided - self._start
                 self._decide(self._buffer[offset : offset + self._warm_up])
                 budget -= DECISION_COST
@@ -238,8 +241,8 @@ class RatesStage:
             return
         self._choose(window)
         self._noise_known = False
-        self._fixed = self._moves_throughout(window)
-        self._decided = NEVER if self._fixed else self._decided + self._warm_up
+        self._moved += self._moves_throughout(window)
+        self._decided = NEVER if self.fixed else self._decided + self._warm_up
 
     def _estimate_noise(self, window: Array) -> None:
         estimate = np.isnan(self._stated)
@@ -264,7 +267,7 @@ class RatesStage:
         rows = self._buffer[first - self.half_width - self._start : stop + self.half_width - self._start]
         values, rates = smooth_and_differentiate(rows, self.half_width, self.sample_rate)
         self._next = stop
-        reach = self.half_width if self._fixed else HALF_WIDTHS[-1]
+        reach = self.half_width if self.fixed else HALF_WIDTHS[-1]
         drop = max(stop - reach - self._start, 0)
         self._buffer, self._start = self._buffer[drop:].copy(), self._start + drop
         return [RateSamples(np.arange(first, stop), values, rates, self._segment, self.half_width)]
