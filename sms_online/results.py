@@ -21,22 +21,27 @@ LARGEST_RELATIVE_STD = 1.0 / 3.0
 def standard_deviation(estimator: Estimator) -> Array:
     """1σ of each parameter (n,) as known now, inf where the data determine nothing.
 
-    The larger of two answers from the residual: one takes the rows' errors as independent with the residual's variance,
-    the other allows errors that last within clusters of rows, as those of an integrated balance do. To it comes what
-    the error of each window's first instant adds, which no residual shows.
+    The larger of two answers from the residual: one takes the rows' errors as independent with the residual's
+    variance, the other allows errors that last within clusters of rows. To it comes what errors add that rows of a
+    window share, which least squares absorbs and no residual shows; it is known while no row is forgotten. Where rows
+    have been weighed against a prior, the posterior's own covariance holds.
     """
     estimate = estimator.estimate()
     std = np.full(estimate.pi.shape, np.inf)
     if estimate.dof <= 0.0:
         return std
     known = estimate.determined
+    if estimate.scale is not None:
+        std[known] = estimate.std[known]
+        return std
     row_variance = estimate.rss / estimate.dof
     variance = np.diag(estimate.covariance)[known] * row_variance
     if estimate.covariance_robust is not None:
         variance = np.maximum(variance, np.diag(estimate.covariance_robust)[known])
-    inverse = np.where(np.outer(known, known), estimate.covariance, 0.0)
-    shared = row_variance * estimate.scale**2 * estimator.starts.variance(inverse / estimate.scale**2)
-    std[known] = np.sqrt(variance + shared[known])
+    if estimate.rows == estimator.shared_errors.rows:
+        inverse = np.where(np.outer(known, known), estimate.covariance, 0.0)
+        variance = variance + estimator.shared_errors.variance(inverse, row_variance)[known]
+    std[known] = np.sqrt(variance)
     return std
 
 
@@ -44,6 +49,28 @@ def identifiable(estimator: Estimator) -> NDArray[np.bool_]:
     """Which parameters (n,) the data determine: in the span of the rows, and three standard deviations from zero."""
     estimate = estimator.estimate()
     return estimate.determined & (standard_deviation(estimator) <= LARGEST_RELATIVE_STD * np.abs(estimate.pi))
+
+
+# A joint whose unexplained torque reaches this share of the measured one lacks an effect, whatever the error bars say.
+LARGEST_RESIDUAL = 0.5
+# Quantities that cannot be negative, as the ends of names.
+POSITIVE = ("mass", "mass_per_length", "stiffness", "damping", "rotor_inertia", "rigidity", "rigidity_y", "rigidity_z")
+
+
+def doubts(parameters: list[dict[str, Any]], residual: dict[str, dict[str, float | None]]) -> list[str]:
+    """Reasons not to trust a fit that its error bars do not know of, a sentence each."""
+    out = []
+    for name, rows in residual.items():
+        relative = rows["relative"]
+        if relative is not None and relative > LARGEST_RESIDUAL:
+            share = f"{100.0 * relative:.0f} % of the torque or force of {name} is not explained"
+            out.append(f"{share}: the model lacks an effect there, and the parameters bend to replace it")
+    for p in parameters:
+        if p["identifiable"] and p["upper95"] < 0.0 and p["name"].endswith(POSITIVE):
+            out.append(
+                f"{p['name']} is negative, which is not physical: the model lacks an effect, or the data are weak"
+            )
+    return out
 
 
 def results_document(
@@ -90,5 +117,5 @@ def results_document(
         "condition_number": estimate.condition_number if np.isfinite(estimate.condition_number) else None,
         "throughput_samples_per_s": throughput,
         "lost_samples": estimator.counters.lost_samples,
-        "warnings": warnings,
+        "warnings": [*warnings, *doubts(parameters, residual)],
     }

@@ -91,6 +91,7 @@ def test_why_the_energy_fit_of_emps_differs(emps_capture: Path) -> None:
     by_power = np.linalg.lstsq(columns * v[:, None], force * v, rcond=None)[0]
     energy = replayed("emps", emps_capture).estimate().pi
     assert by_power[0] < by_force[0]
+    assert by_power[3] < -3.8 < by_force[3]
     np.testing.assert_allclose(by_power, energy, rtol=0.04)
     forward, backward = (v > 0)[:, None], (v < 0)[:, None]
     split = np.concatenate((columns[:, :1], columns[:, 1:3] * forward, columns[:, 1:3] * backward), axis=1)
@@ -98,7 +99,7 @@ def test_why_the_energy_fit_of_emps_differs(emps_capture: Path) -> None:
     def left(Y: Array) -> float:
         return float(np.linalg.norm(force - Y @ np.linalg.lstsq(Y, force, rcond=None)[0]))
 
-    assert left(split) < 0.9 * left(columns)
+    assert left(split) < 0.8 * left(columns)
 
 
 @pytest.fixture(scope="module")
@@ -112,8 +113,10 @@ def quanser_capture(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_quanser_without_its_friction_leaves_the_residual_as_large_as_it_is(quanser_capture: Path) -> None:
     with_maker = results_document(replayed("quanser-2dsfl", quanser_capture, prior=0.1), 0.0, [])
-    assert 0.9 < with_maker["residual"]["joint_1"]["relative"] < 1.0
-    # Without the maker's values the fit bends every parameter to explain friction as something else, and shows it.
+    for joint in ("joint_1", "joint_2"):
+        assert 0.9 < with_maker["residual"][joint]["relative"] < 1.0
+    # Without the maker's values the fit bends every parameter to explain friction as something else, and says so.
     alone = results_document(replayed("quanser-2dsfl", quanser_capture), 0.0, [])
-    assert alone["residual"]["joint_1"]["relative"] > 0.9
+    assert 5.0 < alone["residual"]["joint_1"]["relative"] < 20.0
+    assert any("joint_1 is not explained" in warning for warning in alone["warnings"])
     assert all(parameter["std"] is not None for parameter in alone["parameters"])

@@ -2,22 +2,26 @@
 
 from __future__ import annotations
 
+import json
 import os
 import zipfile
 from pathlib import Path
 
 import numpy as np
 
+from sms_online.description.parse import describe
 from sms_online.errors import InputError
 from sms_online.pipeline.estimator import Estimator, SessionState
 
+# What session a state belongs to: its system and channels, as JSON.
+IDENTITY = "identity"
 # Separates stage and entry in the archive's names.
 SEPARATOR = "/"
 
 
 def save_checkpoint(path: Path, estimator: Estimator) -> None:
     """Write an estimator's state; the file is complete or not there."""
-    arrays = {
+    arrays = {IDENTITY: np.array(_identity(estimator))} | {
         f"{stage}{SEPARATOR}{key}": np.asarray(value)
         for stage, entries in estimator.state().items()
         for key, value in entries.items()
@@ -33,7 +37,9 @@ def load_checkpoint(path: Path, estimator: Estimator) -> None:
     state: SessionState = {}
     try:
         with np.load(path, allow_pickle=False) as archive:
-            for name in archive.files:
+            if str(archive[IDENTITY]) != _identity(estimator):
+                raise ValueError("it belongs to another system or other channels")
+            for name in set(archive.files) - {IDENTITY}:
                 stage, key = name.split(SEPARATOR, 1)
                 state.setdefault(stage, {})[key] = archive[name]
         estimator.restore(state)
@@ -41,3 +47,7 @@ def load_checkpoint(path: Path, estimator: Estimator) -> None:
         raise InputError(
             str(path), "", f"no usable checkpoint ({error})", "a file saved by a session of this system"
         ) from error
+
+
+def _identity(estimator: Estimator) -> str:
+    return json.dumps({"system": describe(estimator.system), "channels": estimator.sensing.channels}, sort_keys=True)

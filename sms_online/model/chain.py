@@ -68,14 +68,6 @@ class Chain:
         # A_i(q) is a combination of these by (1, sin q, 1 - cos q).
         self.turn_basis = [so3.turn_basis(axis) for axis in self.axes]
 
-    @property
-    def frame_names(self) -> tuple[str, ...]:
-        """Names of the frames in the order of `Configuration.frames`."""
-        names = ["base"]
-        for i in range(1, len(self.joints) + 1):
-            names += [f"mount_{i}", f"link_{i}"]
-        return (*names, "tip")
-
     def moves(self, frame: int, own: slice) -> NDArray[np.bool_]:
         """Which speeds (n_v,) move a body in a frame that has speeds of its own besides."""
         mask = np.zeros(self.layout.n_v, dtype=bool)

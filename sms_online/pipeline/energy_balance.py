@@ -36,38 +36,71 @@ def interval_weights() -> Array:
 
 @dataclass(frozen=True)
 class BalanceRows:
-    """Rows Y β = b: Y (M, n), b (M,), and the grid index (M,) of the last sample behind each."""
+    """Rows Y β = b: Y (M, n), b (M,), and the grid index (M,) of the instant that each ends at."""
 
     Y: Array
     b: Array
     index: NDArray[np.int64]
 
 
-class SharedStarts:
-    """What the error of each window's first instant does to an estimate.
+class SharedErrors:
+    """What the errors that rows of a window share do to a least-squares estimate, which takes them for independent.
 
-    All rows of a window are differences to one instant, whose error they share: the rows' errors have covariance
-    σ² (1 + 1 1ᵀ) in a window. Least squares takes them for independent; the shared part adds σ² (Λ⁻¹ g)(Λ⁻¹ g)ᵀ to its
-    covariance, Λ = YᵀY, with g the sum of the window's rows.
+    All rows of a window are differences to its first instant and share that instant's error. The noise of the measured
+    torque is integrated into the work, a random walk: what it adds between two rows is in all later rows of the
+    window. An error e that enters every row from row j on moves the estimate by Λ⁻¹ S_j e, Λ = YᵀY, with S_j the sum
+    of the window's rows from j on. So the start adds var(e_0) Λ⁻¹ S_1 S_1ᵀ Λ⁻¹ to the covariance, the walk Σ_j q_j S_j
+    S_jᵀ in place of S_1 S_1ᵀ, with q_j the variance of the work's noise since the row before.
     """
 
     def __init__(self, n: int) -> None:
-        self.closed = np.zeros((n, n))  # Σ g gᵀ over finished windows
-        self.sum = np.zeros(n)  # g of the window that is open
+        self._starts = np.zeros((n, n))  # Σ S_1 S_1ᵀ over finished windows
+        self._walks = np.zeros((n, n))  # Σ q_j S_j S_jᵀ over finished windows
+        self.rows = 0
+        self._open(n)
 
-    def add(self, Y: Array) -> None:
-        """Rows (M, n) of the open window."""
-        self.sum = self.sum + Y.sum(axis=0)
+    def _open(self, n: int) -> None:
+        # S_j = S_1 - P_j with P_j the sum of the rows before j, so a window needs the q-weighted moments of P alone.
+        self._sum = np.zeros(n)
+        self._q, self._qP, self._qPP = 0.0, np.zeros(n), np.zeros((n, n))
+
+    def add(self, Y: Array, q: Array) -> None:
+        """Rows (M, n) of the open window and the variance (M,) of the work's noise since the row before each, J²."""
+        before = self._sum + np.concatenate((np.zeros((1, Y.shape[1])), np.cumsum(Y, axis=0)[:-1]))
+        self._q += float(q.sum())
+        self._qP = self._qP + q @ before
+        self._qPP = self._qPP + (before * q[:, None]).T @ before
+        self._sum = self._sum + Y.sum(axis=0)
+        self.rows += Y.shape[0]
+
+    def _open_walk(self) -> Array:
+        cross = np.outer(self._sum, self._qP)
+        return np.asarray(self._q * np.outer(self._sum, self._sum) - cross - cross.T + self._qPP)
 
     def close(self) -> None:
         """The next rows belong to another window."""
-        self.closed = self.closed + np.outer(self.sum, self.sum)
-        self.sum = np.zeros_like(self.sum)
+        self._starts = self._starts + np.outer(self._sum, self._sum)
+        self._walks = self._walks + self._open_walk()
+        self._open(self._sum.size)
 
-    def variance(self, inverse: Array) -> Array:
-        """Variance (n,) of each parameter for σ = 1, from Λ⁻¹ (n, n)."""
-        spread = inverse @ (self.closed + np.outer(self.sum, self.sum)) @ inverse
-        return np.asarray(np.diag(spread))
+    def variance(self, inverse: Array, start_variance: float) -> Array:
+        """Variance (n,) that shared errors add, from Λ⁻¹ (n, n) and var(e_0), J²."""
+        starts = self._starts + np.outer(self._sum, self._sum)
+        shared = start_variance * starts + self._walks + self._open_walk()
+        # Differences of moments may round below zero where there is nothing.
+        return np.asarray(np.maximum(0.0, np.einsum("ij,jk,ik->i", inverse, shared, inverse)))
+
+    def state(self) -> dict[str, Array | float]:
+        """What `restore` needs to continue."""
+        return {
+            "starts": self._starts, "walks": self._walks, "rows": self.rows,
+            "sum": self._sum, "q": self._q, "qP": self._qP, "qPP": self._qPP,
+        }  # fmt: skip
+
+    def restore(self, state: dict[str, Array]) -> None:
+        """Continue from a saved state."""
+        self._starts, self._walks, self.rows = state["starts"], state["walks"], int(state["rows"])
+        self._sum, self._q, self._qP, self._qPP = state["sum"], float(state["q"]), state["qP"], state["qPP"]
 
 
 class EnergyBalance:
@@ -76,12 +109,13 @@ class EnergyBalance:
     def __init__(self, model: Model, base: BaseParameters, sample_rate: float) -> None:
         self.model = model
         self.base = base
+        self.sample_rate = sample_rate
         self.stride = max(1, round(sample_rate / ROW_RATE))
         self.window = self.stride * round(WINDOW * sample_rate / self.stride)
         self._weights = interval_weights() / sample_rate
         # What is integrated: the columns that dissipate, then the work of the motors.
         self._columns = [*model.dissipative, model.n_pi]
-        self.starts = SharedStarts(base.n)
+        self.shared = SharedErrors(base.n)
         self.begin_segment()
 
     def begin_segment(self) -> None:
@@ -89,16 +123,25 @@ class EnergyBalance:
         layout = self.model.layout
         # The last 2 SIDE - 1 samples; the instant up to which the integral is known is number SIDE - 1 of them.
         self._x, self._v = np.empty((0, layout.n_x)), np.empty((0, layout.n_v))
-        self._power = np.empty((0, len(self._columns)))
-        self._integral = np.zeros(len(self._columns))
+        self._power = np.empty((0, len(self._columns) + 1))
+        self._integral = np.zeros(len(self._columns) + 1)
         self._instant = 0  # number of that instant in its segment
+        self._noise_told = 0.0  # variance of the work's noise up to the last row
         self._window_start: Array | None = None  # balance at the window's first instant
-        self.starts.close()
+        self.shared.close()
 
-    def push(self, index: NDArray[np.int64], x: Array, v: Array, joint_torque: Array) -> BalanceRows:
-        """Rows that B consecutive samples complete: grid index (B,), x (B, n_x), v (B, n_v), n τ (B, joints)."""
-        work = np.einsum("bj,bj->b", joint_torque, v[:, list(self.model.layout.theta_m)])
-        power = np.concatenate((self.model.power_columns(x, v)[:, self._columns[:-1]], work[:, None]), axis=1)
+    def push(
+        self, index: NDArray[np.int64], x: Array, v: Array, joint_torque: Array, torque_noise: Array
+    ) -> BalanceRows:
+        """Rows that B consecutive samples complete: grid index (B,), x (B, n_x), v (B, n_v), n τ (B, joints).
+
+        torque_noise (joints,): white noise of n τ, 1σ per sample.
+        """
+        motor_rates = v[:, list(self.model.layout.theta_m)]
+        work = np.einsum("bj,bj->b", joint_torque, motor_rates)
+        # The last column gathers the variance of the work's noise; its rate is per sample, not per second.
+        noise = (motor_rates**2 @ torque_noise**2) / self.sample_rate
+        power = np.column_stack((self.model.power_columns(x, v)[:, self._columns[:-1]], work, noise))
         x, v = np.concatenate((self._x, x)), np.concatenate((self._v, v))
         power = np.concatenate((self._power, power))
         kept = 2 * SIDE - 1
@@ -114,21 +157,25 @@ class EnergyBalance:
         balance = np.zeros((chosen.size, self.model.n_pi + 1))
         if chosen.size:
             balance[:, :-1] = self.model.energy_columns(x[SIDE - 1 + chosen], v[SIDE - 1 + chosen])
-        balance[:, self._columns] += integral[chosen]
+        balance[:, self._columns] += integral[chosen, :-1]
         self._integral, self._instant = integral[-1], int(instants[-1])
-        grid = index[-1] - SIDE - intervals + chosen
+        q = np.diff(integral[chosen, -1], prepend=self._noise_told)
+        if chosen.size:
+            self._noise_told = float(integral[chosen[-1], -1])
+        grid = index[-1] - SIDE + 1 - intervals + chosen
         differences = np.empty_like(balance)
-        reported = slice(1 if self._window_start is None else 0, None)
+        # A segment's first instant is no row: it is what the others are compared with.
+        reported = np.arange(1 if self._window_start is None else 0, chosen.size)
         start = balance[0] if self._window_start is None and chosen.size else self._window_start
         closes = instants[chosen] % self.window == 0
-        for rows in np.split(np.arange(chosen.size), np.flatnonzero(closes) + 1):
+        for rows in np.split(reported, np.flatnonzero(closes[reported]) + 1):
             if rows.size and start is not None:
                 differences[rows] = balance[rows] - start
-                self.starts.add(self.base.columns(differences[rows, :-1]))
+                self.shared.add(self.base.columns(differences[rows, :-1]), q[rows])
                 if closes[rows[-1]]:
                     # The last instant of a window is the first of the next.
                     start = balance[rows[-1]]
-                    self.starts.close()
+                    self.shared.close()
         self._window_start = start
         return self._rows(differences[reported], grid[reported])
 
@@ -137,13 +184,13 @@ class EnergyBalance:
         b = differences[:, -1] - self.base.known_part(columns)
         return BalanceRows(self.base.columns(columns), b, ends)
 
-    def state(self) -> dict[str, Array | int]:
+    def state(self) -> dict[str, Array | float]:
         """What `restore` needs to continue."""
         start = np.empty(0) if self._window_start is None else self._window_start
         return {
             "x": self._x, "v": self._v, "power": self._power, "integral": self._integral,
             "instant": self._instant, "window_start": start,
-            "closed": self.starts.closed, "sum": self.starts.sum,
+            "noise_told": self._noise_told,
         }  # fmt: skip
 
     def restore(self, state: dict[str, Array]) -> None:
@@ -151,4 +198,4 @@ class EnergyBalance:
         self._x, self._v, self._power = state["x"], state["v"], state["power"]
         self._integral, self._instant = state["integral"], int(state["instant"])
         self._window_start = state["window_start"] if state["window_start"].size else None
-        self.starts.closed, self.starts.sum = state["closed"], state["sum"]
+        self._noise_told = float(state["noise_told"])

@@ -10,7 +10,7 @@ import numpy as np
 from sms_online.description.schema import System
 from sms_online.model.base_parameters import BaseParameters, find_base_parameters
 from sms_online.model.model import Model
-from sms_online.pipeline.energy_balance import BalanceRows, EnergyBalance, SharedStarts
+from sms_online.pipeline.energy_balance import BalanceRows, EnergyBalance, SharedErrors
 from sms_online.pipeline.joint_balance import JointBalance
 from sms_online.pipeline.rates import RateSamples, RatesStage
 from sms_online.pipeline.sensing import AttitudeContinuity, Sensing
@@ -30,23 +30,26 @@ SessionState = dict[str, dict[str, Any]]
 
 @dataclass
 class SquaredResidual:
-    """Sums that give the rms of Y β - b for any β: the Gram matrix of [Y b], (n + 1, n + 1), and the number of rows."""
+    """Sums that give the rms of Y β - b for any β: the Gram matrix of [Y b], (n + 1, n + 1), and the measured signal's.
+
+    A Gram matrix tells a residual down to 1e-8 of b, which is enough for a share of the signal.
+    """
 
     gram: Array
-    rows: int = 0
+    signal: float = 0.0
 
-    def add(self, Y: Array, b: Array) -> None:
-        """Add rows Y (M, n), b (M,)."""
+    def add(self, Y: Array, b: Array, signal: float) -> None:
+        """Add rows Y (M, n), b (M,), and the measured torque or force behind b, before what is known was subtracted."""
         stacked = np.concatenate((Y, b[:, None]), axis=1)
         self.gram += stacked.T @ stacked
-        self.rows += b.size
+        self.signal += float(signal) ** 2
 
     def relative(self, beta: Array) -> float | None:
-        """rms of the residual over rms of b; None without rows or signal."""
-        if self.rows == 0 or self.gram[-1, -1] == 0.0:
+        """rms of the residual over rms of the measured signal; None where there is none."""
+        if self.signal == 0.0:
             return None
         w = np.append(beta, -1.0)
-        return float(np.sqrt(max(0.0, w @ self.gram @ w) / self.gram[-1, -1]))
+        return float(np.sqrt(max(0.0, w @ self.gram @ w) / self.signal))
 
 
 class Estimator:
@@ -63,6 +66,7 @@ class Estimator:
         self.sensing = Sensing(self.model, channels, source)
         self.tracker: Tracker = RecursiveLeastSquares(self.base.n) if tracker is None else tracker
         self.samples = 0
+        self.dropped_rows = 0
         self.duration = 0.0
         self._columns = [channels.index(name) for name in self.sensing.channels]
         self._attitude = AttitudeContinuity()
@@ -84,9 +88,14 @@ class Estimator:
         return self._rates.half_width
 
     @property
-    def starts(self) -> SharedStarts:
-        """What the error of each energy window's first instant does to the estimate."""
-        return self._energy.starts
+    def shared_errors(self) -> SharedErrors:
+        """What errors that rows share do to the estimate."""
+        return self._energy.shared
+
+    @property
+    def periods(self) -> Array:
+        """Sample period of each channel, s, as found; NaN while it is not known."""
+        return self._synchroniser.periods
 
     @property
     def counters(self) -> SyncCounters:
@@ -138,12 +147,15 @@ class Estimator:
         n_x = self.model.layout.n_x
         x, torque = rates.values[:, :n_x], rates.values[:, n_x:]
         v = self.model.layout.speeds(x, rates.rates[:, :n_x])
-        rows = self._energy.push(rates.index, x, v, torque)
-        if rows.b.size:
-            self.tracker.update(self._stamped(rows))
-        for window in self._joints.push(rates.index, x, v, torque):
-            for residual, Y, b in zip(self.joint_residuals, window.Y, window.b, strict=True):
-                residual.add(Y[None], b[None])
+        rows = self._energy.push(rates.index, x, v, torque, self._rates.sigma[n_x:])
+        finite = np.isfinite(rows.Y).all(axis=1) & np.isfinite(rows.b)
+        self.dropped_rows += int(np.sum(~finite))
+        if finite.any():
+            self.tracker.update(self._stamped(BalanceRows(rows.Y[finite], rows.b[finite], rows.index[finite])))
+        for window, measured in self._joints.push(rates.index, x, v, torque):
+            for residual, Y, b, signal in zip(self.joint_residuals, window.Y, window.b, measured, strict=True):
+                if np.isfinite(Y).all() and np.isfinite(b):
+                    residual.add(Y[None], b[None], signal)
 
     def _stamped(self, rows: BalanceRows) -> Rows:
         t = self._synchroniser.start_time + rows.index / self.system.sample_rate
@@ -165,11 +177,13 @@ class Estimator:
                 "pending_t": self._pending_t,
                 "pending": self._pending,
                 "joint_gram": np.stack([residual.gram for residual in self.joint_residuals]),
-                "joint_rows": np.array([residual.rows for residual in self.joint_residuals]),
+                "joint_signal": np.array([residual.signal for residual in self.joint_residuals]),
+                "dropped_rows": self.dropped_rows,
             },
             "synchroniser": dict(self._synchroniser.state()),
             "rates": dict(self._rates.state()),
             "energy": dict(self._energy.state()),
+            "shared": dict(self._energy.shared.state()),
             "joints": dict(self._joints.state()),
             "tracker": dict(self.tracker.state()),
         }
@@ -181,10 +195,12 @@ class Estimator:
         self._first_time, self._segment = float(session["first_time"]), int(session["segment"])
         self._attitude.last = np.array(session["attitude"])
         self._pending_t, self._pending = np.array(session["pending_t"]), np.array(session["pending"])
-        grams, rows = np.array(session["joint_gram"]), np.array(session["joint_rows"])
-        self.joint_residuals = [SquaredResidual(gram, int(n)) for gram, n in zip(grams, rows, strict=True)]
+        self.dropped_rows = int(session["dropped_rows"])
+        grams, signals = np.array(session["joint_gram"]), np.array(session["joint_signal"])
+        self.joint_residuals = [SquaredResidual(gram, float(s)) for gram, s in zip(grams, signals, strict=True)]
         self._synchroniser.restore(state["synchroniser"])
         self._rates.restore(state["rates"])
         self._energy.restore(state["energy"])
+        self._energy.shared.restore(state["shared"])
         self._joints.restore(state["joints"])
         self.tracker.restore(state["tracker"])

@@ -48,8 +48,10 @@ class JointBalance:
         self._samples = np.empty((0, layout.n_x + layout.n_v + len(layout.q)))
         self._skip = 0  # samples to pass over before the next window
 
-    def push(self, index: NDArray[np.int64], x: Array, v: Array, joint_torque: Array) -> list[BalanceRows]:
-        """For each window that the samples complete, its rows: one a joint, in order."""
+    def push(
+        self, index: NDArray[np.int64], x: Array, v: Array, joint_torque: Array
+    ) -> list[tuple[BalanceRows, Array]]:
+        """For each window that the samples complete, its rows, one a joint, and the torques (joints,) behind them."""
         samples = np.concatenate((self._samples, np.concatenate((x, v, joint_torque), axis=1)))
         grid_end = int(index[-1])
         rows = []
@@ -62,13 +64,14 @@ class JointBalance:
         self._samples, self._skip = samples[dropped:], start - dropped
         return rows
 
-    def _window(self, samples: Array, end: int) -> BalanceRows:
+    def _window(self, samples: Array, end: int) -> tuple[BalanceRows, Array]:
         layout = self.model.layout
         x, v, torque = np.split(samples, [layout.n_x, layout.n_x + layout.n_v], axis=1)
         P, G = self.model.momentum_columns(x, v, layout.theta_m)
         columns = -(np.tensordot(self._phi_dot, P, 1) + np.tensordot(self._phi, G, 1))
-        b = self._phi @ torque - self.base.known_part(columns)
-        return BalanceRows(self.base.columns(columns), b, np.full(len(layout.q), end))
+        measured = self._phi @ torque
+        b = measured - self.base.known_part(columns)
+        return BalanceRows(self.base.columns(columns), b, np.full(len(layout.q), end)), measured
 
     def state(self) -> dict[str, Array | int]:
         """What `restore` needs to continue."""

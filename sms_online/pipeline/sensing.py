@@ -69,7 +69,8 @@ class Sensing:
         for sensor in self.model.system.sensors:
             for name in sensed_channels(self.model.system, sensor):
                 if name in self.channels and sensor.noise > 0.0:
-                    stated[self.channels.index(name)] = sensor.noise
+                    # Rounding to a resolution r adds r²/12.
+                    stated[self.channels.index(name)] = np.hypot(sensor.noise, sensor.resolution / np.sqrt(12.0))
         markers = [
             stated[columns] if isinstance(kinematics, LinearLink) else np.full(kinematics.n_f, np.nan)
             for kinematics, columns in zip(self._flexible, self._markers, strict=True)

@@ -113,6 +113,11 @@ class Synchroniser:
         self._delivered = -1  # last grid point delivered
 
     @property
+    def periods(self) -> Array:
+        """Sample period of each channel (C,), s, from its first intervals; NaN while it is not known."""
+        return self._period.copy()
+
+    @property
     def start_time(self) -> float:
         """t0, the time of grid index 0, s; NaN before the first sample."""
         return float(self._t0)

@@ -87,7 +87,7 @@ class Estimate:
     infinite variance and zeros beside it. determined: (n,) bool. condition_number: of the column-scaled information
     factor, inf where its rank is not full. rows: number of rows, less where old ones count less.
     rss: residual sum of squares of the whitened rows, priors included. dof: its degrees of freedom. scale: what the
-    rows' stated std were multiplied with.
+    rows' stated std were multiplied with to weigh them against a prior; None where they were taken as stated.
     """
 
     pi: Array
@@ -98,7 +98,7 @@ class Estimate:
     rows: float
     rss: float
     dof: float
-    scale: float = 1.0
+    scale: float | None = None
 
     @property
     def std(self) -> Array:

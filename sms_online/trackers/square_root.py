@@ -76,7 +76,7 @@ class RecursiveLeastSquares:
             rows=content.rows,
             rss=solution.rss,
             dof=max(content.rows + len(self._prior) - solution.rank, 0.0),
-            scale=scale,
+            scale=scale if self._scaled else None,
         )
 
     def reset(self) -> None:

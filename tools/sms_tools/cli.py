@@ -22,7 +22,7 @@ PROGRAM = "sms-online"
 # A sum that BLAS splits over threads is rounded differently for every number of threads, and the same samples must give
 # the same bits. The matrices are small; threads would not make them faster. Both are read when NumPy is imported.
 for _variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
-    os.environ.setdefault(_variable, "1")
+    os.environ[_variable] = "1"
 
 
 class Parser(argparse.ArgumentParser):

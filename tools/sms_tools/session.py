@@ -7,8 +7,11 @@ from collections.abc import Callable, Iterable
 from pathlib import Path
 from time import perf_counter
 
+import numpy as np
+
 from sms_adapters.system_file import load_system
 from sms_online.description.schema import System
+from sms_online.errors import InputError
 from sms_online.model.base_parameters import find_base_parameters
 from sms_online.model.model import Model
 from sms_online.pipeline.estimator import Estimator
@@ -62,12 +65,17 @@ def stream(
 
 def conclude(args: argparse.Namespace, document: Document, directory: Path, interrupted: bool) -> int:
     """Write results.json, print it for people or programs, and say how the session ended."""
-    path = write_results(directory, document)
-    closing = f"results: {path}"
     if interrupted:
-        closing = f"interrupted: this is what the samples until then say\n{closing}"
+        document["warnings"].append("interrupted: this is what the samples until then say")
     console = report_console(args.json)
-    show(console, parameter_table(document, console.width), "", *trust_lines(document), closing)
+    parts = (parameter_table(document, console.width), "", *trust_lines(document))
+    try:
+        path = write_results(directory, document)
+    except InputError:
+        # A disk that refuses the file must not take the numbers with it.
+        show(console, *parts)
+        raise
+    show(console, *parts, f"results: {path}")
     if args.json:
         print(to_json(document))
     if interrupted:
@@ -81,6 +89,17 @@ def document_of(
     """results.json of a session, with what the synchroniser and the sensing noticed among its warnings."""
     counters = estimator.counters
     noticed = []
+    if estimator.dropped_rows:
+        noticed.append(f"{estimator.dropped_rows} rows of the balance dropped: a value in them is beyond all numbers")
+    period = 1.0 / estimator.system.sample_rate
+    fastest = float(np.nanmin(estimator.periods, initial=np.inf))
+    if np.isfinite(fastest) and not 0.8 < fastest / period < 1.25:
+        noticed.append(
+            f"the capture has {1.0 / fastest:.4g} samples/s, the system file says {estimator.system.sample_rate:g}"
+        )
+    late = [name for sensor in estimator.system.sensors if sensor.latency > 0.0 for name in sensor.channels]
+    if late:
+        noticed.append(f"latency of {', '.join(late)} is described but not corrected")
     if counters.gaps:
         noticed.append(f"{counters.gaps} gaps too long to bridge; each begins a new window of the balance")
     if counters.interpolated_cells:
