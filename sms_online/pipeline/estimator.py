@@ -20,9 +20,9 @@ from sms_online.trackers.interface import Estimate, Rows, Tracker
 from sms_online.trackers.square_root import RecursiveLeastSquares
 
 # Samples that pass through the pipeline together. Everything behind sees the same blocks however the samples arrive, so
-# the result is the same to the last bit. At 1 kHz it is 0.13 s: with the filter's lag still below 0.15 s, and long
-# enough that the cost of a NumPy call is shared by many samples.
-BLOCK = 128
+# the result is the same to the last bit. The cost of NumPy's calls is shared by a block: with half of it a replay takes
+# half as long again, with more of it the work comes in lumps of several milliseconds and π is later than need be.
+BLOCK = 256
 
 # What a session saves: arrays and numbers, by stage.
 SessionState = dict[str, dict[str, Any]]

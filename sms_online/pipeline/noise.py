@@ -59,7 +59,9 @@ def noise_std(values: Array) -> Array:
 def _spread(difference: Array) -> Array:
     """1σ of each column about zero: differences of a smooth signal have no mean worth keeping."""
     magnitude = np.abs(difference)
-    robust: Array = np.median(magnitude, axis=0) / NORMAL_MAD
+    # The upper median by partition: several times faster than numpy.median, and all the same over so many samples.
+    middle = magnitude.shape[0] // 2
+    robust: Array = np.partition(magnitude.T.copy(), middle, axis=1)[:, middle] / NORMAL_MAD
     still = robust == 0.0
     robust[still] = np.sqrt(np.mean(magnitude[:, still] ** 2, axis=0))
     return robust

@@ -50,10 +50,10 @@ ROUNDINGS = 64.0
 # 5 %.
 WARM_UP = 1000
 # Work that one push may do, in samples filtered for each sample pushed. What waited for M is worked off at this pace,
-# so that no push takes much longer than the others; estimating the noise or choosing M counts as the samples that it
-# costs.
-PACE = 2
-DECISION_COST = 256
+# so that no push takes much longer than the others; estimating the noise or choosing M costs as much as so many
+# samples.
+PACE = 1.5
+DECISION_COST = 512
 # Channels move in a window when one spans this many σ in each of its halves; noise alone spans 7.
 MOTION = 20.0
 # Windows that move before M is fixed: the first motion after rest begins with a jolt, which asks for a narrower filter
@@ -188,7 +188,7 @@ class RatesStage:
             self._start = self._next = int(samples.index[0])
             self._decided = NEVER if self.fixed else self._start
         self._buffer = np.concatenate([self._buffer, samples.values])
-        return pieces + self._advance(PACE * samples.index.size)
+        return pieces + self._advance(int(PACE * samples.index.size) + 1)
 
     def flush(self) -> list[RateSamples]:
         """End of a segment or of the capture: return what has a full filter."""

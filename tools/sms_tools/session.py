@@ -8,6 +8,7 @@ from pathlib import Path
 from time import perf_counter
 
 import numpy as np
+from rich.table import Table
 
 from sms_adapters.system_file import load_system
 from sms_online.description.schema import System
@@ -68,7 +69,7 @@ def conclude(args: argparse.Namespace, document: Document, directory: Path, inte
     if interrupted:
         document["warnings"].append("interrupted: this is what the samples until then say")
     console = report_console(args.json)
-    parts = (parameter_table(document, console.width), "", *trust_lines(document))
+    parts: list[Table | str] = [parameter_table(document, console.width), "", *trust_lines(document)]
     try:
         path = write_results(directory, document)
     except InputError:
