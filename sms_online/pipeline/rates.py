@@ -225,13 +225,18 @@ class RatesStage:
             if delivered:
                 pieces += delivered
                 budget -= delivered[0].index.size
-            elif not self.fixed and self._start + self._buffer.shape[0] - self._warm_up >= self._decided:
+            elif self._window_is_full and (budget >= DECISION_COST or not pieces):
                 offset = self._decided - self._start
                 self._decide(self._buffer[offset : offset + self._warm_up])
                 budget -= DECISION_COST
             else:
                 break
         return pieces
+
+    @property
+    def _window_is_full(self) -> bool:
+        """Whether the samples that wait for M are enough to decide on it."""
+        return not self.fixed and self._start + self._buffer.shape[0] - self._warm_up >= self._decided
 
     def _decide(self, window: Array) -> None:
         """One step towards M for a full window: first its noise, then M."""
