@@ -21,7 +21,7 @@ class Grade:
     torque: float
 
 
-# DESIGN's noise grades at 1 kHz.
+# Noise grades of a session, from a good testbed's (A) to a plain one's (C), at 1 kHz.
 GRADES = {
     "0": Grade(encoder=0.0, marker=0.0, torque=0.0),
     "A": Grade(encoder=1e-5, marker=1e-5, torque=0.1),

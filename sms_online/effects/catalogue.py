@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import difflib
-
+from sms_online.description.explain import hint, nearest
 from sms_online.description.schema import Effect, System
 from sms_online.effects.base import ForceEffect
 from sms_online.effects.joint import CoulombFriction, TorqueOffset, ViscousFriction
@@ -20,9 +19,8 @@ def build_effects(system: System) -> tuple[ForceEffect, ...]:
 
 def _build(system: System, effect: Effect, place: str) -> ForceEffect:
     if effect.name not in NAMES:
-        near = difflib.get_close_matches(effect.name, NAMES, n=1)
-        hint = f", perhaps {near[0]!r}" if near else ""
-        raise InputError(system.name, place, f"unknown effect {effect.name!r}", f"one of {', '.join(NAMES)}{hint}")
+        expected = f"one of {', '.join(NAMES)}{hint(nearest(effect.name, NAMES))}"
+        raise InputError(system.name, place, f"unknown effect {effect.name!r}", expected)
     joints = [f"joint_{i}" for i in range(1, len(system.joints) + 1)]
     if effect.where not in joints:
         raise InputError(system.name, place, f"{effect.name} at {effect.where!r}", f"one of {', '.join(joints)}")

@@ -6,12 +6,12 @@ pivoting, then independent columns chosen in the order of preference. Source: Ga
 
 from __future__ import annotations
 
-import difflib
 from dataclasses import dataclass, replace
 
 import numpy as np
 import scipy.linalg
 
+from sms_online.description.explain import hint, nearest
 from sms_online.errors import InputError
 from sms_online.model.model import Model
 from sms_online.model.parameters import Parameter
@@ -94,8 +94,7 @@ def find_base_parameters(model: Model) -> BaseParameters:
     names = [p.name for p in model.parameters]
     for name in model.system.known:
         if name not in names:
-            near = difflib.get_close_matches(name, names, n=1)
-            expected = "the name of a parameter of this system" + (f", perhaps {near[0]!r}" if near else "")
+            expected = f"the name of a parameter of this system{hint(nearest(name, names))}"
             raise InputError(model.system.name, f'known."{name}"', "no such parameter", expected)
     known = tuple((names.index(name), value) for name, value in model.system.known.items())
     rng = np.random.default_rng(RANDOM_SEED)
