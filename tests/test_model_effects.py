@@ -56,7 +56,7 @@ def test_an_undeclared_coefficient_is_zero() -> None:
 @pytest.mark.parametrize(
     ("effect", "words"),
     [
-        (Effect(name="coulomb_frcition", where="joint_1"), "perhaps 'coulomb_friction'"),
+        (Effect(name="coulomb_frcition", where="joint_1"), "did you mean 'coulomb_friction'"),
         (Effect(name="coulomb_friction", where="joint_3"), "one of joint_1, joint_2"),
         (Effect(name="coulomb_friction", where="joint_1", coefficients={"damping": 1.0}), "expected 'torque'"),
     ],
