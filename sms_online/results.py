@@ -10,12 +10,17 @@ from numpy.typing import NDArray
 from sms_online.description.parse import describe
 from sms_online.pipeline.estimator import Estimator
 from sms_online.stream import Array
+from sms_online.trackers.interface import Estimate
 
 SCHEMA = "sms-online/results/1"
 # Half width of a 95 % interval in standard deviations.
 NORMAL_95 = 1.959963984540054
 # An estimate within three standard deviations of zero is not determined by the data: not even its sign is certain.
 LARGEST_RELATIVE_STD = 1.0 / 3.0
+# A joint whose unexplained torque reaches this share of the measured one lacks an effect, whatever the error bars say.
+LARGEST_RESIDUAL = 0.5
+# Quantities that cannot be negative, as the ends of names.
+POSITIVE = ("mass", "mass_per_length", "stiffness", "damping", "rotor_inertia", "rigidity", "rigidity_y", "rigidity_z")
 
 
 def standard_deviation(estimator: Estimator) -> Array:
@@ -26,7 +31,10 @@ def standard_deviation(estimator: Estimator) -> Array:
     window share, which least squares absorbs and no residual shows; it is known while no row is forgotten. Where rows
     have been weighed against a prior, the posterior's own covariance holds.
     """
-    estimate = estimator.estimate()
+    return _standard_deviation(estimator, estimator.estimate())
+
+
+def _standard_deviation(estimator: Estimator, estimate: Estimate) -> Array:
     std = np.full(estimate.pi.shape, np.inf)
     if estimate.dof <= 0.0:
         return std
@@ -48,13 +56,11 @@ def standard_deviation(estimator: Estimator) -> Array:
 def identifiable(estimator: Estimator) -> NDArray[np.bool_]:
     """Which parameters (n,) the data determine: in the span of the rows, and three standard deviations from zero."""
     estimate = estimator.estimate()
-    return estimate.determined & (standard_deviation(estimator) <= LARGEST_RELATIVE_STD * np.abs(estimate.pi))
+    return _identifiable(estimate, _standard_deviation(estimator, estimate))
 
 
-# A joint whose unexplained torque reaches this share of the measured one lacks an effect, whatever the error bars say.
-LARGEST_RESIDUAL = 0.5
-# Quantities that cannot be negative, as the ends of names.
-POSITIVE = ("mass", "mass_per_length", "stiffness", "damping", "rotor_inertia", "rigidity", "rigidity_y", "rigidity_z")
+def _identifiable(estimate: Estimate, std: Array) -> NDArray[np.bool_]:
+    return estimate.determined & (std <= LARGEST_RELATIVE_STD * np.abs(estimate.pi))
 
 
 def doubts(parameters: list[dict[str, Any]], residual: dict[str, dict[str, float | None]]) -> list[str]:
@@ -86,7 +92,8 @@ def results_document(
     true = None
     if truth is not None and all(p.name in truth for p in base.physical):
         true = base.values(np.array([truth[p.name] for p in base.physical]))
-    flags, deviations = identifiable(estimator), standard_deviation(estimator)
+    deviations = _standard_deviation(estimator, estimate)
+    flags = _identifiable(estimate, deviations)
     parameters = []
     for k, p in enumerate(base.parameters):
         value, std = float(estimate.pi[k]), float(deviations[k])

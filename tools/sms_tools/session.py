@@ -13,8 +13,6 @@ from rich.table import Table
 from sms_adapters.system_file import load_system
 from sms_online.description.schema import System
 from sms_online.errors import InputError
-from sms_online.model.base_parameters import find_base_parameters
-from sms_online.model.model import Model
 from sms_online.pipeline.estimator import Estimator
 from sms_online.results import results_document
 from sms_online.stream import Block
@@ -35,11 +33,12 @@ def described_system(args: argparse.Namespace) -> tuple[System, Path | None]:
 
 def new_estimator(system: System, channels: tuple[str, ...], source: str, nominal_prior: bool = False) -> Estimator:
     """The estimator of a session, with the system file's priors; nominal_prior: see `base_prior`."""
-    if not (nominal_prior or system.priors):
-        return Estimator(system, channels, source)
-    base = find_base_parameters(Model(system))
-    prior = base_prior(system, base, nominal_prior)
-    return Estimator(system, channels, source, RecursiveLeastSquares(base.n, prior=prior, scaled_by_residual=True))
+    estimator = Estimator(system, channels, source)
+    if nominal_prior or system.priors:
+        # A prior is on the base parameters, which the estimator has found.
+        prior = base_prior(system, estimator.base, nominal_prior)
+        estimator.tracker = RecursiveLeastSquares(estimator.base.n, prior=prior, scaled_by_residual=True)
+    return estimator
 
 
 def stream(

@@ -11,6 +11,7 @@ from time import perf_counter
 from rich.console import Console
 from rich.live import Live
 
+from sms_online.pipeline.estimator import Estimator
 from sms_sim.live import LivePlant
 from sms_tools.interruption import Interruption
 from sms_tools.report import Document, parameter_table, report_console, show
@@ -41,7 +42,7 @@ def run(args: argparse.Namespace) -> int:
             with Live(console=console, auto_refresh=False, transient=True) as live:
                 busy = stream(estimator, plant, interruption, _draw(live, document, plant.duration))
         else:
-            busy = stream(estimator, plant, interruption, _tell(console, document))
+            busy = stream(estimator, plant, interruption, _tell(console, estimator, document))
     # The simulation's time is not the estimator's.
     return conclude(args, document(estimator.samples / busy), directory, interruption.requested)
 
@@ -61,16 +62,15 @@ def _draw(live: Live, document: Callable[[float], Document], duration: float) ->
     return draw
 
 
-def _tell(console: Console, document: Callable[[float], Document]) -> Callable[[], None]:
+def _tell(console: Console, estimator: Estimator, document: Callable[[float], Document]) -> Callable[[], None]:
     """Says now and then how far it has come."""
     told = 0.0
 
     def tell() -> None:
         nonlocal told
-        now = document(0.0)
-        if now["duration_s"] >= told + LINE_INTERVAL:
-            told = now["duration_s"]
-            parameters = now["parameters"]
+        if estimator.duration >= told + LINE_INTERVAL:
+            told = estimator.duration
+            parameters = document(0.0)["parameters"]
             determined = [p for p in parameters if p["identifiable"]]
             line = f"{told:5.1f} s: {len(determined)} of {len(parameters)} parameters determined"
             errors = [abs(p["estimate"] / p["true"] - 1.0) for p in determined if p["true"]]
