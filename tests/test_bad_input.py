@@ -134,7 +134,8 @@ def test_a_can_log_needs_its_dbc(bench: Path, capsys: pytest.CaptureFixture[str]
     (bench / "run.log").write_text("(0.000000) can0 001#0102030405060708\n")
     line = refusal(bench, capsys, "replay", "run.log", "--system", "axis.toml", "--out", "done")
     assert "a CAN log without a DBC" in line
-    (bench / "axis.toml").write_text(AXIS + '[source]\nkind = "can"\ndbc = "drive.dbc"\nsignals = { "A.B" = "q_1" }\n')
+    source = '[[source]]\nkind = "can"\nname = "drive"\ndbc = "drive.dbc"\nsignals = { "A.B" = "q_1" }\n'
+    (bench / "axis.toml").write_text(AXIS + source)
     assert "drive.dbc" in refusal(bench, capsys, "replay", "run.log", "--system", "axis.toml", "--out", "done")
 
 
@@ -154,7 +155,7 @@ def test_a_can_log_needs_its_dbc(bench: Path, capsys: pytest.CaptureFixture[str]
         (("replay", "run.csv", "--system", "axis.toml", "-ss", "3", "-to", "2"), "-to: 2 s; expected a time after"),
         (("replay", "run.csv", "--system", "axis.toml", "-ss", "60"), "no samples from 60 s"),
         (("replay", "axis.toml/run.csv", "--system", "axis.toml"), "Not a directory"),
-        (("replay", "run.mf4", "--system", "axis.toml"), "a name ending in .csv"),
+        (("replay", "run.mat", "--system", "axis.toml"), "a name ending in .csv"),
         (("replay", "run.csv", "--system", "axis.toml", "--out", "axis.toml/x"), "axis.toml is no directory"),
         (("simulate", "--system", "paper-planar", "--capture", "new.csv", "--duration", "0"), "greater than 0"),
         (("simulate", "--system", "paper-planar", "--capture", "new.csv", "--grade", "D"), "'D'"),

@@ -234,8 +234,8 @@ def test_nothing_half_written_remains(tmp_path: Path) -> None:
 def test_the_name_chooses_the_reader(tmp_path: Path) -> None:
     path = write(tmp_path / "run.csv", "t,q_1\n0,1\n")
     assert isinstance(open_source(path, SYSTEM), CaptureReader)
-    with pytest.raises(InputError, match=r"\.csv, \.csv\.gz, \.log or \.log\.gz"):
-        open_source(tmp_path / "run.mf4", SYSTEM)
+    with pytest.raises(InputError, match=r"ending in \.csv, \.log, \.asc"):
+        open_source(tmp_path / "run.mat", SYSTEM)
 
 
 def test_truth_survives_and_its_absence_is_no_error(tmp_path: Path) -> None:

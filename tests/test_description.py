@@ -55,8 +55,9 @@ mass = 1.0
 channels = ["tau_*", "q_*"]
 rate = 1000.0
 
-[source]
+[[source]]
 kind = "can"
+name = "drives"
 dbc = "bench.dbc"
 signals = { "DRIVE.ANGLE" = "q_1" }
 
@@ -140,7 +141,7 @@ def test_a_description_survives_its_own_json() -> None:
         ("sine = 1.0", "sin = 1.0", "trajectory.joint_2[1].sin", "unknown key", "did you mean 'sine'?"),
         ("std = 0.1", "sdt = 0.1", "prior.link_2.mass.sdt", "unknown key", "did you mean 'std'?"),
         ("relative = 0.2", "realtive = 0.2", "windows.realtive", "unknown key", "did you mean 'relative'?"),
-        ("dbc =", "dcb =", "source.dcb", "unknown key", "did you mean 'dbc'?"),
+        ("dbc =", "dcb =", "source 1.dcb", "unknown key", "did you mean 'dbc'?"),
         ("coefficients =", "coefficient =", "effect 1.coefficient", "unknown key", "did you mean 'coefficients'?"),
         ("rotor_inertia", "rotor_inetria", "motor_1.rotor_inetria", "unknown key", "did you mean 'rotor_inertia'?"),
         # values
@@ -165,7 +166,7 @@ def test_a_description_survives_its_own_json() -> None:
         ("tip = [0.5, 0.0, 0.0]", "tip = [0.5, 0.0, 0.0, 1.0]", "link_2.tip", "[0.5, 0.0, 0.0, 1.0]", "3 numbers"),
         ("tip = [0.5, 0.0, 0.0]", "tip = 0.5", "link_2.tip", "0.5", "a list"),
         ("inertia = { zz = 65.0 }", "inertia = 65.0", "spacecraft.inertia", "65.0", "a table"),
-        ('dbc = "bench.dbc"', "dbc = 7", "source.dbc", "7", "a text in quotes"),
+        ('dbc = "bench.dbc"', "dbc = 7", "source 1.dbc", "7", "a text in quotes"),
         ("sine = 1.3", "sine = 'x'", "trajectory.joint_1[1].sine", "'x'", "a number"),
         ('"motor_1.mass" = 3.0', "motor_1.mass = 3.0", "known.motor_1", "a table", '"motor_1.mass" = value'),
         ("duration = 10.0", "", "trajectory.duration", "missing", "a value"),
@@ -188,9 +189,9 @@ def test_a_description_survives_its_own_json() -> None:
         ("[500.0, 500.0]", "[500.0]", "controller.stiffness", "1 value", "2, one for each joint"),
         ('"q_*"', '"q_3"', "sensor 1.channels", "'q_3' matches no channel", "such as 'q_"),
         ('"q_*"]', '"q_*"]\n[[sensor]]\nchannels = ["q_2"]', "sensor 2.channels", "by sensor 1 too", "one sensor"),
-        ('= "q_1"', '= "q1"', "source.signals.DRIVE.ANGLE", "unknown channel 'q1'", "'q_1'"),
-        ('"DRIVE.ANGLE"', '"ANGLE"', "source.signals", "'ANGLE'", "MESSAGE.SIGNAL"),
-        ('"bench.dbc"', '"bench"', "source.dbc", "'bench'", ".dbc"),
+        ('= "q_1"', '= "q1"', "source 1.signals.DRIVE.ANGLE", "unknown channel 'q1'", "'q_1'"),
+        ('"DRIVE.ANGLE"', '"ANGLE"', "source 1.signals", "'ANGLE'", "MESSAGE.SIGNAL"),
+        ('"bench.dbc"', '"bench"', "source 1.dbc", "'bench'", ".dbc"),
         ('where = "joint_1"', 'where = "joint_9"', "effect 1.where", "'joint_9'", "did you mean 'joint_"),
         ("[known]", f"{VISCOUS_FRICTION}[known]", "effect 2", "viscous_friction@joint_1 again", "each effect once"),
         ('"motor_1.mass"', '"motor_2.mass"', 'known."motor_2.mass"', "'motor_2' is not in", "did you mean 'motor_1'?"),

@@ -16,54 +16,62 @@ import numpy as np
 from cantools.database.can import Message, Signal
 from numpy.typing import NDArray
 
+from sms_adapters.raw import EXTENDED
 from sms_online.description.explain import nearest
-from sms_online.description.schema import CanSource, System
+from sms_online.description.schema import CanSource
 from sms_online.errors import InputError
 from sms_online.stream import Array
 
+_MOST_BITS = 32  # of a counter
 _FLOATS = {16: np.float16, 32: np.float32, 64: np.float64}
 
 
 @dataclass(frozen=True)
 class WantedMessage:
-    """A message that channels come from: its DBC description, the signals wanted of it and their columns in a block."""
+    """A message that channels come from.
 
-    message: Message
+    id: with EXTENDED set for 29 bits. length: bytes. signals: those wanted of it, and their columns in a block.
+    counter: the signal in which the sender counts its frames, if it does.
+    """
+
+    name: str
+    id: int
+    length: int
     signals: tuple[Signal, ...]
-    columns: NDArray[np.intp]
-
-    def decode(self, frames: NDArray[np.uint8]) -> Array:
-        """(B, signals) values from frames (B, bytes of the message)."""
-        return np.stack([decode_signal(signal, frames) for signal in self.signals], axis=1)
+    columns: tuple[int, ...]
+    counter: Signal | None = None
 
 
-def wanted_messages(system: System, source: CanSource, directory: Path | None) -> list[WantedMessage]:
+def wanted_messages(source: CanSource, directory: Path | None) -> list[WantedMessage]:
     """The messages of source.signals, columns in its order; the DBC from the system's directory or among those shipped.
 
     Raises InputError for a DBC that is missing or unreadable, a message or signal it does not hold, a multiplexed
-    signal, and a channel fed by two signals.
+    signal, and a counter of a message that no channel comes from or that is not a plain unsigned number.
     """
-    place = f"system {system.name}, [source]"
+    place = f"source {source.name}"
     database = _read_dbc(place, source.dbc, directory)
-    if len(set(source.signals.values())) < len(source.signals):
-        raise InputError(place, "signals", "two signals for one channel", "each channel once")
     messages = {message.name: message for message in database.messages}
     wanted: dict[str, list[tuple[int, Signal]]] = {}
     for column, name in enumerate(source.signals):
-        message_name, _, signal_name = name.partition(".")
-        if message_name not in messages:
-            raise _unknown(place, name, [f"{m.name}.{s.name}" for m in database.messages for s in m.signals])
-        message = messages[message_name]
-        found = [signal for signal in message.signals if signal.name == signal_name]
-        if not found:
-            raise _unknown(place, name, [f"{message_name}.{signal.name}" for signal in message.signals])
-        if found[0].multiplexer_ids:
-            raise InputError(
-                place, f"signals, {name}", "a multiplexed signal", "one that every frame of its message holds"
-            )
-        wanted.setdefault(message_name, []).append((column, found[0]))
+        wanted.setdefault(name.split(".")[0], []).append((column, _find(place, "signals", name, messages)))
+    counters: dict[str, Signal] = {}
+    for name in source.counters:
+        message_name, signal = name.split(".")[0], _find(place, "counters", name, messages)
+        if message_name not in wanted:
+            raise InputError(place, f"counters, {name}", "no channel comes from its message", "a message of signals")
+        if signal.is_signed or signal.is_float or signal.scale != 1 or signal.offset != 0 or signal.length > _MOST_BITS:
+            expected = f"an unsigned whole number of at most {_MOST_BITS} bits"
+            raise InputError(place, f"counters, {name}", "a number with sign or scale, or a longer one", expected)
+        counters[message_name] = signal
     return [
-        WantedMessage(messages[name], tuple(signal for _, signal in pairs), np.array([column for column, _ in pairs]))
+        WantedMessage(
+            name,
+            messages[name].frame_id | (EXTENDED if messages[name].is_extended_frame else 0),
+            messages[name].length,
+            tuple(signal for _, signal in pairs),
+            tuple(column for column, _ in pairs),
+            counters.get(name),
+        )
         for name, pairs in wanted.items()
     ]
 
@@ -73,19 +81,28 @@ def decode_signal(signal: Signal, frames: NDArray[np.uint8]) -> Array:
 
     Equal to the bit to cantools' own, up to words of 53 bits.
     """
-    raw = np.zeros(len(frames), dtype=np.uint64)
-    for byte, low, width in _pieces(signal):
-        piece = (frames[:, byte] >> np.uint8(low)) & np.uint8((1 << width) - 1)
-        raw = (raw << np.uint64(width)) | piece
+    raw = raw_word(signal, frames)
     if signal.is_float:
-        word = raw.astype(f"u{signal.length // 8}").view(_FLOATS[signal.length]).astype(np.float64)
+        # A word that is no number (a signalling NaN) is counted later, by whoever looks at the values.
+        with np.errstate(invalid="ignore"):
+            word = raw.astype(f"u{signal.length // 8}").view(_FLOATS[signal.length]).astype(np.float64)
     elif signal.is_signed:
         # To the top of the word and back, which brings the sign bit down with it.
         unused = 64 - signal.length
         word = ((raw << np.uint64(unused)).view(np.int64) >> np.int64(unused)).astype(np.float64)
     else:
         word = raw.astype(np.float64)
-    return word * float(signal.scale) + float(signal.offset)
+    with np.errstate(over="ignore", invalid="ignore"):
+        return word * float(signal.scale) + float(signal.offset)
+
+
+def raw_word(signal: Signal, frames: NDArray[np.uint8]) -> NDArray[np.uint64]:
+    """(B,) bits of a signal from frames (B, bytes), as an unsigned number."""
+    raw = np.zeros(len(frames), dtype=np.uint64)
+    for byte, low, width in _pieces(signal):
+        piece = (frames[:, byte] >> np.uint8(low)) & np.uint8((1 << width) - 1)
+        raw = (raw << np.uint64(width)) | piece
+    return raw
 
 
 def _pieces(signal: Signal) -> list[tuple[int, int, int]]:
@@ -112,6 +129,20 @@ def _pieces(signal: Signal) -> list[tuple[int, int, int]]:
     return pieces if signal.byte_order == "big_endian" else pieces[::-1]
 
 
+def _find(place: str, key: str, name: str, messages: dict[str, Message]) -> Signal:
+    """The signal MESSAGE.SIGNAL; InputError where there is none, or where not every frame of the message holds it."""
+    message_name, signal_name = name.split(".")
+    if message_name not in messages:
+        raise _unknown(place, key, name, [f"{m.name}.{s.name}" for m in messages.values() for s in m.signals])
+    message = messages[message_name]
+    found = [signal for signal in message.signals if signal.name == signal_name]
+    if not found:
+        raise _unknown(place, key, name, [f"{message_name}.{signal.name}" for signal in message.signals])
+    if found[0].multiplexer_ids:
+        raise InputError(place, f"{key}, {name}", "a multiplexed signal", "one that every frame of its message holds")
+    return found[0]
+
+
 def _read_dbc(place: str, name: str, directory: Path | None) -> cantools.database.can.Database:
     shipped = resources.files("sms_adapters") / "dbc"
     beside = None if directory is None else directory / name
@@ -130,6 +161,6 @@ def _read_dbc(place: str, name: str, directory: Path | None) -> cantools.databas
     return database
 
 
-def _unknown(place: str, name: str, names: Sequence[str]) -> InputError:
+def _unknown(place: str, key: str, name: str, names: Sequence[str]) -> InputError:
     expected = f"a signal of it, such as {nearest(name, names) or names[0]!r}" if names else "a DBC with signals"
-    return InputError(place, "signals", f"{name!r}, which the DBC does not hold", expected)
+    return InputError(place, key, f"{name!r}, which the DBC does not hold", expected)

@@ -1,4 +1,4 @@
-"""CAN logs of `candump -l`, matched in bulk as text and decoded as arrays.
+"""CAN logs of `candump -l`, read as arrays.
 
 python-can's reader is not used: a line that it cannot read raises a bare ValueError without the line's number, its
 objects cost 3.7 µs a frame before any signal is decoded, and its times are floats, good to 0.24 µs at this epoch, where
@@ -7,186 +7,181 @@ the log holds whole microseconds.
 
 from __future__ import annotations
 
-import math
-import re
 from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from sms_adapters.can_signals import wanted_messages
-from sms_adapters.capture import BLOCK
 from sms_adapters.lines import LineReader, sampled_line
-from sms_online.description.schema import System
+from sms_adapters.raw import ERROR_FRAME, EXTENDED, FD_FRAME, MOST_BYTES, REMOTE_FRAME, CanFrames
 from sms_online.errors import InputError
-from sms_online.stream import Array, Block
 
-# (seconds.fraction) interface id#data, with the variants of the format: ##flags for CAN FD, R for a remote frame
-# (which carries no data), a direction at the end.
-_LINE = re.compile(
-    rb"^\((\d{1,10})\.(\d{1,9})\) (\S+) ([0-9A-Fa-f]{3}|[0-9A-Fa-f]{8})#"
-    rb"(?:#[0-9A-Fa-f])?(?:R[0-9A-Fa-f]?|((?:[0-9A-Fa-f]{2})*))(?: [RT])?\r?$",
-    re.MULTILINE,
-)
-_EXTENDED = 1 << 32  # set on the ids of eight digits: 007 and 00000007 are two ids
-_EXTENDED_DIGITS = 8
-_NANOSECONDS = 10**9
-_SHOWN_IDS = 5
+Bytes = NDArray[np.uint8]
+Places = NDArray[np.int64]
+Mask = NDArray[np.bool_]
 
-_Column = tuple[bytes, ...]
-_Frames = tuple[_Column, _Column, _Column]  # interface, id and data of each frame, as written
+NANOSECONDS = 10**9
+# Digits before and behind the point of a time, of an identifier, and letters of an interface (IFNAMSIZ of Linux, and
+# what other makers of such logs may need).
+_SECONDS, _FRACTION = 10, 9
+_STANDARD_DIGITS, _EXTENDED_DIGITS = 3, 8
+_INTERFACE = 64
+_LATEST = 9_223_372_035  # s: whole nanoseconds of later times do not fit 64 bits
+_ERROR_FLAG = 1 << 29  # CAN_ERR_FLAG of linux/can.h, which candump writes as part of the identifier
+# Value of a hexadecimal digit by its character, 255 for any other.
+_HEX = np.full(256, 255, dtype=np.uint8)
+for _case in (b"0123456789abcdef", b"0123456789ABCDEF"):
+    _HEX[np.frombuffer(_case, np.uint8)] = np.arange(16, dtype=np.uint8)
+_NOT_HEX = 255
 
 
-class CandumpReader:
-    """A candump log, .log or .log.gz, as blocks in order of time; each iteration starts from its beginning.
+@dataclass(frozen=True)
+class LoggedFrames:
+    """Some consecutive frames of a log: arrival and stamp, s since its first; bus: (N,) of each, indices of `buses`."""
 
-    Each frame of a message of system.source gives one sample: its signals as the DBC scales them, NaN in the channels
-    of other messages. t: seconds since the log's first frame of any kind, from the log's integer times.
-    start, stop, block, on_bytes: as for CaptureReader. directory: where the system file stands; its DBC is
-    looked for there, then among those shipped in sms_adapters/dbc.
+    frames: CanFrames
+    bus: NDArray[np.intp]
+    buses: tuple[str, ...]
 
-    Frames that no channel comes from, wanted frames of another length than the DBC says (remote frames among them),
-    later frames of a message with an equal time, and a last line that does not end in a newline are skipped and
-    counted in `warnings`.
-    Raises InputError, on construction for a system without a CAN source, a DBC that is missing or unreadable, or a
-    signal it does not hold; while iterating for a malformed line, a time that goes back, one message on two
-    interfaces, or no sample at all.
+
+class CandumpLog:
+    """A candump log, .log or .log.gz; each iteration starts from its beginning.
+
+    Lines are `(seconds.fraction) interface id#data`, with the variants of the format: ##flags for CAN FD, R for a
+    remote frame, a direction at the end. Raises InputError for a malformed line and a time that goes back.
     """
 
-    def __init__(
-        self,
-        path: Path,
-        system: System,
-        start: float | None = None,
-        stop: float | None = None,
-        block: int = BLOCK,
-        on_bytes: Callable[[int], None] | None = None,
-        directory: Path | None = None,
-    ) -> None:
-        if system.source is None:
-            expected = f"a table [source] in the system {system.name!r}, with its DBC and signals"
-            raise InputError(str(path), "", "a CAN log without a DBC", expected)
+    def __init__(self, path: Path, on_bytes: Callable[[int], None] | None = None) -> None:
         self._path = path
-        self._start = -math.inf if start is None else start
-        self._stop = math.inf if stop is None else stop
-        self._block = block
-        self._dbc = system.source.dbc
-        self._channels = tuple(system.source.signals.values())
-        self._wanted = {
-            wanted.message.frame_id | (_EXTENDED if wanted.message.is_extended_frame else 0): wanted
-            for wanted in wanted_messages(system, system.source, directory)
-        }
         self._lines = LineReader(path, on_bytes)
-        LineReader(path).first_line()
-        self._reset()
-
-    @property
-    def channels(self) -> tuple[str, ...]:
-        """The channels that the system's [source] maps signals to, in its order."""
-        return self._channels
+        self._lines.first_line()
 
     @property
     def warnings(self) -> list[str]:
-        """What the current iteration has skipped so far."""
-        name, found = self._path.name, []
-        if self._unwanted:
-            ids = [
-                f"{id_ & ~_EXTENDED:0{_EXTENDED_DIGITS if id_ & _EXTENDED else 3}X}"
-                for id_ in sorted(self._unwanted_ids)
-            ]
-            shown = ", ".join(ids[:_SHOWN_IDS]) + (", …" if len(ids) > _SHOWN_IDS else "")
-            found.append(f"{name}: {self._unwanted} frames skipped, no channel comes from their ids ({shown})")
-        if self._wrong_length:
-            found.append(f"{name}: {self._wrong_length} frames skipped, their length is not the one in {self._dbc}")
-        if self._repeated:
-            found.append(
-                f"{name}: {self._repeated} frames skipped, their time repeats that of their message's last one"
-            )
-        if self._lines.cut_line is not None:
-            found.append(f"{name}: 1 line skipped, line {self._lines.cut_line} is cut (no newline at its end)")
-        return found
+        """What the current iteration has left out."""
+        return self._lines.warnings
 
-    def __iter__(self) -> Iterator[Block]:
-        """Yield the blocks from the log's beginning."""
-        self._reset()
+    def __iter__(self) -> Iterator[LoggedFrames]:
+        """The frames, a chunk of text at a time."""
         first: int | None = None
-        last = rows = 0
+        last = 0
+        buses: dict[bytes, int] = {}
         for line, text in self._lines:
-            chunk = bytes(text)
-            stamps, frames = self._frames(line, chunk, last)
+            stamps, frames, bus = self._parse(line, text, buses)
             if not stamps.size:
                 continue
+            back = np.diff(stamps, prepend=last) < 0
+            if back.any():
+                number, _ = sampled_line(line, text, int(back.argmax()))
+                expected = "times that do not go back"
+                raise InputError(str(self._path), f"line {number}", "a time before that of the line above", expected)
             first, last = (int(stamps[0]) if first is None else first), int(stamps[-1])
-            used, values = self._decode(line, chunk, stamps, frames)
-            t = (stamps[used] - first) / _NANOSECONDS
-            inside = slice(*np.searchsorted(t, (self._start, self._stop)))
-            t, values = t[inside], values[used][inside]
-            rows += t.size
-            for k in range(0, t.size, self._block):
-                yield Block(t[k : k + self._block], self._channels, values[k : k + self._block])
-            if (last - first) / _NANOSECONDS >= self._stop:
-                break
-        if not rows:
-            names = ", ".join(wanted.message.name for wanted in self._wanted.values())
-            raise InputError(str(self._path), "", "no samples", f"frames of {names} between start and stop")
+            t = (stamps - first) / NANOSECONDS
+            timed = CanFrames(t, t, frames.id, frames.length, frames.data, frames.flags)
+            yield LoggedFrames(timed, bus, tuple(name.decode("utf-8", "replace") for name in buses))
 
-    def _reset(self) -> None:
-        self._unwanted = self._wrong_length = self._repeated = 0
-        self._unwanted_ids: set[int] = set()
-        self._interface: dict[int, bytes] = {}
-        self._last_stamp: dict[int, int] = {}
+    def _parse(
+        self, line: int, text: memoryview, buses: dict[bytes, int]
+    ) -> tuple[Places, CanFrames, NDArray[np.intp]]:
+        """Stamps (ns), frames without times, and buses of whole lines; new buses are put into `buses`."""
+        b = np.frombuffer(text, np.uint8)
+        end = np.flatnonzero(b == ord("\n"))
+        start = np.concatenate(([0], end[:-1] + 1)).astype(np.int64)
+        end = end - ((end > start) & (b[end - 1] == ord("\r")))
+        number = np.flatnonzero(end > start)
+        start, end = start[number], end[number]
+        directed = (b[end - 2] == ord(" ")) & ((b[end - 1] == ord("R")) | (b[end - 1] == ord("T")))
+        end = end - 2 * (directed & (end - start > 2))
 
-    def _frames(self, line: int, chunk: bytes, last: int) -> tuple[NDArray[np.int64], _Frames]:
-        """Times (ns) and columns of the frames in a chunk; InputError for a malformed line or a time going back."""
-        matches = _LINE.findall(chunk)
-        texts = chunk.split(b"\n")
-        if len(matches) != sum(1 for text in texts if text.rstrip(b"\r")):
-            k = next(k for k, text in enumerate(texts) if text.rstrip(b"\r") and not _LINE.fullmatch(text))
-            found = repr(texts[k][:60].decode("utf-8", "replace"))
-            raise InputError(
-                str(self._path), f"line {line + k}", found, "(seconds) interface id#data, as candump -l writes"
-            )
-        if not matches:
-            return np.empty(0, np.int64), ((), (), ())
-        seconds, fractions, *frames = zip(*matches, strict=True)
-        stamps = np.array([int(s + f.ljust(9, b"0")) for s, f in zip(seconds, fractions, strict=True)], np.int64)
-        back = np.diff(stamps, prepend=last) < 0
-        if back.any():
-            number, _ = sampled_line(line, memoryview(chunk), int(back.argmax()))
-            expected = "times that do not go back"
-            raise InputError(str(self._path), f"line {number}", "a time before that of the line above", expected)
-        return stamps, (frames[0], frames[1], frames[2])
+        # Where the parts of each line begin; where a line lacks one, the place lies outside of it.
+        point = _next(b, ".", start)
+        close = _next(b, ")", point)
+        space = _next(b, " ", np.minimum(close + 2, b.size - 1))
+        hash_ = _next(b, "#", space)
+        good = (b[start] == ord("(")) & (hash_ < end)
+        hash_ = np.minimum(hash_, b.size - 2)
+        good &= (b[np.minimum(close + 1, b.size - 1)] == ord(" ")) & (space > close + 2)
+        seconds, fits = _digits(b, start + 1, point, _SECONDS, 10)
+        good &= fits & (seconds <= _LATEST)
+        fraction, fits = _digits(b, point + 1, close, _FRACTION, 10)
+        good &= fits
+        fraction *= 10 ** (_FRACTION - np.clip(close - point - 1, 1, _FRACTION))
+        id_, fits = _digits(b, space + 1, hash_, _EXTENDED_DIGITS, 16)
+        long = hash_ - space - 1 == _EXTENDED_DIGITS
+        good &= fits & (long | (hash_ - space - 1 == _STANDARD_DIGITS))
+        fd = b[hash_ + 1] == ord("#")
+        after = np.minimum(hash_ + 1 + 2 * fd, b.size - 1)  # behind the flags of CAN FD, one digit
+        good &= ~fd | (_HEX[b[np.minimum(hash_ + 2, b.size - 1)]] != _NOT_HEX) & (after <= end)
+        remote = (b[after] == ord("R")) & (after < end)
+        good &= ~remote | (end - after == 1) | ((end - after == 2) & (_HEX[b[end - 1]] != _NOT_HEX))
+        length = np.where(remote, 0, (end - after) // 2)
+        good &= remote | ((end - after) % 2 == 0) & (length <= MOST_BYTES)
+        data, fits = _data(b, after, np.where(good, length, 0))
+        good &= fits
+        bus, fits = _names(b, close + 2, space, good, buses)
+        good &= fits
+        if not good.all():
+            k = int(number[good.argmin()])
+            found = repr(bytes(text).split(b"\n")[k][:60].decode("utf-8", "replace"))
+            expected = "(seconds) interface id#data, as candump -l writes"
+            raise InputError(str(self._path), f"line {line + k}", found, expected)
+        error = long & ((id_ & _ERROR_FLAG) != 0)
+        ids = np.where(long, id_ & (_ERROR_FLAG - 1) | EXTENDED, id_).astype(np.uint32)
+        flags = (error * ERROR_FRAME | remote * REMOTE_FRAME | fd * FD_FRAME).astype(np.uint8)
+        unknown = np.full(number.size, np.nan)
+        frames = CanFrames(unknown, unknown, ids, length.astype(np.uint8), data, flags)
+        return seconds * NANOSECONDS + fraction, frames, bus
 
-    def _decode(
-        self, line: int, chunk: bytes, stamps: NDArray[np.int64], frames: _Frames
-    ) -> tuple[NDArray[np.bool_], Array]:
-        """Which frames of a chunk give a sample, (B,), and the values (B, C) of all, NaN where they give none."""
-        interfaces, id_texts, data = frames
-        ids = np.array([int(text, 16) | (_EXTENDED if len(text) == _EXTENDED_DIGITS else 0) for text in id_texts])
-        used = np.zeros(stamps.size, dtype=np.bool_)
-        values = np.full((stamps.size, len(self._channels)), np.nan)
-        for id_, wanted in self._wanted.items():
-            rows = np.flatnonzero(ids == id_)
-            interface = self._interface.setdefault(id_, interfaces[rows[0]]) if rows.size else b""
-            other = next((row for row in rows if interfaces[row] != interface), None)
-            if other is not None:
-                number, _ = sampled_line(line, memoryview(chunk), int(other))
-                found = f"{wanted.message.name} on {interfaces[other].decode()} after {interface.decode()}"
-                raise InputError(str(self._path), f"line {number}", found, "a message on one interface")
-            digits = 2 * wanted.message.length
-            whole = rows[[len(data[row]) == digits for row in rows]]
-            fresh = whole[np.diff(stamps[whole], prepend=self._last_stamp.get(id_, -1)) > 0]
-            self._wrong_length += rows.size - whole.size
-            self._repeated += whole.size - fresh.size
-            if fresh.size:
-                self._last_stamp[id_] = int(stamps[fresh[-1]])
-                words = bytes.fromhex(b"".join(data[row] for row in fresh).decode())
-                values[np.ix_(fresh, wanted.columns)] = wanted.decode(
-                    np.frombuffer(words, np.uint8).reshape(fresh.size, -1)
-                )
-                used[fresh] = True
-        unwanted = ids[~np.isin(ids, list(self._wanted))]
-        self._unwanted += unwanted.size
-        self._unwanted_ids.update(unwanted.tolist())
-        return used, values
+
+def _next(b: Bytes, character: str, start: Places) -> Places:
+    """Place of the first such character from each start on; the text's size where there is none."""
+    places = np.append(np.flatnonzero(b == ord(character)), b.size)
+    return np.asarray(places[np.searchsorted(places[:-1], start)], dtype=np.int64)
+
+
+def _digits(b: Bytes, start: Places, stop: Places, most: int, base: int) -> tuple[Places, Mask]:
+    """Numbers of 1 to `most` digits from start to stop, and which of them are such numbers."""
+    width = stop - start
+    good = (width >= 1) & (width <= most)
+    value = np.zeros(start.size, dtype=np.int64)
+    for k in range(int(width[good].max(initial=0))):
+        digit = _HEX[b[np.minimum(start + k, b.size - 1)]]
+        inside = k < width
+        good &= ~inside | (digit < base)
+        value = np.where(inside, value * base + digit, value)
+    return value, good
+
+
+def _data(b: Bytes, start: Places, length: Places) -> tuple[Bytes, Mask]:
+    """(N, 64) bytes from pairs of hexadecimal digits, and which frames have nothing else in them."""
+    data = np.zeros((start.size, MOST_BYTES), dtype=np.uint8)
+    good = np.ones(start.size, dtype=np.bool_)
+    for k in range(int(length.max(initial=0))):
+        inside = k < length
+        place = np.where(inside, start + 2 * k, 0)
+        high, low = _HEX[b[place]], _HEX[b[place + 1]]
+        good &= ~inside | ((high != _NOT_HEX) & (low != _NOT_HEX))
+        data[:, k] = np.where(inside, high << 4 | low & 0xF, 0)
+    return data, good
+
+
+def _names(b: Bytes, start: Places, stop: Places, good: Mask, buses: dict[bytes, int]) -> tuple[NDArray[np.intp], Mask]:
+    """Index in `buses` of the name from start to stop, which is extended by new ones; which lines have such a name."""
+    width = np.where(good, stop - start, 0)
+    good = good & (width <= _INTERFACE)
+    width = np.where(good, width, 0)
+    letters = np.zeros((start.size, max(1, int(width.max(initial=0)))), dtype=np.uint8)
+    for k in range(letters.shape[1]):
+        inside = k < width
+        letters[:, k] = np.where(inside, b[np.minimum(start + k, b.size - 1)], 0)
+        good &= ~inside | (letters[:, k] > ord(" "))
+    index = np.zeros(start.size, dtype=np.intp)
+    left = good.copy()
+    while left.any():
+        row = int(left.argmax())
+        same = (letters == letters[row]).all(axis=1) & left
+        index[same] = buses.setdefault(letters[row].tobytes().rstrip(b"\0"), len(buses))
+        left &= ~same
+    return index, good

@@ -74,11 +74,7 @@ class CaptureReader:
             found.append(f"{self._path.name}: {count} of {self._rows} cells empty or NaN in {', '.join(channels)}")
         if self._repeated:
             found.append(f"{self._path.name}: {self._repeated} samples skipped, their time repeats the one before")
-        if self._lines.cut_line is not None:
-            found.append(
-                f"{self._path.name}: 1 line skipped, line {self._lines.cut_line} is cut (no newline at its end)"
-            )
-        return found
+        return found + self._lines.warnings
 
     def __iter__(self) -> Iterator[Block]:
         """Yield the blocks from the capture's beginning."""

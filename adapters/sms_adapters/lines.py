@@ -35,6 +35,13 @@ class LineReader:
         self.cut_line: int | None = None
         self._on_bytes = on_bytes
 
+    @property
+    def warnings(self) -> list[str]:
+        """That the last iteration left out a cut line, if it did."""
+        if self.cut_line is None:
+            return []
+        return [f"{self.path.name}: 1 line skipped, line {self.cut_line} is cut (no newline at its end)"]
+
     def __iter__(self) -> Iterator[tuple[int, memoryview]]:
         self.cut_line = None
         buffer = bytearray(CHUNK)

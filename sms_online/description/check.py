@@ -9,6 +9,7 @@ from collections.abc import Iterable
 import numpy as np
 
 from sms_online.description.channels import channels, sensed_channels
+from sms_online.description.check_sources import check_sources
 from sms_online.description.explain import hint, nearest, quoted
 from sms_online.description.schema import Deformation, FlexibleLink, Inertia, Joint, Motor, RigidLink, System
 from sms_online.errors import InputError
@@ -46,7 +47,7 @@ def check_system(system: System, source: str) -> None:
     _check_simulation(system, source)
     names = channels(system)
     _check_sensors(system, names, source)
-    _check_source(system, names, source)
+    check_sources(system, names, source)
     _check_effects(system, names, source)
     _check_parameter_names(system, source)
 
@@ -157,26 +158,6 @@ def _check_sensors(system: System, names: tuple[str, ...], source: str) -> None:
                     "one sensor for a channel",
                 )
             filled[channel] = k
-
-
-def _check_source(system: System, names: tuple[str, ...], source: str) -> None:
-    if system.source is None:
-        return
-    if not system.source.dbc.endswith(".dbc"):
-        raise InputError(source, "source.dbc", repr(system.source.dbc), "the name of a .dbc file")
-    if not system.source.signals:
-        raise InputError(source, "source.signals", "an empty table", '"MESSAGE.SIGNAL" = "channel", at least once')
-    for signal, channel in system.source.signals.items():
-        if not re.fullmatch(r"\w+\.\w+", signal):
-            raise InputError(source, "source.signals", repr(signal), '"MESSAGE.SIGNAL" in quotes')
-        if channel not in names:
-            near = nearest(channel, names)
-            raise InputError(
-                source,
-                f"source.signals.{signal}",
-                f"unknown channel {channel!r}",
-                f"a channel of this system, such as {near or names[0]!r}",
-            )
 
 
 def _check_effects(system: System, names: tuple[str, ...], source: str) -> None:

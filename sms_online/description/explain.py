@@ -18,6 +18,7 @@ TABLES = {
     "motors": "motor_{}",
     "links": "link_{}",
     "sensors": "sensor {}",
+    "sources": "source {}",
     "effects": "effect {}",
 }
 RECORDS: dict[str, type[BaseModel]] = {
@@ -27,13 +28,16 @@ RECORDS: dict[str, type[BaseModel]] = {
     "motors": schema.Motor,
     "sensors": schema.Sensor,
     "effects": schema.Effect,
-    "source": schema.CanSource,
     "priors": schema.Prior,
     "controller": schema.Controller,
     "trajectory": schema.Harmonic,
     "windows": schema.Windows,
 }
+# Records that a key of the table tells apart, by its values; a serial source needs two such keys.
 LINKS: dict[str, type[BaseModel]] = {"rigid": schema.RigidLink, "flexible": schema.FlexibleLink}
+SOURCES: dict[str, type[BaseModel]] = {"can": schema.CanSource, "canopen": schema.CanopenSource}
+SERIAL: dict[str, type[BaseModel]] = {"frames": schema.SerialFrames, "lines": schema.SerialLines}
+TAGS = {"links": {"kind": tuple(LINKS)}, "sources": {"kind": (*SOURCES, "serial"), "format": tuple(SERIAL)}}
 INERTIAS = ("inertia", "stator_inertia")
 # Longest value that a message repeats; more would not fit a line.
 LONGEST_VALUE = 60
@@ -78,11 +82,13 @@ def explain(error: ValidationError, source: str) -> InputError:
             return InputError(source, place.rsplit("[", 1)[0], f"{_shown(value)}", "3 numbers")
         return InputError(source, place, "missing", "a value, for this key has no default")
     if kind in ("union_tag_not_found", "union_tag_invalid"):
-        tag = value.get("kind") if isinstance(value, dict) else None
-        near = nearest(str(tag), tuple(LINKS))
-        return InputError(
-            source, f"{place}.kind", "missing" if tag is None else _shown(tag), quoted(tuple(LINKS), near)
-        )
+        key = context["discriminator"].strip("'")
+        tag = value.get(key) if isinstance(value, dict) else None
+        tags = TAGS[str(first["loc"][0])][key]
+        found = "missing" if tag is None else _shown(tag)
+        return InputError(source, f"{place}.{key}", found, quoted(tags, nearest(str(tag), tags)))
+    if first["loc"][0] == "sources" and "options" in first["loc"]:
+        return InputError(source, place.rsplit(".", 1)[0], _shown(value), "a number, a text in quotes, true or false")
     if first["loc"][0] == "known" and isinstance(value, dict):
         name = f"{first['loc'][1]}.{next(iter(value), 'parameter')}"
         return InputError(source, place, "a table", f'a number; a name with a dot is quoted: "{name}" = value')
@@ -110,8 +116,11 @@ def _expected(kind: str, first: ErrorDetails, context: dict[str, Any]) -> str:
             return f"at least {context['min_length']} of them"
         case "too_long":
             return f"{context['max_length']} numbers"
+        case "bool_type":
+            return "true or false"
         case "tuple_type" | "list_type":
-            return "a list"
+            table = TABLES.get(str(first["loc"][0]), "")
+            return f"a list of tables [[{table.split()[0]}]]" if len(first["loc"]) == 1 and table else "a list"
         case "model_type" | "model_attributes_type" | "dict_type":
             return "a table"
     return first["msg"]
@@ -131,14 +140,22 @@ def _place(loc: tuple[int | str, ...]) -> str:
     if parts[0] == "trajectory" and parts[1:2] == ["joints"]:
         parts[1:3] = [f"joint_{int(parts[2]) + 1}"] if len(parts) > 2 else []
     if parts[0] in TABLES and len(parts) > 1:
-        tag = 1 if parts[0] == "links" and parts[2:3] and parts[2] in LINKS else 0
-        parts[: 2 + tag] = [TABLES[str(parts[0])].format(int(parts[1]) + 1)]
-    elif parts[0] in ("priors", "sensors", "effects"):
+        parts[: 2 + len(_tags(loc))] = [TABLES[str(parts[0])].format(int(parts[1]) + 1)]
+    elif parts[0] in ("priors", "sensors", "sources", "effects"):
         parts[0] = str(parts[0]).removesuffix("s")
     text = str(parts[0])
     for part in parts[1:]:
         text += f"[{part + 1}]" if isinstance(part, int) else f".{part}"
     return text
+
+
+def _tags(loc: tuple[int | str, ...]) -> tuple[int | str, ...]:
+    """The tags that pydantic puts into a place in a union, after the number of the table: of two keys, two."""
+    by_key = TAGS.get(str(loc[0]), {}).values()
+    count = 0
+    while count < len(by_key) and loc[2 + count : 3 + count] and loc[2 + count] in tuple(by_key)[count]:
+        count += 1
+    return loc[2 : 2 + count]
 
 
 def _keys_beside(loc: tuple[int | str, ...]) -> tuple[str, ...]:
@@ -147,6 +164,12 @@ def _keys_beside(loc: tuple[int | str, ...]) -> tuple[str, ...]:
         record: type[BaseModel] = schema.Inertia
     elif loc[0] == "links":
         record = LINKS[str(loc[2])]
+    elif loc[0] == "sources" and "signals" in loc:
+        record = schema.Signal
+    elif loc[0] == "sources" and "fields" in loc:
+        record = schema.FrameField if "frames" in loc else schema.SerialField
+    elif loc[0] == "sources":
+        record = (SOURCES | SERIAL)[str(_tags(loc)[-1])]
     else:
         record = RECORDS[str(loc[0])]
     return tuple(record.model_fields)

@@ -1,7 +1,7 @@
 """From the text of a system file (TOML) to a checked `System`, and the texts that are shipped with the package.
 
 Tables of a file: [spacecraft], then [joint_i], [motor_i] (optional) and [link_i] for i = 1..N, [payload], [[sensor]],
-[source], [[effect]], [known], [prior], [controller], [trajectory], [windows]; keys are the fields of `schema`.
+[[source]], [[effect]], [known], [prior], [controller], [trajectory], [windows]; keys are the fields of `schema`.
 """
 
 from __future__ import annotations
@@ -21,8 +21,8 @@ from sms_online.description.schema import System
 from sms_online.errors import InputError
 
 # Top-level keys of a file and the field of `System` that each fills; numbered tables come beside them.
-PLAIN = ("name", "title", "reference", "motion", "gravity", "sample_rate", "spacecraft", "payload", "source", "known")
-RENAMED = {"sensor": "sensors", "effect": "effects", "prior": "priors"}
+PLAIN = ("name", "title", "reference", "motion", "gravity", "sample_rate", "spacecraft", "payload", "known")
+RENAMED = {"sensor": "sensors", "source": "sources", "effect": "effects", "prior": "priors"}
 WITHOUT_NUMBERS = (*PLAIN, *RENAMED, "controller", "trajectory", "windows")
 NUMBERED = re.compile(r"(joint|motor|link)_([1-9]\d*)")
 SYNTAX_ERROR_PLACE = re.compile(r"(?P<what>.*) \(at (?P<place>[^()]*)\)", re.DOTALL)

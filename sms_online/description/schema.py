@@ -6,9 +6,9 @@ never reads them otherwise. SI units throughout. The paper's symbols are given b
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 Vector3 = tuple[float, float, float]
 Positive = Annotated[float, Field(gt=0)]
@@ -125,12 +125,125 @@ class Sensor(Record):
     latency: NonNegative = 0.0
 
 
-class CanSource(Record):
-    """A CAN source: dbc is a file beside the system file or a shipped one; signals: `MESSAGE.SIGNAL` to channel."""
+class Signal(Record):
+    """Where a number of a device goes: channel value = scale number + offset, in the channel's unit.
+
+    A negative scale turns the sign. minimum, maximum: of the channel value before unwrapping; what lies outside cannot
+    be true and is dropped. wrap: an encoder counts modulo this, in the number's own unit; its turns are then counted,
+    the first sample lying in turn 0. In a system file a mere channel name is short for { channel = name }.
+    """
+
+    channel: str
+    scale: float = 1.0
+    offset: float = 0.0
+    minimum: float | None = None
+    maximum: float | None = None
+    wrap: Positive | None = None
+
+    @model_validator(mode="before")
+    @classmethod
+    def _from_name(cls, given: Any) -> Any:
+        return {"channel": given} if isinstance(given, str) else given
+
+
+class SourceRecord(Record):
+    """A device: its name in messages and recordings; latency: constant delay from the instant to the stamp, s."""
+
+    name: str
+    latency: NonNegative = 0.0
+
+
+class CanBus(SourceRecord):
+    """A CAN bus by the names of python-can: interface, channel, bitrate in bit/s, further options of the interface."""
+
+    interface: str = "socketcan"
+    channel: str = "can0"
+    bitrate: Annotated[int, Field(gt=0)] | None = None
+    options: dict[str, bool | int | float | str] = {}
+
+
+class CanSource(CanBus):
+    """Messages of a DBC: a file beside the system file, or a shipped one; signals: `MESSAGE.SIGNAL` to channel.
+
+    counters: the signals, at most one a message, in which a sender counts its frames.
+    """
 
     kind: Literal["can"]
     dbc: str
-    signals: dict[str, str]
+    signals: dict[str, Signal]
+    counters: tuple[str, ...] = ()
+
+
+class CanopenSource(CanBus):
+    """Process data of CANopen nodes, as their EDS maps them; nodes: node id to EDS, a file beside the system file.
+
+    signals: `NODE.INDEX` or `NODE.INDEX:SUBINDEX`, the index in hexadecimal as in the EDS, to channel: "1.6064" is the
+    position of the drive that is node 1.
+    """
+
+    kind: Literal["canopen"]
+    nodes: dict[str, str]
+    signals: dict[str, Signal]
+
+
+class SerialField(Record):
+    """One number of a serial frame or line: a channel, the device's time, a counter of frames, or nothing of interest.
+
+    channel … wrap: see Signal. tick: s a count, for the device's time, or for a counter of frames that are taken at a
+    constant rate. wrap: of tick or counter, where it starts again from 0; a word of a binary frame does so at its
+    width without saying.
+    """
+
+    channel: str | None = None
+    scale: float = 1.0
+    offset: float = 0.0
+    minimum: float | None = None
+    maximum: float | None = None
+    wrap: Positive | None = None
+    tick: Positive | None = None
+    counter: bool = False
+
+
+class FrameField(SerialField):
+    """A word of a binary frame, little-endian: its type is u (unsigned), i (signed) or f (IEEE float) and its bits."""
+
+    type: Literal["u8", "i8", "u16", "i16", "u32", "i32", "u64", "i64", "f32", "f64"]
+
+
+class SerialPort(SourceRecord):
+    """A serial port by the names of pyserial, a URL such as socket://host:port included; baudrate in bit/s."""
+
+    kind: Literal["serial"]
+    port: str
+    baudrate: Annotated[int, Field(gt=0)] = 115200
+
+
+class SerialFrames(SerialPort):
+    """Binary frames: the words of `fields` without padding, then their CRC-32, COBS-encoded, a zero byte at the end.
+
+    The CRC-32 is that of Ethernet and zlib, little-endian. Source: Cheshire and Baker, IEEE/ACM Trans. Networking 7
+    (1999) 159.
+    """
+
+    format: Literal["frames"]
+    fields: Annotated[tuple[FrameField, ...], Field(min_length=1)]
+
+
+class SerialLines(SerialPort):
+    """Lines of decimal numbers in ASCII, `separator` between them ("" for blanks).
+
+    checksum: `xor` expects * and two hexadecimal digits at the end, the exclusive or of the bytes before, without a
+    leading $, as NMEA 0183 has it.
+    """
+
+    format: Literal["lines"]
+    fields: Annotated[tuple[SerialField, ...], Field(min_length=1)]
+    separator: str = ","
+    checksum: Literal["none", "xor"] = "none"
+
+
+SerialSource = Annotated[SerialFrames | SerialLines, Field(discriminator="format")]
+Source = Annotated[CanSource | CanopenSource | SerialSource, Field(discriminator="kind")]
 
 
 class Effect(Record):
@@ -191,7 +304,7 @@ class System(Record):
     links: tuple[Link, ...]
     payload: RigidBody | None = None
     sensors: tuple[Sensor, ...] = ()
-    source: CanSource | None = None
+    sources: tuple[Source, ...] = ()
     effects: tuple[Effect, ...] = ()
     known: dict[str, float] = {}
     priors: dict[str, Prior] = {}

@@ -1,0 +1,106 @@
+"""CAN frames to samples: each frame of a wanted message is one, decoded in arrays with the state of its counters."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sms_adapters.can_signals import WantedMessage, decode_signal, raw_word
+from sms_adapters.conversion import Conversion, FrameCounter, counters_state, restore_counters
+from sms_adapters.raw import ERROR_FRAME, REMOTE_FRAME, CanFrames, DecodedSamples, DecoderState, Raw
+from sms_online.description.schema import Signal
+
+# Unknown identifiers that are remembered, to name them.
+_SHOWN_IDS = 5
+
+
+class CanDecoder:
+    """Decodes the frames of wanted messages: a `Decoder`.
+
+    messages: those wanted. signals: what the system file says of each, in the order of their columns. t_device is the
+    frames' stamp. A frame with the stamp of its message's last one is a repetition (counted as repeated_time).
+    """
+
+    def __init__(self, messages: Sequence[WantedMessage], signals: Sequence[Signal]) -> None:
+        self.channels = tuple(signal.channel for signal in signals)
+        kinds = ("error_frame", "remote", "unknown_id", "wrong_length", "repeated_time", "non_finite", "out_of_range")
+        self.counters = dict.fromkeys((*kinds, *FrameCounter.KINDS), 0)
+        self.unknown_ids: list[int] = []  # the first of them
+        self.messages = tuple(messages)
+        self._ids = np.array([message.id for message in messages], dtype=np.uint32)
+        self._conversions = [Conversion(signal, self.counters) for signal in signals]
+        self._sequences = [
+            None if message.counter is None else FrameCounter(1 << message.counter.length, self.counters)
+            for message in messages
+        ]
+        self._last_stamp = np.full(len(messages), np.nan)
+
+    def push(self, raw: Raw) -> DecodedSamples:
+        """The samples in some frames; (M, C) values with NaN in the channels of other messages."""
+        if not isinstance(raw, CanFrames):
+            raise TypeError(f"{type(raw).__name__} pushed into a decoder of CAN frames")
+        values = np.full((len(raw), len(self.channels)), np.nan)
+        used = np.zeros(len(raw), dtype=np.bool_)
+        plain = self._plain(raw)
+        for k, message in enumerate(self.messages):
+            rows = self._admitted(k, message, raw, np.flatnonzero(plain & (raw.id == message.id)))
+            if not rows.size:
+                continue
+            words = raw.data[:, : message.length][rows]
+            for signal, column in zip(message.signals, message.columns, strict=True):
+                values[rows, column] = self._conversions[column](decode_signal(signal, words))
+            used[rows] = True
+        # A frame whose every value was refused is no sample.
+        used &= ~np.isnan(values).all(axis=1)
+        return DecodedSamples(raw.arrival[used], raw.stamp[used], values[used])
+
+    def _plain(self, raw: CanFrames) -> NDArray[np.bool_]:
+        """(N,) frames that hold data and have a wanted identifier; the others are counted."""
+        error, remote = (raw.flags & ERROR_FRAME) != 0, (raw.flags & (ERROR_FRAME | REMOTE_FRAME)) == REMOTE_FRAME
+        self.counters["error_frame"] += int(np.count_nonzero(error))
+        self.counters["remote"] += int(np.count_nonzero(remote))
+        data = ~(error | remote)
+        known = np.isin(raw.id, self._ids)
+        unknown = raw.id[data & ~known]
+        self.counters["unknown_id"] += unknown.size
+        if unknown.size and len(self.unknown_ids) < _SHOWN_IDS:
+            new = [id_ for id_ in dict.fromkeys(unknown.tolist()) if id_ not in self.unknown_ids]
+            self.unknown_ids += new[: _SHOWN_IDS - len(self.unknown_ids)]
+        plain: NDArray[np.bool_] = data & known
+        return plain
+
+    def _admitted(self, k: int, message: WantedMessage, raw: CanFrames, rows: NDArray[np.intp]) -> NDArray[np.intp]:
+        """Those of the rows of message k that give a sample: of the right length, neither repeated nor late."""
+        whole = rows[raw.length[rows] == message.length]
+        self.counters["wrong_length"] += rows.size - whole.size
+        stamps = raw.stamp[whole]
+        fresh = np.diff(stamps, prepend=self._last_stamp[k]) != 0  # true where there is no stamp
+        if stamps.size:
+            self._last_stamp[k] = stamps[-1]
+        self.counters["repeated_time"] += int(np.count_nonzero(~fresh))
+        admitted: NDArray[np.intp] = whole[fresh]
+        sequence = self._sequences[k]
+        if sequence is not None and message.counter is not None:
+            counts = raw_word(message.counter, raw.data[:, : message.length][admitted]).astype(np.int64)
+            admitted = admitted[sequence.admit(counts)]
+        return admitted
+
+    def state(self) -> DecoderState:
+        """Turns, counts, last stamps and counters."""
+        state: DecoderState = {f"turns.{k}": conversion.state() for k, conversion in enumerate(self._conversions)}
+        state |= {f"sequence.{k}": s.state() for k, s in enumerate(self._sequences) if s is not None}
+        state |= {"last_stamp": self._last_stamp.copy(), "unknown_ids": np.array(self.unknown_ids, dtype=np.uint32)}
+        return state | counters_state(self.counters)
+
+    def restore(self, state: DecoderState) -> None:
+        """Go on from a saved state."""
+        for k, conversion in enumerate(self._conversions):
+            conversion.restore(state[f"turns.{k}"])
+        for k, sequence in enumerate(self._sequences):
+            if sequence is not None:
+                sequence.restore(state[f"sequence.{k}"])
+        self._last_stamp = state["last_stamp"].copy()
+        self.unknown_ids = state["unknown_ids"].tolist()
+        restore_counters(self.counters, state)

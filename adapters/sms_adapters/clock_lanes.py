@@ -1,0 +1,41 @@
+"""The lanes of a described system's sources: which decoder, which streams, which periods."""
+
+from __future__ import annotations
+
+from fnmatch import fnmatchcase
+from pathlib import Path
+
+from sms_adapters.can_signals import WantedMessage, wanted_messages
+from sms_adapters.canopen_signals import pdo_messages
+from sms_adapters.clock_merge import SourceLane, Stream
+from sms_adapters.devices import make_decoder
+from sms_online.description.schema import CanopenSource, CanSource, Source, System
+from sms_online.errors import InputError
+
+
+def lanes(system: System, directory: Path | None) -> list[SourceLane]:
+    """A lane for each source of the system; directory: where its file stands, with the files that it names.
+
+    Raises InputError for a system without sources, and as the decoders do.
+    """
+    if not system.sources:
+        raise InputError(system.name, "source", "no such table", "a table [[source]] for each device of the testbed")
+    return [_lane(system, source, directory) for source in system.sources]
+
+
+def period(system: System, channel: str) -> float:
+    """Nominal period of a channel, s: that of the sensor which fills it."""
+    rates = [s.rate for s in system.sensors if any(fnmatchcase(channel, pattern) for pattern in s.channels)]
+    return 1.0 / (next((rate for rate in rates if rate is not None), None) or system.sample_rate)
+
+
+def _lane(system: System, source: Source, directory: Path | None) -> SourceLane:
+    decoder = make_decoder(source, directory)
+    messages: list[WantedMessage] = []
+    if isinstance(source, CanSource):
+        messages = wanted_messages(source, directory)
+    elif isinstance(source, CanopenSource):
+        messages = pdo_messages(source, directory)
+    streams = [Stream(m.columns, period(system, decoder.channels[m.columns[0]]), m) for m in messages]
+    everything = Stream(tuple(range(len(decoder.channels))), period(system, decoder.channels[0]))
+    return SourceLane(source.name, decoder, streams or [everything], source.latency)

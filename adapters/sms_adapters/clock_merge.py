@@ -1,0 +1,252 @@
+"""From the raw items of several devices to rows on one clock: decoded, timed, and merged in order of time.
+
+The work goes in ticks of the session's clock. What arrived before a tick is decoded, its times are corrected, and the
+rows that nothing older can still overtake are given out. So the rows are a function of the raw items and their arrivals
+alone, whoever calls and whenever: a recording replayed gives the rows of the session.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from sms_adapters.can_signals import WantedMessage, raw_word
+from sms_adapters.clock_line import DeviceClock
+from sms_adapters.clock_samples import CountedTime, NumberedTime
+from sms_adapters.faults import sentences
+from sms_adapters.raw import CanFrames, DecodedSamples, Decoder, Raw, concatenate_frames
+from sms_adapters.stuck import StuckGuard
+from sms_online.stream import Array, Block
+
+# Work is done so often, µs: the tick adds half of itself to the latency, and NumPy's calls cost some 2 % of a core.
+TICK_MICROSECONDS = 20_000
+TICK = TICK_MICROSECONDS * 1e-6
+# Rows wait so much longer than the slowest source's newest one, s: frames of one bus overtake each other by less, and a
+# sensor that sticks is noticed within it.
+REORDERING = 0.01
+# A source that is silent is waited for so long, s; a sender that stumbles loses nothing within it.
+PATIENCE = 0.3
+# A source from which nothing comes for so long is silent, s: its device may be gone without the bus telling.
+SILENCE = 1.0
+# At the start all wait until the clocks of all sources are known, at most so long, s.
+START_PATIENCE = 3.0
+
+
+@dataclass(frozen=True)
+class Stream:
+    """What comes periodically from one sender on one clock: a message of a CAN bus, or a serial line.
+
+    columns: of its source's channels. period: nominal, s. message: the CAN message with a counter, if it is one.
+    """
+
+    columns: tuple[int, ...]
+    period: float
+    message: WantedMessage | None = None
+
+
+class SourceLane:
+    """One source: raw items in order of arrival to rows with times of the session's clock.
+
+    name: of the source. latency: from the instant of a sample to its arrival, s. streams: every channel of the decoder
+    in one of them. newest: (streams,) latest time of each, -inf before its clock is known.
+    """
+
+    def __init__(self, name: str, decoder: Decoder, streams: Sequence[Stream], latency: float) -> None:
+        self.name = name
+        self.decoder = decoder
+        self.clocks = [DeviceClock(latency) for _ in streams]
+        self.newest = np.full(len(streams), -np.inf)
+        self.unplaced = 0
+        self.streams = tuple(streams)
+        self._stream_of = np.zeros(len(decoder.channels), dtype=np.intp)
+        for k, stream in enumerate(streams):
+            self._stream_of[list(stream.columns)] = k
+        self._counted = {
+            stream.message.id: (stream.message, CountedTime(1 << stream.message.counter.length, stream.period))
+            for stream in streams
+            if stream.message is not None and stream.message.counter is not None
+        }
+        self._numbered = [NumberedTime(stream.period) for stream in streams]
+        self._held = [np.empty((0, len(decoder.channels))) for _ in streams]  # rows whose time is not known yet
+
+    def push(self, items: Sequence[Raw]) -> tuple[Array, Array]:
+        """Times (K,) and values (K, C) of the samples whose time has become known with these items."""
+        samples = self._decode(items)
+        t, values = [np.empty(0)], [np.empty((0, len(self.decoder.channels)))]
+        if samples:
+            arrival = np.concatenate([part.t_arrival for part in samples])
+            device = np.concatenate([part.t_device for part in samples])
+            rows = np.concatenate([part.values for part in samples])
+            stream = self._stream_of[np.argmin(np.isnan(rows), axis=1)]
+            for k in np.unique(stream).tolist():
+                mine = stream == k
+                times, timed = self._time(k, arrival[mine], device[mine], rows[mine])
+                t.append(times)
+                values.append(timed)
+        return np.concatenate(t), np.concatenate(values)
+
+    def _decode(self, items: Sequence[Raw]) -> list[DecodedSamples]:
+        """Samples of all items; frames together, as arrays are for many."""
+        frames = [item for item in items if isinstance(item, CanFrames)]
+        chunks: list[Raw] = [item for item in items if not isinstance(item, CanFrames)]
+        if frames:
+            chunks.append(self._stamped(concatenate_frames(frames)))
+        decoded = [self.decoder.push(chunk) for chunk in chunks]
+        return [part for part in decoded if part.t_arrival.size]
+
+    def _stamped(self, frames: CanFrames) -> CanFrames:
+        """Frames of senders that count them, with stamps by their count, which knows no jitter as a kernel's does."""
+        if not self._counted:
+            return frames
+        stamp = frames.stamp.copy()
+        for id_, (message, time) in self._counted.items():
+            assert message.counter is not None
+            rows = np.flatnonzero((frames.id == id_) & (frames.length == message.length) & (frames.flags & 3 == 0))
+            counts = raw_word(message.counter, frames.data[:, : message.length][rows]).astype(np.int64)
+            stamp[rows] = time(counts, frames.arrival[rows])
+        return CanFrames(frames.arrival, stamp, frames.id, frames.length, frames.data, frames.flags)
+
+    def _time(self, k: int, arrival: Array, device: Array, values: Array) -> tuple[Array, Array]:
+        """Times and rows of stream k that have become known."""
+        unmarked = np.isnan(device)
+        if unmarked.any():
+            device = device.copy()
+            device[unmarked] = self._numbered[k](arrival[unmarked])
+        return self._timed(k, self.clocks[k].push(device, arrival), values)
+
+    def finish(self) -> tuple[Array, Array]:
+        """Times and rows that are held back, at the end of the session."""
+        nothing = np.empty((0, len(self.decoder.channels)))
+        parts = [self._timed(k, clock.finish(), nothing) for k, clock in enumerate(self.clocks)]
+        return np.concatenate([t for t, _ in parts]), np.concatenate([rows for _, rows in parts])
+
+    def _timed(self, k: int, t: Array, values: Array) -> tuple[Array, Array]:
+        """Rows of stream k, new ones appended, that the times t belong to."""
+        waiting = np.concatenate((self._held[k], values))
+        rows, self._held[k] = waiting[: t.size], waiting[t.size :]
+        good = ~np.isnan(t)
+        self.unplaced += int(np.count_nonzero(~good))
+        t, rows = t[good], rows[good]
+        self.newest[k] = max(self.newest[k], t.max(initial=-np.inf))
+        return t, rows
+
+    @property
+    def warnings(self) -> list[str]:
+        """What was wrong with this source so far, counted, one sentence for each kind."""
+        found = sentences(self.name, self.decoder.counters)
+        jumps = sum(clock.counters.jumps for clock in self.clocks)
+        steps = sum(clock.counters.steps for clock in self.clocks)
+        if jumps:
+            last = next(clock.last_jump for clock in self.clocks if clock.counters.jumps)
+            found.append(f"{self.name}: {jumps} jumps of its clock, the last by {last:+.3f} s")
+        if steps:
+            found.append(f"{self.name}: {steps} steps of its clock or latency by more than a millisecond")
+        if self.unplaced:
+            found.append(f"{self.name}: {self.unplaced} samples skipped, their stamps cannot be true")
+        return found
+
+
+class Merger:
+    """Rows of all sources in order of time, from raw items by the tick.
+
+    lanes: the sources; their channels, one after the other, are those of the blocks. start: time of the session's clock
+    zero in the blocks, s.
+    """
+
+    def __init__(self, lanes: Sequence[SourceLane], start: float = 0.0) -> None:
+        self.lanes = tuple(lanes)
+        self.channels = tuple(channel for lane in lanes for channel in lane.decoder.channels)
+        self.late = [0 for _ in lanes]
+        self.silences = [0 for _ in lanes]
+        self._heard = [np.inf for _ in lanes]  # tick of the last item of each source
+        self._start = start
+        self._first = np.inf  # arrival of the first item
+        self._settled = False
+        self._given = -np.inf  # time up to which rows are out
+        self._guards = [StuckGuard([stream.columns for stream in lane.streams]) for lane in lanes]
+        self._waiting = [(np.empty(0), np.empty((0, len(lane.decoder.channels)))) for lane in lanes]
+
+    def advance(self, now: float, items: Sequence[Sequence[Raw]]) -> Block | None:
+        """Take what arrived up to the tick `now`, s, of each source, and return the rows that are in order by now."""
+        for k, (lane, raw) in enumerate(zip(self.lanes, items, strict=True)):
+            if not raw:
+                # Counted once, when it has just been too long.
+                self.silences[k] += int(now - TICK - self._heard[k] <= SILENCE < now - self._heard[k])
+            else:
+                self._heard[k] = now
+                self._first = min(self._first, float(np.min([np.min(item.arrival) for item in raw])))
+                self._admit(k, *lane.push(raw))
+        return self._give(self._due(now))
+
+    def finish(self) -> Block | None:
+        """The rows that are left at the end of the session."""
+        for k, lane in enumerate(self.lanes):
+            self._admit(k, *lane.finish())
+        return self._give(np.inf)
+
+    def _admit(self, k: int, t: Array, values: Array) -> None:
+        """Put rows among those that wait, in order of time; those whose time has passed are late."""
+        late = t <= self._given
+        if late.any():
+            self.late[k] += int(np.count_nonzero(late))
+            t, values = t[~late], values[~late]
+        if t.size == 0:
+            return
+        waiting_t, waiting = self._waiting[k]
+        values = np.concatenate((waiting, values))
+        self._guards[k].blank(values, t.size)
+        t = np.concatenate((waiting_t, t))
+        order = np.argsort(t, kind="stable")
+        self._waiting[k] = t[order], values[order]
+
+    def _due(self, now: float) -> float:
+        """The time that nothing older can still be overtaken by."""
+        newest = np.concatenate([lane.newest for lane in self.lanes])
+        if not self._settled:
+            self._settled = bool(np.isfinite(newest).all()) or now > self._first + START_PATIENCE
+        if not self._settled:
+            return -np.inf
+        return max(float(newest.min()) - REORDERING, now - PATIENCE)
+
+    def _give(self, due: float) -> Block | None:
+        if due <= self._given:
+            return None
+        self._given = due if np.isfinite(due) else self._given
+        parts_t, parts = [], []
+        column = 0
+        for k, (t, values) in enumerate(self._waiting):
+            count = int(np.searchsorted(t, due, side="right"))
+            wide = np.full((count, len(self.channels)), np.nan)
+            wide[:, column : column + values.shape[1]] = values[:count]
+            column += values.shape[1]
+            parts_t.append(t[:count])
+            parts.append(wide)
+            self._waiting[k] = t[count:], values[count:]
+        t = np.concatenate(parts_t)
+        if t.size == 0:
+            return None
+        order = np.argsort(t, kind="stable")
+        rows = np.concatenate(parts)[order]
+        filled = ~np.isnan(rows).all(axis=1)
+        return Block(t[order][filled] + self._start, self.channels, rows[filled])
+
+    def silent(self, now: float) -> list[str]:
+        """Names of the sources that are silent at the tick `now`, s."""
+        return [lane.name for lane, heard in zip(self.lanes, self._heard, strict=True) if now - heard > SILENCE]
+
+    @property
+    def warnings(self) -> list[str]:
+        """What was wrong so far, counted, one sentence each."""
+        found = []
+        for k, (lane, guard) in enumerate(zip(self.lanes, self._guards, strict=True)):
+            found += lane.warnings
+            if self.silences[k]:
+                found.append(f"{lane.name}: silent for more than {SILENCE:g} s, {self.silences[k]} times")
+            if self.late[k]:
+                found.append(f"{lane.name}: {self.late[k]} samples skipped, they came more than {PATIENCE:g} s late")
+            for channel, blanked in zip(lane.decoder.channels, guard.blanked.tolist(), strict=True):
+                if blanked:
+                    found.append(f"{channel}: {blanked} samples skipped, the sensor stood still or at its limit")
+        return found

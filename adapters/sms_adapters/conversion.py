@@ -1,0 +1,156 @@
+"""Numbers of a device to SI: scale and limits, turns of a wrapping number, frames that a counter shows to be lost."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sms_adapters.raw import DecoderState
+from sms_online.description.schema import SerialField, Signal
+from sms_online.stream import Array
+
+Counters = dict[str, int]
+
+
+class Turns:
+    """Undoes the wrapping of a number that counts modulo `wrap`: between two samples it moves by less than half of it.
+
+    The first sample lies in turn 0. Limitation: a hole in which it moves further loses whole turns.
+    """
+
+    def __init__(self, wrap: float) -> None:
+        self.wrap = wrap
+        self._last = np.nan
+        self._turns = 0.0
+
+    def count(self, numbers: Array) -> Array:
+        """(B,) turns of the numbers (B,), which are finite: whole numbers to be added times `wrap`."""
+        if not numbers.size:
+            return numbers
+        first = numbers[0] if np.isnan(self._last) else self._last
+        # Whole numbers, so that the sum is exact and the same however the samples are grouped.
+        steps = np.floor(np.diff(numbers, prepend=first) / self.wrap + 0.5)
+        turns = self._turns - np.cumsum(steps)
+        self._last, self._turns = float(numbers[-1]), float(turns[-1])
+        return turns
+
+    def state(self) -> Array:
+        """The last number and its turn."""
+        return np.array([self._last, self._turns])
+
+    def restore(self, state: Array) -> None:
+        """Go on from a saved state."""
+        self._last, self._turns = (float(x) for x in state)
+
+
+class Conversion:
+    """A device's number to its channel, as `Signal` describes it; what is not finite or not plausible becomes NaN.
+
+    counters: non_finite and out_of_range are counted there.
+    """
+
+    def __init__(self, signal: Signal | SerialField, counters: Counters) -> None:
+        self._signal = signal
+        self._counters = counters
+        self._turns = None if signal.wrap is None else Turns(signal.wrap)
+
+    def __call__(self, numbers: Array) -> Array:
+        """(B,) channel values of the numbers (B,) of consecutive samples."""
+        signal = self._signal
+        with np.errstate(over="ignore", invalid="ignore"):
+            values = numbers * signal.scale + signal.offset
+        finite = np.isfinite(values)
+        if not finite.all():
+            self._counters["non_finite"] += int(np.count_nonzero(~finite))
+            values[~finite] = np.nan
+        # NaN compares false, so that no value is counted twice.
+        outside = np.zeros(values.size, dtype=np.bool_)
+        if signal.minimum is not None:
+            outside |= values < signal.minimum
+        if signal.maximum is not None:
+            outside |= values > signal.maximum
+        if outside.any():
+            self._counters["out_of_range"] += int(np.count_nonzero(outside))
+            values[outside] = np.nan
+        if self._turns is not None:
+            # After the limits: one wrong word must not count as a turn.
+            good = ~np.isnan(values)
+            values[good] += self._turns.count(numbers[good]) * (self._turns.wrap * signal.scale)
+        return values
+
+    def state(self) -> Array:
+        """The state of its turns, empty for a number that does not wrap."""
+        return np.empty(0) if self._turns is None else self._turns.state()
+
+    def restore(self, state: Array) -> None:
+        """Go on from a saved state."""
+        if self._turns is not None:
+            self._turns.restore(state)
+
+
+class FrameCounter:
+    """Follows the count, modulo `modulus`, that a sender puts into its frames.
+
+    Steps ahead of up to half the modulus are frames lost (lost_counter counts the missing ones, whole rounds unseen).
+    A frame that repeats the count before is a duplicate (repeated_counter), one that goes back came late
+    (late_counter); both are dropped. Two consecutive counts behind the last are a sender that was started again
+    (restarted_counter); its first frame is dropped as late.
+    """
+
+    KINDS = ("repeated_counter", "lost_counter", "late_counter", "restarted_counter")
+
+    def __init__(self, modulus: int, counters: Counters) -> None:
+        self._modulus = modulus
+        self._counters = counters
+        self._last = -1  # count of the last frame admitted, -1 before the first
+        self._late = -1  # count of the frame before, if that was dropped as late, else -1
+
+    def admit(self, counts: NDArray[np.int64]) -> NDArray[np.bool_]:
+        """(B,) mask of the frames to use, from their counts (B,) in order of arrival."""
+        admitted = np.ones(counts.size, dtype=np.bool_)
+        if not counts.size:
+            return admitted
+        before = counts[0] - 1 if self._last < 0 else self._last
+        steps = np.diff(counts, prepend=before) % self._modulus
+        if np.all((steps > 0) & (steps <= self._modulus // 2)):
+            self._counters["lost_counter"] += int(steps.sum()) - counts.size
+            self._last, self._late = int(counts[-1]), -1
+            return admitted
+        for k, count in enumerate(counts.tolist()):
+            admitted[k] = self._admit_one(count)
+        return admitted
+
+    def _admit_one(self, count: int) -> bool:
+        ahead = 1 if self._last < 0 else (count - self._last) % self._modulus
+        if ahead == 0:
+            self._counters["repeated_counter"] += 1
+            return False
+        if ahead <= self._modulus // 2:
+            self._counters["lost_counter"] += ahead - 1
+        elif self._late >= 0 and (count - self._late) % self._modulus == 1:
+            self._counters["restarted_counter"] += 1
+        else:
+            self._counters["late_counter"] += 1
+            self._late = count
+            return False
+        self._last, self._late = count, -1
+        return True
+
+    def state(self) -> NDArray[np.int64]:
+        """The last counts."""
+        return np.array([self._last, self._late])
+
+    def restore(self, state: NDArray[np.int64]) -> None:
+        """Go on from a saved state."""
+        self._last, self._late = (int(x) for x in state)
+
+
+def counters_state(counters: Counters) -> DecoderState:
+    """Counters as entries of a decoder's state."""
+    return {f"counters.{kind}": np.array(count) for kind, count in counters.items()}
+
+
+def restore_counters(counters: Counters, state: DecoderState) -> None:
+    """Set counters to those of a saved state, in place, for others hold the same dictionary."""
+    for kind in counters:
+        counters[kind] = int(state[f"counters.{kind}"])

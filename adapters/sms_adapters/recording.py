@@ -1,0 +1,121 @@
+"""A recording as a source of blocks: the raw items through the same ticks as when they arrived."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from sms_adapters.clock_lanes import lanes
+from sms_adapters.clock_merge import TICK, TICK_MICROSECONDS, Merger
+from sms_adapters.raw import CanFrames, Raw
+from sms_adapters.session_log import CHECKPOINT, RecordedItems, from_microseconds, read_header
+from sms_online.description.schema import System
+from sms_online.errors import InputError
+from sms_online.stream import Block
+
+
+def tick_time(number: int) -> float:
+    """Time of a tick, s."""
+    return from_microseconds(number * TICK_MICROSECONDS)
+
+
+def split(items: Sequence[Raw], time: float) -> tuple[list[Raw], list[Raw]]:
+    """Items that arrived before `time`, s, and the others; items in order of arrival."""
+    for k, item in enumerate(items):
+        if isinstance(item, CanFrames):
+            count = int(np.searchsorted(item.arrival, time, side="left"))
+            if count < len(item):
+                early = [item[:count]] if count else []
+                return [*items[:k], *early], [item[count:], *items[k + 1 :]]
+        elif item.arrival >= time:
+            return list(items[:k]), list(items[k:])
+    return list(items), []
+
+
+class Recording:
+    """What a live session recorded, as the session's own blocks: a `Source`.
+
+    directory: of session.toml. system: as the session had it; its sources are those of the recording. system_directory:
+    where its file stands. start, stop: s after the session's start. Raises InputError where the directory is no
+    recording, or of other sources.
+    """
+
+    def __init__(
+        self,
+        directory: Path,
+        system: System,
+        system_directory: Path | None = None,
+        start: float | None = None,
+        stop: float | None = None,
+    ) -> None:
+        self._directory = directory
+        self._header, self._ending = read_header(directory)
+        self._start = -math.inf if start is None else start
+        self._stop = math.inf if stop is None else stop
+        self._system, self._system_directory = system, system_directory
+        names = [source.name for source in system.sources]
+        if set(names) != set(self._header.sources):
+            found = ", ".join(self._header.sources) or "none"
+            raise InputError(str(directory), "sources", found, f"those of the system: {', '.join(names) or 'none'}")
+        self._merger = Merger(lanes(system, system_directory), self._header.start)
+
+    @property
+    def channels(self) -> tuple[str, ...]:
+        """The channels of all sources, in the order of the system file."""
+        return self._merger.channels
+
+    @property
+    def checkpoint(self) -> Path | None:
+        """Where the state is that the session resumed from, None where it began anew."""
+        path = self._directory / CHECKPOINT
+        return path if path.is_file() else None
+
+    @property
+    def warnings(self) -> list[str]:
+        """What was wrong with the devices, and with the recording."""
+        found = self._merger.warnings
+        if self._ending is None:
+            found.append(f"{self._directory.name}: the session was killed; this is what was on disk")
+            return found
+        return found + list(self._ending["warnings"])
+
+    def __iter__(self) -> Iterator[Block]:
+        """Yield the blocks from the beginning."""
+        self._merger = merger = Merger(lanes(self._system, self._system_directory), self._header.start)
+        recorded = [
+            iter(RecordedItems(self._directory, source.name, self._header.sources[source.name], self._header.epoch))
+            for source in self._system.sources
+        ]
+        waiting: list[list[Raw]] = [[] for _ in recorded]
+        number = 0
+        last = 0 if self._ending is None else round(self._ending["duration_s"] / TICK)
+        while True:
+            for k, items in enumerate(recorded):
+                # One item beyond the tick shows that the tick is complete.
+                while not split(waiting[k], tick_time(number + 1))[1] and (item := next(items, None)) is not None:
+                    waiting[k].append(item)
+            # The session went on after the last item, and counted the silence.
+            if not any(waiting) and number >= last:
+                break
+            number += 1
+            now = tick_time(number)
+            due = []
+            for k in range(len(waiting)):
+                early, waiting[k] = split(waiting[k], now)
+                due.append(early)
+            block = self._cut(merger.advance(now, due))
+            if block is not None:
+                yield block
+        block = self._cut(merger.finish())
+        if block is not None:
+            yield block
+
+    def _cut(self, block: Block | None) -> Block | None:
+        """The part from start to stop."""
+        if block is None or (self._start == -math.inf and self._stop == math.inf):
+            return block
+        inside = (block.t - self._header.start >= self._start) & (block.t - self._header.start < self._stop)
+        return Block(block.t[inside], block.channels, block.values[inside])

@@ -1,0 +1,64 @@
+"""A serial port through pyserial: whatever bytes have come, in as few calls as can be."""
+
+from __future__ import annotations
+
+import serial
+
+from sms_adapters.raw import Clock, LostDevice, Raw, SerialChunk, one_line
+from sms_online.description.schema import SerialPort
+
+# Most bytes of one read, which bounds what a flooded port can keep in memory: a second at 10 Mbit/s.
+MOST_BYTES_READ = 1 << 20
+
+
+class SerialReader:
+    """Bytes of a serial port, or of a URL that pyserial knows: a `Reader`; after opening it begins with a break."""
+
+    def __init__(self, source: SerialPort, clock: Clock) -> None:
+        self.name = source.name
+        self._source = source
+        self._clock = clock
+        self._port: serial.Serial | None = None
+        self._opened = False  # and nothing read yet
+
+    def open(self) -> None:
+        """Open the port; raises LostDevice where that fails."""
+        self.close()
+        try:
+            # Exclusive, for two readers of one port would each get half of the bytes.
+            self._port = serial.serial_for_url(self._source.port, self._source.baudrate, exclusive=True)
+            self._opened = True
+        # ValueError: a URL or a rate that pyserial does not know.
+        except (OSError, ValueError) as error:
+            raise LostDevice(self.name, one_line(error)) from error
+
+    def read(self, timeout: float) -> list[Raw]:
+        """What has come as one chunk, waiting at most `timeout` s for its first byte."""
+        if self._port is None:
+            raise LostDevice(self.name, "it is not open")
+        try:
+            if timeout != self._port.timeout:  # setting it is a system call
+                self._port.timeout = timeout
+            data = self._port.read(1)
+            # The rest in one call; what came with the first byte is there by now.
+            if data and (waiting := self._port.in_waiting):
+                data += self._port.read(min(waiting, MOST_BYTES_READ))
+        # Unplugged, pyserial raises SerialException from read, but a bare OSError from in_waiting and, where the
+        # descriptor is gone already, a TypeError.
+        except (OSError, TypeError) as error:
+            raise LostDevice(self.name, one_line(error)) from error
+        if not data:
+            return []
+        arrival = self._clock()
+        chunks: list[Raw] = [SerialChunk(arrival, b""), SerialChunk(arrival, data)]
+        opened, self._opened = self._opened, False
+        return chunks if opened else chunks[1:]
+
+    def close(self) -> None:
+        """Release the port."""
+        port, self._port = self._port, None
+        if port is not None:
+            try:
+                port.close()
+            except OSError:
+                return

@@ -1,0 +1,153 @@
+"""Sources of a description: names, channels that exist and are fed once, and numbers that can be read as described."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Sequence
+
+from sms_online.description.explain import hint, nearest
+from sms_online.description.schema import (
+    CanopenSource,
+    CanSource,
+    FrameField,
+    SerialField,
+    SerialFrames,
+    SerialLines,
+    Signal,
+    Source,
+    System,
+)
+from sms_online.errors import InputError
+
+# A source's name also names its files in a recording.
+NAME = re.compile(r"[A-Za-z0-9_-]+")
+CAN_SIGNAL = re.compile(r"\w+\.\w+")
+CANOPEN_SIGNAL = re.compile(r"(?P<node>\d+)\.[0-9A-Fa-f]{4}(:[0-9A-Fa-f]{1,2})?")
+MOST_NODES = 127  # CiA 301
+# One character between numbers that no number holds; "" means blanks.
+SEPARATOR = re.compile(r"[!-~\t]?")
+IN_NUMBERS = "0123456789+-.eE*$"
+# Words that count or tell the time.
+UNSIGNED = ("u8", "u16", "u32")
+# What a field says of the number of a channel; of the others only where it wraps.
+CONVERSION = ("scale", "offset", "minimum", "maximum", "wrap")
+
+
+def check_sources(system: System, names: Sequence[str], source: str) -> None:
+    """Raise InputError at the first contradiction in [[source]]; names: the channels that the system has."""
+    fed: dict[str, str] = {}
+    taken: set[str] = set()
+    for k, device in enumerate(system.sources, start=1):
+        place = f"source {k}"
+        if not NAME.fullmatch(device.name):
+            raise InputError(source, f"{place}.name", repr(device.name), "letters, digits, - and _")
+        if device.name in taken:
+            raise InputError(source, f"{place}.name", f"{device.name!r} again", "a name of its own for each source")
+        taken.add(device.name)
+        if isinstance(device, CanSource):
+            _check_can(device, place, source)
+        elif isinstance(device, CanopenSource):
+            _check_canopen(device, place, source)
+        else:
+            _check_serial(device, place, source)
+        for where, signal in _signals(device, place):
+            _check_signal(signal, where, names, fed, source)
+
+
+def _signals(device: Source, place: str) -> Iterator[tuple[str, Signal | SerialField]]:
+    if isinstance(device, CanSource | CanopenSource):
+        for name, signal in device.signals.items():
+            yield f"{place}.signals.{name}", signal
+    else:
+        for k, field in enumerate(device.fields, start=1):
+            yield f"{place}.fields[{k}]", field
+
+
+def _check_signal(
+    signal: Signal | SerialField, where: str, names: Sequence[str], fed: dict[str, str], source: str
+) -> None:
+    if signal.channel is None:
+        return
+    if signal.channel not in names:
+        near = nearest(signal.channel, names)
+        expected = f"a channel of this system, such as {near or names[0]!r}"
+        raise InputError(source, where, f"unknown channel {signal.channel!r}", expected)
+    if signal.channel in fed:
+        found = f"{signal.channel!r}, which {fed[signal.channel]} fills too"
+        raise InputError(source, where, found, "each channel filled once")
+    fed[signal.channel] = where
+    if signal.scale == 0.0:
+        raise InputError(source, f"{where}.scale", "0", "a scale other than 0")
+    if signal.minimum is not None and signal.maximum is not None and signal.minimum >= signal.maximum:
+        found = f"{signal.minimum:g}, not below the maximum {signal.maximum:g}"
+        raise InputError(source, f"{where}.minimum", found, "a minimum below the maximum")
+
+
+def _check_can(device: CanSource, place: str, source: str) -> None:
+    if not device.dbc.endswith(".dbc"):
+        raise InputError(source, f"{place}.dbc", repr(device.dbc), "the name of a .dbc file")
+    _check_keys(device, f"{place}.signals", CAN_SIGNAL, '"MESSAGE.SIGNAL"', source)
+    counted: set[str] = set()
+    for name in device.counters:
+        if not CAN_SIGNAL.fullmatch(name):
+            raise InputError(source, f"{place}.counters", repr(name), '"MESSAGE.SIGNAL" in quotes')
+        message = name.split(".")[0]
+        if message in counted:
+            raise InputError(source, f"{place}.counters", f"a second counter of {message}", "one counter a message")
+        counted.add(message)
+
+
+def _check_canopen(device: CanopenSource, place: str, source: str) -> None:
+    for node, eds in device.nodes.items():
+        if not (node.isascii() and node.isdigit() and 1 <= int(node) <= MOST_NODES):
+            raise InputError(source, f"{place}.nodes", repr(node), f"node ids from 1 to {MOST_NODES}")
+        if not eds.lower().endswith(".eds"):
+            raise InputError(source, f"{place}.nodes.{node}", repr(eds), "the name of an .eds file")
+    _check_keys(device, f"{place}.signals", CANOPEN_SIGNAL, '"NODE.INDEX", such as "1.6064",', source)
+    for name in device.signals:
+        node = name.split(".")[0]
+        if node not in device.nodes:
+            expected = f"a node of [{place}.nodes]{hint(nearest(node, tuple(device.nodes)))}"
+            raise InputError(source, f"{place}.signals.{name}", f"node {node}", expected)
+
+
+def _check_keys(device: CanSource | CanopenSource, place: str, form: re.Pattern[str], shown: str, source: str) -> None:
+    if not device.signals:
+        raise InputError(source, place, "an empty table", f'{shown} = "channel", at least once')
+    for name in device.signals:
+        if not form.fullmatch(name):
+            raise InputError(source, place, repr(name), f"{shown} in quotes")
+
+
+def _check_serial(device: SerialFrames | SerialLines, place: str, source: str) -> None:
+    seen: set[str] = set()
+    for k, field in enumerate(device.fields, start=1):
+        where = f"{place}.fields[{k}]"
+        roles = [role for role in ("channel", "tick", "counter") if getattr(field, role)]
+        if "channel" in roles and len(roles) > 1:
+            raise InputError(source, where, " and ".join(roles), f"a channel or a {roles[1]}")
+        for key in CONVERSION:
+            stated = getattr(field, key) != SerialField.model_fields[key].default
+            if stated and "channel" not in roles and not (roles and key == "wrap"):
+                raise InputError(source, f"{where}.{key}", "a key of a channel", "a field that fills a channel")
+        if "tick" in roles or "counter" in roles:
+            _check_count(field, where, source)
+        for role in roles:
+            if role in seen and role != "channel":
+                raise InputError(source, where, f"a second {role}", f"one {role} in {device.format}")
+        seen.update(roles)
+    if "channel" not in seen:
+        raise InputError(source, f"{place}.fields", "no field with a channel", "at least one")
+    if isinstance(device, SerialLines) and (
+        not SEPARATOR.fullmatch(device.separator) or (device.separator and device.separator in IN_NUMBERS)
+    ):
+        expected = 'one character that no number holds, or "" for blanks'
+        raise InputError(source, f"{place}.separator", repr(device.separator), expected)
+
+
+def _check_count(field: SerialField, where: str, source: str) -> None:
+    """A tick or counter: an unsigned word, and a wrap in whole counts."""
+    if isinstance(field, FrameField) and field.type not in UNSIGNED:
+        raise InputError(source, f"{where}.type", repr(field.type), "an unsigned count, 'u8', 'u16' or 'u32'")
+    if field.wrap is not None and not field.wrap.is_integer():
+        raise InputError(source, f"{where}.wrap", f"{field.wrap:g}", "a whole number of counts")

@@ -1,0 +1,54 @@
+"""What the guide to sources shows is what the program takes: its tables parse, its reader reads."""
+
+from __future__ import annotations
+
+import re
+import socket
+import time
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from sms_adapters.raw import LostDevice, SerialChunk
+from sms_online.description.parse import parse_system
+
+GUIDE = Path(__file__).parents[1] / "docs" / "sources.md"
+RIG = '[joint_1]\nstiffness = 100.0\n[motor_1]\nrotor_inertia = 0.001\n[link_1]\nkind = "rigid"\n'
+
+
+def shown(language: str) -> list[str]:
+    return re.findall(rf"```{language}\n(.*?)```", GUIDE.read_text(encoding="utf-8"), re.DOTALL)
+
+
+@pytest.mark.parametrize("table", shown("toml"))
+def test_the_tables_of_the_guide_are_accepted(table: str) -> None:
+    assert parse_system(f'name = "rig"\n{RIG}{table}', "guide").sources
+
+
+def test_the_guides_own_source_reads_and_decodes() -> None:
+    (code,) = shown("python")
+    assert len(code.splitlines()) < 50
+    scope: dict[str, Any] = {"__name__": "guide"}
+    exec(compile(code, str(GUIDE), "exec"), scope)
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    reader, decoder = scope["DatagramReader"]("mocap", port, time.monotonic), scope["LineDecoder"](scope["POSE"])
+    reader.open()
+    assert reader.read(0.01) == []
+    with pytest.raises(LostDevice, match="mocap: "):
+        scope["DatagramReader"]("mocap", port, time.monotonic).open()
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
+        for k in (0, 1, 3):
+            sender.sendto(f"{k},{1000 + k},-500,0.25".encode(), ("127.0.0.1", port))
+    chunks = [raw for _ in range(3) for raw in reader.read(1.0)]
+    reader.close()
+    assert all(isinstance(chunk, SerialChunk) for chunk in chunks)
+    samples = [decoder.push(chunk) for chunk in chunks]
+    assert decoder.channels == ("r_S_x", "r_S_y", "theta_0")
+    assert [sample.values.tolist() for sample in samples] == [
+        [[x * 1e-3, -500 * 1e-3, 0.25]] for x in (1000, 1001, 1003)
+    ]
+    assert [float(sample.t_device[0]) for sample in samples] == [0.0, 1 / 240, 3 / 240]
+    assert decoder.counters["lost_counter"] == 1
