@@ -1,22 +1,30 @@
-"""demo: an arm moves in simulation, and its parameters converge while it does."""
+"""demo: an arm moves on a simulated bus, and its parameters converge while it does."""
 
 from __future__ import annotations
 
 import argparse
 import math
 from collections.abc import Callable
+from contextlib import ExitStack
+from pathlib import Path
 from statistics import median
+from tempfile import TemporaryDirectory
 from time import perf_counter
 
 from rich.console import Console
 from rich.live import Live
 
+from sms_adapters.session_log import SESSION
+from sms_adapters.system_file import load_system
+from sms_adapters.truth import write_truth
 from sms_online.pipeline.estimator import Estimator
-from sms_sim.live import LivePlant
 from sms_tools.interruption import Interruption
+from sms_tools.live.signals import termination_interrupts
+from sms_tools.live.simulated import SimulatedArm, write_testbed
+from sms_tools.live.testbed import open_testbed
 from sms_tools.report import Document, parameter_table, report_console, show
 from sms_tools.results_file import results_directory
-from sms_tools.session import conclude, described_system, document_of, new_estimator, stream
+from sms_tools.session import conclude, described_system, document_of
 
 # More tables than this nobody reads, s between two.
 TABLE_INTERVAL = 0.25
@@ -25,26 +33,45 @@ LINE_INTERVAL = 2.0
 
 
 def run(args: argparse.Namespace) -> int:
-    """Simulate and estimate side by side; 0, 3 where nothing is determined, 130 where interrupted."""
+    """An arm on a simulated bus, estimated live; 0, 3 where nothing is determined, 130 where interrupted."""
     system, _ = described_system(args)
     directory = results_directory(args.out)
-    plant = LivePlant(system, args.grade, args.seed)
-    estimator = new_estimator(system, plant.channels, system.name)
+    with TemporaryDirectory() as name:
+        folder = Path(name)
+        file = write_testbed(args.system, system, args.grade, folder)
+        noise = [] if args.grade is None else ["--grade", args.grade]
+        arm = SimulatedArm(file, [*noise, "--seed", str(args.seed)])
+        try:
+            return _watch(args, arm, file, directory)
+        finally:
+            arm.stop()
+
+
+def _watch(args: argparse.Namespace, arm: SimulatedArm, file: Path, directory: Path) -> int:
+    """Estimate while the arm moves."""
+    system = load_system(str(file))
+    session, estimator, merger = open_testbed(str(file), system, file.parent, directory, None, None)
     # The simulated arm has the nominal values.
     truth = {parameter.name: parameter.nominal for parameter in estimator.base.physical}
+    write_truth(directory / SESSION, truth, {})
 
     def document(throughput: float) -> Document:
-        return document_of(estimator, throughput, plant.warnings, truth)
+        return document_of(estimator, throughput, [*merger.warnings, *session.warnings], truth)
 
     console = report_console(args.json)
-    with Interruption() as interruption:
+    with Interruption() as interruption, termination_interrupts(), ExitStack() as stack:
         if console.is_terminal:
-            with Live(console=console, auto_refresh=False, transient=True) as live:
-                busy = stream(estimator, plant, interruption, _draw(live, document, plant.duration))
+            live = stack.enter_context(Live(console=console, auto_refresh=False, transient=True))
+            assert system.trajectory is not None  # the arm moves
+            tell = _draw(live, document, system.trajectory.duration)
         else:
-            busy = stream(estimator, plant, interruption, _tell(console, estimator, document))
-    # The simulation's time is not the estimator's.
-    return conclude(args, document(estimator.samples / busy), directory, interruption.requested)
+            tell = _tell(console, estimator, document)
+        for block in session.blocks(interruption, ended=arm.ended, ready=arm.start):
+            estimator.push(block)
+            tell()
+    estimator.finish()
+    session.close()
+    return conclude(args, document(estimator.samples / session.busy), directory, interruption.requested)
 
 
 def _draw(live: Live, document: Callable[[float], Document], duration: float) -> Callable[[], None]:

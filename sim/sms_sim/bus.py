@@ -1,0 +1,353 @@
+"""The simulated arm as a process of its own, `python -m sms_sim.bus`: it moves in real time and speaks the frames of a
+described testbed, on the CAN interface and the serial ports that the system file names; all but the copper is real.
+
+A serial port is made as a pseudo-terminal with a link at the described path. Every device has an offset, drift, jitter
+and latency of its own clock and transport.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import heapq
+import multiprocessing
+import os
+import sys
+import threading
+import time
+import tty
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from multiprocessing.connection import Connection
+from pathlib import Path
+from typing import Any
+
+import can
+import numpy as np
+
+from sms_adapters.can_decoder import CanDecoder
+from sms_adapters.can_reader import CanReader, open_bus
+from sms_adapters.can_signals import wanted_messages
+from sms_adapters.capture import CaptureReader
+from sms_adapters.raw import EXTENDED, CanFrames, LostDevice
+from sms_adapters.system_file import load_system
+from sms_online.description.channels import drive_channel
+from sms_online.description.schema import CanBus, CanSource, SerialPort, Signal, System
+from sms_online.errors import InputError
+from sms_online.stream import Array, Block
+from sms_sim.bus_encode import CanDevice, DeviceClock, SerialDevice, devices
+from sms_sim.bus_layout import commands
+from sms_sim.bus_motion import HeldTorque, MovingArm
+
+# The motion is solved at most so far ahead of what is sent, s.
+AHEAD = 30.0
+# The arm sets out once its motion is solved so far ahead that solving stays in front of sending to the end, where
+# sending slows it down by this much; FIRST_LEAD, s, is enough to measure its pace by.
+FIRST_LEAD = 0.5
+SLOWED = 2.0
+# Longest wait between two looks at what is due, s.
+PATIENCE = 0.05
+# Shorter waits are not worth a system call, s.
+SHORT = 1e-4
+
+
+@dataclass(frozen=True)
+class Transport:
+    """Delays from a sample's instant to its sending: latency + uniform jitter, s. Order is kept within a source."""
+
+    latency: float
+    jitter: float
+
+
+def sent_at(t: Array, transport: Transport, random: np.random.Generator, not_before: float) -> Array:
+    """Instants (M,) at which samples of instants t (M,) are sent; not_before: when the one before them was."""
+    delayed = t + transport.latency + random.uniform(0.0, transport.jitter, t.size)
+    return np.maximum.accumulate(np.concatenate(([not_before], delayed)))[1:]
+
+
+class CanSender:
+    """Sends a CAN device's frames."""
+
+    def __init__(self, device: CanDevice, source: CanBus) -> None:
+        self._device = device
+        self._bus = open_bus(source)
+
+    def payloads(self, block: Block) -> list[tuple[Array, list[Any]]]:
+        """Instants and frames of a block, for each sender on the bus."""
+        return [(t, _as_messages(frames)) for t, frames in self._device.encode(block)]
+
+    def send(self, message: can.Message) -> None:
+        """Send a frame; a full queue of the kernel loses it, as a real bus does."""
+        with contextlib.suppress(can.CanOperationError):
+            self._bus.send(message)
+
+    def close(self) -> None:
+        """Leave the bus."""
+        self._bus.shutdown()
+
+
+class CommandListener:
+    """Sets an arm's torque to what comes on its CAN bus, from commands as `bus_layout` describes them."""
+
+    def __init__(self, system: System, directory: Path | None, held: HeldTorque) -> None:
+        source = next((source for source in system.sources if isinstance(source, CanSource)), None)
+        if source is None:
+            raise InputError(system.name, "source", "no CAN bus to take commands from", "a source of kind can")
+        drives = [drive_channel(system, i) for i in range(1, len(system.joints) + 1)]
+        signals = {name: Signal(channel=channel) for name, channel in commands(drives).items()}
+        described = source.model_copy(update={"signals": signals, "counters": ()})
+        self._decoder = CanDecoder(wanted_messages(described, directory), tuple(signals.values()))
+        self._joints = [drives.index(signal.channel) for signal in signals.values()]
+        # A command is the torque at the motor shaft, before the gear.
+        gears = [joint.gear_ratio for joint in system.joints]
+        self._gears = np.where([drive.startswith("tau_") for drive in drives], gears, 1.0)
+        self._reader = CanReader(source, time.monotonic)
+        self._reader.open()
+        self._held = held
+        threading.Thread(target=self._run, daemon=True).start()
+
+    def _run(self) -> None:
+        while True:
+            for item in self._reader.read(PATIENCE):
+                for row in self._decoder.push(item).values:
+                    torque = self._held.torque.copy()
+                    given = ~np.isnan(row)
+                    joints = np.array(self._joints)[given]
+                    torque[joints] = row[given] * self._gears[joints]
+                    self._held.torque = torque
+
+
+class SerialSender:
+    """Makes a pseudo-terminal, links it at the port's path, and sends a serial device's frames."""
+
+    def __init__(self, device: SerialDevice, source: SerialPort) -> None:
+        self._device = device
+        self._path = Path(source.port)
+        if self._path.exists() and not self._path.is_symlink():
+            raise InputError(f"source {source.name}", "port", f"{source.port}, which exists", "a path for a new link")
+        self._descriptor, self._other = os.openpty()
+        tty.setraw(self._other)  # nothing but bytes; held open, so that a reader may come and go
+        os.set_blocking(self._descriptor, False)
+        self._path.unlink(missing_ok=True)
+        self._path.symlink_to(os.ttyname(self._other))
+
+    def payloads(self, block: Block) -> list[tuple[Array, list[Any]]]:
+        """Instants and frames of a block."""
+        return [self._device.encode(block)]
+
+    def send(self, data: bytes) -> None:
+        """Send a frame; it is lost where nobody reads the port and its buffer is full."""
+        with contextlib.suppress(BlockingIOError):
+            os.write(self._descriptor, data)
+
+    def close(self) -> None:
+        """Unplug."""
+        self._path.unlink(missing_ok=True)
+        os.close(self._descriptor)
+        os.close(self._other)
+
+
+def _as_messages(frames: CanFrames) -> list[can.Message]:
+    return [
+        can.Message(arbitration_id=id_ & ~EXTENDED, is_extended_id=bool(id_ & EXTENDED), data=data[:length].tobytes())
+        for id_, length, data in zip(frames.id.tolist(), frames.length.tolist(), frames.data, strict=True)
+    ]
+
+
+class Bus:
+    """Senders of a system's sources, and what is still to be sent.
+
+    directory: where the system file stands. clocks, transport: of the sources. seed: of the jitter. Raises InputError
+    and LostDevice where a source cannot be made.
+    """
+
+    def __init__(
+        self, system: System, directory: Path | None, clock: DeviceClock, transport: Transport, seed: int
+    ) -> None:
+        self._senders: list[CanSender | SerialSender] = []
+        self._transport = transport
+        self._random = np.random.default_rng(seed)
+        # Heap of (instant, number, sender, payload): the number keeps what is due at once in order.
+        self._queue: list[tuple[float, int, CanSender | SerialSender, Any]] = []
+        self._number = 0
+        self._last: dict[tuple[CanSender | SerialSender, int], float] = {}
+        self._moving = threading.Condition()
+        self._ended = False
+        self._solved = 0.0  # s of motion that are in the queue, or through it
+        can_devices, serial_devices = devices(system, directory, [clock] * len(system.sources))
+        by_name = {source.name: source for source in system.sources}
+        try:
+            for device in can_devices:
+                source = by_name[device.name]
+                assert isinstance(source, CanBus)
+                self._senders.append(CanSender(device, source))
+            for port in serial_devices:
+                source = by_name[port.name]
+                assert isinstance(source, SerialPort)
+                self._senders.append(SerialSender(port, source))
+        except BaseException:
+            self.close()
+            raise
+
+    def run(self, blocks: Iterable[Block], duration: float, speed: float, ahead: float = AHEAD) -> None:
+        """Send the blocks' samples, `duration` s of them, in step with the clock, times `speed`.
+
+        ahead: how far blocks are taken before they are due, s; 0 where the arm has to obey in time.
+        """
+        threading.Thread(target=self._fill, args=(blocks, ahead), daemon=True).start()
+        start: float | None = None
+        began = time.monotonic()
+        while ahead and not (self._ended or self._far_enough(time.monotonic() - began, duration, speed)):
+            time.sleep(PATIENCE)
+        while True:
+            with self._moving:
+                while not self._queue and not self._ended:
+                    self._moving.wait(PATIENCE)
+                if not self._queue:
+                    return
+                due, _, sender, payload = self._queue[0]
+            if start is None:
+                start = time.monotonic() - due / speed
+            wait = start + due / speed - time.monotonic()
+            if wait > SHORT:
+                time.sleep(min(wait, PATIENCE))
+                continue
+            with self._moving:
+                heapq.heappop(self._queue)
+                self._moving.notify()
+            sender.send(payload)
+
+    def _far_enough(self, elapsed: float, duration: float, speed: float) -> bool:
+        """Whether what is still to be solved will be in time, at the pace since the beginning, `elapsed` s ago."""
+        if self._solved < FIRST_LEAD:
+            return False
+        return self._solved >= AHEAD or SLOWED * (duration - self._solved) * elapsed / self._solved < duration / speed
+
+    def _fill(self, blocks: Iterable[Block], ahead: float) -> None:
+        """Keep the queue filled `ahead` of what is being sent."""
+        try:
+            for block in blocks:
+                with self._moving:
+                    while self._queue and float(block.t[0]) - self._queue[0][0] > ahead:
+                        self._moving.wait(PATIENCE)
+                for sender in self._senders:
+                    for k, (t, payloads) in enumerate(sender.payloads(block)):
+                        self._enqueue(sender, k, t, payloads)
+                self._solved = float(block.t[-1])
+        finally:
+            with self._moving:
+                self._ended = True
+                self._moving.notify()
+
+    def _enqueue(self, sender: CanSender | SerialSender, k: int, t: Array, payloads: Sequence[Any]) -> None:
+        """Queue what the k-th node of a sender sends of samples at t."""
+        before = self._last.get((sender, k), -np.inf)
+        at = sent_at(t, self._transport, self._random, before)
+        self._last[sender, k] = float(at[-1]) if at.size else before
+        with self._moving:
+            for due, payload in zip(at.tolist(), payloads, strict=True):
+                heapq.heappush(self._queue, (due, self._number, sender, payload))
+                self._number += 1
+            self._moving.notify()
+
+    def close(self) -> None:
+        """Leave all buses."""
+        for sender in self._senders:
+            sender.close()
+
+
+def in_own_process(arm: MovingArm) -> Iterator[Block]:
+    """An arm's blocks, solved in a process of its own: beside it, this one is always there to send what is due."""
+    receiver, sender = multiprocessing.Pipe(duplex=False)
+    process = multiprocessing.Process(target=_solve, args=(arm, sender), daemon=True)
+    process.start()
+    sender.close()
+    try:
+        while isinstance(item := receiver.recv(), Block):
+            yield item
+        raise item
+    except EOFError:
+        return
+    finally:
+        process.terminate()
+
+
+def _solve(arm: MovingArm, sender: Connection) -> None:
+    try:
+        for block in arm:
+            sender.send(block)
+    except InputError as error:
+        sender.send(error)
+    except (BrokenPipeError, KeyboardInterrupt):
+        return
+    finally:
+        sender.close()
+
+
+def capture_blocks(path: Path, duration: float, rows: int = 64) -> Iterator[Block]:
+    """A capture's samples up to `duration` s, a few at a time, from t = 0."""
+    first: float | None = None
+    for block in CaptureReader(path, stop=duration):
+        first = float(block.t[0]) if first is None else first
+        for k in range(0, block.t.size, rows):
+            yield Block(block.t[k : k + rows] - first, block.channels, block.values[k : k + rows])
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Run the arm until its motion ends."""
+    args = _parser().parse_args(arguments)
+    try:
+        system = load_system(args.system)
+        path = Path(args.system)
+        blocks: Iterable[Block]
+        duration = args.duration or (system.trajectory.duration if system.trajectory is not None else np.inf)
+        if args.capture is not None:
+            blocks = capture_blocks(args.capture, duration)
+        elif args.commanded:
+            held = HeldTorque(len(system.joints))
+            blocks = MovingArm(system, duration, args.grade, args.seed, held)
+        else:
+            blocks = in_own_process(MovingArm(system, duration, args.grade, args.seed))
+        clock = DeviceClock(args.offset, args.drift)
+        transport = Transport(args.latency, args.jitter)
+        folder = path.parent if path.suffix == ".toml" else None
+        bus = Bus(system, folder, clock, transport, args.seed)
+        if args.commanded:
+            CommandListener(system, folder, held)
+    except (InputError, LostDevice) as error:
+        print(f"sms_sim.bus: {error}", file=sys.stderr)
+        return 2
+    try:
+        if args.wait:
+            print("ready", flush=True)
+            sys.stdin.readline()
+        bus.run(blocks, duration, args.speed, ahead=0.0 if args.commanded else AHEAD)
+    except KeyboardInterrupt:
+        return 130
+    finally:
+        bus.close()
+    return 0
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(prog="python -m sms_sim.bus", description="A simulated testbed on its buses.")
+    parser.add_argument("--system", required=True, help="a system file with [[source]] tables, or a shipped system")
+    parser.add_argument("--capture", type=Path, help="play this capture instead of simulating the motion")
+    parser.add_argument(
+        "--commanded", action="store_true", help="obey torque commands on the CAN bus, not a controller"
+    )
+    parser.add_argument("--duration", type=float, help="s, the trajectory's by default")
+    parser.add_argument("--grade", choices=("0", "A", "B", "C"), help="noise in place of the described sensors")
+    parser.add_argument("--seed", type=int, default=0, help="of noise and jitter")
+    parser.add_argument("--offset", type=float, default=0.0, help="of the serial devices' clocks, s")
+    parser.add_argument("--drift", type=float, default=0.0, help="of the serial devices' clocks, relative")
+    parser.add_argument("--latency", type=float, default=0.0, help="constant delay of the transport, s")
+    parser.add_argument("--jitter", type=float, default=0.0, help="uniform delay from 0 to this, s")
+    parser.add_argument("--speed", type=float, default=1.0, help="times as fast as real time")
+    parser.add_argument("--wait", action="store_true", help="say ready, and move once a line comes on stdin")
+    return parser
+
+
+if __name__ == "__main__":
+    sys.setswitchinterval(5e-4)  # the sender must not wait for the solver
+    sys.exit(main())

@@ -1,0 +1,169 @@
+"""A minute live on the simulated bus, clocks, overload and hours of simulated time. Run on demand.
+
+pytest tests/bench/test_bench_live.py --override-ini addopts= -s
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import resource
+import subprocess
+import sys
+import time
+from itertools import pairwise
+from pathlib import Path
+from time import perf_counter
+
+import numpy as np
+import pytest
+
+from sms_adapters.capture import CaptureWriter
+from sms_adapters.clock_lanes import lanes
+from sms_adapters.clock_merge import TICK, Merger
+from sms_adapters.raw import CanFrames, Raw, SerialChunk, concatenate_frames
+from sms_adapters.recording import tick_time
+from sms_adapters.system_file import load_system
+from sms_online.description.parse import shipped_text
+from sms_online.description.schema import System
+from sms_online.pipeline.estimator import Estimator
+from sms_online.results import standard_deviation
+from sms_online.stream import Array, Block
+from sms_sim.bus_encode import DeviceClock, devices
+from sms_sim.bus_layout import messages
+from sms_sim.bus_motion import MovingArm
+from sms_sim.plant import Plant
+from sms_sim.sensors import Sensors
+from sms_tools.live.simulated import SimulatedArm, write_testbed
+
+# Length of a repetition, s: 20 s of motion and a pause.
+PERIOD = 20.5
+# Noise of grade B, the base and the markers at 240 Hz.
+SENSORS = {
+    '["tau_*"]': "noise = 0.01",
+    '["theta_m_*", "q_*"]': "noise = 1e-4",
+    '["r_S_*", "theta_0"]': "noise = 1e-4\nrate = 240.0",
+    '["link_*.marker_*.u_*", "link_*.marker_*.theta_z"]': "noise = 1e-4\nrate = 240.0",
+}
+
+
+def bench_system(folder: Path) -> tuple[Path, System]:
+    """The paper's example on a simulated bus, its latency stated."""
+    text = shipped_text("paper-planar")
+    for channels, keys in SENSORS.items():
+        text = text.replace(f"channels = {channels}", f"channels = {channels}\n{keys}")
+    (folder / "paper.toml").write_text(text)
+    system = load_system(str(folder / "paper.toml"))
+    path = write_testbed(str(folder / "paper.toml"), system, None, folder)
+    path.write_text(re.sub(r'(kind = "(can|serial)"\n)', r"\1latency = 0.004\n", path.read_text()))
+    return path, load_system(str(path))
+
+
+def arm_capture(system: System, seconds: float, path: Path) -> Path:
+    """The arm's samples, solved beforehand so that two processes share two cores."""
+    arm = MovingArm(system, seconds, None, 1)
+    with CaptureWriter(path, arm.channels) as writer:
+        for block in arm:
+            writer.write(block)
+    return path
+
+
+@pytest.mark.parametrize("seconds", [60.0])
+def test_a_minute_live(tmp_path: Path, seconds: float) -> None:
+    file, system = bench_system(tmp_path)
+    capture = arm_capture(system, seconds, tmp_path / "arm.csv")
+    arm = SimulatedArm(file, ["--capture", str(capture), "--latency", "0.004", "--duration", str(seconds)])
+    command = [sys.executable, "-m", "sms_tools", "live", "--system", str(file), "--out", str(tmp_path / "run")]
+    process = subprocess.Popen([*command, "--duration", str(seconds + 8)], stdout=subprocess.PIPE, text=True)
+    time.sleep(5.0)
+    began = cpu(process.pid)
+    arm.start()
+    time.sleep(seconds)
+    share = (cpu(process.pid) - began) / seconds
+    assert process.stdout is not None
+    out = process.stdout.read()
+    process.wait()
+    arm.stop()
+    document = json.loads((tmp_path / "run" / "results.json").read_text())
+    print(f"\nestimator process: {100 * share:.0f} % of a core")
+    print("\n".join(line for line in out.splitlines() if line.startswith(("latency", "samples", "warning"))))
+    print(f"lost samples: {document['lost_samples']}")
+
+
+def cpu(pid: int) -> float:
+    """Seconds of processor time that a process has used."""
+    fields = Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()
+    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+
+
+class Devices:
+    """Raw items of the bus, block by block, with delays up to 2 ms."""
+
+    def __init__(self, system: System, folder: Path) -> None:
+        (self._can,), self._serial = devices(system, folder, [DeviceClock(0.3, 5e-5)] * len(system.sources))
+        self._random = np.random.default_rng(1)
+
+    def items(self, block: Block) -> list[list[Raw]]:
+        """What each source delivers of a block."""
+        frames = []
+        for t, part in self._can.encode(block):
+            frames.append(CanFrames(self._arrival(t), part.stamp, part.id, part.length, part.data, part.flags))
+        together = concatenate_frames(frames)
+        out: list[list[Raw]] = [[together[np.argsort(together.arrival, kind="stable")]]]
+        for device in self._serial:
+            t, pieces = device.encode(block)
+            out.append([SerialChunk(a, data) for a, data in zip(self._arrival(t).tolist(), pieces, strict=True)])
+        return out
+
+    def _arrival(self, t: Array) -> Array:
+        return np.maximum.accumulate(t + 0.004 + self._random.uniform(0.0, 2e-3, t.size))
+
+
+def by_tick(items: list[Raw], first: int, count: int) -> list[list[Raw]]:
+    """Items that arrived within each of `count` ticks from `first` on, those before it in the first one."""
+    out: list[list[Raw]] = [[] for _ in range(count)]
+    for item in items:
+        if isinstance(item, CanFrames):
+            edges = np.searchsorted(item.arrival, [tick_time(first + k) for k in range(1, count)])
+            for k, (a, b) in enumerate(pairwise([0, *edges.tolist(), len(item)])):
+                out[k] += [item[a:b]] if b > a else []
+        else:
+            out[min(max(int(item.arrival / TICK) - first, 0), count - 1)].append(item)
+    return out
+
+
+def test_hours_at_full_speed(tmp_path: Path) -> None:
+    """Memory and π over hours of simulated time; HOURS in the environment, 1 by default, 24 for the whole day."""
+    file, system = bench_system(tmp_path)
+    blocks = list(MovingArm(system, 20.0, "0", 1))
+    sensors = Sensors(system, Plant(system).channels, None, 1)
+    columns = [blocks[0].channels.index(channel) for channel in sensors.channels]
+    motion = np.concatenate([block.values for block in blocks])[:-1, columns]
+    bus = Devices(system, file.parent)
+    merger = Merger(lanes(system, file.parent))
+    estimator = Estimator(system, merger.channels, "bench")
+    # Each motion begins anew, from rest, after a pause of the serial devices, which ends a segment.
+    pause = np.repeat(motion[-1:], round(PERIOD * system.sample_rate) - motion.shape[0], axis=0)
+    on_can = {channel for group in messages(sensors.channels) for channel in group}
+    pause[:, [channel not in on_can for channel in sensors.channels]] = np.nan
+    motion = np.concatenate((motion, pause))
+    rounds = round(float(os.environ.get("HOURS", "1")) * 3600.0 / PERIOD)
+    ticks = round(PERIOD / TICK)
+    began = perf_counter()
+    for k in range(rounds):
+        rows = np.arange(motion.shape[0])
+        values = sensors.read(k * motion.shape[0], motion)
+        sources = bus.items(Block(k * PERIOD + rows / system.sample_rate, sensors.channels, values))
+        parts = [by_tick(items, k * ticks, ticks) for items in sources]
+        for tick in range(ticks):
+            block = merger.advance(tick_time(k * ticks + tick + 1), [part[tick] for part in parts])
+            if block is not None:
+                estimator.push(block)
+        if k % max(1, rounds // 12) == 0 or k == rounds - 1:
+            hours, peak = (k + 1) * PERIOD / 3600.0, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+            pi, std = estimator.estimate().pi, standard_deviation(estimator)
+            shown = ", ".join(f"{estimator.base.parameters[j].name} {pi[j]:.6g} ± {std[j]:.2g}" for j in (8, 10, 12))
+            print(f"\n{hours:6.2f} h in {perf_counter() - began:6.0f} s, peak {peak:.0f} MB, {shown}", end="")
+    print()
+    print("\n".join(merger.warnings))

@@ -1,0 +1,197 @@
+"""The times of samples: every device has its own clock, and delays that scatter."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import pytest
+from bus_streams import AxisBus, axis_testbed, estimated, merged
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from sms_adapters.clock_line import LARGEST_DRIFT, DeviceClock, line_below
+from sms_adapters.clock_samples import CountedTime, NumberedTime
+from sms_adapters.stuck import StuckGuard
+from sms_online.stream import Array
+
+TICK = 0.02
+LATENCY, JITTER = 0.004, 0.002
+
+
+def corrected(clock: DeviceClock, device: Array, arrival: Array) -> Array:
+    """Times of all samples, pushed by the tick."""
+    edges = np.searchsorted(arrival, np.arange(0.0, arrival[-1] + 2 * TICK, TICK))
+    parts = [clock.push(device[a:b], arrival[a:b]) for a, b in pairwise(edges)]
+    return np.concatenate([*parts, clock.finish()])
+
+
+def pairs(
+    rate: float, seconds: float, drift: float, offset: float, seed: int, jitter: float = 2e-3
+) -> tuple[Array, Array, Array]:
+    """Instants, device times and arrivals of samples whose transport keeps their order."""
+    random = np.random.default_rng(seed)
+    t = 1.0 + np.arange(round(rate * seconds)) / rate
+    device = (t - offset) / (1.0 + drift)
+    return t, device, np.maximum.accumulate(t + LATENCY + random.uniform(0.0, JITTER, t.size))
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_two_devices_agree_within_30_microseconds_and_1_ppm_after_30_seconds(seed: int) -> None:
+    errors, clocks = [], []
+    for rate, drift, offset in ((1000.0, 0.0, 0.0), (240.0, 50e-6, 0.3)):
+        t, device, arrival = pairs(rate, 60.0, drift, offset, seed)
+        clocks.append(DeviceClock(LATENCY))
+        times = corrected(clocks[-1], device, arrival)
+        assert times.size == t.size
+        after = t > 31.0
+        errors.append(np.sqrt(np.mean((times - t)[after] ** 2)))
+    assert np.hypot(*errors) < 30e-6
+    assert abs((clocks[1].drift - 50e-6) - clocks[0].drift) < 1e-6
+
+
+def test_no_sample_waits_longer_than_the_first_second() -> None:
+    t, device, arrival = pairs(240.0, 10.0, 50e-6, 0.3, seed=1)
+    clock = DeviceClock(LATENCY)
+    given_out = 0
+    for k in range(0, t.size, 5):
+        given_out += clock.push(device[k : k + 5], arrival[k : k + 5]).size
+        assert given_out == (0 if not clock.settled else k + device[k : k + 5].size)
+        assert clock.settled == (t[k : k + 5][-1] >= 2.1) or 1.9 < t[k] < 2.1
+
+
+@pytest.mark.parametrize("jump", [2.0, -2.0, 0.06])
+def test_a_jump_of_the_devices_clock_is_found_and_bridged(jump: float) -> None:
+    t, device, arrival = pairs(1000.0, 20.0, 50e-6, 0.3, seed=2)
+    clock = DeviceClock(LATENCY)
+    times = corrected(clock, device + np.where(t > 11.0, jump, 0.0), arrival)
+    assert clock.counters.jumps == 1
+    assert clock.last_jump == pytest.approx(jump, abs=1e-3)
+    assert clock.counters.corrupt == 0
+    np.testing.assert_allclose(times, t, rtol=0, atol=1e-4)
+
+
+@pytest.mark.parametrize("wrong", [1e6, -1e6, 5.0, -5.0, 0.2, -0.2])
+def test_corrupt_stamps_are_dropped_and_move_nothing(wrong: float) -> None:
+    t, device, arrival = pairs(200.0, 8.0, 20e-6, 0.1, seed=9)
+    spoilt = np.sort(np.random.default_rng(9).choice(np.arange(400, t.size), 20, replace=False))
+    device[spoilt] += wrong
+    clock = DeviceClock(LATENCY)
+    times = corrected(clock, device, arrival)
+    assert np.flatnonzero(np.isnan(times)).tolist() == spoilt.tolist()
+    assert (clock.counters.corrupt, clock.counters.jumps, clock.counters.steps) == (20, 0, 0)
+    assert np.nanmax(np.abs(times - t)) < 1e-4
+
+
+def test_a_stall_of_the_transport_moves_no_time() -> None:
+    # Half a second in which nothing comes, then all at once.
+    t, device, arrival = pairs(1000.0, 20.0, 0.0, 0.0, seed=3)
+    stalled = np.where((arrival > 8.0) & (arrival < 8.5), 8.5, arrival)
+    clock = DeviceClock(LATENCY)
+    np.testing.assert_allclose(corrected(clock, device, stalled), t, rtol=0, atol=1e-4)
+    assert (clock.counters.jumps, clock.counters.steps) == (0, 0)
+
+
+def test_seconds_of_load_move_no_time() -> None:
+    t, device, arrival = pairs(1000.0, 30.0, 50e-6, 0.3, seed=4)
+    loaded = np.maximum.accumulate(arrival + np.where((t > 12.0) & (t < 16.0), 0.02, 0.0))
+    clock = DeviceClock(LATENCY)
+    np.testing.assert_allclose(corrected(clock, device, loaded), t, rtol=0, atol=1e-4)
+
+
+def test_a_sender_that_paused_without_counting_on_is_placed_again_within_two_seconds() -> None:
+    t, device, arrival = pairs(1000.0, 30.0, 50e-6, 0.3, seed=10)
+    t, arrival = (x + np.where(t > 11.0, 0.5, 0.0) for x in (t, arrival))
+    clock = DeviceClock(LATENCY)
+    times = corrected(clock, device, arrival)
+    assert clock.counters.steps == 1
+    after = t > 13.5
+    np.testing.assert_allclose(times[after], t[after], rtol=0, atol=1e-4)
+
+
+def test_a_backlog_that_is_worked_off_moves_no_time() -> None:
+    # Half a second late, and for three seconds ever less.
+    t, device, arrival = pairs(1000.0, 30.0, 50e-6, 0.3, seed=11)
+    backlog = np.maximum(arrival, np.where(t > 11.0, 11.5 + (t - 11.0) * 5.0 / 6.0, 0.0))
+    clock = DeviceClock(LATENCY)
+    np.testing.assert_allclose(corrected(clock, device, np.maximum.accumulate(backlog)), t, rtol=0, atol=1e-4)
+
+
+def test_a_latency_that_changes_for_good_is_followed_and_counted() -> None:
+    t, device, arrival = pairs(240.0, 60.0, 0.0, 0.0, seed=5)
+    later = np.maximum.accumulate(arrival + np.where(t > 21.0, 0.01, 0.0))
+    clock = DeviceClock(LATENCY)
+    times = corrected(clock, device, later)
+    assert clock.counters.steps == 1
+    np.testing.assert_allclose(times[t > 33.0], t[t > 33.0] + 0.01, rtol=0, atol=1e-4)
+
+
+@given(st.lists(st.tuples(st.floats(1e-3, 1.0), st.floats(0.0, 2e-3)), min_size=2, max_size=60))
+@settings(max_examples=100, deadline=None)
+def test_the_line_is_below_all_points_and_the_closest_such_line(steps: list[tuple[float, float]]) -> None:
+    gaps, delays = np.array(steps).T
+    x = np.cumsum(gaps)
+    y = x * (1.0 + 30e-6) + delays
+    slope, offset = line_below(x, y)
+    above = y - slope * x - offset
+    assert above.min() == pytest.approx(0.0, abs=1e-12)
+    for other in slope + np.linspace(-1.0, 1.0, 41) * 1e-5:
+        if abs(other - 1.0) <= LARGEST_DRIFT:
+            assert above.mean() <= (y - other * x - np.min(y - other * x)).mean() + 1e-12
+
+
+@pytest.mark.parametrize("modulus", [256, 65536])
+def test_a_count_gives_regular_times_through_roll_overs_losses_and_rounds_lost(modulus: int) -> None:
+    random = np.random.default_rng(6)
+    n = np.arange(200_000)
+    arrival: Array = n * 1e-3 + random.uniform(0.0, 2e-3, n.size)
+    kept = (random.uniform(size=n.size) > 0.1) & ~((n > 50_000) & (n < 51_000 + 2 * modulus))
+    time = CountedTime(modulus, 1e-3)
+    parts = np.array_split(np.flatnonzero(kept), 997)
+    times = np.concatenate([time(n[part] % modulus, arrival[part]) for part in parts])
+    np.testing.assert_array_equal(np.rint(times / 1e-3), n[kept] - n[kept][0])
+
+
+def test_frames_that_overtake_each_other_keep_their_own_times() -> None:
+    counts = np.array([254, 255, 1, 0, 2, 4, 3, 5])
+    times = CountedTime(256, 0.5)(counts, np.linspace(0.0, 3.5, 8))
+    assert times.tolist() == [0.0, 0.5, 1.5, 1.0, 2.0, 3.0, 2.5, 3.5]
+
+
+def test_samples_without_any_mark_are_numbered_and_holes_are_counted() -> None:
+    arrival = np.concatenate((np.arange(10) * 0.01, 1.0 + np.arange(10) * 0.01))
+    times = NumberedTime(0.01)(arrival)
+    assert np.rint(times / 0.01).tolist() == [*range(10), *range(100, 110)]
+
+
+def test_pi_is_as_good_as_on_one_clock(tmp_path: Path) -> None:
+    # Offset 0.3 s, drifts of 20 and -30 ppm (50 between the devices), delays up to 2 ms, against none of them.
+    system = axis_testbed(tmp_path)
+    std, error = [], []
+    for bus in (
+        AxisBus(seconds=30.0, seed=7, jitter=0.0),
+        AxisBus(seconds=30.0, seed=7, drift=(2e-5, -3e-5), offset=0.3),
+    ):
+        merger, blocks = merged(system, tmp_path, bus.drive(), bus.encoder(system))
+        assert merger.warnings == []
+        pi, sigma = estimated(system, blocks, merger.channels)
+        std.append(sigma)
+        error.append(np.abs(pi - [0.3, 0.1]))
+    assert (std[1] < 1.5 * std[0]).all()
+    assert (error[1] < 4.0 * std[1]).all()
+
+
+def test_a_sensor_that_sticks_is_noticed_and_a_coarse_encoder_is_not() -> None:
+    random = np.random.default_rng(8)
+    t = np.arange(4000) / 1000.0
+    fine = np.sin(t) + 1e-4 * random.standard_normal(t.size)
+    fine[2000:2500] = fine[2000]
+    coarse = np.round(np.sin(3 * t) / 1e-3) * 1e-3
+    values = np.column_stack((fine, coarse))
+    guard = StuckGuard([(0, 1)])
+    for k in range(0, t.size, 20):
+        guard.blank(values[max(k - 20, 0) : k + 20], min(20, t.size - k))
+    assert guard.blanked.tolist() == [499, 0]
+    assert np.isnan(values[2001:2500, 0]).all()
+    assert not np.isnan(values[2500:, 0]).any()

@@ -1,0 +1,269 @@
+"""The live loop with made-up devices on a clock that runs ten times as fast: what it records, replays and survives."""
+
+from __future__ import annotations
+
+import json
+import os
+import sys
+import time
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import pytest
+from axis import DAMPING, INERTIA
+from bus_streams import AxisBus, axis_testbed
+
+from sms_adapters.checkpoint import load_checkpoint
+from sms_adapters.clock_lanes import lanes
+from sms_adapters.clock_merge import PATIENCE, Merger
+from sms_adapters.raw import LostDevice, Raw, SerialChunk
+from sms_adapters.recorder import Recorder
+from sms_adapters.recording import split
+from sms_adapters.session_log import SessionHeader, from_microseconds
+from sms_adapters.sources import open_source
+from sms_online.description.schema import System
+from sms_online.pipeline.estimator import Estimator
+from sms_online.results import results_document, standard_deviation
+from sms_tools.interruption import Interruption
+from sms_tools.live import feed as feed_module
+from sms_tools.live.feed import Feed, SessionClock
+from sms_tools.live.latency import Latencies
+from sms_tools.live.loop import LiveSession
+from sms_tools.live.status import Leading, News, StatusWriter, line
+
+SPEED = 10.0
+
+
+class FastClock(SessionClock):
+    """A session's clock that runs SPEED times as fast as the machine's."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._begin = time.monotonic()
+
+    def __call__(self) -> float:
+        return from_microseconds(round(SPEED * (time.monotonic() - self._begin) * 1e6))
+
+
+class Played:
+    """A `Reader` that delivers raw items when they are due, `repeat` times over, and may be unplugged for a while."""
+
+    def __init__(self, name: str, items: Sequence[Raw], clock: SessionClock, repeat: int = 1) -> None:
+        self.name = name
+        self.opened = 0
+        self.unplugged: tuple[float, float] | None = None
+        self._items = list(items)
+        self._clock = clock
+        self._repeat = repeat
+
+    def open(self) -> None:
+        self._check()
+        self.opened += 1
+
+    def _check(self) -> None:
+        if self.unplugged is not None and self.unplugged[0] < self._clock() < self.unplugged[1]:
+            raise LostDevice(self.name, "unplugged")
+
+    def read(self, timeout: float) -> list[Raw]:
+        time.sleep(0.001)
+        self._check()
+        due, self._items = split(self._items, self._clock())
+        return [self._now(item) for item in due for _ in range(self._repeat)]
+
+    def _now(self, item: Raw) -> Raw:
+        """The item as it arrives: not before it was due."""
+        if isinstance(item, SerialChunk):
+            return SerialChunk(max(item.arrival, 0.0), item.data)
+        return item
+
+    def close(self) -> None:
+        pass
+
+
+class Bench:
+    """A live session of the axis, with its parts."""
+
+    def __init__(self, folder: Path, system: System, seconds: float = 20.0, repeat: int = 1, **options: Any) -> None:
+        self.system, self.folder, self.directory = system, folder, folder / "run"
+        bus = AxisBus(seconds=seconds, drift=(2e-5, -3e-5), offset=0.3)
+        self.clock = FastClock()
+        header = SessionHeader(self.clock.epoch, {"drive": "can", "encoder": "serial"}, 0.0, {})
+        self.recorder = Recorder(self.directory, header)
+        self.readers = [
+            Played("drive", [bus.drive()], self.clock, repeat),
+            Played("encoder", bus.encoder(system), self.clock, repeat),
+        ]
+        self.feeds = [Feed(reader, self.recorder) for reader in self.readers]
+        self.merger = Merger(lanes(system, folder))
+        self.estimator = Estimator(system, self.merger.channels, "live")
+        self.session = LiveSession(
+            self.clock, self.feeds, self.merger, self.estimator, 0.0, self.directory, self.recorder, **options
+        )
+
+    def run(self, seconds: float, after: Callable[[], None] = lambda: None) -> dict[str, Any]:
+        """The document of a session of so many seconds."""
+        with Interruption() as interruption:
+            for block in self.session.blocks(interruption, seconds):
+                self.estimator.push(block)
+                after()
+        self.estimator.finish()
+        self.session.close()
+        return results_document(self.estimator, 0.0, [*self.merger.warnings, *self.session.warnings])
+
+    def replayed(self) -> dict[str, Any]:
+        """The document of the recording."""
+        source = open_source(self.directory, self.system, directory=self.folder)
+        estimator = Estimator(self.system, source.channels, "replay")
+        for block in source:
+            estimator.push(block)
+        estimator.finish()
+        return results_document(estimator, 0.0, source.warnings)
+
+
+@pytest.fixture
+def system(tmp_path: Path) -> System:
+    return axis_testbed(tmp_path)
+
+
+def test_a_live_session_and_the_replay_of_its_recording_give_the_same_document(tmp_path: Path, system: System) -> None:
+    bench = Bench(tmp_path, system)
+    live = bench.run(21.0)
+    assert live["samples"] > 7000  # of 8000; a loaded machine plays the last ones too late
+    for p, true in zip(live["parameters"], (INERTIA, DAMPING), strict=True):
+        assert abs(p["estimate"] - true) < 4.0 * p["std"]
+        assert p["identifiable"]
+    assert json.dumps(bench.replayed()) == json.dumps(live)
+
+
+def test_a_device_that_was_unplugged_is_named_opened_again_and_pi_goes_on(tmp_path: Path, system: System) -> None:
+    bench = Bench(tmp_path, system)
+    bench.readers[1].unplugged = (8.0, 10.0)
+    live = bench.run(21.0)
+    assert bench.readers[1].opened == 2
+    assert "encoder: lost 1 times and opened again, the last time for: unplugged" in live["warnings"]
+    for p, true in zip(live["parameters"], (INERTIA, DAMPING), strict=True):
+        assert abs(p["estimate"] - true) < 4.0 * p["std"]
+    assert json.dumps(bench.replayed()) == json.dumps(live)
+
+
+def test_ten_times_the_rate_drops_and_counts_and_replays_what_was_used(
+    tmp_path: Path, system: System, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(feed_module, "MOST_WAITING", 200)
+    bench = Bench(tmp_path, system, seconds=10.0, repeat=10)
+    waiting: list[int] = []
+
+    def slow() -> None:
+        time.sleep(0.02)  # ten ticks
+        waiting.append(max(feed._waiting for feed in bench.feeds))
+
+    live = bench.run(11.0, slow)
+    assert max(waiting) <= 200
+    dropped = sum(feed.dropped for feed in bench.feeds)
+    assert dropped > 1000
+    assert (
+        f"drive: {bench.feeds[0].dropped} items recorded but not used, the estimator was too slow" in live["warnings"]
+    )
+    lines = sum(len((bench.directory / name).read_text().splitlines()) for name in ("drive.log", "encoder.serial"))
+    assert lines == sum(feed.received for feed in bench.feeds)
+    assert json.dumps(bench.replayed()) == json.dumps(live)
+
+
+def test_a_display_that_never_reads_blocks_nobody(tmp_path: Path, system: System) -> None:
+    reader, writer = os.pipe()
+    os.set_blocking(writer, False)
+    try:
+        while True:
+            os.write(writer, b"x" * 4096)
+    except BlockingIOError:
+        os.set_blocking(writer, True)
+    status = StatusWriter(writer)
+    bench = Bench(tmp_path, system, status=status)
+    live = bench.run(21.0)
+    began = time.monotonic()
+    status.close()
+    assert time.monotonic() - began < 2.0
+    assert live["samples"] > 7000  # of 8000; a loaded machine plays the last ones too late
+    os.close(reader)  # which ends the write that waits
+
+
+def test_a_checkpoint_is_there_while_the_session_runs_and_goes_on_to_the_same_bits(
+    tmp_path: Path, system: System, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("sms_tools.live.loop.CHECKPOINT_INTERVAL", 3.0)
+    bench = Bench(tmp_path, system)
+    states: list[tuple[bytes, int]] = []
+
+    def look() -> None:
+        path = bench.directory / "checkpoint.npz"
+        if path.is_file() and bench.estimator.samples > 3000 and not states:
+            states.append((path.read_bytes(), bench.estimator.samples))
+
+    bench.run(21.0, look)
+    (tmp_path / "killed.npz").write_bytes(states[0][0])
+    resumed = Estimator(system, bench.merger.channels, "resumed")
+    load_checkpoint(tmp_path / "killed.npz", resumed)
+    assert 0 < resumed.samples <= states[0][1]
+    skip = resumed.samples
+    for block in open_source(bench.directory, system, directory=tmp_path):
+        rows = slice(min(skip, block.t.size), None)
+        skip -= min(skip, block.t.size)
+        resumed.push(type(block)(block.t[rows], block.channels, block.values[rows]))
+    resumed.finish()
+    assert resumed.estimate().pi.tobytes() == bench.estimator.estimate().pi.tobytes()
+    assert standard_deviation(resumed).tobytes() == standard_deviation(bench.estimator).tobytes()
+
+
+def test_arrivals_never_go_back_behind_a_tick_that_was_worked_off(system: System, tmp_path: Path) -> None:
+    chunk = SerialChunk(0.5, b"a")
+    feed = Feed(Played("encoder", [], FastClock()), None)
+    assert feed.drain(1.0) == []
+    feed._take([chunk])
+    assert feed.drain(1.0) == []
+    assert feed.drain(1.02) == [SerialChunk(1.0, b"a")]
+
+
+def test_a_driver_that_raises_anything_is_a_lost_device() -> None:
+    class Broken(Played):
+        def read(self, timeout: float) -> list[Raw]:
+            raise ZeroDivisionError("in a driver")
+
+    feed = Feed(Broken("drive", [], FastClock()), None)
+    feed.start()
+    end = time.monotonic() + 5.0
+    while feed.losses < 2 and time.monotonic() < end:
+        time.sleep(0.01)
+    feed.stop()
+    assert feed.losses >= 2
+    assert feed.last_loss == "ZeroDivisionError: in a driver"
+
+
+def test_latency_counts_each_sample_once_and_forgets_the_start() -> None:
+    latencies = Latencies()
+    assert latencies.quantile(0.99) is None
+    # A slow start, then a row every 20 ms that is 0.1 s old.
+    for k in range(2000):
+        now = 0.02 * k
+        latencies.add(now, now - (0.1 if now > 5.0 else 1.5))
+    assert latencies.quantile(0.5) == pytest.approx(0.11, abs=2e-3)
+    assert latencies.quantile(0.99) == pytest.approx(0.12, abs=2e-3)
+
+
+def test_the_status_line_says_what_matters() -> None:
+    leading = [Leading("link_1.inertia", "kg m²", 0.3, 0.01)]
+    news = News(12.0, 1234.0, 0.12, 3, 0.02, (1, 2), leading, ["drive: gone (unplugged), tried again"])
+    said = line(news)
+    for part in ("12.0 s", "1,234 samples/s", "p99 120 ms", "lost 3", "residual 2 %", "1 of 2 determined",
+                 "link_1.inertia 0.3 ± 0.02 kg m²", "drive: gone (unplugged)"):  # fmt: skip
+        assert part in said
+
+
+@pytest.fixture(autouse=True)
+def patience(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """As much of it on the fast clock as on a real one; and readers get their turn soon, as in the program."""
+    monkeypatch.setattr("sms_adapters.clock_merge.PATIENCE", SPEED * PATIENCE)
+    before = sys.getswitchinterval()
+    sys.setswitchinterval(1e-3)
+    yield
+    sys.setswitchinterval(before)

@@ -1,0 +1,168 @@
+"""The live loop: ticks of the session's clock, each drained, merged, estimated; saved and shown now and then."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from sms_adapters.checkpoint import save_checkpoint
+from sms_adapters.clock_merge import Merger
+from sms_adapters.recorder import Recorder
+from sms_adapters.recording import tick_time
+from sms_online.pipeline.estimator import Estimator
+from sms_online.results import standard_deviation
+from sms_online.stream import Block
+from sms_tools.interruption import Interruption
+from sms_tools.live.feed import Feed, SessionClock
+from sms_tools.live.latency import Latencies, Watched
+from sms_tools.live.status import Leading, News, StatusWriter
+
+# A session that is killed loses no more of the estimate than this, s; its raw items are on disk all the same.
+CHECKPOINT_INTERVAL = 5.0
+CHECKPOINT = "checkpoint.npz"
+# Devices are given so long to be opened before the session's first tick is worked off, s.
+OPENING = 2.0
+# News is made so often, s.
+NEWS_INTERVAL = 0.5
+# Parameters on the status line: the best known ones.
+LEADING = 4
+
+
+class LiveSession:
+    """Feeds, merger and estimator of one session, until it is interrupted.
+
+    start: of the session's clock in the estimator's time, s. directory: where checkpoints go, which exists.
+    """
+
+    def __init__(
+        self,
+        clock: SessionClock,
+        feeds: Sequence[Feed],
+        merger: Merger,
+        estimator: Estimator,
+        start: float,
+        directory: Path,
+        recorder: Recorder | None = None,
+        status: StatusWriter | None = None,
+    ) -> None:
+        self.latencies = Latencies()
+        self.busy = 0.0  # s spent on samples
+        self._clock = clock
+        self._feeds = feeds
+        self._merger = merger
+        self._estimator = estimator
+        self._watched = estimator.tracker = Watched(estimator.tracker)
+        self._start = start
+        self._directory = directory
+        self._recorder = recorder
+        self._status = status
+        self._tick = 0
+        self._said = 0.0
+        self._said_samples = 0
+        self._saved = 0.0
+
+    def blocks(
+        self,
+        interruption: Interruption,
+        duration: float = np.inf,
+        ended: Callable[[], bool] = lambda: False,
+        ready: Callable[[], None] = lambda: None,
+    ) -> Iterator[Block]:
+        """Yield the rows of each tick until interrupted, for `duration` s, or until `ended` says so; then what is left.
+
+        ready: called when every device is open or found missing. Each block has to be pushed into the estimator before
+        the next one is asked for. At the end the devices are released and a checkpoint is written, which knows nothing
+        of the estimator's own end.
+        """
+        for feed in self._feeds:
+            feed.start()
+        for feed in self._feeds:
+            feed.tried.wait(OPENING)
+        ready()
+        while not (interruption.requested or ended() or self._clock() >= duration):
+            interruption.sleep(tick_time(self._tick + 1) - self._clock())
+            if self._clock() >= tick_time(self._tick + 1):
+                yield from self._advance()
+            self._look_around()
+        for feed in self._feeds:
+            feed.stop()
+        # What arrived until then, also where the loop was behind.
+        while tick_time(self._tick) <= self._clock():
+            yield from self._advance()
+        block = self._merger.finish()
+        if block is not None:
+            yield block
+        self.save()
+
+    def close(self) -> None:
+        """Show the last news and end the recording."""
+        self._publish()
+        if self._recorder is not None:
+            self._recorder.close(tick_time(self._tick), self.warnings)
+
+    def _advance(self) -> Iterator[Block]:
+        """One tick."""
+        self._tick += 1
+        tick = tick_time(self._tick)
+        items = [feed.drain(tick) for feed in self._feeds]
+        started = time.perf_counter()
+        block = self._merger.advance(tick, items)
+        if block is not None:
+            yield block
+            if np.isfinite(self._watched.newest):
+                self.latencies.add(self._clock() + self._start, self._watched.newest)
+        self.busy += time.perf_counter() - started
+
+    def _look_around(self) -> None:
+        """What is done now and then."""
+        now = self._clock()
+        if self._status is not None and now - self._said >= NEWS_INTERVAL:
+            self._publish()
+        if now - self._saved >= CHECKPOINT_INTERVAL:
+            self._saved = now
+            self.save()
+
+    def save(self) -> None:
+        """Write a checkpoint."""
+        save_checkpoint(self._directory / CHECKPOINT, self._estimator)
+
+    @property
+    def warnings(self) -> list[str]:
+        """What no raw item tells of this session."""
+        found = [warning for feed in self._feeds for warning in feed.warnings]
+        if self._recorder is not None and self._recorder.unrecorded:
+            why = f" ({self._recorder.problem})" if self._recorder.problem else ""
+            found.append(f"{self._recorder.unrecorded} items could not be recorded{why}")
+        return found
+
+    def _publish(self) -> None:
+        if self._status is None:
+            return
+        now = self._clock()
+        estimate = self._estimator.estimate()
+        std = standard_deviation(self._estimator)
+        relative = std / np.maximum(np.abs(estimate.pi), np.finfo(float).tiny)
+        best = [k for k in np.argsort(relative)[:LEADING].tolist() if np.isfinite(std[k])]
+        parameters = self._estimator.base.parameters
+        residuals = [joint.relative(estimate.pi) for joint in self._estimator.joint_residuals]
+        troubles = [f"{feed.name}: gone ({feed.lost}), tried again" for feed in self._feeds if feed.lost is not None]
+        troubles += [f"{name}: silent" for name in self._merger.silent(tick_time(self._tick))]
+        if self._recorder is not None and self._recorder.problem is not None:
+            troubles.append(f"not recorded: {self._recorder.problem}")
+        news = News(
+            time=now,
+            rate=(self._estimator.samples - self._said_samples) / max(now - self._said, 1e-9),
+            latency=self.latencies.quantile(0.99),
+            lost=self._estimator.counters.lost_samples,
+            residual=max((r for r in residuals if r is not None), default=None),
+            determined=(int(np.count_nonzero(relative < 1.0 / 3.0)), len(parameters)),
+            leading=[
+                Leading(parameters[k].name, parameters[k].unit, float(estimate.pi[k]), float(std[k])) for k in best
+            ],
+            troubles=[*troubles, *self._merger.warnings, *self.warnings],
+        )
+        self._said, self._said_samples = now, self._estimator.samples
+        self._status.publish(news)

@@ -1,0 +1,85 @@
+"""A described testbed, opened: clock, recorder, a feed for each source, merger and estimator as one session."""
+
+from __future__ import annotations
+
+import shutil
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+
+from sms_adapters.checkpoint import load_checkpoint
+from sms_adapters.clock_lanes import lanes
+from sms_adapters.clock_merge import Merger
+from sms_adapters.devices import make_reader
+from sms_adapters.recorder import Recorder
+from sms_adapters.session_log import CHECKPOINT as RESUMED_FROM
+from sms_adapters.session_log import MICROSECOND, SYSTEM, SessionHeader, read_header
+from sms_online.description.parse import shipped_systems, shipped_text
+from sms_online.description.schema import System
+from sms_online.errors import InputError
+from sms_online.pipeline.estimator import Estimator
+from sms_tools.live.feed import Feed, SessionClock, kind_of
+from sms_tools.live.loop import CHECKPOINT, LiveSession
+from sms_tools.live.status import StatusWriter
+from sms_tools.session import new_estimator
+
+PROGRAMS = ("sms-online", "numpy", "python-can", "pyserial", "cantools")
+# After the last sample before a resumption, s: longer than any hole that the synchroniser bridges.
+PAUSE = 2.0
+
+
+def versions() -> dict[str, str]:
+    """Of the programs that a recording depends on, as far as they are installed."""
+    found = {}
+    for program in PROGRAMS:
+        try:
+            found[program] = version(program)
+        except PackageNotFoundError:
+            continue
+    return found
+
+
+def system_files(name: str, system: System) -> dict[str, bytes]:
+    """The system file of a name or path, as `system.toml`, and the files beside it that it names."""
+    if name in shipped_systems():
+        return {SYSTEM: shipped_text(name).encode()}
+    path = Path(name)
+    files = {SYSTEM: path.read_bytes()}
+    for source in system.sources:
+        for file in [getattr(source, "dbc", None), *getattr(source, "nodes", {}).values()]:
+            if file is not None and (path.parent / file).is_file():
+                files[Path(file).name] = (path.parent / file).read_bytes()
+    return files
+
+
+def open_testbed(
+    name: str, system: System, folder: Path | None, directory: Path, resume: Path | None, status: StatusWriter | None
+) -> tuple[LiveSession, Estimator, Merger]:
+    """The session of a system, its devices not yet opened; it records into `directory`.
+
+    name: of the system, as given. folder: where its file stands. resume: directory of an earlier session, from whose
+    last checkpoint this one goes on. Raises InputError for a system without sources, files that do not fit, a directory
+    that cannot be written, a checkpoint of another system.
+    """
+    opened = lanes(system, folder)
+    channels = tuple(channel for lane in opened for channel in lane.decoder.channels)
+    estimator = new_estimator(system, channels, name)
+    clock = SessionClock()
+    start = 0.0 if resume is None else resumed_start(resume, estimator, clock.epoch)
+    header = SessionHeader(clock.epoch, {source.name: kind_of(source) for source in system.sources}, start, versions())
+    recorder = Recorder(directory, header, system_files(name, system))
+    if resume is not None:
+        shutil.copyfile(resume / CHECKPOINT, directory / RESUMED_FROM)
+    feeds = [Feed(make_reader(source, clock), recorder) for source in system.sources]
+    merger = Merger(opened, start)
+    return LiveSession(clock, feeds, merger, estimator, start, directory, recorder, status), estimator, merger
+
+
+def resumed_start(resume: Path, estimator: Estimator, epoch: int) -> float:
+    """Load the checkpoint of an earlier session; time of the new session's clock zero in its time, s."""
+    checkpoint = resume / CHECKPOINT
+    if not checkpoint.is_file():
+        raise InputError(str(resume), "", f"no {CHECKPOINT}", "the directory of a live session of five seconds or more")
+    header, _ = read_header(resume)
+    load_checkpoint(checkpoint, estimator)
+    last = float(estimator.state()["session"]["first_time"]) + estimator.duration
+    return max(header.start + (epoch - header.epoch) * MICROSECOND, last + PAUSE)

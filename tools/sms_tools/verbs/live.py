@@ -1,0 +1,43 @@
+"""live: the testbed of a system file, estimated while it moves, and recorded."""
+
+from __future__ import annotations
+
+import argparse
+import math
+import sys
+
+from sms_tools.exit_codes import INTERRUPTED
+from sms_tools.interruption import Interruption
+from sms_tools.live.signals import termination_interrupts
+from sms_tools.live.status import StatusWriter
+from sms_tools.live.testbed import open_testbed
+from sms_tools.report import report_console, show
+from sms_tools.results_file import results_directory
+from sms_tools.session import conclude, described_system, document_of
+
+# Threads give way to each other after so long, s; by default it is 5 ms, in which a bus sends a dozen frames.
+SWITCH_INTERVAL = 1e-3
+
+
+def run(args: argparse.Namespace) -> int:
+    """Read, record and estimate until interrupted; 130 then, 0 or 3 at the end of --duration."""
+    system, folder = described_system(args)
+    directory = results_directory(args.out)
+    status = StatusWriter()
+    session, estimator, merger = open_testbed(args.system, system, folder, directory, args.resume, status)
+    sys.setswitchinterval(SWITCH_INTERVAL)
+    with Interruption() as interruption, termination_interrupts():
+        for block in session.blocks(interruption, math.inf if args.duration is None else args.duration):
+            estimator.push(block)
+    estimator.finish()
+    session.close()
+    status.close()
+    throughput = estimator.samples / session.busy if session.busy else 0.0
+    document = document_of(estimator, throughput, [*merger.warnings, *session.warnings], None)
+    code = conclude(args, document, directory, interrupted=False)
+    half, nearly_all = session.latencies.quantile(0.5), session.latencies.quantile(0.99)
+    if half is not None and nearly_all is not None:
+        latency = f"median {1e3 * half:.0f} ms, p99 {1e3 * nearly_all:.0f} ms, over the last seconds"
+        show(report_console(args.json), f"latency, arrival to estimate: {latency}")
+    # That is how a session without an end ends, and no reason to doubt its results.
+    return INTERRUPTED if interruption.requested else code
