@@ -19,6 +19,10 @@ NORMAL_95 = 1.959963984540054
 LARGEST_RELATIVE_STD = 1.0 / 3.0
 # A joint whose unexplained torque reaches this share of the measured one lacks an effect, whatever the error bars say.
 LARGEST_RESIDUAL = 0.5
+# Mean square of rows over their predicted variance that noise alone may leave: the noise itself is estimated to 5 %.
+LARGEST_ROW_VARIANCE = 1.2
+# Noise in the columns matters where it pulls an estimate by more than this many standard deviations.
+LARGEST_PULL = 1.0
 # Quantities that cannot be negative, as the ends of names.
 POSITIVE = ("mass", "mass_per_length", "stiffness", "damping", "rotor_inertia", "rigidity", "rigidity_y", "rigidity_z")
 
@@ -26,10 +30,13 @@ POSITIVE = ("mass", "mass_per_length", "stiffness", "damping", "rotor_inertia", 
 def standard_deviation(estimator: Estimator) -> Array:
     """1σ of each parameter (n,) as known now, inf where the data determine nothing.
 
-    The larger of two answers from the residual: one takes the rows' errors as independent with the residual's
-    variance, the other allows errors that last within clusters of rows. To it comes what errors add that rows of a
-    window share, which least squares absorbs and no residual shows; it is known while no row is forgotten. Where rows
-    have been weighed against a prior, the posterior's own covariance holds.
+    Rows of the momentum balance have a predicted variance. While the residual agrees with it, the estimate's covariance
+    follows from it; where rows leave more, the model lacks something and the residual decides, as it does for rows of
+    the energy balance.
+    From the residual: the larger of two answers. One takes the rows' errors as independent with the residual's
+    variance, the other allows errors that last within clusters of rows. To it comes what errors add that rows of an
+    energy window share, which least squares absorbs and no residual shows; it is known while no row is forgotten. Where
+    rows have been weighed against a prior, the posterior's own covariance holds.
     """
     return _standard_deviation(estimator, estimator.estimate())
 
@@ -43,10 +50,13 @@ def _standard_deviation(estimator: Estimator, estimate: Estimate) -> Array:
         std[known] = estimate.std[known]
         return std
     row_variance = estimate.rss / estimate.dof
+    if estimator.by_momentum and row_variance <= LARGEST_ROW_VARIANCE:
+        std[known] = estimate.std[known]
+        return std
     variance = np.diag(estimate.covariance)[known] * row_variance
     if estimate.covariance_robust is not None:
         variance = np.maximum(variance, np.diag(estimate.covariance_robust)[known])
-    if estimate.rows == estimator.shared_errors.rows:
+    if not estimator.by_momentum and estimate.rows == estimator.shared_errors.rows:
         inverse = np.where(np.outer(known, known), estimate.covariance, 0.0)
         variance = variance + estimator.shared_errors.variance(inverse, row_variance)[known]
     std[known] = np.sqrt(variance)
@@ -77,6 +87,45 @@ def doubts(parameters: list[dict[str, Any]], residual: dict[str, dict[str, float
                 f"{p['name']} is negative, which is not physical: the model lacks an effect, or the data are weak"
             )
     return out
+
+
+def _residuals(estimator: Estimator, beta: Array) -> dict[str, dict[str, float | None]]:
+    """By row type: `relative` to the measured torque or force, `whitened` over its predicted standard deviation."""
+    layout, momentum = estimator.model.layout, estimator.momentum
+
+    def whitened(rows: list[int]) -> float | None:
+        return momentum.whitened(rows, beta) if momentum is not None and rows else None
+
+    out: dict[str, dict[str, float | None]] = {"energy": {"relative": None, "whitened": None}}
+    for i, joint in enumerate(estimator.joint_residuals, start=1):
+        out[f"joint_{i}"] = {"relative": joint.relative(beta), "whitened": whitened([layout.theta_m[i - 1]])}
+    for i, (q, theta_m, q_f) in enumerate(zip(layout.q, layout.theta_m, layout.q_f, strict=True), start=1):
+        rows = [*range(q_f.start, q_f.stop), *([q] if q != theta_m else [])]
+        if rows:
+            out[f"link_{i}"] = {"relative": None, "whitened": whitened(rows)}
+    if layout.n_base_speeds:
+        out["base"] = {"relative": None, "whitened": whitened(list(range(layout.n_base_speeds)))}
+    return out
+
+
+def pulled(estimator: Estimator) -> list[str]:
+    """Names of parameters that noise in the columns pulls by more than their standard deviation: errors in variables.
+
+    The comparison is Hausman's, of least squares with an estimate that is free of this bias.
+    """
+    if estimator.momentum is None or not estimator.by_momentum:
+        return []
+    estimate = estimator.estimate()
+    shift = np.abs(estimator.momentum.bias.shift(estimate.determined))
+    std = _standard_deviation(estimator, estimate)
+    return [p.name for p, s, d in zip(estimator.base.parameters, shift, std, strict=True) if s > LARGEST_PULL * d]
+
+
+def _pull_warning(estimator: Estimator) -> list[str]:
+    names = pulled(estimator)
+    if not names:
+        return []
+    return [f"sensor noise in the columns pulls {', '.join(names)} by more than the error bar"]
 
 
 def results_document(
@@ -111,9 +160,7 @@ def results_document(
                 "identifiable": bool(flags[k]),
             }
         )
-    residual: dict[str, dict[str, float | None]] = {"energy": {"relative": None, "whitened": None}}
-    for i, joint in enumerate(estimator.joint_residuals, start=1):
-        residual[f"joint_{i}"] = {"relative": joint.relative(estimate.pi), "whitened": None}
+    residual = _residuals(estimator, estimate.pi)
     return {
         "schema": SCHEMA,
         "system": describe(estimator.system),
@@ -124,5 +171,5 @@ def results_document(
         "condition_number": estimate.condition_number if np.isfinite(estimate.condition_number) else None,
         "throughput_samples_per_s": throughput,
         "lost_samples": estimator.counters.lost_samples,
-        "warnings": [*warnings, *doubts(parameters, residual)],
+        "warnings": [*warnings, *doubts(parameters, residual), *_pull_warning(estimator)],
     }

@@ -1,0 +1,172 @@
+"""Noise of weak-form rows, propagated from the sensors, and the rows made independent of each other by it.
+
+A row's error is linear in the noise n(t) of the positions: ∫ c(t) n(t) dt with
+c = φ̈ H + φ̇ (Ḣ + ∂Gπ/∂v - ∂Pπ/∂x) + φ (d/dt ∂Gπ/∂v - ∂Gπ/∂x), P π = H v the momentum and G π the force of the
+balance; and ∫ φ n_τ dt from the noise of the torque. White noise of 1σ per sample has the density σ² T_s. Rows of
+windows that overlap share noise, so their covariance is block-banded, and so is its Cholesky factor L: L⁻¹ [Y b] are
+rows with independent errors of standard deviation one.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import scipy.linalg
+from numpy.typing import NDArray
+
+from sms_online.model.model import Model
+from sms_online.pipeline.momentum_balance import EXPONENT, HOPS, INSTANTS
+from sms_online.pipeline.weak_form import test_function
+from sms_online.stream import Array
+
+# Steps of the integrals over c(t): two for each instant that the sensitivity is told at.
+STEPS = 2 * INSTANTS
+STEPS_A_HOP = STEPS // HOPS
+# Step of the differences that give sensitivities: 1e-8 of their size is lost to curvature, as much to rounding.
+DIFFERENCE = 1e-6
+# Share of a row's variance that is added to it alone, for the rounding of the factorisation.
+OWN_SHARE = 1e-7
+
+
+@dataclass(frozen=True)
+class Sensitivity:
+    """Derivatives of momentum and force at K instants, (K, n_v, n_v): H = ∂Pπ/∂v, ∂Pπ/∂x, ∂Gπ/∂v, ∂Gπ/∂x.
+
+    Columns are displacements in the order of the speeds.
+    """
+
+    P_v: Array
+    P_x: Array
+    G_v: Array
+    G_x: Array
+
+
+def sensitivity(model: Model, pi: Array, x: Array, v: Array) -> Sensitivity:
+    """Sensitivity at x (K, n_x), v (K, n_v) for parameters π (n_pi,)."""
+    K, n_v = v.shape
+
+    def momentum_and_force(x: Array, v: Array) -> Array:
+        P, G = model.momentum_columns(x, v)
+        return np.stack((P @ pi, G @ pi))
+
+    eye = np.eye(n_v)
+    here = momentum_and_force(x, v)[:, :, None]
+    x_n, v_n = np.repeat(x, n_v, axis=0), np.repeat(v, n_v, axis=0)
+    moved = DIFFERENCE * np.tile(eye, (K, 1))
+    by_x = momentum_and_force(x_n + model.position_rate(x_n, moved), v_n).reshape(2, K, n_v, n_v)
+    by_v = momentum_and_force(x_n, v_n + moved).reshape(2, K, n_v, n_v)
+    P_x, G_x = ((by_x - here) / DIFFERENCE).transpose(0, 1, 3, 2)
+    P_v, G_v = ((by_v - here) / DIFFERENCE).transpose(0, 1, 3, 2)
+    return Sensitivity(P_v, P_x, G_v, G_x)
+
+
+class RowNoise:
+    """Covariance of each window's rows with those of the windows before it.
+
+    joint_rows: rows that hold each joint's torque.
+    """
+
+    def __init__(self, joint_rows: tuple[int, ...], span: float) -> None:
+        self._joint_rows = list(joint_rows)
+        self._instant = span / INSTANTS
+        self._step = span / STEPS
+        self._phi, self._phi_dot, self._phi_ddot = test_function(STEPS, span, EXPONENT)
+        # ∫ φ(t) φ(t + k hops) dt.
+        shifted = [self._phi[: STEPS + 1 - k * STEPS_A_HOP] @ self._phi[k * STEPS_A_HOP :] for k in range(HOPS)]
+        self._overlap = self._step * np.array(shifted)
+        self._before: deque[Array] = deque(maxlen=HOPS - 1)
+
+    def begin_segment(self) -> None:
+        """The next window shares no samples with those before."""
+        self._before.clear()
+
+    def covariance(
+        self, window: Sensitivity, readings: Array, sensor_density: Array, torque_density: Array
+    ) -> list[Array]:
+        """Covariances (n_v, n_v) with the windows before, oldest first, then the window's own; (N s)² and so on.
+
+        readings (K, n_v, sensors): displacement that one unit of each position sensor's noise makes. sensor_density
+        (sensors,): σ² T_s of each position sensor. torque_density (joints,): of n τ, (N m)² s.
+        """
+        H_dot = np.gradient(window.P_v, self._instant, axis=0)
+        G_v_dot = np.gradient(window.G_v, self._instant, axis=0)
+        weight = np.sqrt(self._step * sensor_density)
+        c = np.zeros((STEPS + 1, *readings.shape[1:]))
+        sources = (window.P_v, H_dot + window.G_v - window.P_x, G_v_dot - window.G_x)
+        for phi, source in zip((self._phi_ddot, self._phi_dot, self._phi), sources, strict=True):
+            c += phi[:, None, None] * _halved((source @ readings) * weight)
+        c = np.ascontiguousarray(c.transpose(1, 0, 2))  # (n_v, STEPS + 1, sensors)
+        out = []
+        for k in range(len(self._before), -1, -1):
+            other = c if k == 0 else self._before[-k]
+            shift = k * STEPS_A_HOP
+            ours, theirs = c[:, : STEPS + 1 - shift], other[:, shift:]
+            block = ours.reshape(len(c), -1) @ theirs.reshape(len(c), -1).T
+            block[self._joint_rows, self._joint_rows] += self._overlap[k] * torque_density
+            out.append(block)
+        self._before.append(c)
+        return out
+
+    def state(self) -> dict[str, Array]:
+        """What `restore` needs to continue."""
+        return {"before": np.array(self._before)}
+
+    def restore(self, state: Mapping[str, NDArray[Any]]) -> None:
+        """Continue from a saved state."""
+        self._before = deque(np.array(state["before"]), maxlen=HOPS - 1)
+
+
+def _halved(samples: Array) -> Array:
+    """Samples (K, …) with the means of neighbours between them, (2K - 1, …)."""
+    out = np.empty((2 * samples.shape[0] - 1, *samples.shape[1:]))
+    out[::2] = samples
+    out[1::2] = 0.5 * (samples[1:] + samples[:-1])
+    return out
+
+
+class Whitener:
+    """Rows of overlapping windows, one window after the other, turned into rows with independent unit errors."""
+
+    def __init__(self, n_v: int, width: int) -> None:
+        self._n_v, self._width = n_v, width
+        self.begin_segment()
+
+    def begin_segment(self) -> None:
+        """The next window shares no noise with those before."""
+        self._L = np.empty((0, 0))  # Cholesky factor of the windows that the next one overlaps
+        self._white = np.empty((0, self._width))  # and their whitened rows
+
+    def push(self, covariances: list[Array], rows: Array) -> Array:
+        """Whitened rows (n_v, width) of the next window's (n_v, width), from `RowNoise.covariance`.
+
+        Raises numpy.linalg.LinAlgError where the covariance is not positive definite.
+        """
+        n_v = self._n_v
+        own = covariances[-1].copy()
+        own[np.diag_indices(n_v)] *= 1.0 + OWN_SHARE
+        size = n_v * (len(covariances) - 1)
+        forget = len(self._L) - size
+        L, white = self._L[forget:, forget:], self._white[forget:]
+        cross = np.concatenate([np.empty((n_v, 0)), *covariances[:-1]], axis=1).T  # (size, n_v)
+        X = scipy.linalg.solve_triangular(L, cross, lower=True, check_finite=False) if size else cross
+        own -= X.T @ X
+        rows = rows - X.T @ white
+        diagonal = np.linalg.cholesky(own)
+        out = np.asarray(scipy.linalg.solve_triangular(diagonal, rows, lower=True, check_finite=False))
+        grown = np.zeros((size + n_v, size + n_v))
+        grown[:size, :size] = L
+        grown[size:, :size], grown[size:, size:] = X.T, diagonal
+        self._L, self._white = grown, np.concatenate((white, out))
+        return out
+
+    def state(self) -> dict[str, Array]:
+        """What `restore` needs to continue."""
+        return {"L": self._L, "white": self._white}
+
+    def restore(self, state: Mapping[str, NDArray[Any]]) -> None:
+        """Continue from a saved state."""
+        self._L, self._white = np.array(state["L"]), np.array(state["white"])
