@@ -8,6 +8,8 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from itertools import groupby
+from operator import itemgetter
 from typing import Any
 
 import numpy as np
@@ -124,13 +126,16 @@ class MomentumBalance:
         """
         self._samples = np.concatenate((self._samples, np.concatenate((*copies, joint_torque), axis=1)))
         grid = int(index[-1]) - (self._first + self._samples.shape[0] - 1)
-        windows, instants = [], []
+        chosen: list[tuple[int, int]] = []  # first sample and half width of each window
         while self._window + self.width + 2 * MARGIN < self._first + self._samples.shape[0]:
-            half_width = self._choose(sigma)
-            instants += self._tell(half_width)
-            windows.append(self._row(half_width, grid))
+            chosen.append((self._window, self._choose(sigma)))
             self._window += self.hop
             self._compared.pop(0)
+        instants = [piece for window, half_width in chosen for piece in self._tell(window, half_width)]
+        windows: list[Window] = []
+        # Windows of one width in a row are worked off together.
+        for half_width, run in groupby(chosen, key=itemgetter(1)):
+            windows += self._rows(half_width, [window for window, _ in run], grid)
         drop = self._window - self._first
         if drop > 0:
             self._samples, self._first = self._samples[drop:], self._window
@@ -145,9 +150,9 @@ class MomentumBalance:
             self._compared.append(self._choice.squares(self._samples[:, :n_x], centres))
         return self._choice.widest(np.sum(self._compared, axis=0) / (HOPS * COMPARED), sigma)
 
-    def _tell(self, half_width: int) -> list[Instants]:
-        """States at the instants up to the end of the next window that have not been told yet."""
-        last = (self._window + self.width) // self.half_hop
+    def _tell(self, window: int, half_width: int) -> list[Instants]:
+        """States at the instants up to the end of a window that have not been told yet."""
+        last = (window + self.width) // self.half_hop
         numbers = np.arange(self._told, last + 1)
         if numbers.size == 0:
             return []
@@ -164,26 +169,29 @@ class MomentumBalance:
         v = layout.speeds(x.reshape(-1, layout.n_x), x_dot.reshape(-1, layout.n_x))
         return x, v.reshape(COPIES, -1, layout.n_v), values[:, end:]
 
-    def _row(self, half_width: int, grid: int) -> Window:
+    def _rows(self, half_width: int, windows: list[int], grid: int) -> list[Window]:
         s = stride(half_width, self.hop)
         smoothed = self._smoothed.get(half_width)
-        if smoothed is None or smoothed.first + smoothed.columns.shape[0] * s < self._window:
-            smoothed = self._smoothed[half_width] = _Smoothed(self._window, np.empty((0, self._entries)))
+        if smoothed is None or smoothed.first + smoothed.columns.shape[0] * s < windows[0]:
+            smoothed = self._smoothed[half_width] = _Smoothed(windows[0], np.empty((0, self._entries)))
         known = smoothed.first + smoothed.columns.shape[0] * s
-        fresh = np.arange(known, self._window + self.width + 1, s)
+        fresh = np.arange(known, windows[-1] + self.width + 1, s)
+        skip = max(0, (windows[0] - smoothed.first) // s)
+        smoothed.columns = smoothed.columns[skip:]
+        smoothed.first += skip * s
         if fresh.size:
-            columns = self._columns(*self._states(fresh, half_width))
-            skip = max(0, (self._window - smoothed.first) // s)
-            smoothed.columns = np.concatenate((smoothed.columns[skip:], columns))
-            smoothed.first += skip * s
-        begin = (self._window - smoothed.first) // s
+            smoothed.columns = np.concatenate((smoothed.columns, self._columns(*self._states(fresh, half_width))))
         phi, phi_dot = self._phi[s]
-        values = smoothed.columns[begin : begin + phi.size]
         width = COPIES * (self.rows.size + self.model.layout.n_v)
-        weak = -(phi_dot @ values[:, :width] + phi @ values[:, width : 2 * width]).reshape(COPIES, -1)
-        b = phi @ values[:, 2 * width :] - weak[:, self.rows.size :]
-        end = grid + self._window + self.width + MARGIN
-        return Window(self._window // self.half_hop, end, weak[:, : self.rows.size], b, half_width)
+        out = []
+        for window in windows:
+            begin = (window - smoothed.first) // s
+            values = smoothed.columns[begin : begin + phi.size]
+            weak = -(phi_dot @ values[:, :width] + phi @ values[:, width : 2 * width]).reshape(COPIES, -1)
+            b = phi @ values[:, 2 * width :] - weak[:, self.rows.size :]
+            end = grid + window + self.width + MARGIN
+            out.append(Window(window // self.half_hop, end, weak[:, : self.rows.size], b, half_width))
+        return out
 
     @property
     def _entries(self) -> int:

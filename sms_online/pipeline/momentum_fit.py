@@ -17,7 +17,8 @@ from numpy.typing import NDArray
 from sms_online.model.base_parameters import BaseParameters
 from sms_online.model.model import Model
 from sms_online.pipeline.momentum_balance import COPIES, HOPS, INSTANTS, Instants, MomentumBalance, Window
-from sms_online.pipeline.row_noise import RowNoise, Sensitivity, Whitener, sensitivity
+from sms_online.pipeline.row_noise import RowNoise, Whitener
+from sms_online.pipeline.sensitivity import Sensitivities
 from sms_online.pipeline.sensor_noise import SensorNoise
 from sms_online.stream import Array
 
@@ -69,8 +70,8 @@ class MomentumFit:
         self.model = model
         self.base = base
         self._balance = balance
-        self._readings = readings
         self._solve = solve
+        self._sensitivities = Sensitivities(model, readings)
         self._noise = RowNoise(model.layout.theta_m, balance.span)
         self._whitener = Whitener(model.layout.n_v, COPIES * (base.n + 1))
         self.weights: Array | None = None  # β (n,) behind the weights
@@ -92,19 +93,13 @@ class MomentumFit:
         self._moving = 0
         self._first = 0  # number of the first instant kept
         self._x, self._v = np.empty((0, layout.n_x)), np.empty((0, layout.n_v))
-        self._told = np.empty((0, *self._told_shape))
+        self._sensitivities.forget(0)
         self._forget_rows()
 
     def _forget_rows(self) -> None:
         self._noise.begin_segment()
         self._whitener.begin_segment()
         self._bends = self._bends[:0]
-
-    @property
-    def _told_shape(self) -> tuple[int, int]:
-        """H, ∂Pπ/∂x, ∂Gπ/∂v, ∂Gπ/∂x and readings, side by side."""
-        n_v = self.model.layout.n_v
-        return n_v, 4 * n_v + self.model.layout.n_x
 
     def push(self, windows: list[Window], instants: list[Instants], noise: SensorNoise) -> list[WhiteRows]:
         """Rows of the windows that a push completed, and of those held back before."""
@@ -152,17 +147,15 @@ class MomentumFit:
             self._since = 0
 
     def _retell(self) -> None:
-        self._told = self._told[:0]
+        self._sensitivities.forget(self._first)
         self._forget_rows()
         self._tell()
 
     def _tell(self) -> None:
         """Sensitivities of the instants that have none yet."""
-        x, v = self._x[len(self._told) :], self._v[len(self._told) :]
-        if len(x):
-            s = sensitivity(self.model, self.base.physical_values(self._known_weights), x, v)
-            told = np.concatenate((s.P_v, s.P_x, s.G_v, s.G_x, self._readings(x)), axis=2)
-            self._told = np.concatenate((self._told, told))
+        fresh = self._sensitivities.next_instant - self._first
+        pi = self.base.physical_values(self._known_weights)
+        self._sensitivities.tell(pi, self._x[fresh:], self._v[fresh:])
 
     def _dense(self, window: Window) -> Array:
         """[Y b] (copies, n_v, n + 1)."""
@@ -173,9 +166,8 @@ class MomentumFit:
 
     def _white(self, window: Window, noise: SensorNoise) -> WhiteRows:
         n_v = self.model.layout.n_v
-        told = self._told[window.start - self._first : window.start - self._first + INSTANTS + 1]
-        parts = np.split(told, n_v * np.arange(1, 5), axis=2)
-        covariances = self._noise.covariance(Sensitivity(*parts[:4]), parts[4], noise.sensors, noise.torque)
+        sensitivity = self._sensitivities.window(window.start)
+        covariances = self._noise.covariance(sensitivity, noise.sensors, noise.torque)
         rows = self._dense(window)
         residual = rows[..., -1] - rows[..., :-1] @ self._known_weights
         # What noise does beyond first order, which nothing propagates: a sample of it for every row.
@@ -192,7 +184,9 @@ class MomentumFit:
         needed = self._held[0].start if self._held else windows[-1].start if windows else self._first
         drop = needed - self._first
         self._first = needed
-        self._x, self._v, self._told = self._x[drop:], self._v[drop:], self._told[drop:]
+        self._x, self._v = self._x[drop:], self._v[drop:]
+        if self.weights is not None:
+            self._sensitivities.drop(needed)
 
     def state(self) -> dict[str, Any]:
         """What `restore` needs to continue."""
@@ -203,15 +197,17 @@ class MomentumFit:
         }
         return {
             "weights": np.empty(0) if self.weights is None else self.weights, "since": self._since,
-            "moving": self._moving, "first": self._first, "x": self._x, "v": self._v, "told": self._told,
+            "moving": self._moving, "first": self._first, "x": self._x, "v": self._v,
             "bends": self._bends, **held, **self._noise.state(), **self._whitener.state(),
+            **self._sensitivities.state(),
         }  # fmt: skip
 
     def restore(self, state: Mapping[str, NDArray[Any]]) -> None:
         """Continue from a saved state."""
         self.weights = np.array(state["weights"]) if state["weights"].size else None
         self._since, self._moving, self._first = int(state["since"]), int(state["moving"]), int(state["first"])
-        self._x, self._v, self._told = (np.array(state[name]) for name in ("x", "v", "told"))
+        self._x, self._v = np.array(state["x"]), np.array(state["v"])
+        self._sensitivities.restore(state)
         self._bends = np.array(state["bends"])
         self._held = [
             Window(int(start), int(end), np.array(Y), np.array(b), int(half_width))

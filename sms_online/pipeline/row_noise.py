@@ -11,57 +11,22 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Mapping
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import scipy.linalg
 from numpy.typing import NDArray
 
-from sms_online.model.model import Model
 from sms_online.pipeline.momentum_balance import EXPONENT, HOPS, INSTANTS
+from sms_online.pipeline.sensitivity import Sensitivity
 from sms_online.pipeline.weak_form import test_function
 from sms_online.stream import Array
 
 # Steps of the integrals over c(t): two for each instant that the sensitivity is told at.
 STEPS = 2 * INSTANTS
 STEPS_A_HOP = STEPS // HOPS
-# Step of the differences that give sensitivities: 1e-8 of their size is lost to curvature, as much to rounding.
-DIFFERENCE = 1e-6
 # Share of a row's variance that is added to it alone, for the rounding of the factorisation.
 OWN_SHARE = 1e-7
-
-
-@dataclass(frozen=True)
-class Sensitivity:
-    """Derivatives of momentum and force at K instants, (K, n_v, n_v): H = ∂Pπ/∂v, ∂Pπ/∂x, ∂Gπ/∂v, ∂Gπ/∂x.
-
-    Columns are displacements in the order of the speeds.
-    """
-
-    P_v: Array
-    P_x: Array
-    G_v: Array
-    G_x: Array
-
-
-def sensitivity(model: Model, pi: Array, x: Array, v: Array) -> Sensitivity:
-    """Sensitivity at x (K, n_x), v (K, n_v) for parameters π (n_pi,)."""
-    K, n_v = v.shape
-
-    def momentum_and_force(x: Array, v: Array) -> Array:
-        P, G = model.momentum_columns(x, v)
-        return np.stack((P @ pi, G @ pi))
-
-    eye = np.eye(n_v)
-    here = momentum_and_force(x, v)[:, :, None]
-    x_n, v_n = np.repeat(x, n_v, axis=0), np.repeat(v, n_v, axis=0)
-    moved = DIFFERENCE * np.tile(eye, (K, 1))
-    by_x = momentum_and_force(x_n + model.position_rate(x_n, moved), v_n).reshape(2, K, n_v, n_v)
-    by_v = momentum_and_force(x_n, v_n + moved).reshape(2, K, n_v, n_v)
-    P_x, G_x = ((by_x - here) / DIFFERENCE).transpose(0, 1, 3, 2)
-    P_v, G_v = ((by_v - here) / DIFFERENCE).transpose(0, 1, 3, 2)
-    return Sensitivity(P_v, P_x, G_v, G_x)
 
 
 class RowNoise:
@@ -84,21 +49,18 @@ class RowNoise:
         """The next window shares no samples with those before."""
         self._before.clear()
 
-    def covariance(
-        self, window: Sensitivity, readings: Array, sensor_density: Array, torque_density: Array
-    ) -> list[Array]:
+    def covariance(self, window: Sensitivity, sensor_density: Array, torque_density: Array) -> list[Array]:
         """Covariances (n_v, n_v) with the windows before, oldest first, then the window's own; (N s)² and so on.
 
-        readings (K, n_v, sensors): displacement that one unit of each position sensor's noise makes. sensor_density
-        (sensors,): σ² T_s of each position sensor. torque_density (joints,): of n τ, (N m)² s.
+        sensor_density (sensors,): σ² T_s of each position sensor. torque_density (joints,): of n τ, (N m)² s.
         """
-        H_dot = np.gradient(window.P_v, self._instant, axis=0)
+        H_dot = np.gradient(window.H, self._instant, axis=0)
         G_v_dot = np.gradient(window.G_v, self._instant, axis=0)
-        weight = np.sqrt(self._step * sensor_density)
+        readings = window.readings * np.sqrt(self._step * sensor_density)
         c = np.zeros((STEPS + 1, *readings.shape[1:]))
-        sources = (window.P_v, H_dot + window.G_v - window.P_x, G_v_dot - window.G_x)
+        sources = (window.H, H_dot + window.G_v - window.P_x, G_v_dot - window.G_x)
         for phi, source in zip((self._phi_ddot, self._phi_dot, self._phi), sources, strict=True):
-            c += phi[:, None, None] * _halved((source @ readings) * weight)
+            c += phi[:, None, None] * _halved(source @ readings)
         c = np.ascontiguousarray(c.transpose(1, 0, 2))  # (n_v, STEPS + 1, sensors)
         out = []
         for k in range(len(self._before), -1, -1):
