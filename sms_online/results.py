@@ -50,7 +50,7 @@ def _standard_deviation(estimator: Estimator, estimate: Estimate) -> Array:
         std[known] = estimate.std[known]
         return std
     row_variance = estimate.rss / estimate.dof
-    if estimator.by_momentum and row_variance <= LARGEST_ROW_VARIANCE:
+    if estimator.by_momentum and row_variance <= LARGEST_ROW_VARIANCE and not estimator.misfit:
         std[known] = estimate.std[known]
         return std
     variance = np.diag(estimate.covariance)[known] * row_variance

@@ -105,6 +105,11 @@ class Estimator:
         return self.momentum is not None and (self.momentum.started or self.system.balance == "momentum")
 
     @property
+    def misfit(self) -> bool:
+        """Whether rows of the momentum balance leave clearly more than the sensors' noise."""
+        return self.momentum is not None and self.momentum.misfit
+
+    @property
     def half_width(self) -> int:
         """Half width M of the rates' filter, samples."""
         return self._rates.half_width

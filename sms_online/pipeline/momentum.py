@@ -29,8 +29,7 @@ class Momentum:
     """Balance, weights and tracker of one session.
 
     tracker: square-root RLS, fed with rows of unit variance. bias: what noise in the columns does to the estimate.
-    row_gram (n_v, n + 1, n + 1): of the rows [Y b] over their predicted standard deviations, by generalized speed;
-    windows: how many they are.
+    windows: how many it took.
     """
 
     def __init__(self, model: Model, base: BaseParameters, sensing: Sensing) -> None:
@@ -40,7 +39,6 @@ class Momentum:
         self.bias = NoiseBias(base.n)
         self.windows = 0
         self.dropped_windows = 0
-        self.row_gram = np.zeros((model.layout.n_v, base.n + 1, base.n + 1))
         self.sensor_noise: SensorNoise | None = None
         self._sample_rate = system.sample_rate
         self._estimate = NoiseEstimate(sensing, system.sample_rate)
@@ -55,6 +53,11 @@ class Momentum:
     def started(self) -> bool:
         """Whether weights are known and rows come."""
         return self._fit.weights is not None
+
+    @property
+    def misfit(self) -> bool:
+        """Whether rows leave clearly more than the sensors' noise."""
+        return bool(self._fit.misfit.any())
 
     def _solved(self) -> Array:
         """β where it is determined and its sign is certain; zero where it is not, for weights alone."""
@@ -116,15 +119,11 @@ class Momentum:
             M = rows.Y.shape[0]
             self.tracker.update(Rows(rows.Y[:, :-1], rows.Y[:, -1], np.ones(M), np.full(M, t)))
             self.bias.add(rows.Y, rows.noisy)
-            self.row_gram += rows.plain[:, :, None] * rows.plain[:, None, :]
             self.windows += 1
 
     def whitened(self, rows: list[int], beta: Array) -> float | None:
-        """rms of the residual of some generalized speeds' rows over its predicted standard deviation."""
-        if self.windows == 0:
-            return None
-        w = np.append(beta, -1.0)
-        return float(np.sqrt(max(0.0, w @ self.row_gram[rows].mean(axis=0) @ w) / self.windows))
+        """rms of the residual of some generalized speeds' rows over its predicted standard deviation, for β (n,)."""
+        return self._fit.whitened(rows, beta)
 
     def state(self) -> dict[str, dict[str, Any]]:
         """Everything that `restore` needs to continue to the same bits."""
@@ -134,7 +133,6 @@ class Momentum:
             "momentum": {
                 "windows": self.windows,
                 "dropped_windows": self.dropped_windows,
-                "row_gram": self.row_gram,
                 "segment": self._segment,
                 "start_time": self._start_time,
                 "noise_known": self.sensor_noise is not None,
@@ -163,7 +161,6 @@ class Momentum:
         """Continue from a saved state."""
         state = saved["momentum"]
         self.windows, self.dropped_windows = int(state["windows"]), int(state["dropped_windows"])
-        self.row_gram = np.array(state["row_gram"])
         self._segment, self._start_time = int(state["segment"]), float(state["start_time"])
         position, increment = (int(number) for number in state["random"])
         generator = dict(self._random.bit_generator.state)

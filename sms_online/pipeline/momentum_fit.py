@@ -3,6 +3,10 @@
 Weights follow from the sensors' noise and the parameters, never from residuals: those collapse where noise is high. The
 parameters come from the fit itself: the first windows that move are held back, fitted without weights and then with
 them, and from then on every second takes the estimate so far. A start that is 70 % off gives the same answer.
+
+Where rows leave clearly more than the sensors' noise, the model lacks something, and neighbouring rows that share noise
+almost fully must not be subtracted from each other as if that were all: what is left over there counts as an error of
+each row's own.
 """
 
 from __future__ import annotations
@@ -22,18 +26,21 @@ from sms_online.pipeline.sensitivity import Sensitivities
 from sms_online.pipeline.sensor_noise import SensorNoise
 from sms_online.stream import Array
 
-# Windows that move before weights are made: four windows side by side.
-FIRST_WINDOWS = 40
-# Fewer do where a gap or the end of the session leaves no more.
-LEAST_WINDOWS = 10
-# Windows held back at most; the oldest go, for an arm that rests tells nothing.
-HELD_BACK = 400
+# Motion before weights are made, s: at the usual width, four windows side by side.
+FIRST_MOTION = 1.6
+# Less does where a gap or the end of the session leaves no more.
+LEAST_MOTION = 0.4
+# What is held back at most, s; the oldest goes, for an arm that rests tells nothing.
+HELD_BACK = 16.0
 # Weighted fits of the windows held back before their rows are handed on.
 PASSES = 2
 # A window moves when a coordinate spans this many σ in it; noise alone spans 6.
 MOTION = 20.0
-# Windows from one renewal of the weights to the next: a second at the usual width.
-RENEWED = 25
+# Mean square of a coordinate's residual over its predicted variance beyond which the model lacks something there: a
+# second of windows scatters by 20 %, the noise behind the prediction by 10 %.
+LARGEST_RATIO = 2.0
+# Time from one renewal of the weights to the next, s.
+RENEWED = 1.0
 # Singular values below this share of the largest, of columns scaled to unit length, are not solved for.
 RANK_TOLERANCE = 1e-10
 
@@ -42,13 +49,12 @@ RANK_TOLERANCE = 1e-10
 class WhiteRows:
     """Rows of one window, n_v of them: Y (n_v, n + 1) with b as its last column, independent, errors of unit variance.
 
-    noisy (2, n_v, n + 1): the same with synthetic noise added and subtracted. plain: the rows divided by their own
-    standard deviations alone, to tell residuals by coordinate. end: grid index of the window's last sample.
+    noisy (2, n_v, n + 1): the same with synthetic noise added and subtracted. end: grid index of the window's last
+    sample.
     """
 
     Y: Array
     noisy: Array
-    plain: Array
     end: int
 
 
@@ -71,7 +77,7 @@ class MomentumFit:
         self.base = base
         self._balance = balance
         self._solve = solve
-        self._sensitivities = Sensitivities(model, readings)
+        self._sensitivities = Sensitivities(model, readings, balance.span / INSTANTS)
         self._noise = RowNoise(model.layout.theta_m, balance.span)
         self._whitener = Whitener(model.layout.n_v, COPIES * (base.n + 1))
         self.weights: Array | None = None  # β (n,) behind the weights
@@ -79,11 +85,15 @@ class MomentumFit:
         self._moving = 0
         self._held: list[Window] = []
         self._bends = np.empty((0, model.layout.n_v))
+        # Gram matrices of rows [Y b] over their own standard deviations, by generalized speed, and how many windows.
+        self.plain_gram = np.zeros((model.layout.n_v, base.n + 1, base.n + 1))
+        self.plain_windows = 0
+        self.misfit = np.zeros(model.layout.n_v)  # excess of the mean square of such rows' residual over one
         self._begin_segment()
 
     def end_segment(self, noise: SensorNoise) -> list[WhiteRows]:
         """Rows of the windows held back, if they tell enough for weights; the next ones share no samples with them."""
-        out = self.flush(noise) if self._held and self._moving >= LEAST_WINDOWS else []
+        out = self.flush(noise) if self._held and self._moving >= self._count(LEAST_MOTION) else []
         self._begin_segment()
         return out
 
@@ -113,8 +123,8 @@ class MomentumFit:
         else:
             self._held += windows
             self._moving += sum(self._moves(window, noise) for window in windows)
-            out = self.flush(noise) if self._moving >= FIRST_WINDOWS else []
-            self._held = self._held[-HELD_BACK:]
+            out = self.flush(noise) if self._moving >= self._count(FIRST_MOTION) else []
+            self._held = self._held[-self._count(HELD_BACK) :]
         self._forget_instants(windows)
         return out
 
@@ -125,15 +135,28 @@ class MomentumFit:
             self._retell()
             white = [self._white(window, noise).Y for window in self._held]
             self.weights = _least_squares(np.concatenate(white))
+            self._judge()
         self._retell()
         out = [self._white(window, noise) for window in self._held]
         self._held.clear()
         return out
 
+    def _count(self, seconds: float) -> int:
+        """Windows that begin in so many seconds."""
+        return max(1, round(seconds * HOPS / self._balance.span))
+
     @property
     def _known_weights(self) -> Array:
         assert self.weights is not None
         return self.weights
+
+    def whitened(self, rows: list[int], beta: Array) -> float | None:
+        """rms of the residual of some generalized speeds' rows over its predicted standard deviation, for β (n,)."""
+        if self.plain_windows == 0:
+            return None
+        w = np.append(beta, -1.0)
+        mean_square = w @ self.plain_gram[rows].mean(axis=0) @ w / self.plain_windows
+        return float(np.sqrt(max(0.0, mean_square)))
 
     def _moves(self, window: Window, noise: SensorNoise) -> bool:
         inside = slice(window.start - self._first, window.start - self._first + INSTANTS + 1)
@@ -141,12 +164,22 @@ class MomentumFit:
 
     def _renew(self) -> None:
         """Take the estimate so far for the weights of the windows to come, once a second."""
-        if self._since >= RENEWED:
+        if self._since >= self._count(RENEWED):
             beta = self._solve()
             self.weights = np.where(np.isnan(beta), self._known_weights, beta)
+            self._judge()
             self._since = 0
 
+    def _judge(self) -> None:
+        """What rows leave beyond their predicted variance so far, where that is no accident."""
+        w = np.append(self._known_weights, -1.0)
+        ratio = np.einsum("i,vij,j->v", w, self.plain_gram, w) / self.plain_windows
+        self.misfit = np.where(ratio > LARGEST_RATIO, ratio - 1.0, 0.0)
+
     def _retell(self) -> None:
+        """Work off the windows held back from the first one on."""
+        self.plain_gram[:] = 0.0
+        self.plain_windows = 0
         self._sensitivities.forget(self._first)
         self._forget_rows()
         self._tell()
@@ -174,10 +207,14 @@ class MomentumFit:
         bend = 0.5 * (residual[1] + residual[2]) - residual[0]
         self._bends = np.concatenate((self._bends[1 - HOPS :], bend[None]))
         covariances[-1][np.diag_indices(n_v)] += np.mean(self._bends**2, axis=0)
-        plain = rows[0] / np.sqrt(np.diag(covariances[-1]))[:, None]
+        variance = np.diag(covariances[-1]).copy()
+        plain = rows[0] / np.sqrt(variance)[:, None]
+        self.plain_gram += plain[:, :, None] * plain[:, None, :]
+        self.plain_windows += 1
+        covariances[-1][np.diag_indices(n_v)] += self.misfit * variance
         side_by_side = rows.swapaxes(0, 1).reshape(n_v, -1)
         white = self._whitener.push(covariances, side_by_side).reshape(n_v, COPIES, -1).swapaxes(0, 1)
-        return WhiteRows(white[0], white[1:], plain, window.end)
+        return WhiteRows(white[0], white[1:], window.end)
 
     def _forget_instants(self, windows: list[Window]) -> None:
         """Drop the states that no window to come asks for."""
@@ -198,7 +235,8 @@ class MomentumFit:
         return {
             "weights": np.empty(0) if self.weights is None else self.weights, "since": self._since,
             "moving": self._moving, "first": self._first, "x": self._x, "v": self._v,
-            "bends": self._bends, **held, **self._noise.state(), **self._whitener.state(),
+            "bends": self._bends, "misfit": self.misfit, "plain_gram": self.plain_gram,
+            "plain_windows": self.plain_windows, **held, **self._noise.state(), **self._whitener.state(),
             **self._sensitivities.state(),
         }  # fmt: skip
 
@@ -208,7 +246,8 @@ class MomentumFit:
         self._since, self._moving, self._first = int(state["since"]), int(state["moving"]), int(state["first"])
         self._x, self._v = np.array(state["x"]), np.array(state["v"])
         self._sensitivities.restore(state)
-        self._bends = np.array(state["bends"])
+        self._bends, self.misfit = np.array(state["bends"]), np.array(state["misfit"])
+        self.plain_gram, self.plain_windows = np.array(state["plain_gram"]), int(state["plain_windows"])
         self._held = [
             Window(int(start), int(end), np.array(Y), np.array(b), int(half_width))
             for (start, end, half_width), Y, b in zip(

@@ -18,7 +18,7 @@ import scipy.linalg
 from numpy.typing import NDArray
 
 from sms_online.pipeline.momentum_balance import EXPONENT, HOPS, INSTANTS
-from sms_online.pipeline.sensitivity import Sensitivity
+from sms_online.pipeline.sensitivity import SPARSE, Sensitivity, nodes
 from sms_online.pipeline.weak_form import test_function
 from sms_online.stream import Array
 
@@ -37,13 +37,23 @@ class RowNoise:
 
     def __init__(self, joint_rows: tuple[int, ...], span: float) -> None:
         self._joint_rows = list(joint_rows)
-        self._instant = span / INSTANTS
         self._step = span / STEPS
         self._phi, self._phi_dot, self._phi_ddot = test_function(STEPS, span, EXPONENT)
+        self._weights = [self._told(offset, span) for offset in range(SPARSE)]
         # ∫ φ(t) φ(t + k hops) dt.
         shifted = [self._phi[: STEPS + 1 - k * STEPS_A_HOP] @ self._phi[k * STEPS_A_HOP :] for k in range(HOPS)]
         self._overlap = self._step * np.array(shifted)
         self._before: deque[Array] = deque(maxlen=HOPS - 1)
+
+    def _told(self, offset: int, span: float) -> Array:
+        """Weights (STEPS + 1, ·) that make c out of H, Ḣ, ∂Pπ/∂x, ∂Gπ/∂v and ∂Gπ/∂x where they are told."""
+        steps, instants = np.arange(STEPS + 1.0), np.arange(0.0, STEPS + 1.0, STEPS // INSTANTS)
+        dense = _interpolation(steps, instants)
+        sparse = _interpolation(steps, instants[nodes(offset)])
+        slope = dense @ np.gradient(sparse[:: STEPS // INSTANTS], span / INSTANTS, axis=0)
+        phi, phi_dot, phi_ddot = self._phi[:, None], self._phi_dot[:, None], self._phi_ddot[:, None]
+        of_force = (-phi_dot * sparse, phi_dot * sparse + phi * slope, -phi * sparse)
+        return np.concatenate((phi_ddot * dense, phi_dot * dense, *of_force), axis=1)
 
     def begin_segment(self) -> None:
         """The next window shares no samples with those before."""
@@ -54,14 +64,12 @@ class RowNoise:
 
         sensor_density (sensors,): σ² T_s of each position sensor. torque_density (joints,): of n τ, (N m)² s.
         """
-        H_dot = np.gradient(window.H, self._instant, axis=0)
-        G_v_dot = np.gradient(window.G_v, self._instant, axis=0)
-        readings = window.readings * np.sqrt(self._step * sensor_density)
-        c = np.zeros((STEPS + 1, *readings.shape[1:]))
-        sources = (window.H, H_dot + window.G_v - window.P_x, G_v_dot - window.G_x)
-        for phi, source in zip((self._phi_ddot, self._phi_dot, self._phi), sources, strict=True):
-            c += phi[:, None, None] * _halved(source @ readings)
-        c = np.ascontiguousarray(c.transpose(1, 0, 2))  # (n_v, STEPS + 1, sensors)
+        parts = (window.H, window.H_dot, window.P_x, window.G_v, window.G_x)
+        n_v, sensors = window.H.shape[1:]
+        stacked = np.concatenate(parts).reshape(-1, n_v * sensors)
+        c = (self._weights[window.offset] @ stacked).reshape(STEPS + 1, n_v, sensors)
+        c = (c * np.sqrt(self._step * sensor_density)).transpose(1, 0, 2)  # (n_v, STEPS + 1, sensors)
+        c = np.ascontiguousarray(c)
         out = []
         for k in range(len(self._before), -1, -1):
             other = c if k == 0 else self._before[-k]
@@ -82,12 +90,9 @@ class RowNoise:
         self._before = deque(np.array(state["before"]), maxlen=HOPS - 1)
 
 
-def _halved(samples: Array) -> Array:
-    """Samples (K, …) with the means of neighbours between them, (2K - 1, …)."""
-    out = np.empty((2 * samples.shape[0] - 1, *samples.shape[1:]))
-    out[::2] = samples
-    out[1::2] = 0.5 * (samples[1:] + samples[:-1])
-    return out
+def _interpolation(at: Array, nodes: Array) -> Array:
+    """Weights (at, nodes) of linear interpolation, constant beyond the ends."""
+    return np.stack([np.interp(at, nodes, unit) for unit in np.eye(nodes.size)], axis=1)
 
 
 class Whitener:

@@ -22,17 +22,18 @@ SPARSE = 4
 
 @dataclass(frozen=True)
 class Sensitivity:
-    """At the INSTANTS + 1 instants of a window, (·, n_v, n_v): H = ∂Pπ/∂v, ∂Pπ/∂x, ∂Gπ/∂v, ∂Gπ/∂x.
+    """Over a window of INSTANTS + 1 instants, for displacements that one unit of each position sensor's noise makes.
 
-    Columns are displacements in the order of the speeds. readings (·, n_v, sensors): displacement that one unit of each
-    position sensor's noise makes.
+    H, H_dot (INSTANTS + 1, n_v, sensors): ∂Pπ/∂v and Ḣ. P_x, G_v, G_x (nodes, n_v, sensors): ∂Pπ/∂x, ∂Gπ/∂v, ∂Gπ/∂x at
+    every fourth instant, the first of which is `offset` instants into the window.
     """
 
     H: Array
+    H_dot: Array
     P_x: Array
     G_v: Array
     G_x: Array
-    readings: Array
+    offset: int
 
 
 def derivatives(dynamics: Dynamics, x: Array, v: Array) -> Array:
@@ -48,15 +49,23 @@ def derivatives(dynamics: Dynamics, x: Array, v: Array) -> Array:
     return np.asarray(out.swapaxes(1, 2))
 
 
+def nodes(offset: int) -> NDArray[np.int64]:
+    """Instants of a window that derivatives of the force are told at."""
+    return np.arange(offset, INSTANTS + 1, SPARSE)
+
+
 class Sensitivities:
     """Sensitivity at the instants of a segment, as far as windows still need them.
 
-    readings: x (K, n_x) to displacements (K, n_v, sensors) that unit noise of each position sensor makes.
+    readings: x (K, n_x) to displacements (K, n_v, sensors) that unit noise of each position sensor makes. half_hop: s
+    between instants.
     """
 
-    def __init__(self, model: Model, readings: Callable[[Array], Array]) -> None:
+    def __init__(self, model: Model, readings: Callable[[Array], Array], half_hop: float) -> None:
         self.model = model
         self._readings = readings
+        # Central differences, one-sided at the ends, for a matrix that changes in time, per half hop.
+        self._slope: Array = np.asarray(np.gradient(np.eye(INSTANTS + 1), axis=0)) / half_hop
         self.forget(0)
 
     def forget(self, next_instant: int) -> None:
@@ -91,12 +100,12 @@ class Sensitivities:
         n_v = self.model.layout.n_v
         inside = slice(start - self._first, start - self._first + INSTANTS + 1)
         H, readings = self._dense[inside, :, :n_v], self._dense[inside, :, n_v:]
-        told = (self._numbers >= start) & (self._numbers <= start + INSTANTS)
-        weights = _interpolation(self._numbers[told] - start)
-        values = self._derivatives[told]
-        spread = (weights @ values.reshape(len(values), -1)).reshape(INSTANTS + 1, *values.shape[1:])
-        P_x, G_v, G_x = (spread[:, :, k * n_v : (k + 1) * n_v] for k in range(3))
-        return Sensitivity(H, P_x, G_v, G_x, readings)
+        H_dot = (self._slope @ H.reshape(INSTANTS + 1, -1)).reshape(H.shape)
+        offset = -start % SPARSE
+        first = int(np.searchsorted(self._numbers, start))
+        told = self._derivatives[first : first + nodes(offset).size]
+        P_x, G_v, G_x = (told[:, :, k * n_v : (k + 1) * n_v] @ readings[nodes(offset)] for k in range(3))
+        return Sensitivity(H @ readings, H_dot @ readings, P_x, G_v, G_x, offset)
 
     def drop(self, before: int) -> None:
         """Forget instants with smaller numbers."""
@@ -116,9 +125,3 @@ class Sensitivities:
         """Continue from a saved state."""
         self._first, self._dense = int(state["told_first"]), np.array(state["told_dense"])
         self._numbers, self._derivatives = np.array(state["told_numbers"]), np.array(state["told_derivatives"])
-
-
-def _interpolation(nodes: NDArray[np.int64]) -> Array:
-    """Weights (INSTANTS + 1, nodes) of linear interpolation, constant beyond the ends."""
-    grid = np.arange(INSTANTS + 1.0)
-    return np.stack([np.interp(grid, nodes, unit) for unit in np.eye(len(nodes))], axis=1)
