@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sms_online.description.parse import describe
+from sms_online.physical import PhysicalSet, Projection
 from sms_online.pipeline.estimator import Estimator
 from sms_online.stream import Array
 from sms_online.trackers.interface import Estimate
@@ -128,13 +129,35 @@ def _pull_warning(estimator: Estimator) -> list[str]:
     return [f"sensor noise in the columns pulls {', '.join(names)} by more than the error bar"]
 
 
+def projected(estimator: Estimator, estimate: Estimate, std: Array) -> Projection:
+    """The parameters of real bodies that are nearest to the estimate, by its covariance with deviations std (n,)."""
+    known = np.flatnonzero(np.isfinite(std))
+    stated = estimate.std[known]
+    scale = np.divide(std[known], stated, out=np.ones_like(stated), where=stated > 0.0)
+    covariance = np.diag(np.full(std.size, np.inf))
+    covariance[np.ix_(known, known)] = estimate.covariance[np.ix_(known, known)] * np.outer(scale, scale)
+    return PhysicalSet(estimator.model, estimator.base).project(estimate.pi, covariance)
+
+
+def _projection_warning(projection: Projection) -> list[str]:
+    if projection.distance == 0.0:
+        return []
+    distance, names = f"{projection.distance:.2g} standard deviations", ", ".join(projection.active)
+    return [f"no real bodies have these parameters, because of {names}: the nearest that some have are {distance} away"]
+
+
 def results_document(
-    estimator: Estimator, throughput: float, warnings: list[str], truth: dict[str, float] | None = None
+    estimator: Estimator,
+    throughput: float,
+    warnings: list[str],
+    truth: dict[str, float] | None = None,
+    bound: Array | None = None,
 ) -> dict[str, Any]:
     """results.json of a finished session.
 
     throughput: samples/s. truth: true values of physical parameters by name, of a simulated capture; they enter this
-    report alone. Numbers that do not exist (the std of an undetermined parameter) are None.
+    report alone. bound (n,): Cramér-Rao bound of each base parameter, where it has been computed. Numbers that do not
+    exist (the std of an undetermined parameter) are None.
     """
     estimate = estimator.estimate()
     base = estimator.base
@@ -143,6 +166,7 @@ def results_document(
         true = base.values(np.array([truth[p.name] for p in base.physical]))
     deviations = _standard_deviation(estimator, estimate)
     flags = _identifiable(estimate, deviations)
+    projection = projected(estimator, estimate, deviations)
     parameters = []
     for k, p in enumerate(base.parameters):
         value, std = float(estimate.pi[k]), float(deviations[k])
@@ -158,6 +182,8 @@ def results_document(
                 "upper95": value + NORMAL_95 * std if finite else None,
                 "true": None if true is None else float(true[k]),
                 "identifiable": bool(flags[k]),
+                "projected": None if projection.distance == 0.0 else float(projection.beta[k]),
+                "bound": None if bound is None or not np.isfinite(bound[k]) else float(bound[k]),
             }
         )
     residual = _residuals(estimator, estimate.pi)
@@ -168,8 +194,14 @@ def results_document(
         "duration_s": estimator.duration,
         "parameters": parameters,
         "residual": residual,
+        "physical": {"distance_std": projection.distance, "active": list(projection.active)},
         "condition_number": estimate.condition_number if np.isfinite(estimate.condition_number) else None,
         "throughput_samples_per_s": throughput,
         "lost_samples": estimator.counters.lost_samples,
-        "warnings": [*warnings, *doubts(parameters, residual), *_pull_warning(estimator)],
+        "warnings": [
+            *warnings,
+            *doubts(parameters, residual),
+            *_pull_warning(estimator),
+            *_projection_warning(projection),
+        ],
     }

@@ -197,7 +197,7 @@ class Estimator:
     def estimate(self) -> Estimate:
         """The base parameters as they are known now."""
         if self.momentum is not None and self.by_momentum:
-            return self.momentum.tracker.estimate()
+            return self.momentum.estimate()
         return self.energy_tracker.estimate()
 
     def state(self) -> SessionState:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -17,11 +18,13 @@ from sms_online.pipeline.sensing import Sensing
 from sms_online.pipeline.sensor_noise import NoiseEstimate, SensorNoise
 from sms_online.pipeline.synchronise import GridSamples
 from sms_online.stream import Array
-from sms_online.trackers.interface import Rows, Tracker
+from sms_online.trackers.interface import Estimate, Rows, Tracker
 from sms_online.trackers.square_root import RecursiveLeastSquares
 
 # The synthetic noise is the same in every session, so that the same samples give the same bits.
 SEED = 6
+# Time from one estimate of the sensors' noise to the next, s.
+NOISE_RENEWED = 1.0
 NOISE_ARRAYS = ("sensors", "torque", "coordinates", "grid")
 
 
@@ -47,6 +50,7 @@ class Momentum:
         self._random = np.random.default_rng(SEED)
         self._segment = -1
         self._start_time = np.nan
+        self._noise_told = 0  # grid index at which the noise was estimated last
         self._waiting: list[GridSamples] = []  # until the noise is known
 
     @property
@@ -59,23 +63,30 @@ class Momentum:
         """Whether rows leave clearly more than the sensors' noise."""
         return bool(self._fit.misfit.any())
 
-    def _solved(self) -> Array:
-        """β where it is determined and its sign is certain; zero where it is not, for weights alone."""
+    def estimate(self) -> Estimate:
+        """The base parameters as known now, free of what noise in the columns does; with a prior, as the rows say."""
         estimate = self.tracker.estimate()
-        certain = estimate.determined & (np.abs(estimate.pi) > np.where(estimate.determined, estimate.std, 0.0))
-        return np.where(estimate.determined, np.where(certain, estimate.pi, 0.0), np.nan)
+        if estimate.scale is not None:
+            return estimate
+        return replace(estimate, pi=estimate.pi + self.bias.shift(estimate.determined))
+
+    def _solved(self) -> Array:
+        """β where the rows determine it, else NaN."""
+        estimate = self.estimate()
+        return np.where(estimate.determined, estimate.pi, np.nan)
 
     def observe(self, values: Array) -> None:
         """Take the channels' own samples (B, channels), NaN where there is none, to tell their noise."""
-        if not self.started:
-            self._estimate.push(values)
+        self._estimate.push(values)
 
     def push(self, piece: GridSamples, start_time: float, periods: Array) -> None:
         """Take grid samples of the channels; start_time: s of grid index 0; periods (channels,): sample periods, s."""
         self._start_time = start_time
         self._waiting.append(piece)
-        if not self.started and self._estimate.ready:
+        due = self._noise_told + round(NOISE_RENEWED * self._sample_rate)
+        if self._estimate.ready and (self.sensor_noise is None or piece.index[-1] >= due):
             self.sensor_noise = self._estimate.noise(periods)
+            self._noise_told = int(piece.index[-1])
         if self.sensor_noise is None:
             return
         waiting, self._waiting = self._waiting, []
@@ -135,6 +146,7 @@ class Momentum:
                 "dropped_windows": self.dropped_windows,
                 "segment": self._segment,
                 "start_time": self._start_time,
+                "noise_told": self._noise_told,
                 "noise_known": self.sensor_noise is not None,
                 "random": np.array([str(random["state"]), str(random["inc"])]),
                 "waiting_index": np.concatenate([np.empty(0, dtype=np.int64), *(p.index for p in waiting)]),
@@ -161,6 +173,7 @@ class Momentum:
         """Continue from a saved state."""
         state = saved["momentum"]
         self.windows, self.dropped_windows = int(state["windows"]), int(state["dropped_windows"])
+        self._noise_told = int(state["noise_told"])
         self._segment, self._start_time = int(state["segment"]), float(state["start_time"])
         position, increment = (int(number) for number in state["random"])
         generator = dict(self._random.bit_generator.state)

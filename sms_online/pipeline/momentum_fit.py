@@ -5,8 +5,8 @@ parameters come from the fit itself: the first windows that move are held back, 
 them, and from then on every second takes the estimate so far. A start that is 70 % off gives the same answer.
 
 Where rows leave clearly more than the sensors' noise, the model lacks something, and neighbouring rows that share noise
-almost fully must not be subtracted from each other as if that were all: what is left over there counts as an error of
-each row's own.
+almost fully must not be subtracted from each other as if that were all: what is left over counts as an error of each
+row's own.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from sms_online.model.model import Model
 from sms_online.pipeline.momentum_balance import COPIES, HOPS, INSTANTS, Instants, MomentumBalance, Window
 from sms_online.pipeline.row_noise import RowNoise, Whitener
 from sms_online.pipeline.sensitivity import Sensitivities
-from sms_online.pipeline.sensor_noise import SensorNoise
+from sms_online.pipeline.sensor_noise import FINEST, SensorNoise
 from sms_online.stream import Array
 
 # Motion before weights are made, s: at the usual width, four windows side by side.
@@ -39,6 +39,8 @@ MOTION = 20.0
 # Mean square of a coordinate's residual over its predicted variance beyond which the model lacks something there: a
 # second of windows scatters by 20 %, the noise behind the prediction by 10 %.
 LARGEST_RATIO = 2.0
+# Share of a joint's torque that a fit may leave for its weights to be used.
+LARGEST_UNEXPLAINED = 0.5
 # Time from one renewal of the weights to the next, s.
 RENEWED = 1.0
 # Singular values below this share of the largest, of columns scaled to unit length, are not solved for.
@@ -85,10 +87,11 @@ class MomentumFit:
         self._moving = 0
         self._held: list[Window] = []
         self._bends = np.empty((0, model.layout.n_v))
+        self._largest = np.zeros(model.layout.n_v)  # largest sum of a row's terms
         # Gram matrices of rows [Y b] over their own standard deviations, by generalized speed, and how many windows.
         self.plain_gram = np.zeros((model.layout.n_v, base.n + 1, base.n + 1))
         self.plain_windows = 0
-        self.misfit = np.zeros(model.layout.n_v)  # excess of the mean square of such rows' residual over one
+        self.misfit = np.zeros(model.layout.n_v)  # excess over one of the mean square of such rows' residual
         self._begin_segment()
 
     def end_segment(self, noise: SensorNoise) -> list[WhiteRows]:
@@ -129,9 +132,17 @@ class MomentumFit:
         return out
 
     def flush(self, noise: SensorNoise) -> list[WhiteRows]:
-        """Fit the windows held back, without weights and then with those of the fit before, and return their rows."""
+        """Fit the windows held back, without weights and then with those of the fit before, and return their rows.
+
+        Nothing where the model does not explain the torques: then the rows without a torque, which are homogeneous in
+        π, would win, and weights that follow π would shrink it to zero. More motion is waited for.
+        """
+        self._moving = 0
         self.weights = _least_squares(np.concatenate([self._dense(window)[0] for window in self._held]))
         for _ in range(PASSES):
+            if not self._explains_torques():
+                self.weights = None
+                return []
             self._retell()
             white = [self._white(window, noise).Y for window in self._held]
             self.weights = _least_squares(np.concatenate(white))
@@ -141,14 +152,21 @@ class MomentumFit:
         self._held.clear()
         return out
 
-    def _count(self, seconds: float) -> int:
-        """Windows that begin in so many seconds."""
-        return max(1, round(seconds * HOPS / self._balance.span))
+    def _explains_torques(self) -> bool:
+        """Whether the fit so far explains every joint's torque over the windows held back, by and large."""
+        joints = list(self.model.layout.theta_m)
+        rows = np.stack([self._dense(window)[0, joints] for window in self._held])
+        left = rows[..., -1] - rows[..., :-1] @ self._known_weights
+        return bool(np.all(np.linalg.norm(left, axis=0) <= LARGEST_UNEXPLAINED * np.linalg.norm(rows[..., -1], axis=0)))
 
     @property
     def _known_weights(self) -> Array:
         assert self.weights is not None
         return self.weights
+
+    def _count(self, seconds: float) -> int:
+        """Windows that begin in so many seconds."""
+        return max(1, round(seconds * HOPS / self._balance.span))
 
     def whitened(self, rows: list[int], beta: Array) -> float | None:
         """rms of the residual of some generalized speeds' rows over its predicted standard deviation, for β (n,)."""
@@ -206,7 +224,11 @@ class MomentumFit:
         # What noise does beyond first order, which nothing propagates: a sample of it for every row.
         bend = 0.5 * (residual[1] + residual[2]) - residual[0]
         self._bends = np.concatenate((self._bends[1 - HOPS :], bend[None]))
-        covariances[-1][np.diag_indices(n_v)] += np.mean(self._bends**2, axis=0)
+        # A row whose coordinate has no noise, as far as the weights know, is exact to rounding only.
+        size = np.abs(rows[0, :, :-1]) @ np.abs(self._known_weights) + np.abs(rows[0, :, -1])
+        self._largest = np.maximum(self._largest, size)
+        rounding = (FINEST * self._largest) ** 2 + np.finfo(np.float64).tiny
+        covariances[-1][np.diag_indices(n_v)] += np.mean(self._bends**2, axis=0) + rounding
         variance = np.diag(covariances[-1]).copy()
         plain = rows[0] / np.sqrt(variance)[:, None]
         self.plain_gram += plain[:, :, None] * plain[:, None, :]
@@ -235,7 +257,7 @@ class MomentumFit:
         return {
             "weights": np.empty(0) if self.weights is None else self.weights, "since": self._since,
             "moving": self._moving, "first": self._first, "x": self._x, "v": self._v,
-            "bends": self._bends, "misfit": self.misfit, "plain_gram": self.plain_gram,
+            "bends": self._bends, "largest": self._largest, "misfit": self.misfit, "plain_gram": self.plain_gram,
             "plain_windows": self.plain_windows, **held, **self._noise.state(), **self._whitener.state(),
             **self._sensitivities.state(),
         }  # fmt: skip
@@ -246,6 +268,7 @@ class MomentumFit:
         self._since, self._moving, self._first = int(state["since"]), int(state["moving"]), int(state["first"])
         self._x, self._v = np.array(state["x"]), np.array(state["v"])
         self._sensitivities.restore(state)
+        self._largest = np.array(state["largest"])
         self._bends, self.misfit = np.array(state["bends"]), np.array(state["misfit"])
         self.plain_gram, self.plain_windows = np.array(state["plain_gram"]), int(state["plain_windows"])
         self._held = [

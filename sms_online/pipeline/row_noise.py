@@ -44,6 +44,7 @@ class RowNoise:
         shifted = [self._phi[: STEPS + 1 - k * STEPS_A_HOP] @ self._phi[k * STEPS_A_HOP :] for k in range(HOPS)]
         self._overlap = self._step * np.array(shifted)
         self._before: deque[Array] = deque(maxlen=HOPS - 1)
+        self._torque_before: deque[Array] = deque(maxlen=HOPS - 1)
 
     def _told(self, offset: int, span: float) -> Array:
         """Weights (STEPS + 1, ·) that make c out of H, Ḣ, ∂Pπ/∂x, ∂Gπ/∂v and ∂Gπ/∂x where they are told."""
@@ -58,6 +59,7 @@ class RowNoise:
     def begin_segment(self) -> None:
         """The next window shares no samples with those before."""
         self._before.clear()
+        self._torque_before.clear()
 
     def covariance(self, window: Sensitivity, sensor_density: Array, torque_density: Array) -> list[Array]:
         """Covariances (n_v, n_v) with the windows before, oldest first, then the window's own; (N s)² and so on.
@@ -76,18 +78,21 @@ class RowNoise:
             shift = k * STEPS_A_HOP
             ours, theirs = c[:, : STEPS + 1 - shift], other[:, shift:]
             block = ours.reshape(len(c), -1) @ theirs.reshape(len(c), -1).T
-            block[self._joint_rows, self._joint_rows] += self._overlap[k] * torque_density
+            torque = np.sqrt(torque_density * (torque_density if k == 0 else self._torque_before[-k]))
+            block[self._joint_rows, self._joint_rows] += self._overlap[k] * torque
             out.append(block)
         self._before.append(c)
+        self._torque_before.append(torque_density)
         return out
 
     def state(self) -> dict[str, Array]:
         """What `restore` needs to continue."""
-        return {"before": np.array(self._before)}
+        return {"before": np.array(self._before), "torque_before": np.array(self._torque_before)}
 
     def restore(self, state: Mapping[str, NDArray[Any]]) -> None:
         """Continue from a saved state."""
         self._before = deque(np.array(state["before"]), maxlen=HOPS - 1)
+        self._torque_before = deque(np.array(state["torque_before"]), maxlen=HOPS - 1)
 
 
 def _interpolation(at: Array, nodes: Array) -> Array:

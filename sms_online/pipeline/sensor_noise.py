@@ -13,8 +13,8 @@ from sms_online.pipeline.noise import noise_std
 from sms_online.pipeline.sensing import Sensing
 from sms_online.stream import Array
 
-# A channel's samples that an estimate takes: 5 % scatter.
-SAMPLES = 1000
+# A channel's last samples that an estimate takes: 2 % scatter.
+SAMPLES = 4000
 # Fewer give no estimate.
 FEWEST_SAMPLES = 100
 # No sensor is better than this share of its largest reading: what is left is rounding, and interpolation between the
