@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sms_online.description.parse import describe
+from sms_online.physical import PhysicalSet, Projection
 from sms_online.pipeline.estimator import Estimator
 from sms_online.stream import Array
 from sms_online.trackers.interface import Estimate
@@ -19,6 +20,10 @@ NORMAL_95 = 1.959963984540054
 LARGEST_RELATIVE_STD = 1.0 / 3.0
 # A joint whose unexplained torque reaches this share of the measured one lacks an effect, whatever the error bars say.
 LARGEST_RESIDUAL = 0.5
+# Mean square of rows over their predicted variance that noise alone may leave: the noise itself is estimated to 5 %.
+LARGEST_ROW_VARIANCE = 1.2
+# Noise in the columns matters where it pulls an estimate by more than this many standard deviations.
+LARGEST_PULL = 1.0
 # Quantities that cannot be negative, as the ends of names.
 POSITIVE = ("mass", "mass_per_length", "stiffness", "damping", "rotor_inertia", "rigidity", "rigidity_y", "rigidity_z")
 
@@ -26,10 +31,13 @@ POSITIVE = ("mass", "mass_per_length", "stiffness", "damping", "rotor_inertia", 
 def standard_deviation(estimator: Estimator) -> Array:
     """1σ of each parameter (n,) as known now, inf where the data determine nothing.
 
-    The larger of two answers from the residual: one takes the rows' errors as independent with the residual's
-    variance, the other allows errors that last within clusters of rows. To it comes what errors add that rows of a
-    window share, which least squares absorbs and no residual shows; it is known while no row is forgotten. Where rows
-    have been weighed against a prior, the posterior's own covariance holds.
+    Rows of the momentum balance have a predicted variance. While the residual agrees with it, the estimate's covariance
+    follows from it; where rows leave more, the model lacks something and the residual decides, as it does for rows of
+    the energy balance.
+    From the residual: the larger of two answers. One takes the rows' errors as independent with the residual's
+    variance, the other allows errors that last within clusters of rows. To it comes what errors add that rows of an
+    energy window share, which least squares absorbs and no residual shows; it is known while no row is forgotten. Where
+    rows have been weighed against a prior, the posterior's own covariance holds.
     """
     return _standard_deviation(estimator, estimator.estimate())
 
@@ -43,10 +51,13 @@ def _standard_deviation(estimator: Estimator, estimate: Estimate) -> Array:
         std[known] = estimate.std[known]
         return std
     row_variance = estimate.rss / estimate.dof
+    if estimator.by_momentum and row_variance <= LARGEST_ROW_VARIANCE and not estimator.misfit:
+        std[known] = estimate.std[known]
+        return std
     variance = np.diag(estimate.covariance)[known] * row_variance
     if estimate.covariance_robust is not None:
         variance = np.maximum(variance, np.diag(estimate.covariance_robust)[known])
-    if estimate.rows == estimator.shared_errors.rows:
+    if not estimator.by_momentum and estimate.rows == estimator.shared_errors.rows:
         inverse = np.where(np.outer(known, known), estimate.covariance, 0.0)
         variance = variance + estimator.shared_errors.variance(inverse, row_variance)[known]
     std[known] = np.sqrt(variance)
@@ -79,13 +90,74 @@ def doubts(parameters: list[dict[str, Any]], residual: dict[str, dict[str, float
     return out
 
 
+def _residuals(estimator: Estimator, beta: Array) -> dict[str, dict[str, float | None]]:
+    """By row type: `relative` to the measured torque or force, `whitened` over its predicted standard deviation."""
+    layout, momentum = estimator.model.layout, estimator.momentum
+
+    def whitened(rows: list[int]) -> float | None:
+        return momentum.whitened(rows, beta) if momentum is not None and rows else None
+
+    out: dict[str, dict[str, float | None]] = {"energy": {"relative": None, "whitened": None}}
+    for i, joint in enumerate(estimator.joint_residuals, start=1):
+        out[f"joint_{i}"] = {"relative": joint.relative(beta), "whitened": whitened([layout.theta_m[i - 1]])}
+    for i, (q, theta_m, q_f) in enumerate(zip(layout.q, layout.theta_m, layout.q_f, strict=True), start=1):
+        rows = [*range(q_f.start, q_f.stop), *([q] if q != theta_m else [])]
+        if rows:
+            out[f"link_{i}"] = {"relative": None, "whitened": whitened(rows)}
+    if layout.n_base_speeds:
+        out["base"] = {"relative": None, "whitened": whitened(list(range(layout.n_base_speeds)))}
+    return out
+
+
+def pulled(estimator: Estimator) -> list[str]:
+    """Names of parameters that noise in the columns pulls by more than their standard deviation: errors in variables.
+
+    The comparison is Hausman's, of least squares with an estimate that is free of this bias.
+    """
+    if estimator.momentum is None or not estimator.by_momentum:
+        return []
+    estimate = estimator.estimate()
+    shift = np.abs(estimator.momentum.bias.shift(estimate.determined))
+    std = _standard_deviation(estimator, estimate)
+    return [p.name for p, s, d in zip(estimator.base.parameters, shift, std, strict=True) if s > LARGEST_PULL * d]
+
+
+def _pull_warning(estimator: Estimator) -> list[str]:
+    names = pulled(estimator)
+    if not names:
+        return []
+    return [f"sensor noise in the columns pulls {', '.join(names)} by more than the error bar"]
+
+
+def projected(estimator: Estimator, estimate: Estimate, std: Array) -> Projection:
+    """The parameters of real bodies that are nearest to the estimate, by its covariance with deviations std (n,)."""
+    known = np.flatnonzero(np.isfinite(std))
+    stated = estimate.std[known]
+    scale = np.divide(std[known], stated, out=np.ones_like(stated), where=stated > 0.0)
+    covariance = np.diag(np.full(std.size, np.inf))
+    covariance[np.ix_(known, known)] = estimate.covariance[np.ix_(known, known)] * np.outer(scale, scale)
+    return PhysicalSet(estimator.model, estimator.base).project(estimate.pi, covariance)
+
+
+def _projection_warning(projection: Projection) -> list[str]:
+    if projection.distance == 0.0:
+        return []
+    distance, names = f"{projection.distance:.2g} standard deviations", ", ".join(projection.active)
+    return [f"no real bodies have these parameters, because of {names}: the nearest that some have are {distance} away"]
+
+
 def results_document(
-    estimator: Estimator, throughput: float, warnings: list[str], truth: dict[str, float] | None = None
+    estimator: Estimator,
+    throughput: float,
+    warnings: list[str],
+    truth: dict[str, float] | None = None,
+    bound: Array | None = None,
 ) -> dict[str, Any]:
     """results.json of a finished session.
 
     throughput: samples/s. truth: true values of physical parameters by name, of a simulated capture; they enter this
-    report alone. Numbers that do not exist (the std of an undetermined parameter) are None.
+    report alone. bound (n,): Cramér-Rao bound of each base parameter, where it has been computed. Numbers that do not
+    exist (the std of an undetermined parameter) are None.
     """
     estimate = estimator.estimate()
     base = estimator.base
@@ -94,6 +166,7 @@ def results_document(
         true = base.values(np.array([truth[p.name] for p in base.physical]))
     deviations = _standard_deviation(estimator, estimate)
     flags = _identifiable(estimate, deviations)
+    projection = projected(estimator, estimate, deviations)
     parameters = []
     for k, p in enumerate(base.parameters):
         value, std = float(estimate.pi[k]), float(deviations[k])
@@ -109,11 +182,11 @@ def results_document(
                 "upper95": value + NORMAL_95 * std if finite else None,
                 "true": None if true is None else float(true[k]),
                 "identifiable": bool(flags[k]),
+                "projected": None if projection.distance == 0.0 else float(projection.beta[k]),
+                "bound": None if bound is None or not np.isfinite(bound[k]) else float(bound[k]),
             }
         )
-    residual: dict[str, dict[str, float | None]] = {"energy": {"relative": None, "whitened": None}}
-    for i, joint in enumerate(estimator.joint_residuals, start=1):
-        residual[f"joint_{i}"] = {"relative": joint.relative(estimate.pi), "whitened": None}
+    residual = _residuals(estimator, estimate.pi)
     return {
         "schema": SCHEMA,
         "system": describe(estimator.system),
@@ -121,8 +194,14 @@ def results_document(
         "duration_s": estimator.duration,
         "parameters": parameters,
         "residual": residual,
+        "physical": {"distance_std": projection.distance, "active": list(projection.active)},
         "condition_number": estimate.condition_number if np.isfinite(estimate.condition_number) else None,
         "throughput_samples_per_s": throughput,
         "lost_samples": estimator.counters.lost_samples,
-        "warnings": [*warnings, *doubts(parameters, residual)],
+        "warnings": [
+            *warnings,
+            *doubts(parameters, residual),
+            *_pull_warning(estimator),
+            *_projection_warning(projection),
+        ],
     }

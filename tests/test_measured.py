@@ -15,7 +15,6 @@ from sms_online.pipeline.rates import smooth_and_differentiate
 from sms_online.results import results_document, standard_deviation
 from sms_online.stream import Array
 from sms_online.trackers.interface import Prior
-from sms_online.trackers.square_root import RecursiveLeastSquares
 
 DATA = Path(__file__).resolve().parents[1].parent / "shared" / "data"
 EMPS = DATA / "emps" / "DATA_EMPS.mat"
@@ -32,9 +31,7 @@ def replayed(name: str, capture: Path, prior: float | None = None) -> Estimator:
     if prior is not None:
         nominal = estimator.base.values(estimator.model.nominal)
         spread = np.where(nominal == 0.0, np.nan, prior * np.abs(nominal))
-        estimator.tracker = RecursiveLeastSquares(
-            estimator.base.n, prior=Prior(nominal, spread), scaled_by_residual=True
-        )
+        estimator.set_prior(Prior(nominal, spread))
     for block in source:
         estimator.push(block)
     estimator.finish()

@@ -17,6 +17,7 @@ from sms_online.results import results_document, standard_deviation
 from sms_online.stream import Array, Block
 from sms_online.trackers.batch import batch_least_squares
 from sms_online.trackers.interface import Rows
+from sms_online.trackers.square_root import RecursiveLeastSquares
 from sms_sim.simulate import Simulation, exact_states, simulate
 
 NAMES = (
@@ -81,22 +82,25 @@ def test_streamed_positions_and_torques_give_all_but_one_to_a_hundredth_percent(
 
 
 def test_recursive_equals_batch(planar_block: Block) -> None:
-    class Recorder:
-        """A tracker that only keeps the rows that the pipeline made."""
+    class Recorder(RecursiveLeastSquares):
+        """A tracker that keeps the rows too."""
 
-        def __init__(self) -> None:
-            self.rows: list[Rows] = []
+        def __init__(self, n: int) -> None:
+            super().__init__(n)
+            self.kept: list[Rows] = []
 
         def update(self, rows: Rows) -> None:
-            self.rows.append(rows)
+            self.kept.append(rows)
+            super().update(rows)
 
-    recorder = Recorder()
-    estimator = Estimator(load_system("paper-planar"), planar_block.channels, "simulation", recorder)  # type: ignore[arg-type]
+    estimator = Estimator(load_system("paper-planar"), planar_block.channels, "simulation")
+    assert estimator.momentum is not None
+    recorder = estimator.momentum.tracker = Recorder(estimator.base.n)
     estimator.push(planar_block)
     estimator.finish()
-    Y = np.concatenate([rows.Y for rows in recorder.rows])
-    b = np.concatenate([rows.b for rows in recorder.rows])
-    recursive = streamed("paper-planar", planar_block).estimate().pi
+    Y = np.concatenate([rows.Y for rows in recorder.kept])
+    b = np.concatenate([rows.b for rows in recorder.kept])
+    recursive = estimator.estimate().pi
     scale = np.linalg.norm(Y, axis=0)
     np.testing.assert_allclose(recursive, np.linalg.lstsq(Y / scale, b, rcond=None)[0] / scale, rtol=1e-8)
 

@@ -284,13 +284,17 @@ class Trajectory(Record):
 
 
 class Windows(Record):
-    """relative: full width of the test function in which relative residuals are stated, s."""
+    """Full widths of test functions, s. relative: of relative residuals. momentum: of the rows that are fitted."""
 
     relative: Positive = 0.1
+    momentum: Positive = 0.4
 
 
 class System(Record):
-    """A whole testbed. No spacecraft means a fixed base. joints, motors, links are in order from the base outwards."""
+    """A whole testbed. No spacecraft means a fixed base. joints, motors, links are in order from the base outwards.
+
+    balance: which rows are fitted; `both` is the momentum balance, and the energy balance until its weights are known.
+    """
 
     name: str
     title: str = ""
@@ -311,3 +315,4 @@ class System(Record):
     controller: Controller | None = None
     trajectory: Trajectory | None = None
     windows: Windows = Windows()
+    balance: Literal["both", "energy", "momentum"] = "both"

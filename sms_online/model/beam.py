@@ -141,6 +141,10 @@ class LinearLink:
         """The nodal coordinates themselves, (B, n_f)."""
         return q_f
 
+    def marker_jacobian(self, q_f: Array) -> Array:
+        """The identity: the coordinates are the markers' readings."""
+        return np.broadcast_to(np.eye(self.n_f), (q_f.shape[0], self.n_f, self.n_f))
+
     def coordinates(self, markers: Array) -> Array:
         """The nodal coordinates themselves, (B, n_f)."""
         return markers

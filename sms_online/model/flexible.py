@@ -61,5 +61,8 @@ class LinkKinematics(Protocol):
     def markers(self, q_f: Array) -> Array:
         """Nodal displacements (m) and rotations (rad) of the markers, (B, n_markers · per node), in {i}, (31)."""
 
+    def marker_jacobian(self, q_f: Array) -> Array:
+        """Derivatives of `markers` by q_f, (B, n_markers · per node, n_f)."""
+
     def coordinates(self, markers: Array) -> Array:
         """Inverse of `markers`: q_f (B, n_f)."""

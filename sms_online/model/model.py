@@ -370,6 +370,44 @@ class Dynamics:
             C -= effect.force(model.layout, x, v) @ self.pi[columns]
         return H, C
 
+    def momentum_and_force(self, x: Array, v: Array) -> tuple[Array, Array]:
+        """P π and G π (B, n_v) of `Model.momentum_columns`, without the columns."""
+        model = self.model
+        configuration = model.chain.configure(x)
+        shape_rates = configuration.shape_rates(v)
+        rates, none = v[:, :, None], np.zeros_like(self._eye)
+        velocities = configuration.twists(rates, model._frames)
+        W = configuration.jacobians
+        W_dot = configuration.twist_rates(self._eye, W, v, shape_rates)
+        p = np.zeros_like(v)
+        g = -(model._spring_coordinates(x) @ self.stiffness + v @ self.damping)
+
+        def add(term: Term, momentum: Array, force: Array) -> None:
+            nonlocal p, g
+            J, J_dot = term.local(W, self._eye), term.local(W_dot, none)
+            p = p + (momentum.swapaxes(1, 2) @ J)[:, 0]
+            g = g + (momentum.swapaxes(1, 2) @ J_dot + force.swapaxes(1, 2) @ J)[:, 0]
+
+        for body in self._bodies:
+            nu = body.local(velocities, rates)[..., 0]
+            momentum = body.momentum(nu)
+            force = convective(nu, momentum)
+            if model.gravity.any():
+                force = force + body.momentum(model._fall(configuration, body))
+            add(body, momentum, force)
+        for link in model.links:
+            nu = link.local(velocities, rates)[..., 0]
+            motion, rate = LinkMotion(link, configuration), shape_rates[link.link]
+            assert rate is not None
+            pi = self.pi[list(link.parameters), None]
+            force = motion.convective(nu, rate) @ pi
+            if model.gravity.any():
+                force = force + motion.momentum(model._fall(configuration, link)) @ pi
+            add(link, motion.momentum(nu) @ pi, force)
+        for effect, columns in zip(model.effects, model.effect_slices, strict=True):
+            g = g + effect.force(model.layout, x, v) @ self.pi[columns]
+        return p, g
+
     def acceleration(self, x: Array, v: Array, Q: Array) -> Array:
         """v̇ (B, n_v) under generalized forces Q (B, n_v)."""
         H, C = self.mass_and_bias(x, v)

@@ -146,6 +146,10 @@ class ExactRod:
         """Displacements (m) and rotation vectors (rad) of the markers, (B, n_markers · per node), in {i}."""
         return self._markers_of(self.shape_at_stations(q_f))
 
+    def marker_jacobian(self, q_f: Array) -> Array:
+        """Derivatives of `markers` by q_f, (B, n_markers · per node, n_f)."""
+        return self._marker_jacobian(self.shape_at_stations(q_f))
+
     def coordinates(self, markers: Array) -> Array:
         """Strain coefficients q_f (B, n_f) that reproduce the markers' readings, by Newton's method."""
         q_f = np.linalg.solve(self._linear_map, markers.T).T

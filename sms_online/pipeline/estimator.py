@@ -1,4 +1,9 @@
-"""The pipeline of one session: blocks of samples in, estimates of the base parameters out."""
+"""The pipeline of one session: blocks of samples in, estimates of the base parameters out.
+
+The momentum balance gives the estimate as soon as its weights are known. Until then, and where a system asks for
+nothing else, it comes from the energy balance. The two are never added up: both are functions of the same samples, so
+their errors are not independent, and the momentum rows hold what the energy rows hold (power is force times speed).
+"""
 
 from __future__ import annotations
 
@@ -12,11 +17,12 @@ from sms_online.model.base_parameters import BaseParameters, find_base_parameter
 from sms_online.model.model import Model
 from sms_online.pipeline.energy_balance import BalanceRows, EnergyBalance, SharedErrors
 from sms_online.pipeline.joint_balance import JointBalance
+from sms_online.pipeline.momentum import Momentum
 from sms_online.pipeline.rates import RateSamples, RatesStage
 from sms_online.pipeline.sensing import AttitudeContinuity, Sensing
 from sms_online.pipeline.synchronise import GridSamples, SyncCounters, Synchroniser
 from sms_online.stream import Array, Block
-from sms_online.trackers.interface import Estimate, Rows, Tracker
+from sms_online.trackers.interface import Estimate, Prior, Rows, Tracker
 from sms_online.trackers.square_root import RecursiveLeastSquares
 
 # Samples that pass through the pipeline together. Everything behind sees the same blocks however the samples arrive, so
@@ -55,16 +61,15 @@ class SquaredResidual:
 class Estimator:
     """Streams one session of a described system.
 
-    channels: what the source's blocks hold. source: its name, for messages. tracker: square-root RLS by default, fed
-    with the rows of the energy balance. Raises InputError when a channel is missing that the model needs.
+    channels: what the source's blocks hold. source: its name, for messages. Raises InputError when a channel is missing
+    that the model needs.
     """
 
-    def __init__(self, system: System, channels: tuple[str, ...], source: str, tracker: Tracker | None = None) -> None:
+    def __init__(self, system: System, channels: tuple[str, ...], source: str) -> None:
         self.system = system
         self.model = Model(system)
         self.base: BaseParameters = find_base_parameters(self.model)
         self.sensing = Sensing(self.model, channels, source)
-        self.tracker: Tracker = RecursiveLeastSquares(self.base.n) if tracker is None else tracker
         self.samples = 0
         self.dropped_rows = 0
         self.duration = 0.0
@@ -76,11 +81,33 @@ class Estimator:
         self._rates = RatesStage(system.sample_rate, range(layout.n_x), self.sensing.noise)
         self._energy = EnergyBalance(self.model, self.base, system.sample_rate)
         self._joints = JointBalance(self.model, self.base, system.sample_rate)
+        self.momentum = None if system.balance == "energy" else Momentum(self.model, self.base, self.sensing)
+        self.energy_tracker: Tracker = RecursiveLeastSquares(self.base.n)
         self.joint_residuals = [SquaredResidual(np.zeros((self.base.n + 1, self.base.n + 1))) for _ in layout.q]
         self._segment = -1
         self._first_time = np.nan
         self._pending_t = np.empty(0)
         self._pending = np.empty((0, len(self._columns)))
+
+    def set_prior(self, prior: Prior) -> None:
+        """Weigh the rows against what is known of the base parameters beforehand; before the first sample."""
+
+        def tracker() -> RecursiveLeastSquares:
+            return RecursiveLeastSquares(self.base.n, prior=prior, scaled_by_residual=True)
+
+        self.energy_tracker = tracker()
+        if self.momentum is not None:
+            self.momentum.tracker = tracker()
+
+    @property
+    def by_momentum(self) -> bool:
+        """Whether the estimate comes from the momentum balance."""
+        return self.momentum is not None and (self.momentum.started or self.system.balance == "momentum")
+
+    @property
+    def misfit(self) -> bool:
+        """Whether rows of the momentum balance leave clearly more than the sensors' noise."""
+        return self.momentum is not None and self.momentum.misfit
 
     @property
     def half_width(self) -> int:
@@ -126,9 +153,13 @@ class Estimator:
             self._differentiate(piece)
         for rates in self._rates.flush():
             self._balance(rates)
+        if self.momentum is not None:
+            self.momentum.finish(self.periods)
 
     def _synchronise(self, t: Array, values: Array) -> None:
         block = self._attitude.restore(Block(t, self.sensing.channels, values))
+        if self.momentum is not None:
+            self.momentum.observe(block.values)
         for piece in self._synchroniser.push(block):
             self._differentiate(piece)
 
@@ -138,6 +169,8 @@ class Estimator:
         )
         for rates in self._rates.push(GridSamples(piece.index, signals, piece.segment)):
             self._balance(rates)
+        if self.momentum is not None:
+            self.momentum.push(piece, self._synchroniser.start_time, self.periods)
 
     def _balance(self, rates: RateSamples) -> None:
         if rates.segment != self._segment:
@@ -151,7 +184,7 @@ class Estimator:
         finite = np.isfinite(rows.Y).all(axis=1) & np.isfinite(rows.b)
         self.dropped_rows += int(np.sum(~finite))
         if finite.any():
-            self.tracker.update(self._stamped(BalanceRows(rows.Y[finite], rows.b[finite], rows.index[finite])))
+            self.energy_tracker.update(self._stamped(BalanceRows(rows.Y[finite], rows.b[finite], rows.index[finite])))
         for window, measured in self._joints.push(rates.index, x, v, torque):
             for residual, Y, b, signal in zip(self.joint_residuals, window.Y, window.b, measured, strict=True):
                 if np.isfinite(Y).all() and np.isfinite(b):
@@ -163,7 +196,9 @@ class Estimator:
 
     def estimate(self) -> Estimate:
         """The base parameters as they are known now."""
-        return self.tracker.estimate()
+        if self.momentum is not None and self.by_momentum:
+            return self.momentum.estimate()
+        return self.energy_tracker.estimate()
 
     def state(self) -> SessionState:
         """Everything that a new estimator of the same system and channels needs to continue to the same bits."""
@@ -185,7 +220,8 @@ class Estimator:
             "energy": dict(self._energy.state()),
             "shared": dict(self._energy.shared.state()),
             "joints": dict(self._joints.state()),
-            "tracker": dict(self.tracker.state()),
+            "tracker": dict(self.energy_tracker.state()),
+            **({} if self.momentum is None else self.momentum.state()),
         }
 
     def restore(self, state: SessionState) -> None:
@@ -203,4 +239,6 @@ class Estimator:
         self._energy.restore(state["energy"])
         self._energy.shared.restore(state["shared"])
         self._joints.restore(state["joints"])
-        self.tracker.restore(state["tracker"])
+        self.energy_tracker.restore(state["tracker"])
+        if self.momentum is not None:
+            self.momentum.restore(state)

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from sms_online.model.base_parameters import BaseParameters
 from sms_online.model.model import Model
 from sms_online.pipeline.energy_balance import BalanceRows
+from sms_online.pipeline.weak_form import test_function
 from sms_online.stream import Array
 
 # Exponent of the test function: with its first three derivatives zero at the ends, sums over samples are integrals.
@@ -19,14 +20,6 @@ EXPONENT = 4
 # A quarter of the data is enough for an rms, so short windows leave three times their width out; but windows follow
 # each other at least this often, s, and overlap by half at most.
 LARGEST_HOP = 0.4
-
-
-def test_function(width: int, sample_rate: float) -> tuple[Array, Array]:
-    """φ and φ̇ (1/s) at `width` + 1 samples across the window."""
-    z = np.linspace(-1.0, 1.0, width + 1)
-    phi = (1.0 - z**2) ** EXPONENT
-    phi_dot = -2.0 * EXPONENT * z * (1.0 - z**2) ** (EXPONENT - 1) * (2.0 * sample_rate / width)
-    return phi, phi_dot
 
 
 class JointBalance:
@@ -38,7 +31,7 @@ class JointBalance:
         seconds = model.system.windows.relative
         self.width = 2 * max(1, round(0.5 * seconds * sample_rate))
         self.hop = max(self.width // 2, min(4 * self.width, round(LARGEST_HOP * sample_rate)))
-        phi, phi_dot = test_function(self.width, sample_rate)
+        phi, phi_dot, _ = test_function(self.width, self.width / sample_rate, EXPONENT)
         self._phi, self._phi_dot = phi / sample_rate, phi_dot / sample_rate
         self.begin_segment()
 

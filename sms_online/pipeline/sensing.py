@@ -60,23 +60,60 @@ class Sensing:
         self.unused = tuple(name for name in available if name not in channels)
 
     @property
-    def noise(self) -> Array:
-        """Stated white noise, 1σ per sample, of positions and joint torques (n_x + joints,); NaN where none is stated.
-
-        Strain coefficients of exact links mix several markers, so nothing is stated of them.
-        """
+    def stated_noise(self) -> Array:
+        """Stated white noise of each channel (channels,), 1σ per sample in its own unit; NaN where none is stated."""
         stated = np.full(len(self.channels), np.nan)
         for sensor in self.model.system.sensors:
             for name in sensed_channels(self.model.system, sensor):
                 if name in self.channels and sensor.noise > 0.0:
                     # Rounding to a resolution r adds r²/12.
                     stated[self.channels.index(name)] = np.hypot(sensor.noise, sensor.resolution / np.sqrt(12.0))
+        return stated
+
+    @property
+    def noise(self) -> Array:
+        """Stated white noise, 1σ per sample, of positions and joint torques (n_x + joints,); NaN where none is stated.
+
+        Strain coefficients of exact links mix several markers, so nothing is stated of them.
+        """
+        stated = self.stated_noise
         markers = [
             stated[columns] if isinstance(kinematics, LinearLink) else np.full(kinematics.n_f, np.nan)
             for kinematics, columns in zip(self._flexible, self._markers, strict=True)
         ]
         joints = stated[self._torque] * self._ratio
         return np.concatenate((stated[self._base], stated[self._q], stated[self._theta_m], *markers, joints))
+
+    @property
+    def position_columns(self) -> list[int]:
+        """Channels of the position sensors (n_x,), in the order of the coordinates that they stand for."""
+        return [*self._base, *self._q, *self._theta_m, *(column for columns in self._markers for column in columns)]
+
+    def displacements(self, x: Array) -> Array:
+        """Displacements (K, n_v, n_x) along the speeds, at x (K, n_x), for one more unit of each sensor's reading."""
+        layout = self.model.layout
+        K, n_x = x.shape
+        by_sensor = np.broadcast_to(np.eye(n_x), (K, n_x, n_x)).copy()
+        offset = layout.n_base_positions - layout.n_base_speeds
+        for i, (kinematics, q_f) in enumerate(zip(self.model.chain.flexible, layout.q_f, strict=True)):
+            if kinematics is not None:
+                own = slice(q_f.start + offset, q_f.stop + offset)
+                by_sensor[:, own, own] = np.linalg.inv(kinematics.marker_jacobian(self.model.chain.elastic(x, i)))
+        every = np.repeat(x, n_x, axis=0)
+        moved = layout.speeds(every, by_sensor.swapaxes(1, 2).reshape(-1, n_x))
+        return np.asarray(moved.reshape(K, n_x, -1).swapaxes(1, 2))
+
+    def coordinate_noise(self, sensors: Array) -> Array:
+        """1σ of the coordinates (n_x,) for that of the position sensors (n_x,), about the straight arm."""
+        layout = self.model.layout
+        out = sensors.copy()
+        offset = layout.n_base_positions - layout.n_base_speeds
+        for kinematics, q_f in zip(self.model.chain.flexible, layout.q_f, strict=True):
+            if kinematics is not None:
+                own = slice(q_f.start + offset, q_f.stop + offset)
+                inverse = np.linalg.inv(kinematics.marker_jacobian(np.zeros((1, kinematics.n_f)))[0])
+                out[own] = np.sqrt(inverse**2 @ sensors[own] ** 2)
+        return out
 
     def coordinates(self, values: Array) -> Array:
         """Positions x (B, n_x) of samples (B, channels)."""

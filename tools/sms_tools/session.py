@@ -16,7 +16,6 @@ from sms_online.errors import InputError
 from sms_online.pipeline.estimator import Estimator
 from sms_online.results import results_document
 from sms_online.stream import Block
-from sms_online.trackers.square_root import RecursiveLeastSquares
 from sms_tools.exit_codes import INTERRUPTED, NOTHING_DETERMINED, OK
 from sms_tools.interruption import Interruption
 from sms_tools.priors import base_prior
@@ -36,8 +35,7 @@ def new_estimator(system: System, channels: tuple[str, ...], source: str, nomina
     estimator = Estimator(system, channels, source)
     if nominal_prior or system.priors:
         # A prior is on the base parameters, which the estimator has found.
-        prior = base_prior(system, estimator.base, nominal_prior)
-        estimator.tracker = RecursiveLeastSquares(estimator.base.n, prior=prior, scaled_by_residual=True)
+        estimator.set_prior(base_prior(system, estimator.base, nominal_prior))
     return estimator
 
 

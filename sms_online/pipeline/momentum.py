@@ -1,0 +1,193 @@
+"""The momentum balance of a session, from grid samples to an estimate with error bars."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sms_online.model.base_parameters import BaseParameters
+from sms_online.model.model import Model
+from sms_online.pipeline.errors_in_variables import NoiseBias
+from sms_online.pipeline.momentum_balance import MomentumBalance
+from sms_online.pipeline.momentum_fit import MomentumFit, WhiteRows
+from sms_online.pipeline.sensing import Sensing
+from sms_online.pipeline.sensor_noise import NoiseEstimate, SensorNoise
+from sms_online.pipeline.synchronise import GridSamples
+from sms_online.stream import Array
+from sms_online.trackers.interface import Estimate, Rows, Tracker
+from sms_online.trackers.square_root import RecursiveLeastSquares
+
+# The synthetic noise is the same in every session, so that the same samples give the same bits.
+SEED = 6
+# Time from one estimate of the sensors' noise to the next, s.
+NOISE_RENEWED = 1.0
+NOISE_ARRAYS = ("sensors", "torque", "coordinates", "grid")
+
+
+class Momentum:
+    """Balance, weights and tracker of one session.
+
+    tracker: square-root RLS, fed with rows of unit variance. bias: what noise in the columns does to the estimate.
+    windows: how many it took.
+    """
+
+    def __init__(self, model: Model, base: BaseParameters, sensing: Sensing) -> None:
+        system = model.system
+        self.sensing = sensing
+        self.tracker: Tracker = RecursiveLeastSquares(base.n)
+        self.bias = NoiseBias(base.n)
+        self.windows = 0
+        self.dropped_windows = 0
+        self.sensor_noise: SensorNoise | None = None
+        self._sample_rate = system.sample_rate
+        self._estimate = NoiseEstimate(sensing, system.sample_rate)
+        self._balance = MomentumBalance(model, base, system.sample_rate, system.windows.momentum)
+        self._fit = MomentumFit(model, base, self._balance, sensing.displacements, self._solved)
+        self._random = np.random.default_rng(SEED)
+        self._segment = -1
+        self._start_time = np.nan
+        self._noise_told = 0  # grid index at which the noise was estimated last
+        self._waiting: list[GridSamples] = []  # until the noise is known
+
+    @property
+    def started(self) -> bool:
+        """Whether weights are known and rows come."""
+        return self._fit.weights is not None
+
+    @property
+    def misfit(self) -> bool:
+        """Whether rows leave clearly more than the sensors' noise."""
+        return bool(self._fit.misfit.any())
+
+    def estimate(self) -> Estimate:
+        """The base parameters as known now, free of what noise in the columns does; with a prior, as the rows say."""
+        estimate = self.tracker.estimate()
+        if estimate.scale is not None:
+            return estimate
+        return replace(estimate, pi=estimate.pi + self.bias.shift(estimate.determined))
+
+    def _solved(self) -> Array:
+        """β where the rows determine it, else NaN."""
+        estimate = self.estimate()
+        return np.where(estimate.determined, estimate.pi, np.nan)
+
+    def observe(self, values: Array) -> None:
+        """Take the channels' own samples (B, channels), NaN where there is none, to tell their noise."""
+        self._estimate.push(values)
+
+    def push(self, piece: GridSamples, start_time: float, periods: Array) -> None:
+        """Take grid samples of the channels; start_time: s of grid index 0; periods (channels,): sample periods, s."""
+        self._start_time = start_time
+        self._waiting.append(piece)
+        due = self._noise_told + round(NOISE_RENEWED * self._sample_rate)
+        if self._estimate.ready and (self.sensor_noise is None or piece.index[-1] >= due):
+            self.sensor_noise = self._estimate.noise(periods)
+            self._noise_told = int(piece.index[-1])
+        if self.sensor_noise is None:
+            return
+        waiting, self._waiting = self._waiting, []
+        for each in waiting:
+            self._advance(each, self.sensor_noise)
+
+    def _advance(self, piece: GridSamples, noise: SensorNoise) -> None:
+        if piece.segment != self._segment:
+            if self._segment >= 0:
+                self._absorb(self._fit.end_segment(noise))
+            self._balance.begin_segment()
+            self._segment = piece.segment
+        windows, instants = self._balance.push(
+            piece.index, self._copies(piece.values, noise), self.sensing.joint_torque(piece.values), noise.coordinates
+        )
+        self._absorb(self._fit.push(windows, instants, noise))
+
+    def _copies(self, values: Array, noise: SensorNoise) -> list[Array]:
+        """Coordinates as measured, and with synthetic noise added and subtracted."""
+        x = self.sensing.coordinates(values)
+        if noise.exact:
+            return [x, x, x]
+        added = np.zeros_like(values)
+        columns = self.sensing.position_columns
+        added[:, columns] = self._random.standard_normal((values.shape[0], len(columns))) * noise.grid
+        return [x, self.sensing.coordinates(values + added), self.sensing.coordinates(values - added)]
+
+    def finish(self, periods: Array) -> None:
+        """End of the session: fit what is still held back."""
+        if self.sensor_noise is None and self._waiting and self._estimate.ready:
+            self.sensor_noise = self._estimate.noise(periods)
+        if self.sensor_noise is not None:
+            self._absorb(self._fit.end_segment(self.sensor_noise))
+
+    def _absorb(self, fresh: list[WhiteRows]) -> None:
+        for rows in fresh:
+            if not np.isfinite(rows.Y).all():
+                self.dropped_windows += 1
+                continue
+            t = self._start_time + rows.end / self._sample_rate
+            M = rows.Y.shape[0]
+            self.tracker.update(Rows(rows.Y[:, :-1], rows.Y[:, -1], np.ones(M), np.full(M, t)))
+            self.bias.add(rows.Y, rows.noisy)
+            self.windows += 1
+
+    def whitened(self, rows: list[int], beta: Array) -> float | None:
+        """rms of the residual of some generalized speeds' rows over its predicted standard deviation, for β (n,)."""
+        return self._fit.whitened(rows, beta)
+
+    def state(self) -> dict[str, dict[str, Any]]:
+        """Everything that `restore` needs to continue to the same bits."""
+        waiting = self._waiting
+        random = self._random.bit_generator.state["state"]
+        return {
+            "momentum": {
+                "windows": self.windows,
+                "dropped_windows": self.dropped_windows,
+                "segment": self._segment,
+                "start_time": self._start_time,
+                "noise_told": self._noise_told,
+                "noise_known": self.sensor_noise is not None,
+                "random": np.array([str(random["state"]), str(random["inc"])]),
+                "waiting_index": np.concatenate([np.empty(0, dtype=np.int64), *(p.index for p in waiting)]),
+                "waiting_values": np.concatenate(
+                    [np.empty((0, len(self.sensing.channels))), *(p.values for p in waiting)]
+                ),
+                "waiting_segment": np.repeat([p.segment for p in waiting], [p.index.size for p in waiting]),
+                **self._noise_state(),
+                **self.bias.state(),
+            },
+            "momentum_noise": self._estimate.state(),
+            "momentum_balance": self._balance.state(),
+            "momentum_fit": self._fit.state(),
+            "momentum_tracker": dict(self.tracker.state()),
+        }
+
+    def _noise_state(self) -> dict[str, Any]:
+        noise = self.sensor_noise
+        if noise is None:
+            return {}
+        return {f"noise_{name}": getattr(noise, name) for name in (*NOISE_ARRAYS, "exact")}
+
+    def restore(self, saved: Mapping[str, Mapping[str, NDArray[Any]]]) -> None:
+        """Continue from a saved state."""
+        state = saved["momentum"]
+        self.windows, self.dropped_windows = int(state["windows"]), int(state["dropped_windows"])
+        self._noise_told = int(state["noise_told"])
+        self._segment, self._start_time = int(state["segment"]), float(state["start_time"])
+        position, increment = (int(number) for number in state["random"])
+        generator = dict(self._random.bit_generator.state)
+        generator["state"] = {"state": position, "inc": increment}
+        self._random.bit_generator.state = generator
+        self.sensor_noise = None
+        if bool(state["noise_known"]):
+            sensors, torque, coordinates, grid = (np.array(state[f"noise_{name}"]) for name in NOISE_ARRAYS)
+            self.sensor_noise = SensorNoise(sensors, torque, coordinates, grid, bool(state["noise_exact"]))
+        segments = np.array(state["waiting_segment"])
+        index, values = np.array(state["waiting_index"]), np.array(state["waiting_values"])
+        self._waiting = [GridSamples(index[segments == k], values[segments == k], int(k)) for k in np.unique(segments)]
+        self.bias.restore(state)
+        self._estimate.restore(saved["momentum_noise"])
+        self._balance.restore(saved["momentum_balance"])
+        self._fit.restore(saved["momentum_fit"])
+        self.tracker.restore(saved["momentum_tracker"])

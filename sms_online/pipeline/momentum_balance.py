@@ -1,0 +1,233 @@
+"""Momentum balance in weak form, streaming: one row for each generalized speed and window, (33)-(37).
+
+Windows overlap by nine tenths: a weak-form row passes a band of frequencies of its own, and hops of a tenth lose none
+of it (windows side by side cost fifteen times the error).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from itertools import groupby
+from operator import itemgetter
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sms_online.model.base_parameters import RANDOM_SEED, RANK_TOLERANCE, BaseParameters, random_states
+from sms_online.model.model import Model
+from sms_online.pipeline.smoothing import HALF_WIDTHS, WidthChoice, smooth, stride
+from sms_online.pipeline.weak_form import test_function
+from sms_online.stream import Array
+
+# Exponent of φ = (1 - z²)⁶: smooth enough that sums over samples are integrals and that two derivatives of φ, which
+# multiply position noise, stay calm.
+EXPONENT = 6
+HOPS = 10  # a window begins every tenth of a window
+# Instants of a window at which the sensitivity to noise is told, two a hop: it changes as slowly as the motion.
+INSTANTS = 2 * HOPS
+# Random states that tell which entries of a row are zero by structure.
+PATTERN_STATES = 8
+# A hop compares the widths of the filter at so many instants.
+COMPARED = 5
+# Copies of the motion: as measured, and with synthetic noise added and subtracted.
+COPIES = 3
+# Widest windows are decided on and smoothed with so many samples around a window.
+MARGIN = HALF_WIDTHS[-1]
+
+
+@dataclass(frozen=True)
+class Instants:
+    """States at `number`, `number` + 1, …, in half hops since the segment began: x (K, n_x), v (K, n_v)."""
+
+    number: int
+    x: Array
+    v: Array
+
+
+@dataclass(frozen=True)
+class Window:
+    """Weak-form rows of one window, one for each generalized speed, in N s (N m s).
+
+    start: its first instant, in half hops since the segment began. end: grid index of its last sample. Y (copies,
+    nonzero): columns of the base parameters where the model has any (`MomentumBalance.rows`, `.columns`); b (copies,
+    n_v). The first copy is that of the measured positions, the others those of the positions with noise added.
+    half_width: M of the filter.
+    """
+
+    start: int
+    end: int
+    Y: Array
+    b: Array
+    half_width: int
+
+
+def momentum_pattern(model: Model) -> NDArray[np.bool_]:
+    """Entries (n_v, n_pi) of a weak-form row that the structure of the model does not make zero."""
+    x, v = random_states(model, PATTERN_STATES, np.random.default_rng(RANDOM_SEED))
+    size = sum(np.abs(columns).max(axis=0) for columns in model.momentum_columns(x, v))
+    return np.asarray(size > RANK_TOLERANCE * size.max(axis=0))
+
+
+@dataclass
+class _Smoothed:
+    """Momenta and forces at the thinned samples of one half width, as far as windows have asked for them.
+
+    first: number of the sample in the segment. columns (K, entries).
+    """
+
+    first: int
+    columns: Array
+
+
+class MomentumBalance:
+    """Turns grid samples of one segment into windows of rows.
+
+    rows, columns (nonzero,): places of the entries of Y that are not zero by the structure of the model.
+    """
+
+    def __init__(self, model: Model, base: BaseParameters, sample_rate: float, span: float) -> None:
+        self.model = model
+        self.base = base
+        self.sample_rate = sample_rate
+        # Half hops are whole samples.
+        self.half_hop = max(1, round(span * sample_rate / INSTANTS))
+        self.hop = 2 * self.half_hop
+        self.width = INSTANTS * self.half_hop
+        self.span = self.width / sample_rate
+        self.rows, self.columns = np.nonzero(momentum_pattern(model)[:, list(base.independent)])
+        self._physical = np.array(base.independent)[self.columns]
+        self._choice = WidthChoice()
+        self._phi = {s: self._weights(s) for s in {stride(M, self.hop) for M in HALF_WIDTHS}}
+        self.begin_segment()
+
+    def _weights(self, s: int) -> tuple[Array, Array]:
+        phi, phi_dot, _ = test_function(self.width // s, self.span, EXPONENT)
+        return phi * s / self.sample_rate, phi_dot * s / self.sample_rate
+
+    def begin_segment(self) -> None:
+        """Forget the samples before a gap."""
+        layout = self.model.layout
+        self._samples = np.empty((0, COPIES * layout.n_x + len(layout.q)))
+        self._first = 0  # number in the segment of the buffer's first sample
+        self._window = 0  # number of the next window's first sample
+        self._told = 0  # number of the next instant, in half hops
+        self._compared: list[Array] = []  # squares of the hops from the next window on
+        self._smoothed: dict[int, _Smoothed] = {}
+
+    def push(
+        self, index: NDArray[np.int64], copies: list[Array], joint_torque: Array, sigma: Array
+    ) -> tuple[list[Window], list[Instants]]:
+        """Windows that B consecutive samples complete, and the states at their instants.
+
+        index (B,): grid index. copies: x (B, n_x) as measured, then with noise added and with the same subtracted.
+        joint_torque (B, joints): n τ. sigma (n_x,): noise of x, 1σ per sample.
+        """
+        self._samples = np.concatenate((self._samples, np.concatenate((*copies, joint_torque), axis=1)))
+        grid = int(index[-1]) - (self._first + self._samples.shape[0] - 1)
+        chosen: list[tuple[int, int]] = []  # first sample and half width of each window
+        while self._window + self.width + 2 * MARGIN < self._first + self._samples.shape[0]:
+            chosen.append((self._window, self._choose(sigma)))
+            self._window += self.hop
+            self._compared.pop(0)
+        instants = [piece for window, half_width in chosen for piece in self._tell(window, half_width)]
+        windows: list[Window] = []
+        # Windows of one width in a row are worked off together.
+        for half_width, run in groupby(chosen, key=itemgetter(1)):
+            windows += self._rows(half_width, [window for window, _ in run], grid)
+        drop = self._window - self._first
+        if drop > 0:
+            self._samples, self._first = self._samples[drop:], self._window
+        return windows, instants
+
+    def _choose(self, sigma: Array) -> int:
+        """Half width for the next window. Sample number n of the segment is at the buffer's n - first + MARGIN."""
+        n_x = self.model.layout.n_x
+        while len(self._compared) < HOPS:
+            start = self._window + len(self._compared) * self.hop - self._first + MARGIN
+            centres = start + (np.arange(COMPARED) * self.hop) // COMPARED
+            self._compared.append(self._choice.squares(self._samples[:, :n_x], centres))
+        return self._choice.widest(np.sum(self._compared, axis=0) / (HOPS * COMPARED), sigma)
+
+    def _tell(self, window: int, half_width: int) -> list[Instants]:
+        """States at the instants up to the end of a window that have not been told yet."""
+        last = (window + self.width) // self.half_hop
+        numbers = np.arange(self._told, last + 1)
+        if numbers.size == 0:
+            return []
+        x, v, _ = self._states(numbers * self.half_hop, half_width)
+        self._told = last + 1
+        return [Instants(int(numbers[0]), x[0], v[0])]
+
+    def _states(self, samples: NDArray[np.int64], half_width: int) -> tuple[Array, Array, Array]:
+        """x (copies, K, n_x), v (copies, K, n_v) and n τ (K, joints) at K samples of the segment."""
+        layout = self.model.layout
+        values, rates = smooth(self._samples, samples - self._first + MARGIN, half_width, self.sample_rate)
+        end = COPIES * layout.n_x
+        x, x_dot = (part[:, :end].reshape(-1, COPIES, layout.n_x).swapaxes(0, 1) for part in (values, rates))
+        v = layout.speeds(x.reshape(-1, layout.n_x), x_dot.reshape(-1, layout.n_x))
+        return x, v.reshape(COPIES, -1, layout.n_v), values[:, end:]
+
+    def _rows(self, half_width: int, windows: list[int], grid: int) -> list[Window]:
+        s = stride(half_width, self.hop)
+        smoothed = self._smoothed.get(half_width)
+        if smoothed is None or smoothed.first + smoothed.columns.shape[0] * s < windows[0]:
+            smoothed = self._smoothed[half_width] = _Smoothed(windows[0], np.empty((0, self._entries)))
+        known = smoothed.first + smoothed.columns.shape[0] * s
+        fresh = np.arange(known, windows[-1] + self.width + 1, s)
+        skip = max(0, (windows[0] - smoothed.first) // s)
+        smoothed.columns = smoothed.columns[skip:]
+        smoothed.first += skip * s
+        if fresh.size:
+            smoothed.columns = np.concatenate((smoothed.columns, self._columns(*self._states(fresh, half_width))))
+        phi, phi_dot = self._phi[s]
+        width = COPIES * (self.rows.size + self.model.layout.n_v)
+        out = []
+        for window in windows:
+            begin = (window - smoothed.first) // s
+            values = smoothed.columns[begin : begin + phi.size]
+            weak = -(phi_dot @ values[:, :width] + phi @ values[:, width : 2 * width]).reshape(COPIES, -1)
+            b = phi @ values[:, 2 * width :] - weak[:, self.rows.size :]
+            end = grid + window + self.width + MARGIN
+            out.append(Window(window // self.half_hop, end, weak[:, : self.rows.size], b, half_width))
+        return out
+
+    @property
+    def _entries(self) -> int:
+        n_v = self.model.layout.n_v
+        return 2 * COPIES * (self.rows.size + n_v) + n_v
+
+    def _columns(self, x: Array, v: Array, torque: Array) -> Array:
+        """P and G, each of the base parameters, packed, and of what is known, for every copy; Q: (K, entries)."""
+        K = torque.shape[0]
+        # Without noise all copies are one.
+        distinct = COPIES if np.any(x[1] != x[0]) else 1
+        packed = []
+        for part in self.model.momentum_columns(
+            x[:distinct].reshape(-1, x.shape[2]), v[:distinct].reshape(-1, v.shape[2])
+        ):
+            both = np.concatenate((part[:, self.rows, self._physical], self.base.known_part(part)), axis=1)
+            both = both.reshape(distinct, K, -1).swapaxes(0, 1)
+            packed.append(np.broadcast_to(both, (K, COPIES, both.shape[2])).reshape(K, -1))
+        return np.concatenate((*packed, self.model.generalized_force(torque)), axis=1)
+
+    def state(self) -> dict[str, Any]:
+        """What `restore` needs to continue."""
+        smoothed = {f"columns_{M}": kept.columns for M, kept in self._smoothed.items()}
+        return {
+            "samples": self._samples,
+            "position": np.array([self._first, self._window, self._told]),
+            "compared": np.array(self._compared),
+            "widths": np.array([(M, kept.first) for M, kept in self._smoothed.items()], dtype=np.int64).reshape(-1, 2),
+            **smoothed,
+        }
+
+    def restore(self, state: Mapping[str, NDArray[Any]]) -> None:
+        """Continue from a saved state."""
+        self._samples = np.array(state["samples"])
+        self._first, self._window, self._told = (int(k) for k in state["position"])
+        self._compared = list(np.array(state["compared"]))
+        self._smoothed = {
+            int(M): _Smoothed(int(first), np.array(state[f"columns_{M}"])) for M, first in state["widths"]
+        }

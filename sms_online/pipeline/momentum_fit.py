@@ -1,0 +1,289 @@
+"""Weights of the momentum balance: from windows of rows to rows with independent unit errors.
+
+Weights follow from the sensors' noise and the parameters, never from residuals: those collapse where noise is high. The
+parameters come from the fit itself: the first windows that move are held back, fitted without weights and then with
+them, and from then on every second takes the estimate so far. A start that is 70 % off gives the same answer.
+
+Where rows leave clearly more than the sensors' noise, the model lacks something, and neighbouring rows that share noise
+almost fully must not be subtracted from each other as if that were all: what is left over counts as an error of each
+row's own.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sms_online.model.base_parameters import BaseParameters
+from sms_online.model.model import Model
+from sms_online.pipeline.momentum_balance import COPIES, HOPS, INSTANTS, Instants, MomentumBalance, Window
+from sms_online.pipeline.row_noise import RowNoise, Whitener
+from sms_online.pipeline.sensitivity import Sensitivities
+from sms_online.pipeline.sensor_noise import FINEST, SensorNoise
+from sms_online.stream import Array
+
+# Motion before weights are made, s: at the usual width, four windows side by side.
+FIRST_MOTION = 1.6
+# Less does where a gap or the end of the session leaves no more.
+LEAST_MOTION = 0.4
+# What is held back at most, s; the oldest goes, for an arm that rests tells nothing.
+HELD_BACK = 16.0
+# Weighted fits of the windows held back before their rows are handed on.
+PASSES = 2
+# A window moves when a coordinate spans this many σ in it; noise alone spans 6.
+MOTION = 20.0
+# Mean square of a coordinate's residual over its predicted variance beyond which the model lacks something there: a
+# second of windows scatters by 20 %, the noise behind the prediction by 10 %.
+LARGEST_RATIO = 2.0
+# Share of a joint's torque that a fit may leave for its weights to be used.
+LARGEST_UNEXPLAINED = 0.5
+# Time from one renewal of the weights to the next, s.
+RENEWED = 1.0
+# Singular values below this share of the largest, of columns scaled to unit length, are not solved for.
+RANK_TOLERANCE = 1e-10
+
+
+@dataclass(frozen=True)
+class WhiteRows:
+    """Rows of one window, n_v of them: Y (n_v, n + 1) with b as its last column, independent, errors of unit variance.
+
+    noisy (2, n_v, n + 1): the same with synthetic noise added and subtracted. end: grid index of the window's last
+    sample.
+    """
+
+    Y: Array
+    noisy: Array
+    end: int
+
+
+class MomentumFit:
+    """Whitens the windows of a session, segment by segment.
+
+    solve: gives the estimate of β so far (n,), NaN where nothing is known of it. readings: x (K, n_x) to the
+    displacements (K, n_v, sensors) that unit noise of each position sensor makes.
+    """
+
+    def __init__(
+        self,
+        model: Model,
+        base: BaseParameters,
+        balance: MomentumBalance,
+        readings: Callable[[Array], Array],
+        solve: Callable[[], Array],
+    ) -> None:
+        self.model = model
+        self.base = base
+        self._balance = balance
+        self._solve = solve
+        self._sensitivities = Sensitivities(model, readings, balance.span / INSTANTS)
+        self._noise = RowNoise(model.layout.theta_m, balance.span)
+        self._whitener = Whitener(model.layout.n_v, COPIES * (base.n + 1))
+        self.weights: Array | None = None  # β (n,) behind the weights
+        self._since = 0  # windows since they were renewed
+        self._moving = 0
+        self._held: list[Window] = []
+        self._bends = np.empty((0, model.layout.n_v))
+        self._largest = np.zeros(model.layout.n_v)  # largest sum of a row's terms
+        # Gram matrices of rows [Y b] over their own standard deviations, by generalized speed, and how many windows.
+        self.plain_gram = np.zeros((model.layout.n_v, base.n + 1, base.n + 1))
+        self.plain_windows = 0
+        self.misfit = np.zeros(model.layout.n_v)  # excess over one of the mean square of such rows' residual
+        self._begin_segment()
+
+    def end_segment(self, noise: SensorNoise) -> list[WhiteRows]:
+        """Rows of the windows held back, if they tell enough for weights; the next ones share no samples with them."""
+        out = self.flush(noise) if self._held and self._moving >= self._count(LEAST_MOTION) else []
+        self._begin_segment()
+        return out
+
+    def _begin_segment(self) -> None:
+        layout = self.model.layout
+        self._held.clear()
+        self._moving = 0
+        self._first = 0  # number of the first instant kept
+        self._x, self._v = np.empty((0, layout.n_x)), np.empty((0, layout.n_v))
+        self._sensitivities.forget(0)
+        self._forget_rows()
+
+    def _forget_rows(self) -> None:
+        self._noise.begin_segment()
+        self._whitener.begin_segment()
+        self._bends = self._bends[:0]
+
+    def push(self, windows: list[Window], instants: list[Instants], noise: SensorNoise) -> list[WhiteRows]:
+        """Rows of the windows that a push completed, and of those held back before."""
+        self._x = np.concatenate((self._x, *(piece.x for piece in instants)))
+        self._v = np.concatenate((self._v, *(piece.v for piece in instants)))
+        if self.weights is not None:
+            self._renew()
+            self._tell()
+            out = [self._white(window, noise) for window in windows]
+            self._since += len(out)
+        else:
+            self._held += windows
+            self._moving += sum(self._moves(window, noise) for window in windows)
+            out = self.flush(noise) if self._moving >= self._count(FIRST_MOTION) else []
+            self._held = self._held[-self._count(HELD_BACK) :]
+        self._forget_instants(windows)
+        return out
+
+    def flush(self, noise: SensorNoise) -> list[WhiteRows]:
+        """Fit the windows held back, without weights and then with those of the fit before, and return their rows.
+
+        Nothing where the model does not explain the torques: then the rows without a torque, which are homogeneous in
+        π, would win, and weights that follow π would shrink it to zero. More motion is waited for.
+        """
+        self._moving = 0
+        self.weights = _least_squares(np.concatenate([self._dense(window)[0] for window in self._held]))
+        for _ in range(PASSES):
+            if not self._explains_torques():
+                self.weights = None
+                return []
+            self._retell()
+            white = [self._white(window, noise).Y for window in self._held]
+            self.weights = _least_squares(np.concatenate(white))
+            self._judge()
+        self._retell()
+        out = [self._white(window, noise) for window in self._held]
+        self._held.clear()
+        return out
+
+    def _explains_torques(self) -> bool:
+        """Whether the fit so far explains every joint's torque over the windows held back, by and large."""
+        joints = list(self.model.layout.theta_m)
+        rows = np.stack([self._dense(window)[0, joints] for window in self._held])
+        left = rows[..., -1] - rows[..., :-1] @ self._known_weights
+        return bool(np.all(np.linalg.norm(left, axis=0) <= LARGEST_UNEXPLAINED * np.linalg.norm(rows[..., -1], axis=0)))
+
+    @property
+    def _known_weights(self) -> Array:
+        assert self.weights is not None
+        return self.weights
+
+    def _count(self, seconds: float) -> int:
+        """Windows that begin in so many seconds."""
+        return max(1, round(seconds * HOPS / self._balance.span))
+
+    def whitened(self, rows: list[int], beta: Array) -> float | None:
+        """rms of the residual of some generalized speeds' rows over its predicted standard deviation, for β (n,)."""
+        if self.plain_windows == 0:
+            return None
+        w = np.append(beta, -1.0)
+        mean_square = w @ self.plain_gram[rows].mean(axis=0) @ w / self.plain_windows
+        return float(np.sqrt(max(0.0, mean_square)))
+
+    def _moves(self, window: Window, noise: SensorNoise) -> bool:
+        inside = slice(window.start - self._first, window.start - self._first + INSTANTS + 1)
+        return bool(np.any(np.ptp(self._x[inside], axis=0) > MOTION * noise.coordinates))
+
+    def _renew(self) -> None:
+        """Take the estimate so far for the weights of the windows to come, once a second."""
+        if self._since >= self._count(RENEWED):
+            beta = self._solve()
+            self.weights = np.where(np.isnan(beta), self._known_weights, beta)
+            self._judge()
+            self._since = 0
+
+    def _judge(self) -> None:
+        """What rows leave beyond their predicted variance so far, where that is no accident."""
+        w = np.append(self._known_weights, -1.0)
+        ratio = np.einsum("i,vij,j->v", w, self.plain_gram, w) / self.plain_windows
+        self.misfit = np.where(ratio > LARGEST_RATIO, ratio - 1.0, 0.0)
+
+    def _retell(self) -> None:
+        """Work off the windows held back from the first one on."""
+        self.plain_gram[:] = 0.0
+        self.plain_windows = 0
+        self._sensitivities.forget(self._first)
+        self._forget_rows()
+        self._tell()
+
+    def _tell(self) -> None:
+        """Sensitivities of the instants that have none yet."""
+        fresh = self._sensitivities.next_instant - self._first
+        pi = self.base.physical_values(self._known_weights)
+        self._sensitivities.tell(pi, self._x[fresh:], self._v[fresh:])
+
+    def _dense(self, window: Window) -> Array:
+        """[Y b] (copies, n_v, n + 1)."""
+        rows = np.zeros((COPIES, self.model.layout.n_v, self.base.n + 1))
+        rows[:, self._balance.rows, self._balance.columns] = window.Y
+        rows[:, :, -1] = window.b
+        return rows
+
+    def _white(self, window: Window, noise: SensorNoise) -> WhiteRows:
+        n_v = self.model.layout.n_v
+        sensitivity = self._sensitivities.window(window.start)
+        covariances = self._noise.covariance(sensitivity, noise.sensors, noise.torque)
+        rows = self._dense(window)
+        residual = rows[..., -1] - rows[..., :-1] @ self._known_weights
+        # What noise does beyond first order, which nothing propagates: a sample of it for every row.
+        bend = 0.5 * (residual[1] + residual[2]) - residual[0]
+        self._bends = np.concatenate((self._bends[1 - HOPS :], bend[None]))
+        # A row whose coordinate has no noise, as far as the weights know, is exact to rounding only.
+        size = np.abs(rows[0, :, :-1]) @ np.abs(self._known_weights) + np.abs(rows[0, :, -1])
+        self._largest = np.maximum(self._largest, size)
+        rounding = (FINEST * self._largest) ** 2 + np.finfo(np.float64).tiny
+        covariances[-1][np.diag_indices(n_v)] += np.mean(self._bends**2, axis=0) + rounding
+        variance = np.diag(covariances[-1]).copy()
+        plain = rows[0] / np.sqrt(variance)[:, None]
+        self.plain_gram += plain[:, :, None] * plain[:, None, :]
+        self.plain_windows += 1
+        covariances[-1][np.diag_indices(n_v)] += self.misfit * variance
+        side_by_side = rows.swapaxes(0, 1).reshape(n_v, -1)
+        white = self._whitener.push(covariances, side_by_side).reshape(n_v, COPIES, -1).swapaxes(0, 1)
+        return WhiteRows(white[0], white[1:], window.end)
+
+    def _forget_instants(self, windows: list[Window]) -> None:
+        """Drop the states that no window to come asks for."""
+        needed = self._held[0].start if self._held else windows[-1].start if windows else self._first
+        drop = needed - self._first
+        self._first = needed
+        self._x, self._v = self._x[drop:], self._v[drop:]
+        if self.weights is not None:
+            self._sensitivities.drop(needed)
+
+    def state(self) -> dict[str, Any]:
+        """What `restore` needs to continue."""
+        held = {
+            "held_place": np.array([(w.start, w.end, w.half_width) for w in self._held], dtype=np.int64).reshape(-1, 3),
+            "held_Y": np.array([w.Y for w in self._held]).reshape(-1, COPIES, self._balance.rows.size),
+            "held_b": np.array([w.b for w in self._held]).reshape(-1, COPIES, self.model.layout.n_v),
+        }
+        return {
+            "weights": np.empty(0) if self.weights is None else self.weights, "since": self._since,
+            "moving": self._moving, "first": self._first, "x": self._x, "v": self._v,
+            "bends": self._bends, "largest": self._largest, "misfit": self.misfit, "plain_gram": self.plain_gram,
+            "plain_windows": self.plain_windows, **held, **self._noise.state(), **self._whitener.state(),
+            **self._sensitivities.state(),
+        }  # fmt: skip
+
+    def restore(self, state: Mapping[str, NDArray[Any]]) -> None:
+        """Continue from a saved state."""
+        self.weights = np.array(state["weights"]) if state["weights"].size else None
+        self._since, self._moving, self._first = int(state["since"]), int(state["moving"]), int(state["first"])
+        self._x, self._v = np.array(state["x"]), np.array(state["v"])
+        self._sensitivities.restore(state)
+        self._largest = np.array(state["largest"])
+        self._bends, self.misfit = np.array(state["bends"]), np.array(state["misfit"])
+        self.plain_gram, self.plain_windows = np.array(state["plain_gram"]), int(state["plain_windows"])
+        self._held = [
+            Window(int(start), int(end), np.array(Y), np.array(b), int(half_width))
+            for (start, end, half_width), Y, b in zip(
+                state["held_place"], state["held_Y"], state["held_b"], strict=True
+            )
+        ]
+        self._noise.restore(state)
+        self._whitener.restore(state)
+
+
+def _least_squares(rows: Array) -> Array:
+    """Least-squares solution (n,) of rows [Y b] (M, n + 1), of minimum norm in units of the columns' sizes."""
+    size = np.linalg.norm(rows, axis=0)
+    scale = np.where(size[:-1] > 0.0, size[:-1], 1.0)
+    solution = np.linalg.lstsq(rows[:, :-1] / scale, rows[:, -1], rcond=RANK_TOLERANCE)[0]
+    return np.asarray(solution / scale)

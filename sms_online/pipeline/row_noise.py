@@ -1,0 +1,144 @@
+"""Noise of weak-form rows, propagated from the sensors, and the rows made independent of each other by it.
+
+A row's error is linear in the noise n(t) of the positions: ∫ c(t) n(t) dt with
+c = φ̈ H + φ̇ (Ḣ + ∂Gπ/∂v - ∂Pπ/∂x) + φ (d/dt ∂Gπ/∂v - ∂Gπ/∂x), P π = H v the momentum and G π the force of the
+balance; and ∫ φ n_τ dt from the noise of the torque. White noise of 1σ per sample has the density σ² T_s. Rows of
+windows that overlap share noise, so their covariance is block-banded, and so is its Cholesky factor L: L⁻¹ [Y b] are
+rows with independent errors of standard deviation one.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+import scipy.linalg
+from numpy.typing import NDArray
+
+from sms_online.pipeline.momentum_balance import EXPONENT, HOPS, INSTANTS
+from sms_online.pipeline.sensitivity import SPARSE, Sensitivity, nodes
+from sms_online.pipeline.weak_form import test_function
+from sms_online.stream import Array
+
+# Steps of the integrals over c(t): two for each instant that the sensitivity is told at.
+STEPS = 2 * INSTANTS
+STEPS_A_HOP = STEPS // HOPS
+# Share of a row's variance that is added to it alone, for the rounding of the factorisation.
+OWN_SHARE = 1e-7
+
+
+class RowNoise:
+    """Covariance of each window's rows with those of the windows before it.
+
+    joint_rows: rows that hold each joint's torque.
+    """
+
+    def __init__(self, joint_rows: tuple[int, ...], span: float) -> None:
+        self._joint_rows = list(joint_rows)
+        self._step = span / STEPS
+        self._phi, self._phi_dot, self._phi_ddot = test_function(STEPS, span, EXPONENT)
+        self._weights = [self._told(offset, span) for offset in range(SPARSE)]
+        # ∫ φ(t) φ(t + k hops) dt.
+        shifted = [self._phi[: STEPS + 1 - k * STEPS_A_HOP] @ self._phi[k * STEPS_A_HOP :] for k in range(HOPS)]
+        self._overlap = self._step * np.array(shifted)
+        self._before: deque[Array] = deque(maxlen=HOPS - 1)
+        self._torque_before: deque[Array] = deque(maxlen=HOPS - 1)
+
+    def _told(self, offset: int, span: float) -> Array:
+        """Weights (STEPS + 1, ·) that make c out of H, Ḣ, ∂Pπ/∂x, ∂Gπ/∂v and ∂Gπ/∂x where they are told."""
+        steps, instants = np.arange(STEPS + 1.0), np.arange(0.0, STEPS + 1.0, STEPS // INSTANTS)
+        dense = _interpolation(steps, instants)
+        sparse = _interpolation(steps, instants[nodes(offset)])
+        slope = dense @ np.gradient(sparse[:: STEPS // INSTANTS], span / INSTANTS, axis=0)
+        phi, phi_dot, phi_ddot = self._phi[:, None], self._phi_dot[:, None], self._phi_ddot[:, None]
+        of_force = (-phi_dot * sparse, phi_dot * sparse + phi * slope, -phi * sparse)
+        return np.concatenate((phi_ddot * dense, phi_dot * dense, *of_force), axis=1)
+
+    def begin_segment(self) -> None:
+        """The next window shares no samples with those before."""
+        self._before.clear()
+        self._torque_before.clear()
+
+    def covariance(self, window: Sensitivity, sensor_density: Array, torque_density: Array) -> list[Array]:
+        """Covariances (n_v, n_v) with the windows before, oldest first, then the window's own; (N s)² and so on.
+
+        sensor_density (sensors,): σ² T_s of each position sensor. torque_density (joints,): of n τ, (N m)² s.
+        """
+        parts = (window.H, window.H_dot, window.P_x, window.G_v, window.G_x)
+        n_v, sensors = window.H.shape[1:]
+        stacked = np.concatenate(parts).reshape(-1, n_v * sensors)
+        c = (self._weights[window.offset] @ stacked).reshape(STEPS + 1, n_v, sensors)
+        c = (c * np.sqrt(self._step * sensor_density)).transpose(1, 0, 2)  # (n_v, STEPS + 1, sensors)
+        c = np.ascontiguousarray(c)
+        out = []
+        for k in range(len(self._before), -1, -1):
+            other = c if k == 0 else self._before[-k]
+            shift = k * STEPS_A_HOP
+            ours, theirs = c[:, : STEPS + 1 - shift], other[:, shift:]
+            block = ours.reshape(len(c), -1) @ theirs.reshape(len(c), -1).T
+            torque = np.sqrt(torque_density * (torque_density if k == 0 else self._torque_before[-k]))
+            block[self._joint_rows, self._joint_rows] += self._overlap[k] * torque
+            out.append(block)
+        self._before.append(c)
+        self._torque_before.append(torque_density)
+        return out
+
+    def state(self) -> dict[str, Array]:
+        """What `restore` needs to continue."""
+        return {"before": np.array(self._before), "torque_before": np.array(self._torque_before)}
+
+    def restore(self, state: Mapping[str, NDArray[Any]]) -> None:
+        """Continue from a saved state."""
+        self._before = deque(np.array(state["before"]), maxlen=HOPS - 1)
+        self._torque_before = deque(np.array(state["torque_before"]), maxlen=HOPS - 1)
+
+
+def _interpolation(at: Array, nodes: Array) -> Array:
+    """Weights (at, nodes) of linear interpolation, constant beyond the ends."""
+    return np.stack([np.interp(at, nodes, unit) for unit in np.eye(nodes.size)], axis=1)
+
+
+class Whitener:
+    """Rows of overlapping windows, one window after the other, turned into rows with independent unit errors."""
+
+    def __init__(self, n_v: int, width: int) -> None:
+        self._n_v, self._width = n_v, width
+        self.begin_segment()
+
+    def begin_segment(self) -> None:
+        """The next window shares no noise with those before."""
+        self._L = np.empty((0, 0))  # Cholesky factor of the windows that the next one overlaps
+        self._white = np.empty((0, self._width))  # and their whitened rows
+
+    def push(self, covariances: list[Array], rows: Array) -> Array:
+        """Whitened rows (n_v, width) of the next window's (n_v, width), from `RowNoise.covariance`.
+
+        Raises numpy.linalg.LinAlgError where the covariance is not positive definite.
+        """
+        n_v = self._n_v
+        own = covariances[-1].copy()
+        own[np.diag_indices(n_v)] *= 1.0 + OWN_SHARE
+        size = n_v * (len(covariances) - 1)
+        forget = len(self._L) - size
+        L, white = self._L[forget:, forget:], self._white[forget:]
+        cross = np.concatenate([np.empty((n_v, 0)), *covariances[:-1]], axis=1).T  # (size, n_v)
+        X = scipy.linalg.solve_triangular(L, cross, lower=True, check_finite=False) if size else cross
+        own -= X.T @ X
+        rows = rows - X.T @ white
+        diagonal = np.linalg.cholesky(own)
+        out = np.asarray(scipy.linalg.solve_triangular(diagonal, rows, lower=True, check_finite=False))
+        grown = np.zeros((size + n_v, size + n_v))
+        grown[:size, :size] = L
+        grown[size:, :size], grown[size:, size:] = X.T, diagonal
+        self._L, self._white = grown, np.concatenate((white, out))
+        return out
+
+    def state(self) -> dict[str, Array]:
+        """What `restore` needs to continue."""
+        return {"L": self._L, "white": self._white}
+
+    def restore(self, state: Mapping[str, NDArray[Any]]) -> None:
+        """Continue from a saved state."""
+        self._L, self._white = np.array(state["L"]), np.array(state["white"])

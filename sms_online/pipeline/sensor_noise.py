@@ -1,0 +1,95 @@
+"""Noise of the sensors as the balances need it: stated in the system file, or estimated from a channel's samples."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sms_online.pipeline.noise import noise_std
+from sms_online.pipeline.sensing import Sensing
+from sms_online.stream import Array
+
+# A channel's last samples that an estimate takes: 2 % scatter.
+SAMPLES = 4000
+# Fewer give no estimate.
+FEWEST_SAMPLES = 100
+# No sensor is better than this share of its largest reading: what is left is rounding, and interpolation between the
+# samples.
+FINEST = 1e-10
+
+
+@dataclass(frozen=True)
+class SensorNoise:
+    """Noise of position sensors and joint torques.
+
+    sensors (n_x,), torque (joints,): densities σ² T_s of each position sensor, in the order of the coordinates, and of
+    n τ. coordinates (n_x,): 1σ of the coordinates x a grid sample, had they white noise of those densities. grid
+    (n_x,): the same of the position sensors. exact: there is none, but for rounding.
+    """
+
+    sensors: Array
+    torque: Array
+    coordinates: Array
+    grid: Array
+    exact: bool
+
+
+class NoiseEstimate:
+    """Collects each channel's own samples, which are not interpolated, and tells the noise of all.
+
+    sample_rate: of the grid, Hz.
+    """
+
+    def __init__(self, sensing: Sensing, sample_rate: float) -> None:
+        self._sensing = sensing
+        self._sample_rate = sample_rate
+        count = len(sensing.channels)
+        self._samples = [np.empty(0) for _ in range(count)]
+        self._largest = np.zeros(count)
+
+    def push(self, values: Array) -> None:
+        """Take samples (B, channels), NaN where a channel has none."""
+        if not np.isnan(values).any():
+            self._largest = np.maximum(self._largest, np.abs(values).max(axis=0, initial=0.0))
+            self._samples = [
+                np.concatenate((kept, column))[-SAMPLES:] for kept, column in zip(self._samples, values.T, strict=True)
+            ]
+            return
+        for k, column in enumerate(values.T):
+            own = column[np.isfinite(column)]
+            self._largest[k] = max(self._largest[k], np.abs(own).max(initial=0.0))
+            self._samples[k] = np.concatenate((self._samples[k], own))[-SAMPLES:]
+
+    @property
+    def ready(self) -> bool:
+        """Whether every channel has samples enough."""
+        return all(kept.size >= FEWEST_SAMPLES for kept in self._samples)
+
+    def noise(self, periods: Array) -> SensorNoise:
+        """Noise from what is stated and, where nothing is, from the samples so far; periods (channels,): s, or NaN."""
+        sigma = self._sensing.stated_noise
+        silent = np.flatnonzero(np.isnan(sigma))
+        for k in silent:
+            sigma[k] = noise_std(self._samples[k][:, None])[0]
+        floor = FINEST * self._largest + np.finfo(np.float64).tiny
+        exact = bool(np.all(sigma <= floor))
+        period = np.maximum(np.where(np.isnan(periods), 0.0, periods), 1.0 / self._sample_rate)
+        density = np.maximum(sigma, floor) ** 2 * period
+        sensors = density[self._sensing.position_columns]
+        torque = self._sensing.joint_torque(np.sqrt(density)[None])[0] ** 2
+        grid = np.sqrt(sensors * self._sample_rate)
+        return SensorNoise(sensors, torque, self._sensing.coordinate_noise(grid), grid, exact)
+
+    def state(self) -> dict[str, Any]:
+        """What `restore` needs to continue."""
+        sizes = np.array([kept.size for kept in self._samples])
+        return {"samples": np.concatenate(self._samples), "sizes": sizes, "largest": self._largest}
+
+    def restore(self, state: Mapping[str, NDArray[Any]]) -> None:
+        """Continue from a saved state."""
+        self._samples = np.split(np.array(state["samples"]), np.cumsum(state["sizes"])[:-1])
+        self._largest = np.array(state["largest"])
