@@ -1,10 +1,14 @@
 """Cramér–Rao bound of π: the least standard deviation that an unbiased estimator can reach with given sensors.
 
-All positions and the joint torques are measured with white noise. The measured torque is the input of the equations of
-motion, so its noise drives the state; controller and initial state are unknown. Linearised about the true motion, with
-s = [δx, δv] (attitude as a small inertial rotation),
+Sensors have white noise. The measured torque is the input of the equations of motion, so its noise drives the state;
+controller and initial state are unknown. With the momentum p = ∂K/∂v as half of the state, s = [δx, δp] (attitude as a
+small inertial rotation), the balance d/dt(P π) - G π = Q, (33)-(38), is linearised about the true motion as it stands:
 
-    s_{k+1} = Φ_k s_k + Γ_k δ(n τ)_k + B_k δβ,    δy_k = C_k s_k + noise,
+    δv = H⁻¹ (δp - ∂Pπ/∂x δx - P δβ),    d/dt δp = ∂Gπ/∂x δx + ∂Gπ/∂v δv + G δβ + δQ,
+
+without accelerations, which a jolt makes large and a capture does not hold. In discrete time
+
+    s_{k+1} = Φ_k s_k + Γ_k δ(n τ)_k + B_k δβ,    δy_k = C_k s_k + D_k δβ + noise,
 
 the innovations of the Kalman filter of s are white and depend linearly on β, which gives Fisher's information as
 Σ Sᵀ R_e⁻¹ S with S their sensitivity. Source: Kailath, Sayed, Hassibi, Linear Estimation (2000), ch. 9 for the
@@ -13,22 +17,32 @@ innovations and ch. 12 for the square-root array form used here.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import scipy.linalg
+from numpy.typing import NDArray
 
 from sms_online.model.base_parameters import BaseParameters
 from sms_online.model.model import Dynamics, Model
 from sms_online.model.so3 import skew
+from sms_online.pipeline.estimator import Estimator
+from sms_online.pipeline.sensitivity import derivatives
+from sms_online.sensor_set import Readings, SensorSet, session_sensors
 from sms_online.stream import Array
 
-# Step of the central differences, rad, m (and s along the motion): truncation and rounding both near 1e-10 relative.
+# Step of a bound, s. Planar example, grade B, 20 s: all bounds within 2 % of those at 1 ms (the second stator's inertia
+# within 10 %), at a tenth of the cost.
+STEP = 0.01
+# Derivatives by displacements and readings are told that often and interpolated, s: they follow the joints, while the
+# mass matrix, which carries conserved momenta, is told at every step. 0.16 s changes no bound by 2 %.
+DERIVATIVES_INTERVAL = 0.08
+# Instants worked off together: enough to hide the cost of a call, little memory.
+INSTANTS_PER_CALL = 512
+# Step of the central differences of readings, rad, m, rad/s, m/s: truncation and rounding both near 1e-10 relative.
 DIFFERENCE = 1e-5
-# States evaluated in one call of the model: enough to hide the cost of a call, little memory.
-STATES_PER_CALL = 2000
-# Initial standard deviations, rad or m and rad/s or m/s, that leave the initial state free: ten thousand times what
-# sensors of the coarsest grade resolve.
+# Initial standard deviations, rad or m, and of the momenta as of speeds in rad/s or m/s, that leave the initial state
+# free: ten thousand times what sensors of the coarsest grade resolve.
 FREE_POSITION = 10.0
 FREE_SPEED = 100.0
 # A step is halved until the scaled norm of A h is below SMALL_STEP: a Taylor series to this order is then exact to
@@ -36,10 +50,67 @@ FREE_SPEED = 100.0
 SMALL_STEP = 0.25
 TAYLOR_ORDER = 10
 # Singular values of the information's root, with columns of unit length, below this share of the largest are zero: the
-# columns are differences good to 1e-10, while a combination that the motion does determine stays above 1e-6.
+# derivatives are good to 1e-8, while a combination that the motion does determine stays above 1e-6.
 RANK_TOLERANCE = 1e-8
 # Share of a parameter in an undetermined direction above which it is itself undetermined.
 UNDETERMINED_SHARE = 1e-6
+
+
+@dataclass(frozen=True)
+class Motion:
+    """A motion at a uniform step: t (B,) s, x (B, n_x), v (B, n_v) in the order of the model's layout."""
+
+    t: Array
+    x: Array
+    v: Array
+
+    @property
+    def step(self) -> float:
+        """Time from one instant to the next, s."""
+        return float((self.t[-1] - self.t[0]) / (self.t.size - 1))
+
+
+class MotionRecord:
+    """A session's motion at the step of a bound, segment by segment; some 250 n_v bytes a second at STEP."""
+
+    def __init__(self, sample_rate: float) -> None:
+        self._sample_rate = sample_rate
+        self._every = max(1, round(STEP * sample_rate))
+        self._segments: dict[int, list[Motion]] = {}
+
+    def add(self, index: NDArray[np.int64], segment: int, x: Array, v: Array) -> None:
+        """Take consecutive grid samples (B,) of one segment: grid index, x (B, n_x), v (B, n_v)."""
+        kept = index % self._every == 0
+        piece = Motion(index[kept] / self._sample_rate, x[kept], v[kept])
+        self._segments.setdefault(segment, []).append(piece)
+
+    @property
+    def motions(self) -> list[Motion]:
+        """One motion a segment; those too short to hold a step are left out."""
+        joined = [
+            Motion(*(np.concatenate([getattr(piece, name) for piece in pieces]) for name in ("t", "x", "v")))
+            for pieces in self._segments.values()
+        ]
+        return [motion for motion in joined if motion.t.size > 1]
+
+
+def session_bound(estimator: Estimator, record: MotionRecord) -> Array | None:
+    """Bound (n,) of a finished session at its own estimate, with the noise that it has used of its sensors.
+
+    None where there is none: no noise known or no noise at all, no motion, parameters not determined, or estimates that
+    are no mechanism, with a mass matrix that is not positive definite.
+    """
+    noise = None if estimator.momentum is None else estimator.momentum.sensor_noise
+    estimate, motions = estimator.estimate(), record.motions
+    if noise is None or noise.exact or not motions or not estimate.determined.all():
+        return None
+    dynamics = estimator.model.dynamics(estimator.base.physical_values(estimate.pi))
+    try:
+        for motion in motions:
+            np.linalg.cholesky(dynamics.mass_matrix(motion.x))
+    except np.linalg.LinAlgError:
+        return None
+    return cramer_rao_bound(dynamics, estimator.base, motions, session_sensors(estimator.model, noise))
 
 
 @dataclass(frozen=True)
@@ -47,51 +118,44 @@ class LinearSystem:
     """The linearised system at B instants, m = 2 n_v states.
 
     A (B, m, m): of ṡ = A s. E (B, m, joints + n): columns by which joint torques n τ and parameters β drive ṡ.
-    C (B, n_x, m): readings of base and joint positions, then of markers, by s.
+    C (B, channels, m), D (B, channels, n): readings by s and by β. H (B, n_v, n_v): mass matrix.
     """
 
     A: Array
     E: Array
     C: Array
+    D: Array
+    H: Array
 
 
-def cramer_rao_bound(
-    dynamics: Dynamics,
-    base: BaseParameters,
-    t: Array,
-    x: Array,
-    v: Array,
-    joint_torque: Array,
-    sigma_x: Array,
-    sigma_tau: Array,
-) -> Array:
+def cramer_rao_bound(dynamics: Dynamics, base: BaseParameters, motions: Sequence[Motion], sensors: SensorSet) -> Array:
     """Least standard deviation (n,) of every base parameter, in its unit; inf where the motion does not determine it.
 
-    t (B,) s, uniform; x (B, n_x), v (B, n_v), n τ (B, joints) on the true motion under `dynamics`; the last instant
-    only ends the last step. sigma_x (n_x,): noise of the positions, markers in the place of elastic coordinates;
-    sigma_tau (joints,): of n τ, N m (N). Both 1σ, white per sample at the system's sample rate, positive.
-
-    t may be coarser than that rate: of white noise only the density σ² T_s matters where the step is short against what
-    an estimator averages over, so that fewer samples with less noise say the same. The step has to follow the motion,
-    though. Planar example, grade B, 20 s: 1 and 2 ms agree to 0.5 %, but for joint_2.damping to 4 %; at 10 ms that one,
-    which lives in the jolt at the start, comes out 28 % too low.
-    Raises ValueError where t is not uniform.
+    motions: true motions under `dynamics`, of which the initial state is unknown each; the last instant only ends the
+    last step. The step need not be that of the sensors: of white noise only the density counts while the step is short
+    against what an estimator averages over. It has to follow the motion, though, see STEP.
+    Limitations: a sensor slower than the motion is taken for one of as much density that is not. Where x and v are
+    estimates themselves, their noise counts as excitation: bounds of more than some percent come out low.
+    Raises ValueError where a motion has no uniform step, InputError where a reading is unknown.
     """
-    step = (t[-1] - t[0]) / (t.size - 1)
-    if not np.allclose(np.diff(t), step, rtol=1e-6, atol=0.0):
-        raise ValueError("the bound needs instants at a uniform step")
-    model = dynamics.model
-    joints = len(model.layout.q)
-    shrink = np.sqrt(step * model.system.sample_rate)
-    sensors = sigma_x / shrink
-    drive = sigma_tau / shrink
-    information = Information(model.layout.n_v, base.n)
-    B = max(1, STATES_PER_CALL // model.layout.n_v)
-    for start in range(0, t.size - 1, B):
-        rows = slice(start, start + B + 1)
-        linear = linearise(dynamics, base, x[rows], v[rows], joint_torque[rows])
-        Phi, D = discretise(_middle(linear.A), _middle(linear.E), step)
-        information.add(linear.C[:-1] / sensors[:, None], Phi, D[..., :joints] * drive, D[..., joints:])
+    readings = Readings(dynamics.model, sensors.channels)
+    n_v, joints = dynamics.model.layout.n_v, len(dynamics.model.layout.q)
+    information = Information(n_v, base.n)
+    for motion in motions:
+        step = motion.step
+        if not np.allclose(np.diff(motion.t), step, rtol=1e-6, atol=0.0):
+            raise ValueError("the bound needs instants at a uniform step")
+        every = max(1, round(DERIVATIVES_INTERVAL / step))
+        instants = every * max(1, INSTANTS_PER_CALL // every)
+        noise, drive = np.sqrt(sensors.density / step)[:, None], np.sqrt(sensors.torque / step)
+        for start in range(0, motion.t.size - 1, instants):
+            rows = slice(start, start + instants + 1)
+            linear = linearise(dynamics, base, readings, motion.x[rows], motion.v[rows], every)
+            if start == 0:
+                information.begin(linear.H[0])
+            Phi, driven = discretise(_middle(linear.A), _middle(linear.E), step)
+            Gamma, B = driven[..., :joints] * drive, driven[..., joints:]
+            information.add(linear.C[:-1] / noise, linear.D[:-1] / noise, Phi, Gamma, B)
     return information.standard_deviations()
 
 
@@ -99,67 +163,55 @@ def _middle(samples: Array) -> Array:
     return np.asarray(0.5 * (samples[1:] + samples[:-1]))
 
 
-def linearise(dynamics: Dynamics, base: BaseParameters, x: Array, v: Array, joint_torque: Array) -> LinearSystem:
-    """The equations of motion (40) and the readings, linearised at x (B, n_x), v (B, n_v), n τ (B, joints)."""
+def linearise(
+    dynamics: Dynamics, base: BaseParameters, readings: Readings, x: Array, v: Array, every: int = 1
+) -> LinearSystem:
+    """The balance and the readings, linearised at x (B, n_x), v (B, n_v).
+
+    every: derivatives by displacements and of readings are told at one instant in so many, and interpolated between.
+    """
     model, layout = dynamics.model, dynamics.model.layout
-    (B, n_v), joints = v.shape, joint_torque.shape[1]
-    H, bias = dynamics.mass_and_bias(x, v)
-    Q = model.generalized_force(joint_torque)
-    a = np.asarray(np.linalg.solve(H, (Q - bias)[..., None])[..., 0], dtype=np.float64)
-    # Every instant n_v times, moved along one coordinate or rate each.
-    x_n, v_n, a_n = (np.repeat(values, n_v, axis=0) for values in (x, v, a))
-    dv = DIFFERENCE * np.tile(np.eye(n_v), (B, 1))
-    dx = layout.position_rate(x_n, dv)
+    (B, n_v), joints = v.shape, len(layout.q)
+    nodes = np.unique(np.append(np.arange(0, B, every), B - 1))
+    weights = np.stack([np.interp(np.arange(B), nodes, unit) for unit in np.eye(nodes.size)], axis=1)
 
-    def difference(plus: Array, minus: Array) -> Array:
-        """Derivatives (B, ·, n_v), a column for each coordinate moved."""
-        return np.asarray(((plus - minus) / (2.0 * DIFFERENCE)).reshape(B, n_v, -1).transpose(0, 2, 1))
+    def interpolated(told: Array) -> Array:
+        return np.asarray(np.tensordot(weights, told, 1))
 
-    def inverse_dynamics(x: Array, v: Array) -> Array:
-        """H v̇ + C at the unmoved v̇."""
-        H, bias = dynamics.mass_and_bias(x, v)
-        return np.asarray((H @ a_n[..., None])[..., 0] + bias)
-
-    forces = np.concatenate(
-        (
-            difference(inverse_dynamics(x_n + dx, v_n), inverse_dynamics(x_n - dx, v_n)),
-            difference(inverse_dynamics(x_n, v_n + dv), inverse_dynamics(x_n, v_n - dv)),
-            np.broadcast_to(-model.generalized_force(np.eye(joints)).T, (B, n_v, joints)),
-            base.columns(inverse_dynamics_columns(model, x, v, a)),
-        ),
-        axis=2,
+    P_x, G_v, G_x = np.split(interpolated(derivatives(dynamics, x[nodes], v[nodes])), 3, axis=2)
+    C_x, C_v = (interpolated(part) for part in reading_derivatives(readings, model, x[nodes], v[nodes]))
+    H = dynamics.mass_matrix(x)
+    P, G = (base.columns(part) for part in model.momentum_columns(x, v))
+    # δv by δx, δp and δβ.
+    v_p = np.linalg.inv(H)
+    v_x, v_beta = -v_p @ P_x, -v_p @ P
+    A = np.concatenate(
+        (np.concatenate((v_x, v_p), axis=2), np.concatenate((G_x + G_v @ v_x, G_v @ v_p), axis=2)), axis=1
     )
-    accelerations = -np.linalg.solve(H, forces)
-    A = np.zeros((B, 2 * n_v, 2 * n_v))
-    A[:, :n_v, n_v:] = np.eye(n_v)
-    A[:, n_v:] = accelerations[..., : 2 * n_v]
     if layout.free and not layout.planar:
         # A small inertial rotation φ of the attitude obeys φ̇ = δω + ω × φ.
-        A[:, 3:6, 3:6] = skew(v[:, 3:6])
+        A[:, 3:6, 3:6] += skew(v[:, 3:6])
     E = np.zeros((B, 2 * n_v, joints + base.n))
-    E[:, n_v:] = accelerations[..., 2 * n_v :]
-    C = np.zeros((B, layout.n_x, 2 * n_v))
-    C[..., :n_v] = difference(_readings(model, x_n + dx), _readings(model, x_n - dx))
-    return LinearSystem(A, E, C)
+    E[:, n_v:, :joints] = model.generalized_force(np.eye(joints)).T
+    E[:, :n_v, joints:], E[:, n_v:, joints:] = v_beta, G + G_v @ v_beta
+    return LinearSystem(A, E, np.concatenate((C_x + C_v @ v_x, C_v @ v_p), axis=2), C_v @ v_beta, H)
 
 
-def inverse_dynamics_columns(model: Model, x: Array, v: Array, a: Array) -> Array:
-    """Columns (B, n_v, n_pi) of H v̇ + C: d/dt P - G, (33)–(37), with P differenced along the motion."""
-    dx, dv = DIFFERENCE * model.position_rate(x, v), DIFFERENCE * a
-    P_plus, _ = model.momentum_columns(x + dx, v + dv)
-    P_minus, _ = model.momentum_columns(x - dx, v - dv)
-    _, G = model.momentum_columns(x, v)
-    return np.asarray((P_plus - P_minus) / (2.0 * DIFFERENCE) - G)
+def reading_derivatives(readings: Readings, model: Model, x: Array, v: Array) -> tuple[Array, Array]:
+    """Derivatives (B, channels, n_v) of readings by displacements in the order of the speeds, and by speeds."""
+    B, n_v = v.shape
+    # Every instant n_v times, moved along one coordinate or rate each.
+    x_n, v_n = np.repeat(x, n_v, axis=0), np.repeat(v, n_v, axis=0)
+    dv = DIFFERENCE * np.tile(np.eye(n_v), (B, 1))
+    dx = model.position_rate(x_n, dv)
 
+    def difference(plus: Array, minus: Array) -> Array:
+        return np.asarray(((plus - minus) / (2.0 * DIFFERENCE)).reshape(B, n_v, -1).transpose(0, 2, 1))
 
-def _readings(model: Model, x: Array) -> Array:
-    """What the position sensors read (B, n_x): x with every link's markers in the place of its elastic coordinates."""
-    offset = model.layout.n_base_positions - model.layout.n_base_speeds
-    y = x.copy()
-    for i, (link, q_f) in enumerate(zip(model.chain.flexible, model.layout.q_f, strict=True)):
-        if link is not None:
-            y[:, q_f.start + offset : q_f.stop + offset] = link.markers(model.chain.elastic(x, i))
-    return y
+    by_x = difference(readings(x_n + dx, v_n), readings(x_n - dx, v_n))
+    if not readings.reads_rates:
+        return by_x, np.zeros_like(by_x)
+    return by_x, difference(readings(x_n, v_n + dv), readings(x_n, v_n - dv))
 
 
 def discretise(A: Array, E: Array, step: float) -> tuple[Array, Array]:
@@ -168,9 +220,11 @@ def discretise(A: Array, E: Array, step: float) -> tuple[Array, Array]:
     By scaling and squaring, exact to rounding however stiff A is (closed-loop poles reach -8500 1/s).
     """
     n_v = A.shape[1] // 2
-    # Speeds in units that make both halves of A alike: fewer halvings.
+    # Momenta in a unit that makes displacements and momenta drive each other alike: fewer halvings.
     unit = np.ones(A.shape[1])
-    unit[n_v:] = np.sqrt(max(1.0, float(np.abs(A[:, n_v:, :n_v]).max())))
+    force, speed = (float(np.abs(part).max()) for part in (A[:, n_v:, :n_v], A[:, :n_v, n_v:]))
+    if force > 0.0:
+        unit[n_v:] = np.sqrt(force / speed)
     A, E = A * unit / unit[:, None], E / unit[:, None]
     norm = float(np.abs(A).sum(axis=1).max()) * step
     halvings = max(0, int(np.ceil(np.log2(norm / SMALL_STEP)))) if norm > 0.0 else 0
@@ -187,36 +241,40 @@ def discretise(A: Array, E: Array, step: float) -> tuple[Array, Array]:
     return (eye + change) * unit[:, None] / unit, D * unit[:, None]
 
 
-def _triangle(rows: Array) -> Array:
-    """Upper triangular R with Rᵀ R = rowsᵀ rows."""
-    return np.asarray(np.linalg.qr(rows, mode="r"), dtype=np.float64)
-
-
 class Information:
     """Fisher's information of β by a Kalman filter of s in square-root array form."""
 
     def __init__(self, n_v: int, n: int) -> None:
-        # P = Lᵀ L of s before the next sample; M = ∂ŝ/∂β.
-        self._L = np.diag(np.repeat([FREE_POSITION, FREE_SPEED], n_v))
-        self._M = np.zeros((2 * n_v, n))
+        self._n_v, self._n = n_v, n
         self._root = np.zeros((0, n))
 
-    def add(self, C: Array, Phi: Array, Gamma: Array, B: Array) -> None:
-        """K samples, each with the step after it: C (K, n_y, m), Φ (K, m, m), Γ (K, m, joints), B (K, m, n).
+    def begin(self, H: Array) -> None:
+        """A motion begins, its initial state free; H (n_v, n_v): mass matrix there."""
+        # P = Lᵀ L of s before the next sample; M = ∂ŝ/∂β.
+        self._L = np.diag(np.repeat([FREE_POSITION, FREE_SPEED], self._n_v))
+        self._L[self._n_v :, self._n_v :] @= H
+        self._M = np.zeros((2 * self._n_v, self._n))
 
-        Rows of C and columns of Γ are scaled to unit noise.
+    def add(self, C: Array, D: Array, Phi: Array, Gamma: Array, B: Array) -> None:
+        """K samples, each with the step after it: C (K, n_y, m), D (K, n_y, n), Φ (K, m, m), Γ (K, m, joints),
+        B (K, m, n).
+
+        Rows of C and D and columns of Γ are scaled to unit noise.
         """
-        n_y = C.shape[1]
-        eye = np.eye(n_y)
+        n_y, m = C.shape[1:]
+        upper = np.triu(np.ones((m, m)))
+        prior = np.zeros((n_y + m, n_y + m))
+        prior[:n_y, :n_y] = np.eye(n_y)
         rows = [self._root]
-        for C_k, Phi_k, Gamma_k, B_k in zip(C, Phi, Gamma, B, strict=True):
-            prior = np.block([[eye, np.zeros((n_y, C.shape[2]))], [self._L @ C_k.T, self._L]])
-            posterior = _triangle(prior)  # [[R_e^½, R_e^-½ C P], [0, root of P after the sample]]
-            S = scipy.linalg.solve_triangular(posterior[:n_y, :n_y], C_k @ self._M, trans="T")
+        for C_k, D_k, Phi_k, Gamma_k, B_k in zip(C, D, Phi, Gamma, B, strict=True):
+            prior[n_y:, :n_y], prior[n_y:, n_y:] = self._L @ C_k.T, self._L
+            posterior = _triangle(prior)  # [[R_e^½, R_e^-½ C P], [·, root of P after the sample]]
+            S = np.linalg.solve(np.triu(posterior[:n_y, :n_y]).T, C_k @ self._M + D_k)
             rows.append(S)
             self._M = Phi_k @ (self._M - posterior[:n_y, n_y:].T @ S) + B_k
-            self._L = _triangle(np.concatenate((posterior[n_y:, n_y:] @ Phi_k.T, Gamma_k.T)))
-        self._root = _triangle(np.concatenate(rows))
+            L = posterior[n_y:, n_y:] * upper
+            self._L = _triangle(np.concatenate((L @ Phi_k.T, Gamma_k.T)))[:m] * upper
+        self._root = np.triu(_triangle(np.concatenate(rows))[: self._n])
 
     def standard_deviations(self) -> Array:
         """Root of the diagonal of the information's inverse (n,); inf where it is singular."""
@@ -231,3 +289,8 @@ class Information:
         lost = (np.abs(V[~determined]) > UNDETERMINED_SHARE).any(axis=0)
         out[seen] = np.where(lost, np.inf, np.sqrt(variance) / norms[seen])
         return out
+
+
+def _triangle(rows: Array) -> Array:
+    """R with Rᵀ R = rowsᵀ rows in its upper triangle; below it there is what LAPACK leaves there."""
+    return np.asarray(np.linalg.qr(rows, mode="raw")[0].T, dtype=np.float64)

@@ -129,17 +129,25 @@ def _pull_warning(estimator: Estimator) -> list[str]:
     return [f"sensor noise in the columns pulls {', '.join(names)} by more than the error bar"]
 
 
-def projected(estimator: Estimator, estimate: Estimate, std: Array) -> Projection:
-    """The parameters of real bodies that are nearest to the estimate, by its covariance with deviations std (n,)."""
+def projected(estimator: Estimator, estimate: Estimate, std: Array) -> Projection | None:
+    """The parameters of real bodies that are nearest to the estimate, by its covariance with deviations std (n,).
+
+    None where they are not found: a finished session is not lost for it.
+    """
     known = np.flatnonzero(np.isfinite(std))
     stated = estimate.std[known]
     scale = np.divide(std[known], stated, out=np.ones_like(stated), where=stated > 0.0)
     covariance = np.diag(np.full(std.size, np.inf))
     covariance[np.ix_(known, known)] = estimate.covariance[np.ix_(known, known)] * np.outer(scale, scale)
-    return PhysicalSet(estimator.model, estimator.base).project(estimate.pi, covariance)
+    try:
+        return PhysicalSet(estimator.model, estimator.base).project(estimate.pi, covariance)
+    except ArithmeticError:
+        return None
 
 
-def _projection_warning(projection: Projection) -> list[str]:
+def _projection_warning(projection: Projection | None) -> list[str]:
+    if projection is None:
+        return ["whether real bodies can have these parameters is not known: the search for them did not converge"]
     if projection.distance == 0.0:
         return []
     distance, names = f"{projection.distance:.2g} standard deviations", ", ".join(projection.active)
@@ -182,7 +190,7 @@ def results_document(
                 "upper95": value + NORMAL_95 * std if finite else None,
                 "true": None if true is None else float(true[k]),
                 "identifiable": bool(flags[k]),
-                "projected": None if projection.distance == 0.0 else float(projection.beta[k]),
+                "projected": float(projection.beta[k]) if projection is not None and projection.active else None,
                 "bound": None if bound is None or not np.isfinite(bound[k]) else float(bound[k]),
             }
         )
@@ -194,7 +202,9 @@ def results_document(
         "duration_s": estimator.duration,
         "parameters": parameters,
         "residual": residual,
-        "physical": {"distance_std": projection.distance, "active": list(projection.active)},
+        "physical": None
+        if projection is None
+        else {"distance_std": projection.distance, "active": list(projection.active)},
         "condition_number": estimate.condition_number if np.isfinite(estimate.condition_number) else None,
         "throughput_samples_per_s": throughput,
         "lost_samples": estimator.counters.lost_samples,
