@@ -17,6 +17,7 @@ from typing import Any, NoReturn
 
 from sms_online.errors import InputError
 from sms_tools.exit_codes import BAD_INPUT, INTERRUPTED, OK
+from sms_tools.view.choice import parse_choice
 
 PROGRAM = "sms-online"
 # A sum that BLAS splits over threads is rounded differently for every number of threads, and the same samples must give
@@ -71,7 +72,7 @@ def _parser() -> Parser:
         epilog="Exit codes: 0 done, 2 bad input, 3 nothing is determined (results are written), 130 interrupted.",
     )
     verbs = parser.add_subparsers(metavar="VERB", required=True)
-    for add in (_add_demo, _add_simulate, _add_replay, _add_import, _add_markers):
+    for add in (_add_demo, _add_live, _add_record, _add_simulate, _add_replay, _add_import, _add_markers):
         add(verbs)
     return parser
 
@@ -96,6 +97,14 @@ def _add_out(parser: Parser) -> None:
     parser.add_argument("--out", metavar="DIR", type=Path, help="where results.json goes, runs/<time> by default")
 
 
+def _add_view(parser: Parser) -> None:
+    text = "view in rerun: a file in DIR, a page in the browser, a viewer started or running already; off by default"
+    names = "off|save|serve|spawn|connect=URL"
+    parser.add_argument("--rerun", metavar=names, type=_rerun, default="off", help=text)
+    text = "factor on the deflections that the view draws, 1 by default"
+    parser.add_argument("--exaggerate", metavar="FACTOR", type=_factor, default=1.0, help=text)
+
+
 def _add_noise(parser: Parser) -> None:
     text = "noise of all sensors in place of the described one: 0 none, A, B, C ever more"
     parser.add_argument("--grade", choices=("0", "A", "B", "C"), help=text)
@@ -111,6 +120,30 @@ def _add_demo(verbs: Verbs) -> None:
     _add_system(parser, default="paper-planar")
     _add_noise(parser)
     _add_out(parser)
+
+
+def _add_live(verbs: Verbs) -> None:
+    parser = _add_verb(verbs, "live", "live", "Estimate while the testbed moves, and record what its devices send.")
+    _add_system(parser)
+    _add_out(parser)
+    text = "go on from the last checkpoint of an earlier session"
+    parser.add_argument("--resume", metavar="DIR", type=Path, help=text)
+    _add_session_length(parser)
+
+
+def _add_record(verbs: Verbs) -> None:
+    parser = _add_verb(verbs, "record", "record", "Record what devices send, without estimating anything.")
+    text = "a CAN bus by python-can's names: [NAME=]INTERFACE:CHANNEL[:BITRATE], such as socketcan:can0"
+    parser.add_argument("--can", metavar="BUS", action="append", default=[], help=text)
+    text = "a serial port: [NAME=]PATH[:BAUDRATE], such as /dev/ttyUSB0:115200"
+    parser.add_argument("--serial", metavar="PORT", action="append", default=[], help=text)
+    parser.add_argument("--out", metavar="DIR", type=Path, help="where the recording goes, runs/<time> by default")
+    _add_session_length(parser)
+
+
+def _add_session_length(parser: Parser) -> None:
+    text = "end after so long; Ctrl-C ends it too"
+    parser.add_argument("--duration", metavar="SECONDS", type=_seconds(positive=True), help=text)
 
 
 def _add_simulate(verbs: Verbs) -> None:
@@ -138,6 +171,7 @@ def _add_replay(verbs: Verbs) -> None:
     parser.add_argument("--prior", action="store_true", help=text)
     text = "as fast as it goes, or in step with the recorded time"
     parser.add_argument("--speed", choices=("max", "1"), default="max", help=text)
+    _add_view(parser)
 
 
 def _add_import(verbs: Verbs) -> None:
@@ -165,6 +199,21 @@ def _seconds(positive: bool = False) -> Callable[[str], float]:
         return value
 
     return read
+
+
+def _rerun(text: str) -> str:
+    try:
+        parse_choice(text)
+    except ValueError as error:
+        raise argparse.ArgumentTypeError(str(error)) from None
+    return text
+
+
+def _factor(text: str) -> float:
+    value = _number(text)
+    if not (math.isfinite(value) and value > 0.0):
+        raise argparse.ArgumentTypeError(f"{text!r}; expected a number greater than 0")
+    return value
 
 
 def _number(text: str) -> float:

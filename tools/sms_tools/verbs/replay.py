@@ -11,13 +11,20 @@ from time import perf_counter
 from rich.console import Console
 from rich.progress import BarColumn, DownloadColumn, Progress, TextColumn, TimeRemainingColumn
 
+from sms_adapters.checkpoint import load_checkpoint
+from sms_adapters.recording import Recording
+from sms_adapters.session_log import SESSION
 from sms_adapters.sources import open_source
 from sms_adapters.truth import read_truth
 from sms_online.errors import InputError
 from sms_online.stream import Block
+from sms_tools.html_report.history import History
+from sms_tools.html_report.page import write_report
 from sms_tools.interruption import Interruption
+from sms_tools.report import report_console, show
 from sms_tools.results_file import results_directory
 from sms_tools.session import conclude, described_system, document_of, new_estimator, stream
+from sms_tools.view.session import open_view, references
 
 # A progress bar appears from this size on, bytes: a second of work.
 LONG_FILE = 20_000_000
@@ -36,26 +43,46 @@ def run(args: argparse.Namespace) -> int:
     capture: Path = args.capture
     opened = perf_counter()
     progress = _progress(capture, always=args.speed == "1")
-    with progress or nullcontext(), Interruption() as interruption:
-        on_bytes = None
-        if progress is not None:
-            task = progress.add_task(capture.name, total=capture.stat().st_size)
+    with Interruption() as interruption:
+        with progress or nullcontext():
+            on_bytes = None
+            if progress is not None:
+                task = progress.add_task(capture.name, total=capture.stat().st_size)
 
-            def on_bytes(consumed: int) -> None:
-                progress.update(task, completed=consumed)
+                def on_bytes(consumed: int) -> None:
+                    progress.update(task, completed=consumed)
 
-        source = open_source(capture, system, args.start, args.stop, on_bytes, folder)
-        truth = read_truth(capture)
-        estimator = new_estimator(system, source.channels, str(capture), args.prior)
-        if args.speed == "1":
-            blocks = _paced(_pieces(source, max(1, round(PACE * system.sample_rate))), interruption)
-        else:
-            blocks = _pieces(source, PIECE)
-        stream(estimator, blocks, interruption)
-        wall = perf_counter() - opened
-    parameters = None if truth is None else truth["parameters"]
-    document = document_of(estimator, estimator.samples / wall, source.warnings, parameters)
-    return conclude(args, document, directory, interruption.requested)
+            source = open_source(capture, system, args.start, args.stop, on_bytes, folder)
+            truth = read_truth(capture / SESSION if capture.is_dir() else capture)
+            parameters = None if truth is None else truth["parameters"]
+            estimator = new_estimator(system, source.channels, str(capture), args.prior)
+            if isinstance(source, Recording) and source.checkpoint is not None:
+                load_checkpoint(source.checkpoint, estimator)
+            if args.speed == "1":
+                blocks = _paced(_pieces(source, max(1, round(PACE * system.sample_rate))), interruption)
+            else:
+                blocks = _pieces(source, PIECE)
+            history = History(estimator, source.channels)
+            with open_view(
+                args.rerun,
+                estimator,
+                source.channels,
+                directory,
+                parameters,
+                patient=args.speed == "max",
+                exaggeration=args.exaggerate,
+            ) as view:
+                stream(estimator, history.watch(view.watch(blocks)), interruption)
+                wall = perf_counter() - opened
+        history.finish()
+        warnings = [*source.warnings, *view.warnings]
+        document = document_of(estimator, estimator.samples / wall, warnings, parameters)
+        code = conclude(args, document, directory, interruption.requested)
+        compared = references(estimator, parameters)
+        page = write_report(directory, document, estimator, history, compared, args.exaggerate)
+        show(report_console(args.json), f"report: {page}")
+        view.linger(interruption)
+    return code
 
 
 def _progress(capture: Path, always: bool) -> Progress | None:

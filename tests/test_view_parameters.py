@@ -1,0 +1,85 @@
+"""Which parameters share a plot, what a table of them says, and the colours of residuals."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from sms_adapters.system_file import load_system
+from sms_online.model.base_parameters import find_base_parameters
+from sms_online.model.model import Model
+from sms_online.model.parameters import Parameter
+from sms_online.pipeline.estimator import SquaredResidual
+from sms_tools.view.frames import Reference
+from sms_tools.view.parameter_groups import MOST_LINES, parameter_groups, shortened
+from sms_tools.view.residuals import RecentResidual
+from sms_tools.view.style import BAD, GOOD, residual_colors
+from sms_tools.view.table import markdown_table
+
+
+@pytest.mark.parametrize("name", ["paper-planar", "seven-joint", "quanser-2dsfl", "emps"])
+def test_every_parameter_is_in_one_plot_of_one_unit(name: str) -> None:
+    parameters = find_base_parameters(Model(load_system(name))).parameters
+    groups = parameter_groups(parameters, [Reference(p.nominal, False) if p.nominal else None for p in parameters])
+    members = np.concatenate([group.indices for group in groups])
+    assert sorted(members.tolist()) == list(range(len(parameters)))
+    assert len({group.path for group in groups}) == len(groups)
+    for group in groups:
+        assert len(group.indices) <= MOST_LINES
+        units = {"%" if parameters[k].nominal else parameters[k].unit for k in group.indices}
+        assert units == {group.unit}
+        assert group.unit in group.title
+
+
+def test_a_deviation_is_in_percent_of_its_reference() -> None:
+    parameter = Parameter("link_1.first_moment_x", "m_1 c_1x", "kg m", 1.0)
+    (group,) = parameter_groups([parameter], [Reference(-2.0, True)])
+    assert (-2.1 - group.zero[0]) / group.scale[0] == pytest.approx(-5.0)
+
+
+def test_without_a_reference_a_plot_shows_the_value_itself() -> None:
+    parameter = Parameter("coulomb_friction@joint_1.torque", "c_1", "N m", 0.0)
+    (group,) = parameter_groups([parameter], [None])
+    assert (group.zero[0], group.scale[0], group.unit, group.half_range) == (0.0, 1.0, "N m", None)
+    assert group.kind == "effects"
+
+
+def test_long_combinations_are_cut_to_a_label() -> None:
+    assert shortened("k_1") == "k_1"
+    assert len(shortened("m_0+m_1+m_2+m_m1+m_m2+m_m3")) == 18
+    assert shortened("m_0+m_1+m_2+m_m1+m_m2+m_m3").startswith("m_0+m_1")
+
+
+def test_a_table_tells_no_number_of_what_is_not_determined() -> None:
+    parameters = [Parameter("joint_1.stiffness", "k_1", "N m/rad", 1000.0)] * 2
+    known = [Reference(1000.0, True), None]
+    estimate, std = np.array([1010.0, 7.0]), np.array([5.0, np.inf])
+    lines = markdown_table(parameters, known, estimate, std, np.array([True, False])).splitlines()
+    assert lines[2] == "| k_1 | N m/rad | 1010 | 5 | 1000 | +1 % |"
+    assert lines[3] == "| k_1 | N m/rad | – | – | – | – |"
+
+
+def test_colours_go_from_good_to_bad() -> None:
+    colors = residual_colors(np.array([np.nan, 0.0, 0.5, 7.0]))
+    np.testing.assert_array_equal(colors, np.array([GOOD, GOOD, BAD, BAD]).astype(np.uint8))
+
+
+class Watched:
+    """As much of an estimator as a residual needs."""
+
+    def __init__(self) -> None:
+        self.joint_residuals = [SquaredResidual(np.zeros((2, 2)))]
+
+
+def test_the_recent_residual_forgets_what_is_over() -> None:
+    estimator, recent = Watched(), RecentResidual()
+    beta = np.array([2.0])
+    rows = np.ones((1, 1))
+    for t in np.arange(0.0, 3.0, 0.25):
+        # Nothing of the torque of 4 is explained by β Y = 2 at first, all of 2 later.
+        measured = 4.0 if t < 1.0 else 2.0
+        estimator.joint_residuals[0].add(rows, np.array([measured]), measured)
+        share = recent.push(float(t), estimator, beta)  # type: ignore[arg-type]
+        if t < 1.0:
+            assert share[0] == pytest.approx(0.5)
+    assert share[0] == pytest.approx(0.0, abs=1e-7)

@@ -1,0 +1,247 @@
+"""A session that is watched: the same bits, a recording that says what the results say, and no viewer that stops it."""
+
+from __future__ import annotations
+
+import json
+import resource
+import socket
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from time import monotonic, sleep
+from typing import Any
+
+import numpy as np
+import pytest
+from rerun.chunk import RrdReader
+
+from sms_adapters.capture import CaptureWriter
+from sms_adapters.system_file import load_system
+from sms_adapters.truth import write_truth
+from sms_online.model.base_parameters import find_base_parameters
+from sms_online.model.model import Model
+from sms_online.pipeline.estimator import Estimator
+from sms_online.results import results_document
+from sms_online.stream import Array, Block
+from sms_sim.sensors import Sensors
+from sms_sim.simulate import Simulation, sampled_blocks
+from sms_tools.cli import main
+from sms_tools.view import snapshot
+from sms_tools.view.session import open_view, references
+
+SECONDS = 20.0
+DISPLAY_RATE = 20.0  # pictures/s
+
+
+@pytest.fixture(scope="module")
+def capture(tmp_path_factory: pytest.TempPathFactory, planar_session: Simulation) -> Path:
+    """The paper's example with noise of grade B, seed 1, and its truth beside it."""
+    path = tmp_path_factory.mktemp("view") / "run.csv"
+    plant = planar_session.plant
+    with CaptureWriter(path, Sensors(plant.system, plant.channels, "B", 1).channels) as writer:
+        for block in sampled_blocks(planar_session, "B", seed=1):
+            writer.write(block)
+    write_truth(path, {p.name: p.nominal for p in plant.model.parameters}, {})
+    return path
+
+
+@pytest.fixture(scope="module")
+def recorded(capture: Path) -> Path:
+    """The directory of a replay with a recording."""
+    out = capture.parent / "recorded"
+    arguments = ["replay", str(capture), "--system", "paper-planar", "--out", str(out), "--rerun", "save"]
+    assert main(arguments) == 0
+    return out
+
+
+def columns(recording: Path, entity: str) -> list[dict[str, Any]]:
+    """Rows of an entity in order of time, with what never changes as the first."""
+    rows = []
+    for chunk in RrdReader(str(recording)).stream():
+        if chunk.entity_path == entity:
+            rows += chunk.to_record_batch().to_pylist()
+    return sorted(rows, key=lambda row: row.get("time").total_seconds() if row.get("time") is not None else -1.0)
+
+
+def scalars(recording: Path, entity: str) -> tuple[Array, Array]:
+    """Times (B,), s, and values (B, n) of an entity's numbers."""
+    rows = [row for row in columns(recording, entity) if row.get("Scalars:scalars") is not None]
+    return np.array([row["time"].total_seconds() for row in rows]), np.array([row["Scalars:scalars"] for row in rows])
+
+
+def results(directory: Path) -> dict[str, Any]:
+    found: dict[str, Any] = json.loads((directory / "results.json").read_text())
+    return found
+
+
+def test_the_recordings_last_values_are_the_results(recorded: Path) -> None:
+    found = {p["symbol"]: p for p in results(recorded)["parameters"]}
+    seen = set()
+    for kind in ("spacecraft", "motors", "links", "joints"):
+        entity = f"/parameters/{kind}/estimate"
+        names = columns(recorded / "session.rrd", entity)[0]["SeriesLines:names"]
+        _, estimates = scalars(recorded / "session.rrd", entity)
+        _, deviations = scalars(recorded / "session.rrd", f"/parameters/{kind}/std")
+        for name, estimate, std in zip(names, estimates[-1], deviations[-1], strict=True):
+            assert estimate == found[name]["estimate"]
+            assert std == (np.inf if found[name]["std"] is None else found[name]["std"])
+            seen.add(name)
+    assert seen == set(found)
+
+
+def test_the_recordings_timeline_is_complete(recorded: Path) -> None:
+    rows = columns(recorded / "session.rrd", "/arm/tip")
+    t = np.array([row["time"].total_seconds() for row in rows if row.get("Points3D:positions") is not None])
+    np.testing.assert_allclose(t, np.arange(round(SECONDS * DISPLAY_RATE) + 1) / DISPLAY_RATE, rtol=0, atol=1.1e-3)
+    t, _ = scalars(recorded / "session.rrd", "/parameters/links/estimate")
+    assert np.diff(t).max() <= 0.5
+    assert t[-1] == pytest.approx(SECONDS)
+
+
+def test_rerun_verifies_the_recording(recorded: Path) -> None:
+    rerun = Path(sys.executable).with_name("rerun")
+    done = subprocess.run(
+        [str(rerun), "rrd", "verify", str(recorded / "session.rrd")], capture_output=True, text=True, timeout=60
+    )
+    assert done.returncode == 0, done.stderr
+
+
+def test_events_are_told_when_they_happen(recorded: Path) -> None:
+    rows = [row for row in columns(recorded / "session.rrd", "/log") if row.get("TextLog:text")]
+    told = {row["TextLog:text"][0].split(" is ")[0] for row in rows if "is determined" in row["TextLog:text"][0]}
+    assert told >= {p["name"] for p in results(recorded)["parameters"] if p["identifiable"]}
+
+
+def test_watching_changes_no_bit(recorded: Path, capture: Path, tmp_path: Path) -> None:
+    main(["replay", str(capture), "--system", "paper-planar", "--out", str(tmp_path)])
+    unseen, seen = results(tmp_path), results(recorded)
+    assert unseen["parameters"] == seen["parameters"]
+    assert unseen["residual"] == seen["residual"]
+
+
+def test_a_replica_knows_what_the_estimator_knew(planar_block: Block) -> None:
+    system = load_system("paper-planar")
+    estimator = Estimator(system, planar_block.channels, "test")
+    replica = Estimator(system, planar_block.channels, "test")
+    half = planar_block.t.size // 2
+    estimator.push(Block(planar_block.t[:half], planar_block.channels, planar_block.values[:half]))
+    taken = snapshot.take(estimator)
+    then = results_document(estimator, 0.0, [])
+    estimator.push(Block(planar_block.t[half:], planar_block.channels, planar_block.values[half:]))
+    snapshot.apply(taken, replica)
+    assert results_document(replica, 0.0, []) == then
+    assert results_document(estimator, 0.0, []) != then
+
+
+@pytest.fixture
+def deaf_viewer() -> Iterator[int]:
+    """The port of somebody who accepts connections and never reads."""
+    with socket.socket() as listening:
+        listening.bind(("127.0.0.1", 0))
+        listening.listen()
+        yield int(listening.getsockname()[1])
+
+
+def test_an_absent_viewer_is_named_and_the_session_goes_on(capture: Path, tmp_path: Path) -> None:
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))  # nobody listens there
+        choice = f"connect=127.0.0.1:{taken.getsockname()[1]}"
+        code = main(
+            ["replay", str(capture), "--system", "paper-planar", "--out", str(tmp_path), "--rerun", choice, "-to", "5"]
+        )
+    assert code == 0
+    assert any("no viewer at" in warning for warning in results(tmp_path)["warnings"])
+
+
+def test_a_viewer_that_never_reads_is_given_up(
+    deaf_viewer: int, planar_block: Block, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("sms_tools.view.session.CLOSING", 1.0)
+    estimator = Estimator(load_system("paper-planar"), planar_block.channels, "test")
+    with open_view(f"connect=127.0.0.1:{deaf_viewer}", estimator, planar_block.channels, tmp_path) as view:
+        for block in view.watch([planar_block]):
+            estimator.push(block)
+        estimator.finish()
+    assert view.status
+    assert view.warnings
+    alone = Estimator(load_system("paper-planar"), planar_block.channels, "test")
+    alone.push(planar_block)
+    alone.finish()
+    np.testing.assert_array_equal(estimator.estimate().pi, alone.estimate().pi)
+
+
+def test_a_full_disk_ends_the_recording_alone(capture: Path, tmp_path: Path) -> None:
+    largest = 300_000  # bytes of any file; the recording needs three times as many
+
+    def small_disk() -> None:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (largest, largest))
+
+    arguments = ["replay", str(capture), "--system", "paper-planar", "--out", str(tmp_path), "--rerun", "save"]
+    done = subprocess.run(
+        [sys.executable, "-m", "sms_tools", *arguments],
+        preexec_fn=small_disk,
+        capture_output=True,
+        text=True,
+        timeout=60,
+    )
+    assert done.returncode == 0, done.stderr
+    assert "cannot be written any further" in done.stderr
+    assert any("cannot be written any further" in warning for warning in results(tmp_path)["warnings"])
+
+
+def test_a_view_that_dies_is_named(planar_block: Block, tmp_path: Path) -> None:
+    estimator = Estimator(load_system("paper-planar"), planar_block.channels, "test")
+    with open_view("save", estimator, planar_block.channels, tmp_path) as view:
+        assert view._process is not None
+        view._process.kill()
+        for block in view.watch([planar_block]):
+            estimator.push(block)
+        estimator.finish()
+    assert "its process ended" in view.status
+
+
+def test_a_killed_session_leaves_a_whole_recording(capture: Path, tmp_path: Path) -> None:
+    arguments = ["replay", str(capture), "--system", "paper-planar", "--out", str(tmp_path), "--rerun", "save"]
+    session = subprocess.Popen(
+        [sys.executable, "-m", "sms_tools", *arguments, "--speed", "1"],
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    assert session.stderr is not None
+    session.stderr.readline()  # the view is open
+    sleep(1.0)
+    session.kill()
+    session.wait()
+    rerun = [str(Path(sys.executable).with_name("rerun")), "rrd", "verify", str(tmp_path / "session.rrd")]
+    end = monotonic() + 20.0
+    while subprocess.run(rerun, capture_output=True, timeout=60).returncode != 0:
+        assert monotonic() < end, "the recording is never completed"
+        sleep(0.2)
+    assert columns(tmp_path / "session.rrd", "/arm/tip")
+
+
+def test_references_are_the_truth_or_else_nominal_values() -> None:
+    estimator = Estimator(load_system("paper-planar"), _channels(), "test")
+    nominal = references(estimator, None)
+    assert all(reference is not None and not reference.is_true for reference in nominal)
+    truth = {p.name: 2.0 * p.nominal for p in estimator.base.physical}
+    for known, p in zip(references(estimator, truth), estimator.base.parameters, strict=True):
+        assert known is not None
+        assert known.is_true
+        assert known.value == pytest.approx(2.0 * p.nominal)
+
+
+def test_a_parameter_without_a_nominal_value_has_no_reference() -> None:
+    system = load_system("quanser-2dsfl")
+    base = find_base_parameters(Model(system))
+    channels = ("tau_1", "tau_2", "theta_m_1", "theta_m_2", "q_1", "q_2")
+    found = references(Estimator(system, channels, "test"), None)
+    assert [reference is None for reference in found] == [p.nominal == 0.0 for p in base.parameters]
+    assert None in found
+
+
+def _channels() -> tuple[str, ...]:
+    layout = Model(load_system("paper-planar")).layout
+    return (*layout.position_names, "tau_1", "tau_2")

@@ -1,0 +1,106 @@
+"""The README's pictures: real screenshots of real sessions, made again by whoever wants to.
+
+python tools/make_pictures.py [--quanser lqr_full_10deg.mat]
+
+Needs the `test` extra and what tools/install_browser.sh installs: the viewer draws without a screen, on a software
+renderer.
+"""
+
+from __future__ import annotations
+
+import argparse
+import io
+import os
+import sys
+import tempfile
+from collections.abc import Sequence
+from pathlib import Path
+from time import sleep
+
+import numpy as np
+from PIL import Image
+from rerun.experimental import ViewerClient
+
+from sms_tools.cli import main as sms_online
+
+PICTURES = Path(__file__).parent.parent / "docs" / "pictures"
+WIDTH = 1440  # px, of a screenshot
+# The animated one: px, pictures a second of the session and of the animation, quality of its compression.
+ANIMATED_WIDTH, FRAME_RATE, QUALITY = 960, 5.0, 60
+ANIMATED_SECONDS = 12.0
+# The viewer needs so long to load a recording, and to draw another instant, s.
+LOADING, DRAWING = 6.0, 0.8
+PORT = 19876
+# System, seconds of motion, grade of noise.
+SESSIONS = {
+    "planar": ("paper-planar", "20", "B"),
+    "seven-joint": ("seven-joint", "20", "A"),
+}
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Simulate, replay with a recording, and photograph it."""
+    parser = argparse.ArgumentParser(description="Make the pictures in docs/pictures.")
+    parser.add_argument("--quanser", metavar="FILE.mat", type=Path, help="the published measurement, for its picture")
+    parser.add_argument("--only", metavar="NAME", help="planar, seven-joint or quanser")
+    options = parser.parse_args(arguments)
+    PICTURES.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory() as folder:
+        recordings = {}
+        for name, (system, seconds, grade) in SESSIONS.items():
+            if options.only in (None, name):
+                capture = Path(folder) / f"{name}.csv"
+                _run("simulate", "--system", system, "--capture", capture, "--duration", seconds, "--grade", grade)
+                recordings[name] = _recording(capture, system)
+        if options.quanser is not None and options.only in (None, "quanser"):
+            capture = Path(folder) / "quanser.csv"
+            _run("import", "quanser", options.quanser, "--capture", capture)
+            recordings["quanser"] = _recording(capture, "quanser-2dsfl", "--prior", "--exaggerate", "3")
+        for name, recording in recordings.items():
+            _photograph(recording, name, animated=name == "planar")
+
+
+def _run(*arguments: object) -> None:
+    if code := sms_online([str(argument) for argument in arguments]):
+        sys.exit(code)
+
+
+def _recording(capture: Path, system: str, *options: str) -> Path:
+    directory = capture.with_suffix("")
+    _run("replay", capture, "--system", system, "--out", directory, "--rerun", "save", *options)
+    return directory / "session.rrd"
+
+
+def _photograph(recording: Path, name: str, animated: bool) -> None:
+    # The viewer stands beside the interpreter, whether or not that directory is in PATH.
+    os.environ["PATH"] = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
+    viewer = ViewerClient.spawn(headless=True, port=PORT, detach_process=False)
+    try:
+        viewer.open([str(recording)])
+        sleep(LOADING)
+        _screenshot(viewer, WIDTH).save(PICTURES / f"{name}.png", optimize=True)
+        if animated:
+            frames = []
+            for t in np.arange(0.4, ANIMATED_SECONDS, 1.0 / FRAME_RATE):
+                viewer.set_time("time", duration=float(t), play_state="paused")
+                sleep(DRAWING)
+                frames.append(_screenshot(viewer, ANIMATED_WIDTH))
+            frames[0].save(
+                PICTURES / f"{name}.webp",
+                save_all=True,
+                append_images=frames[1:],
+                duration=round(1000.0 / FRAME_RATE),
+                loop=0,
+                quality=QUALITY,
+            )
+    finally:
+        viewer.quit()
+
+
+def _screenshot(viewer: ViewerClient, width: int) -> Image.Image:
+    picture = Image.open(io.BytesIO(viewer.take_screenshot())).convert("RGB")
+    return picture.resize((width, round(width * picture.height / picture.width)), Image.Resampling.LANCZOS)
+
+
+if __name__ == "__main__":
+    main()

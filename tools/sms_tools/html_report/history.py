@@ -1,0 +1,87 @@
+"""What a session looked like on the way: estimates, residuals and positions at instants, in bounded memory."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sms_online.pipeline.estimator import Estimator
+from sms_online.results import LARGEST_RELATIVE_STD, standard_deviation
+from sms_online.stream import Array, Block
+from sms_tools.view.readings import last_readings
+from sms_tools.view.residuals import RecentResidual
+
+# Instants a second to begin with: estimates change by internal blocks of a quarter second.
+RATE = 4.0
+# More instants than a chart has room for are thinned to every other one.
+MOST_INSTANTS = 400
+
+
+@dataclass(frozen=True)
+class Instant:
+    """t, s; estimate (n,), its std (n,) and whether it is determined (n,); relative residuals (joints,); x (n_x,)."""
+
+    t: float
+    estimate: Array
+    std: Array
+    determined: NDArray[np.bool_]
+    residual: Array
+    x: Array
+
+
+class History:
+    """Instants of one session, evenly spread over it."""
+
+    def __init__(self, estimator: Estimator, channels: tuple[str, ...]) -> None:
+        self.instants: list[Instant] = []
+        self._estimator = estimator
+        self._columns = [channels.index(name) for name in estimator.sensing.channels]
+        self._last = np.full(len(self._columns), np.nan)
+        self._interval = 1.0 / RATE
+        self._due = -np.inf
+        self._t = np.nan
+        self._recent = RecentResidual()
+
+    def watch(self, blocks: Iterable[Block]) -> Iterator[Block]:
+        """The same samples, in pieces no longer than the interval; each is looked at once it has been used."""
+        longest = max(1, round(self._estimator.system.sample_rate / RATE))
+        for block in blocks:
+            for k in range(0, block.t.size, longest):
+                piece = Block(block.t[k : k + longest], block.channels, block.values[k : k + longest])
+                yield piece
+                self._look(piece)
+
+    def finish(self) -> None:
+        """The session's end, after the estimator has finished: its last instant is what the results say."""
+        if self.instants and self.instants[-1].t == self._t:
+            self.instants.pop()
+        if np.isfinite(self._t):
+            self._add()
+
+    def _look(self, block: Block) -> None:
+        values = block.values[:, self._columns]
+        if np.isnan(values[-1]).any():
+            values = last_readings(values, self._last)
+        self._last = values[-1]
+        self._t = float(block.t[-1])
+        if self._t < self._due:
+            return
+        self._due = self._t + self._interval
+        self._add()
+        if len(self.instants) >= MOST_INSTANTS:
+            self.instants = self.instants[::2]
+            self._interval *= 2.0
+
+    def _add(self) -> None:
+        estimator = self._estimator
+        estimate = estimator.estimate().pi
+        residual = self._recent.push(self._t, estimator, estimate)
+        x = np.full(estimator.model.layout.n_x, np.nan)
+        if np.isfinite(self._last).all():
+            x = estimator.sensing.coordinates(self._last[None])[0]
+        std = standard_deviation(estimator)
+        determined = std <= LARGEST_RELATIVE_STD * np.abs(estimate)
+        self.instants.append(Instant(self._t, estimate, std, determined, residual, x))

@@ -1,0 +1,196 @@
+"""report.html: parameters with error bars, how they converged, residuals, the arm, conditions and warnings."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from html import escape
+from pathlib import Path
+
+import numpy as np
+
+from sms_online.errors import InputError
+from sms_online.pipeline.estimator import Estimator
+from sms_online.stream import Array
+from sms_tools.html_report.arm_drawing import arm_drawings
+from sms_tools.html_report.history import History
+from sms_tools.html_report.svg import Series, chart, svg
+from sms_tools.report import NOT_DETERMINED, Document, trust_lines
+from sms_tools.view.frames import Reference
+from sms_tools.view.parameter_groups import Group, parameter_groups, shortened
+from sms_tools.view.scene import Scene
+
+NAME = "report.html"
+# Pictures of the arm: at the start, at the end, and evenly between.
+PICTURES = 5
+BOUNDS = 2.0  # standard deviations
+# Error bars: size, px, and the range of deviations, %, tried in this order until three quarters of them fit.
+BAR_WIDTH, BAR_HEIGHT = 190, 16
+BAR_RANGES = (0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0, 20.0, 50.0, 100.0)
+FITTING = 0.75
+
+STYLE = """
+body { font: 15px/1.45 system-ui, sans-serif; color: #1c2733; max-width: 1160px; margin: 2em auto; padding: 0 1em }
+h1 { font-size: 1.5em; margin-bottom: 0.1em } h2 { font-size: 1.15em; margin-top: 1.8em }
+table { border-collapse: collapse }
+td, th { padding: 0.15em 0.6em; text-align: right; white-space: nowrap; border-bottom: 1px solid #e4e9ee }
+td:first-child, th:first-child, td.left { text-align: left } tr.unknown { color: #8895a3 }
+figure { display: inline-block; margin: 0.3em; text-align: center } figcaption { font-size: 0.85em; color: #5a6875 }
+svg { background: #fff } svg text { font: 11px system-ui, sans-serif; fill: #5a6875 }
+svg .title { font-size: 13px; fill: #1c2733 } svg .legend { text-anchor: end; paint-order: stroke; stroke: #fff;
+stroke-width: 3px } .grid { stroke: #e8edf2 } .mark { stroke: #d04040; stroke-dasharray: 3 3 }
+.warning { background: #fff4e0; border-left: 4px solid #e0a030; padding: 0.3em 0.8em; margin: 0.4em 0 }
+"""
+
+
+def write_report(
+    directory: Path,
+    document: Document,
+    estimator: Estimator,
+    history: History,
+    references: Sequence[Reference | None],
+    exaggeration: float = 1.0,
+) -> Path:
+    """Write report.html of a finished session beside its results.
+
+    document: its results. references: what each parameter is compared with. exaggeration: factor on drawn deflections.
+    Raises InputError where the file cannot be written.
+    """
+    system = document["system"]
+    sections = [
+        f"<h1>{escape(system['title'] or system['name'])}</h1><p>{escape(system['reference'])}</p>",
+        *(f'<p class="warning">{escape(warning)}</p>' for warning in document["warnings"]),
+        "<h2>Parameters</h2>",
+        _parameters(document, references),
+        "<h2>Convergence</h2>",
+        *_convergence(estimator, history, references),
+        "<h2>Residual</h2>",
+        *_residual(document, history),
+        "<h2>The arm</h2>",
+        *_arm(Scene(estimator.model, exaggeration), history),
+        "<h2>Conditions</h2><ul>",
+        *(f"<li>{escape(line)}</li>" for line in trust_lines(document) if not line.startswith(("residual", "warning"))),
+        "</ul>",
+    ]
+    return write_page(directory / NAME, f"{system['name']}: parameters", "\n".join(sections))
+
+
+def write_page(path: Path, title: str, body: str) -> Path:
+    """A self-contained page; InputError where it cannot be written."""
+    text = (
+        f'<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8"><title>{escape(title)}</title>'
+        f"<style>{STYLE}</style></head><body>\n{body}\n</body></html>\n"
+    )
+    part = path.with_name(path.name + ".part")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        part.write_text(text, encoding="utf-8")
+        part.replace(path)
+    except OSError as error:
+        raise InputError(str(path), "", error.strerror or str(error), "a file that can be written") from None
+    return path
+
+
+def _parameters(document: Document, references: Sequence[Reference | None]) -> str:
+    """The table, each parameter with its error bar relative to the reference."""
+    parameters = document["parameters"]
+    deviations = np.full((len(parameters), 2), np.nan)  # of estimate from reference, and 2σ, %
+    for k, (p, reference) in enumerate(zip(parameters, references, strict=True)):
+        if p["identifiable"] and reference is not None and reference.value:
+            size = abs(reference.value) / 100.0
+            deviations[k] = (p["estimate"] - reference.value) / size, BOUNDS * p["std"] / size
+    reach = np.abs(deviations).sum(axis=1)
+    reach = reach[np.isfinite(reach)]
+    fits = [limit for limit in BAR_RANGES if reach.size and np.mean(reach <= limit) >= FITTING]
+    limit = fits[0] if fits else BAR_RANGES[-1]
+    is_true = any(reference is not None and reference.is_true for reference in references)
+    compared = "true" if is_true else "nominal"
+    rows = [
+        "<table><tr><th>parameter</th><th></th><th>unit</th><th>estimate</th><th>± std</th><th>95 % interval</th>"
+        f"<th>{compared}</th><th>deviation %</th><th>± 2σ, axis ± {limit:g} %</th></tr>"
+    ]
+    for p, reference, (deviation, bound) in zip(parameters, references, deviations, strict=True):
+        known = "" if reference is None else f"{reference.value:.6g}"
+        if p["identifiable"]:
+            percent = f"{deviation:+.3g}" if np.isfinite(deviation) else ""
+            numbers = [f"{p['estimate']:.5g}", f"{p['std']:.2g}", f"{p['lower95']:.5g} … {p['upper95']:.5g}"]
+            cells = [*numbers, known, percent, _bar(deviation, bound, limit)]
+        else:
+            cells = [NOT_DETERMINED, "", "", known, "", ""]
+        symbol = escape(shortened(p["symbol"]))
+        start = f'<td>{escape(p["name"])}</td><td class="left">{symbol}</td><td>{escape(p["unit"])}</td>'
+        kind = "" if p["identifiable"] else ' class="unknown"'
+        rows.append(f"<tr{kind}>{start}{''.join(f'<td>{cell}</td>' for cell in cells)}</tr>")
+    return "\n".join([*rows, "</table>"])
+
+
+def _bar(deviation: float, bound: float, limit: float) -> str:
+    """Estimate and ± 2σ on a scale of ± limit %, the reference in the middle; red where it lies outside the bounds."""
+    if not np.isfinite(deviation):
+        return ""
+    center, y = BAR_WIDTH / 2, BAR_HEIGHT / 2
+    left, middle, right = (
+        center + float(np.clip(value / limit, -1.0, 1.0)) * (center - 4)
+        for value in (deviation - bound, deviation, deviation + bound)
+    )
+    color = "#0072b2" if abs(deviation) <= bound else "#d04040"
+    return svg(
+        BAR_WIDTH,
+        BAR_HEIGHT,
+        f'<line class="grid" x1="4" x2="{BAR_WIDTH - 4}" y1="{y}" y2="{y}"/>'
+        f'<line x1="{center}" x2="{center}" y1="1" y2="{BAR_HEIGHT - 1}" stroke="#8895a3"/>'
+        f'<line x1="{left:.1f}" x2="{right:.1f}" y1="{y}" y2="{y}" stroke="{color}" stroke-width="3"/>'
+        f'<circle cx="{middle:.1f}" cy="{y}" r="3.5" fill="{color}"/>',
+    )
+
+
+def _convergence(estimator: Estimator, history: History, references: Sequence[Reference | None]) -> list[str]:
+    instants = history.instants
+    if not instants:
+        return ["<p>No samples.</p>"]
+    t = np.array([instant.t for instant in instants])
+    determined = np.array([instant.determined for instant in instants])
+    estimate = np.where(determined, np.array([instant.estimate for instant in instants]), np.nan)
+    std = np.where(determined, np.array([instant.std for instant in instants]), np.nan)
+    return [_group_chart(group, t, estimate, std) for group in parameter_groups(estimator.base.parameters, references)]
+
+
+def _group_chart(group: Group, t: Array, estimate: Array, std: Array) -> str:
+    drawn = (estimate[:, group.indices] - group.zero) / group.scale
+    width = BOUNDS * std[:, group.indices] / group.scale
+    series = [
+        Series(label, drawn[:, k], drawn[:, k] - width[:, k], drawn[:, k] + width[:, k])
+        for k, label in enumerate(group.labels)
+    ]
+    y_range = None if group.half_range is None else (-group.half_range, group.half_range)
+    return chart(group.title, t, series, "time, s", y_range)
+
+
+def _residual(document: Document, history: History) -> list[str]:
+    rows = "".join(
+        f"<tr><td>{escape(name)}</td><td>{_number(residual['relative'])}</td><td>{_number(residual['whitened'])}</td></tr>"
+        for name, residual in document["residual"].items()
+    )
+    heading = "<tr><th>rows</th><th>share of torque or force</th><th>whitened, 1 is noise</th></tr>"
+    parts = [f"<table>{heading}{rows}</table>"]
+    if history.instants:
+        t = np.array([instant.t for instant in history.instants])
+        relative = np.array([instant.residual for instant in history.instants])
+        series = [Series(f"joint {i + 1}", relative[:, i]) for i in range(relative.shape[1])]
+        parts.append(chart("Unexplained torque or force, share", t, series, "time, s", (0.0, 1.0)))
+    return parts
+
+
+def _number(value: float | None) -> str:
+    return "–" if value is None else f"{value:.3g}"
+
+
+def _arm(scene: Scene, history: History) -> list[str]:
+    seen = [instant for instant in history.instants if np.isfinite(instant.x).all()]
+    if not seen:
+        return ["<p>Never seen whole: some channel has no reading.</p>"]
+    chosen = np.unique(np.linspace(0, len(seen) - 1, PICTURES).round().astype(int)).tolist()
+    captions = [f"{seen[k].t:.2f} s" for k in chosen]
+    view = "from above" if scene.model.layout.planar else "from one side"
+    factor = f"; deflections × {scene.exaggeration:g}" if scene.exaggeration != 1.0 else ""
+    explained = f"Seen {view}{factor}. Grey: the same motor angles if the arm were rigid. Blue: where the tip has been."
+    return [f"<p>{explained}</p>", *arm_drawings(scene, np.array([i.x for i in seen]), chosen, captions)]

@@ -1,0 +1,105 @@
+"""The paper's example again: Figure 6 and Table V, the printed values beside ours.
+
+python -m sms_tools.html_report.paper_example FILE.html
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Sequence
+from html import escape
+from pathlib import Path
+
+import numpy as np
+
+from sms_adapters.system_file import load_system
+from sms_online.results import results_document
+from sms_sim.simulate import Simulation, exact_states, sampled_blocks, simulate
+from sms_tools.html_report.page import write_page
+from sms_tools.html_report.svg import Series, chart
+from sms_tools.session import new_estimator
+
+# Table V says EI_2 = 1768.8 N m², Table III 597.87; the figure's size of motion does not tell them apart.
+SYSTEM = "paper-planar-table-v"
+DURATION = 10.0  # s, section VI
+# Points of a curve: enough for a smooth line.
+POINTS = 1001
+# Table V as printed, in its order: actual value, estimated value, relative error in %.
+TABLE_V = (
+    ("865.01", "865.02", "-0.0014"),
+    ("400", "400.01", "-0.0016"),
+    ("400", "400.01", "-0.0016"),
+    ("403", "403.01", "-0.0017"),
+    ("0.0075", "0.0075", "-0.0001"),
+    ("0.0075", "0.0075", "0.0004"),
+    ("0.0075", "0.0075", "0.11"),
+    ("3", "3.00", "0.0050"),
+    ("31.42", "31.42", "-0.0004"),
+    ("31.42", "31.42", "0.0002"),
+    ("1768.8", "1768.80", "0.0000"),
+    ("1768.8", "1768.80", "-0.0016"),
+    ("1000", "1000.00", "0.0000"),
+    ("1000", "1000.00", "0.0004"),
+    ("75.85", "75.85", "0.0002"),
+    ("75.85", "75.85", "-0.0008"),
+)
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Simulate the example without noise, identify it, and write the page."""
+    parser = argparse.ArgumentParser(description="Figure 6 and Table V of the paper beside ours, as a page.")
+    parser.add_argument("file", metavar="FILE.html", type=Path, help="the page to write")
+    file: Path = parser.parse_args(arguments).file
+    simulation = simulate(load_system(SYSTEM), DURATION)
+    body = f"<h1>The paper's example</h1>{figure_6(simulation)}{table_v(simulation)}"
+    write_page(file, "The paper's example", body)
+
+
+def figure_6(simulation: Simulation) -> str:
+    """Joint angles, rates and motor torques over time, as in Figure 6."""
+    t = np.linspace(0.0, simulation.duration, POINTS)
+    exact = exact_states(simulation, t)
+    system, layout = simulation.plant.system, simulation.plant.model.layout
+    offset = layout.n_base_positions - layout.n_base_speeds
+    angles, rates, torques = [], [], []
+    for i, (q, theta_m) in enumerate(zip(layout.q, layout.theta_m, strict=True)):
+        number = "₁₂"[i]
+        angles += [Series(f"q{number}", exact.x[:, q + offset]), Series(f"θ_m{number}", exact.x[:, theta_m + offset])]
+        rates += [Series(f"q̇{number}", exact.v[:, q]), Series(f"θ̇_m{number}", exact.v[:, theta_m])]
+        torques.append(Series(f"τ{number}", exact.torque[:, i] / system.joints[i].gear_ratio))
+    charts = [
+        chart("(a) joint angles q and θ_m, rad", t, angles, "time, s"),
+        chart("(b) rates of q and θ_m, rad/s", t, rates, "time, s"),
+        chart("(c) motor torques τ before the gear, N m", t, torques, "time, s"),
+    ]
+    return "<h2>Figure 6</h2>" + "".join(charts)
+
+
+def table_v(simulation: Simulation) -> str:
+    """Actual and estimated values and the relative error in %, printed and ours."""
+    system = simulation.plant.system
+    blocks = list(sampled_blocks(simulation, "0"))
+    estimator = new_estimator(system, blocks[0].channels, system.name)
+    for block in blocks:
+        estimator.push(block)
+    estimator.finish()
+    truth = {parameter.name: parameter.nominal for parameter in estimator.base.physical}
+    rows = []
+    for p, printed in zip(results_document(estimator, 0.0, [], truth)["parameters"], TABLE_V, strict=True):
+        error = 100.0 * (p["estimate"] / p["true"] - 1.0)
+        ours = (f"{p['true']:.6g}", f"{p['estimate']:.6g}", f"{error:+.2g}")
+        cells = "".join(f"<td>{cell}</td>" for cell in (*printed, *ours))
+        rows.append(f'<tr><td>{escape(p["symbol"])}</td><td class="left">{escape(p["unit"])}</td>{cells}</tr>')
+    heading = (
+        '<tr><th></th><th></th><th colspan="3">Table V as printed</th><th colspan="3">ours</th></tr>'
+        "<tr><th>π</th><th></th>" + 2 * "<th>actual</th><th>estimated</th><th>error %</th>" + "</tr>"
+    )
+    how = (
+        f"Ours: {estimator.samples} samples of {simulation.duration:g} s at {system.sample_rate:g} Hz without noise, "
+        "rates found from the positions."
+    )
+    return f"<h2>Table V</h2><p>{how}</p><table>{heading}{''.join(rows)}</table>"
+
+
+if __name__ == "__main__":
+    main()

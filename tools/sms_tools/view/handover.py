@@ -1,0 +1,59 @@
+"""A bounded queue from the estimator's thread to a pipe: putting costs microseconds, whatever the other end does."""
+
+from __future__ import annotations
+
+import pickle
+from queue import Empty, SimpleQueue
+from threading import Thread
+from time import perf_counter, sleep
+from typing import IO, Any
+
+# Frames that wait for the other end: three seconds of a live session, which is more than the view's process needs to
+# start. Every fifth holds what the estimator knows, 16 MB of a large arm.
+CAPACITY = 64
+# A source that can be kept waiting looks so often whether there is room again, s.
+LOOK_AGAIN = 0.001
+
+
+class Handover:
+    """Items put here are pickled and written to a pipe by a thread of its own, in order.
+
+    Where the pipe does not take them, the oldest waiting items are dropped and counted.
+    """
+
+    def __init__(self, pipe: IO[bytes], capacity: int = CAPACITY) -> None:
+        self.dropped = 0
+        self.broken = False
+        self._pipe = pipe
+        self._capacity = capacity
+        self._waiting: SimpleQueue[Any] = SimpleQueue()
+        Thread(target=self._send, name="view hand-over", daemon=True).start()
+
+    def put(self, item: Any, patience: float = 0.0) -> bool:
+        """Hand an item over; False where after `patience` seconds there was no room and the oldest was dropped.
+
+        The item must not change afterwards: it is pickled later, by another thread.
+        """
+        if self.broken:
+            return False
+        if self._waiting.qsize() >= self._capacity:
+            end = perf_counter() + patience
+            while self._waiting.qsize() >= self._capacity and not self.broken and perf_counter() < end:
+                sleep(LOOK_AGAIN)
+        room = self._waiting.qsize() < self._capacity
+        if not room:
+            try:
+                self._waiting.get_nowait()
+                self.dropped += 1
+            except Empty:  # taken by the pipe just now
+                pass
+        self._waiting.put(item)
+        return room
+
+    def _send(self) -> None:
+        try:
+            while True:
+                pickle.dump(self._waiting.get(), self._pipe, protocol=pickle.HIGHEST_PROTOCOL)
+                self._pipe.flush()
+        except (OSError, ValueError):  # the other end is gone
+            self.broken = True

@@ -1,0 +1,174 @@
+"""Draws a session from its frames: a replica of the estimator takes on each state, and what it says is logged."""
+
+from __future__ import annotations
+
+import pickle
+from collections import deque
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sms_online.pipeline.estimator import Estimator
+from sms_online.results import LARGEST_RELATIVE_STD, _residuals, results_document, standard_deviation
+from sms_online.stream import Array
+from sms_tools.view import style
+from sms_tools.view.arm_log import ArmLog
+from sms_tools.view.blueprint import layout
+from sms_tools.view.frames import End, Event, Evidence, Picture, Start
+from sms_tools.view.number_log import EVIDENCE, HEALTH, RESIDUAL, NumberLog, ParameterLog
+from sms_tools.view.parameter_groups import parameter_groups
+from sms_tools.view.readings import Readings
+from sms_tools.view.residuals import RecentResidual
+from sms_tools.view.scene import Scene
+from sms_tools.view.sink import Sink
+from sms_tools.view.snapshot import Snapshot, apply
+from sms_tools.view.table import markdown_table
+
+# The table, and residuals of all rows so far, which move slowly: s of the session.
+SLOW_INTERVAL = 1.0
+
+# The rate of samples is stated over so many states: five seconds of a live session.
+RATE_STATES = 20
+
+
+class Recorder:
+    """One session on one sink. opened: told where the view is to be found, once something is drawn.
+
+    Raises TroubleError, from every method, where the sink does not take the data.
+    """
+
+    def __init__(self, start: Start, opened: Callable[[str], None]) -> None:
+        self.waiting = 0  # pictures in the batch
+        estimator: Estimator = pickle.loads(start.estimator)
+        self._estimator = estimator
+        self._references = start.references
+        self._opened: Callable[[str], None] | None = opened
+        self._scene = Scene(estimator.model, start.exaggeration)
+        self._readings = Readings(estimator.sensing, start.channels)
+        self._groups = parameter_groups(estimator.base.parameters, start.references)
+        system = estimator.system
+        self._sink = Sink(start.choice, start.recording, system.title or system.name)
+        self._arm: list[tuple[Array, Array, Array]] = []  # t, x, relative residual of each link's rows
+        self._residual = np.full(len(system.joints), np.nan)
+        self._recent = RecentResidual()
+        self._determined: NDArray[np.bool_] = np.zeros(estimator.base.n, dtype=bool)
+        self._gaps = 0
+        self._slow_due = -np.inf
+        self._clock: deque[tuple[int, float]] = deque(maxlen=RATE_STATES)  # samples and wall clock of the last states
+
+    def _open(self, x: Array) -> None:
+        """Begin to log: the layout looks at where the arm is first seen."""
+        if self._opened is None:
+            return
+        self._opened(self._sink.open(layout(self._scene, self._groups, self._scene.draw(x[:1]))))
+        self._opened = None
+        stream = self._sink.stream
+        self._arm_log = ArmLog(stream, self._scene)
+        self._numbers = NumberLog(stream)
+        self._parameters = ParameterLog(self._numbers, self._groups)
+        joints = [f"joint {i}" for i in range(1, len(self._estimator.system.joints) + 1)]
+        self._numbers.describe(f"{RESIDUAL}/relative", joints)
+        self._numbers.describe(f"{RESIDUAL}/energy", ["energy"])
+        self._numbers.describe(f"{RESIDUAL}/noise", ["noise"], [style.REFERENCE], width=1.0)
+        self._numbers.describe(f"{HEALTH}/rates/samples", ["samples/s"])
+        counts = ["samples lost", "rows dropped", "gaps", "cells interpolated", "pictures dropped"]
+        self._numbers.describe(f"{HEALTH}/counts/all", counts)
+
+    def picture(self, picture: Picture) -> None:
+        """Take in the samples and, where one comes with them, the estimator's state."""
+        for block in picture.blocks:
+            t, x = self._readings.push(block)
+            if t.size:
+                self._open(x)
+                self._arm.append((t, x, np.broadcast_to(self._residual, (t.size, self._residual.size))))
+                self.waiting += t.size
+        if picture.state is not None and self._opened is None:
+            t_state = float(picture.blocks[-1].t[-1])
+            self._take(t_state, picture.state)
+            samples = self._estimator.samples
+            self._clock.append((samples, picture.wall))
+            took = picture.wall - self._clock[0][1]
+            if took > 0.0:
+                rate = (samples - self._clock[0][0]) / took
+                self._numbers.add(f"{HEALTH}/rates/samples", t_state, np.array([rate]))
+            counters = self._estimator.counters
+            counts = [counters.lost_samples, self._estimator.dropped_rows, counters.gaps, counters.interpolated_cells]
+            self._numbers.add(f"{HEALTH}/counts/all", t_state, np.array([*counts, picture.dropped], dtype=np.float64))
+            self._numbers.add_named(f"{HEALTH}/source", t_state, picture.health)
+
+    def event(self, event: Event) -> None:
+        """Mark an event in the plots and tell it in the log."""
+        if self._opened is None:
+            self._parameters.mark(event.t)
+            self._numbers.tell(event.t, event.text)
+
+    def evidence(self, evidence: Evidence) -> None:
+        """Scores of candidate effects."""
+        if self._opened is None:
+            self._numbers.add_named(EVIDENCE, evidence.t, evidence.scores)
+
+    def write(self) -> None:
+        """Send what waits."""
+        if self._opened is not None:
+            return
+        if self._arm:
+            t, x, residual = (np.concatenate(column) for column in zip(*self._arm, strict=True))
+            self._arm_log.write(t, x, residual)
+            self._arm.clear()
+        self.waiting = 0
+        self._numbers.send()
+        self._sink.flush()
+
+    def end(self, end: End | None) -> None:
+        """The session's last state, with what its results warn of; None where it was cut off."""
+        if end is not None and self._opened is None:
+            self._slow_due = -np.inf
+            self._take(end.t, end.state)
+            for warning in results_document(self._estimator, 0.0, [])["warnings"]:
+                self._numbers.tell(end.t, warning, warning=True)
+        self.write()
+        if self._opened is None:
+            self._sink.close()
+
+    def _take(self, t: float, state: Snapshot) -> None:
+        estimator = self._estimator
+        apply(state, estimator)
+        estimate, std = estimator.estimate().pi, standard_deviation(estimator)
+        determined = std <= LARGEST_RELATIVE_STD * np.abs(estimate)
+        self._parameters.add(t, estimate, std, determined)
+        self._residual = self._recent.push(t, estimator, estimate)
+        self._numbers.add(f"{RESIDUAL}/relative", t, self._residual)
+        self._tell_changes(t, estimate, std, determined)
+        if t >= self._slow_due:
+            parameters = estimator.base.parameters
+            self._numbers.table(t, markdown_table(parameters, self._references, estimate, std, determined))
+            self._whole_residuals(t, estimate)
+            self._slow_due = t + SLOW_INTERVAL
+
+    def _whole_residuals(self, t: float, estimate: Array) -> None:
+        """Residuals of all rows so far: over their predicted deviation, and of the energy balance."""
+        residuals = _residuals(self._estimator, estimate)
+        whitened = {rows: r["whitened"] for rows, r in residuals.items()}
+        known = {rows: value for rows, value in whitened.items() if value is not None}
+        if known:
+            self._numbers.add_named(f"{RESIDUAL}/whitened", t, known)
+            self._numbers.add(f"{RESIDUAL}/noise", t, np.ones(1))
+        energy = self._estimator.energy_tracker.estimate()
+        rms = np.sqrt(energy.rss / energy.dof) if energy.dof > 0.0 else np.nan
+        self._numbers.add(f"{RESIDUAL}/energy", t, np.array([rms]))
+
+    def _tell_changes(self, t: float, estimate: Array, std: Array, determined: NDArray[np.bool_]) -> None:
+        """What has become known or has been lost since the last state."""
+        for k in np.flatnonzero(determined != self._determined):
+            p = self._estimator.base.parameters[k]
+            if determined[k]:
+                self._numbers.tell(t, f"{p.name} is determined: {estimate[k]:.4g} ± {std[k]:.2g} {p.unit}")
+            else:
+                self._numbers.tell(t, f"{p.name} is not determined any more", warning=True)
+        self._determined = determined
+        gaps = self._estimator.counters.gaps
+        if gaps > self._gaps:
+            self._parameters.mark(t)
+            self._numbers.tell(t, "a gap too long to bridge: a new window of the balance begins", warning=True)
+        self._gaps = gaps

@@ -1,0 +1,31 @@
+"""Residuals as they are now, not as they were on average since the session's start."""
+
+from __future__ import annotations
+
+from collections import deque
+
+import numpy as np
+
+from sms_online.pipeline.estimator import Estimator, SquaredResidual
+from sms_online.stream import Array
+
+# A residual is stated over the last so many seconds: some windows of the balance.
+SPAN = 1.0
+
+
+class RecentResidual:
+    """Relative residual of every joint's rows over the last second, with the estimate of now."""
+
+    def __init__(self) -> None:
+        self._past: deque[tuple[float, list[SquaredResidual]]] = deque()
+
+    def push(self, t: float, estimator: Estimator, beta: Array) -> Array:
+        """Shares (joints,) of the measured torque or force that are not explained; NaN where nothing was measured."""
+        now = estimator.joint_residuals
+        self._past.append((t, [SquaredResidual(r.gram.copy(), r.signal) for r in now]))
+        while len(self._past) > 1 and self._past[1][0] <= t - SPAN:
+            self._past.popleft()
+        then = self._past[0][1] if len(self._past) > 1 else [SquaredResidual(0.0 * r.gram, 0.0) for r in now]
+        recent = [SquaredResidual(a.gram - b.gram, a.signal - b.signal) for a, b in zip(now, then, strict=True)]
+        shares = [residual.relative(beta) for residual in recent]
+        return np.array([np.nan if share is None else share for share in shares])

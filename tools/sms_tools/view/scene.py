@@ -1,0 +1,133 @@
+"""The drawn arm: points and lines in inertial axes for many positions at once, by the model's own kinematics."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from sms_online.description.schema import FlexibleLink, RigidLink
+from sms_online.model.chain import Configuration
+from sms_online.model.model import Model
+from sms_online.stream import Array
+
+# A dimension of the spacecraft that the description does not tell is drawn as this share of its largest.
+LEAST_SIDE = 0.2
+# In the plane the spacecraft is a plate so far below the arm, as a share of its reach, that the arm passes over it.
+PLATE_DEPTH = 0.03
+# m, where the description tells of no length at all, as of a single axis.
+UNKNOWN_REACH = 1.0
+# A fixed base is drawn as a cube with this share of the arm's reach as half its side.
+PEDESTAL = 0.06
+DISPLACEMENTS = ("u_x", "u_y", "u_z")
+
+
+@dataclass(frozen=True)
+class Drawing:
+    """B pictures of an arm, in m.
+
+    S (B, 3); base_rotation (B, 3, 3); base_origin (B, 3): joint 1, the origin of {0}. joints (B, joints, 3). links:
+    for each link its line (B, P, 3), from joint to end. ghost (B, G, 3): the same arm if it were rigid. markers
+    (B, M, 3). tip (B, 3): the end of the last link.
+    """
+
+    S: Array
+    base_origin: Array
+    base_rotation: Array
+    joints: Array
+    links: tuple[Array, ...]
+    ghost: Array
+    markers: Array
+    tip: Array
+
+
+class Scene:
+    """What can be drawn of a model.
+
+    exaggeration: factor on the deflections of links and joints. box: centre and half sides (3,) of the spacecraft in
+    {0}, m: the smallest box about its centre of mass that holds joint 1 and S. reach: length of the stretched arm, m.
+    markers: (link from 1, marker from 1) of each drawn marker.
+    """
+
+    def __init__(self, model: Model, exaggeration: float = 1.0) -> None:
+        self.model = model
+        self.exaggeration = exaggeration
+        system = model.system
+        self.reach = float(sum(_length(link) for link in system.links)) or UNKNOWN_REACH
+        if system.spacecraft is None:
+            self.box = (np.zeros(3), np.full(3, PEDESTAL * self.reach))
+        else:
+            center = np.array(system.spacecraft.center_of_mass)
+            half = np.maximum(np.abs(center), np.abs(np.array(system.spacecraft.tracked_point) - center))
+            half = np.maximum(half, LEAST_SIDE * (float(half.max()) or PEDESTAL * self.reach))
+            if model.layout.planar:
+                center[2], half[2] = -PLATE_DEPTH * self.reach, 0.0
+            self.box = (center, half)
+        self.markers = tuple(
+            (i, j)
+            for i, link in enumerate(system.links, start=1)
+            if isinstance(link, FlexibleLink)
+            for j in range(1, link.elements + 1)
+        )
+        layout = model.layout
+        offset = layout.n_base_positions - layout.n_base_speeds
+        self._q = [index + offset for index in layout.q]
+        self._theta_m = [index + offset for index in layout.theta_m]
+        self._elastic = np.concatenate([np.arange(s.start, s.stop) + offset for s in layout.q_f]).astype(np.int64)
+
+    def draw(self, x: Array) -> Drawing:
+        """Pictures of the positions x (B, n_x)."""
+        shown = self._with_deflections(x, self.exaggeration)
+        configuration = self.model.chain.configure(shown)
+        frames = configuration.frames
+        n = len(self.model.system.joints)
+        rigid = self.model.chain.configure(self._with_deflections(x, 0.0)).frames
+        return Drawing(
+            S=configuration.r_S,
+            base_origin=frames[0].origin,
+            base_rotation=frames[0].rotation,
+            joints=np.stack([frames[2 * i + 2].origin for i in range(n)], axis=1),
+            links=tuple(self._line(configuration, i) for i in range(n)),
+            ghost=np.stack([*(rigid[2 * i + 2].origin for i in range(n)), rigid[-1].origin], axis=1),
+            markers=self._markers(configuration),
+            tip=frames[-1].origin,
+        )
+
+    def _with_deflections(self, x: Array, factor: float) -> Array:
+        """The same motor angles with every deflection, of links and of joints, multiplied."""
+        out = x.copy()
+        out[:, self._elastic] *= factor
+        out[:, self._q] = x[:, self._theta_m] + factor * (x[:, self._q] - x[:, self._theta_m])
+        return out
+
+    def _line(self, configuration: Configuration, i: int) -> Array:
+        """Axis of link i (from 0): its ends, and between them the points at which the model integrates its shape."""
+        link, end = configuration.frames[2 * i + 2 : 2 * i + 4]
+        shape = configuration.shape(i)
+        if shape is None:
+            return np.stack((link.origin, end.origin), axis=1)
+        inner = link.origin[:, None] + np.einsum("bij,bgj->bgi", link.rotation, shape.points)
+        return np.concatenate((link.origin[:, None], inner, end.origin[:, None]), axis=1)
+
+    def _markers(self, configuration: Configuration) -> Array:
+        """Markers (B, M, 3): their displacements from the straight link, turned to inertial axes."""
+        points = [np.empty((configuration.size, 0, 3))]
+        chain = self.model.chain
+        for i, kinematics in enumerate(chain.flexible):
+            link = chain.links[i]
+            if kinematics is None or not isinstance(link, FlexibleLink):
+                continue
+            readings = kinematics.markers(chain.elastic(configuration.x, i))
+            local = np.zeros((configuration.size, link.elements, 3))
+            local[..., 0] = link.length * np.arange(1, link.elements + 1) / link.elements
+            for column, name in enumerate(kinematics.marker_names):
+                marker, field = name.removeprefix("marker_").split(".")
+                if field in DISPLACEMENTS:
+                    local[:, int(marker) - 1, DISPLACEMENTS.index(field)] += readings[:, column]
+            frame = configuration.frames[2 * i + 2]
+            points.append(frame.origin[:, None] + np.einsum("bij,bmj->bmi", frame.rotation, local))
+        return np.concatenate(points, axis=1)
+
+
+def _length(link: RigidLink | FlexibleLink) -> float:
+    return link.length if isinstance(link, FlexibleLink) else float(np.linalg.norm(link.tip))

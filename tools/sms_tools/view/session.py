@@ -1,0 +1,229 @@
+"""The estimator's side of the view: cheap to feed, never waits for whoever looks."""
+
+from __future__ import annotations
+
+import json
+import pickle
+import socket
+import subprocess
+import sys
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from pathlib import Path
+from threading import Event as Flag
+from threading import Thread
+from time import perf_counter
+from types import TracebackType
+from typing import IO
+
+import numpy as np
+
+from sms_online.errors import InputError
+from sms_online.pipeline.estimator import Estimator
+from sms_online.stream import Block
+from sms_tools.interruption import Interruption
+from sms_tools.view.choice import EXPECTED, Choice, parse_choice
+from sms_tools.view.frames import End, Event, Evidence, Frame, Picture, Reference, Start
+from sms_tools.view.handover import CAPACITY, Handover
+from sms_tools.view.snapshot import take
+
+RECORDING = "session.rrd"
+# Hand-overs a second of the session: samples as often as they are drawn; with every fifth the estimator's state, for it
+# changes by internal blocks of a quarter second.
+SAMPLES_RATE = 20.0
+SAMPLES_A_STATE = 5
+# Frames that wait where the source can be kept waiting; each holds what the estimator knows, 16 MB of a large arm.
+FEW = 8
+# A view that has taken nothing for so long, s, is given up.
+STALL = 10.0
+# What is left at the end of a session gets so long to be written, s.
+CLOSING = 10.0
+# A viewer in the same laboratory answers within this time, s.
+PROBE_TIMEOUT = 1.0
+
+# Further numbers of a source (latency, clock offsets), name with unit to value, asked for with every state.
+Health = Callable[[], Mapping[str, float]]
+
+
+class View:
+    """Shows one session, or with `off` nothing at all.
+
+    status: one line for people, empty while all is well. warnings: what went wrong, for the results.
+    """
+
+    def __init__(self, estimator: Estimator, start: Start | None, patient: bool, health: Health | None) -> None:
+        self.status = ""
+        self.warnings: list[str] = []
+        self._estimator = estimator
+        self._patience = STALL if patient else 0.0
+        self._health = health
+        self._t = 0.0
+        self._room = perf_counter()  # when the last frame was taken without one being dropped
+        self._process: subprocess.Popen[bytes] | None = None
+        self._handover: Handover | None = None
+        self._done = Flag()
+        self._serving = start is not None and start.choice.kind == "serve"
+        if start is not None and start.choice.kind == "connect" and (absent := _absent(start.choice)):
+            self._trouble(absent)
+        elif start is not None:
+            # A session of its own: Ctrl-C is for the estimator, which then ends the view in order.
+            self._process = subprocess.Popen(
+                [sys.executable, "-m", "sms_tools.view.worker"],
+                stdin=subprocess.PIPE,
+                stdout=subprocess.PIPE,
+                stderr=subprocess.DEVNULL,
+                start_new_session=True,
+            )
+            assert self._process.stdin is not None
+            assert self._process.stdout is not None
+            self._handover = Handover(self._process.stdin, FEW if patient else CAPACITY)
+            Thread(target=self._listen, args=(self._process.stdout,), name="view messages", daemon=True).start()
+            self._handover.put(start)
+
+    def watch(self, blocks: Iterable[Block]) -> Iterator[Block]:
+        """The same samples, in pieces no longer than the view's interval; each is shown once it has been used.
+
+        The estimator's result does not depend on how samples are cut.
+        """
+        if self._handover is None:
+            yield from blocks
+            return
+        longest = max(1, round(self._estimator.system.sample_rate * SAMPLES_A_STATE / SAMPLES_RATE))
+        # Numbers of the display intervals that were shown last.
+        shown = stated = -1
+        waiting: list[Block] = []
+        for block in blocks:
+            for k in range(0, block.t.size, longest):
+                piece = Block(block.t[k : k + longest], block.channels, block.values[k : k + longest])
+                yield piece
+                waiting.append(piece)
+                self._t = float(piece.t[-1])
+                interval = int(self._t * SAMPLES_RATE)
+                if interval != shown:
+                    state_due = interval // SAMPLES_A_STATE != stated
+                    self._show(tuple(waiting), state_due)
+                    waiting.clear()
+                    shown, stated = interval, interval // SAMPLES_A_STATE
+
+    def event(self, t: float, text: str) -> None:
+        """Mark an instant, s, in the plots, and tell it in the log."""
+        self._put(Event(t, text))
+
+    def evidence(self, t: float, scores: Mapping[str, float]) -> None:
+        """Scores of candidate effects (`name@where`) at an instant, s."""
+        self._put(Evidence(t, dict(scores)))
+
+    def linger(self, interruption: Interruption) -> None:
+        """Where the session is served: keep it so until Ctrl-C."""
+        if self._serving and self._process is not None and not interruption.requested:
+            print("the view stays until Ctrl-C", file=sys.stderr)
+            while not interruption.requested and self._process.poll() is None:
+                interruption.sleep(1.0)
+        self._kill()
+
+    def __enter__(self) -> View:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if self._handover is None:
+            return
+        if kind is None:
+            self._put(End(self._t, take(self._estimator)))
+            if not self._done.wait(CLOSING):
+                self._trouble("the view did not finish in time")
+        if self._handover.dropped:
+            self.warnings.append(f"{self._handover.dropped} pictures of the view dropped: it does not keep up")
+        if not (self._serving and kind is None and not self.status):
+            self._kill()
+
+    def _show(self, blocks: tuple[Block, ...], with_state: bool) -> None:
+        assert self._handover is not None
+        health = dict(self._health()) if with_state and self._health is not None else {}
+        state = take(self._estimator) if with_state else None
+        self._put(Picture(blocks, state, health, perf_counter(), self._handover.dropped))
+
+    def _put(self, frame: Frame) -> None:
+        if self._handover is None or self.status:
+            return
+        if self._handover.put(frame, self._patience):
+            self._room = perf_counter()
+        elif perf_counter() - self._room > STALL:
+            self._trouble(f"nothing of it was taken for {STALL:g} s")
+
+    def _trouble(self, text: str) -> None:
+        """Give the view up; the session goes on."""
+        if not self.status:
+            self.status = f"no view: {text}"
+            self.warnings.append(f"the view ended at {self._t:.1f} s: {text}" if self._t else self.status)
+            print(self.status, file=sys.stderr)
+        self._done.set()
+
+    def _listen(self, messages: IO[bytes]) -> None:
+        for line in messages:
+            message: dict[str, str] = json.loads(line)
+            if "place" in message:
+                print(f"view: {message['place']}", file=sys.stderr)
+            elif "trouble" in message:
+                self._trouble(message["trouble"])
+            else:
+                self._done.set()
+        if not self._done.is_set():
+            self._trouble("its process ended")
+
+    def _kill(self) -> None:
+        if self._process is not None:
+            self._process.kill()
+            self._process.wait()
+
+
+def open_view(
+    choice: str,
+    estimator: Estimator,
+    channels: tuple[str, ...],
+    directory: Path,
+    truth: Mapping[str, float] | None = None,
+    *,
+    patient: bool = False,
+    exaggeration: float = 1.0,
+    health: Health | None = None,
+) -> View:
+    """A view of a session that has not begun, by the value of --rerun.
+
+    channels: of the session's blocks. directory: where `save` writes session.rrd. truth: true physical parameters by
+    name. patient: wait for the view rather than leave pictures out, for a source that can be kept waiting.
+    exaggeration: factor on drawn deflections. health: see there. Raises InputError on an unknown choice or a directory
+    that cannot be made.
+    """
+    try:
+        parsed = parse_choice(choice)
+    except ValueError as error:
+        raise InputError("--rerun", "", str(error).split(";")[0], EXPECTED) from None
+    if parsed.kind == "off":
+        return View(estimator, None, patient, None)
+    recording = directory / RECORDING
+    if parsed.kind == "save":
+        try:
+            directory.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise InputError(str(directory), "", error.strerror or str(error), "a directory that can be made") from None
+    start = Start(pickle.dumps(estimator), channels, parsed, recording, references(estimator, truth), exaggeration)
+    return View(estimator, start, patient, health)
+
+
+def _absent(choice: Choice) -> str:
+    """Why there is no viewer at the address, or nothing."""
+    try:
+        socket.create_connection((choice.host.strip("[]"), choice.port), PROBE_TIMEOUT).close()
+    except OSError as error:
+        return f"no viewer at {choice.url} ({error.strerror or error})"
+    return ""
+
+
+def references(estimator: Estimator, truth: Mapping[str, float] | None) -> tuple[Reference | None, ...]:
+    """What each base parameter is compared with: the truth where it is known, else a nominal value other than zero."""
+    base = estimator.base
+    if truth is not None and all(p.name in truth for p in base.physical):
+        values = base.values(np.array([truth[p.name] for p in base.physical]))
+        return tuple(Reference(float(value), True) for value in values)
+    return tuple(Reference(p.nominal, False) if p.nominal else None for p in base.parameters)

@@ -1,0 +1,90 @@
+"""What an estimator knows at an instant, copied fast enough for its own thread, and put into a replica of it.
+
+A replica answers whatever the estimator itself would: estimate, error bars, the whole results document. It cannot
+continue the session; `Estimator.state` is for that, and holds much more.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+from sms_online.pipeline.estimator import Estimator, SquaredResidual
+from sms_online.pipeline.momentum import Momentum
+from sms_online.pipeline.synchronise import SyncCounters
+from sms_online.stream import Array
+from sms_online.trackers.interface import State
+
+
+@dataclass(frozen=True)
+class MomentumSnapshot:
+    """Of the momentum balance: its tracker, the bias of noisy columns, and the sums behind whitened residuals."""
+
+    windows: int
+    dropped_windows: int
+    tracker: State
+    bias: dict[str, Array]
+    weights: Array | None
+    misfit: Array
+    plain_gram: Array
+    plain_windows: int
+
+
+@dataclass(frozen=True)
+class Snapshot:
+    """Counts, and the states of what turns rows into numbers."""
+
+    samples: int
+    duration: float
+    dropped_rows: int
+    counters: SyncCounters
+    energy_tracker: State
+    shared_errors: dict[str, Any]
+    joint_residuals: list[SquaredResidual]
+    momentum: MomentumSnapshot | None
+
+
+def take(estimator: Estimator) -> Snapshot:
+    """What the estimator knows now; nothing in it changes when the estimator goes on."""
+    return Snapshot(
+        samples=estimator.samples,
+        duration=estimator.duration,
+        dropped_rows=estimator.dropped_rows,
+        counters=replace(estimator.counters),
+        energy_tracker=estimator.energy_tracker.state(),
+        shared_errors=estimator.shared_errors.state(),
+        joint_residuals=[SquaredResidual(r.gram.copy(), r.signal) for r in estimator.joint_residuals],
+        momentum=None if estimator.momentum is None else _take_momentum(estimator.momentum),
+    )
+
+
+def _take_momentum(momentum: Momentum) -> MomentumSnapshot:
+    fit = momentum._fit
+    return MomentumSnapshot(
+        windows=momentum.windows,
+        dropped_windows=momentum.dropped_windows,
+        tracker=momentum.tracker.state(),
+        bias={name: array.copy() for name, array in momentum.bias.state().items()},
+        weights=fit.weights,
+        misfit=fit.misfit,
+        plain_gram=fit.plain_gram.copy(),
+        plain_windows=fit.plain_windows,
+    )
+
+
+def apply(snapshot: Snapshot, replica: Estimator) -> None:
+    """Make an estimator of the same system, channels and priors know the same."""
+    replica.samples, replica.duration = snapshot.samples, snapshot.duration
+    replica.dropped_rows = snapshot.dropped_rows
+    vars(replica.counters).update(vars(snapshot.counters))
+    replica.energy_tracker.restore(snapshot.energy_tracker)
+    replica.shared_errors.restore(snapshot.shared_errors)
+    replica.joint_residuals = snapshot.joint_residuals
+    known, momentum = snapshot.momentum, replica.momentum
+    if known is not None and momentum is not None:
+        momentum.windows, momentum.dropped_windows = known.windows, known.dropped_windows
+        momentum.tracker.restore(known.tracker)
+        momentum.bias.restore(known.bias)
+        fit = momentum._fit
+        fit.weights, fit.misfit = known.weights, known.misfit
+        fit.plain_gram, fit.plain_windows = known.plain_gram, known.plain_windows
