@@ -13,6 +13,7 @@ from rich.progress import BarColumn, DownloadColumn, Progress, TextColumn, TimeR
 
 from sms_adapters.sources import open_source
 from sms_adapters.truth import read_truth
+from sms_online.bound import MotionRecord, session_bound
 from sms_online.errors import InputError
 from sms_online.stream import Block
 from sms_tools.interruption import Interruption
@@ -47,6 +48,9 @@ def run(args: argparse.Namespace) -> int:
         source = open_source(capture, system, args.start, args.stop, on_bytes, folder)
         truth = read_truth(capture)
         estimator = new_estimator(system, source.channels, str(capture), args.prior)
+        record = MotionRecord(system.sample_rate) if args.bound else None
+        if record is not None:
+            estimator.on_motion = record.add
         if args.speed == "1":
             blocks = _paced(_pieces(source, max(1, round(PACE * system.sample_rate))), interruption)
         else:
@@ -54,7 +58,8 @@ def run(args: argparse.Namespace) -> int:
         stream(estimator, blocks, interruption)
         wall = perf_counter() - opened
     parameters = None if truth is None else truth["parameters"]
-    document = document_of(estimator, estimator.samples / wall, source.warnings, parameters)
+    bound = None if record is None else session_bound(estimator, record)
+    document = document_of(estimator, estimator.samples / wall, source.warnings, parameters, bound)
     return conclude(args, document, directory, interruption.requested)
 
 
