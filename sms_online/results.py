@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from sms_online.description.parse import describe
 from sms_online.physical import PhysicalSet, Projection
 from sms_online.pipeline.estimator import Estimator
+from sms_online.pipeline.events import Event
 from sms_online.stream import Array
 from sms_online.trackers.interface import Estimate
 
@@ -154,6 +155,16 @@ def _projection_warning(projection: Projection | None) -> list[str]:
     return [f"no real bodies have these parameters, because of {names}: the nearest that some have are {distance} away"]
 
 
+def _event(event: Event) -> dict[str, Any]:
+    jumps = zip(event.parameters, event.units, event.sizes, event.stds, strict=True)
+    return {
+        "time": event.time,
+        "kind": event.kind,
+        "parameters": [{"name": name, "unit": unit, "size": size, "std": std} for name, unit, size, std in jumps],
+        "dropped_windows": event.dropped_windows,
+    }
+
+
 def results_document(
     estimator: Estimator,
     throughput: float,
@@ -165,7 +176,7 @@ def results_document(
 
     throughput: samples/s. truth: true values of physical parameters by name, of a simulated capture; they enter this
     report alone. bound (n,): Cramér-Rao bound of each base parameter, where it has been computed. Numbers that do not
-    exist (the std of an undetermined parameter) are None.
+    exist (the std of an undetermined parameter) are None. After an event parameters and residuals are those since then.
     """
     estimate = estimator.estimate()
     base = estimator.base
@@ -191,7 +202,7 @@ def results_document(
                 "true": None if true is None else float(true[k]),
                 "identifiable": bool(flags[k]),
                 "projected": float(projection.beta[k]) if projection is not None and projection.active else None,
-                "bound": None if bound is None or not np.isfinite(bound[k]) else float(bound[k]),
+                "bound": None if bound is None or k >= bound.size or not np.isfinite(bound[k]) else float(bound[k]),
             }
         )
     residual = _residuals(estimator, estimate.pi)
@@ -201,6 +212,7 @@ def results_document(
         "samples": estimator.samples,
         "duration_s": estimator.duration,
         "parameters": parameters,
+        "events": [_event(event) for event in estimator.events],
         "residual": residual,
         "physical": None
         if projection is None

@@ -23,11 +23,8 @@ from numpy.testing import assert_allclose
 
 from sms_adapters.system_file import load_system
 from sms_online.description.schema import FlexibleLink, System
-from sms_online.model.base_parameters import BaseParameters, find_base_parameters
-from sms_online.model.model import Model
-from sms_online.pipeline.rates import HALF_WIDTHS, smooth_and_differentiate
-from sms_online.pipeline.sensing import Sensing
-from sms_online.stream import Array, Block
+from sms_online.pipeline.estimator import Estimator
+from sms_online.stream import Block
 from sms_sim.sensors import GRADES
 from sms_sim.simulate import sampled_blocks, simulate
 
@@ -243,50 +240,13 @@ WINDOW, EXPONENT, HOP = 0.4, 6, 0.02
 COLUMN_SAMPLES = 1000  # at once: what fits in a cache
 
 
-def momentum_rows(model: Model, base: BaseParameters, block: Block) -> tuple[Array, Array]:
-    """Weak-form rows Y (windows, n_v, n) and right-hand sides (windows, n_v) of every generalized coordinate."""
-    rate = model.system.sample_rate
-    sensing = Sensing(model, block.channels, "engine")
-    values = block.values[:, [block.channels.index(channel) for channel in sensing.channels]]
-    half_width = HALF_WIDTHS[0]
-    x, v = smooth_and_differentiate(sensing.coordinates(values), half_width, rate)
-    Q = model.generalized_force(sensing.joint_torque(values)[half_width:-half_width])
-    width = round(WINDOW * rate)
-    z = np.linspace(-1.0, 1.0, width + 1)
-    phi = (1.0 - z**2) ** EXPONENT / rate
-    phi_dot = -2.0 * EXPONENT * z * (1.0 - z**2) ** (EXPONENT - 1) * 2.0 / width
-    # (samples, n_v, 2 n): P beside G.
-    columns = np.concatenate(
-        [
-            np.concatenate([base.columns(part) for part in model.momentum_columns(x[rows], v[rows])], axis=2)
-            for rows in (slice(k, k + COLUMN_SAMPLES) for k in range(0, x.shape[0], COLUMN_SAMPLES))
-        ]
-    )
-    P, G = columns[..., : base.n], columns[..., base.n :]
-    Y, b = [], []
-    for start in range(0, x.shape[0] - width, round(HOP * rate)):
-        rows = slice(start, start + width + 1)
-        Y.append(-np.tensordot(phi_dot, P[rows], 1) - np.tensordot(phi, G[rows], 1))
-        b.append(phi @ Q[rows])
-    return np.array(Y), np.array(b)
-
-
-def fit(Y: Array, b: Array) -> Array:
-    """Least squares, then once more with each coordinate's rows weighted by what the first fit left of them."""
-    weights = np.ones(Y.shape[1])
-    for _ in range(2):
-        stacked = (Y * weights[:, None]).reshape(-1, Y.shape[2])
-        scale = np.linalg.norm(stacked, axis=0)
-        beta = np.linalg.lstsq(stacked / scale, (b * weights).ravel(), rcond=None)[0] / scale
-        weights = 1.0 / np.sqrt(np.mean((Y @ beta - b) ** 2, axis=0))
-    return np.asarray(beta)
-
-
-def test_a_fit_to_the_engine_gives_the_parameters_that_it_was_built_with(engine_capture: Block) -> None:
-    model = Model(SYSTEM)
-    base = find_base_parameters(model)
-    estimate = fit(*momentum_rows(model, base, engine_capture))
-    truth = base.values(model.nominal)
+def test_the_estimator_finds_the_parameters_that_the_engine_was_built_with(engine_capture: Block) -> None:
+    estimator = Estimator(SYSTEM, engine_capture.channels, "engine")
+    estimator.push(engine_capture)
+    estimator.finish()
+    assert estimator.by_momentum
+    base, truth = estimator.base, estimator.base.values(estimator.model.nominal)
+    estimate = estimator.estimate().pi
     error = {p.name: abs(e / t - 1.0) for p, e, t in zip(base.parameters, estimate, truth, strict=True)}
     # 0.0075 kg m² at the end of a link of 18 kg m²: the segments alone change more than that.
     del error["motor_2.stator_inertia"]

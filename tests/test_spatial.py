@@ -10,14 +10,15 @@ import pytest
 from conftest import noise_free_block
 
 from sms_adapters.system_file import load_system
-from sms_online.bound import cramer_rao_bound
+from sms_online.bound import Motion, cramer_rao_bound
 from sms_online.pipeline.estimator import Estimator
 from sms_online.results import identifiable, standard_deviation
+from sms_online.sensor_set import sensor_set
 from sms_online.stream import Array
-from sms_sim.sensors import GRADES
+from sms_sim.sensors import Sensors
 from sms_sim.simulate import Simulation, exact_states, simulate
 
-GRADE = GRADES["A"]
+GRADE = "A"
 ACCURACY = 1e-3
 EXCITED = 1e-2
 
@@ -46,16 +47,13 @@ def test_two_link_arm_gives_every_parameter_that_is_not_zero() -> None:
 
 def relative_bound(simulation: Simulation, step: float) -> Array:
     """Cramér–Rao bound over value (n,) with every position and torque measured at grade A; inf for zero values."""
-    plant, layout = simulation.plant, simulation.plant.model.layout
+    plant = simulation.plant
     t = np.arange(0.0, simulation.duration + 0.5 * step, step)
     exact = exact_states(simulation, np.minimum(t, simulation.duration))
-    sigma_x = np.full(layout.n_x, GRADE.encoder)
-    for k, name in enumerate(layout.position_names):
-        if name.startswith("e"):  # Euler parameters turn by half the angle
-            sigma_x[k] = 0.5 * GRADE.encoder
-    sigma_tau = np.full(len(layout.q), GRADE.torque)
+    graded = Sensors(plant.system, plant.channels, GRADE, seed=0)
     base = Estimator(plant.system, plant.channels, "simulation").base
-    bound = cramer_rao_bound(plant.dynamics, base, t, exact.x, exact.v, exact.torque, sigma_x, sigma_tau)
+    sensors = sensor_set(plant.model, graded.channels, graded.noise, graded.rate)
+    bound = cramer_rao_bound(plant.dynamics, base, [Motion(t, exact.x, exact.v)], sensors)
     truth = base.values(plant.model.nominal)
     return np.where(truth == 0.0, np.inf, bound / np.where(truth == 0.0, 1.0, np.abs(truth)))
 

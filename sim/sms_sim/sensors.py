@@ -53,9 +53,9 @@ class Sensors:
             used = [Sensor(channels=(c,), noise=_grade_noise(system, c, drives, GRADES[grade])) for c in self.channels]
         self.sample_rate = system.sample_rate
         self.latency = np.array([sensor.latency for sensor in used])
-        self._rate = np.array([min(sensor.rate or self.sample_rate, self.sample_rate) for sensor in used])
-        self._noise = np.array([sensor.noise for sensor in used])
-        self._resolution = np.array([sensor.resolution for sensor in used])
+        self.rate = np.array([min(sensor.rate or self.sample_rate, self.sample_rate) for sensor in used])
+        self.noise = np.array([sensor.noise for sensor in used])
+        self.resolution = np.array([sensor.resolution for sensor in used])
         self._random = np.random.default_rng(seed)
 
     def read(self, first: int, exact: Array) -> Array:
@@ -64,12 +64,12 @@ class Sensors:
         A sensor slower than the system fills the first sample of each of its own intervals. Samples have to be read in
         order: noise is drawn for every channel of every sample, so that it depends on the seed alone.
         """
-        values = exact + self._noise * self._random.standard_normal(exact.shape)
-        step = np.where(self._resolution > 0.0, self._resolution, 1.0)
-        values = np.where(self._resolution > 0.0, step * np.round(values / step), values)
+        values = exact + self.noise * self._random.standard_normal(exact.shape)
+        step = np.where(self.resolution > 0.0, self.resolution, 1.0)
+        values = np.where(self.resolution > 0.0, step * np.round(values / step), values)
         # The sensor's own interval that each sample, and the one before it, falls into; rounding must not split one.
         samples = first + np.arange(-1, exact.shape[0])
-        interval = np.floor(samples[:, None] * (self._rate / self.sample_rate) + 1e-9)
+        interval = np.floor(samples[:, None] * (self.rate / self.sample_rate) + 1e-9)
         return np.where(np.diff(interval, axis=0) > 0, values, np.nan)
 
 

@@ -7,15 +7,18 @@ their errors are not independent, and the momentum rows hold what the energy row
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from sms_online.description.schema import System
 from sms_online.model.base_parameters import BaseParameters, find_base_parameters
 from sms_online.model.model import Model
 from sms_online.pipeline.energy_balance import BalanceRows, EnergyBalance, SharedErrors
+from sms_online.pipeline.events import Event
 from sms_online.pipeline.joint_balance import JointBalance
 from sms_online.pipeline.momentum import Momentum
 from sms_online.pipeline.rates import RateSamples, RatesStage
@@ -32,6 +35,9 @@ BLOCK = 256
 
 # What a session saves: arrays and numbers, by stage.
 SessionState = dict[str, dict[str, Any]]
+
+# Takes consecutive smoothed samples: grid index (B,), segment, x (B, n_x), v (B, n_v).
+MotionSink = Callable[[NDArray[np.int64], int, Array, Array], None]
 
 
 @dataclass
@@ -67,23 +73,23 @@ class Estimator:
 
     def __init__(self, system: System, channels: tuple[str, ...], source: str) -> None:
         self.system = system
-        self.model = Model(system)
-        self.base: BaseParameters = find_base_parameters(self.model)
-        self.sensing = Sensing(self.model, channels, source)
+        self._model = model = Model(system)
+        self._base = base = find_base_parameters(model)
+        self.sensing = Sensing(model, channels, source)
         self.samples = 0
         self.dropped_rows = 0
         self.duration = 0.0
+        self.on_motion: MotionSink | None = None
         self._columns = [channels.index(name) for name in self.sensing.channels]
         self._attitude = AttitudeContinuity()
         self._synchroniser = Synchroniser(self.sensing.channels, system.sample_rate)
-        layout = self.model.layout
+        layout = model.layout
         # Positions choose the filter's width; torques pass the same filter for the sake of the lag.
         self._rates = RatesStage(system.sample_rate, range(layout.n_x), self.sensing.noise)
-        self._energy = EnergyBalance(self.model, self.base, system.sample_rate)
-        self._joints = JointBalance(self.model, self.base, system.sample_rate)
-        self.momentum = None if system.balance == "energy" else Momentum(self.model, self.base, self.sensing)
-        self.energy_tracker: Tracker = RecursiveLeastSquares(self.base.n)
-        self.joint_residuals = [SquaredResidual(np.zeros((self.base.n + 1, self.base.n + 1))) for _ in layout.q]
+        self._energy = EnergyBalance(model, base, system.sample_rate)
+        self.momentum = None if system.balance == "energy" else Momentum(model, base, self.sensing)
+        self.energy_tracker: Tracker = RecursiveLeastSquares(base.n)
+        self._begin_joints()
         self._segment = -1
         self._first_time = np.nan
         self._pending_t = np.empty(0)
@@ -91,13 +97,30 @@ class Estimator:
 
     def set_prior(self, prior: Prior) -> None:
         """Weigh the rows against what is known of the base parameters beforehand; before the first sample."""
-
-        def tracker() -> RecursiveLeastSquares:
-            return RecursiveLeastSquares(self.base.n, prior=prior, scaled_by_residual=True)
-
-        self.energy_tracker = tracker()
+        self.energy_tracker = RecursiveLeastSquares(self.base.n, prior=prior, scaled_by_residual=True)
         if self.momentum is not None:
-            self.momentum.tracker = tracker()
+            self.momentum.set_prior(prior)
+
+    @property
+    def model(self) -> Model:
+        """The system's model, with what events have added to it."""
+        return self._model if self.momentum is None else self.momentum.changes.model
+
+    @property
+    def base(self) -> BaseParameters:
+        """The parameters that are estimated: the system's own, and what events have added to them."""
+        return self._base if self.momentum is None else self.momentum.changes.base
+
+    @property
+    def events(self) -> list[Event]:
+        """Changes of the system while the session ran."""
+        return [] if self.momentum is None else self.momentum.changes.events
+
+    def _begin_joints(self) -> None:
+        """Residuals of the joints count since the last event, in the parameters that hold since then."""
+        n = self.base.n
+        self._joints = JointBalance(self.model, self.base, self.system.sample_rate)
+        self.joint_residuals = [SquaredResidual(np.zeros((n + 1, n + 1))) for _ in self.model.layout.q]
 
     @property
     def by_momentum(self) -> bool:
@@ -154,7 +177,10 @@ class Estimator:
         for rates in self._rates.flush():
             self._balance(rates)
         if self.momentum is not None:
+            events = len(self.events)
             self.momentum.finish(self.periods)
+            if len(self.events) > events:
+                self._begin_joints()
 
     def _synchronise(self, t: Array, values: Array) -> None:
         block = self._attitude.restore(Block(t, self.sensing.channels, values))
@@ -170,7 +196,10 @@ class Estimator:
         for rates in self._rates.push(GridSamples(piece.index, signals, piece.segment)):
             self._balance(rates)
         if self.momentum is not None:
+            events = len(self.events)
             self.momentum.push(piece, self._synchroniser.start_time, self.periods)
+            if len(self.events) > events:
+                self._begin_joints()
 
     def _balance(self, rates: RateSamples) -> None:
         if rates.segment != self._segment:
@@ -180,6 +209,8 @@ class Estimator:
         n_x = self.model.layout.n_x
         x, torque = rates.values[:, :n_x], rates.values[:, n_x:]
         v = self.model.layout.speeds(x, rates.rates[:, :n_x])
+        if self.on_motion is not None:
+            self.on_motion(rates.index, rates.segment, x, v)
         rows = self._energy.push(rates.index, x, v, torque, self._rates.sigma[n_x:])
         finite = np.isfinite(rows.Y).all(axis=1) & np.isfinite(rows.b)
         self.dropped_rows += int(np.sum(~finite))
@@ -227,6 +258,9 @@ class Estimator:
     def restore(self, state: SessionState) -> None:
         """Continue from a saved state."""
         session = state["session"]
+        if self.momentum is not None:
+            self.momentum.restore(state)
+            self._begin_joints()
         self.samples, self.duration = int(session["samples"]), float(session["duration"])
         self._first_time, self._segment = float(session["first_time"]), int(session["segment"])
         self._attitude.last = np.array(session["attitude"])
@@ -240,5 +274,3 @@ class Estimator:
         self._energy.shared.restore(state["shared"])
         self._joints.restore(state["joints"])
         self.energy_tracker.restore(state["tracker"])
-        if self.momentum is not None:
-            self.momentum.restore(state)

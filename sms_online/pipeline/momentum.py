@@ -11,47 +11,65 @@ from numpy.typing import NDArray
 
 from sms_online.model.base_parameters import BaseParameters
 from sms_online.model.model import Model
+from sms_online.pipeline.changes import Adoption, Changes
 from sms_online.pipeline.errors_in_variables import NoiseBias
 from sms_online.pipeline.momentum_balance import MomentumBalance
 from sms_online.pipeline.momentum_fit import MomentumFit, WhiteRows
 from sms_online.pipeline.sensing import Sensing
-from sms_online.pipeline.sensor_noise import NoiseEstimate, SensorNoise
+from sms_online.pipeline.sensor_noise import NoiseEstimate, SensorNoise, noise_from_state, noise_state
 from sms_online.pipeline.synchronise import GridSamples
 from sms_online.stream import Array
-from sms_online.trackers.interface import Estimate, Rows, Tracker
+from sms_online.trackers.interface import Estimate, Prior, Rows, Tracker
 from sms_online.trackers.square_root import RecursiveLeastSquares
 
 # The synthetic noise is the same in every session, so that the same samples give the same bits.
 SEED = 6
 # Time from one estimate of the sensors' noise to the next, s.
 NOISE_RENEWED = 1.0
-NOISE_ARRAYS = ("sensors", "torque", "coordinates", "grid")
 
 
 class Momentum:
     """Balance, weights and tracker of one session.
 
     tracker: square-root RLS, fed with rows of unit variance. bias: what noise in the columns does to the estimate.
-    windows: how many it took.
+    windows: how many it took since the last event. changes: events, and the model and parameters that the session goes
+    on with after them.
     """
 
     def __init__(self, model: Model, base: BaseParameters, sensing: Sensing) -> None:
         system = model.system
         self.sensing = sensing
-        self.tracker: Tracker = RecursiveLeastSquares(base.n)
-        self.bias = NoiseBias(base.n)
-        self.windows = 0
+        self.changes = Changes(model, base, sensing)
         self.dropped_windows = 0
         self.sensor_noise: SensorNoise | None = None
         self._sample_rate = system.sample_rate
         self._estimate = NoiseEstimate(sensing, system.sample_rate)
-        self._balance = MomentumBalance(model, base, system.sample_rate, system.windows.momentum)
-        self._fit = MomentumFit(model, base, self._balance, sensing.displacements, self._solved)
+        self._span = system.windows.momentum
+        self._prior: Prior | None = None
+        self._build()
         self._random = np.random.default_rng(SEED)
         self._segment = -1
         self._start_time = np.nan
         self._noise_told = 0  # grid index at which the noise was estimated last
         self._waiting: list[GridSamples] = []  # until the noise is known
+
+    def _build(self) -> None:
+        """Empty stages for the current model and parameters."""
+        model, base = self.changes.model, self.changes.base
+        self.bias = NoiseBias(base.n)
+        self.windows = 0
+        self._balance = MomentumBalance(model, base, self._sample_rate, self._span)
+        self._fit = MomentumFit(model, base, self._balance, self.sensing.displacements, self._solved)
+        self.tracker: Tracker = self._new_tracker()
+
+    def _new_tracker(self) -> RecursiveLeastSquares:
+        prior = None if self._prior is None else self.changes.prior(self._prior)
+        return RecursiveLeastSquares(self.changes.base.n, prior=prior, scaled_by_residual=prior is not None)
+
+    def set_prior(self, prior: Prior) -> None:
+        """Weigh the rows against what is known of the base parameters beforehand; before the first sample."""
+        self._prior = prior
+        self.tracker = self._new_tracker()
 
     @property
     def started(self) -> bool:
@@ -97,12 +115,38 @@ class Momentum:
         if piece.segment != self._segment:
             if self._segment >= 0:
                 self._absorb(self._fit.end_segment(noise))
+                self._decide(noise, last=True)
             self._balance.begin_segment()
             self._segment = piece.segment
+        self.changes.keep(piece)
+        self._process(piece, noise)
+        self._decide(noise, last=False)
+
+    def _process(self, piece: GridSamples, noise: SensorNoise) -> None:
         windows, instants = self._balance.push(
             piece.index, self._copies(piece.values, noise), self.sensing.joint_torque(piece.values), noise.coordinates
         )
         self._absorb(self._fit.push(windows, instants, noise))
+
+    def _decide(self, noise: SensorNoise, last: bool) -> None:
+        """Where rows are held back for an event: decide on it, when there is enough to tell, and go on."""
+        adoption = self.changes.decide(noise, self._start_time, last)
+        if adoption is not None:
+            self._adopt(adoption, noise)
+
+    def _adopt(self, adoption: Adoption, noise: SensorNoise) -> None:
+        """Go on after an event with what is known from before it."""
+        bias = self.bias.state()
+        n = len(bias["bias_gram"]) - 1
+        self._build()
+        # Sums over the rows before, in which further parameters have no part.
+        fresh = [n] * (adoption.base.n - n)
+        self.bias.restore({k: np.insert(np.insert(gram, fresh, 0.0, 0), fresh, 0.0, 1) for k, gram in bias.items()})
+        rows = float(adoption.windows * adoption.model.layout.n_v)
+        self.tracker.restore({**self.tracker.state(), "factor": adoption.factor, "rows": rows})
+        self._fit.go_on(adoption.weights, noise)
+        if adoption.samples.index.size:
+            self._process(adoption.samples, noise)
 
     def _copies(self, values: Array, noise: SensorNoise) -> list[Array]:
         """Coordinates as measured, and with synthetic noise added and subtracted."""
@@ -120,11 +164,17 @@ class Momentum:
             self.sensor_noise = self._estimate.noise(periods)
         if self.sensor_noise is not None:
             self._absorb(self._fit.end_segment(self.sensor_noise))
+            self._decide(self.sensor_noise, last=True)
+            adoption = self.changes.abandon(self._start_time)
+            if adoption is not None:
+                self._adopt(adoption, self.sensor_noise)
 
     def _absorb(self, fresh: list[WhiteRows]) -> None:
         for rows in fresh:
             if not np.isfinite(rows.Y).all():
                 self.dropped_windows += 1
+                continue
+            if not self.changes.detector.push(rows, self.misfit):
                 continue
             t = self._start_time + rows.end / self._sample_rate
             M = rows.Y.shape[0]
@@ -147,31 +197,27 @@ class Momentum:
                 "segment": self._segment,
                 "start_time": self._start_time,
                 "noise_told": self._noise_told,
-                "noise_known": self.sensor_noise is not None,
                 "random": np.array([str(random["state"]), str(random["inc"])]),
                 "waiting_index": np.concatenate([np.empty(0, dtype=np.int64), *(p.index for p in waiting)]),
                 "waiting_values": np.concatenate(
                     [np.empty((0, len(self.sensing.channels))), *(p.values for p in waiting)]
                 ),
                 "waiting_segment": np.repeat([p.segment for p in waiting], [p.index.size for p in waiting]),
-                **self._noise_state(),
+                **noise_state("noise", self.sensor_noise),
                 **self.bias.state(),
             },
             "momentum_noise": self._estimate.state(),
             "momentum_balance": self._balance.state(),
             "momentum_fit": self._fit.state(),
+            "momentum_changes": self.changes.state(),
             "momentum_tracker": dict(self.tracker.state()),
         }
-
-    def _noise_state(self) -> dict[str, Any]:
-        noise = self.sensor_noise
-        if noise is None:
-            return {}
-        return {f"noise_{name}": getattr(noise, name) for name in (*NOISE_ARRAYS, "exact")}
 
     def restore(self, saved: Mapping[str, Mapping[str, NDArray[Any]]]) -> None:
         """Continue from a saved state."""
         state = saved["momentum"]
+        self.changes.restore(saved["momentum_changes"])
+        self._build()
         self.windows, self.dropped_windows = int(state["windows"]), int(state["dropped_windows"])
         self._noise_told = int(state["noise_told"])
         self._segment, self._start_time = int(state["segment"]), float(state["start_time"])
@@ -179,10 +225,7 @@ class Momentum:
         generator = dict(self._random.bit_generator.state)
         generator["state"] = {"state": position, "inc": increment}
         self._random.bit_generator.state = generator
-        self.sensor_noise = None
-        if bool(state["noise_known"]):
-            sensors, torque, coordinates, grid = (np.array(state[f"noise_{name}"]) for name in NOISE_ARRAYS)
-            self.sensor_noise = SensorNoise(sensors, torque, coordinates, grid, bool(state["noise_exact"]))
+        self.sensor_noise = noise_from_state("noise", state)
         segments = np.array(state["waiting_segment"])
         index, values = np.array(state["waiting_index"]), np.array(state["waiting_values"])
         self._waiting = [GridSamples(index[segments == k], values[segments == k], int(k)) for k in np.unique(segments)]

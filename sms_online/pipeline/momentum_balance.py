@@ -33,7 +33,10 @@ PATTERN_STATES = 8
 COMPARED = 5
 # Copies of the motion: as measured, and with synthetic noise added and subtracted.
 COPIES = 3
-# Widest windows are decided on and smoothed with so many samples around a window.
+# Half widths of the filter are at most this share of a window: what a row takes in must pass the filter untouched, for
+# its noise is propagated as if there were none.
+WIDEST_SHARE = 5
+# Samples before and after a window that its filter needs at most.
 MARGIN = HALF_WIDTHS[-1]
 
 
@@ -98,8 +101,11 @@ class MomentumBalance:
         self.span = self.width / sample_rate
         self.rows, self.columns = np.nonzero(momentum_pattern(model)[:, list(base.independent)])
         self._physical = np.array(base.independent)[self.columns]
-        self._choice = WidthChoice()
-        self._phi = {s: self._weights(s) for s in {stride(M, self.hop) for M in HALF_WIDTHS}}
+        # Where windows are short, the narrowest filter is all there is.
+        self._widths = tuple(M for M in HALF_WIDTHS if self.width >= WIDEST_SHARE * M) or HALF_WIDTHS[:1]
+        self.margin = self._widths[-1]  # samples before and after a window that its filter needs
+        self._choice = WidthChoice(self._widths)
+        self._phi = {s: self._weights(s) for s in {stride(M, self.hop) for M in self._widths}}
         self.begin_segment()
 
     def _weights(self, s: int) -> tuple[Array, Array]:
@@ -127,7 +133,7 @@ class MomentumBalance:
         self._samples = np.concatenate((self._samples, np.concatenate((*copies, joint_torque), axis=1)))
         grid = int(index[-1]) - (self._first + self._samples.shape[0] - 1)
         chosen: list[tuple[int, int]] = []  # first sample and half width of each window
-        while self._window + self.width + 2 * MARGIN < self._first + self._samples.shape[0]:
+        while self._window + self.width + 2 * self.margin < self._first + self._samples.shape[0]:
             chosen.append((self._window, self._choose(sigma)))
             self._window += self.hop
             self._compared.pop(0)
@@ -142,10 +148,10 @@ class MomentumBalance:
         return windows, instants
 
     def _choose(self, sigma: Array) -> int:
-        """Half width for the next window. Sample number n of the segment is at the buffer's n - first + MARGIN."""
+        """Half width for the next window. Sample n of the segment is at n - first + margin of the buffer."""
         n_x = self.model.layout.n_x
         while len(self._compared) < HOPS:
-            start = self._window + len(self._compared) * self.hop - self._first + MARGIN
+            start = self._window + len(self._compared) * self.hop - self._first + self.margin
             centres = start + (np.arange(COMPARED) * self.hop) // COMPARED
             self._compared.append(self._choice.squares(self._samples[:, :n_x], centres))
         return self._choice.widest(np.sum(self._compared, axis=0) / (HOPS * COMPARED), sigma)
@@ -163,7 +169,7 @@ class MomentumBalance:
     def _states(self, samples: NDArray[np.int64], half_width: int) -> tuple[Array, Array, Array]:
         """x (copies, K, n_x), v (copies, K, n_v) and n τ (K, joints) at K samples of the segment."""
         layout = self.model.layout
-        values, rates = smooth(self._samples, samples - self._first + MARGIN, half_width, self.sample_rate)
+        values, rates = smooth(self._samples, samples - self._first + self.margin, half_width, self.sample_rate)
         end = COPIES * layout.n_x
         x, x_dot = (part[:, :end].reshape(-1, COPIES, layout.n_x).swapaxes(0, 1) for part in (values, rates))
         v = layout.speeds(x.reshape(-1, layout.n_x), x_dot.reshape(-1, layout.n_x))
@@ -189,7 +195,7 @@ class MomentumBalance:
             values = smoothed.columns[begin : begin + phi.size]
             weak = -(phi_dot @ values[:, :width] + phi @ values[:, width : 2 * width]).reshape(COPIES, -1)
             b = phi @ values[:, 2 * width :] - weak[:, self.rows.size :]
-            end = grid + window + self.width + MARGIN
+            end = grid + window + self.width + self.margin
             out.append(Window(window // self.half_hop, end, weak[:, : self.rows.size], b, half_width))
         return out
 

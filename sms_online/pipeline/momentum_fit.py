@@ -2,7 +2,7 @@
 
 Weights follow from the sensors' noise and the parameters, never from residuals: those collapse where noise is high. The
 parameters come from the fit itself: the first windows that move are held back, fitted without weights and then with
-them, and from then on every second takes the estimate so far. A start that is 70 % off gives the same answer.
+them; from then on the estimate so far is taken now and then. A start that is 70 % off gives the same answer.
 
 Where rows leave clearly more than the sensors' noise, the model lacks something, and neighbouring rows that share noise
 almost fully must not be subtracted from each other as if that were all: what is left over counts as an error of each
@@ -23,7 +23,7 @@ from sms_online.model.model import Model
 from sms_online.pipeline.momentum_balance import COPIES, HOPS, INSTANTS, Instants, MomentumBalance, Window
 from sms_online.pipeline.row_noise import RowNoise, Whitener
 from sms_online.pipeline.sensitivity import Sensitivities
-from sms_online.pipeline.sensor_noise import FINEST, SensorNoise
+from sms_online.pipeline.sensor_noise import FINEST, SensorNoise, noise_from_state, noise_state
 from sms_online.stream import Array
 
 # Motion before weights are made, s: at the usual width, four windows side by side.
@@ -39,10 +39,14 @@ MOTION = 20.0
 # Mean square of a coordinate's residual over its predicted variance beyond which the model lacks something there: a
 # second of windows scatters by 20 %, the noise behind the prediction by 10 %.
 LARGEST_RATIO = 2.0
+# Multiple of the square of one sample of what noise does beyond first order in a row that stands for its variance in
+# the row's own covariance.
+UNSTEADY = 4.0
 # Share of a joint's torque that a fit may leave for its weights to be used.
 LARGEST_UNEXPLAINED = 0.5
-# Time from one renewal of the weights to the next, s.
-RENEWED = 1.0
+# Time from one renewal of the weights to the next, s: it doubles from the first to the latest.
+FIRST_RENEWAL = 1.0
+LATEST_RENEWAL = 4.0
 # Singular values below this share of the largest, of columns scaled to unit length, are not solved for.
 RANK_TOLERANCE = 1e-10
 
@@ -51,12 +55,14 @@ RANK_TOLERANCE = 1e-10
 class WhiteRows:
     """Rows of one window, n_v of them: Y (n_v, n + 1) with b as its last column, independent, errors of unit variance.
 
-    noisy (2, n_v, n + 1): the same with synthetic noise added and subtracted. end: grid index of the window's last
-    sample.
+    noisy (2, n_v, n + 1): the same with synthetic noise added and subtracted. raw (n_v, n + 1): the rows as they were,
+    with their own covariance (n_v, n_v). end: grid index of the window's last sample.
     """
 
     Y: Array
     noisy: Array
+    raw: Array
+    covariance: Array
     end: int
 
 
@@ -85,7 +91,8 @@ class MomentumFit:
         self.weights: Array | None = None  # β (n,) behind the weights
         self._since = 0  # windows since they were renewed
         self._moving = 0
-        self._held: list[Window] = []
+        self._renewal = 0  # windows from one renewal to the next
+        self._sensor_noise: SensorNoise | None = None  # behind the weights
         self._bends = np.empty((0, model.layout.n_v))
         self._largest = np.zeros(model.layout.n_v)  # largest sum of a row's terms
         # Gram matrices of rows [Y b] over their own standard deviations, by generalized speed, and how many windows.
@@ -102,7 +109,8 @@ class MomentumFit:
 
     def _begin_segment(self) -> None:
         layout = self.model.layout
-        self._held.clear()
+        self._held: list[Window] = []
+        self._recent: list[Window] = []  # the windows that the next one overlaps
         self._moving = 0
         self._first = 0  # number of the first instant kept
         self._x, self._v = np.empty((0, layout.n_x)), np.empty((0, layout.n_v))
@@ -119,17 +127,24 @@ class MomentumFit:
         self._x = np.concatenate((self._x, *(piece.x for piece in instants)))
         self._v = np.concatenate((self._v, *(piece.v for piece in instants)))
         if self.weights is not None:
-            self._renew()
+            self._renew(noise)
             self._tell()
-            out = [self._white(window, noise) for window in windows]
+            out = [self._white(window) for window in windows]
+            self._recent = [*self._recent, *windows][1 - HOPS :]
             self._since += len(out)
         else:
             self._held += windows
             self._moving += sum(self._moves(window, noise) for window in windows)
             out = self.flush(noise) if self._moving >= self._count(FIRST_MOTION) else []
             self._held = self._held[-self._count(HELD_BACK) :]
-        self._forget_instants(windows)
+        self._forget_instants()
         return out
+
+    def go_on(self, weights: Array, noise: SensorNoise) -> None:
+        """Begin with weights β (n,) that are known."""
+        self.weights = weights
+        self._sensor_noise = noise
+        self._renewal = self._count(FIRST_RENEWAL)
 
     def flush(self, noise: SensorNoise) -> list[WhiteRows]:
         """Fit the windows held back, without weights and then with those of the fit before, and return their rows.
@@ -138,18 +153,21 @@ class MomentumFit:
         π, would win, and weights that follow π would shrink it to zero. More motion is waited for.
         """
         self._moving = 0
+        self._sensor_noise = noise
         self.weights = _least_squares(np.concatenate([self._dense(window)[0] for window in self._held]))
         for _ in range(PASSES):
             if not self._explains_torques():
                 self.weights = None
                 return []
             self._retell()
-            white = [self._white(window, noise).Y for window in self._held]
+            white = [self._white(window).Y for window in self._held]
             self.weights = _least_squares(np.concatenate(white))
             self._judge()
         self._retell()
-        out = [self._white(window, noise) for window in self._held]
-        self._held.clear()
+        out = [self._white(window) for window in self._held]
+        self._recent = self._held[1 - HOPS :]
+        self._renewal = self._count(FIRST_RENEWAL)
+        self._held = []
         return out
 
     def _explains_torques(self) -> bool:
@@ -180,16 +198,33 @@ class MomentumFit:
         inside = slice(window.start - self._first, window.start - self._first + INSTANTS + 1)
         return bool(np.any(np.ptp(self._x[inside], axis=0) > MOTION * noise.coordinates))
 
-    def _renew(self) -> None:
-        """Take the estimate so far for the weights of the windows to come, once a second."""
-        if self._since >= self._count(RENEWED):
-            beta = self._solve()
-            self.weights = np.where(np.isnan(beta), self._known_weights, beta)
-            self._judge()
-            self._since = 0
+    def _renew(self, noise: SensorNoise) -> None:
+        """Take the estimate and the noise so far for the weights of the windows to come, now and then.
+
+        Rows of windows that overlap are subtracted from each other down to what their noise does not share, so the
+        windows behind the next one are weighed anew too: a hundredth of difference between their weights would pass for
+        information.
+        """
+        if self._since < self._renewal:
+            return
+        beta = self._solve()
+        self.weights = np.where(np.isnan(beta), self._known_weights, beta)
+        self._sensor_noise = noise
+        self._judge()
+        self._since = 0
+        self._renewal = min(2 * self._renewal, self._count(LATEST_RENEWAL))
+        counted = self.plain_gram.copy(), self.plain_windows
+        self._sensitivities.forget(self._first)
+        self._forget_rows()
+        self._tell()
+        for window in self._recent:
+            self._white(window)
+        self.plain_gram, self.plain_windows = counted
 
     def _judge(self) -> None:
         """What rows leave beyond their predicted variance so far, where that is no accident."""
+        if self.plain_windows == 0:
+            return
         w = np.append(self._known_weights, -1.0)
         ratio = np.einsum("i,vij,j->v", w, self.plain_gram, w) / self.plain_windows
         self.misfit = np.where(ratio > LARGEST_RATIO, ratio - 1.0, 0.0)
@@ -215,9 +250,10 @@ class MomentumFit:
         rows[:, :, -1] = window.b
         return rows
 
-    def _white(self, window: Window, noise: SensorNoise) -> WhiteRows:
+    def _white(self, window: Window) -> WhiteRows:
         n_v = self.model.layout.n_v
-        sensitivity = self._sensitivities.window(window.start)
+        noise, sensitivity = self._sensor_noise, self._sensitivities.window(window.start)
+        assert noise is not None
         covariances = self._noise.covariance(sensitivity, noise.sensors, noise.torque)
         rows = self._dense(window)
         residual = rows[..., -1] - rows[..., :-1] @ self._known_weights
@@ -236,11 +272,14 @@ class MomentumFit:
         covariances[-1][np.diag_indices(n_v)] += self.misfit * variance
         side_by_side = rows.swapaxes(0, 1).reshape(n_v, -1)
         white = self._whitener.push(covariances, side_by_side).reshape(n_v, COPIES, -1).swapaxes(0, 1)
-        return WhiteRows(white[0], white[1:], window.end)
+        # A filter that has just become narrow lets through more than the windows before tell.
+        own = covariances[-1] + np.diag(UNSTEADY * bend**2)
+        return WhiteRows(white[0], white[1:], rows[0], own, window.end)
 
-    def _forget_instants(self, windows: list[Window]) -> None:
+    def _forget_instants(self) -> None:
         """Drop the states that no window to come asks for."""
-        needed = self._held[0].start if self._held else windows[-1].start if windows else self._first
+        kept = self._held or self._recent
+        needed = kept[0].start if kept else self._first
         drop = needed - self._first
         self._first = needed
         self._x, self._v = self._x[drop:], self._v[drop:]
@@ -249,17 +288,13 @@ class MomentumFit:
 
     def state(self) -> dict[str, Any]:
         """What `restore` needs to continue."""
-        held = {
-            "held_place": np.array([(w.start, w.end, w.half_width) for w in self._held], dtype=np.int64).reshape(-1, 3),
-            "held_Y": np.array([w.Y for w in self._held]).reshape(-1, COPIES, self._balance.rows.size),
-            "held_b": np.array([w.b for w in self._held]).reshape(-1, COPIES, self.model.layout.n_v),
-        }
         return {
             "weights": np.empty(0) if self.weights is None else self.weights, "since": self._since,
             "moving": self._moving, "first": self._first, "x": self._x, "v": self._v,
             "bends": self._bends, "largest": self._largest, "misfit": self.misfit, "plain_gram": self.plain_gram,
-            "plain_windows": self.plain_windows, **held, **self._noise.state(), **self._whitener.state(),
-            **self._sensitivities.state(),
+            "plain_windows": self.plain_windows, "renewal": self._renewal, **self._noise.state(),
+            **self._whitener.state(), **self._sensitivities.state(), **_packed("held", self._held),
+            **_packed("recent", self._recent), **noise_state("steady", self._sensor_noise),
         }  # fmt: skip
 
     def restore(self, state: Mapping[str, NDArray[Any]]) -> None:
@@ -271,14 +306,27 @@ class MomentumFit:
         self._largest = np.array(state["largest"])
         self._bends, self.misfit = np.array(state["bends"]), np.array(state["misfit"])
         self.plain_gram, self.plain_windows = np.array(state["plain_gram"]), int(state["plain_windows"])
-        self._held = [
-            Window(int(start), int(end), np.array(Y), np.array(b), int(half_width))
-            for (start, end, half_width), Y, b in zip(
-                state["held_place"], state["held_Y"], state["held_b"], strict=True
-            )
-        ]
+        self._held, self._recent = _unpacked("held", state), _unpacked("recent", state)
+        self._renewal = int(state["renewal"])
+        self._sensor_noise = noise_from_state("steady", state)
         self._noise.restore(state)
         self._whitener.restore(state)
+
+
+def _packed(name: str, windows: list[Window]) -> dict[str, Any]:
+    return {
+        f"{name}_place": np.array([(w.start, w.end, w.half_width) for w in windows], dtype=np.int64).reshape(-1, 3),
+        f"{name}_Y": np.array([w.Y for w in windows]),
+        f"{name}_b": np.array([w.b for w in windows]),
+    }
+
+
+def _unpacked(name: str, state: Mapping[str, NDArray[Any]]) -> list[Window]:
+    places, columns, right = (state[f"{name}_{part}"] for part in ("place", "Y", "b"))
+    return [
+        Window(int(start), int(end), np.array(Y), np.array(b), int(half_width))
+        for (start, end, half_width), Y, b in zip(places, columns, right, strict=True)
+    ]
 
 
 def _least_squares(rows: Array) -> Array:

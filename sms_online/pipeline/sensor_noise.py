@@ -20,6 +20,8 @@ FEWEST_SAMPLES = 100
 # No sensor is better than this share of its largest reading: what is left is rounding, and interpolation between the
 # samples.
 FINEST = 1e-10
+# Positions whose noise is within this of the finest are exact: what products make of it is below rounding.
+ROUGHLY_EXACT = 100.0
 
 
 @dataclass(frozen=True)
@@ -28,7 +30,7 @@ class SensorNoise:
 
     sensors (n_x,), torque (joints,): densities σ² T_s of each position sensor, in the order of the coordinates, and of
     n τ. coordinates (n_x,): 1σ of the coordinates x a grid sample, had they white noise of those densities. grid
-    (n_x,): the same of the position sensors. exact: there is none, but for rounding.
+    (n_x,): the same of the position sensors. exact: positions have none, but for rounding.
     """
 
     sensors: Array
@@ -36,6 +38,24 @@ class SensorNoise:
     coordinates: Array
     grid: Array
     exact: bool
+
+
+NOISE_ARRAYS = ("sensors", "torque", "coordinates", "grid")
+
+
+def noise_state(name: str, noise: SensorNoise | None) -> dict[str, Any]:
+    """A noise as arrays, to be saved under names that begin with `name`."""
+    if noise is None:
+        return {f"{name}_known": False}
+    return {f"{name}_known": True} | {f"{name}_{part}": getattr(noise, part) for part in (*NOISE_ARRAYS, "exact")}
+
+
+def noise_from_state(name: str, state: Mapping[str, NDArray[Any]]) -> SensorNoise | None:
+    """The noise that `noise_state` saved."""
+    if not bool(state[f"{name}_known"]):
+        return None
+    sensors, torque, coordinates, grid = (np.array(state[f"{name}_{part}"]) for part in NOISE_ARRAYS)
+    return SensorNoise(sensors, torque, coordinates, grid, bool(state[f"{name}_exact"]))
 
 
 class NoiseEstimate:
@@ -76,10 +96,11 @@ class NoiseEstimate:
         for k in silent:
             sigma[k] = noise_std(self._samples[k][:, None])[0]
         floor = FINEST * self._largest + np.finfo(np.float64).tiny
-        exact = bool(np.all(sigma <= floor))
+        positions = self._sensing.position_columns
+        exact = bool(np.all(sigma[positions] <= ROUGHLY_EXACT * floor[positions]))
         period = np.maximum(np.where(np.isnan(periods), 0.0, periods), 1.0 / self._sample_rate)
         density = np.maximum(sigma, floor) ** 2 * period
-        sensors = density[self._sensing.position_columns]
+        sensors = density[positions]
         torque = self._sensing.joint_torque(np.sqrt(density)[None])[0] ** 2
         grid = np.sqrt(sensors * self._sample_rate)
         return SensorNoise(sensors, torque, self._sensing.coordinate_noise(grid), grid, exact)

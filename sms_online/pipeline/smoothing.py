@@ -58,22 +58,23 @@ def smooth(samples: Array, centres: NDArray[np.int64], half_width: int, sample_r
 
 
 class WidthChoice:
-    """Compares slopes of neighbouring widths: who differs by more than noise explains."""
+    """Compares slopes of neighbouring widths on a ladder: who differs by more than noise explains."""
 
-    def __init__(self) -> None:
-        widest = HALF_WIDTHS[-1]
-        padded = np.stack([np.pad(KERNELS[M][:, 1], widest - M) for M in HALF_WIDTHS], axis=1)
+    def __init__(self, half_widths: tuple[int, ...]) -> None:
+        self._half_widths = half_widths
+        widest = half_widths[-1]
+        padded = np.stack([np.pad(KERNELS[M][:, 1], widest - M) for M in half_widths], axis=1)
         self._differences = np.diff(padded, axis=1)  # (2 M_max + 1, steps)
         # Variance that unit white noise leaves in each difference.
         self._gain = np.sum(self._differences**2, axis=0)
 
     def squares(self, samples: Array, centres: NDArray[np.int64]) -> Array:
         """Summed squares (steps, C) of the differences at `centres`, in multiples of unit noise's expectation."""
-        windows = sliding_window_view(samples, 2 * HALF_WIDTHS[-1] + 1, axis=0)[centres - HALF_WIDTHS[-1]]
+        widest = self._half_widths[-1]
+        windows = sliding_window_view(samples, 2 * widest + 1, axis=0)[centres - widest]
         return np.asarray(np.sum((windows @ self._differences) ** 2, axis=0).T / self._gain[:, None])
 
-    @staticmethod
-    def widest(mean_squares: Array, sigma: Array) -> int:
+    def widest(self, mean_squares: Array, sigma: Array) -> int:
         """Half width M that every narrower neighbour agrees with, from mean squares (steps, C) and noise (C,)."""
         agree = np.all(mean_squares <= (AGREEMENT * sigma) ** 2, axis=1)
-        return HALF_WIDTHS[int(np.argmin(np.append(agree, False)))]
+        return self._half_widths[int(np.argmin(np.append(agree, False)))]

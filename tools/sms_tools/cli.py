@@ -72,7 +72,10 @@ def _parser() -> Parser:
         epilog="Exit codes: 0 done, 2 bad input, 3 nothing is determined (results are written), 130 interrupted.",
     )
     verbs = parser.add_subparsers(metavar="VERB", required=True)
-    for add in (_add_demo, _add_live, _add_record, _add_simulate, _add_replay, _add_import, _add_markers):
+    verb_parsers = (
+        _add_demo, _add_live, _add_record, _add_simulate, _add_replay, _add_import, _add_markers, _add_bound,
+    )  # fmt: skip
+    for add in verb_parsers:
         add(verbs)
     return parser
 
@@ -169,6 +172,8 @@ def _add_replay(verbs: Verbs) -> None:
         "priors that the file itself states hold with and without it"
     )
     parser.add_argument("--prior", action="store_true", help=text)
+    text = "the Cramér-Rao bound of every parameter too, as the yardstick of its estimate"
+    parser.add_argument("--bound", action="store_true", help=text)
     text = "as fast as it goes, or in step with the recorded time"
     parser.add_argument("--speed", choices=("max", "1"), default="max", help=text)
     _add_view(parser)
@@ -186,6 +191,18 @@ def _add_markers(verbs: Verbs) -> None:
     _add_system(parser)
     text = "how many modes the markers have to tell apart, 2 by default"
     parser.add_argument("--modes", metavar="N", type=_whole(1), default=2, help=text)
+
+
+def _add_bound(verbs: Verbs) -> None:
+    text = "The least standard deviation that a motion and its sensors allow (Cramér-Rao)."
+    parser = _add_verb(verbs, "bound", "bound", text)
+    text = "a capture; without one the described trajectory is simulated"
+    parser.add_argument("capture", metavar="CAPTURE", type=Path, nargs="?", help=text)
+    _add_system(parser)
+    text = "noise of all sensors in place of the described one: A, B, C ever more"
+    parser.add_argument("--grade", choices=("A", "B", "C"), help=text)
+    text = "what the bounds would be without each of the described sensors"
+    parser.add_argument("--each-sensor", action="store_true", help=text)
 
 
 def _seconds(positive: bool = False) -> Callable[[str], float]:

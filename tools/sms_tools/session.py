@@ -15,7 +15,7 @@ from sms_online.description.schema import System
 from sms_online.errors import InputError
 from sms_online.pipeline.estimator import Estimator
 from sms_online.results import results_document
-from sms_online.stream import Block
+from sms_online.stream import Array, Block
 from sms_tools.exit_codes import INTERRUPTED, NOTHING_DETERMINED, OK
 from sms_tools.interruption import Interruption
 from sms_tools.priors import base_prior
@@ -82,7 +82,11 @@ def conclude(args: argparse.Namespace, document: Document, directory: Path, inte
 
 
 def document_of(
-    estimator: Estimator, throughput: float, warnings: list[str], truth: dict[str, float] | None
+    estimator: Estimator,
+    throughput: float,
+    warnings: list[str],
+    truth: dict[str, float] | None,
+    bound: Array | None = None,
 ) -> Document:
     """results.json of a session, with what the synchroniser and the sensing noticed among its warnings."""
     counters = estimator.counters
@@ -109,4 +113,4 @@ def document_of(
         missing = next(name for name in names if name not in truth)
         noticed.append(f"no comparison with the truth: it does not hold {missing}")
         truth = None
-    return results_document(estimator, throughput, [*warnings, *noticed], truth)
+    return results_document(estimator, throughput, [*warnings, *noticed], truth, bound)

@@ -15,24 +15,28 @@ from sms_online.bound import STEP, Motion, MotionRecord, cramer_rao_bound, sessi
 from sms_online.description.channels import sensed_channels
 from sms_online.description.schema import System
 from sms_online.errors import InputError
-from sms_online.model.base_parameters import BaseParameters, find_base_parameters
+from sms_online.model.base_parameters import find_base_parameters
 from sms_online.model.parameters import Parameter
-from sms_online.sensor_set import readable_channels, sensor_set
+from sms_online.sensor_set import SensorSet, readable_channels, sensor_set
 from sms_online.stream import Array
+from sms_sim.plant import Plant
 from sms_sim.sensors import Sensors
-from sms_sim.simulate import Simulation, exact_states, simulate
+from sms_sim.simulate import exact_states, simulate
 from sms_tools.exit_codes import NOTHING_DETERMINED, OK
 from sms_tools.interruption import Interruption
 from sms_tools.report import report_console, show
 from sms_tools.results_file import to_json
 from sms_tools.session import described_system, new_estimator, stream
 
+# A bound needs every drive measured, so these are never left out.
+DRIVES = ("tau_", "force_")
+
 
 @dataclass(frozen=True)
 class Bounds:
-    """Bounds (n,) at parameter values (n,); without: the same with one sensor of the description left out, by channels.
+    """Bounds (n,) at parameter values (n,).
 
-    A bound that does not exist because the motion cannot be determined at all without a sensor is infinite.
+    without: the same with one sensor of the description left out, by its channels.
     """
 
     parameters: tuple[Parameter, ...]
@@ -52,35 +56,39 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _of_simulation(system: System, args: argparse.Namespace) -> Bounds:
+    plant = Plant(system)
+    # Sensors come first: what is missing of them is known before a long simulation.
+    described = _sensors(plant, system, args.grade)
+    without = {}
+    for k, sensor in enumerate(system.sensors if args.each_sensor else ()):
+        if not any(channel.startswith(DRIVES) for channel in sensed_channels(system, sensor)):
+            others = tuple(other for j, other in enumerate(system.sensors) if j != k)
+            reduced = system.model_copy(update={"sensors": others})
+            without[", ".join(sensor.channels)] = _sensors(plant, reduced, args.grade)
     try:
         simulation = simulate(system)
     except ArithmeticError as error:
         expected = "a motion that the integrator can follow"
         raise InputError(args.system, "trajectory and controller", str(error), expected) from None
-    model = simulation.plant.model
-    base = find_base_parameters(model)
-    without = {}
-    if args.each_sensor:
-        for k, sensor in enumerate(system.sensors):
-            left = tuple(other for j, other in enumerate(system.sensors) if j != k)
-            if not any(channel.startswith(("tau_", "force_")) for channel in sensed_channels(system, sensor)):
-                reduced = system.model_copy(update={"sensors": left})
-                without[", ".join(sensor.channels)] = _simulated(simulation, base, reduced, args.grade)
-    bound = _simulated(simulation, base, system, args.grade)
-    return Bounds(base.parameters, base.values(model.nominal), bound, without)
+    exact = exact_states(
+        simulation, np.linspace(0.0, simulation.duration, max(1, round(simulation.duration / STEP)) + 1)
+    )
+    base, motion = find_base_parameters(plant.model), Motion(exact.t, exact.x, exact.v)
+
+    def bound(sensors: SensorSet) -> Array:
+        return cramer_rao_bound(plant.dynamics, base, [motion], sensors)
+
+    reduced_bounds = {left: bound(sensors) for left, sensors in without.items()}
+    return Bounds(base.parameters, base.values(plant.parameters), bound(described), reduced_bounds)
 
 
-def _simulated(simulation: Simulation, base: BaseParameters, system: System, grade: str | None) -> Array:
-    """Bound (n,) of a simulation with the sensors that `system` describes, or all that it has with a grade's noise."""
-    plant = simulation.plant
+def _sensors(plant: Plant, system: System, grade: str | None) -> SensorSet:
+    """The sensors that `system` describes on a plant, or those of positions and drives with a grade's noise."""
     readable = (*plant.channels[: len(system.joints)], *readable_channels(plant.model))
     sensors = Sensors(system, readable if grade is None else plant.channels, grade, seed=0)
     # Rounding to a resolution r adds r²/12.
     sigma = np.hypot(sensors.noise, sensors.resolution / math.sqrt(12.0))
-    steps = max(1, round(simulation.duration / STEP))
-    exact = exact_states(simulation, np.linspace(0.0, simulation.duration, steps + 1))
-    chosen = sensor_set(plant.model, sensors.channels, sigma, sensors.rate)
-    return cramer_rao_bound(plant.dynamics, base, [Motion(exact.t, exact.x, exact.v)], chosen)
+    return sensor_set(plant.model, sensors.channels, sigma, sensors.rate)
 
 
 def _of_capture(system: System, folder: Path | None, args: argparse.Namespace) -> Bounds:

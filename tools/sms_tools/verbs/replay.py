@@ -16,6 +16,7 @@ from sms_adapters.recording import Recording
 from sms_adapters.session_log import SESSION
 from sms_adapters.sources import open_source
 from sms_adapters.truth import read_truth
+from sms_online.bound import MotionRecord, session_bound
 from sms_online.errors import InputError
 from sms_online.stream import Block
 from sms_tools.html_report.history import History
@@ -58,6 +59,9 @@ def run(args: argparse.Namespace) -> int:
             estimator = new_estimator(system, source.channels, str(capture), args.prior)
             if isinstance(source, Recording) and source.checkpoint is not None:
                 load_checkpoint(source.checkpoint, estimator)
+            record = MotionRecord(system.sample_rate) if args.bound else None
+            if record is not None:
+                estimator.on_motion = record.add
             if args.speed == "1":
                 blocks = _paced(_pieces(source, max(1, round(PACE * system.sample_rate))), interruption)
             else:
@@ -76,7 +80,8 @@ def run(args: argparse.Namespace) -> int:
                 wall = perf_counter() - opened
         history.finish()
         warnings = [*source.warnings, *view.warnings]
-        document = document_of(estimator, estimator.samples / wall, warnings, parameters)
+        bound = None if record is None else session_bound(estimator, record)
+        document = document_of(estimator, estimator.samples / wall, warnings, parameters, bound)
         code = conclude(args, document, directory, interruption.requested)
         compared = references(estimator, parameters)
         page = write_report(directory, document, estimator, history, compared, args.exaggerate)

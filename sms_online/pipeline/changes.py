@@ -1,0 +1,247 @@
+"""From an alarm to an adopted event: rows held back, hypotheses compared, the estimate opened where it jumped."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sms_online.model.base_parameters import BaseParameters
+from sms_online.model.model import Model
+from sms_online.pipeline.event_hypotheses import (
+    Explanation,
+    additional,
+    everything,
+    explain,
+    extended,
+    hypotheses,
+    opened,
+    restricted,
+    widened,
+)
+from sms_online.pipeline.event_instant import event_instant
+from sms_online.pipeline.events import REMEMBERED, ChangeDetector, Event, Seen
+from sms_online.pipeline.momentum_balance import COPIES, INSTANTS, MARGIN, MomentumBalance
+from sms_online.pipeline.momentum_fit import MomentumFit
+from sms_online.pipeline.sensing import Sensing
+from sms_online.pipeline.sensor_noise import SensorNoise
+from sms_online.pipeline.synchronise import GridSamples
+from sms_online.stream import Array
+from sms_online.trackers.factor import solve
+from sms_online.trackers.interface import Prior
+
+# Windows after the event that a decision takes, and where two hypotheses remain, or a gap comes.
+DECISION = 10
+LONGEST_DECISION = 40
+LEAST_DECISION = 5
+# An instant is certain to so many half hops; samples closer to it are left out on both sides.
+GUARD = 1
+# Times that the rows after an event are whitened, each with the jumps found before.
+PASSES = 2
+
+
+@dataclass(frozen=True)
+class Adoption:
+    """What the session goes on with after an event.
+
+    base: its parameters, of `model`. factor (n + 1, n + 1): what is known of them, from so many `windows`. weights
+    (n,): values behind the weights of the rows to come. samples: those after the event.
+    """
+
+    model: Model
+    base: BaseParameters
+    factor: Array
+    windows: int
+    weights: Array
+    samples: GridSamples
+
+
+class Changes:
+    """Events of one session.
+
+    model, base: current ones, with what events have added to the system's own.
+    """
+
+    def __init__(self, model: Model, base: BaseParameters, sensing: Sensing) -> None:
+        self.model, self.base = model, base
+        self.events: list[Event] = []
+        self._system, self._described = model.system, base
+        self._sensing = sensing
+        self._added: list[str] = []
+        rate, span = self._system.sample_rate, self._system.windows.momentum
+        self._half_hop = max(1, round(span * rate / INSTANTS))
+        self.detector = self._new_detector()
+        self._segment = -1
+        self._index = np.empty(0, dtype=np.int64)
+        self._values = np.empty((0, len(sensing.channels)))
+        self._clear = 0  # grid index from which on no sample is from before the event
+        self._wanted = DECISION
+
+    def _new_detector(self) -> ChangeDetector:
+        return ChangeDetector(self.base.n, self.model.layout.n_v, 2 * self._half_hop / self._system.sample_rate)
+
+    @property
+    def _width(self) -> int:
+        return INSTANTS * self._half_hop
+
+    def keep(self, piece: GridSamples) -> None:
+        """Remember samples of the grid: those of one segment, as far back as windows are remembered."""
+        if piece.segment != self._segment:
+            self._segment, self._clear = piece.segment, int(piece.index[0])
+            self._index, self._values = self._index[:0], self._values[:0]
+        kept = 2 * REMEMBERED * self._half_hop + self._width + 2 * MARGIN
+        self._index = np.concatenate((self._index, piece.index))[-kept:]
+        self._values = np.concatenate((self._values, piece.values))[-kept:]
+
+    @property
+    def windows_after(self) -> int:
+        """Number of windows that samples from after the event give."""
+        if self.detector.alarm is None or self._index.size == 0:
+            return 0
+        samples = int(self._index[-1]) - max(self.detector.alarm, self._clear) - self._width - 2 * MARGIN
+        return max(0, samples // (2 * self._half_hop))
+
+    def decide(self, noise: SensorNoise, start_time: float, last: bool) -> Adoption | None:
+        """The event, once the windows after it are enough to tell; last: in this segment no more of them come.
+
+        start_time: s of grid index 0.
+        """
+        alarm = self.detector.alarm
+        if alarm is None or self.windows_after < (LEAST_DECISION if last else self._wanted):
+            return None
+        whole = Model(everything(self._system))
+        names = additional(self._system, whole, self.base)
+        base = extended(self._described, whole, [*self._added, *names])
+        onset = self.detector.onset - MARGIN
+        before = self.detector.before(onset) or self.detector.history[0]
+        explanation = self._explain(whole, base, before, max(alarm, self._clear), noise)
+        if not (explanation.explained and explanation.decisive) and self.windows_after < LONGEST_DECISION and not last:
+            self._wanted = self.windows_after + DECISION
+            return None
+        self._wanted = DECISION
+        return self._adopt(whole, base, explanation, onset, alarm, start_time)
+
+    def abandon(self, start_time: float) -> Adoption | None:
+        """The session ends while rows are held back: what was known before the event is all there is."""
+        if self.detector.alarm is None:
+            return None
+        onset = self.detector.onset - MARGIN
+        before = self.detector.before(onset) or self.detector.history[0]
+        time = start_time + 0.5 * (onset + self.detector.alarm) / self._system.sample_rate
+        dropped = sum(seen.end > before.end for seen in self.detector.history)
+        self.events.append(Event(time, "undecided", (), (), (), (), dropped))
+        weights = solve(before.factor).pi
+        nothing = GridSamples(self._index[:0], self._values[:0], self._segment)
+        return Adoption(self.model, self.base, before.factor, before.windows, weights, nothing)
+
+    def _explain(self, model: Model, base: BaseParameters, before: Seen, start: int, noise: SensorNoise) -> Explanation:
+        n = self.base.n
+        jumps = hypotheses(base.parameters)
+        after = self._index >= start
+        values = self._values[after]
+        balance = MomentumBalance(model, base, self._system.sample_rate, self._system.windows.momentum)
+        x = self._sensing.coordinates(values)
+        torque = self._sensing.joint_torque(values)
+        windows, instants = balance.push(self._index[after], [x] * COPIES, torque, noise.coordinates)
+        weights = np.zeros(base.n)
+        weights[:n] = solve(before.factor).pi
+        # What the rows before left decides, where it is more than noise.
+        freedom = max(1, before.windows * model.layout.n_v - n)
+        left = max(1.0, abs(before.factor[-1, -1]) / np.sqrt(freedom))
+        for _ in range(PASSES):
+            fit = MomentumFit(model, base, balance, self._sensing.displacements, weights.copy)
+            fit.go_on(weights, noise)
+            rows = np.concatenate([white.Y for white in fit.push(windows, instants, noise)])
+            explanation = explain(before.factor / left, rows / left, jumps)
+            weights = np.zeros(base.n)
+            weights[:n] = explanation.beta
+            if explanation.jump is not None:
+                weights[list(explanation.jump.columns)] += explanation.sizes
+        return explanation
+
+    def _adopt(
+        self, whole: Model, base: BaseParameters, explanation: Explanation, onset: int, alarm: int, start_time: float
+    ) -> Adoption:
+        jump, n = explanation.jump if explanation.explained else None, self.base.n
+        instant = None
+        if jump is not None:
+            by = np.zeros(whole.n_pi)
+            by[[base.independent[k] for k in jump.columns]] = explanation.sizes
+            x = self._sensing.coordinates(self._values)
+            between = (onset - self._width // 2, alarm)
+            instant = event_instant(
+                whole, by, explanation.beta, self.detector.history, self._index, x, between, self._half_hop,
+                self._system.sample_rate,
+            )  # fmt: skip
+        guard = GUARD * self._half_hop
+        first, last = (onset, alarm) if instant is None else (int(instant) - guard, int(np.ceil(instant)) + guard)
+        at = 0.5 * (first + last) if instant is None else instant
+        before = self.detector.before(first - MARGIN) or self.detector.history[0]
+        columns = () if jump is None else jump.columns
+        fresh = [base.parameters[k].name for k in columns if k >= n]
+        if fresh:
+            self._added += fresh
+            self._extend()
+        names = [p.name for p in self.base.parameters]
+        jumped = [names.index(base.parameters[k].name) for k in columns]
+        weights = np.zeros(self.base.n)
+        weights[:n] = explanation.beta if jumped else solve(before.factor).pi
+        weights[jumped] += explanation.sizes[: len(jumped)]
+        factor = widened(before.factor, len(fresh))
+        # What no hypothesis explains leaves nothing of what was known.
+        factor = np.zeros_like(factor) if jump is None else opened(factor, jumped)
+        event = Event(
+            time=start_time + at / self._system.sample_rate,
+            kind="unexplained" if jump is None else jump.kind,
+            parameters=tuple(names[k] for k in jumped),
+            units=tuple(self.base.parameters[k].unit for k in jumped),
+            sizes=tuple(float(size) for size in explanation.sizes[: len(jumped)]),
+            stds=tuple(float(std) for std in explanation.stds[: len(jumped)]),
+            dropped_windows=sum(first - MARGIN < seen.end <= last + self._width for seen in self.detector.history),
+        )
+        self.events.append(event)
+        after = self._index >= max(last, self._clear)
+        samples = GridSamples(self._index[after], self._values[after], self._segment)
+        self.detector = self._new_detector()
+        self.detector.begin(factor, before.windows if jump is not None else 0)
+        return Adoption(self.model, self.base, factor, self.detector.windows, weights, samples)
+
+    def prior(self, described: Prior) -> Prior:
+        """What is known beforehand of the current parameters: nothing of those that have jumped."""
+        more = np.full(self.base.n - described.value.size, np.nan)
+        std = np.concatenate((described.std, more))
+        jumped = {name for event in self.events for name in event.parameters}
+        everything_jumped = any(event.kind == "unexplained" for event in self.events)
+        std[[everything_jumped or p.name in jumped for p in self.base.parameters]] = np.nan
+        return Prior(np.concatenate((described.value, more)), std)
+
+    def _extend(self) -> None:
+        """Model and base with the parameters that events have added."""
+        if self._added:
+            self.model = Model(restricted(self._system, self._added))
+            self.base = extended(self._described, self.model, self._added)
+
+    def state(self) -> dict[str, Any]:
+        """What `restore` needs to continue."""
+        return {
+            "events": np.array(json.dumps([asdict(event) for event in self.events])),
+            "added": np.array(json.dumps(self._added)),
+            "place": np.array([self._segment, self._clear, self._wanted]),
+            "index": self._index,
+            "values": self._values,
+            **self.detector.state(),
+        }
+
+    def restore(self, state: Mapping[str, NDArray[Any]]) -> None:
+        """Continue from a saved state."""
+        self.events = [Event.from_saved(entry) for entry in json.loads(str(state["events"]))]
+        self._added = json.loads(str(state["added"]))
+        self._extend()
+        self._segment, self._clear, self._wanted = (int(number) for number in state["place"])
+        self._index, self._values = np.array(state["index"]), np.array(state["values"])
+        self.detector = self._new_detector()
+        self.detector.restore(state)

@@ -1,0 +1,63 @@
+"""Sessions of a campaign: a system simulated once, with new sensor noise for every run."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from sms_online.description.parse import describe
+from sms_online.description.schema import System
+from sms_online.model.base_parameters import find_base_parameters
+from sms_online.model.model import Model
+from sms_online.stream import Array, Block
+from sms_sim.sensors import Sensors
+from sms_sim.simulate import sampled_blocks, simulate
+
+# Nominal values that an estimator gets to see are these keys of the description times this: any number would do.
+DISGUISED = (
+    *("mass", "mass_per_length", "polar_inertia_per_length", "rotor_inertia", "xx", "yy", "zz", "xy", "xz", "yz"),
+    *("stiffness", "damping", "axial_rigidity", "torsional_rigidity", "flexural_rigidity_y", "flexural_rigidity_z"),
+)
+DISGUISE = 2.0
+
+
+def exact_session(system: System, cache: Path) -> Block:
+    """Exact samples of the system's own trajectory, read from `cache` or else simulated and written there."""
+    description = json.dumps(describe(system))
+    if cache.exists():
+        with np.load(cache) as saved:
+            if str(saved["system"]) == description:
+                return Block(saved["t"], tuple(saved["channels"].tolist()), saved["values"])
+    blocks = list(sampled_blocks(simulate(system), "0"))
+    t, values = (np.concatenate([getattr(block, name) for block in blocks]) for name in ("t", "values"))
+    cache.parent.mkdir(parents=True, exist_ok=True)
+    np.savez(cache, system=np.array(description), t=t, channels=np.array(blocks[0].channels), values=values)
+    return Block(t, blocks[0].channels, values)
+
+
+def noisy_session(system: System, exact: Block, grade: str, seed: int) -> Block:
+    """The samples that `simulate --grade --seed` writes."""
+    sensors = Sensors(system, exact.channels, grade, seed)
+    return Block(exact.t, exact.channels, sensors.read(0, exact.values))
+
+
+def true_parameters(system: System) -> Array:
+    """Base parameters (n,) of the nominal values, in the order in which they are estimated."""
+    model = Model(system)
+    return find_base_parameters(model).values(model.nominal)
+
+
+def disguised(system: System) -> System:
+    """The system with nominal values that are not the true ones, so that no estimator can have read them."""
+
+    def other(key: str, value: Any) -> Any:
+        if isinstance(value, dict):
+            return {name: other(name, part) for name, part in value.items()}
+        if isinstance(value, list):
+            return [other("", part) for part in value]
+        return DISGUISE * value if key in DISGUISED else value
+
+    return System.model_validate(other("", describe(system)))

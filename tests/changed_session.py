@@ -1,0 +1,48 @@
+"""Sessions in which something changes: a motion that goes on, from where it is, with another system."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from sms_online.description.schema import System
+from sms_online.stream import Array, Block
+from sms_sim.integrate import solve
+from sms_sim.plant import Plant
+from sms_sim.sensors import Sensors
+from sms_sim.simulate import LONGEST_STEP, Simulation, exact_states, tolerance
+
+
+class LaterController:
+    """A controller whose clock began `elapsed` seconds before the simulation."""
+
+    def __init__(self, plant: Plant, elapsed: float) -> None:
+        assert plant.controller is not None
+        self._controller, self._elapsed = plant.controller, elapsed
+
+    def __call__(self, t: Array, q: Array, q_dot: Array) -> Array:
+        """Torque (B, joints) at instants t (B,) of the simulation."""
+        return self._controller(t + self._elapsed, q, q_dot)
+
+
+def changed_session(before: Simulation, after: System, change: float, duration: float) -> Block:
+    """Exact samples of `before` up to `change` (s), then of the system `after` up to `duration` (s).
+
+    Positions and speeds are continuous: what is grasped moves with the tip already.
+    """
+    rate = after.sample_rate
+    samples = round(change * rate) + 1
+    start = exact_states(before, np.arange(samples) / rate)
+    plant = Plant(after)
+    plant.controller = LaterController(plant, change)  # type: ignore[assignment]
+    state = np.concatenate((start.x[-1], start.v[-1]))
+    rest = duration - change
+    solution = solve(plant.rate, state, rest, tolerance(plant), longest=LONGEST_STEP)
+    end = exact_states(Simulation(plant, solution), np.arange(1, round(rest * rate) + 1) / rate)
+    x, torque = np.concatenate((start.x, end.x)), np.concatenate((start.torque, end.torque))
+    return Block(np.arange(len(x)) / rate, plant.channels, plant.channel_values(torque, x))
+
+
+def noisy(system: System, exact: Block, grade: str, seed: int) -> Block:
+    """The samples with a grade's sensor noise."""
+    sensors = Sensors(system, exact.channels, grade, seed)
+    return Block(exact.t, exact.channels, sensors.read(0, exact.values))

@@ -1,0 +1,78 @@
+"""bound and replay --bound on the command line."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from sms_online.description.parse import shipped_text
+from sms_tools.cli import main
+
+SENSORS = """
+[[sensor]]
+channels = ["tau_*"]
+noise = 0.01
+
+[[sensor]]
+channels = ["theta_m_*", "q_*"]
+resolution = 4.793689962142629e-5 # 17 bits a turn
+
+[[sensor]]
+channels = ["r_S_*", "theta_0"]
+rate = 240.0
+noise = 1e-4
+"""
+
+
+@pytest.fixture
+def rig(tmp_path: Path) -> Path:
+    """The paper's example for 0.4 s, with encoders, torques and the base alone."""
+    text = shipped_text("paper-planar").replace("duration = 20.0", "duration = 0.4")
+    start, end = text.index("[[sensor]]"), text.index("[controller]")
+    path = tmp_path / "rig.toml"
+    path.write_text(text[:start] + SENSORS + text[end:], encoding="utf-8")
+    return path
+
+
+def test_bounds_rise_with_the_noise_and_without_a_sensor(rig: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["bound", "--system", str(rig), "--each-sensor", "--json"]) == 0
+    document = json.loads(capsys.readouterr().out)
+    assert document["schema"] == "sms-online/bound/1"
+    for p in document["parameters"]:
+        assert set(p["bound_without"]) == {"theta_m_*, q_*", "r_S_*, theta_0"}
+        for without in p["bound_without"].values():
+            assert without is None or without > p["bound"] * (1.0 - 1e-6)
+    bounds = []
+    for grade in "AB":
+        assert main(["bound", "--system", str(rig), "--grade", grade, "--json"]) == 0
+        parameters = json.loads(capsys.readouterr().out)["parameters"]
+        bounds.append({p["name"]: p["bound"] for p in parameters})
+    assert all(bounds[1][name] > 4.0 * bounds[0][name] for name in bounds[0])
+
+
+def test_a_bound_needs_noise(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["bound", "--system", "paper-planar"]) == 2
+    assert "no noise is stated" in capsys.readouterr().err
+
+
+def test_a_replay_states_the_bound_on_demand(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    capture = tmp_path / "capture.csv"
+    arguments = ["--system", "paper-planar", "--capture", str(capture), "--duration", "2", "--grade", "B"]
+    assert main(["simulate", *arguments]) == 0
+    capsys.readouterr()
+    documents = []
+    for options in ([], ["--bound"]):
+        out = ["--out", str(tmp_path / "run"), "--json"]
+        assert main(["replay", str(capture), "--system", "paper-planar", *out, *options]) == 0
+        documents.append(json.loads(capsys.readouterr().out)["parameters"])
+    without, with_bound = documents
+    assert all(p["bound"] is None for p in without)
+    assert [p["estimate"] for p in without] == [p["estimate"] for p in with_bound]
+    # No honest error bar is below the bound; both come from noise estimated to some percent.
+    assert all(p["std"] > 0.9 * p["bound"] for p in with_bound)
+    assert main(["bound", str(capture), "--system", "paper-planar", "--json"]) == 0
+    alone = json.loads(capsys.readouterr().out)["parameters"]
+    assert [p["bound"] for p in alone] == [p["bound"] for p in with_bound]
+    assert main(["bound", str(capture), "--system", "paper-planar", "--grade", "A"]) == 2

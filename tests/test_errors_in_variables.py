@@ -1,0 +1,96 @@
+"""Noise in the columns attenuates least squares by a known factor; adding more of it tells by how much."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from sms_online.pipeline.errors_in_variables import NoiseBias
+from sms_online.stream import Array
+
+TRUE = 2.0
+ROWS = 50_000
+# In the rows' b alone.
+RESIDUAL = 0.1
+
+
+def scalar_problem(sigma: float, seed: int) -> tuple[Array, Array]:
+    """Rows [x b] (ROWS, 2) of b = 2 x, x of unit variance and known to σ; and the same with noise ± (2, ROWS, 2)."""
+    rng = np.random.default_rng(seed)
+    exact = rng.standard_normal(ROWS)
+    measured = exact + sigma * rng.standard_normal(ROWS)
+    b = TRUE * exact + RESIDUAL * rng.standard_normal(ROWS)
+    added = sigma * rng.standard_normal(ROWS)
+    rows = np.stack((measured, b), axis=1)
+    return rows, np.stack([np.stack((measured + sign * added, b), axis=1) for sign in (1.0, -1.0)])
+
+
+def least_squares(rows: Array) -> Array:
+    return np.asarray(np.linalg.lstsq(rows[:, :-1], rows[:, -1], rcond=None)[0])
+
+
+@pytest.mark.parametrize("sigma", [0.1, 0.3, 0.5])
+def test_the_shift_undoes_a_known_attenuation(sigma: float) -> None:
+    """Least squares gives β / (1 + σ²). Standard errors of both: sqrt(σ² β² + s²) / sqrt(ROWS), some 5e-3. Seed 1."""
+    rows, noisy = scalar_problem(sigma, seed=1)
+    found = least_squares(rows)[0]
+    error = np.hypot(sigma * TRUE, RESIDUAL) / np.sqrt(ROWS)
+    attenuated = TRUE / (1.0 + sigma**2)
+    assert abs(found - attenuated) < 4.0 * error
+    assert TRUE - attenuated > 3.9 * error
+    bias = NoiseBias(1)
+    bias.add(rows, noisy)
+    # The added noise scatters as much again as the noise that is there.
+    assert abs(found + bias.shift(np.array([True]))[0] - TRUE) < 8.0 * error
+
+
+def test_squares_of_a_noisy_speed_are_freed_in_second_order() -> None:
+    """The column x² of a noisy x: what is left of the pull is of the fourth order in σ. Seed 2.
+
+    Least squares gives β (⟨x⁴⟩ + σ² ⟨x²⟩) / (⟨x⁴⟩ + 6 σ² ⟨x²⟩ + 3 σ⁴); ⟨x²⟩ = 7/3 and ⟨x⁴⟩ = 31/5 for x in 1 … 2.
+    """
+    sigma = 0.1
+    rng = np.random.default_rng(2)
+    exact = rng.uniform(1.0, 2.0, ROWS)
+    measured, added = exact + sigma * rng.standard_normal(ROWS), sigma * rng.standard_normal(ROWS)
+    b = TRUE * exact**2
+    rows = np.stack((measured**2, b), axis=1)
+    noisy = np.stack([np.stack(((measured + sign * added) ** 2, b), axis=1) for sign in (1.0, -1.0)])
+    bias = NoiseBias(1)
+    bias.add(rows, noisy)
+    before = least_squares(rows)[0] - TRUE
+    after = before + bias.shift(np.array([True]))[0]
+    square, fourth = sigma**2 * 7.0 / 3.0, 31.0 / 5.0
+    pull = TRUE * ((fourth + square) / (fourth + 6.0 * square + 3.0 * sigma**4) - 1.0)
+    np.testing.assert_allclose(before, pull, rtol=0.1)
+    assert abs(after) < 0.1 * abs(before)
+
+
+def test_rows_without_noise_in_their_columns_are_left_alone() -> None:
+    rows, _ = scalar_problem(0.0, seed=3)
+    bias = NoiseBias(1)
+    bias.add(rows, np.stack((rows, rows)))
+    assert bias.shift(np.array([True]))[0] == 0.0
+
+
+def test_a_parameter_that_nothing_determines_is_not_shifted_and_shifts_no_other() -> None:
+    rows, noisy = scalar_problem(0.3, seed=4)
+    empty = np.zeros(ROWS)
+    alone, beside = NoiseBias(1), NoiseBias(2)
+    alone.add(rows, noisy)
+    beside.add(np.insert(rows, 1, empty, axis=1), np.stack([np.insert(each, 1, empty, axis=1) for each in noisy]))
+    shift = beside.shift(np.array([True, False]))
+    np.testing.assert_allclose(shift[0], alone.shift(np.array([True]))[0], rtol=1e-12)
+    assert shift[1] == 0.0
+
+
+def test_the_shift_does_not_depend_on_how_rows_were_split_and_survives_a_checkpoint() -> None:
+    rows, noisy = scalar_problem(0.3, seed=5)
+    whole, parts = NoiseBias(1), NoiseBias(1)
+    whole.add(rows, noisy)
+    for block in np.array_split(np.arange(ROWS), 9):
+        parts.add(rows[block], noisy[:, block])
+        restored = NoiseBias(1)
+        restored.restore(parts.state())
+        parts = restored
+    np.testing.assert_allclose(parts.shift(np.array([True])), whole.shift(np.array([True])), rtol=1e-10)
