@@ -79,6 +79,7 @@ class Estimator:
         self.samples = 0
         self.dropped_rows = 0
         self.duration = 0.0
+        self._newest_energy_row = -np.inf
         self.on_motion: MotionSink | None = None
         self._columns = [channels.index(name) for name in self.sensing.channels]
         self._attitude = AttitudeContinuity()
@@ -121,6 +122,13 @@ class Estimator:
         n = self.base.n
         self._joints = JointBalance(self.model, self.base, self.system.sample_rate)
         self.joint_residuals = [SquaredResidual(np.zeros((n + 1, n + 1))) for _ in self.model.layout.q]
+
+    @property
+    def newest_row(self) -> float:
+        """Time of the newest sample behind the estimate, s; -inf where there is none."""
+        if self.momentum is not None and self.by_momentum:
+            return self.momentum.newest_row
+        return self._newest_energy_row
 
     @property
     def by_momentum(self) -> bool:
@@ -215,7 +223,9 @@ class Estimator:
         finite = np.isfinite(rows.Y).all(axis=1) & np.isfinite(rows.b)
         self.dropped_rows += int(np.sum(~finite))
         if finite.any():
-            self.energy_tracker.update(self._stamped(BalanceRows(rows.Y[finite], rows.b[finite], rows.index[finite])))
+            fresh = self._stamped(BalanceRows(rows.Y[finite], rows.b[finite], rows.index[finite]))
+            self.energy_tracker.update(fresh)
+            self._newest_energy_row = float(fresh.t[-1])
         for window, measured in self._joints.push(rates.index, x, v, torque):
             for residual, Y, b, signal in zip(self.joint_residuals, window.Y, window.b, measured, strict=True):
                 if np.isfinite(Y).all() and np.isfinite(b):

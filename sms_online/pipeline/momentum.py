@@ -41,6 +41,7 @@ class Momentum:
         self.sensing = sensing
         self.changes = Changes(model, base, sensing)
         self.dropped_windows = 0
+        self.newest_row = -np.inf  # time of the last window's end, s
         self.sensor_noise: SensorNoise | None = None
         self._sample_rate = system.sample_rate
         self._estimate = NoiseEstimate(sensing, system.sample_rate)
@@ -179,6 +180,7 @@ class Momentum:
             t = self._start_time + rows.end / self._sample_rate
             M = rows.Y.shape[0]
             self.tracker.update(Rows(rows.Y[:, :-1], rows.Y[:, -1], np.ones(M), np.full(M, t)))
+            self.newest_row = t
             self.bias.add(rows.Y, rows.noisy)
             self.windows += 1
 

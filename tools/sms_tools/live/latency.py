@@ -2,54 +2,12 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
-
-from sms_online.trackers.interface import Estimate, Rows, State, Tracker
 
 # Width of a bin, s, and number of bins: up to 4 s, beyond which the last one counts.
 BIN, BINS = 1e-3, 4000
 # Age at which samples begin to be forgotten, s.
 RECENT = 10.0
-
-
-class Watched:
-    """A tracker that remembers the time of its newest row; all else is the tracker's own."""
-
-    def __init__(self, tracker: Tracker) -> None:
-        self.newest = -np.inf
-        self._tracker = tracker
-
-    @property
-    def enabled(self) -> bool:
-        """While False, rows are ignored."""
-        return self._tracker.enabled
-
-    @enabled.setter
-    def enabled(self, value: bool) -> None:
-        self._tracker.enabled = value
-
-    def update(self, rows: Rows) -> None:
-        """Take in rows."""
-        self._tracker.update(rows)
-        self.newest = float(rows.t[-1])
-
-    def estimate(self) -> Estimate:
-        """The tracker's estimate."""
-        return self._tracker.estimate()
-
-    def reset(self) -> None:
-        """Forget all rows."""
-        self._tracker.reset()
-
-    def state(self) -> State:
-        """The tracker's state."""
-        return self._tracker.state()
-
-    def restore(self, state: Any) -> None:
-        """Continue from a saved state."""
-        self._tracker.restore(state)
 
 
 class Latencies:

@@ -17,7 +17,7 @@ from sms_online.results import standard_deviation
 from sms_online.stream import Block
 from sms_tools.interruption import Interruption
 from sms_tools.live.feed import Feed, SessionClock
-from sms_tools.live.latency import Latencies, Watched
+from sms_tools.live.latency import Latencies
 from sms_tools.live.status import Leading, News, StatusWriter
 
 # A session that is killed loses no more of the estimate than this, s; its raw items are on disk all the same.
@@ -54,7 +54,6 @@ class LiveSession:
         self._feeds = feeds
         self._merger = merger
         self._estimator = estimator
-        self._watched = estimator.tracker = Watched(estimator.tracker)
         self._start = start
         self._directory = directory
         self._recorder = recorder
@@ -112,8 +111,9 @@ class LiveSession:
         block = self._merger.advance(tick, items)
         if block is not None:
             yield block
-            if np.isfinite(self._watched.newest):
-                self.latencies.add(self._clock() + self._start, self._watched.newest)
+            newest = self._estimator.newest_row
+            if np.isfinite(newest):
+                self.latencies.add(self._clock() + self._start, newest)
         self.busy += time.perf_counter() - started
 
     def _look_around(self) -> None:
