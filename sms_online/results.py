@@ -91,7 +91,7 @@ def doubts(parameters: list[dict[str, Any]], residual: dict[str, dict[str, float
     return out
 
 
-def _residuals(estimator: Estimator, beta: Array) -> dict[str, dict[str, float | None]]:
+def residuals(estimator: Estimator, beta: Array) -> dict[str, dict[str, float | None]]:
     """By row type: `relative` to the measured torque or force, `whitened` over its predicted standard deviation."""
     layout, momentum = estimator.model.layout, estimator.momentum
 
@@ -205,7 +205,7 @@ def results_document(
                 "bound": None if bound is None or k >= bound.size or not np.isfinite(bound[k]) else float(bound[k]),
             }
         )
-    residual = _residuals(estimator, estimate.pi)
+    residual = residuals(estimator, estimate.pi)
     return {
         "schema": SCHEMA,
         "system": describe(estimator.system),

@@ -48,7 +48,7 @@ class NoiseBias:
 
     def state(self) -> dict[str, Array]:
         """What `restore` needs to continue."""
-        return {"bias_gram": self._gram, "bias_excess": self._excess}
+        return {"bias_gram": self._gram.copy(), "bias_excess": self._excess.copy()}
 
     def restore(self, state: Mapping[str, NDArray[Any]]) -> None:
         """Continue from a saved state."""

@@ -291,7 +291,7 @@ class MomentumFit:
         return {
             "weights": np.empty(0) if self.weights is None else self.weights, "since": self._since,
             "moving": self._moving, "first": self._first, "x": self._x, "v": self._v,
-            "bends": self._bends, "largest": self._largest, "misfit": self.misfit, "plain_gram": self.plain_gram,
+            "bends": self._bends, "largest": self._largest, "misfit": self.misfit, "plain_gram": self.plain_gram.copy(),
             "plain_windows": self.plain_windows, "renewal": self._renewal, **self._noise.state(),
             **self._whitener.state(), **self._sensitivities.state(), **_packed("held", self._held),
             **_packed("recent", self._recent), **noise_state("steady", self._sensor_noise),

@@ -123,6 +123,7 @@ def _add_demo(verbs: Verbs) -> None:
     _add_system(parser, default="paper-planar")
     _add_noise(parser)
     _add_out(parser)
+    _add_view(parser)
 
 
 def _add_live(verbs: Verbs) -> None:
@@ -132,6 +133,7 @@ def _add_live(verbs: Verbs) -> None:
     text = "go on from the last checkpoint of an earlier session"
     parser.add_argument("--resume", metavar="DIR", type=Path, help=text)
     _add_session_length(parser)
+    _add_view(parser)
 
 
 def _add_record(verbs: Verbs) -> None:

@@ -25,6 +25,7 @@ from sms_tools.live.testbed import open_testbed
 from sms_tools.report import Document, parameter_table, report_console, show
 from sms_tools.results_file import results_directory
 from sms_tools.session import conclude, described_system, document_of
+from sms_tools.showing import showing
 
 # More tables than this nobody reads, s between two.
 TABLE_INTERVAL = 0.25
@@ -66,12 +67,18 @@ def _watch(args: argparse.Namespace, arm: SimulatedArm, file: Path, directory: P
             tell = _draw(live, document, system.trajectory.duration)
         else:
             tell = _tell(console, estimator, document)
-        for block in session.blocks(interruption, ended=arm.ended, ready=arm.start):
+        shown = stack.enter_context(showing(args, estimator, merger.channels, directory, truth))
+        for block in shown.watch(session.blocks(interruption, ended=arm.ended, ready=arm.start)):
             estimator.push(block)
             tell()
-    estimator.finish()
-    session.close()
-    return conclude(args, document(estimator.samples / session.busy), directory, interruption.requested)
+        estimator.finish()
+        session.close()
+        stack.close()
+        result = document(estimator.samples / session.busy)
+        result["warnings"] += shown.warnings
+        code = conclude(args, result, directory, interruption.requested)
+        shown.report(result, interruption)
+    return code
 
 
 def _draw(live: Live, document: Callable[[float], Document], duration: float) -> Callable[[], None]:

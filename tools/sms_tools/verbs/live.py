@@ -14,6 +14,7 @@ from sms_tools.live.testbed import open_testbed
 from sms_tools.report import report_console, show
 from sms_tools.results_file import results_directory
 from sms_tools.session import conclude, described_system, document_of
+from sms_tools.showing import showing
 
 # Threads give way to each other after so long, s; by default it is 5 ms, in which a bus sends a dozen frames.
 SWITCH_INTERVAL = 1e-3
@@ -27,14 +28,18 @@ def run(args: argparse.Namespace) -> int:
     session, estimator, merger = open_testbed(args.system, system, folder, directory, args.resume, status)
     sys.setswitchinterval(SWITCH_INTERVAL)
     with Interruption() as interruption, termination_interrupts():
-        for block in session.blocks(interruption, math.inf if args.duration is None else args.duration):
-            estimator.push(block)
-    estimator.finish()
-    session.close()
-    status.close()
-    throughput = estimator.samples / session.busy if session.busy else 0.0
-    document = document_of(estimator, throughput, [*merger.warnings, *session.warnings], None)
-    code = conclude(args, document, directory, interrupted=False)
+        with showing(args, estimator, merger.channels, directory, None) as shown:
+            blocks = session.blocks(interruption, math.inf if args.duration is None else args.duration)
+            for block in shown.watch(blocks):
+                estimator.push(block)
+            estimator.finish()
+        session.close()
+        status.close()
+        throughput = estimator.samples / session.busy if session.busy else 0.0
+        warnings = [*merger.warnings, *session.warnings, *shown.warnings]
+        document = document_of(estimator, throughput, warnings, None)
+        code = conclude(args, document, directory, interrupted=False)
+        shown.report(document, interruption)
     half, nearly_all = session.latencies.quantile(0.5), session.latencies.quantile(0.99)
     if half is not None and nearly_all is not None:
         latency = f"median {1e3 * half:.0f} ms, p99 {1e3 * nearly_all:.0f} ms, over the last seconds"

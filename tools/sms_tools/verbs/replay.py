@@ -19,13 +19,10 @@ from sms_adapters.truth import read_truth
 from sms_online.bound import MotionRecord, session_bound
 from sms_online.errors import InputError
 from sms_online.stream import Block
-from sms_tools.html_report.history import History
-from sms_tools.html_report.page import write_report
 from sms_tools.interruption import Interruption
-from sms_tools.report import report_console, show
 from sms_tools.results_file import results_directory
 from sms_tools.session import conclude, described_system, document_of, new_estimator, stream
-from sms_tools.view.session import open_view, references
+from sms_tools.showing import showing
 
 # A progress bar appears from this size on, bytes: a second of work.
 LONG_FILE = 20_000_000
@@ -66,27 +63,15 @@ def run(args: argparse.Namespace) -> int:
                 blocks = _paced(_pieces(source, max(1, round(PACE * system.sample_rate))), interruption)
             else:
                 blocks = _pieces(source, PIECE)
-            history = History(estimator, source.channels)
-            with open_view(
-                args.rerun,
-                estimator,
-                source.channels,
-                directory,
-                parameters,
-                patient=args.speed == "max",
-                exaggeration=args.exaggerate,
-            ) as view:
-                stream(estimator, history.watch(view.watch(blocks)), interruption)
+            patient = args.speed == "max"
+            with showing(args, estimator, source.channels, directory, parameters, patient) as shown:
+                stream(estimator, shown.watch(blocks), interruption)
                 wall = perf_counter() - opened
-        history.finish()
-        warnings = [*source.warnings, *view.warnings]
         bound = None if record is None else session_bound(estimator, record)
+        warnings = [*source.warnings, *shown.warnings]
         document = document_of(estimator, estimator.samples / wall, warnings, parameters, bound)
         code = conclude(args, document, directory, interruption.requested)
-        compared = references(estimator, parameters)
-        page = write_report(directory, document, estimator, history, compared, args.exaggerate)
-        show(report_console(args.json), f"report: {page}")
-        view.linger(interruption)
+        shown.report(document, interruption)
     return code
 
 

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sms_online.pipeline.estimator import Estimator
-from sms_online.results import LARGEST_RELATIVE_STD, _residuals, results_document, standard_deviation
+from sms_online.results import LARGEST_RELATIVE_STD, residuals, results_document, standard_deviation
 from sms_online.stream import Array
 from sms_tools.view import style
 from sms_tools.view.arm_log import ArmLog
@@ -148,8 +148,8 @@ class Recorder:
 
     def _whole_residuals(self, t: float, estimate: Array) -> None:
         """Residuals of all rows so far: over their predicted deviation, and of the energy balance."""
-        residuals = _residuals(self._estimator, estimate)
-        whitened = {rows: r["whitened"] for rows, r in residuals.items()}
+        whole = residuals(self._estimator, estimate)
+        whitened = {rows: r["whitened"] for rows, r in whole.items()}
         known = {rows: value for rows, value in whitened.items() if value is not None}
         if known:
             self._numbers.add_named(f"{RESIDUAL}/whitened", t, known)

@@ -1,0 +1,72 @@
+"""A session as people see it: the view while it runs, the page when it is over."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+
+from sms_online.pipeline.estimator import Estimator
+from sms_online.stream import Block
+from sms_tools.html_report.history import History
+from sms_tools.html_report.page import write_report
+from sms_tools.interruption import Interruption
+from sms_tools.report import Document, report_console, show
+from sms_tools.view.session import View, open_view, references
+
+
+class Showing:
+    """View and history of one session. Blocks have to be pushed into the estimator as they come out of `watch`."""
+
+    def __init__(
+        self,
+        args: argparse.Namespace,
+        estimator: Estimator,
+        view: View,
+        channels: tuple[str, ...],
+        directory: Path,
+        truth: Mapping[str, float] | None,
+    ) -> None:
+        self._args = args
+        self._estimator = estimator
+        self._view = view
+        self._history = History(estimator, channels)
+        self._directory = directory
+        self._truth = truth
+
+    @property
+    def warnings(self) -> list[str]:
+        """What the view could not show."""
+        return self._view.warnings
+
+    def watch(self, blocks: Iterable[Block]) -> Iterator[Block]:
+        """The same blocks, looked at on their way."""
+        return iter(self._history.watch(self._view.watch(blocks)))
+
+    def report(self, document: Document, interruption: Interruption) -> None:
+        """Write the page of a finished session, say where it is, and keep serving the view while that is asked for."""
+        self._history.finish()
+        compared = references(self._estimator, self._truth)
+        page = write_report(self._directory, document, self._estimator, self._history, compared, self._args.exaggerate)
+        show(report_console(self._args.json), f"report: {page}")
+        self._view.linger(interruption)
+
+
+@contextmanager
+def showing(
+    args: argparse.Namespace,
+    estimator: Estimator,
+    channels: tuple[str, ...],
+    directory: Path,
+    truth: Mapping[str, float] | None,
+    patient: bool = False,
+) -> Iterator[Showing]:
+    """What `--rerun` asks for, while the context lasts; the estimator has to be finished within it.
+
+    patient: the session may wait for the view, as a replay as fast as it goes does.
+    """
+    with open_view(
+        args.rerun, estimator, channels, directory, truth, patient=patient, exaggeration=args.exaggerate
+    ) as view:
+        yield Showing(args, estimator, view, channels, directory, truth)
