@@ -25,6 +25,20 @@ def scalar_problem(sigma: float, seed: int) -> tuple[Array, Array]:
     return rows, np.stack([np.stack((measured + sign * added, b), axis=1) for sign in (1.0, -1.0)])
 
 
+WINDOWS = 2500
+
+
+def gathered(rows: Array, noisy: Array, restored_after: int | None = None) -> NoiseBias:
+    """Rows in windows of 20, as a session gives them, with a checkpoint after so many."""
+    bias = NoiseBias(rows.shape[1] - 1)
+    for k, window in enumerate(np.array_split(np.arange(len(rows)), WINDOWS)):
+        bias.add(rows[window], noisy[:, window])
+        if k == restored_after:
+            saved, bias = bias.state(), NoiseBias(rows.shape[1] - 1)
+            bias.restore(saved)
+    return bias
+
+
 def least_squares(rows: Array) -> Array:
     return np.asarray(np.linalg.lstsq(rows[:, :-1], rows[:, -1], rcond=None)[0])
 
@@ -38,8 +52,7 @@ def test_the_shift_undoes_a_known_attenuation(sigma: float) -> None:
     attenuated = TRUE / (1.0 + sigma**2)
     assert abs(found - attenuated) < 4.0 * error
     assert TRUE - attenuated > 3.9 * error
-    bias = NoiseBias(1)
-    bias.add(rows, noisy)
+    bias = gathered(rows, noisy)
     # The added noise scatters as much again as the noise that is there.
     assert abs(found + bias.shift(np.array([True]))[0] - TRUE) < 8.0 * error
 
@@ -56,8 +69,7 @@ def test_squares_of_a_noisy_speed_are_freed_in_second_order() -> None:
     b = TRUE * exact**2
     rows = np.stack((measured**2, b), axis=1)
     noisy = np.stack([np.stack(((measured + sign * added) ** 2, b), axis=1) for sign in (1.0, -1.0)])
-    bias = NoiseBias(1)
-    bias.add(rows, noisy)
+    bias = gathered(rows, noisy)
     before = least_squares(rows)[0] - TRUE
     after = before + bias.shift(np.array([True]))[0]
     square, fourth = sigma**2 * 7.0 / 3.0, 31.0 / 5.0
@@ -76,21 +88,31 @@ def test_rows_without_noise_in_their_columns_are_left_alone() -> None:
 def test_a_parameter_that_nothing_determines_is_not_shifted_and_shifts_no_other() -> None:
     rows, noisy = scalar_problem(0.3, seed=4)
     empty = np.zeros(ROWS)
-    alone, beside = NoiseBias(1), NoiseBias(2)
-    alone.add(rows, noisy)
-    beside.add(np.insert(rows, 1, empty, axis=1), np.stack([np.insert(each, 1, empty, axis=1) for each in noisy]))
+    wide = np.stack([np.insert(each, 1, empty, axis=1) for each in noisy])
+    alone, beside = gathered(rows, noisy), gathered(np.insert(rows, 1, empty, axis=1), wide)
     shift = beside.shift(np.array([True, False]))
     np.testing.assert_allclose(shift[0], alone.shift(np.array([True]))[0], rtol=1e-12)
     assert shift[1] == 0.0
 
 
-def test_the_shift_does_not_depend_on_how_rows_were_split_and_survives_a_checkpoint() -> None:
+def test_the_shift_survives_a_checkpoint() -> None:
     rows, noisy = scalar_problem(0.3, seed=5)
-    whole, parts = NoiseBias(1), NoiseBias(1)
-    whole.add(rows, noisy)
-    for block in np.array_split(np.arange(ROWS), 9):
-        parts.add(rows[block], noisy[:, block])
-        restored = NoiseBias(1)
-        restored.restore(parts.state())
-        parts = restored
-    np.testing.assert_allclose(parts.shift(np.array([True])), whole.shift(np.array([True])), rtol=1e-10)
+    shift, restored = (gathered(rows, noisy, after).shift(np.array([True]))[0] for after in (None, 777))
+    assert shift == restored
+    assert shift > 0.1
+
+
+def test_a_shift_that_one_window_makes_is_taken_for_chance() -> None:
+    rows, _ = scalar_problem(0.0, seed=6)
+    noisy = np.stack((rows, rows))
+    noisy[:, :20, 0] *= 2.0
+    assert gathered(rows, noisy).shift(np.array([True]))[0] == 0.0
+
+
+def test_few_parameters_more_leave_the_shift_of_the_others() -> None:
+    rows, noisy = scalar_problem(0.3, seed=7)
+    bias = gathered(rows, noisy)
+    before = bias.shift(np.array([True]))[0]
+    bias.widen(2)
+    after = bias.shift(np.array([True, False, False]))
+    assert after.tolist() == [before, 0.0, 0.0]

@@ -15,7 +15,7 @@ from sms_online.description.parse import parse_system
 from sms_online.description.schema import System
 from sms_online.model.base_parameters import find_base_parameters
 from sms_online.model.model import Model
-from sms_online.pipeline.momentum_balance import HOPS, INSTANTS, MARGIN, MomentumBalance, Window
+from sms_online.pipeline.momentum_balance import HOPS, INSTANTS, MomentumBalance, Window
 from sms_online.pipeline.row_noise import OWN_SHARE, RowNoise, Whitener
 from sms_online.pipeline.sensing import Sensing
 from sms_online.pipeline.sensitivity import Sensitivities
@@ -68,7 +68,7 @@ def scatter(system: System, draws: int, seed: int) -> Scatter:
     sensing = Sensing(model, plant.channels, "test")
     order = [plant.channels.index(name) for name in sensing.channels]
     probe = MomentumBalance(model, base, system.sample_rate, SPAN)
-    motion = prescribed(model, probe.width + 2 * MARGIN + HOPS_FOLLOWED * probe.hop + 1, seed=1)
+    motion = prescribed(model, probe.width + 2 * probe.margin + HOPS_FOLLOWED * probe.hop + 1, seed=1)
     torque = motion.Q[:, list(model.layout.theta_m)]
     exact = plant.channel_values(torque, motion.x)[:, order]
     sigma = np.zeros(len(order))

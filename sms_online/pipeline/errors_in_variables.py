@@ -18,38 +18,79 @@ from numpy.typing import NDArray
 
 from sms_online.stream import Array
 
+# Windows that share samples answer for noise together; a cluster is of windows side by side.
+CLUSTER = 20
+# A shift counts from so many of its standard deviations on.
+EVIDENCE = 2.0
+# When there are so many clusters, neighbours merge.
+MOST_CLUSTERS = 128
+
 
 class NoiseBias:
     """Gathers normal equations with and without additional noise."""
 
     def __init__(self, n: int) -> None:
         self._gram = np.zeros((n + 1, n + 1))
-        self._excess = np.zeros((n + 1, n + 1))
+        self._clusters = np.zeros((0, n + 1, n + 1))  # what additional noise changes, by clusters of windows
+        self._length = CLUSTER
+        self._open = 0  # windows in the last cluster
 
     def add(self, rows: Array, noisy: Array) -> None:
-        """Rows [Y b] (M, n + 1), and the same with noise added and subtracted (2, M, n + 1)."""
+        """Rows [Y b] (M, n + 1) of a window, and the same with noise added and subtracted (2, M, n + 1)."""
         gram = rows.T @ rows
-        self._gram += gram
-        self._excess += 0.5 * (noisy[0].T @ noisy[0] + noisy[1].T @ noisy[1]) - gram
+        self._gram = self._gram + gram
+        if self._open == 0:
+            if len(self._clusters) == MOST_CLUSTERS:
+                self._clusters = self._clusters[::2] + self._clusters[1::2]
+                self._length *= 2
+            self._clusters = np.concatenate((self._clusters, np.zeros((1, *gram.shape))))
+        self._clusters[-1] += 0.5 * (noisy[0].T @ noisy[0] + noisy[1].T @ noisy[1]) - gram
+        self._open = (self._open + 1) % self._length
 
     def shift(self, determined: NDArray[np.bool_]) -> Array:
-        """What to add to the least-squares estimate (n,) to free it of this bias; zero where nothing is determined."""
+        """What to add to the least-squares estimate (n,) to free it of this bias; zero where nothing is determined.
+
+        The synthetic noise is one sample, so the answer scatters. As much of it is given as is no scatter: a bias that
+        many clusters agree on counts, one that few of them make shrinks to zero as James and Stein's estimate does.
+        """
         out = np.zeros(determined.size)
         kept = np.flatnonzero(determined)
         rows = np.append(kept, determined.size)
         size = np.sqrt(np.diag(self._gram)[rows])
         if kept.size == 0 or not (size > 0.0).all():
             return out
-        gram, excess = (matrix[np.ix_(rows, rows)] / np.outer(size, size) for matrix in (self._gram, self._excess))
+        scale = np.outer(size, size)
+        gram = self._gram[np.ix_(rows, rows)] / scale
+        clusters = self._clusters[:, rows[:, None], rows] / scale
+        corrected = gram - clusters.sum(axis=0)
         biased = np.linalg.solve(gram[:-1, :-1], gram[:-1, -1])
-        corrected = gram - excess
-        out[kept] = (np.linalg.solve(corrected[:-1, :-1], corrected[:-1, -1]) - biased) * size[-1] / size[:-1]
+        shift = np.linalg.solve(corrected[:-1, :-1], corrected[:-1, -1]) - biased
+        # Each cluster's part of it, to first order.
+        parts = np.linalg.solve(gram[:-1, :-1], (clusters[:, :-1] @ np.append(biased, -1.0)).T)
+        scatter = np.sum(parts**2, axis=1)
+        certain = np.maximum(0.0, 1.0 - EVIDENCE**2 * scatter / np.maximum(shift**2, np.finfo(np.float64).tiny))
+        out[kept] = certain * shift * size[-1] / size[:-1]
         return out
 
-    def state(self) -> dict[str, Array]:
+    @property
+    def parameters(self) -> int:
+        """Number n of parameters."""
+        return int(self._gram.shape[0]) - 1
+
+    def widen(self, more: int) -> None:
+        """Go on with so many parameters more, in which the rows so far have no part."""
+        at = [self._gram.shape[0] - 1] * more
+        self._gram = np.insert(np.insert(self._gram, at, 0.0, 0), at, 0.0, 1)
+        self._clusters = np.insert(np.insert(self._clusters, at, 0.0, 1), at, 0.0, 2)
+
+    def state(self) -> dict[str, Any]:
         """What `restore` needs to continue."""
-        return {"bias_gram": self._gram.copy(), "bias_excess": self._excess.copy()}
+        return {
+            "bias_gram": self._gram, "bias_clusters": self._clusters.copy(), "bias_length": self._length,
+            "bias_open": self._open,
+        }  # fmt: skip
 
     def restore(self, state: Mapping[str, NDArray[Any]]) -> None:
         """Continue from a saved state."""
-        self._gram, self._excess = np.array(state["bias_gram"]), np.array(state["bias_excess"])
+        self._gram, self._clusters = np.array(state["bias_gram"]), np.array(state["bias_clusters"])
+        self._length, self._open = int(state["bias_length"]), int(state["bias_open"])

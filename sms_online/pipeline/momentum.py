@@ -137,12 +137,10 @@ class Momentum:
 
     def _adopt(self, adoption: Adoption, noise: SensorNoise) -> None:
         """Go on after an event with what is known from before it."""
-        bias = self.bias.state()
-        n = len(bias["bias_gram"]) - 1
+        bias = self.bias
+        bias.widen(adoption.base.n - bias.parameters)
         self._build()
-        # Sums over the rows before, in which further parameters have no part.
-        fresh = [n] * (adoption.base.n - n)
-        self.bias.restore({k: np.insert(np.insert(gram, fresh, 0.0, 0), fresh, 0.0, 1) for k, gram in bias.items()})
+        self.bias = bias
         rows = float(adoption.windows * adoption.model.layout.n_v)
         self.tracker.restore({**self.tracker.state(), "factor": adoption.factor, "rows": rows})
         self._fit.go_on(adoption.weights, noise)

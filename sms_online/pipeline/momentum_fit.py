@@ -264,7 +264,9 @@ class MomentumFit:
         size = np.abs(rows[0, :, :-1]) @ np.abs(self._known_weights) + np.abs(rows[0, :, -1])
         self._largest = np.maximum(self._largest, size)
         rounding = (FINEST * self._largest) ** 2 + np.finfo(np.float64).tiny
-        covariances[-1][np.diag_indices(n_v)] += np.mean(self._bends**2, axis=0) + rounding
+        # A filter that has just become narrow lets through more than the windows before tell.
+        bent = np.maximum(np.mean(self._bends**2, axis=0), bend**2)
+        covariances[-1][np.diag_indices(n_v)] += bent + rounding
         variance = np.diag(covariances[-1]).copy()
         plain = rows[0] / np.sqrt(variance)[:, None]
         self.plain_gram += plain[:, :, None] * plain[:, None, :]
@@ -272,7 +274,6 @@ class MomentumFit:
         covariances[-1][np.diag_indices(n_v)] += self.misfit * variance
         side_by_side = rows.swapaxes(0, 1).reshape(n_v, -1)
         white = self._whitener.push(covariances, side_by_side).reshape(n_v, COPIES, -1).swapaxes(0, 1)
-        # A filter that has just become narrow lets through more than the windows before tell.
         own = covariances[-1] + np.diag(UNSTEADY * bend**2)
         return WhiteRows(white[0], white[1:], rows[0], own, window.end)
 

@@ -15,9 +15,10 @@ from sms_online.stream import Array
 
 # Step of the differences that give derivatives: 1e-8 of their size is lost to curvature, as much to rounding.
 DIFFERENCE = 1e-6
-# Derivatives of the force and of the momentum by displacements are told at every fourth instant and interpolated: they
-# weigh little beside the mass matrix, and telling them at every one changes no standard deviation by 2 %.
-SPARSE = 4
+# Derivatives of the force and of the momentum by displacements, which weigh little beside the mass matrix, are told at
+# every other instant and interpolated: on the planar example with strong noise that costs 3 % in accuracy, telling them
+# at every fourth one 17 %.
+SPARSE = 2
 
 
 @dataclass(frozen=True)
@@ -25,7 +26,7 @@ class Sensitivity:
     """Over a window of INSTANTS + 1 instants, for displacements that one unit of each position sensor's noise makes.
 
     H, H_dot (INSTANTS + 1, n_v, sensors): ∂Pπ/∂v and Ḣ. P_x, G_v, G_x (nodes, n_v, sensors): ∂Pπ/∂x, ∂Gπ/∂v, ∂Gπ/∂x at
-    every fourth instant, the first of which is `offset` instants into the window.
+    every other instant, the first of which is `offset` instants into the window.
     """
 
     H: Array
