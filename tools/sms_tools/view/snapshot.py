@@ -64,7 +64,7 @@ def _take_momentum(momentum: Momentum) -> MomentumSnapshot:
         windows=momentum.windows,
         dropped_windows=momentum.dropped_windows,
         tracker=momentum.tracker.state(),
-        bias={name: array.copy() for name, array in momentum.bias.state().items()},
+        bias=momentum.bias.state(),
         weights=fit.weights,
         misfit=fit.misfit,
         plain_gram=fit.plain_gram.copy(),
