@@ -298,7 +298,8 @@ def test_at_a_terminal_the_demo_draws_its_table_again_and_again(
     assert "1.0 of 2 s" in out
     assert "2.0 of 2 s" in out
     assert out.count("link_1.inertia") >= 10
-    assert out.rstrip().endswith(str(Path("done") / "results.json"))
+    assert str(Path("done") / "results.json") in out
+    assert out.rstrip().endswith(str(Path("done") / "report.html"))
 
 
 # import, markers
