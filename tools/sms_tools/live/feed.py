@@ -17,9 +17,10 @@ from sms_online.description.schema import SerialPort, Source
 READ_TIMEOUT = 0.1
 # Waits before a lost device is tried again, s: each twice the one before, from the first to the longest.
 FIRST_RETRY, LONGEST_RETRY = 0.1, 1.0
-# Items that may wait for the estimator: more than two seconds of a busy bus. What comes when it is full is dropped: the
-# samples that wait are then without a gap, which many small ones would be worth nothing.
-MOST_WAITING = 8192
+# Items that may wait for the estimator: a dozen seconds of a busy bus, for the first fit of the momentum balance takes
+# one or two. What comes when it is full is dropped: the samples that wait are then without a gap, which many small ones
+# would be worth nothing.
+MOST_WAITING = 65536
 
 
 class SessionClock:
