@@ -24,7 +24,8 @@ EXPONENT = 6
 # Half widths M in samples, each about √2 times the one before. The first goes through all nine samples (the rate is
 # the eighth-order central difference); the last passes 26 Hz at 1 kHz to -3 dB.
 HALF_WIDTHS = (4, 7, 10, 14, 20, 28, 40, 57, 80)
-# Thinning of smoothed samples, one in so many, by half width: what would fold back is below 1e-4.
+# Thinning of smoothed samples, one in so many, by half width: what folds back is below 1e-4 at multiples of the thinned
+# rate, where a row is widest open, and 1e-3 within all that the filter passes.
 SAMPLES_A_STEP = 7
 # Neighbours on the ladder agree in a window while the rms of their difference, channel by channel, is at most this
 # times what noise makes it: it scatters by 20 % over a window, and the largest of many channels counts.
