@@ -98,11 +98,12 @@ def session_bound(estimator: Estimator, record: MotionRecord) -> Array | None:
     """Bound (n,) of a finished session at its own estimate, with the noise that it has used of its sensors.
 
     None where there is none: no noise known or no noise at all, no motion, parameters not determined, or estimates that
-    are no mechanism, with a mass matrix that is not positive definite.
+    are no mechanism, with a mass matrix that is not positive definite; nor where an effect needs the torques, which a
+    motion does not hold.
     """
     noise = None if estimator.momentum is None else estimator.momentum.sensor_noise
     estimate, motions = estimator.estimate(), record.motions
-    if noise is None or noise.exact or not motions or not estimate.determined.all():
+    if noise is None or noise.exact or not motions or not estimate.determined.all() or estimator.model.needs_torque:
         return None
     dynamics = estimator.model.dynamics(estimator.base.physical_values(estimate.pi))
     try:

@@ -8,6 +8,7 @@ import numpy as np
 
 from sms_online.description.channels import drive_channel
 from sms_online.description.schema import System
+from sms_online.effects.base import Inputs
 from sms_online.model.model import Model
 from sms_online.stream import Array
 from sms_sim.controller import JointPD
@@ -17,14 +18,15 @@ from sms_sim.references import FourierReference
 class Plant:
     """A described system with parameter values π and a controller; without one no torque acts.
 
-    The state y is positions x and speeds v in one array, (B, n_x + n_v). Euler parameters are integrated as plain
-    states: their norm is an invariant of the equations, which the adaptive integrator keeps to its own accuracy; only a
-    run of hours at a fixed step needs `normalised`. Declared effects are part of the model's dynamics.
+    The state y is positions x, speeds v and the internal states z of declared effects in one array, (B, n_y). Euler
+    parameters are integrated as plain states: their norm is an invariant of the equations, which the adaptive
+    integrator keeps to its own accuracy; only a run of hours at a fixed step needs `normalised`. Declared effects are
+    part of the model's dynamics; those on channels are the sensors'.
     """
 
     def __init__(self, system: System, parameters: Array | None = None) -> None:
-        self.system = system
-        self.model = Model(system)
+        self.model = Model(system, parameters)
+        self.system = self.model.system
         self.parameters = self.model.nominal if parameters is None else parameters
         self.dynamics = self.model.dynamics(self.parameters)
         self.controller: JointPD | None = None
@@ -37,15 +39,19 @@ class Plant:
 
     @property
     def rest(self) -> Array:
-        """State (n_x + n_v,) at rest: undeformed, joints at zero, S at the origin, base unturned."""
+        """State (n_y,) at rest: undeformed, joints at zero, S at the origin, base unturned."""
         layout = self.model.layout
-        y = np.zeros(layout.n_x + layout.n_v)
+        x = np.zeros(layout.n_x)
         if "eta" in layout.position_names:
-            y[layout.position_names.index("eta")] = 1.0
-        return y
+            x[layout.position_names.index("eta")] = 1.0
+        return self.state(x, np.zeros(layout.n_v))
+
+    def state(self, x: Array, v: Array) -> Array:
+        """State (n_y,) at positions x (n_x,) and speeds v (n_v,), from where effects are as if at rest before."""
+        return np.concatenate((x, v, self.model.initial_state(x)))
 
     def normalised(self, y: Array) -> Array:
-        """States y (B, n_x + n_v) with Euler parameters, where there are any, of norm 1."""
+        """States y (B, n_y) with Euler parameters, where there are any, of norm 1."""
         names = self.model.layout.position_names
         if "eta" not in names:
             return y
@@ -56,8 +62,14 @@ class Plant:
 
     def split(self, y: Array) -> tuple[Array, Array]:
         """Positions x (B, n_x) and speeds v (B, n_v) of states y."""
-        n_x = self.model.layout.n_x
-        return y[:, :n_x], y[:, n_x:]
+        layout = self.model.layout
+        return y[:, : layout.n_x], y[:, layout.n_x : layout.n_x + layout.n_v]
+
+    def inputs(self, t: Array, y: Array) -> Inputs:
+        """What effects need beside positions and speeds at instants t (B,), s, in states y."""
+        layout, torque = self.model.layout, self.torque(t, y)
+        # A delayed torque is its sensor's affair: the arm feels what acts.
+        return Inputs(torque, y[:, layout.n_x + layout.n_v :], np.zeros_like(torque))
 
     def torque(self, t: Array, y: Array) -> Array:
         """Torque after the gear n τ (B, joints), N m (N), at instants t (B,), s."""
@@ -92,10 +104,13 @@ class Plant:
         return np.concatenate(parts, axis=1)
 
     def rate(self, t: Array, y: Array) -> Array:
-        """ẏ (B, n_x + n_v) from H v̇ + C = Q, (40)."""
+        """ẏ (B, n_y) from H v̇ + C = Q, (40), and the effects' own laws."""
         x, v = self.split(y)
-        Q = self.model.generalized_force(self.torque(t, y))
-        return np.concatenate((self.model.position_rate(x, v), self.dynamics.acceleration(x, v, Q)), axis=1)
+        inputs = self.inputs(t, y)
+        v_dot = self.dynamics.acceleration(x, v, self.model.generalized_force(inputs.torque), inputs)
+        return np.concatenate(
+            (self.model.position_rate(x, v), v_dot, self.model.state_rate(x, v, inputs.states)), axis=1
+        )
 
     def motor_power(self, t: Array, y: Array) -> Array:
         """Power of each motor n τ θ̇_m (B, joints), W: its integral is the left side of (42)."""

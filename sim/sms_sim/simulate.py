@@ -33,7 +33,7 @@ class Drift:
 
     energy: of motor work - K - U - E_diss, relative to the largest energy (above that at rest). linear_momentum,
     angular_momentum: of the whole system about the inertial origin, relative to what base and arm exchange; None where
-    momentum is not conserved (a fixed base, gravity).
+    momentum is not conserved (a fixed base, gravity, effects on the base).
     """
 
     energy: float
@@ -79,7 +79,8 @@ class Simulation:
         parts = []
         for start in range(0, t.size, BLOCK_SAMPLES):
             rows = slice(start, start + BLOCK_SAMPLES)
-            dissipated = plant.dynamics.dissipation_power(*plant.split(y[rows]))
+            inputs = plant.inputs(t[rows], y[rows])
+            dissipated = plant.dynamics.dissipation_power(*plant.split(y[rows]), inputs)
             parts.append(np.column_stack((plant.motor_power(t[rows], y[rows]), dissipated)))
         return np.concatenate(parts).reshape(shape[0], shape[1], -1)
 
@@ -93,7 +94,8 @@ class Simulation:
         at_rest = dynamics.energy(*self.plant.split(self.plant.rest[None]))
         energy_drift = _ratio(lost, energy - at_rest)
         layout, system = self.plant.model.layout, self.plant.system
-        if not layout.free or any(system.gravity):
+        pushed = any(effect.where == "base" for effect in self.plant.model.effects)
+        if not layout.free or any(system.gravity) or pushed:
             return Drift(energy_drift, None, None)
         rows = dynamics.mass_matrix(x)[:, : layout.n_base_speeds]
         # (B, n_base, n_v): momentum conjugate to the base's speeds, about S, by the speed that it comes from.
@@ -135,15 +137,16 @@ def simulate(
             raise InputError(system.name, "trajectory", "no such table", "a trajectory, or a duration in seconds")
         duration = system.trajectory.duration
     plant = Plant(system, parameters)
-    start = plant.rest if initial is None else np.concatenate(initial)
+    start = plant.rest if initial is None else plant.state(*initial)
     bounds = tolerance(plant, position_tolerance)
     return Simulation(plant, solve(plant.rate, start, duration, bounds, longest=LONGEST_STEP))
 
 
 def tolerance(plant: Plant, position: float = POSITION_TOLERANCE) -> Array:
-    """Bounds of the local error of each state, (n_x + n_v,)."""
+    """Bounds of the local error of each state, (n_y,); internal states of effects are positions and their rates."""
     layout = plant.model.layout
-    return np.concatenate((np.full(layout.n_x, position), np.full(layout.n_v, SPEED_FACTOR * position)))
+    speeds = layout.n_v + plant.model.n_states
+    return np.concatenate((np.full(layout.n_x, position), np.full(speeds, SPEED_FACTOR * position)))
 
 
 def exact_states(simulation: Simulation, t: Array) -> ExactStates:

@@ -1,18 +1,228 @@
-"""What an effect is: a generalized force, linear in its coefficients; rows and energy column follow from it."""
+"""What an effect is: a generalized force, linear in its coefficients; rows, energy column and injection follow from it.
+
+f(x, v, t) = Σ c_j f_j on the right-hand side of the equations of motion, d/dt(P π) - G π = Q + f. Shape constants (a
+Stribeck velocity, a gap) enter nonlinearly and are fixed when the effect is built.
+"""
 
 from __future__ import annotations
 
-from typing import Protocol
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import ClassVar, Literal, Protocol
 
+import numpy as np
+
+from sms_online.description.schema import System
+from sms_online.model.chain import Chain
 from sms_online.model.layout import Layout
 from sms_online.model.parameters import Parameter
 from sms_online.stream import Array
 
+Kind = Literal["force", "inertia", "channel", "kinematics"]
+Place = Literal["joint", "flexible joint", "later joint", "link", "linear link", "base", "tip", "angle", "position"]
+# Relative step of the differences that carry standard deviations over to reported coefficients.
+DIFFERENCE = 1e-6
+
+
+@dataclass(frozen=True)
+class Inputs:
+    """What an effect may need besides positions and speeds, at B instants.
+
+    torque (B, joints): n τ as measured, N m (N). states (B, n_z): internal states, to the model those of all effects in
+    their order, to an effect its own. torque_rate (B, joints): of n τ, N m/s; only the power of a delay asks for it.
+    """
+
+    torque: Array
+    states: Array
+    torque_rate: Array | None = None
+
 
 class ForceEffect(Protocol):
-    """An effect of kind `force`, f(x, v) = Σ c_j f_j."""
+    """An effect of kind `force`.
 
+    parameters: the linear coefficients as they enter π. shapes: shape constants. relative_to: names of the model's
+    parameters that reported coefficients are divided by. n_states: number of internal states.
+    """
+
+    name: str
+    where: str
     parameters: tuple[Parameter, ...]
+    shapes: Mapping[str, float]
+    relative_to: tuple[str, ...]
+    needs_torque: bool
+    n_states: int
 
-    def force(self, layout: Layout, x: Array, v: Array) -> Array:
+    def force(self, layout: Layout, x: Array, v: Array, inputs: Inputs | None) -> Array:
         """Columns f_j (B, n_v, coefficients): generalized force of one unit of each coefficient."""
+
+    def momentum(self, layout: Layout, x: Array, v: Array, inputs: Inputs | None) -> Array | None:
+        """Columns (B, n_v, coefficients) of P in d/dt(P π) - G π = Q; None where the effect has none."""
+
+    def power(self, layout: Layout, x: Array, v: Array, inputs: Inputs | None) -> Array:
+        """Power (B, coefficients) that one unit of each coefficient takes out, W."""
+
+    def state_rate(self, layout: Layout, x: Array, v: Array, z: Array) -> Array:
+        """ż (B, n_states) of the internal states z (B, n_states)."""
+
+    def initial_state(self, layout: Layout, x_0: Array) -> Array:
+        """z (n_states,) at the start, at positions x_0 (n_x,) and rest."""
+
+    def reported(self, values: Array) -> dict[str, float]:
+        """The coefficients that a person reads, shape constants included, by name.
+
+        values: of `parameters`, then of the parameters that `relative_to` names.
+        """
+
+
+@dataclass(frozen=True)
+class Ranges:
+    """How far a motion goes where an effect sits, for grids of shape constants.
+
+    speed: largest motor rate, rad/s. deflection: largest joint deflection, rad. duration: s. sample_rate: Hz.
+    """
+
+    speed: float
+    deflection: float
+    duration: float
+    sample_rate: float
+
+
+@dataclass(frozen=True)
+class Shape:
+    """A shape constant: unit, value where none is given, and the values to search for a motion's ranges."""
+
+    unit: str
+    default: float
+    grid: Callable[[Ranges], tuple[float, ...]]
+
+
+@dataclass(frozen=True)
+class Entry:
+    """What the catalogue says of an effect.
+
+    coefficients: those that may be declared and are reported, name to unit ("": a ratio); on a prismatic joint m stands
+    for rad and N for N m. separated_by: the motion that tells it from its look-alikes. shapes: shape constants.
+    further: coefficients that may be declared but are not reported.
+    """
+
+    name: str
+    kind: Kind
+    at: Place
+    coefficients: Mapping[str, str]
+    separated_by: str
+    shapes: Mapping[str, Shape] = field(default_factory=dict)
+    further: Mapping[str, str] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Site:
+    """Where an effect sits.
+
+    index: number of the joint or link, from 1; 0 elsewhere. weight: x (B, n_x) to the generalized forces (B, n_v, 2) of
+    1 m/s² of gravity along inertial x and y on every mass.
+    """
+
+    system: System
+    chain: Chain
+    where: str
+    index: int
+    weight: Callable[[Array], Array]
+
+    @property
+    def prismatic(self) -> bool:
+        """Whether the joint slides."""
+        return self.system.joints[self.index - 1].kind == "prismatic"
+
+    @property
+    def gear_ratio(self) -> float:
+        """n of the joint."""
+        return self.system.joints[self.index - 1].gear_ratio
+
+    def unit(self, unit: str) -> str:
+        """A coefficient's unit at this place."""
+        if not self.where.startswith("joint_") or not self.prismatic:
+            return unit
+        return unit.replace("N m", "N").replace("rad", "m")
+
+
+class Force:
+    """What most force effects share: no torque, no internal state, no momentum, coefficients reported as they are."""
+
+    entry: ClassVar[Entry]
+    needs_torque = False
+    n_states = 0
+
+    def __init__(
+        self, site: Site, linear: Mapping[str, tuple[str, str, float]], shapes: Mapping[str, float] | None = None
+    ) -> None:
+        """linear: quantity to symbol, unit and nominal value."""
+        self.name, self.where, self.index = self.entry.name, site.where, site.index
+        self.shapes: Mapping[str, float] = {} if shapes is None else shapes
+        self.relative_to: tuple[str, ...] = ()
+        self.parameters = tuple(
+            Parameter(f"{self.name}@{self.where}.{quantity}", symbol, site.unit(unit), nominal)
+            for quantity, (symbol, unit, nominal) in linear.items()
+        )
+
+    def force(self, layout: Layout, x: Array, v: Array, inputs: Inputs | None) -> Array:
+        """See `ForceEffect`."""
+        raise NotImplementedError
+
+    def momentum(self, layout: Layout, x: Array, v: Array, inputs: Inputs | None) -> Array | None:
+        """None."""
+        return None
+
+    def power(self, layout: Layout, x: Array, v: Array, inputs: Inputs | None) -> Array:
+        """-f · v."""
+        return np.asarray(-np.einsum("bvn,bv->bn", self.force(layout, x, v, inputs), v))
+
+    def state_rate(self, layout: Layout, x: Array, v: Array, z: Array) -> Array:
+        """No states, no rates."""
+        return np.zeros_like(z)
+
+    def initial_state(self, layout: Layout, x_0: Array) -> Array:
+        """No states."""
+        return np.zeros(self.n_states)
+
+    def reported(self, values: Array) -> dict[str, float]:
+        """The linear coefficients and the shape constants."""
+        linear = {p.quantity: float(value) for p, value in zip(self.parameters, values, strict=True)}
+        return linear | dict(self.shapes)
+
+
+def position(layout: Layout, x: Array, speed: int) -> Array:
+    """Position (B,) whose rate is a speed beyond the base's."""
+    return np.asarray(x[:, speed + layout.n_base_positions - layout.n_base_speeds])
+
+
+def report(
+    effect: ForceEffect, names: Sequence[str], values: Array, covariance: Array
+) -> dict[str, tuple[float, float]]:
+    """Reported coefficients with their standard deviations (1σ, first order), from an estimate.
+
+    names, values (n,), covariance (n, n): of the estimated parameters. A shape constant has no deviation. Raises
+    ValueError where the estimate lacks a parameter that the effect reports.
+    """
+    wanted = [*(p.name for p in effect.parameters), *effect.relative_to]
+    if missing := [name for name in wanted if name not in names]:
+        raise ValueError(f"the estimate holds no {missing[0]!r}")
+    columns = [list(names).index(name) for name in wanted]
+    at, spread = values[columns], covariance[np.ix_(columns, columns)]
+    steps = DIFFERENCE * np.maximum(np.abs(at), np.sqrt(np.diag(spread)))
+    steps[steps == 0.0] = DIFFERENCE
+    told = effect.reported(at)
+    slopes = np.array(
+        [
+            [
+                (plus - minus) / (2.0 * step)
+                for plus, minus in zip(
+                    effect.reported(at + step * unit).values(),
+                    effect.reported(at - step * unit).values(),
+                    strict=True,
+                )
+            ]
+            for step, unit in zip(steps, np.eye(at.size), strict=True)
+        ]
+    )
+    variance = np.einsum("ic,ij,jc->c", slopes, spread, slopes)
+    return {name: (value, float(np.sqrt(v))) for (name, value), v in zip(told.items(), variance, strict=True)}

@@ -1,39 +1,189 @@
-"""From the declarations of a system file to effects."""
+"""All effects by name: what may be declared where, and from declarations to effects.
+
+A further effect is a class with an `entry`, listed in CLASSES.
+"""
 
 from __future__ import annotations
 
+import re
+from collections.abc import Callable, Iterable, Mapping
+from fnmatch import fnmatchcase
+
+from sms_online.description.channels import channels, drive_channel
 from sms_online.description.explain import hint, nearest
-from sms_online.description.schema import Effect, System
-from sms_online.effects.base import ForceEffect
-from sms_online.effects.joint import CoulombFriction, TorqueOffset, ViscousFriction
+from sms_online.description.schema import Effect, FlexibleLink, System
+from sms_online.effects.base import Entry, ForceEffect, Place, Site
+from sms_online.effects.channel import ChannelEffect, EncoderEccentricity, EncoderOffset, SensorLag
+from sms_online.effects.drive import Cogging, TorqueDelay, TorqueGain, TorqueOffset, TorqueRipple
+from sms_online.effects.friction import (
+    CoulombFriction,
+    DirectionFriction,
+    LoadFriction,
+    StribeckFriction,
+    ViscousFriction,
+)
+from sms_online.effects.link import SEPARATED_BY, LinkDamping, LinkMassDamping
+from sms_online.effects.payload import TipPayload
+from sms_online.effects.spacecraft import AirDrag, CableSpring, ReactionWheel, Slosh, TableTilt, ThrusterLeak
+from sms_online.effects.transmission import Backlash, CubicStiffness, KinematicError, TorsionalHysteresis
 from sms_online.errors import InputError
+from sms_online.model.chain import Chain
+from sms_online.stream import Array
 
-NAMES = ("coulomb_friction", "torque_offset", "viscous_friction")
-COEFFICIENT = {"coulomb_friction": "torque", "torque_offset": "torque", "viscous_friction": "damping"}
+FORCES = (
+    CoulombFriction, ViscousFriction, StribeckFriction, LoadFriction, DirectionFriction, TorsionalHysteresis,
+    CubicStiffness, Backlash, KinematicError, Cogging, TorqueRipple, LinkDamping, LinkMassDamping, ReactionWheel,
+    ThrusterLeak, TableTilt, AirDrag, CableSpring, Slosh, TorqueGain, TorqueOffset, TorqueDelay,
+)  # fmt: skip
+CHANNELS = (EncoderOffset, EncoderEccentricity, SensorLag)
+CLASSES = (*FORCES, TipPayload, *CHANNELS)
+# The step from `linear` to `exact` kinematics of a link; it has no coefficients and no class.
+GEOMETRIC_STIFFENING = Entry("geometric_stiffening", "kinematics", "linear link", {}, SEPARATED_BY)
+
+NUMBERED = re.compile(r"(?:joint|link)_(\d+)")
+ENTRIES: dict[str, Entry] = {entry.name: entry for entry in (*(each.entry for each in CLASSES), GEOMETRIC_STIFFENING)}
+NAMES = tuple(ENTRIES)
+# Built from a site and the declared coefficients, or from a channel (or pattern) and these.
+_FORCES: dict[str, Callable[[Site, Mapping[str, float]], ForceEffect]] = {each.entry.name: each for each in FORCES}
+_CHANNELS: dict[str, Callable[[str, Mapping[str, float]], ChannelEffect]] = {
+    EncoderOffset.entry.name: EncoderOffset,
+    EncoderEccentricity.entry.name: EncoderEccentricity,
+    SensorLag.entry.name: SensorLag,
+}
 
 
-def build_effects(system: System) -> tuple[ForceEffect, ...]:
-    """Effects declared in a system, in its order; InputError on an unknown name, place or coefficient."""
-    return tuple(_build(system, effect, f"effect {k}") for k, effect in enumerate(system.effects, start=1))
-
-
-def _build(system: System, effect: Effect, place: str) -> ForceEffect:
-    if effect.name not in NAMES:
-        expected = f"one of {', '.join(NAMES)}{hint(nearest(effect.name, NAMES))}"
-        raise InputError(system.name, place, f"unknown effect {effect.name!r}", expected)
+def places(system: System, at: Place) -> tuple[str, ...]:
+    """Where effects of a kind of place may sit in a system; for channels, the channels."""
     joints = [f"joint_{i}" for i in range(1, len(system.joints) + 1)]
-    if effect.where not in joints:
-        raise InputError(system.name, place, f"{effect.name} at {effect.where!r}", f"one of {', '.join(joints)}")
-    coefficient = COEFFICIENT[effect.name]
-    unknown = set(effect.coefficients) - {coefficient}
-    if unknown:
-        raise InputError(system.name, place, f"coefficient {min(unknown)!r} of {effect.name}", f"{coefficient!r}")
-    i = joints.index(effect.where) + 1
-    joint = system.joints[i - 1]
-    nominal = effect.coefficients.get(coefficient, 0.0)
-    prismatic = joint.kind == "prismatic"
-    if effect.name == "viscous_friction":
-        return ViscousFriction(i, nominal, prismatic)
-    if effect.name == "coulomb_friction":
-        return CoulombFriction(i, nominal, prismatic)
-    return TorqueOffset(i, nominal, joint.gear_ratio, prismatic)
+    flexible = [(f"link_{i}", k) for i, k in enumerate(system.links, start=1) if isinstance(k, FlexibleLink)]
+    match at:
+        case "joint":
+            return tuple(joints)
+        case "later joint":
+            return tuple(joints[1:])
+        case "flexible joint":
+            return tuple(n for n, j in zip(joints, system.joints, strict=True) if j.transmission == "flexible")
+        case "link":
+            return tuple(name for name, _ in flexible)
+        case "linear link":
+            return tuple(n for n, k in flexible if k.kinematics == "linear" and "traction" not in k.deformations)
+        case "base":
+            return () if system.spacecraft is None else ("base",)
+        case "tip":
+            return ("tip",)
+        case "angle":
+            revolute = [j.kind == "revolute" for j in system.joints]
+            names = [f"{kind}_{i}" for i, turns in enumerate(revolute, start=1) if turns for kind in ("q", "theta_m")]
+            return tuple(c for c in channels(system) if c in names)
+        case "position":
+            drives = {drive_channel(system, i) for i in range(1, len(joints) + 1)}
+            return tuple(c for c in channels(system) if c not in drives and not c.startswith(("v_S", "omega", "gyro")))
+
+
+def declarable(entry: Entry, system: System) -> dict[str, str]:
+    """Coefficients and shape constants that may be declared in a system, name to unit; some differ with its motion."""
+    names = {**entry.coefficients, **entry.further, **{name: shape.unit for name, shape in entry.shapes.items()}}
+    if entry.at == "base":
+        for name in PLANAR_LACKS if system.motion == "planar" else SPATIAL_LACKS:
+            names.pop(name, None)
+    return names
+
+
+PLANAR_LACKS = ("torque_x", "torque_y", "torque_z", "force_z", "rest_z")
+SPATIAL_LACKS = ("torque",)
+
+
+def check_effect(system: System, effect: Effect, place: str, source: str) -> None:
+    """InputError (source, place) on an unknown name, place, coefficient, or a shape constant that is not positive."""
+    if effect.name not in ENTRIES:
+        expected = f"one of {', '.join(NAMES)}{hint(nearest(effect.name, NAMES))}"
+        raise InputError(source, place, f"unknown effect {effect.name!r}", expected)
+    entry = ENTRIES[effect.name]
+    allowed = places(system, entry.at)
+    matching = fnmatchcase if entry.kind == "channel" else str.__eq__
+    if not any(matching(each, effect.where) for each in allowed):
+        expected = f"one of {', '.join(allowed)}" if allowed else f"a system with a {entry.at}"
+        raise InputError(source, place, f"{effect.name} at {effect.where!r}", expected)
+    known = declarable(entry, system)
+    for name, value in effect.coefficients.items():
+        if name not in known:
+            expected = " or ".join(repr(k) for k in known) if known else "none"
+            raise InputError(source, place, f"coefficient {name!r} of {effect.name}", expected)
+        if name in entry.shapes and value <= 0.0 < entry.shapes[name].default:
+            raise InputError(source, place, f"{name} = {value:g} of {effect.name}", "a number greater than 0")
+
+
+def with_shapes(effect: Effect, system: System) -> Effect:
+    """The effect with defaults for shape constants that it does not declare."""
+    entry = ENTRIES[effect.name]
+    known = declarable(entry, system)
+    shapes = {name: shape.default for name, shape in entry.shapes.items() if name in known}
+    return effect.model_copy(update={"coefficients": shapes | effect.coefficients})
+
+
+def with_kinematics(system: System) -> System:
+    """The system with `exact` kinematics of links that declare geometric_stiffening; InputError as `check_effect`."""
+    links = list(system.links)
+    for k, effect in enumerate(system.effects, start=1):
+        if effect.name == GEOMETRIC_STIFFENING.name:
+            check_effect(system, effect, f"effect {k}", system.name)
+            i = int(effect.where.removeprefix("link_")) - 1
+            links[i] = links[i].model_copy(update={"kinematics": "exact"})
+    return system.model_copy(update={"links": tuple(links)}) if links != list(system.links) else system
+
+
+def build_effects(
+    system: System, chain: Chain, weight: Callable[[Array], Array]
+) -> tuple[tuple[ForceEffect, ...], tuple[TipPayload, ...]]:
+    """Effects of kind force, and of kind inertia, that a system declares, in its order; weight: see `Site`.
+
+    InputError on an unknown name, place or coefficient.
+    """
+    forces: list[ForceEffect] = []
+    inertias: list[TipPayload] = []
+    for k, effect in enumerate(system.effects, start=1):
+        if effect.name == GEOMETRIC_STIFFENING.name:
+            continue  # the links are exact already
+        check_effect(system, effect, f"effect {k}", system.name)
+        numbered = NUMBERED.fullmatch(effect.where)
+        site = Site(system, chain, effect.where, int(numbered[1]) if numbered else 0, weight)
+        given = with_shapes(effect, system).coefficients
+        if effect.name in _FORCES:
+            forces.append(_FORCES[effect.name](site, given))
+        elif effect.name == TipPayload.entry.name:
+            inertias.append(TipPayload(site, given))
+    return tuple(forces), tuple(inertias)
+
+
+def channel_effects(system: System) -> tuple[ChannelEffect, ...]:
+    """Effects of kind channel that a system declares, in its order; InputError as `build_effects`."""
+    out: list[ChannelEffect] = []
+    for k, effect in enumerate(system.effects, start=1):
+        check_effect(system, effect, f"effect {k}", system.name)
+        if effect.name in _CHANNELS:
+            out.append(_CHANNELS[effect.name](effect.where, with_shapes(effect, system).coefficients))
+    return tuple(out)
+
+
+def candidates(system: System) -> list[Effect]:
+    """Every effect that may be declared, at every place that makes sense, shape constants at their defaults.
+
+    A lag is that of a whole group of channels, as the sensors' tables form them; an offset and an eccentricity are
+    those of one encoder. What the system declares already is left out.
+    """
+    declared = {(effect.name, effect.where) for effect in system.effects}
+    out = []
+    for entry in ENTRIES.values():
+        for where in _groups(system, entry) if entry.kind == "channel" else places(system, entry.at):
+            if (entry.name, where) not in declared:
+                out.append(with_shapes(Effect(name=entry.name, where=where), system))
+    return out
+
+
+def _groups(system: System, entry: Entry) -> Iterable[str]:
+    """Channels, or patterns of channels, that one cause is likely to act on together."""
+    if entry.name != SensorLag.entry.name:
+        return places(system, "angle")
+    positions = places(system, "position")
+    patterns = [pattern for sensor in system.sensors for pattern in sensor.channels] or list(positions)
+    return [p for p in patterns if any(fnmatchcase(channel, p) for channel in positions)]

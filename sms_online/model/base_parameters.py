@@ -12,6 +12,7 @@ import numpy as np
 import scipy.linalg
 
 from sms_online.description.explain import hint, nearest
+from sms_online.effects.base import Inputs
 from sms_online.errors import InputError
 from sms_online.model.model import Model
 from sms_online.model.parameters import Parameter
@@ -89,6 +90,12 @@ def random_states(model: Model, count: int, rng: np.random.Generator) -> tuple[A
     return x, rng.uniform(-1.0, 1.0, size=(count, layout.n_v))
 
 
+def random_inputs(model: Model, count: int, rng: np.random.Generator) -> Inputs:
+    """Random torques and internal states for the effects of `count` random states."""
+    joints = (count, len(model.layout.q))
+    return Inputs(rng.normal(size=joints), rng.normal(size=(count, model.n_states)), rng.normal(size=joints))
+
+
 def find_base_parameters(model: Model) -> BaseParameters:
     """Base parameters of a system; parameters declared known leave the unknowns. InputError on an unknown name."""
     names = [p.name for p in model.parameters]
@@ -100,7 +107,8 @@ def find_base_parameters(model: Model) -> BaseParameters:
     rng = np.random.default_rng(RANDOM_SEED)
     x, v = random_states(model, STATES_PER_PARAMETER * model.n_pi, rng)
     energy = model.energy_columns(x, v)
-    Y = np.concatenate((energy[1:] - energy[0], model.power_columns(x, v)))
+    power = model.power_columns(x, v, random_inputs(model, len(x), rng))
+    Y = np.concatenate((energy[1:] - energy[0], power))
     scale = np.linalg.norm(Y, axis=0)
     known_indices = {index for index, _ in known}
     largest = float(scale.max())

@@ -6,14 +6,16 @@ One set of kinetic terms serves the energy balance (43), (44), the weak form of 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
 
 from sms_online.description.schema import FlexibleLink, RigidLink, System
-from sms_online.effects.catalogue import build_effects
+from sms_online.effects.base import ForceEffect, Inputs
+from sms_online.effects.catalogue import build_effects, with_kinematics
+from sms_online.effects.payload import TipPayload
 from sms_online.model.chain import Chain, Configuration
 from sms_online.model.flexible import ShapeRate
 from sms_online.model.inertia import BodyTerm, LinkMotion, LinkTerm, Term, convective
@@ -54,14 +56,19 @@ class QuadraticForms:
 
 
 class Model:
-    """A system's model. Constant: all methods are functions of positions x (B, n_x) and speeds v (B, n_v), SI units."""
+    """A system's model. Constant: all methods are functions of positions x (B, n_x) and speeds v (B, n_v), SI units.
 
-    def __init__(self, system: System) -> None:
-        self.system = system
+    Some declared effects ask for more, the torques or internal states of their own: `needs_torque`, `n_states`. Methods
+    take these as `inputs` and raise ValueError where they are missing.
+    """
+
+    def __init__(self, system: System, reference: Array | None = None) -> None:
+        """reference: π whose masses the effect table_tilt weighs, the nominal ones unless given."""
+        self.system = system = with_kinematics(system)
         self.layout: Layout = build_layout(system)
         self.chain = Chain(system, self.layout)
         self.gravity = np.array(system.gravity)
-        self.effects = build_effects(system)
+        self.effects, inertias = build_effects(system, self.chain, self.weight)
         parameters: list[Parameter] = []
         self.bodies: list[BodyTerm] = []
         self.links: list[LinkTerm] = []
@@ -72,14 +79,23 @@ class Model:
         self._add_springs(parameters)
         self._stiffness = QuadraticForms(self.springs, self.layout.n_v)
         self._damping = QuadraticForms(self.dampers, self.layout.n_v)
+        for inertia in inertias:
+            self._add_inertia(parameters, inertia)
         # Frames that something sits in: the last one, the end of the last link, holds the payload alone.
         self._frames = 1 + max(term.frame for term in (*self.bodies, *self.links))
+        # Of each effect, its columns in π and its internal states in `Inputs.states`.
         self.effect_slices: list[slice] = []
+        self.state_slices: list[slice] = []
+        self.n_states = 0
         for effect in self.effects:
             self.effect_slices.append(slice(len(parameters), len(parameters) + len(effect.parameters)))
             parameters += effect.parameters
+            self.state_slices.append(slice(self.n_states, self.n_states + effect.n_states))
+            self.n_states += effect.n_states
+        self.needs_torque = any(effect.needs_torque for effect in self.effects)
         self.parameters = tuple(parameters)
         self.nominal = np.array([p.nominal for p in parameters])
+        self.reference = self.nominal if reference is None else reference
 
     def _add_bodies(self, parameters: list[Parameter]) -> None:
         system, planar = self.system, self.layout.planar
@@ -111,6 +127,16 @@ class Model:
         # After the links: a motor that sits on a rigid link is lumped into that link, not the link into the motor.
         for i, (_, stator) in motors.items():
             add(stator, 2 * i - 1, speeds[i])
+
+    def _add_inertia(self, parameters: list[Parameter], effect: TipPayload) -> None:
+        indices = tuple(range(len(parameters), len(parameters) + len(effect.parameters)))
+        parameters += effect.parameters
+        for k, body in enumerate(self.bodies):
+            if body.frame == effect.frame:
+                joined = np.concatenate((body.matrices, effect.matrices))
+                self.bodies[k] = BodyTerm(body.frame, body.speeds, body.parameters + indices, joined)
+                return
+        self.bodies.append(BodyTerm(effect.frame, slice(0, 0), indices, effect.matrices))
 
     def _add_links(self, parameters: list[Parameter]) -> None:
         flexible = [(i, link) for i, link in enumerate(self.system.links, start=1) if isinstance(link, FlexibleLink)]
@@ -164,6 +190,10 @@ class Model:
         """ẋ (B, n_x)."""
         return self.layout.position_rate(x, v)
 
+    def inputs(self, joint_torque: Array, joint_torque_rate: Array | None = None) -> Inputs:
+        """Inputs of effects without internal states, from n τ (B, joints) and, where it is known, its rate."""
+        return Inputs(joint_torque, np.empty((len(joint_torque), 0)), joint_torque_rate)
+
     def generalized_force(self, joint_torque: Array) -> Array:
         """Q of (41), (B, n_v), for torques after the gear n τ (B, joints), N m (N)."""
         Q = np.zeros((joint_torque.shape[0], self.layout.n_v))
@@ -210,15 +240,36 @@ class Model:
             weight = link.weights.sum() * (frame.origin @ g) + np.einsum("bi,bi->b", center, g @ frame.rotation)
             Y[:, link.parameters[0]] -= weight
 
-    def power_columns(self, x: Array, v: Array) -> Array:
+    def power_columns(self, x: Array, v: Array, inputs: Inputs | None = None) -> Array:
         """Columns (B, n_pi) of dissipated power, (24), and of the power that the effects take out, W per unit."""
         D = np.zeros((x.shape[0], self.n_pi))
         D[:, self._damping.parameters] = 2.0 * self._damping.energies(v)
-        for effect, columns in zip(self.effects, self.effect_slices, strict=True):
-            D[:, columns] = -np.einsum("bvn,bv->bn", effect.force(self.layout, x, v), v)
+        for effect, columns, own in self.acting(inputs):
+            D[:, columns] = effect.power(self.layout, x, v, own)
         return D
 
-    def momentum_columns(self, x: Array, v: Array, rows: Sequence[int] | None = None) -> tuple[Array, Array]:
+    def acting(self, inputs: Inputs | None) -> Iterator[tuple[ForceEffect, slice, Inputs | None]]:
+        """Each effect with its columns in π and its own inputs; ValueError where it lacks some."""
+        for effect, columns, states in zip(self.effects, self.effect_slices, self.state_slices, strict=True):
+            if inputs is None and (effect.needs_torque or effect.n_states):
+                raise ValueError(f"{effect.name}@{effect.where} needs torques and its internal states")
+            yield effect, columns, None if inputs is None else replace(inputs, states=inputs.states[:, states])
+
+    def state_rate(self, x: Array, v: Array, z: Array) -> Array:
+        """ż (B, n_states) of the effects' internal states."""
+        rates = [
+            effect.state_rate(self.layout, x, v, z[:, states])
+            for effect, states in zip(self.effects, self.state_slices, strict=True)
+        ]
+        return np.concatenate((np.empty((len(z), 0)), *rates), axis=1)
+
+    def initial_state(self, x_0: Array) -> Array:
+        """Internal states (n_states,) of the effects at rest at positions x_0 (n_x,)."""
+        return np.concatenate((np.empty(0), *(effect.initial_state(self.layout, x_0) for effect in self.effects)))
+
+    def momentum_columns(
+        self, x: Array, v: Array, rows: Sequence[int] | None = None, inputs: Inputs | None = None
+    ) -> tuple[Array, Array]:
         """P and G (B, rows, n_pi) of the equations of motion d/dt(P π) - G π = Q, (33)–(38), without accelerations.
 
         P = ∂K/∂v. G collects ∂K/∂x, gravity, springs, dampers and effects. Rows of the base are those of S.
@@ -230,7 +281,7 @@ class Model:
         configuration = self.chain.configure(x)
         rates, select, none = v[:, :, None], np.eye(n_v)[None, :, list(rows)], np.zeros((1, n_v, len(rows)))
         twists = configuration.twists(rates, self._frames)
-        self._add_forces(G, x, v, rows)
+        self._add_forces(P, G, x, v, rows, inputs)
         if not self.chain.moves(self._frames - 1, slice(0, 0))[list(rows)].any():
             # Motor sides of flexible joints alone: no frame moves with them, their momentum is all there is.
             for body in self.bodies:
@@ -252,7 +303,7 @@ class Model:
                 p = body.momentum(nu)
                 g = convective(nu, p)
                 if self.gravity.any():
-                    g += body.momentum(self._fall(configuration, body))
+                    g += body.momentum(self._fall(configuration, body, self.gravity))
                 add(body, p, g)
         for link in self.links:
             if self.chain.moves(link.frame, link.speeds)[list(rows)].any():
@@ -262,18 +313,33 @@ class Model:
                 assert rate is not None
                 g = motion.convective(nu, rate)
                 if self.gravity.any():
-                    g += motion.momentum(self._fall(configuration, link))
+                    g += motion.momentum(self._fall(configuration, link, self.gravity))
                 add(link, motion.momentum(nu), g)
         return P, G
 
-    def _fall(self, configuration: Configuration, term: Term) -> Array:
-        """Local speeds (B, d) of free fall: the gravity vector in the frame's axes."""
-        local = self.gravity @ configuration.frames[term.frame].rotation
+    def _fall(self, configuration: Configuration, term: Term, g: Array) -> Array:
+        """Local speeds (B, d) of free fall: a gravity vector g (3,) in the frame's axes."""
+        local = g @ configuration.frames[term.frame].rotation
         fall = np.zeros((configuration.size, 6 + term.speeds.stop - term.speeds.start))
         fall[:, :3] = local
         return fall
 
-    def _add_forces(self, G: Array, x: Array, v: Array, rows: Sequence[int]) -> None:
+    def weight(self, x: Array) -> Array:
+        """Generalized forces (B, n_v, 2) of 1 m/s² along inertial x and y on the masses of the reference π."""
+        configuration = self.chain.configure(x)
+        select = np.eye(self.layout.n_v)[None]
+        out = np.zeros((x.shape[0], self.layout.n_v, 2))
+        terms: list[BodyTerm | LinkTerm] = [*self.bodies, *self.links]
+        for term in terms:
+            J = term.local(configuration.jacobians, select)
+            pi = self.reference[list(term.parameters)]
+            inert = LinkMotion(term, configuration) if isinstance(term, LinkTerm) else term
+            for axis, g in enumerate(np.eye(3)[:2]):
+                momentum = inert.momentum(self._fall(configuration, term, g)) @ pi
+                out[:, :, axis] += np.einsum("bdv,bd->bv", J, momentum)
+        return out
+
+    def _add_forces(self, P: Array, G: Array, x: Array, v: Array, rows: Sequence[int], inputs: Inputs | None) -> None:
         place = {speed: row for row, speed in enumerate(rows)}
         for springs, deflection in ((self.springs, self._spring_coordinates(x)), (self.dampers, v)):
             for spring in springs:
@@ -281,8 +347,11 @@ class Model:
                 for k, speed in enumerate(np.arange(self.layout.n_v)[spring.speeds]):
                     if speed in place:
                         G[:, place[speed], spring.parameter] -= force[:, k]
-        for effect, columns in zip(self.effects, self.effect_slices, strict=True):
-            G[:, :, columns] += effect.force(self.layout, x, v)[:, list(rows)]
+        for effect, columns, own in self.acting(inputs):
+            G[:, :, columns] = effect.force(self.layout, x, v, own)[:, list(rows)]
+            momentum = effect.momentum(self.layout, x, v, own)
+            if momentum is not None:
+                P[:, :, columns] = momentum[:, list(rows)]
 
     def dynamics(self, pi: Array) -> Dynamics:
         """Equations of motion for parameter values π (n_pi,): the full dynamics that the paper reconstructs."""
@@ -330,7 +399,7 @@ class Dynamics:
             H += W.transpose(0, 2, 1) @ (M @ W)
         return H
 
-    def mass_and_bias(self, x: Array, v: Array) -> tuple[Array, Array]:
+    def mass_and_bias(self, x: Array, v: Array, inputs: Inputs | None = None) -> tuple[Array, Array]:
         """H (B, n_v, n_v) and C (B, n_v): Coriolis and centrifugal, gravity, springs, dampers, effects."""
         model = self.model
         configuration = model.chain.configure(x)
@@ -366,11 +435,11 @@ class Dynamics:
             assert rate is not None
             force = M @ link.local(bias, none) + motion.bias_force(nu, rate) @ pi[:, None]
             C += (W.transpose(0, 2, 1) @ force)[..., 0]
-        for effect, columns in zip(model.effects, model.effect_slices, strict=True):
-            C -= effect.force(model.layout, x, v) @ self.pi[columns]
+        for effect, columns, own in model.acting(inputs):
+            C -= effect.force(model.layout, x, v, own) @ self.pi[columns]
         return H, C
 
-    def momentum_and_force(self, x: Array, v: Array) -> tuple[Array, Array]:
+    def momentum_and_force(self, x: Array, v: Array, inputs: Inputs | None = None) -> tuple[Array, Array]:
         """P π and G π (B, n_v) of `Model.momentum_columns`, without the columns."""
         model = self.model
         configuration = model.chain.configure(x)
@@ -393,7 +462,7 @@ class Dynamics:
             momentum = body.momentum(nu)
             force = convective(nu, momentum)
             if model.gravity.any():
-                force = force + body.momentum(model._fall(configuration, body))
+                force = force + body.momentum(model._fall(configuration, body, model.gravity))
             add(body, momentum, force)
         for link in model.links:
             nu = link.local(velocities, rates)[..., 0]
@@ -402,26 +471,29 @@ class Dynamics:
             pi = self.pi[list(link.parameters), None]
             force = motion.convective(nu, rate) @ pi
             if model.gravity.any():
-                force = force + motion.momentum(model._fall(configuration, link)) @ pi
+                force = force + motion.momentum(model._fall(configuration, link, model.gravity)) @ pi
             add(link, motion.momentum(nu) @ pi, force)
-        for effect, columns in zip(model.effects, model.effect_slices, strict=True):
-            g = g + effect.force(model.layout, x, v) @ self.pi[columns]
+        for effect, columns, own in model.acting(inputs):
+            g = g + effect.force(model.layout, x, v, own) @ self.pi[columns]
+            effect_momentum = effect.momentum(model.layout, x, v, own)
+            if effect_momentum is not None:
+                p = p + effect_momentum @ self.pi[columns]
         return p, g
 
-    def acceleration(self, x: Array, v: Array, Q: Array) -> Array:
+    def acceleration(self, x: Array, v: Array, Q: Array, inputs: Inputs | None = None) -> Array:
         """v̇ (B, n_v) under generalized forces Q (B, n_v)."""
-        H, C = self.mass_and_bias(x, v)
+        H, C = self.mass_and_bias(x, v, inputs)
         return np.asarray(np.linalg.solve(H, (Q - C)[..., None])[..., 0])
 
     def energy(self, x: Array, v: Array) -> Array:
         """K + U (B,), J."""
         return self.model.energy_columns(x, v) @ self.pi
 
-    def dissipation_power(self, x: Array, v: Array) -> Array:
+    def dissipation_power(self, x: Array, v: Array, inputs: Inputs | None = None) -> Array:
         """Power that dampers and effects take out (B,), W."""
-        return self.model.power_columns(x, v) @ self.pi
+        return self.model.power_columns(x, v, inputs) @ self.pi
 
-    def base_momentum(self, x: Array, v: Array) -> Array:
+    def base_momentum(self, x: Array, v: Array, inputs: Inputs | None = None) -> Array:
         """Momentum of the whole system conjugate to the base's speeds (B, n_base): inertial, angular part about S."""
-        P, _ = self.model.momentum_columns(x, v, range(self.model.layout.n_base_speeds))
+        P, _ = self.model.momentum_columns(x, v, range(self.model.layout.n_base_speeds), inputs)
         return P @ self.pi

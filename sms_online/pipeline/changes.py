@@ -171,10 +171,10 @@ class Changes:
         if jump is not None:
             by = np.zeros(whole.n_pi)
             by[[base.independent[k] for k in jump.columns]] = explanation.sizes
-            x = self._sensing.coordinates(self._values)
+            x, torque = self._sensing.coordinates(self._values), self._sensing.joint_torque(self._values)
             between = (onset - self._width // 2, alarm)
             instant = event_instant(
-                whole, by, explanation.beta, self.detector.history, self._index, x, between, self._half_hop,
+                whole, by, explanation.beta, self.detector.history, self._index, x, torque, between, self._half_hop,
                 self._system.sample_rate,
             )  # fmt: skip
         guard = GUARD * self._half_hop

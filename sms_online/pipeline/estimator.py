@@ -219,7 +219,7 @@ class Estimator:
         v = self.model.layout.speeds(x, rates.rates[:, :n_x])
         if self.on_motion is not None:
             self.on_motion(rates.index, rates.segment, x, v)
-        rows = self._energy.push(rates.index, x, v, torque, self._rates.sigma[n_x:])
+        rows = self._energy.push(rates.index, x, v, torque, self._rates.sigma[n_x:], rates.rates[:, n_x:])
         finite = np.isfinite(rows.Y).all(axis=1) & np.isfinite(rows.b)
         self.dropped_rows += int(np.sum(~finite))
         if finite.any():

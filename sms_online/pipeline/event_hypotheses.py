@@ -14,7 +14,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from sms_online.description.schema import Effect, RigidBody, System
-from sms_online.effects.catalogue import NAMES
 from sms_online.model.base_parameters import BaseParameters
 from sms_online.model.model import Model
 from sms_online.model.parameters import Parameter
@@ -39,6 +38,8 @@ SAME = 1e-3
 # A column of which the others leave less than this share cannot jump alone.
 FREE = 1e-6
 
+# Effects that may begin while a session runs, at any joint.
+EVENT_EFFECTS = ("coulomb_friction", "torque_offset", "viscous_friction")
 # Kinds of events by the ends of what jumped: an effect's name, or a parameter's quantity.
 KINDS = {
     "stiffness": ("stiffness", "rigidity", "rigidity_y", "rigidity_z"),
@@ -77,10 +78,12 @@ class Explanation:
 
 
 def everything(system: System) -> System:
-    """The system with a payload, and with every effect of the catalogue at every joint."""
+    """The system with a payload, and with every effect that may begin in a session at every joint."""
     declared = {(effect.name, effect.where) for effect in system.effects}
     joints = [f"joint_{i}" for i in range(1, len(system.joints) + 1)]
-    missing = [Effect(name=name, where=where) for where in joints for name in NAMES if (name, where) not in declared]
+    missing = [
+        Effect(name=name, where=where) for where in joints for name in EVENT_EFFECTS if (name, where) not in declared
+    ]
     payload = RigidBody() if system.payload is None else system.payload
     return system.model_copy(update={"payload": payload, "effects": (*system.effects, *missing)})
 

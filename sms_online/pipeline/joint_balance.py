@@ -60,7 +60,7 @@ class JointBalance:
     def _window(self, samples: Array, end: int) -> tuple[BalanceRows, Array]:
         layout = self.model.layout
         x, v, torque = np.split(samples, [layout.n_x, layout.n_x + layout.n_v], axis=1)
-        P, G = self.model.momentum_columns(x, v, layout.theta_m)
+        P, G = self.model.momentum_columns(x, v, layout.theta_m, self.model.inputs(torque))
         columns = -(np.tensordot(self._phi_dot, P, 1) + np.tensordot(self._phi, G, 1))
         measured = self._phi @ torque
         b = measured - self.base.known_part(columns)

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sms_online.model.base_parameters import RANDOM_SEED, RANK_TOLERANCE, BaseParameters, random_states
+from sms_online.model.base_parameters import RANDOM_SEED, RANK_TOLERANCE, BaseParameters, random_inputs, random_states
 from sms_online.model.model import Model
 from sms_online.pipeline.smoothing import HALF_WIDTHS, WidthChoice, smooth, stride
 from sms_online.pipeline.weak_form import test_function
@@ -42,11 +42,15 @@ MARGIN = HALF_WIDTHS[-1]
 
 @dataclass(frozen=True)
 class Instants:
-    """States at `number`, `number` + 1, …, in half hops since the segment began: x (K, n_x), v (K, n_v)."""
+    """States at `number`, `number` + 1, …, in half hops since the segment began: x (K, n_x), v (K, n_v).
+
+    torque (K, joints): n τ.
+    """
 
     number: int
     x: Array
     v: Array
+    torque: Array
 
 
 @dataclass(frozen=True)
@@ -68,8 +72,10 @@ class Window:
 
 def momentum_pattern(model: Model) -> NDArray[np.bool_]:
     """Entries (n_v, n_pi) of a weak-form row that the structure of the model does not make zero."""
-    x, v = random_states(model, PATTERN_STATES, np.random.default_rng(RANDOM_SEED))
-    size = sum(np.abs(columns).max(axis=0) for columns in model.momentum_columns(x, v))
+    rng = np.random.default_rng(RANDOM_SEED)
+    x, v = random_states(model, PATTERN_STATES, rng)
+    inputs = random_inputs(model, PATTERN_STATES, rng)
+    size = sum(np.abs(columns).max(axis=0) for columns in model.momentum_columns(x, v, inputs=inputs))
     return np.asarray(size > RANK_TOLERANCE * size.max(axis=0))
 
 
@@ -162,9 +168,9 @@ class MomentumBalance:
         numbers = np.arange(self._told, last + 1)
         if numbers.size == 0:
             return []
-        x, v, _ = self._states(numbers * self.half_hop, half_width)
+        x, v, torque = self._states(numbers * self.half_hop, half_width)
         self._told = last + 1
-        return [Instants(int(numbers[0]), x[0], v[0])]
+        return [Instants(int(numbers[0]), x[0], v[0], torque)]
 
     def _states(self, samples: NDArray[np.int64], half_width: int) -> tuple[Array, Array, Array]:
         """x (copies, K, n_x), v (copies, K, n_v) and n τ (K, joints) at K samples of the segment."""
@@ -210,8 +216,9 @@ class MomentumBalance:
         # Without noise all copies are one.
         distinct = COPIES if np.any(x[1] != x[0]) else 1
         packed = []
+        inputs = self.model.inputs(np.tile(torque, (distinct, 1)))
         for part in self.model.momentum_columns(
-            x[:distinct].reshape(-1, x.shape[2]), v[:distinct].reshape(-1, v.shape[2])
+            x[:distinct].reshape(-1, x.shape[2]), v[:distinct].reshape(-1, v.shape[2]), inputs=inputs
         ):
             both = np.concatenate((part[:, self.rows, self._physical], self.base.known_part(part)), axis=1)
             both = both.reshape(distinct, K, -1).swapaxes(0, 1)

@@ -1,0 +1,144 @@
+"""Torque of a motor and its measurement: cogging, ripple, offset, gain, delay.
+
+Source: Holtz, Springob, IEEE Trans. Industrial Electronics 43 (1996) 309 (cogging and ripple of servo motors).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from sms_online.effects.base import Entry, Inputs, Shape, Site, position
+from sms_online.effects.friction import MotorSide
+from sms_online.effects.harmonic import amplitude_and_phase, nominal_parts, phase_columns
+from sms_online.model.layout import Layout
+from sms_online.stream import Array
+
+# Orders that windings and poles of usual motors give, per motor turn.
+ORDERS = (1.0, 2.0, 3.0, 4.0, 6.0, 8.0, 12.0, 18.0, 24.0)
+
+
+class Cogging(MotorSide):
+    """f = a cos(p n θ_m - φ): torque of magnets against teeth, `order` p times a motor turn, after the gear.
+
+    a: `amplitude`, N m; φ: `phase`, rad; linear in π are a cos φ and a sin φ.
+    Limitations: one order; independent of the current.
+    """
+
+    entry = Entry(
+        "cogging", "force", "joint", {"amplitude": "N m", "phase": "rad"},
+        "many motor turns, under little and much torque (ripple grows with it)",
+        {"order": Shape("", 6.0, lambda ranges: ORDERS)},
+    )  # fmt: skip
+
+    def __init__(self, site: Site, given: Mapping[str, float]) -> None:
+        super().__init__(site, nominal_parts("g", site.index, "N m", given), {"order": given["order"]})
+        self.gear_ratio = site.gear_ratio
+
+    def along(self, layout: Layout, x: Array, v: Array, inputs: Inputs | None) -> Array:
+        """cos and sin of p n θ_m."""
+        theta_m = position(layout, x, layout.theta_m[self.index - 1])
+        return phase_columns(self.shapes["order"] * self.gear_ratio * theta_m)
+
+    def reported(self, values: Array) -> dict[str, float]:
+        """a and φ."""
+        return amplitude_and_phase(values) | dict(self.shapes)
+
+
+class TorqueRipple(MotorSide):
+    """f = a n τ cos(p n θ_m - φ): the torque constant varies with the rotor's angle, `order` p times a motor turn.
+
+    a: `amplitude`, a ratio; φ: `phase`, rad; linear in π are a cos φ and a sin φ.
+    Limitations: one order.
+    """
+
+    entry = Entry(
+        "torque_ripple", "force", "joint", {"amplitude": "", "phase": "rad"},
+        "many motor turns, under little and much torque (cogging does not grow with it)",
+        {"order": Shape("", 6.0, lambda ranges: ORDERS)},
+    )  # fmt: skip
+    needs_torque = True
+
+    def __init__(self, site: Site, given: Mapping[str, float]) -> None:
+        super().__init__(site, nominal_parts("w", site.index, "", given), {"order": given["order"]})
+        self.gear_ratio = site.gear_ratio
+
+    def along(self, layout: Layout, x: Array, v: Array, inputs: Inputs | None) -> Array:
+        """n τ times cos and sin of p n θ_m."""
+        assert inputs is not None
+        theta_m = position(layout, x, layout.theta_m[self.index - 1])
+        columns = phase_columns(self.shapes["order"] * self.gear_ratio * theta_m)
+        return np.asarray(inputs.torque[:, self.index - 1, None] * columns)
+
+    def reported(self, values: Array) -> dict[str, float]:
+        """a and φ."""
+        return amplitude_and_phase(values) | dict(self.shapes)
+
+
+class TorqueOffset(MotorSide):
+    """The measured torque reads c too much at the motor shaft (N m; N on a direct drive), so the arm feels -n c.
+
+    Limitations: constant over the session; a drifting amplifier needs a slower model.
+    """
+
+    entry = Entry("torque_offset", "force", "joint", {"torque": "N m"}, "standstill under a known torque")
+
+    def __init__(self, site: Site, given: Mapping[str, float]) -> None:
+        super().__init__(site, {"torque": (f"o_{site.index}", "N m", given.get("torque", 0.0))})
+        self.gear_ratio = site.gear_ratio
+
+    def along(self, layout: Layout, x: Array, v: Array, inputs: Inputs | None) -> Array:
+        """-n."""
+        return np.full((v.shape[0], 1), -self.gear_ratio)
+
+
+class TorqueGain(MotorSide):
+    """The arm feels (1 + g) n τ where n τ is measured; g: `ratio`.
+
+    Limitations: a gain common to all joints only rescales π, so it is relative to joint 1, which has none.
+    """
+
+    entry = Entry("torque_gain", "force", "later joint", {"ratio": ""}, "motion of each joint alone, then of all")
+    needs_torque = True
+
+    def __init__(self, site: Site, given: Mapping[str, float]) -> None:
+        super().__init__(site, {"ratio": (f"g_{site.index}", "", given.get("ratio", 0.0))})
+
+    def along(self, layout: Layout, x: Array, v: Array, inputs: Inputs | None) -> Array:
+        """n τ."""
+        assert inputs is not None
+        return inputs.torque[:, self.index - 1, None]
+
+
+class TorqueDelay(MotorSide):
+    """The measured torque is late by d: the arm feels n τ + d · d(n τ)/dt, d: `time`, s.
+
+    The rate of the torque goes into the momentum, P = -n τ, so nothing is differentiated in momentum rows. The
+    simulator delays the measured channel instead, see `latency`.
+    Limitations: first order in d, so d must be short against the torque's own changes.
+    """
+
+    entry = Entry("torque_delay", "force", "joint", {"time": "s"}, "fast reversals of the torque")
+    needs_torque = True
+
+    def __init__(self, site: Site, given: Mapping[str, float]) -> None:
+        super().__init__(site, {"time": (f"t_{site.index}", "s", given.get("time", 0.0))})
+
+    def along(self, layout: Layout, x: Array, v: Array, inputs: Inputs | None) -> Array:
+        """0: all is in the momentum."""
+        return np.zeros((v.shape[0], 1))
+
+    def momentum(self, layout: Layout, x: Array, v: Array, inputs: Inputs | None) -> Array:
+        """-n τ."""
+        assert inputs is not None
+        P = np.zeros((*v.shape, 1))
+        P[:, layout.theta_m[self.index - 1], 0] = -inputs.torque[:, self.index - 1]
+        return P
+
+    def power(self, layout: Layout, x: Array, v: Array, inputs: Inputs | None) -> Array:
+        """-θ̇_m d(n τ)/dt; ValueError where the torque's rate is not given."""
+        assert inputs is not None
+        if inputs.torque_rate is None:
+            raise ValueError(f"{self.name}@{self.where} needs the torque's rate")
+        return -(inputs.torque_rate[:, self.index - 1] * self.rate(layout, v))[:, None]

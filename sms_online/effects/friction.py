@@ -1,0 +1,151 @@
+"""Friction of a motor shaft against the stator, at the output side of the gear.
+
+Source of the laws: Armstrong-Hélouvry, Dupont, Canudas de Wit, Automatica 30 (1994) 1083; load-dependent friction of
+gears: Bittencourt, Gunnarsson, J. Dynamic Systems, Measurement and Control 134 (2012) 051013.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from sms_online.effects.base import Entry, Force, Inputs, Ranges, Shape, Site, position
+from sms_online.model.layout import Layout
+from sms_online.stream import Array
+
+# Speed below which an axis stands still, rad/s (m/s): an integrator cannot follow a jump, and encoders resolve no less.
+STANDSTILL = 1e-4
+
+
+def sign(rate: Array) -> Array:
+    """Sign of a rate as tanh(rate / STANDSTILL), so that one definition serves rows and integration."""
+    return np.asarray(np.tanh(rate / STANDSTILL))
+
+
+class MotorSide(Force):
+    """A generalized force along θ_m of one joint."""
+
+    def along(self, layout: Layout, x: Array, v: Array, inputs: Inputs | None) -> Array:
+        """Force (B, coefficients) of one unit of each coefficient."""
+        raise NotImplementedError
+
+    def force(self, layout: Layout, x: Array, v: Array, inputs: Inputs | None) -> Array:
+        """`along` on the row of θ_m."""
+        f = np.zeros((*v.shape, len(self.parameters)))
+        f[:, layout.theta_m[self.index - 1]] = self.along(layout, x, v, inputs)
+        return f
+
+    def rate(self, layout: Layout, v: Array) -> Array:
+        """θ̇_m (B,)."""
+        return v[:, layout.theta_m[self.index - 1]]
+
+
+class ViscousFriction(MotorSide):
+    """f = -c θ̇_m on the motor side, c `damping` in N m s/rad (N s/m on a prismatic joint).
+
+    Limitations: linear; bearing friction that depends on load, temperature or direction is not in it.
+    """
+
+    entry = Entry(
+        "viscous_friction", "force", "joint", {"damping": "N m s/rad"}, "two speeds, each held in both directions"
+    )
+
+    def __init__(self, site: Site, given: Mapping[str, float]) -> None:
+        super().__init__(site, {"damping": (f"d_{site.index}", "N m s/rad", given.get("damping", 0.0))})
+
+    def along(self, layout: Layout, x: Array, v: Array, inputs: Inputs | None) -> Array:
+        """-θ̇_m."""
+        return -self.rate(layout, v)[:, None]
+
+
+class CoulombFriction(MotorSide):
+    """f = -c sign(θ̇_m), c `torque` in N m at the output side (N on a prismatic joint); power -c |θ̇_m|.
+
+    Limitations: no stiction and no presliding; around standstill the sign of a noisy rate is noise.
+    """
+
+    entry = Entry("coulomb_friction", "force", "joint", {"torque": "N m"}, "two speeds, each held in both directions")
+
+    def __init__(self, site: Site, given: Mapping[str, float]) -> None:
+        super().__init__(site, {"torque": (f"c_{site.index}", "N m", given.get("torque", 0.0))})
+
+    def along(self, layout: Layout, x: Array, v: Array, inputs: Inputs | None) -> Array:
+        """-sign(θ̇_m)."""
+        return -sign(self.rate(layout, v))[:, None]
+
+
+def _stribeck_velocities(ranges: Ranges) -> tuple[float, ...]:
+    return tuple(share * ranges.speed for share in (0.01, 0.03, 0.1, 0.2, 0.4))
+
+
+class StribeckFriction(MotorSide):
+    """f = -c sign(θ̇_m) exp(-(θ̇_m / v_s)²): what friction loses as the axis picks up speed.
+
+    c: `torque`, N m; v_s: shape constant `velocity`, rad/s.
+    Limitations: comes on top of Coulomb friction; no lag between speed and friction.
+    """
+
+    entry = Entry(
+        "stribeck_friction", "force", "joint", {"torque": "N m"}, "slow motion through standstill, and fast motion",
+        {"velocity": Shape("rad/s", 0.05, _stribeck_velocities)},
+    )  # fmt: skip
+
+    def __init__(self, site: Site, given: Mapping[str, float]) -> None:
+        linear = {"torque": (f"c_s{site.index}", "N m", given.get("torque", 0.0))}
+        super().__init__(site, linear, {"velocity": given["velocity"]})
+
+    def along(self, layout: Layout, x: Array, v: Array, inputs: Inputs | None) -> Array:
+        """-sign(θ̇_m) exp(-(θ̇_m / v_s)²)."""
+        rate = self.rate(layout, v)
+        return -(sign(rate) * np.exp(-((rate / self.shapes["velocity"]) ** 2)))[:, None]
+
+
+class LoadFriction(MotorSide):
+    """f = -c |k δ| sign(θ̇_m): friction in proportion to the torque that the spring carries, δ = θ_m - q.
+
+    c: `ratio`; linear in π is c k, `friction_stiffness`, N m/rad.
+    Limitations: the load is the spring's torque alone, without the damper's; needs a flexible transmission.
+    """
+
+    entry = Entry(
+        "load_friction", "force", "flexible joint", {"ratio": ""}, "the same speeds under little and much load"
+    )
+
+    def __init__(self, site: Site, given: Mapping[str, float]) -> None:
+        nominal = given.get("ratio", 0.0) * site.system.joints[site.index - 1].stiffness
+        super().__init__(site, {"friction_stiffness": (f"c k_{site.index}", "N m/rad", nominal)})
+        self.relative_to = (f"joint_{site.index}.stiffness",)
+
+    def along(self, layout: Layout, x: Array, v: Array, inputs: Inputs | None) -> Array:
+        """-|δ| sign(θ̇_m)."""
+        motor, link = layout.theta_m[self.index - 1], layout.q[self.index - 1]
+        delta = position(layout, x, motor) - position(layout, x, link)
+        return -(np.abs(delta) * sign(v[:, motor]))[:, None]
+
+    def reported(self, values: Array) -> dict[str, float]:
+        """c = c k / k."""
+        return {"ratio": float(values[0] / values[1])}
+
+
+class DirectionFriction(MotorSide):
+    """Coulomb friction with a torque for each direction: f = -c_+ for θ̇_m > 0 and +c_- for θ̇_m < 0, N m.
+
+    Equal coefficients `plus` and `minus` are Coulomb friction; the steps are as smooth.
+    Limitations: those of Coulomb friction; a torque offset looks the same and is half the difference.
+    """
+
+    entry = Entry(
+        "direction_friction", "force", "joint", {"plus": "N m", "minus": "N m"},
+        "standstill under a known torque, and both directions: a torque offset acts at rest too",
+    )  # fmt: skip
+
+    def __init__(self, site: Site, given: Mapping[str, float]) -> None:
+        i = site.index
+        linear = {side: (f"c_{mark}{i}", "N m", given.get(side, 0.0)) for side, mark in (("plus", "+"), ("minus", "-"))}
+        super().__init__(site, linear)
+
+    def along(self, layout: Layout, x: Array, v: Array, inputs: Inputs | None) -> Array:
+        """-1 forwards, +1 backwards."""
+        s = sign(self.rate(layout, v))
+        return np.stack((-np.maximum(s, 0.0), -np.minimum(s, 0.0)), axis=1)

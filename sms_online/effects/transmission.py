@@ -1,0 +1,143 @@
+"""What a gear and its spring do beyond k δ, δ = θ_m - q: torques between motor and link side alone.
+
+Sources: hysteresis: Dahl, AIAA J. 14 (1976) 1675, of a spring; cubic stiffness and kinematic error of harmonic drives:
+Tuttle, Seering, IEEE Trans. Robotics and Automation 12 (1996) 368; backlash: Nordin, Gutman, Automatica 38 (2002) 1633.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from sms_online.effects.base import Entry, Force, Inputs, Ranges, Shape, Site, position
+from sms_online.effects.harmonic import amplitude_and_phase, nominal_parts, phase_columns
+from sms_online.model.layout import Layout
+from sms_online.stream import Array
+
+
+class Transmission(Force):
+    """A generalized force pair along δ: what `along` gives acts on θ_m, and its opposite on q."""
+
+    def along(self, layout: Layout, x: Array, v: Array, inputs: Inputs | None) -> Array:
+        """Force (B, coefficients) on θ_m of one unit of each coefficient."""
+        raise NotImplementedError
+
+    def force(self, layout: Layout, x: Array, v: Array, inputs: Inputs | None) -> Array:
+        """`along` on the row of θ_m, its opposite on that of q."""
+        f = np.zeros((*v.shape, len(self.parameters)))
+        f[:, layout.theta_m[self.index - 1]] = self.along(layout, x, v, inputs)
+        f[:, layout.q[self.index - 1]] = -f[:, layout.theta_m[self.index - 1]]
+        return f
+
+    def deflection(self, layout: Layout, x: Array) -> Array:
+        """δ (B,)."""
+        i = self.index - 1
+        return np.asarray(position(layout, x, layout.theta_m[i]) - position(layout, x, layout.q[i]))
+
+
+def _widths(ranges: Ranges) -> tuple[float, ...]:
+    return tuple(share * ranges.deflection for share in (0.01, 0.03, 0.1, 0.3))
+
+
+class TorsionalHysteresis(Transmission):
+    """f = -c z / δ_s along δ with ż = δ̇ - |δ̇| z / δ_s: the spring's torque depends on where it comes from.
+
+    c: `torque` that it saturates at, N m. δ_s: shape constant `width`, rad. The internal state z starts at 0.
+    Limitations: rate-independent; its energy per cycle does not depend on the load.
+    """
+
+    entry = Entry(
+        "torsional_hysteresis", "force", "flexible joint", {"torque": "N m"},
+        "slow load cycles of two amplitudes: damping fades with speed, hysteresis does not",
+        {"width": Shape("rad", 0.01, _widths)},
+    )  # fmt: skip
+    n_states = 1
+
+    def __init__(self, site: Site, given: Mapping[str, float]) -> None:
+        linear = {"torque": (f"h_{site.index}", "N m", given.get("torque", 0.0))}
+        super().__init__(site, linear, {"width": given["width"]})
+
+    def along(self, layout: Layout, x: Array, v: Array, inputs: Inputs | None) -> Array:
+        """-z / δ_s."""
+        assert inputs is not None
+        return -inputs.states / self.shapes["width"]
+
+    def state_rate(self, layout: Layout, x: Array, v: Array, z: Array) -> Array:
+        """δ̇ - |δ̇| z / δ_s."""
+        rate = (v[:, layout.theta_m[self.index - 1]] - v[:, layout.q[self.index - 1]])[:, None]
+        return np.asarray(rate - np.abs(rate) * z / self.shapes["width"])
+
+
+class CubicStiffness(Transmission):
+    """f = -c δ³ along δ, c `stiffness` in N m/rad³: a spring that hardens (c > 0) or softens.
+
+    Limitations: odd and smooth; a harmonic drive's soft zone around zero asks for more.
+    """
+
+    entry = Entry(
+        "cubic_stiffness", "force", "flexible joint", {"stiffness": "N m/rad³"}, "small and large deflections"
+    )
+
+    def __init__(self, site: Site, given: Mapping[str, float]) -> None:
+        super().__init__(site, {"stiffness": (f"k_3{site.index}", "N m/rad³", given.get("stiffness", 0.0))})
+
+    def along(self, layout: Layout, x: Array, v: Array, inputs: Inputs | None) -> Array:
+        """-δ³."""
+        return -(self.deflection(layout, x) ** 3)[:, None]
+
+
+class Backlash(Transmission):
+    """The spring acts beyond a dead zone of ± gap: f = +k clip(δ, -gap, gap) along δ on top of the linear spring.
+
+    k: `stiffness` that is lost inside the gap, N m/rad, that of the joint unless stated. gap: shape constant, half
+    width, rad.
+    Limitations: no impact losses; the damper acts inside the gap too.
+    """
+
+    entry = Entry(
+        "backlash", "force", "flexible joint", {"gap": "rad"}, "deflections within and far beyond the gap",
+        {"gap": Shape("rad", 0.001, _widths)}, {"stiffness": "N m/rad"},
+    )  # fmt: skip
+
+    def __init__(self, site: Site, given: Mapping[str, float]) -> None:
+        nominal = given.get("stiffness", site.system.joints[site.index - 1].stiffness)
+        super().__init__(site, {"stiffness": (f"k_g{site.index}", "N m/rad", nominal)}, {"gap": given["gap"]})
+
+    def along(self, layout: Layout, x: Array, v: Array, inputs: Inputs | None) -> Array:
+        """clip(δ, -gap, gap)."""
+        gap = self.shapes["gap"]
+        return np.clip(self.deflection(layout, x), -gap, gap)[:, None]
+
+    def reported(self, values: Array) -> dict[str, float]:
+        """The gap."""
+        return dict(self.shapes)
+
+
+class KinematicError(Transmission):
+    """f = -k e along δ, e = a cos(p n θ_m - φ) rad: the gear's output is off by e, `order` p = 2 times a motor turn.
+
+    a: `amplitude`, rad; φ: `phase`, rad; linear in π are k a cos φ and k a sin φ, N m.
+    Limitations: the torque e' k e by which the error also drives the motor, e' = de/dθ_m, is left out.
+    """
+
+    entry = Entry(
+        "kinematic_error", "force", "flexible joint", {"amplitude": "rad", "phase": "rad"},
+        "constant speeds that put the error's frequency below and above the joint's resonance",
+        {"order": Shape("", 2.0, lambda ranges: (1.0, 2.0, 4.0))},
+    )  # fmt: skip
+
+    def __init__(self, site: Site, given: Mapping[str, float]) -> None:
+        linear = nominal_parts("e", site.index, "N m", given, site.system.joints[site.index - 1].stiffness)
+        super().__init__(site, linear, {"order": given["order"]})
+        self.gear_ratio = site.gear_ratio
+        self.relative_to = (f"joint_{site.index}.stiffness",)
+
+    def along(self, layout: Layout, x: Array, v: Array, inputs: Inputs | None) -> Array:
+        """-cos and -sin of p n θ_m."""
+        theta_m = position(layout, x, layout.theta_m[self.index - 1])
+        return -phase_columns(self.shapes["order"] * self.gear_ratio * theta_m)
+
+    def reported(self, values: Array) -> dict[str, float]:
+        """a and φ, for the stiffness k of the estimate."""
+        return amplitude_and_phase(values[:2] / values[2]) | dict(self.shapes)
