@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from sms_online.description.schema import System
 from sms_online.errors import InputError
 from sms_online.stream import Array, Block
+from sms_sim.distortion import Distortion
 from sms_sim.plant import Plant
 from sms_sim.realtime import STEP, STEPS_AT_ONCE, RealTimeStepper
 from sms_sim.sensors import Sensors
@@ -55,6 +56,7 @@ class MovingArm:
     def __iter__(self) -> Iterator[Block]:
         """Yield the blocks from rest, t = 0 first."""
         plant, sensors = self._plant, self._sensors
+        self._distortion = Distortion(plant.system, sensors.channels, single=True)
         columns = [plant.channels.index(channel) for channel in self.channels]
         rate = plant.system.sample_rate
         samples = int(self.duration * rate + 0.5) + 1
@@ -90,4 +92,4 @@ class MovingArm:
         rows = np.arange(history.shape[0] - count, history.shape[0])
         late = np.take_along_axis(history, rows[:, None] - delays, axis=0)
         t = np.arange(first, first + count) / self._plant.system.sample_rate
-        return Block(t, self.channels, self._sensors.read(first, late))
+        return Block(t, self.channels, self._sensors.read(first, self._distortion(late)))

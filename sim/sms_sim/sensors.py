@@ -8,6 +8,8 @@ import numpy as np
 
 from sms_online.description.channels import drive_channel, sensed_channels
 from sms_online.description.schema import Sensor, System
+from sms_online.effects.catalogue import check_effect
+from sms_online.effects.drive import TorqueDelay
 from sms_online.errors import InputError
 from sms_online.stream import Array
 
@@ -52,7 +54,7 @@ class Sensors:
         else:
             used = [Sensor(channels=(c,), noise=_grade_noise(system, c, drives, GRADES[grade])) for c in self.channels]
         self.sample_rate = system.sample_rate
-        self.latency = np.array([sensor.latency for sensor in used])
+        self.latency = np.array([sensor.latency for sensor in used]) + _torque_delays(system, self.channels)
         self.rate = np.array([min(sensor.rate or self.sample_rate, self.sample_rate) for sensor in used])
         self.noise = np.array([sensor.noise for sensor in used])
         self.resolution = np.array([sensor.resolution for sensor in used])
@@ -71,6 +73,19 @@ class Sensors:
         samples = first + np.arange(-1, exact.shape[0])
         interval = np.floor(samples[:, None] * (self.rate / self.sample_rate) + 1e-9)
         return np.where(np.diff(interval, axis=0) > 0, values, np.nan)
+
+
+def _torque_delays(system: System, channels: tuple[str, ...]) -> Array:
+    """Delays (channels,) of drives that the effect torque_delay states, s."""
+    out = np.zeros(len(channels))
+    for k, effect in enumerate(system.effects, start=1):
+        if effect.name == TorqueDelay.entry.name:
+            check_effect(system, effect, f"effect {k}", system.name)
+            time = effect.coefficients.get("time", 0.0)
+            if time < 0.0:
+                raise InputError(system.name, f"effect {k}", f"time = {time:g} s of torque_delay", "0 s or more")
+            out[channels.index(drive_channel(system, int(effect.where.removeprefix("joint_"))))] += time
+    return out
 
 
 def _grade_noise(system: System, channel: str, drives: tuple[str, ...], grade: Grade) -> float:

@@ -11,6 +11,7 @@ import numpy as np
 from sms_online.description.schema import System
 from sms_online.errors import InputError
 from sms_online.stream import Array, Block
+from sms_sim.distortion import Distortion
 from sms_sim.integrate import Dense, solve
 from sms_sim.plant import Plant
 from sms_sim.sensors import Sensors
@@ -181,6 +182,9 @@ def read_blocks(
     # Half a sample of slack: duration times rate may fall short of a whole number by rounding.
     samples = int(duration * rate + 0.5) + 1
 
+    distortion = Distortion(plant.system, sensors.channels)
+    many = distortion.oversampling
+
     def exact(t: Array, solution: Dense) -> Array:
         """Exact values (B, C) at instants t (B,); before the start the system rests."""
         inside = np.clip(t, 0.0, duration)
@@ -189,10 +193,12 @@ def read_blocks(
         return plant.channel_values(torque, plant.split(y)[0])[:, columns]
 
     for first in range(0, samples, at_once):
-        t = np.arange(first, min(first + at_once, samples)) / rate
+        end = min(first + at_once, samples)
+        fine = np.arange(max(0, many * (first - 1) + 1), many * (end - 1) + 1) / (many * rate)
+        t = np.arange(first, end) / rate
         solution = solution_until(min(float(t[-1]), duration))
-        values = np.empty((t.size, len(columns)))
+        values = np.empty((fine.size, len(columns)))
         for latency in np.unique(sensors.latency):
             late = sensors.latency == latency
-            values[:, late] = exact(t - latency, solution)[:, late]
-        yield Block(t, sensors.channels, sensors.read(first, values))
+            values[:, late] = exact(fine - latency, solution)[:, late]
+        yield Block(t, sensors.channels, sensors.read(first, distortion(values)))

@@ -5,6 +5,7 @@ A further effect is a class with an `entry`, listed in CLASSES.
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Callable, Iterable, Mapping
 from fnmatch import fnmatchcase
@@ -153,6 +154,30 @@ def build_effects(
         elif effect.name == TipPayload.entry.name:
             inertias.append(TipPayload(site, given))
     return tuple(forces), tuple(inertias)
+
+
+def parse_effect(text: str, system: System) -> Effect:
+    """Effect of `NAME@WHERE:coefficient=value,…`, coefficients optional; InputError on whatever is wrong with it."""
+    head, _, tail = text.partition(":")
+    name, at, where = head.partition("@")
+    if not at:
+        raise InputError("--effect", text, "no @", "NAME@WHERE:coefficient=value,…, such as coulomb_friction@joint_1")
+    coefficients: dict[str, float] = {}
+    for part in filter(None, tail.split(",")):
+        key, _, number = (piece.strip() for piece in part.partition("="))
+        try:
+            value = float(number)
+        except ValueError:
+            value = float("nan")
+        if not math.isfinite(value) or key in coefficients:
+            found = f"{key!r} twice" if key in coefficients else repr(part)
+            raise InputError("--effect", text, found, "coefficient=value with a finite number, each once")
+        coefficients[key] = value
+    effect = Effect(name=name, where=where, coefficients=coefficients)
+    check_effect(system, effect, text, "--effect")
+    if any((other.name, other.where) == (name, where) for other in system.effects):
+        raise InputError("--effect", text, f"{head} again", "each effect once at a place")
+    return effect
 
 
 def channel_effects(system: System) -> tuple[ChannelEffect, ...]:

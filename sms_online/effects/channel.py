@@ -11,15 +11,16 @@ from typing import Protocol
 
 import numpy as np
 import scipy.signal
+from scipy.ndimage import correlate1d
 
 from sms_online.effects.base import Entry, Ranges, Shape
 from sms_online.stream import Array
 
+# Degree of the local polynomials that correct a lag, and their full width in periods of its corner: narrow enough for
+# what the low-pass lets through, wide enough that noise grows little.
+DEGREE, PERIODS = 4, 0.5
 # Fixed-point steps from a reading back to the angle; the error falls by the amplitude (rad) each.
 INVERSIONS = 20
-# The lag's filter is integrated at so many times its corner (or the sample rate, whichever is higher), Hz: the
-# trapezoidal rule is then off by (2 π/50)² / 12, a thousandth, of the signal's share at the corner.
-LAG_OVERSAMPLING = 50.0
 
 
 class ChannelEffect(Protocol):
@@ -115,7 +116,7 @@ def _corners(ranges: Ranges) -> tuple[float, ...]:
 class SensorLag(_Channel):
     """A reading behind a second-order Butterworth low-pass, ÿ = ω² (x - y) - √2 ω ẏ, ω = 2π f, f `corner` in Hz.
 
-    Below the corner that is a delay of √2 / ω. Correcting adds √2 ẏ / ω + ÿ / ω² to the reading.
+    Below the corner that is a delay of √2 / ω.
     Limitations: what lies above the corner is lost in noise.
     """
 
@@ -132,36 +133,35 @@ class SensorLag(_Channel):
         """ω, rad/s."""
         return float(2.0 * np.pi * self.coefficients["corner"])
 
-    def filter(self, sample_rate: float) -> Array:
-        """Second-order sections of the low-pass for samples that are joined by straight lines (Tustin, prewarped)."""
-        sections = scipy.signal.butter(2, self.coefficients["corner"], fs=sample_rate, output="sos")
-        return np.asarray(sections, dtype=np.float64)
+    def filter(self, sample_rate: float) -> tuple[Array, Array]:
+        """Numerator and denominator of the low-pass for samples that are joined by straight lines."""
+        omega = self.omega
+        low_pass = (np.array([omega**2]), np.array([1.0, np.sqrt(2.0) * omega, omega**2]))
+        b, a, _ = scipy.signal.cont2discrete(low_pass, 1.0 / sample_rate, method="foh")
+        return np.asarray(b[0]), np.asarray(a)
 
     def distort(self, samples: Array, sample_rate: float) -> Array:
-        """The low-pass from rest at the first sample; `sample_rate` must lie far above the corner."""
-        sections = self.filter(sample_rate)
-        start = scipy.signal.sosfilt_zi(sections) * samples[0]
-        return np.asarray(scipy.signal.sosfilt(sections, samples, zi=start)[0])
+        """The low-pass, from rest at the first sample, of samples joined by straight lines."""
+        b, a = self.filter(sample_rate)
+        start = scipy.signal.lfilter_zi(b, a) * samples[0]
+        return np.asarray(scipy.signal.lfilter(b, a, samples, zi=start)[0])
+
+    def kernel(self, sample_rate: float) -> Array:
+        """Weights (2M + 1,) of the samples about an instant in what was before the lag there, y + √2 ẏ / ω + ÿ / ω².
+
+        The derivatives are those of a polynomial of degree DEGREE over PERIODS of the corner.
+        """
+        M = max(DEGREE, round(0.5 * PERIODS * sample_rate / self.coefficients["corner"]))
+        z = np.arange(-M, M + 1) / M
+        _, first, second = np.linalg.pinv(np.vander(z, DEGREE + 1, increasing=True))[:3]
+        scale = sample_rate / (M * self.omega)
+        out = np.sqrt(2.0) * scale * first + 2.0 * scale**2 * second
+        out[M] += 1.0
+        return np.asarray(out)
 
     def correct(self, samples: Array, sample_rate: float) -> Array:
-        """Reading + √2 ẏ / ω + ÿ / ω², its derivatives from local polynomials over a quarter of the lag's period."""
-        values = derivatives(samples, sample_rate, self.coefficients["corner"])
-        return np.asarray(values[0] + np.sqrt(2.0) * values[1] / self.omega + values[2] / self.omega**2)
-
-
-# Degree of the local polynomials that correct a lag, and their full width in periods of its corner.
-DEGREE, PERIODS = 4, 0.5
-
-
-def half_width(sample_rate: float, corner: float) -> int:
-    """Half width of the local polynomials, samples: at least what their degree needs."""
-    return max(DEGREE, round(0.5 * PERIODS * sample_rate / corner))
-
-
-def derivatives(samples: Array, sample_rate: float, corner: float) -> list[Array]:
-    """Value, first and second derivative of samples (B,), by Savitzky–Golay; the ends from the last whole window."""
-    M = half_width(sample_rate, corner)
-    return [
-        np.asarray(scipy.signal.savgol_filter(samples, 2 * M + 1, DEGREE, deriv=k, delta=1.0 / sample_rate))
-        for k in range(3)
-    ]
+        """What was before the lag; beyond its ends the record goes on as its own point reflection."""
+        kernel = self.kernel(sample_rate)
+        M = kernel.size // 2
+        padded = np.pad(samples, M, mode="reflect", reflect_type="odd")
+        return np.asarray(correlate1d(padded, kernel, mode="nearest")[M:-M])

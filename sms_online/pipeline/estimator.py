@@ -15,8 +15,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sms_online.description.schema import System
+from sms_online.effects.spacecraft import TableTilt
+from sms_online.errors import InputError
 from sms_online.model.base_parameters import BaseParameters, find_base_parameters
 from sms_online.model.model import Model
+from sms_online.pipeline.conditioning import Conditioning
 from sms_online.pipeline.energy_balance import BalanceRows, EnergyBalance, SharedErrors
 from sms_online.pipeline.events import Event
 from sms_online.pipeline.joint_balance import JointBalance
@@ -68,12 +71,13 @@ class Estimator:
     """Streams one session of a described system.
 
     channels: what the source's blocks hold. source: its name, for messages. Raises InputError when a channel is missing
-    that the model needs.
+    that the model needs, or where the system declares an effect that a stream of samples cannot identify.
     """
 
     def __init__(self, system: System, channels: tuple[str, ...], source: str) -> None:
         self.system = system
         self._model = model = Model(system)
+        _refuse_unfollowed(model)
         self._base = base = find_base_parameters(model)
         self.sensing = Sensing(model, channels, source)
         self.samples = 0
@@ -84,6 +88,7 @@ class Estimator:
         self._columns = [channels.index(name) for name in self.sensing.channels]
         self._attitude = AttitudeContinuity()
         self._synchroniser = Synchroniser(self.sensing.channels, system.sample_rate)
+        self._conditioning = Conditioning(system, self.sensing.channels)
         layout = model.layout
         # Positions choose the filter's width; torques pass the same filter for the sake of the lag.
         self._rates = RatesStage(system.sample_rate, range(layout.n_x), self.sensing.noise)
@@ -181,7 +186,7 @@ class Estimator:
             self._synchronise(self._pending_t, self._pending)
         self._pending_t, self._pending = self._pending_t[:0], self._pending[:0]
         for piece in self._synchroniser.flush():
-            self._differentiate(piece)
+            self._condition(piece)
         for rates in self._rates.flush():
             self._balance(rates)
         if self.momentum is not None:
@@ -195,7 +200,11 @@ class Estimator:
         if self.momentum is not None:
             self.momentum.observe(block.values)
         for piece in self._synchroniser.push(block):
-            self._differentiate(piece)
+            self._condition(piece)
+
+    def _condition(self, piece: GridSamples) -> None:
+        for corrected in self._conditioning.push(piece):
+            self._differentiate(corrected)
 
     def _differentiate(self, piece: GridSamples) -> None:
         signals = np.concatenate(
@@ -257,6 +266,7 @@ class Estimator:
                 "dropped_rows": self.dropped_rows,
             },
             "synchroniser": dict(self._synchroniser.state()),
+            "conditioning": dict(self._conditioning.state()),
             "rates": dict(self._rates.state()),
             "energy": dict(self._energy.state()),
             "shared": dict(self._energy.shared.state()),
@@ -279,8 +289,21 @@ class Estimator:
         grams, signals = np.array(session["joint_gram"]), np.array(session["joint_signal"])
         self.joint_residuals = [SquaredResidual(gram, float(s)) for gram, s in zip(grams, signals, strict=True)]
         self._synchroniser.restore(state["synchroniser"])
+        self._conditioning.restore(state["conditioning"])
         self._rates.restore(state["rates"])
         self._energy.restore(state["energy"])
         self._energy.shared.restore(state["shared"])
         self._joints.restore(state["joints"])
         self.energy_tracker.restore(state["tracker"])
+
+
+def _refuse_unfollowed(model: Model) -> None:
+    """InputError on a declared effect with internal states, or whose columns hold masses that are yet to be found."""
+    for effect in model.effects:
+        place = f"effect {effect.name}@{effect.where}"
+        if effect.n_states:
+            expected = "an effect without internal states: those are found from a whole capture"
+            raise InputError(model.system.name, place, "an internal state, which is not followed online", expected)
+        if effect.name == TableTilt.entry.name:
+            expected = "the system's gravity, or a tilt that is found from a whole capture"
+            raise InputError(model.system.name, place, "a product with the masses, which are unknown", expected)

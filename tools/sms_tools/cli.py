@@ -157,6 +157,8 @@ def _add_simulate(verbs: Verbs) -> None:
     _add_capture(parser)
     text = "length of the session, the described trajectory's by default"
     parser.add_argument("--duration", metavar="SECONDS", type=_seconds(positive=True), help=text)
+    text = "an effect that the system file does not declare, NAME@WHERE:coefficient=value,…; may be repeated"
+    parser.add_argument("--effect", metavar="EFFECT", action="append", default=[], help=text)
     _add_noise(parser)
 
 

@@ -7,7 +7,9 @@ from pathlib import Path
 
 from sms_adapters.capture import CaptureWriter
 from sms_adapters.truth import truth_path, write_truth
+from sms_online.effects.catalogue import parse_effect
 from sms_online.errors import InputError
+from sms_online.model.model import Model
 from sms_sim.plant import Plant
 from sms_sim.sensors import Sensors
 from sms_sim.simulate import sampled_blocks, simulate
@@ -19,7 +21,10 @@ from sms_tools.session import described_system
 
 def run(args: argparse.Namespace) -> int:
     """Simulate a session and write FILE.csv and FILE.csv.truth.json."""
-    system, _ = described_system(args)
+    described, _ = described_system(args)
+    system = described
+    for text in args.effect:
+        system = system.model_copy(update={"effects": (*system.effects, parse_effect(text, system))})
     capture: Path = args.capture
     channels = Sensors(system, Plant(system).channels, args.grade, args.seed).channels
     # The writer comes first: a name that cannot be written is known before a long simulation.
@@ -33,9 +38,13 @@ def run(args: argparse.Namespace) -> int:
         for block in sampled_blocks(simulation, args.grade, args.seed):
             writer.write(block)
             samples += block.t.size
-    plant, drift = simulation.plant, simulation.drift
-    truth = {p.name: float(value) for p, value in zip(plant.model.parameters, plant.parameters, strict=True)}
-    provenance = {"system": system.name, "grade": args.grade, "seed": args.seed, "duration_s": simulation.duration}
+    drift = simulation.drift
+    truth = {p.name: p.nominal for p in Model(described).parameters}
+    injected = [effect.model_dump(mode="json") for effect in system.effects[len(described.effects) :]]
+    provenance = {
+        "system": system.name, "grade": args.grade, "seed": args.seed, "duration_s": simulation.duration,
+        "effects": injected,
+    }  # fmt: skip
     write_truth(capture, truth, provenance)
     document = {
         "schema": "sms-online/simulation/1",
@@ -52,7 +61,7 @@ def run(args: argparse.Namespace) -> int:
     lines = [f"capture: {capture}, {samples} samples in {simulation.duration:g} s", f"truth: {truth_path(capture)}"]
     lines.append(f"energy drift: {drift.energy:.1e} of the largest energy")
     for what, value in (("linear", drift.linear_momentum), ("angular", drift.angular_momentum)):
-        conserved = "not conserved here (fixed base or gravity)"
+        conserved = "not conserved here (fixed base, gravity, or effects on the base)"
         text = conserved if value is None else f"{value:.1e} of what base and arm exchange"
         lines.append(f"{what} momentum drift: {text}")
     show(report_console(args.json), *lines)

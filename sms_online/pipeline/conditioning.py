@@ -1,0 +1,58 @@
+"""Declared effects on channels, taken off the grid samples before anything is made of them.
+
+Offsets and eccentricities are functions of a sample; lags ask for samples on both sides, so that every channel is
+passed on as much later, and what lies so close to a gap is lost.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.ndimage import correlate1d
+
+from sms_online.description.schema import System
+from sms_online.effects.catalogue import channel_effects
+from sms_online.effects.channel import SensorLag
+from sms_online.pipeline.synchronise import GridSamples, StageState
+
+
+class Conditioning:
+    """Corrects the channels of one session by the constants that its system file states.
+
+    Lags come off first, for they act on what the sensor reads. InputError as `channel_effects`.
+    """
+
+    def __init__(self, system: System, channels: tuple[str, ...]) -> None:
+        self._sample_rate = system.sample_rate
+        effects = [(k, e) for e in channel_effects(system) for k, channel in enumerate(channels) if e.acts_on(channel)]
+        self._lags = [(k, e.kernel(system.sample_rate)) for k, e in effects if isinstance(e, SensorLag)]
+        self._of_value = [(k, effect) for k, effect in effects if not isinstance(effect, SensorLag)]
+        self.margin = max((kernel.size // 2 for _, kernel in self._lags), default=0)
+        self._values = np.empty((0, len(channels)))
+        self._segment = -1
+
+    def push(self, piece: GridSamples) -> list[GridSamples]:
+        """The samples that can be corrected by now."""
+        if piece.segment != self._segment:
+            self._segment = piece.segment
+            self._values = self._values[:0]
+        values = np.concatenate((self._values, piece.values))
+        self._values = values[max(0, len(values) - 2 * self.margin) :]
+        inner = slice(self.margin, len(values) - self.margin)
+        if inner.stop <= inner.start:
+            return []
+        corrected = values[inner].copy()
+        for column, kernel in self._lags:
+            corrected[:, column] = correlate1d(values[:, column], kernel, mode="nearest")[inner]
+        for column, effect in reversed(self._of_value):
+            corrected[:, column] = effect.correct(corrected[:, column], self._sample_rate)
+        last = int(piece.index[-1]) - self.margin
+        index = np.arange(last + 1 - len(corrected), last + 1, dtype=np.int64)
+        return [GridSamples(index, corrected, piece.segment)]
+
+    def state(self) -> StageState:
+        """What `restore` needs to continue."""
+        return {"values": self._values, "segment": np.array(self._segment)}
+
+    def restore(self, state: StageState) -> None:
+        """Continue from a saved state."""
+        self._values, self._segment = np.array(state["values"]), int(state["segment"])
