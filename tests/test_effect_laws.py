@@ -1,0 +1,313 @@
+"""Every effect's law against a formula of its own; its power; where it may be declared."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+from model_systems import paper, random_states, spatial
+from numpy.testing import assert_allclose
+
+from sms_online.description.schema import Effect, Inertia, RigidBody, System
+from sms_online.effects.base import Inputs, Ranges, report
+from sms_online.effects.catalogue import ENTRIES, NAMES, candidates, parse_effect
+from sms_online.effects.friction import STANDSTILL
+from sms_online.errors import InputError
+from sms_online.model.model import Model
+from sms_online.stream import Array
+
+GEAR, K = 50.0, 1000.0  # of both joints of the planar example
+STATES = 12
+# Speeds of the planar example: x, y, θ_0, q_1, q_2, θ_m1, θ_m2, then four a link.
+Q_1, M_1, M_2, LINK_2 = 3, 5, 6, slice(11, 15)
+
+
+class Motion:
+    """Random states of the planar example with random torques and internal states, seed 21."""
+
+    def __init__(self, model: Model) -> None:
+        rng = np.random.default_rng(21)
+        self.x, self.v = random_states(model.layout, STATES, seed=21)
+        self.tau, self.tau_rate = rng.normal(size=(2, STATES, 2))
+        self.z = rng.normal(size=(STATES, model.n_states))
+        self.inputs = Inputs(self.tau, self.z, self.tau_rate)
+        self.delta = self.x[:, M_1] - self.x[:, Q_1]
+        self.rate = self.v[:, M_1]
+        self.theta_m = self.x[:, M_1]
+        self.zero = np.zeros(STATES)
+
+
+Law = Callable[[Motion], dict[int, Array]]
+
+
+def with_effect(text: str, system: System | None = None) -> Model:
+    system = paper() if system is None else system
+    return Model(system.model_copy(update={"effects": (parse_effect(text, system),)}))
+
+
+def spring(force: Array) -> dict[int, Array]:
+    return {M_1: force, Q_1: -force}
+
+
+# Effect as declared to its generalized force, speed by speed.
+LAWS: dict[str, Law] = {
+    "viscous_friction@joint_1:damping=0.4": lambda s: {M_1: -0.4 * s.rate},
+    "coulomb_friction@joint_1:torque=0.4": lambda s: {M_1: -0.4 * np.sign(s.rate)},
+    "stribeck_friction@joint_1:torque=0.4,velocity=0.7": lambda s: {
+        M_1: -0.4 * np.sign(s.rate) / np.exp(s.rate * s.rate / 0.49)
+    },
+    "load_friction@joint_1:ratio=0.03": lambda s: {M_1: -0.03 * np.abs(K * s.delta) * np.sign(s.rate)},
+    "direction_friction@joint_1:plus=0.4,minus=0.7": lambda s: {M_1: np.where(s.rate > 0.0, -0.4, 0.7)},
+    "torsional_hysteresis@joint_1:torque=0.4,width=0.02": lambda s: spring(-0.4 * s.z[:, 0] / 0.02),
+    "cubic_stiffness@joint_1:stiffness=70": lambda s: spring(-70 * s.delta * s.delta**2),
+    # What is left of the spring beyond the gap, less the spring itself.
+    "backlash@joint_1:gap=0.6": lambda s: spring(
+        K * s.delta - K * np.sign(s.delta) * np.maximum(np.abs(s.delta) - 0.6, 0.0)
+    ),
+    "kinematic_error@joint_1:amplitude=0.01,phase=0.3": lambda s: spring(
+        -K * 0.01 * np.cos(2 * GEAR * s.theta_m - 0.3)
+    ),
+    "cogging@joint_1:amplitude=0.4,phase=-2,order=3": lambda s: {M_1: 0.4 * np.cos(3 * GEAR * s.theta_m + 2)},
+    "torque_ripple@joint_1:amplitude=0.04,phase=1,order=4": lambda s: {
+        M_1: s.tau[:, 0] * 0.04 * np.cos(4 * GEAR * s.theta_m - 1)
+    },
+    "torque_gain@joint_2:ratio=0.1": lambda s: {M_2: 0.1 * s.tau[:, 1]},
+    "torque_offset@joint_2:torque=0.1": lambda s: {M_2: s.zero - 0.1 * GEAR},
+    "reaction_wheel@base:torque=0.3": lambda s: {2: s.zero + 0.3},
+    "thruster_leak@base:force_x=0.3,force_y=0.5": lambda s: {
+        0: 0.3 * np.cos(s.x[:, 2]) - 0.5 * np.sin(s.x[:, 2]),
+        1: 0.3 * np.sin(s.x[:, 2]) + 0.5 * np.cos(s.x[:, 2]),
+    },
+    "air_drag@base:damping=3": lambda s: {0: -3 * s.v[:, 0], 1: -3 * s.v[:, 1]},
+    "cable_spring@base:stiffness=3,rest_x=0.1,rest_y=-2": lambda s: {
+        0: 3 * (0.1 - s.x[:, 0]), 1: 3 * (-2 - s.x[:, 1])
+    },
+    "slosh@base:mass=2,stiffness=50": lambda s: {0: 50 * (s.z[:, 0] - s.x[:, 0]), 1: 50 * (s.z[:, 1] - s.x[:, 1])},
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("text", LAWS)
+def test_the_generalized_force_is_the_law(text: str) -> None:
+    """In the rows it acts on and in no other; the power it takes out is -f · v; mass and energy know nothing of it."""
+    model = with_effect(text)
+    s = Motion(model)
+    expected = np.zeros_like(s.v)
+    for speed, force in LAWS[text](s).items():
+        expected[:, speed] = force
+    own = model.effect_slices[0]
+    P, G = model.momentum_columns(s.x, s.v, inputs=s.inputs)
+    # A sign is a tanh: at the slowest of these rates it is one to 1e-12.
+    assert np.abs(s.rate).min() > 15.0 * STANDSTILL
+    assert_allclose(G[..., own] @ model.nominal[own], expected, rtol=1e-9, atol=1e-12)
+    assert not P[..., own].any()
+    assert not model.energy_columns(s.x, s.v)[:, own].any()
+    power = model.power_columns(s.x, s.v, s.inputs)[:, own] @ model.nominal[own]
+    assert_allclose(power, -np.sum(expected * s.v, axis=1), rtol=1e-9, atol=1e-12)
+    C = model.dynamics(model.nominal).mass_and_bias(s.x, s.v, s.inputs)[1]
+    C_without = Model(paper()).dynamics(Model(paper()).nominal).mass_and_bias(s.x, s.v)[1]
+    assert_allclose(C_without - C, expected, rtol=0, atol=1e-10 * np.abs(C).max())
+
+
+def test_link_damping_resists_bending_as_its_stiffness_would() -> None:
+    """A rate of bending q̇_f meets η times the force of a bend q_f = q̇_f."""
+    model, clean = with_effect("link_damping@link_2:time=0.002"), Model(paper())
+    s = Motion(model)
+    own = model.effect_slices[0]
+    bent = s.x.copy()
+    bent[:, LINK_2] = s.v[:, LINK_2]
+    stiffness = [p.name for p in clean.parameters].index("link_2.flexural_rigidity")
+    K_bent = clean.momentum_columns(bent, s.v)[1][..., stiffness] * 597.87
+    K_bent[:, : LINK_2.start] = 0.0
+    assert_allclose(model.momentum_columns(s.x, s.v)[1][..., own] @ model.nominal[own], 0.002 * K_bent, atol=1e-9)
+
+
+@pytest.mark.parametrize("kinematics", ["linear", "exact"])
+def test_mass_damping_takes_out_twice_the_rate_times_a_link_s_own_kinetic_energy(kinematics: str) -> None:
+    """With its root held fast, c q̇_fᵀ M_f q̇_f = 2 c K."""
+    model = with_effect("link_mass_damping@link_1:rate=0.7", paper(kinematics))
+    x, v = random_states(model.layout, STATES, seed=3)
+    fast = np.zeros_like(v)
+    fast[:, model.layout.q_f[0]] = v[:, model.layout.q_f[0]]
+    names = [p.name for p in model.parameters]
+    mass = names.index("link_1.mass_per_length")
+    energy = model.energy_columns(x, fast)[:, mass] * model.nominal[mass]
+    own = model.effect_slices[0]
+    power = model.power_columns(x, fast)[:, own] @ model.nominal[own]
+    assert_allclose(power, 2 * 0.7 * energy, rtol=1e-12)
+
+
+def test_a_tilted_table_is_gravity() -> None:
+    """Of the same masses: columns of a system with gravity, for which the model has code of its own."""
+    tilted = with_effect("table_tilt@base:gravity_x=0.2,gravity_y=-0.3")
+    level, heavy = Model(paper()), Model(paper().model_copy(update={"gravity": (0.2, -0.3, 0.0)}))
+    x, v = random_states(tilted.layout, STATES, seed=4)
+    own = tilted.effect_slices[0]
+    force = tilted.momentum_columns(x, v)[1][..., own] @ tilted.nominal[own]
+    weight = (heavy.momentum_columns(x, v)[1] - level.momentum_columns(x, v)[1]) @ level.nominal
+    assert_allclose(force, weight, rtol=0, atol=1e-11 * np.abs(weight).max())
+    half = Model(tilted.system, reference=0.5 * tilted.nominal)
+    assert_allclose(half.momentum_columns(x, v)[1][..., own] @ tilted.nominal[own], 0.5 * force, atol=1e-9)
+
+
+def test_a_point_mass_at_the_tip_is_a_payload_of_no_size() -> None:
+    system = paper()
+    body = RigidBody(mass=2.0, inertia=Inertia(zz=0.3))
+    described = Model(system.model_copy(update={"payload": body}))
+    declared = with_effect("tip_payload@tip:mass=2,inertia=0.3", system)
+    x, v = random_states(declared.layout, STATES, seed=5)
+    for ours, theirs in zip(declared.momentum_columns(x, v), described.momentum_columns(x, v), strict=True):
+        assert_allclose(ours @ declared.nominal, theirs @ described.nominal, rtol=0, atol=1e-9)
+    assert_allclose(
+        declared.energy_columns(x, v) @ declared.nominal, described.energy_columns(x, v) @ described.nominal
+    )
+
+
+def test_a_delayed_torque_enters_as_its_rate() -> None:
+    """d/dt(P d) = -d n τ̇ on the left is + d n τ̇ on the right; its power is that torque's."""
+    model = with_effect("torque_delay@joint_2:time=0.003")
+    s = Motion(model)
+    own = model.effect_slices[0]
+    P, G = model.momentum_columns(s.x, s.v, inputs=s.inputs)
+    assert_allclose(P[:, M_2, own] @ model.nominal[own], -0.003 * s.tau[:, 1])
+    assert not np.delete(P, M_2, axis=1)[..., own].any()
+    assert not G[..., own].any()
+    power = model.power_columns(s.x, s.v, s.inputs)[:, own] @ model.nominal[own]
+    assert_allclose(power, -0.003 * s.tau_rate[:, 1] * s.v[:, M_2])
+    with pytest.raises(ValueError, match="torque's rate"):
+        model.power_columns(s.x, s.v, Inputs(s.tau, s.z))
+
+
+def test_an_effect_that_lacks_its_inputs_says_so() -> None:
+    for text in ("torque_gain@joint_2:ratio=0.1", "torsional_hysteresis@joint_1:torque=1"):
+        model = with_effect(text)
+        s = Motion(model)
+        with pytest.raises(ValueError, match=text.split(":")[0]):
+            model.momentum_columns(s.x, s.v)
+
+
+def test_hysteresis_saturates_and_turns_back_with_the_spring_s_slope() -> None:
+    model = with_effect("torsional_hysteresis@joint_1:torque=2,width=0.02")
+    x, v = np.zeros((1, model.layout.n_x)), np.zeros((1, model.layout.n_v))
+    v[0, M_1] = 0.3
+    saturated = np.array([[0.02]])
+    assert model.state_rate(x, v, saturated)[0, 0] == pytest.approx(0.0, abs=1e-15)
+    assert model.state_rate(x, -v, saturated)[0, 0] == pytest.approx(-0.6)
+    assert model.state_rate(x, v, np.zeros((1, 1)))[0, 0] == pytest.approx(0.3)
+
+
+def test_slosh_swings_about_the_base_at_its_frequency() -> None:
+    model = with_effect("slosh@base:mass=2,stiffness=50")
+    s = Motion(model)
+    assert_allclose(model.state_rate(s.x, s.v, s.z)[:, :2], s.z[:, 2:])
+    assert_allclose(model.state_rate(s.x, s.v, s.z)[:, 2:], -25.0 * (s.z[:, :2] - s.x[:, :2]))
+    assert_allclose(model.initial_state(s.x[0]), [*s.x[0, :2], 0.0, 0.0])
+
+
+# Reported coefficients
+
+
+REPORTED = (
+    *LAWS,
+    "link_damping@link_2:time=0.002",
+    "link_mass_damping@link_1:rate=0.7",
+    "torque_delay@joint_1:time=0.1",
+    "table_tilt@base:gravity_x=0.2,gravity_y=-0.3",
+)
+
+
+@pytest.mark.parametrize("text", REPORTED)
+def test_what_is_declared_is_what_is_reported(text: str) -> None:
+    model = with_effect(text)
+    names = [p.name for p in model.parameters]
+    told = report(model.effects[0], names, model.nominal, np.zeros((model.n_pi, model.n_pi)))
+    for coefficient, value in model.system.effects[0].coefficients.items():
+        assert told[coefficient][0] == pytest.approx(value, rel=1e-12), coefficient
+
+
+def test_an_amplitude_s_deviation_is_that_of_its_parts_along_it() -> None:
+    """Parts 3 and 4 with deviations 0.1 and 0.2: a = 5 ± √(0.06² + 0.16²), φ ± √((4·0.1)² + (3·0.2)²) / 25."""
+    model = with_effect("cogging@joint_1:amplitude=5,phase=0.9272952180016122,order=2")
+    covariance = np.diag([0.01, 0.04])
+    names = [p.name for p in model.effects[0].parameters]
+    told = report(model.effects[0], names, np.array([3.0, 4.0]), covariance)
+    assert told["amplitude"] == (pytest.approx(5.0), pytest.approx(np.hypot(0.06, 0.16), rel=1e-6))
+    assert told["phase"] == (pytest.approx(0.9272952180016122), pytest.approx(np.hypot(0.4, 0.6) / 25.0, rel=1e-6))
+    assert told["order"] == (2.0, 0.0)
+
+
+def test_a_ratio_needs_what_it_is_relative_to() -> None:
+    model = with_effect("load_friction@joint_1:ratio=0.1")
+    with pytest.raises(ValueError, match=r"joint_1\.stiffness"):
+        report(model.effects[0], [model.effects[0].parameters[0].name], np.ones(1), np.eye(1))
+
+
+# The catalogue
+
+
+def test_every_candidate_of_a_system_can_be_declared_with_all_others() -> None:
+    for system in (paper(), spatial("linear").model_copy(update={"effects": ()})):
+        effects = candidates(system)
+        model = Model(system.model_copy(update={"effects": tuple(effects)}))
+        assert {effect.name for effect in effects} <= set(NAMES)
+        assert {e.name for e in effects if ENTRIES[e.name].kind == "force"} == {e.name for e in model.effects}
+        assert len({(effect.name, effect.where) for effect in effects}) == len(effects)
+        assert len({p.name for p in model.parameters}) == model.n_pi
+
+
+def test_candidates_of_the_planar_example_are_the_whole_vocabulary() -> None:
+    assert {effect.name for effect in candidates(paper())} == set(NAMES)
+    declared = paper(effects=(Effect(name="air_drag", where="base"),))
+    assert "air_drag" not in {effect.name for effect in candidates(declared)}
+
+
+def test_a_gain_is_relative_to_the_first_joint() -> None:
+    places = [effect.where for effect in candidates(paper()) if effect.name == "torque_gain"]
+    assert places == ["joint_2"]
+
+
+def test_grids_lie_within_the_motion_s_ranges() -> None:
+    ranges = Ranges(speed=2.0, deflection=0.05, duration=20.0, sample_rate=1000.0)
+    for entry in ENTRIES.values():
+        assert entry.separated_by
+        for name, shape in entry.shapes.items():
+            grid = shape.grid(ranges)
+            assert len(set(grid)) == len(grid) > 0
+            if name in ("gap", "width"):
+                assert 0.0 < min(grid) < max(grid) < ranges.deflection
+            if name == "velocity":
+                assert 0.0 < min(grid) < max(grid) < ranges.speed
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("coulomb_frcition@joint_1", "did you mean 'coulomb_friction'"),
+        ("coulomb_friction", "expected NAME@WHERE"),
+        ("coulomb_friction@joint_3", "one of joint_1, joint_2"),
+        ("torque_gain@joint_1", "expected one of joint_2"),
+        ("coulomb_friction@joint_1:damping=1", "expected 'torque'"),
+        ("coulomb_friction@joint_1:torque=much", "'torque=much'; expected coefficient=value with a finite number"),
+        ("coulomb_friction@joint_1:torque=inf", "a finite number"),
+        ("coulomb_friction@joint_1:torque", "a finite number"),
+        ("coulomb_friction@joint_1:torque=1,torque=2", "'torque' twice"),
+        ("backlash@joint_1:gap=0", "a number greater than 0"),
+        ("thruster_leak@base:force_z=1", "expected 'force_x' or 'force_y'"),
+        ("sensor_lag@tau_1:corner=10", "sensor_lag at 'tau_1'"),
+        ("encoder_offset@nothing_*", "encoder_offset at 'nothing_*'"),
+    ],
+)
+def test_a_wrong_effect_is_refused_in_one_line(text: str, words: str) -> None:
+    with pytest.raises(InputError) as caught:
+        parse_effect(text, paper())
+    assert words in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_geometric_stiffening_is_no_effect_of_a_link_that_is_exact_already() -> None:
+    assert (
+        Model(paper(effects=(Effect(name="geometric_stiffening", where="link_1"),))).system.links[0].kinematics
+        == "exact"
+    )
+    with pytest.raises(InputError, match="linear link"):
+        parse_effect("geometric_stiffening@link_1", paper("exact"))
