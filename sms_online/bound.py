@@ -24,7 +24,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sms_online.model.base_parameters import BaseParameters
-from sms_online.model.model import Dynamics, Model
+from sms_online.model.dynamics import Dynamics
+from sms_online.model.model import Model
 from sms_online.model.so3 import skew
 from sms_online.pipeline.estimator import Estimator
 from sms_online.pipeline.sensitivity import derivatives

@@ -7,8 +7,7 @@ One set of kinetic terms serves the energy balance (43), (44), the weak form of 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
-from functools import cached_property
+from dataclasses import replace
 
 import numpy as np
 
@@ -17,42 +16,12 @@ from sms_online.effects.base import ForceEffect, Inputs
 from sms_online.effects.catalogue import build_effects, with_kinematics
 from sms_online.effects.payload import TipPayload
 from sms_online.model.chain import Chain, Configuration
-from sms_online.model.flexible import ShapeRate
+from sms_online.model.dynamics import Dynamics
 from sms_online.model.inertia import BodyTerm, LinkMotion, LinkTerm, Term, convective
 from sms_online.model.layout import Layout, build_layout
 from sms_online.model.parameters import InertialParameter, Parameter, motor, rigid_body, rigidity_parameter
+from sms_online.model.springs import QuadraticForms, Spring
 from sms_online.stream import Array
-
-
-@dataclass(frozen=True)
-class Spring:
-    """A quadratic potential ½ c zᵀ S z of some coordinates z, or a damper of their rates."""
-
-    parameter: int
-    speeds: slice | list[int]
-    matrix: Array
-
-    def add_to(self, full: Array, factor: float) -> None:
-        """Add `factor` S to an (n_v, n_v) matrix."""
-        columns = np.arange(full.shape[0])[self.speeds]
-        full[np.ix_(columns, columns)] += factor * self.matrix
-
-
-class QuadraticForms:
-    """Several springs (or dampers) at once: ½ zᵀ S z of each is linear in the products of coordinates."""
-
-    def __init__(self, springs: list[Spring], n_v: int) -> None:
-        self.parameters = [spring.parameter for spring in springs]
-        full = np.zeros((len(springs), n_v, n_v))
-        for matrix, spring in zip(full, springs, strict=True):
-            spring.add_to(matrix, 0.5)
-        # Products that occur in none of them are left out.
-        self._first, self._second = np.nonzero(np.any(full != 0.0, axis=0))
-        self._weights = full[:, self._first, self._second].T
-
-    def energies(self, z: Array) -> Array:
-        """½ zᵀ S z (B, springs) for all coordinates in the order of the speeds (B, n_v)."""
-        return np.asarray((z[:, self._first] * z[:, self._second]) @ self._weights)
 
 
 class Model:
@@ -356,144 +325,3 @@ class Model:
     def dynamics(self, pi: Array) -> Dynamics:
         """Equations of motion for parameter values π (n_pi,): the full dynamics that the paper reconstructs."""
         return Dynamics(self, pi)
-
-
-class Dynamics:
-    """H v̇ + C = Q, (40), for given parameter values."""
-
-    def __init__(self, model: Model, pi: Array) -> None:
-        self.model = model
-        self.pi = pi
-        self._bodies = [
-            BodyTerm(b.frame, b.speeds, (0,), np.tensordot(pi[list(b.parameters)], b.matrices, 1)[None])
-            for b in model.bodies
-        ]
-        self._eye = np.eye(model.layout.n_v)[None]
-
-    @cached_property
-    def stiffness(self) -> Array:
-        """K_f (n_v, n_v): stiffness of links and joints."""
-        return self._assemble(self.model.springs)
-
-    @cached_property
-    def damping(self) -> Array:
-        """Damping of the joints (n_v, n_v)."""
-        return self._assemble(self.model.dampers)
-
-    def _assemble(self, springs: list[Spring]) -> Array:
-        full = np.zeros((self.model.layout.n_v, self.model.layout.n_v))
-        for spring in springs:
-            spring.add_to(full, self.pi[spring.parameter])
-        return full
-
-    def mass_matrix(self, x: Array) -> Array:
-        """H (B, n_v, n_v)."""
-        configuration = self.model.chain.configure(x)
-        H = np.zeros((x.shape[0], self.model.layout.n_v, self.model.layout.n_v))
-        for body in self._bodies:
-            W = body.local(configuration.jacobians, self._eye)
-            H += W.transpose(0, 2, 1) @ (body.matrices[0] @ W)
-        for link in self.model.links:
-            W = link.local(configuration.jacobians, self._eye)
-            M = LinkMotion(link, configuration).mass_matrix(self.pi[list(link.parameters)])
-            H += W.transpose(0, 2, 1) @ (M @ W)
-        return H
-
-    def mass_and_bias(self, x: Array, v: Array, inputs: Inputs | None = None) -> tuple[Array, Array]:
-        """H (B, n_v, n_v) and C (B, n_v): Coriolis and centrifugal, gravity, springs, dampers, effects."""
-        model = self.model
-        configuration = model.chain.configure(x)
-        shape_rates: list[ShapeRate | None] = configuration.shape_rates(v)
-        J, rates = configuration.jacobians, v[..., None]
-        velocities = [W @ rates for W in J]
-        bias = configuration.twist_rates(rates, velocities, v, shape_rates)
-        if model.gravity.any():
-            # Frames that coincide share their arrays, so none is changed in place.
-            for k, frame in enumerate(configuration.frames):
-                fall = np.zeros_like(bias[k])
-                fall[:, :3, 0] = model.gravity @ frame.rotation
-                bias[k] = bias[k] - fall
-        none = np.zeros_like(rates)
-        H = np.zeros((x.shape[0], model.layout.n_v, model.layout.n_v))
-        z = model._spring_coordinates(x)
-        C = z @ self.stiffness + v @ self.damping
-        for body in self._bodies:
-            W = body.local(J, self._eye)
-            nu = body.local(velocities, rates)[..., 0]
-            M = body.matrices[0]
-            H += W.transpose(0, 2, 1) @ (M @ W)
-            force = M @ body.local(bias, none) - convective(nu, (nu @ M)[..., None])
-            C += (W.transpose(0, 2, 1) @ force)[..., 0]
-        for link in model.links:
-            W = link.local(J, self._eye)
-            nu = link.local(velocities, rates)[..., 0]
-            motion = LinkMotion(link, configuration)
-            pi = self.pi[list(link.parameters)]
-            M = motion.mass_matrix(pi)
-            H += W.transpose(0, 2, 1) @ (M @ W)
-            rate = shape_rates[link.link]
-            assert rate is not None
-            force = M @ link.local(bias, none) + motion.bias_force(nu, rate) @ pi[:, None]
-            C += (W.transpose(0, 2, 1) @ force)[..., 0]
-        for effect, columns, own in model.acting(inputs):
-            C -= effect.force(model.layout, x, v, own) @ self.pi[columns]
-        return H, C
-
-    def momentum_and_force(self, x: Array, v: Array, inputs: Inputs | None = None) -> tuple[Array, Array]:
-        """P π and G π (B, n_v) of `Model.momentum_columns`, without the columns."""
-        model = self.model
-        configuration = model.chain.configure(x)
-        shape_rates = configuration.shape_rates(v)
-        rates, none = v[:, :, None], np.zeros_like(self._eye)
-        velocities = configuration.twists(rates, model._frames)
-        W = configuration.jacobians
-        W_dot = configuration.twist_rates(self._eye, W, v, shape_rates)
-        p = np.zeros_like(v)
-        g = -(model._spring_coordinates(x) @ self.stiffness + v @ self.damping)
-
-        def add(term: Term, momentum: Array, force: Array) -> None:
-            nonlocal p, g
-            J, J_dot = term.local(W, self._eye), term.local(W_dot, none)
-            p = p + (momentum.swapaxes(1, 2) @ J)[:, 0]
-            g = g + (momentum.swapaxes(1, 2) @ J_dot + force.swapaxes(1, 2) @ J)[:, 0]
-
-        for body in self._bodies:
-            nu = body.local(velocities, rates)[..., 0]
-            momentum = body.momentum(nu)
-            force = convective(nu, momentum)
-            if model.gravity.any():
-                force = force + body.momentum(model._fall(configuration, body, model.gravity))
-            add(body, momentum, force)
-        for link in model.links:
-            nu = link.local(velocities, rates)[..., 0]
-            motion, rate = LinkMotion(link, configuration), shape_rates[link.link]
-            assert rate is not None
-            pi = self.pi[list(link.parameters), None]
-            force = motion.convective(nu, rate) @ pi
-            if model.gravity.any():
-                force = force + motion.momentum(model._fall(configuration, link, model.gravity)) @ pi
-            add(link, motion.momentum(nu) @ pi, force)
-        for effect, columns, own in model.acting(inputs):
-            g = g + effect.force(model.layout, x, v, own) @ self.pi[columns]
-            effect_momentum = effect.momentum(model.layout, x, v, own)
-            if effect_momentum is not None:
-                p = p + effect_momentum @ self.pi[columns]
-        return p, g
-
-    def acceleration(self, x: Array, v: Array, Q: Array, inputs: Inputs | None = None) -> Array:
-        """v̇ (B, n_v) under generalized forces Q (B, n_v)."""
-        H, C = self.mass_and_bias(x, v, inputs)
-        return np.asarray(np.linalg.solve(H, (Q - C)[..., None])[..., 0])
-
-    def energy(self, x: Array, v: Array) -> Array:
-        """K + U (B,), J."""
-        return self.model.energy_columns(x, v) @ self.pi
-
-    def dissipation_power(self, x: Array, v: Array, inputs: Inputs | None = None) -> Array:
-        """Power that dampers and effects take out (B,), W."""
-        return self.model.power_columns(x, v, inputs) @ self.pi
-
-    def base_momentum(self, x: Array, v: Array, inputs: Inputs | None = None) -> Array:
-        """Momentum of the whole system conjugate to the base's speeds (B, n_base): inertial, angular part about S."""
-        P, _ = self.model.momentum_columns(x, v, range(self.model.layout.n_base_speeds), inputs)
-        return P @ self.pi

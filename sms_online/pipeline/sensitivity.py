@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sms_online.model.model import Dynamics, Model
+from sms_online.model.dynamics import Dynamics
+from sms_online.model.model import Model
 from sms_online.pipeline.momentum_balance import INSTANTS
 from sms_online.stream import Array
 
