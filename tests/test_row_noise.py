@@ -84,7 +84,7 @@ def scatter(system: System, draws: int, seed: int) -> Scatter:
         found, instants = balance.push(np.arange(len(x)), [x, x, x], sensing.joint_torque(values), coordinates)
         told = Sensitivities(model, sensing.displacements, balance.span / INSTANTS)
         for piece in instants if values is exact else []:
-            told.tell(model.nominal, piece.x, piece.v, piece.torque)
+            told.tell(model.nominal, piece.x, piece.v, piece.signals)
         return found, told
 
     def residual(found: list[Window]) -> Array:

@@ -159,9 +159,10 @@ class Model:
         """ẋ (B, n_x)."""
         return self.layout.position_rate(x, v)
 
-    def inputs(self, joint_torque: Array, joint_torque_rate: Array | None = None) -> Inputs:
-        """Inputs of effects without internal states, from n τ (B, joints) and, where it is known, its rate."""
-        return Inputs(joint_torque, np.empty((len(joint_torque), 0)), joint_torque_rate)
+    def inputs(self, signals: Array, torque_rate: Array | None = None) -> Inputs:
+        """Inputs of the effects from signals (B, joints + n_states), n τ and then internal states."""
+        joints = len(self.layout.q)
+        return Inputs(signals[:, :joints], signals[:, joints:], torque_rate)
 
     def generalized_force(self, joint_torque: Array) -> Array:
         """Q of (41), (B, n_v), for torques after the gear n τ (B, joints), N m (N)."""

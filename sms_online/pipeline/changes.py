@@ -77,7 +77,7 @@ class Changes:
         self.detector = self._new_detector()
         self._segment = -1
         self._index = np.empty(0, dtype=np.int64)
-        self._values = np.empty((0, len(sensing.channels)))
+        self._values = np.empty((0, len(sensing.channels) + model.n_states))
         self._clear = 0  # grid index from which on no sample is from before the event
         self._wanted = DECISION
 
@@ -145,8 +145,8 @@ class Changes:
         values = self._values[after]
         balance = MomentumBalance(model, base, self._system.sample_rate, self._system.windows.momentum)
         x = self._sensing.coordinates(values)
-        torque = self._sensing.joint_torque(values)
-        windows, instants = balance.push(self._index[after], [x] * COPIES, torque, noise.coordinates)
+        signals = self._sensing.signals(values)
+        windows, instants = balance.push(self._index[after], [x] * COPIES, signals, noise.coordinates)
         weights = np.zeros(base.n)
         weights[:n] = solve(before.factor).pi
         # What the rows before left decides, where it is more than noise.
@@ -171,10 +171,10 @@ class Changes:
         if jump is not None:
             by = np.zeros(whole.n_pi)
             by[[base.independent[k] for k in jump.columns]] = explanation.sizes
-            x, torque = self._sensing.coordinates(self._values), self._sensing.joint_torque(self._values)
+            x, signals = self._sensing.coordinates(self._values), self._sensing.signals(self._values)
             between = (onset - self._width // 2, alarm)
             instant = event_instant(
-                whole, by, explanation.beta, self.detector.history, self._index, x, torque, between, self._half_hop,
+                whole, by, explanation.beta, self.detector.history, self._index, x, signals, between, self._half_hop,
                 self._system.sample_rate,
             )  # fmt: skip
         guard = GUARD * self._half_hop

@@ -135,20 +135,20 @@ class EnergyBalance:
         index: NDArray[np.int64],
         x: Array,
         v: Array,
-        joint_torque: Array,
+        signals: Array,
         torque_noise: Array,
-        joint_torque_rate: Array | None = None,
+        torque_rate: Array | None = None,
     ) -> BalanceRows:
-        """Rows that B consecutive samples complete: grid index (B,), x (B, n_x), v (B, n_v), n τ (B, joints).
+        """Rows that B consecutive samples complete: grid index (B,), x (B, n_x), v (B, n_v).
 
-        torque_noise (joints,): white noise of n τ, 1σ per sample. joint_torque_rate (B, joints): of n τ, for the effect
-        torque_delay.
+        signals (B, joints + n_states): n τ, then internal states of effects. torque_noise (joints,): white noise of
+        n τ, 1σ per sample. torque_rate (B, joints): of n τ, for the effect torque_delay.
         """
         motor_rates = v[:, list(self.model.layout.theta_m)]
-        work = np.einsum("bj,bj->b", joint_torque, motor_rates)
+        work = np.einsum("bj,bj->b", signals[:, : motor_rates.shape[1]], motor_rates)
         # The last column gathers the variance of the work's noise; its rate is per sample, not per second.
         noise = (motor_rates**2 @ torque_noise**2) / self.sample_rate
-        taken = self.model.power_columns(x, v, self.model.inputs(joint_torque, joint_torque_rate))
+        taken = self.model.power_columns(x, v, self.model.inputs(signals, torque_rate))
         power = np.column_stack((taken[:, self._columns[:-1]], work, noise))
         x, v = np.concatenate((self._x, x)), np.concatenate((self._v, v))
         power = np.concatenate((self._power, power))

@@ -22,6 +22,7 @@ from sms_online.model.model import Model
 from sms_online.pipeline.conditioning import Conditioning
 from sms_online.pipeline.energy_balance import BalanceRows, EnergyBalance, SharedErrors
 from sms_online.pipeline.events import Event
+from sms_online.pipeline.internal_states import FollowedStates
 from sms_online.pipeline.joint_balance import JointBalance
 from sms_online.pipeline.momentum import Momentum
 from sms_online.pipeline.rates import RateSamples, RatesStage
@@ -77,7 +78,7 @@ class Estimator:
     def __init__(self, system: System, channels: tuple[str, ...], source: str) -> None:
         self.system = system
         self._model = model = Model(system)
-        _refuse_unfollowed(model)
+        _refuse_unknown_masses(model)
         self._base = base = find_base_parameters(model)
         self.sensing = Sensing(model, channels, source)
         self.samples = 0
@@ -92,6 +93,7 @@ class Estimator:
         layout = model.layout
         # Positions choose the filter's width; torques pass the same filter for the sake of the lag.
         self._rates = RatesStage(system.sample_rate, range(layout.n_x), self.sensing.noise)
+        self._followed = FollowedStates(model, system.sample_rate, len(self.sensing.channels))
         self._energy = EnergyBalance(model, base, system.sample_rate)
         self.momentum = None if system.balance == "energy" else Momentum(model, base, self.sensing)
         self.energy_tracker: Tracker = RecursiveLeastSquares(base.n)
@@ -189,6 +191,7 @@ class Estimator:
             self._condition(piece)
         for rates in self._rates.flush():
             self._balance(rates)
+        self._fit()
         if self.momentum is not None:
             events = len(self.events)
             self.momentum.finish(self.periods)
@@ -210,13 +213,19 @@ class Estimator:
         signals = np.concatenate(
             (self.sensing.coordinates(piece.values), self.sensing.joint_torque(piece.values)), axis=1
         )
+        self._followed.wait(piece)
         for rates in self._rates.push(GridSamples(piece.index, signals, piece.segment)):
             self._balance(rates)
-        if self.momentum is not None:
-            events = len(self.events)
-            self.momentum.push(piece, self._synchroniser.start_time, self.periods)
-            if len(self.events) > events:
-                self._begin_joints()
+        self._fit()
+
+    def _fit(self) -> None:
+        """Hand on to the momentum balance the samples whose internal states are known."""
+        for piece in self._followed.met():
+            if self.momentum is not None:
+                events = len(self.events)
+                self.momentum.push(piece, self._synchroniser.start_time, self.periods)
+                if len(self.events) > events:
+                    self._begin_joints()
 
     def _balance(self, rates: RateSamples) -> None:
         if rates.segment != self._segment:
@@ -228,14 +237,15 @@ class Estimator:
         v = self.model.layout.speeds(x, rates.rates[:, :n_x])
         if self.on_motion is not None:
             self.on_motion(rates.index, rates.segment, x, v)
-        rows = self._energy.push(rates.index, x, v, torque, self._rates.sigma[n_x:], rates.rates[:, n_x:])
+        signals = np.concatenate((torque, self._followed.push(rates, x, v)), axis=1)
+        rows = self._energy.push(rates.index, x, v, signals, self._rates.sigma[n_x:], rates.rates[:, n_x:])
         finite = np.isfinite(rows.Y).all(axis=1) & np.isfinite(rows.b)
         self.dropped_rows += int(np.sum(~finite))
         if finite.any():
             fresh = self._stamped(BalanceRows(rows.Y[finite], rows.b[finite], rows.index[finite]))
             self.energy_tracker.update(fresh)
             self._newest_energy_row = float(fresh.t[-1])
-        for window, measured in self._joints.push(rates.index, x, v, torque):
+        for window, measured in self._joints.push(rates.index, x, v, signals):
             for residual, Y, b, signal in zip(self.joint_residuals, window.Y, window.b, measured, strict=True):
                 if np.isfinite(Y).all() and np.isfinite(b):
                     residual.add(Y[None], b[None], signal)
@@ -268,6 +278,7 @@ class Estimator:
             "synchroniser": dict(self._synchroniser.state()),
             "conditioning": dict(self._conditioning.state()),
             "rates": dict(self._rates.state()),
+            "followed": dict(self._followed.state()),
             "energy": dict(self._energy.state()),
             "shared": dict(self._energy.shared.state()),
             "joints": dict(self._joints.state()),
@@ -291,19 +302,17 @@ class Estimator:
         self._synchroniser.restore(state["synchroniser"])
         self._conditioning.restore(state["conditioning"])
         self._rates.restore(state["rates"])
+        self._followed.restore(state["followed"])
         self._energy.restore(state["energy"])
         self._energy.shared.restore(state["shared"])
         self._joints.restore(state["joints"])
         self.energy_tracker.restore(state["tracker"])
 
 
-def _refuse_unfollowed(model: Model) -> None:
-    """InputError on a declared effect with internal states, or whose columns hold masses that are yet to be found."""
+def _refuse_unknown_masses(model: Model) -> None:
+    """InputError on a declared effect whose columns hold masses that are yet to be found."""
     for effect in model.effects:
-        place = f"effect {effect.name}@{effect.where}"
-        if effect.n_states:
-            expected = "an effect without internal states: those are found from a whole capture"
-            raise InputError(model.system.name, place, "an internal state, which is not followed online", expected)
         if effect.name == TableTilt.entry.name:
+            place, found = f"effect {effect.name}@{effect.where}", "a product with masses, which are unknown"
             expected = "the system's gravity, or a tilt that is found from a whole capture"
-            raise InputError(model.system.name, place, "a product with the masses, which are unknown", expected)
+            raise InputError(model.system.name, place, found, expected)

@@ -28,7 +28,7 @@ def event_instant(
     windows: Iterable[Seen],
     index: NDArray[np.int64],
     x: Array,
-    torque: Array,
+    signals: Array,
     between: tuple[int, int],
     half_hop: int,
     sample_rate: float,
@@ -36,8 +36,8 @@ def event_instant(
     """Grid index (with a fraction) at which parameters jumped; None where the samples do not reach far enough.
 
     jump (n_pi,): by how much. beta (n,): parameters before, of the windows' rows. windows: with those across the event.
-    index (B,), x (B, n_x), torque (B, joints), n τ: consecutive samples. between: grid indices that the event lies
-    between.
+    index (B,), x (B, n_x), signals (B, joints + n_states): consecutive samples. between: grid indices that the event
+    lies between.
 
     From the instant t_e on the equations of motion hold J = d/dt(P jump) - G jump more than before. Times φ and by
     parts, -∫ (φ̇ P + φ G) dt jump - φ(t_e) P(t_e) jump, both from t_e on: what is picked up in motion brings its
@@ -57,7 +57,7 @@ def event_instant(
     if candidates.size < 3 or not across:
         return None
     n_x = x.shape[1]
-    smoothed, rates = smooth(np.concatenate((x, torque), axis=1), at - int(index[0]), HALF_WIDTH, sample_rate)
+    smoothed, rates = smooth(np.concatenate((x, signals), axis=1), at - int(index[0]), HALF_WIDTH, sample_rate)
     values, inputs = smoothed[:, :n_x], model.inputs(smoothed[:, n_x:])
     P, G = model.momentum_columns(values, model.layout.speeds(values, rates[:, :n_x]), inputs=inputs)
     momentum, force = P @ jump, G @ jump

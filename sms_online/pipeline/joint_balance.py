@@ -38,14 +38,15 @@ class JointBalance:
     def begin_segment(self) -> None:
         """Forget the samples before a gap."""
         layout = self.model.layout
-        self._samples = np.empty((0, layout.n_x + layout.n_v + len(layout.q)))
+        self._samples = np.empty((0, layout.n_x + layout.n_v + len(layout.q) + self.model.n_states))
         self._skip = 0  # samples to pass over before the next window
 
-    def push(
-        self, index: NDArray[np.int64], x: Array, v: Array, joint_torque: Array
-    ) -> list[tuple[BalanceRows, Array]]:
-        """For each window that the samples complete, its rows, one a joint, and the torques (joints,) behind them."""
-        samples = np.concatenate((self._samples, np.concatenate((x, v, joint_torque), axis=1)))
+    def push(self, index: NDArray[np.int64], x: Array, v: Array, signals: Array) -> list[tuple[BalanceRows, Array]]:
+        """For each window that the samples complete, its rows, one a joint, and the torques (joints,) behind them.
+
+        signals (B, joints + n_states): n τ, then internal states of effects.
+        """
+        samples = np.concatenate((self._samples, np.concatenate((x, v, signals), axis=1)))
         grid_end = int(index[-1])
         rows = []
         start = self._skip
@@ -59,10 +60,10 @@ class JointBalance:
 
     def _window(self, samples: Array, end: int) -> tuple[BalanceRows, Array]:
         layout = self.model.layout
-        x, v, torque = np.split(samples, [layout.n_x, layout.n_x + layout.n_v], axis=1)
-        P, G = self.model.momentum_columns(x, v, layout.theta_m, self.model.inputs(torque))
+        x, v, signals = np.split(samples, [layout.n_x, layout.n_x + layout.n_v], axis=1)
+        P, G = self.model.momentum_columns(x, v, layout.theta_m, self.model.inputs(signals))
         columns = -(np.tensordot(self._phi_dot, P, 1) + np.tensordot(self._phi, G, 1))
-        measured = self._phi @ torque
+        measured = self._phi @ signals[:, : len(layout.q)]
         b = measured - self.base.known_part(columns)
         return BalanceRows(self.base.columns(columns), b, np.full(len(layout.q), end)), measured
 

@@ -99,7 +99,10 @@ class Momentum:
         self._estimate.push(values)
 
     def push(self, piece: GridSamples, start_time: float, periods: Array) -> None:
-        """Take grid samples of the channels; start_time: s of grid index 0; periods (channels,): sample periods, s."""
+        """Take grid samples of the channels, followed by internal states of effects.
+
+        start_time: s of grid index 0. periods (channels,): sample periods, s.
+        """
         self._start_time = start_time
         self._waiting.append(piece)
         due = self._noise_told + round(NOISE_RENEWED * self._sample_rate)
@@ -125,7 +128,7 @@ class Momentum:
 
     def _process(self, piece: GridSamples, noise: SensorNoise) -> None:
         windows, instants = self._balance.push(
-            piece.index, self._copies(piece.values, noise), self.sensing.joint_torque(piece.values), noise.coordinates
+            piece.index, self._copies(piece.values, noise), self.sensing.signals(piece.values), noise.coordinates
         )
         self._absorb(self._fit.push(windows, instants, noise))
 
@@ -189,6 +192,7 @@ class Momentum:
     def state(self) -> dict[str, dict[str, Any]]:
         """Everything that `restore` needs to continue to the same bits."""
         waiting = self._waiting
+        columns = len(self.sensing.channels) + self.changes.model.n_states
         random = self._random.bit_generator.state["state"]
         return {
             "momentum": {
@@ -199,9 +203,7 @@ class Momentum:
                 "noise_told": self._noise_told,
                 "random": np.array([str(random["state"]), str(random["inc"])]),
                 "waiting_index": np.concatenate([np.empty(0, dtype=np.int64), *(p.index for p in waiting)]),
-                "waiting_values": np.concatenate(
-                    [np.empty((0, len(self.sensing.channels))), *(p.values for p in waiting)]
-                ),
+                "waiting_values": np.concatenate([np.empty((0, columns)), *(p.values for p in waiting)]),
                 "waiting_segment": np.repeat([p.segment for p in waiting], [p.index.size for p in waiting]),
                 **noise_state("noise", self.sensor_noise),
                 **self.bias.state(),

@@ -44,13 +44,13 @@ MARGIN = HALF_WIDTHS[-1]
 class Instants:
     """States at `number`, `number` + 1, …, in half hops since the segment began: x (K, n_x), v (K, n_v).
 
-    torque (K, joints): n τ.
+    signals (K, joints + n_states): n τ, then internal states of effects.
     """
 
     number: int
     x: Array
     v: Array
-    torque: Array
+    signals: Array
 
 
 @dataclass(frozen=True)
@@ -121,7 +121,7 @@ class MomentumBalance:
     def begin_segment(self) -> None:
         """Forget the samples before a gap."""
         layout = self.model.layout
-        self._samples = np.empty((0, COPIES * layout.n_x + len(layout.q)))
+        self._samples = np.empty((0, COPIES * layout.n_x + len(layout.q) + self.model.n_states))
         self._first = 0  # number in the segment of the buffer's first sample
         self._window = 0  # number of the next window's first sample
         self._told = 0  # number of the next instant, in half hops
@@ -129,14 +129,14 @@ class MomentumBalance:
         self._smoothed: dict[int, _Smoothed] = {}
 
     def push(
-        self, index: NDArray[np.int64], copies: list[Array], joint_torque: Array, sigma: Array
+        self, index: NDArray[np.int64], copies: list[Array], signals: Array, sigma: Array
     ) -> tuple[list[Window], list[Instants]]:
         """Windows that B consecutive samples complete, and the states at their instants.
 
         index (B,): grid index. copies: x (B, n_x) as measured, then with noise added and with the same subtracted.
-        joint_torque (B, joints): n τ. sigma (n_x,): noise of x, 1σ per sample.
+        signals (B, joints + n_states): n τ, then internal states of effects. sigma (n_x,): noise of x, 1σ per sample.
         """
-        self._samples = np.concatenate((self._samples, np.concatenate((*copies, joint_torque), axis=1)))
+        self._samples = np.concatenate((self._samples, np.concatenate((*copies, signals), axis=1)))
         grid = int(index[-1]) - (self._first + self._samples.shape[0] - 1)
         chosen: list[tuple[int, int]] = []  # first sample and half width of each window
         while self._window + self.width + 2 * self.margin < self._first + self._samples.shape[0]:
@@ -168,12 +168,12 @@ class MomentumBalance:
         numbers = np.arange(self._told, last + 1)
         if numbers.size == 0:
             return []
-        x, v, torque = self._states(numbers * self.half_hop, half_width)
+        x, v, signals = self._states(numbers * self.half_hop, half_width)
         self._told = last + 1
-        return [Instants(int(numbers[0]), x[0], v[0], torque)]
+        return [Instants(int(numbers[0]), x[0], v[0], signals)]
 
     def _states(self, samples: NDArray[np.int64], half_width: int) -> tuple[Array, Array, Array]:
-        """x (copies, K, n_x), v (copies, K, n_v) and n τ (K, joints) at K samples of the segment."""
+        """x (copies, K, n_x), v (copies, K, n_v) and signals (K, joints + n_states) at K samples of the segment."""
         layout = self.model.layout
         values, rates = smooth(self._samples, samples - self._first + self.margin, half_width, self.sample_rate)
         end = COPIES * layout.n_x
@@ -210,20 +210,20 @@ class MomentumBalance:
         n_v = self.model.layout.n_v
         return 2 * COPIES * (self.rows.size + n_v) + n_v
 
-    def _columns(self, x: Array, v: Array, torque: Array) -> Array:
+    def _columns(self, x: Array, v: Array, signals: Array) -> Array:
         """P and G, each of the base parameters, packed, and of what is known, for every copy; Q: (K, entries)."""
-        K = torque.shape[0]
+        K = signals.shape[0]
         # Without noise all copies are one.
         distinct = COPIES if np.any(x[1] != x[0]) else 1
         packed = []
-        inputs = self.model.inputs(np.tile(torque, (distinct, 1)))
+        inputs = self.model.inputs(np.tile(signals, (distinct, 1)))
         for part in self.model.momentum_columns(
             x[:distinct].reshape(-1, x.shape[2]), v[:distinct].reshape(-1, v.shape[2]), inputs=inputs
         ):
             both = np.concatenate((part[:, self.rows, self._physical], self.base.known_part(part)), axis=1)
             both = both.reshape(distinct, K, -1).swapaxes(0, 1)
             packed.append(np.broadcast_to(both, (K, COPIES, both.shape[2])).reshape(K, -1))
-        return np.concatenate((*packed, self.model.generalized_force(torque)), axis=1)
+        return np.concatenate((*packed, self.model.generalized_force(signals[:, : len(self.model.layout.q)])), axis=1)
 
     def state(self) -> dict[str, Any]:
         """What `restore` needs to continue."""

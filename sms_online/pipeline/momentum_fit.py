@@ -114,7 +114,7 @@ class MomentumFit:
         self._moving = 0
         self._first = 0  # number of the first instant kept
         self._x, self._v = np.empty((0, layout.n_x)), np.empty((0, layout.n_v))
-        self._torque = np.empty((0, len(layout.q)))
+        self._signals = np.empty((0, len(layout.q) + self.model.n_states))
         self._sensitivities.forget(0)
         self._forget_rows()
 
@@ -127,7 +127,7 @@ class MomentumFit:
         """Rows of the windows that a push completed, and of those held back before."""
         self._x = np.concatenate((self._x, *(piece.x for piece in instants)))
         self._v = np.concatenate((self._v, *(piece.v for piece in instants)))
-        self._torque = np.concatenate((self._torque, *(piece.torque for piece in instants)))
+        self._signals = np.concatenate((self._signals, *(piece.signals for piece in instants)))
         if self.weights is not None:
             self._renew(noise)
             self._tell()
@@ -243,7 +243,7 @@ class MomentumFit:
         """Sensitivities of the instants that have none yet."""
         fresh = self._sensitivities.next_instant - self._first
         pi = self.base.physical_values(self._known_weights)
-        self._sensitivities.tell(pi, self._x[fresh:], self._v[fresh:], self._torque[fresh:])
+        self._sensitivities.tell(pi, self._x[fresh:], self._v[fresh:], self._signals[fresh:])
 
     def _dense(self, window: Window) -> Array:
         """[Y b] (copies, n_v, n + 1)."""
@@ -285,7 +285,7 @@ class MomentumFit:
         needed = kept[0].start if kept else self._first
         drop = needed - self._first
         self._first = needed
-        self._x, self._v, self._torque = self._x[drop:], self._v[drop:], self._torque[drop:]
+        self._x, self._v, self._signals = self._x[drop:], self._v[drop:], self._signals[drop:]
         if self.weights is not None:
             self._sensitivities.drop(needed)
 
@@ -293,7 +293,7 @@ class MomentumFit:
         """What `restore` needs to continue."""
         return {
             "weights": np.empty(0) if self.weights is None else self.weights, "since": self._since,
-            "moving": self._moving, "first": self._first, "x": self._x, "v": self._v, "torque": self._torque,
+            "moving": self._moving, "first": self._first, "x": self._x, "v": self._v, "signals": self._signals,
             "bends": self._bends, "largest": self._largest, "misfit": self.misfit, "plain_gram": self.plain_gram.copy(),
             "plain_windows": self.plain_windows, "renewal": self._renewal, **self._noise.state(),
             **self._whitener.state(), **self._sensitivities.state(), **_packed("held", self._held),
@@ -304,7 +304,7 @@ class MomentumFit:
         """Continue from a saved state."""
         self.weights = np.array(state["weights"]) if state["weights"].size else None
         self._since, self._moving, self._first = int(state["since"]), int(state["moving"]), int(state["first"])
-        self._x, self._v, self._torque = (np.array(state[name]) for name in ("x", "v", "torque"))
+        self._x, self._v, self._signals = (np.array(state[name]) for name in ("x", "v", "signals"))
         self._sensitivities.restore(state)
         self._largest = np.array(state["largest"])
         self._bends, self.misfit = np.array(state["bends"]), np.array(state["misfit"])

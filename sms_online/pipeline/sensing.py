@@ -126,6 +126,10 @@ class Sensing:
         """Torque after the gear n τ (B, joints), N m (N)."""
         return np.asarray(values[:, self._torque] * self._ratio)
 
+    def signals(self, values: Array) -> Array:
+        """n τ (B, joints), and what samples (B, channels + n_states) hold beyond the channels."""
+        return np.concatenate((self.joint_torque(values), values[:, len(self.channels) :]), axis=1)
+
 
 class AttitudeContinuity:
     """Turns the sign of Euler parameters, which is arbitrary, so that they are continuous from sample to sample."""

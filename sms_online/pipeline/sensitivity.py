@@ -38,19 +38,19 @@ class Sensitivity:
     offset: int
 
 
-def derivatives(dynamics: Dynamics, x: Array, v: Array, torque: Array | None = None) -> Array:
+def derivatives(dynamics: Dynamics, x: Array, v: Array, signals: Array | None = None) -> Array:
     """∂Pπ/∂x, ∂Gπ/∂v and ∂Gπ/∂x side by side (K, n_v, 3 n_v) at x (K, n_x), v (K, n_v).
 
-    torque (K, joints): n τ, for the effects that need it.
+    signals (K, joints + n_states): n τ, then internal states, for the effects that need them.
     """
     K, n_v = v.shape
     x_n, v_n = np.repeat(x, n_v, axis=0), np.repeat(v, n_v, axis=0)
     moved = DIFFERENCE * np.tile(np.eye(n_v), (K, 1))
     shifted = x_n + dynamics.model.position_rate(x_n, moved)
     alone = repeated = None
-    if torque is not None:
+    if signals is not None:
         inputs = dynamics.model.inputs
-        alone, repeated = inputs(torque), inputs(np.repeat(torque, n_v, axis=0))
+        alone, repeated = inputs(signals), inputs(np.repeat(signals, n_v, axis=0))
     p, g = (part[:, None] for part in dynamics.momentum_and_force(x, v, alone))
     p_x, g_x = (part.reshape(K, n_v, n_v) for part in dynamics.momentum_and_force(shifted, v_n, repeated))
     g_v = dynamics.momentum_and_force(x_n, v_n + moved, repeated)[1].reshape(K, n_v, n_v)
@@ -90,8 +90,8 @@ class Sensitivities:
         """Number of the instant after the last one told."""
         return self._first + len(self._dense)
 
-    def tell(self, pi: Array, x: Array, v: Array, torque: Array) -> None:
-        """Take the next instants: x (K, n_x), v (K, n_v), n τ (K, joints), with parameters π (n_pi,)."""
+    def tell(self, pi: Array, x: Array, v: Array, signals: Array) -> None:
+        """Take the next instants: x (K, n_x), v (K, n_v), signals as in `Instants`, with parameters π."""
         if not len(x):
             return
         dynamics = self.model.dynamics(pi)
@@ -102,7 +102,7 @@ class Sensitivities:
         )
         if sparse.any():
             self._numbers = np.concatenate((self._numbers, numbers[sparse]))
-            told = derivatives(dynamics, x[sparse], v[sparse], torque[sparse])
+            told = derivatives(dynamics, x[sparse], v[sparse], signals[sparse])
             self._derivatives = np.concatenate((self._derivatives, told))
 
     def window(self, start: int) -> Sensitivity:
