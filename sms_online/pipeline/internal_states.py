@@ -92,27 +92,23 @@ class FollowedStates:
         if self._n == 0:
             ready, self._waiting = self._waiting, []
             return ready
-        out = []
-        for known in self._known:
-            for piece in self._waiting:
-                if piece.segment != known.segment:
-                    continue
-                first, last = max(piece.index[0], known.index[0]), min(piece.index[-1], known.index[-1])
-                if first <= last:
-                    rows = slice(first - piece.index[0], last + 1 - piece.index[0])
-                    values = known.values[first - known.index[0] : last + 1 - known.index[0]]
-                    joined = np.concatenate((piece.values[rows], values), axis=1)
-                    out.append(GridSamples(piece.index[rows], joined, piece.segment))
+        # One piece for each of states, however the samples came: what follows depends on where pieces end.
+        out = [self._joined(known) for known in self._known]
         if self._known:
             newest = self._known[-1]
-            self._waiting = [
-                piece
-                for piece in self._waiting
-                if piece.segment > newest.segment
-                or (piece.segment == newest.segment and piece.index[-1] > newest.index[-1])
-            ]
+            done = newest.segment, int(newest.index[-1])
+            self._waiting = [piece for piece in self._waiting if (piece.segment, int(piece.index[-1])) > done]
             self._known = []
         return out
+
+    def _joined(self, known: GridSamples) -> GridSamples:
+        """The samples that wait for `known` states, and these beside them."""
+        values = [
+            piece.values[(piece.index >= known.index[0]) & (piece.index <= known.index[-1])]
+            for piece in self._waiting
+            if piece.segment == known.segment
+        ]
+        return GridSamples(known.index, np.concatenate((np.concatenate(values), known.values), axis=1), known.segment)
 
     def state(self) -> dict[str, Any]:
         """What `restore` needs to continue, between pushes."""
