@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import textwrap
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import cast
 
 import numpy as np
 import pytest
@@ -10,9 +13,9 @@ from model_systems import paper, random_states, spatial
 from numpy.testing import assert_allclose
 
 from sms_online.description.schema import Effect, Inertia, RigidBody, System
-from sms_online.effects.base import Inputs, Ranges, report
+from sms_online.effects.base import Entry, Force, Inputs, Ranges, Site, report
 from sms_online.effects.catalogue import ENTRIES, NAMES, candidates, parse_effect
-from sms_online.effects.friction import STANDSTILL
+from sms_online.effects.friction import STANDSTILL, MotorSide
 from sms_online.errors import InputError
 from sms_online.model.model import Model
 from sms_online.stream import Array
@@ -311,3 +314,29 @@ def test_geometric_stiffening_is_no_effect_of_a_link_that_is_exact_already() -> 
     )
     with pytest.raises(InputError, match="linear link"):
         parse_effect("geometric_stiffening@link_1", paper("exact"))
+
+
+def test_the_guide_lists_every_effect_with_its_coefficients_and_defaults() -> None:
+    guide = (Path(__file__).parent.parent / "docs" / "effects.md").read_text(encoding="utf-8")
+    rows = {line.split("`")[1]: line for line in guide.splitlines() if line.startswith("| `")}
+    assert set(rows) == set(NAMES)
+    for name, entry in ENTRIES.items():
+        for coefficient in (*entry.coefficients, *entry.further, *entry.shapes):
+            assert f"`{coefficient}`" in rows[name], (name, coefficient)
+        for shape in entry.shapes.values():
+            assert f"{shape.default:.3g} {shape.unit}".strip() in rows[name], name
+
+
+def test_an_effect_as_the_guide_for_contributors_writes_it_is_one() -> None:
+    guide = (Path(__file__).parent.parent / "CONTRIBUTING.md").read_text(encoding="utf-8")
+    code = guide.split("    class WindageFriction")[1].split("\n\nList the class")[0]
+    names = {"np": np, "MotorSide": MotorSide, "Entry": Entry, "Mapping": Mapping}
+    exec(textwrap.dedent(f"    from __future__ import annotations\n\n    class WindageFriction{code}"), names)
+    model = Model(paper())
+    site = Site(model.system, model.chain, "joint_1", 1, model.weight)
+    effect = cast(type[Force], names["WindageFriction"])(site, {"drag": 0.3})  # type: ignore[arg-type]
+    s = Motion(model)
+    f = effect.force(model.layout, s.x, s.v, None)[..., 0] * effect.parameters[0].nominal
+    assert_allclose(f[:, M_1], np.where(s.rate > 0.0, -0.3, 0.3) * s.rate**2)
+    assert not np.delete(f, M_1, axis=1).any()
+    assert effect.parameters[0].name == "windage_friction@joint_1.drag"
