@@ -42,6 +42,8 @@ SessionState = dict[str, dict[str, Any]]
 
 # Takes consecutive smoothed samples: grid index (B,), segment, x (B, n_x), v (B, n_v).
 MotionSink = Callable[[NDArray[np.int64], int, Array, Array], None]
+# Takes the grid samples of the channels that the model reads, as the synchroniser gives them.
+SampleSink = Callable[[GridSamples], None]
 
 
 @dataclass
@@ -86,6 +88,7 @@ class Estimator:
         self.duration = 0.0
         self._newest_energy_row = -np.inf
         self.on_motion: MotionSink | None = None
+        self.on_samples: SampleSink | None = None
         self._columns = [channels.index(name) for name in self.sensing.channels]
         self._attitude = AttitudeContinuity()
         self._synchroniser = Synchroniser(self.sensing.channels, system.sample_rate)
@@ -210,6 +213,8 @@ class Estimator:
             self._differentiate(corrected)
 
     def _differentiate(self, piece: GridSamples) -> None:
+        if self.on_samples is not None:
+            self.on_samples(piece)
         signals = np.concatenate(
             (self.sensing.coordinates(piece.values), self.sensing.joint_torque(piece.values)), axis=1
         )

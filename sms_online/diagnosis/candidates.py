@@ -1,0 +1,151 @@
+"""Every effect of the catalogue at every place of a system, as columns of a session's rows."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from itertools import product
+
+import numpy as np
+
+from sms_online.description.schema import Effect, System
+from sms_online.diagnosis.internal_states import InternalStates
+from sms_online.diagnosis.rows import SessionRows
+from sms_online.diagnosis.trace import Candidate
+from sms_online.diagnosis.weak_windows import Motion, WeakWindows
+from sms_online.effects.base import Inputs, Ranges
+from sms_online.effects.catalogue import ENTRIES, candidates, channel_effects
+from sms_online.model.model import Model
+from sms_online.model.parameters import Parameter
+from sms_online.stream import Array
+
+# Size of a channel's effect in the difference that makes its column: of an offset and an amplitude in rad (m), of a lag
+# the corner as a share of the sample rate, where it delays by a sample and a half.
+CHANNEL_STEP = 1e-4
+LAG_CORNER = 0.15
+
+
+class CandidateColumns:
+    """Makes candidates for the rows of a session, of effects that the system does not declare.
+
+    pi (n_pi,): parameters that columns of channels are taken at.
+    """
+
+    def __init__(self, rows: SessionRows, system: System, weak: WeakWindows | None = None) -> None:
+        """weak: windows that columns are wanted in, in place of the rows'."""
+        self.rows, self.system = rows, system
+        self._weak = rows.weak if weak is None else weak
+        self.pi = rows.base.physical_values(rows.beta)
+        self._own = {p.name for p in rows.model.parameters}
+        self._states = InternalStates(rows)
+        self._dynamics = rows.model.dynamics(self.pi)
+        self._uncorrected: Array | None = None
+
+    def all(self) -> list[Candidate]:
+        """Each effect at each place, with each shape constant of its grid; those that leave no trace left out."""
+        made = [self.of(effect) for effect in self.effects()]
+        return [candidate for candidate in made if np.any(candidate.columns)]
+
+    def effects(self) -> Iterator[Effect]:
+        """Declarations that may be missing; kinematics are compared as whole systems, not as columns."""
+        for effect in candidates(self.system):
+            entry = ENTRIES[effect.name]
+            if entry.kind == "kinematics":
+                continue
+            if entry.kind == "channel":
+                yield effect
+                continue
+            grids = {s: shape.grid(self.ranges(effect.where)) for s, shape in entry.shapes.items()}
+            grids = {s: values for s, values in grids.items() if s in effect.coefficients}
+            for values in product(*grids.values()):
+                shapes = dict(zip(grids, values, strict=True))
+                yield effect.model_copy(update={"coefficients": effect.coefficients | shapes})
+
+    def ranges(self, where: str) -> Ranges:
+        """How far the session goes at a place."""
+        layout = self.rows.model.layout
+        joints = [int(where.removeprefix("joint_")) - 1] if where.startswith("joint_") else range(len(layout.q))
+        offset = layout.n_base_positions - layout.n_base_speeds
+        theta_m, q = np.array(layout.theta_m)[list(joints)], np.array(layout.q)[list(joints)]
+        speed = deflection = 0.0
+        for motion, _ in self.rows.weak.motions():
+            speed = max(speed, float(np.abs(motion.v[:, theta_m]).max()))
+            deflection = max(deflection, float(np.abs(motion.x[:, theta_m + offset] - motion.x[:, q + offset]).max()))
+        rate = self.system.sample_rate
+        return Ranges(speed, deflection, sum(segment.index.size for segment in self.rows.segments) / rate, rate)
+
+    def of(self, effect: Effect) -> Candidate:
+        """The candidate of one declaration."""
+        declared = self.system.model_copy(update={"effects": (*self.system.effects, effect)})
+        if ENTRIES[effect.name].kind == "channel":
+            return self._channel(effect)
+        model = Model(declared, self.pi)
+        added = [k for k, p in enumerate(model.parameters) if p.name not in self._own]
+        parameters = tuple(model.parameters[k] for k in added)
+        if ENTRIES[effect.name].kind == "inertia":
+
+            def inertia(motion: Motion) -> tuple[Array | None, Array]:
+                inputs = Inputs(motion.torque, np.zeros((len(motion.x), model.n_states)))
+                P, G = model.momentum_columns(motion.x, motion.v, inputs=inputs)
+                return P[..., added], G[..., added]
+
+            return Candidate(effect, parameters, self._weak.columns(inertia))
+        force = model.effects[-1]
+
+        def columns(motion: Motion) -> tuple[Array | None, Array]:
+            inputs = Inputs(motion.torque, self._states.along(force, motion))
+            P = force.momentum(model.layout, motion.x, motion.v, inputs)
+            return P, force.force(model.layout, motion.x, motion.v, inputs)
+
+        return Candidate(effect, parameters, self._weak.columns(columns))
+
+    def _channel(self, effect: Effect) -> Candidate:
+        """Columns that are differences: of rows from corrected samples and rows from the samples as they are."""
+        columns, parameters = [], []
+        for quantity, unit, step, coefficients in _steps(effect.name, self.system.sample_rate):
+            moved = effect.model_copy(update={"coefficients": coefficients})
+            columns.append((self._momenta(moved) - self._momenta(None)) / step)
+            parameters.append(Parameter(f"{effect.name}@{effect.where}.{quantity}", quantity, unit, 0.0))
+        return Candidate(effect, tuple(parameters), np.concatenate(columns, axis=2))
+
+    def _momenta(self, effect: Effect | None) -> Array:
+        """Rows (W, n_v, 1) of the momentum and force of `pi` along the session, or along what a correction makes of it."""
+        if effect is None:
+            if self._uncorrected is None:
+                self._uncorrected = self._weak.columns(self._momentum)
+            return self._uncorrected
+        values = [corrected(self.rows.sensing.channels, s.values, effect, self.system) for s in self.rows.segments]
+        return self._weak.columns(self._momentum, values)
+
+    def _momentum(self, motion: Motion) -> tuple[Array | None, Array]:
+        inputs = Inputs(motion.torque, self._states.of_model(motion))
+        p, g = self._dynamics.momentum_and_force(motion.x, motion.v, inputs)
+        return p[..., None], g[..., None]
+
+
+def _steps(name: str, sample_rate: float) -> list[tuple[str, str, float, dict[str, float]]]:
+    """Linear coefficients of a channel's effect: quantity, unit, step, and the declaration of so much of it."""
+    match name:
+        case "encoder_offset":
+            return [("offset", "rad", CHANNEL_STEP, {"offset": CHANNEL_STEP})]
+        case "encoder_eccentricity":
+            phases = {"sine": 0.0, "cosine": 0.5 * np.pi}
+            return [(q, "rad", CHANNEL_STEP, {"amplitude": CHANNEL_STEP, "phase": p}) for q, p in phases.items()]
+        case "sensor_lag":
+            corner = LAG_CORNER * sample_rate
+            return [("delay", "s", delay_of(corner), {"corner": corner})]
+    raise ValueError(f"{name} is no effect on a channel")
+
+
+def delay_of(corner: float) -> float:
+    """Delay, s, of a second-order Butterworth low-pass with a corner in Hz, far below it: √2 / ω. Its own inverse."""
+    return float(np.sqrt(2.0) / (2.0 * np.pi * corner))
+
+
+def corrected(channels: tuple[str, ...], values: Array, effect: Effect, system: System) -> Array:
+    """Samples (N, channels) without a channel's effect."""
+    correction = channel_effects(system.model_copy(update={"effects": (effect,)}))[0]
+    out = values.copy()
+    for k, channel in enumerate(channels):
+        if correction.acts_on(channel):
+            out[:, k] = correction.correct(values[:, k], system.sample_rate)
+    return out

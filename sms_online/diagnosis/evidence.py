@@ -1,0 +1,122 @@
+"""How much of what a model leaves each candidate takes away: whitened least squares of many columns at once.
+
+With Q an orthonormal basis of the columns that the model has, r = (I - QQᵀ) b is its residual and Z⊥ = (I - QQᵀ) Z what
+a candidate adds. The candidate lowers the residual sum of squares by |P r|², P the projection on Z⊥: twice the log of
+the likelihood ratio, a χ² with as many degrees of freedom as Z⊥ has columns where the candidate is absent.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import chi2
+
+from sms_online.stream import Array
+
+# A column of which the model leaves less than this share is a combination of what it has.
+FREE = 1e-5
+# Singular values below this share of the largest, of columns scaled to unit length, are not solved for.
+RANK_TOLERANCE = 1e-10
+
+
+def basis(columns: Array) -> Array:
+    """Orthonormal basis (M, rank) of columns (M, n)."""
+    norm = np.linalg.norm(columns, axis=0)
+    U, s, _ = np.linalg.svd(columns / np.where(norm > 0.0, norm, 1.0), full_matrices=False)
+    return np.asarray(U[:, s > RANK_TOLERANCE * s[0]])
+
+
+def free_of(Q: Array, columns: Array) -> Array:
+    """What of columns (M, c) is orthogonal to the basis Q (M, rank); projected twice, for rounding."""
+    once = columns - Q @ (Q.T @ columns)
+    return np.asarray(once - Q @ (Q.T @ once))
+
+
+@dataclass(frozen=True)
+class Gain:
+    """What a candidate would do: gain of the residual sum of squares, coefficients (c,), covariance (c, c).
+
+    seen: whether any of its columns is more than a combination of what the model has.
+    """
+
+    gain: float
+    coefficients: Array
+    covariance: Array
+    seen: bool
+
+
+def gain(Q: Array, r: Array, columns: Array) -> Gain:
+    """Of columns (M, c), beside a model with basis Q (M, rank) and residual r (M,)."""
+    c = columns.shape[1]
+    free = free_of(Q, columns)
+    size, left = np.linalg.norm(columns, axis=0), np.linalg.norm(free, axis=0)
+    seen = left > FREE * size
+    coefficients, covariance = np.zeros(c), np.diag(np.full(c, np.inf))
+    if not seen.any():
+        return Gain(0.0, coefficients, covariance, False)
+    kept = np.flatnonzero(seen)
+    scaled = free[:, kept] / left[kept]
+    U, s, Vt = np.linalg.svd(scaled, full_matrices=False)
+    rank = int(np.count_nonzero(s > FREE * s[0]))
+    part = U[:, :rank].T @ r
+    root = Vt[:rank].T / s[:rank] / left[kept, None]
+    coefficients[kept] = root @ part
+    covariance[np.ix_(kept, kept)] = root @ root.T
+    return Gain(float(part @ part), coefficients, covariance, True)
+
+
+def angle(Q: Array, first: Array, second: Array) -> float:
+    """Smallest principal angle, rad, of two candidates' columns (M, ·) beside the model with basis Q."""
+    A, B = (basis(free_of(Q, columns)) for columns in (first, second))
+    cosine = np.linalg.svd(A.T @ B, compute_uv=False)[0]
+    return float(np.arccos(min(1.0, cosine)))
+
+
+def threshold(level: float, trials: int, freedom: int) -> float:
+    """Gain that the best of so many absent candidates of `freedom` columns exceeds with probability `level` at most."""
+    return float(chi2.isf(level / trials, freedom))
+
+
+@dataclass(frozen=True)
+class MeanSquare:
+    """Mean square of rows over their predicted variance, and what it would be with noise alone.
+
+    limit: exceeded by noise alone with the probability asked for. rows: how many.
+    """
+
+    value: float
+    limit: float
+    rows: int
+
+    @property
+    def beyond(self) -> bool:
+        """Whether it is more than noise."""
+        return self.value > self.limit
+
+
+def mean_square(residual: Array, freedom: float, level: float, knowledge: float) -> MeanSquare:
+    """Of whitened residuals (·,) with so many degrees of freedom; knowledge: relative error of the predicted variance.
+
+    Correlated rows have fewer degrees of freedom than there are rows (Satterthwaite, Biometrics Bulletin 2 (1946) 110).
+    """
+    limit = float(chi2.isf(level, freedom)) / freedom * (1.0 + knowledge)
+    return MeanSquare(float(np.mean(residual**2)), limit, residual.size)
+
+
+def effective_freedom(correlations: Sequence[Array], windows: NDArray[np.int64]) -> float:
+    """Degrees of freedom of a mean square over correlated rows, W² / Σ ρ².
+
+    correlations: of each window with those before it, oldest first, its own (1) last. windows: numbers of those meant.
+    """
+    meant = set(windows.tolist())
+    total = 0.0
+    for k in windows.tolist():
+        own = correlations[k]
+        for lag in range(1, own.size):
+            if k - lag in meant:
+                total += 2.0 * own[-1 - lag] ** 2
+        total += 1.0
+    return len(meant) ** 2 / total

@@ -1,0 +1,197 @@
+"""The weak-form rows of a whole session with the noise that its sensors propagate into them, to be whitened.
+
+The rows are those of the streaming balance: the same windows, filter widths and noise. What a missing effect adds to
+them is a column Z: Y β + Z c = b. Columns pass the same test functions and the same whitening.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import scipy.linalg
+
+from sms_online.diagnosis.record import Segment
+from sms_online.diagnosis.weak_windows import WeakWindows, Windows
+from sms_online.model.base_parameters import BaseParameters
+from sms_online.model.model import Model
+from sms_online.pipeline.joint_balance import EXPONENT as JOINT_EXPONENT
+from sms_online.pipeline.joint_balance import JointBalance
+from sms_online.pipeline.momentum_balance import EXPONENT, HOPS, INSTANTS, Instants, MomentumBalance, Window
+from sms_online.pipeline.row_noise import OWN_SHARE, RowNoise
+from sms_online.pipeline.sensing import Sensing
+from sms_online.pipeline.sensitivity import Sensitivities
+from sms_online.pipeline.sensor_noise import FINEST, SensorNoise
+from sms_online.pipeline.smoothing import stride
+from sms_online.stream import Array
+
+# Windows that a diagnosis takes at most. Of more it takes runs of neighbours, five windows long and evenly spread.
+MOST_WINDOWS = 2500
+RUN = 5 * HOPS
+# Instants that the sensitivity to noise is told at in one call.
+TOLD = 64
+# The synthetic noise that tells what noise does beyond first order is the same in every diagnosis.
+SEED = 6
+
+
+class SessionRows:
+    """Rows of the windows of a session, n_v a window.
+
+    beta (n,): values behind the noise of the rows. Y (W, n_v, n), b (W, n_v): rows as they are. std (W, n_v): their own
+    predicted deviation. time (W,): the windows' middles, s since grid index 0. weak: evaluates further columns.
+    """
+
+    def __init__(
+        self,
+        model: Model,
+        base: BaseParameters,
+        sensing: Sensing,
+        noise: SensorNoise,
+        segments: Sequence[Segment],
+        beta: Array,
+    ) -> None:
+        self.model, self.base, self.sensing, self.noise, self.beta = model, base, sensing, noise, beta
+        self.segments = list(segments)
+        rate = model.system.sample_rate
+        balance = MomentumBalance(model, base, rate, model.system.windows.momentum)
+        self._random = np.random.default_rng(SEED)
+        self._covariances: list[list[Array]] = []
+        total = sum(segment.index.size for segment in self.segments) // balance.hop
+        self._every = RUN * max(1.0, total / MOST_WINDOWS)  # windows from one run to the next
+        windows: list[tuple[int, Window]] = []
+        rows: list[Array] = []
+        for number, segment in enumerate(self.segments):
+            for window, dense in self._of_segment(balance, segment):
+                windows.append((number, window))
+                rows.append(dense)
+        n_v = model.layout.n_v
+        stacked = np.array(rows).reshape(-1, n_v, base.n + 1)
+        self.Y, self.b = stacked[..., :-1], stacked[..., -1]
+        self.std = np.sqrt([np.diag(covariances[-1]) for covariances in self._covariances]).reshape(-1, n_v)
+        half = balance.width / 2 + balance.margin
+        self.time = np.array([window.end - half for _, window in windows]) / rate
+        where = Windows(
+            segment=np.array([number for number, _ in windows], dtype=np.int64),
+            # The filter of a window's first sample begins with the segment's.
+            start=np.array([window.start * balance.half_hop + balance.margin for _, window in windows], dtype=np.int64),
+            half_width=np.array([window.half_width for _, window in windows], dtype=np.int64),
+            width=balance.width,
+            exponent=EXPONENT,
+            stride=lambda M: stride(M, balance.hop),
+        )
+        self.weak = WeakWindows(where, model.layout, sensing, self.segments, rate)
+        self.whiten(np.zeros(n_v))
+
+    def _of_segment(self, balance: MomentumBalance, segment: Segment) -> list[tuple[Window, Array]]:
+        """Windows of one segment with their rows [Y b] (n_v, n + 1); their covariances are appended to the others."""
+        noise, n_v = self.noise, self.model.layout.n_v
+        balance.begin_segment()
+        x = self.sensing.coordinates(segment.values)
+        copies = [x, x, x]
+        if not noise.exact:
+            added = np.zeros_like(segment.values)
+            columns = self.sensing.position_columns
+            added[:, columns] = self._random.standard_normal((len(x), len(columns))) * noise.grid
+            copies[1:] = [self.sensing.coordinates(segment.values + sign * added) for sign in (1.0, -1.0)]
+        torque = self.sensing.joint_torque(segment.values)
+        windows, instants = balance.push(segment.index, copies, torque, noise.coordinates)
+        if not windows:
+            return []
+        sensitivities = self._sensitivities(instants, balance.span)
+        row_noise = RowNoise(self.model.layout.theta_m, balance.span)
+        bends, largest = np.empty((0, n_v)), np.zeros(n_v)
+        out = []
+        for begin in np.round(np.arange(0.0, len(windows), self._every)).astype(int).tolist():
+            row_noise.begin_segment()
+            for window in windows[begin : begin + (RUN if self._every > RUN else len(windows))]:
+                covariances = row_noise.covariance(sensitivities.window(window.start), noise.sensors, noise.torque)
+                dense = np.zeros((len(copies), n_v, self.base.n + 1))
+                dense[:, balance.rows, balance.columns] = window.Y
+                dense[:, :, -1] = window.b
+                # What noise does beyond first order, and rounding, as in the fit.
+                residual = dense[..., -1] - dense[..., :-1] @ self.beta
+                bends = np.concatenate((bends[1 - HOPS :], (0.5 * (residual[1] + residual[2]) - residual[0])[None]))
+                largest = np.maximum(largest, np.abs(dense[0, :, :-1]) @ np.abs(self.beta) + np.abs(dense[0, :, -1]))
+                bent = np.maximum(np.mean(bends**2, axis=0), bends[-1] ** 2)
+                covariances[-1][np.diag_indices(n_v)] += bent + (FINEST * largest) ** 2 + np.finfo(np.float64).tiny
+                self._covariances.append(covariances)
+                out.append((window, dense[0]))
+            if self._every <= RUN:
+                break
+        return out
+
+    def _sensitivities(self, instants: list[Instants], span: float) -> Sensitivities:
+        out = Sensitivities(self.model, self.sensing.displacements, span / INSTANTS)
+        pi = self.base.physical_values(self.beta)
+        x, v = (np.concatenate([getattr(piece, part) for piece in instants]) for part in ("x", "v"))
+        for start in range(0, len(x), TOLD):
+            out.tell(pi, x[start : start + TOLD], v[start : start + TOLD])
+        return out
+
+    @property
+    def count(self) -> int:
+        """Number of windows W."""
+        return len(self._covariances)
+
+    def whiten(self, floor: Array) -> None:
+        """Make the windows' rows independent; floor (n_v,): share of a row's variance that is an error of its own."""
+        n_v = self.model.layout.n_v
+        self._operators: list[tuple[Array, Array]] = []
+        L = np.empty((0, 0))
+        for covariances in self._covariances:
+            own = covariances[-1].copy()
+            own[np.diag_indices(n_v)] *= 1.0 + OWN_SHARE + floor
+            size = n_v * (len(covariances) - 1)
+            L = L[len(L) - size :, len(L) - size :]
+            cross = np.concatenate([np.empty((n_v, 0)), *covariances[:-1]], axis=1).T
+            X = scipy.linalg.solve_triangular(L, cross, lower=True, check_finite=False) if size else cross
+            diagonal = np.linalg.cholesky(own - X.T @ X)
+            self._operators.append((X.T, diagonal))
+            grown = np.zeros((size + n_v, size + n_v))
+            grown[:size, :size] = L
+            grown[size:, :size], grown[size:, size:] = X.T, diagonal
+            L = grown
+
+    def white(self, columns: Array) -> Array:
+        """Columns (W, n_v, c) in the whitened rows, (W n_v, c)."""
+        n_v, c = columns.shape[1:]
+        out = np.empty((self.count * n_v, c))
+        for k, (X, diagonal) in enumerate(self._operators):
+            begin = k * n_v
+            rows = columns[k] - X @ out[begin - X.shape[1] : begin]
+            out[begin : begin + n_v] = scipy.linalg.solve_triangular(diagonal, rows, lower=True, check_finite=False)
+        return out
+
+    def freedom(self, speeds: Sequence[int]) -> float:
+        """Degrees of freedom of the mean square of some speeds' rows over their variance, which overlapping rows share.
+
+        2 / variance of the mean of squares of correlated normal numbers: (W S)² / Σ ρ².
+        """
+        total = 0.0
+        deviations = [np.sqrt(np.diag(covariances[-1]))[list(speeds)] for covariances in self._covariances]
+        for k, covariances in enumerate(self._covariances):
+            for lag, block in enumerate(reversed(covariances)):
+                scale = np.outer(deviations[k], deviations[k - lag])
+                part = float(np.sum((block[np.ix_(speeds, speeds)] / scale) ** 2))
+                total += part if lag == 0 else 2.0 * part
+        return (self.count * len(speeds)) ** 2 / total
+
+
+def joint_windows(rows: SessionRows) -> WeakWindows:
+    """The windows of the relative residual over the same session: those of `JointBalance`, all samples seen."""
+    system = rows.model.system
+    balance = JointBalance(rows.model, rows.base, system.sample_rate)
+    M = int(np.median(rows.weak.windows.half_width))
+    starts = [
+        np.arange(M, segment.index.size - M - balance.width - 1, balance.hop, dtype=np.int64)
+        for segment in rows.segments
+    ]
+    where = Windows(
+        segment=np.repeat(np.arange(len(starts)), [each.size for each in starts]),
+        start=np.concatenate(starts),
+        half_width=np.full(sum(each.size for each in starts), M),
+        width=balance.width,
+        exponent=JOINT_EXPONENT,
+        stride=lambda M: 1,
+    )
+    return WeakWindows(where, rows.model.layout, rows.sensing, rows.segments, system.sample_rate)

@@ -1,0 +1,226 @@
+"""From a residual to the effects behind it: greedy selection, checked on held-out rows, with honest doubt.
+
+Candidates compete for what the model leaves of the whitened rows. The best is taken where its gain is no accident among
+all that were tried and where it also lowers the residual of windows that it was not fitted to; then the rest compete
+for what is left. A candidate that takes nearly as much as the one taken is named beside it as indistinguishable.
+Source of the selection: Pati, Rezaiifar and Krishnaprasad, Asilomar Conf. Signals, Systems and Computers (1993) 40
+(orthogonal matching pursuit); of the correction for many candidates: Bonferroni's inequality.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sms_online.description.schema import Effect
+from sms_online.diagnosis.evidence import Gain, basis, free_of, gain, threshold
+from sms_online.diagnosis.rows import SessionRows
+from sms_online.model.parameters import Parameter
+from sms_online.stream import Array
+
+# Probability that a session without any effect beyond the model shows one.
+FALSE_ALARM = 0.01
+# An effect must lower the rms of the held-out rows that it acts on by this share.
+LEAST_IMPROVEMENT = 0.05
+# Candidates whose columns differ by less than 10°, sin² = 0.03 of the gain, are not told apart; nor are those whose
+# likelihoods differ by less than a factor of e^5.
+SAME_SHARE = 0.03
+DECISIVE = 10.0
+# A row is acted on where a candidate's column has at least this share of its largest row's squares.
+ACTS = 0.01
+# Rows whose mean square exceeds their variance by more than this although everything that is known of has been
+# subtracted have an error of their own: friction is never quite its model.
+LARGEST_RATIO = 1.5
+# At most so many effects are looked for in turn.
+MOST_EFFECTS = 8
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """An effect that may be missing.
+
+    effect: as a system file would declare it, shape constants included. parameters: its linear coefficients (c,).
+    columns (W, n_v, c): what one unit of each adds to the rows.
+    """
+
+    effect: Effect
+    parameters: tuple[Parameter, ...]
+    columns: Array
+
+    @property
+    def key(self) -> str:
+        """name@where."""
+        return f"{self.effect.name}@{self.effect.where}"
+
+
+@dataclass(frozen=True)
+class Finding:
+    """An effect that the data show.
+
+    gain: beside everything else that was found, whitened. limit: what the best of all absent candidates would reach.
+    improvement: share by which the rms of held-out rows that it acts on falls. ambiguous: keys of candidates that take
+    nearly as much in its place.
+    """
+
+    candidate: Candidate
+    gain: Gain
+    limit: float
+    improvement: float
+    ambiguous: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class Ranked:
+    """A candidate in the first comparison: share of the residual's excess that it alone takes away, and its gain."""
+
+    candidate: Candidate
+    gain: float
+    share: float
+
+
+class Tracing:
+    """Searches the candidates for what the rows of a session leave.
+
+    fitted (W,): windows that coefficients are fitted to; the others check them.
+    """
+
+    def __init__(self, rows: SessionRows, candidates: Sequence[Candidate], fitted: NDArray[np.bool_]) -> None:
+        self.rows, self.candidates, self.fitted = rows, list(candidates), fitted
+        self._n_v = rows.model.layout.n_v
+        self._plain = [candidate.columns / rows.std[..., None] for candidate in self.candidates]
+        self.floor = self._floor()
+        rows.whiten(self.floor)
+        self._Y, self._b = rows.white(rows.Y), rows.white(rows.b[..., None])[:, 0]
+        self._Z = [rows.white(candidate.columns) for candidate in self.candidates]
+        self.trials = len(self.candidates)
+
+    def _floor(self) -> Array:
+        """Excess of each speed's rows over their variance, (n_v,), that all candidates together leave."""
+        plain = [self.rows.Y / self.rows.std[..., None], *self._plain]
+        stacked = np.concatenate(plain, axis=2).reshape(-1, sum(part.shape[2] for part in plain))
+        b = self.rows.b / self.rows.std
+        left = free_of(basis(stacked), b.reshape(-1, 1)).reshape(b.shape)
+        ratio = np.mean(left**2, axis=0)
+        return np.where(ratio > LARGEST_RATIO, ratio - 1.0, 0.0)
+
+    def _columns(self, chosen: Sequence[int]) -> Array:
+        return np.concatenate([self._Y, *(self._Z[k] for k in chosen)], axis=1)
+
+    def gains(self, chosen: Sequence[int]) -> list[Gain]:
+        """What each candidate would take beside those chosen."""
+        Q = basis(self._columns(chosen))
+        r = free_of(Q, self._b[:, None])[:, 0]
+        return [gain(Q, r, Z) for Z in self._Z]
+
+    def _excess(self, k: int, g: Gain) -> float:
+        return g.gain - threshold(FALSE_ALARM, self.trials, self._Z[k].shape[1])
+
+    def _preferred(self, gains: Sequence[Gain], allowed: Sequence[int]) -> int | None:
+        """The candidate to take: the best one, or one with fewer constants that takes nearly as much."""
+        excess = {k: self._excess(k, gains[k]) for k in allowed}
+        if not excess or max(excess.values()) <= 0.0:
+            return None
+        best = max(allowed, key=lambda k: excess[k])
+        near = [k for k in allowed if excess[k] > 0.0 and self._near(gains[k].gain, gains[best].gain)]
+        return min(near, key=lambda k: (self._constants(k), -gains[k].gain))
+
+    @staticmethod
+    def _near(one: float, best: float) -> bool:
+        return one >= best - max(DECISIVE, SAME_SHARE * best)
+
+    def _constants(self, k: int) -> int:
+        candidate = self.candidates[k]
+        return max(candidate.columns.shape[2], len(candidate.effect.coefficients))
+
+    def run(self) -> list[Finding]:
+        """The effects found, in the order of what they explain."""
+        chosen: list[int] = []
+        refused: set[str] = set()
+        improvements: dict[int, float] = {}
+        while len(chosen) < MOST_EFFECTS:
+            taken = {self.candidates[k].key for k in chosen} | refused
+            allowed = [k for k, candidate in enumerate(self.candidates) if candidate.key not in taken]
+            best = self._preferred(self.gains(chosen), allowed)
+            if best is None:
+                break
+            improvement = self.improvement(chosen, best)
+            if improvement < LEAST_IMPROVEMENT:
+                refused.add(self.candidates[best].key)
+                continue
+            improvements[best] = improvement
+            chosen = self._revised([*chosen, best], improvements)
+        return [self._finding(chosen, k, improvements[k]) for k in chosen]
+
+    def _revised(self, chosen: list[int], improvements: dict[int, float]) -> list[int]:
+        """The same effects without those that the last one has made superfluous, each in its best form beside them."""
+        for k in list(chosen):
+            others = [other for other in chosen if other != k]
+            taken = {self.candidates[other].key for other in others}
+            gains = self.gains(others)
+            free = [j for j, candidate in enumerate(self.candidates) if candidate.key not in taken]
+            best = self._preferred(gains, free)
+            if best is None:
+                chosen = others
+            elif best != k and not self._near(gains[k].gain, gains[best].gain):
+                improvements[best] = self.improvement(others, best)
+                chosen = [best if other == k else other for other in chosen]
+        return chosen
+
+    def improvement(self, chosen: Sequence[int], candidate: int) -> float:
+        """Share by which the rms of the held-out rows that a candidate acts on falls, when it is fitted to the others."""
+        before = self._held_out([*chosen], candidate)
+        after = self._held_out([*chosen, candidate], candidate)
+        return 1.0 - after / before if before > 0.0 else 0.0
+
+    def _held_out(self, chosen: Sequence[int], acting: int) -> float:
+        fit = np.repeat(self.fitted, self._n_v)
+        columns = self._columns(chosen)[fit]
+        size = np.linalg.norm(columns, axis=0)
+        size[size == 0.0] = 1.0
+        beta = np.linalg.lstsq(columns / size, self._b[fit], rcond=1e-10)[0] / size
+        held = ~self.fitted
+        plain = np.concatenate([self.rows.Y / self.rows.std[..., None], *(self._plain[k] for k in chosen)], axis=2)
+        left = (self.rows.b / self.rows.std)[held] - plain[held] @ beta
+        squares = np.sum(self._plain[acting] ** 2, axis=(0, 2))
+        acts = squares > ACTS * squares.max()
+        return float(np.sqrt(np.mean(left[:, acts] ** 2)))
+
+    def _finding(self, chosen: list[int], k: int, improvement: float) -> Finding:
+        gains = self.gains([other for other in chosen if other != k])
+        own = gains[k]
+        taken = {self.candidates[other].key for other in chosen}
+        ambiguous = dict.fromkeys(
+            candidate.key
+            for j, candidate in enumerate(self.candidates)
+            if candidate.key not in taken and gains[j].seen and self._near(gains[j].gain, own.gain)
+        )
+        limit = threshold(FALSE_ALARM, self.trials, self._Z[k].shape[1])
+        return Finding(self.candidates[k], own, limit, improvement, tuple(ambiguous))
+
+    def ranking(self) -> list[Ranked]:
+        """Every effect in its best form, by what it alone takes from the residual."""
+        gains = self.gains([])
+        r = free_of(basis(self._Y), self._b[:, None])[:, 0]
+        excess = max(float(r @ r) - r.size, float(np.finfo(np.float64).tiny))
+        best: dict[str, int] = {}
+        for k, candidate in enumerate(self.candidates):
+            if candidate.key not in best or gains[k].gain > gains[best[candidate.key]].gain:
+                best[candidate.key] = k
+        ranked = [Ranked(self.candidates[k], gains[k].gain, min(1.0, gains[k].gain / excess)) for k in best.values()]
+        return sorted(ranked, key=lambda entry: -entry.gain)
+
+    def solution(self, chosen: Sequence[int], windows: NDArray[np.bool_]) -> Array:
+        """Parameters and coefficients (n + c,) of the model with those chosen, from some windows (W,)."""
+        use = np.repeat(windows, self._n_v)
+        columns = self._columns(chosen)[use]
+        size = np.linalg.norm(columns, axis=0)
+        size[size == 0.0] = 1.0
+        return np.asarray(np.linalg.lstsq(columns / size, self._b[use], rcond=1e-10)[0] / size)
+
+    def residual(self, chosen: Sequence[int], solution: Array) -> Array:
+        """What is left of every row (W, n_v) over its own deviation."""
+        plain = np.concatenate([self.rows.Y / self.rows.std[..., None], *(self._plain[k] for k in chosen)], axis=2)
+        return np.asarray(self.rows.b / self.rows.std - plain @ solution)
