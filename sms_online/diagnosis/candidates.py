@@ -22,6 +22,8 @@ from sms_online.stream import Array
 # the corner as a share of the sample rate, where it delays by a sample and a half.
 CHANNEL_STEP = 1e-4
 LAG_CORNER = 0.15
+# Delay of a lag at least, s.
+SHORTEST_DELAY = 1e-5
 
 
 class CandidateColumns:
@@ -40,6 +42,14 @@ class CandidateColumns:
         self._dynamics = rows.model.dynamics(self.pi)
         self._uncorrected: Array | None = None
 
+    def within(self, weak: WeakWindows) -> CandidateColumns:
+        """The same for other windows of the session."""
+        return CandidateColumns(self.rows, self.system, weak)
+
+    def inputs(self, motion: Motion) -> Inputs:
+        """What the effects that the system declares need beside the motion."""
+        return Inputs(motion.torque, self._states.of_model(motion))
+
     def all(self) -> list[Candidate]:
         """Each effect at each place, with each shape constant of its grid; those that leave no trace left out."""
         made = [self.of(effect) for effect in self.effects()]
@@ -52,7 +62,7 @@ class CandidateColumns:
             if entry.kind == "kinematics":
                 continue
             if entry.kind == "channel":
-                yield effect
+                yield effect.model_copy(update={"coefficients": {}})
                 continue
             grids = {s: shape.grid(self.ranges(effect.where)) for s, shape in entry.shapes.items()}
             grids = {s: values for s, values in grids.items() if s in effect.coefficients}
@@ -84,8 +94,7 @@ class CandidateColumns:
         if ENTRIES[effect.name].kind == "inertia":
 
             def inertia(motion: Motion) -> tuple[Array | None, Array]:
-                inputs = Inputs(motion.torque, np.zeros((len(motion.x), model.n_states)))
-                P, G = model.momentum_columns(motion.x, motion.v, inputs=inputs)
+                P, G = model.momentum_columns(motion.x, motion.v, inputs=self.inputs(motion))
                 return P[..., added], G[..., added]
 
             return Candidate(effect, parameters, self._weak.columns(inertia))
@@ -117,8 +126,7 @@ class CandidateColumns:
         return self._weak.columns(self._momentum, values)
 
     def _momentum(self, motion: Motion) -> tuple[Array | None, Array]:
-        inputs = Inputs(motion.torque, self._states.of_model(motion))
-        p, g = self._dynamics.momentum_and_force(motion.x, motion.v, inputs)
+        p, g = self._dynamics.momentum_and_force(motion.x, motion.v, self.inputs(motion))
         return p[..., None], g[..., None]
 
 
@@ -134,6 +142,25 @@ def _steps(name: str, sample_rate: float) -> list[tuple[str, str, float, dict[st
             corner = LAG_CORNER * sample_rate
             return [("delay", "s", delay_of(corner), {"corner": corner})]
     raise ValueError(f"{name} is no effect on a channel")
+
+
+def with_coefficients(effect: Effect, values: Array) -> Effect:
+    """A channel's effect with its constants changed by linear coefficients, of the session corrected by it so far."""
+    c = effect.coefficients
+    match effect.name:
+        case "encoder_offset":
+            changed = {"offset": c.get("offset", 0.0) + float(values[0])}
+        case "encoder_eccentricity":
+            a, phi = c.get("amplitude", 0.0), c.get("phase", 0.0)
+            sine, cosine = a * np.cos(phi) + values[0], a * np.sin(phi) + values[1]
+            changed = {"amplitude": float(np.hypot(sine, cosine)), "phase": float(np.arctan2(cosine, sine))}
+        case "sensor_lag":
+            # A lag that the data make negative is none: the others lag, or nothing does.
+            delay = max(SHORTEST_DELAY, (delay_of(c["corner"]) if "corner" in c else 0.0) + float(values[0]))
+            changed = {"corner": delay_of(delay)}
+        case _:
+            raise ValueError(f"{effect.name} is no effect on a channel")
+    return effect.model_copy(update={"coefficients": changed})
 
 
 def delay_of(corner: float) -> float:

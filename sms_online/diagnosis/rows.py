@@ -123,9 +123,9 @@ class SessionRows:
     def _sensitivities(self, instants: list[Instants], span: float) -> Sensitivities:
         out = Sensitivities(self.model, self.sensing.displacements, span / INSTANTS)
         pi = self.base.physical_values(self.beta)
-        x, v = (np.concatenate([getattr(piece, part) for piece in instants]) for part in ("x", "v"))
-        for start in range(0, len(x), TOLD):
-            out.tell(pi, x[start : start + TOLD], v[start : start + TOLD])
+        parts = [np.concatenate([getattr(piece, part) for piece in instants]) for part in ("x", "v", "torque")]
+        for start in range(0, len(parts[0]), TOLD):
+            out.tell(pi, *(part[start : start + TOLD] for part in parts))
         return out
 
     @property

@@ -16,10 +16,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sms_online.description.schema import Effect
-from sms_online.diagnosis.evidence import Gain, basis, free_of, gain, threshold
+from sms_online.diagnosis.evidence import RANK_TOLERANCE, Gain, basis, free_of, gain, threshold
 from sms_online.diagnosis.rows import SessionRows
 from sms_online.model.parameters import Parameter
 from sms_online.stream import Array
+from sms_online.trackers.factor import prior_factor
+from sms_online.trackers.interface import Prior
 
 # Probability that a session without any effect beyond the model shows one.
 FALSE_ALARM = 0.01
@@ -87,19 +89,33 @@ class Tracing:
     fitted (W,): windows that coefficients are fitted to; the others check them.
     """
 
-    def __init__(self, rows: SessionRows, candidates: Sequence[Candidate], fitted: NDArray[np.bool_]) -> None:
+    def __init__(
+        self,
+        rows: SessionRows,
+        candidates: Sequence[Candidate],
+        fitted: NDArray[np.bool_],
+        prior: Prior | None = None,
+        fixed: Sequence[Candidate] = (),
+    ) -> None:
+        """fixed: effects that belong to the model already, whose columns come right after its parameters'."""
         self.rows, self.candidates, self.fitted = rows, list(candidates), fitted
         self._n_v = rows.model.layout.n_v
+        self._model = np.concatenate([rows.Y, *(candidate.columns for candidate in fixed)], axis=2)
+        self._plain_model = self._model / rows.std[..., None]
         self._plain = [candidate.columns / rows.std[..., None] for candidate in self.candidates]
         self.floor = self._floor()
         rows.whiten(self.floor)
-        self._Y, self._b = rows.white(rows.Y), rows.white(rows.b[..., None])[:, 0]
-        self._Z = [rows.white(candidate.columns) for candidate in self.candidates]
+        # What is known beforehand are rows too, of parameters alone.
+        known = prior_factor(prior, rows.base.n)
+        more = self._model.shape[2] - rows.base.n
+        self._Y = np.concatenate((rows.white(self._model), np.pad(known[:, :-1], ((0, 0), (0, more)))))
+        self._b = np.concatenate((rows.white(rows.b[..., None])[:, 0], known[:, -1]))
+        self._Z = [self._whitened(candidate) for candidate in self.candidates]
         self.trials = len(self.candidates)
 
     def _floor(self) -> Array:
         """Excess of each speed's rows over their variance, (n_v,), that all candidates together leave."""
-        plain = [self.rows.Y / self.rows.std[..., None], *self._plain]
+        plain = [self._plain_model, *self._plain]
         stacked = np.concatenate(plain, axis=2).reshape(-1, sum(part.shape[2] for part in plain))
         b = self.rows.b / self.rows.std
         left = free_of(basis(stacked), b.reshape(-1, 1)).reshape(b.shape)
@@ -114,6 +130,21 @@ class Tracing:
         Q = basis(self._columns(chosen))
         r = free_of(Q, self._b[:, None])[:, 0]
         return [gain(Q, r, Z) for Z in self._Z]
+
+    def gain_of(self, candidate: Candidate, chosen: Sequence[int]) -> Gain:
+        """What any candidate would take beside those chosen."""
+        Q = basis(self._columns(chosen))
+        return gain(Q, free_of(Q, self._b[:, None])[:, 0], self._whitened(candidate))
+
+    def put(self, k: int, candidate: Candidate) -> None:
+        """Put another form of an effect in the place of a candidate."""
+        self.candidates[k] = candidate
+        self._plain[k] = candidate.columns / self.rows.std[..., None]
+        self._Z[k] = self._whitened(candidate)
+
+    def _whitened(self, candidate: Candidate) -> Array:
+        white = self.rows.white(candidate.columns)
+        return np.concatenate((white, np.zeros((len(self._Y) - len(white), white.shape[1]))))
 
     def _excess(self, k: int, g: Gain) -> float:
         return g.gain - threshold(FALSE_ALARM, self.trials, self._Z[k].shape[1])
@@ -135,26 +166,23 @@ class Tracing:
         candidate = self.candidates[k]
         return max(candidate.columns.shape[2], len(candidate.effect.coefficients))
 
-    def run(self) -> list[Finding]:
-        """The effects found, in the order of what they explain."""
+    def run(self) -> list[int]:
+        """Numbers of the candidates found, in the order of what they explain."""
         chosen: list[int] = []
         refused: set[str] = set()
-        improvements: dict[int, float] = {}
         while len(chosen) < MOST_EFFECTS:
             taken = {self.candidates[k].key for k in chosen} | refused
             allowed = [k for k, candidate in enumerate(self.candidates) if candidate.key not in taken]
             best = self._preferred(self.gains(chosen), allowed)
             if best is None:
                 break
-            improvement = self.improvement(chosen, best)
-            if improvement < LEAST_IMPROVEMENT:
+            if self.improvement(chosen, best) < LEAST_IMPROVEMENT:
                 refused.add(self.candidates[best].key)
                 continue
-            improvements[best] = improvement
-            chosen = self._revised([*chosen, best], improvements)
-        return [self._finding(chosen, k, improvements[k]) for k in chosen]
+            chosen = self._revised([*chosen, best])
+        return chosen
 
-    def _revised(self, chosen: list[int], improvements: dict[int, float]) -> list[int]:
+    def _revised(self, chosen: list[int]) -> list[int]:
         """The same effects without those that the last one has made superfluous, each in its best form beside them."""
         for k in list(chosen):
             others = [other for other in chosen if other != k]
@@ -165,7 +193,6 @@ class Tracing:
             if best is None:
                 chosen = others
             elif best != k and not self._near(gains[k].gain, gains[best].gain):
-                improvements[best] = self.improvement(others, best)
                 chosen = [best if other == k else other for other in chosen]
         return chosen
 
@@ -176,20 +203,19 @@ class Tracing:
         return 1.0 - after / before if before > 0.0 else 0.0
 
     def _held_out(self, chosen: Sequence[int], acting: int) -> float:
-        fit = np.repeat(self.fitted, self._n_v)
-        columns = self._columns(chosen)[fit]
-        size = np.linalg.norm(columns, axis=0)
-        size[size == 0.0] = 1.0
-        beta = np.linalg.lstsq(columns / size, self._b[fit], rcond=1e-10)[0] / size
+        beta = self.solution(chosen, self.fitted)
         held = ~self.fitted
-        plain = np.concatenate([self.rows.Y / self.rows.std[..., None], *(self._plain[k] for k in chosen)], axis=2)
+        plain = np.concatenate([self._plain_model, *(self._plain[k] for k in chosen)], axis=2)
         left = (self.rows.b / self.rows.std)[held] - plain[held] @ beta
         squares = np.sum(self._plain[acting] ** 2, axis=(0, 2))
         acts = squares > ACTS * squares.max()
         return float(np.sqrt(np.mean(left[:, acts] ** 2)))
 
-    def _finding(self, chosen: list[int], k: int, improvement: float) -> Finding:
-        gains = self.gains([other for other in chosen if other != k])
+    def finding(self, chosen: Sequence[int], k: int) -> Finding:
+        """What is to be said of one of the candidates chosen."""
+        others = [other for other in chosen if other != k]
+        gains = self.gains(others)
+        improvement = self.improvement(others, k)
         own = gains[k]
         taken = {self.candidates[other].key for other in chosen}
         ambiguous = dict.fromkeys(
@@ -212,15 +238,20 @@ class Tracing:
         ranked = [Ranked(self.candidates[k], gains[k].gain, min(1.0, gains[k].gain / excess)) for k in best.values()]
         return sorted(ranked, key=lambda entry: -entry.gain)
 
+    def columns(self, chosen: Sequence[int]) -> Array:
+        """Columns (W, n_v, n + c) of the model with those chosen."""
+        return np.concatenate([self._model, *(self.candidates[k].columns for k in chosen)], axis=2)
+
     def solution(self, chosen: Sequence[int], windows: NDArray[np.bool_]) -> Array:
         """Parameters and coefficients (n + c,) of the model with those chosen, from some windows (W,)."""
-        use = np.repeat(windows, self._n_v)
+        use = np.ones(len(self._b), dtype=bool)
+        use[: windows.size * self._n_v] = np.repeat(windows, self._n_v)
         columns = self._columns(chosen)[use]
         size = np.linalg.norm(columns, axis=0)
         size[size == 0.0] = 1.0
-        return np.asarray(np.linalg.lstsq(columns / size, self._b[use], rcond=1e-10)[0] / size)
+        return np.asarray(np.linalg.lstsq(columns / size, self._b[use], rcond=RANK_TOLERANCE)[0] / size)
 
     def residual(self, chosen: Sequence[int], solution: Array) -> Array:
         """What is left of every row (W, n_v) over its own deviation."""
-        plain = np.concatenate([self.rows.Y / self.rows.std[..., None], *(self._plain[k] for k in chosen)], axis=2)
+        plain = np.concatenate([self._plain_model, *(self._plain[k] for k in chosen)], axis=2)
         return np.asarray(self.rows.b / self.rows.std - plain @ solution)

@@ -1,0 +1,77 @@
+"""What a model leaves of a session's rows, by row type, beside what noise alone would leave."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import chi2
+
+from sms_online.diagnosis.rows import SessionRows
+from sms_online.model.layout import Layout
+from sms_online.stream import Array
+
+# Sensors' noise, and with it the predicted variance of rows, is known to a tenth where it is estimated from samples.
+NOISE_KNOWN = 0.1
+# Probability that noise alone takes any row type beyond its limit.
+FALSE_ALARM = 0.01
+
+
+def row_types(layout: Layout) -> dict[str, list[int]]:
+    """Generalized speeds by row type: `joint_i` holds the motor's torque, `link_i` what moves with link i, `base`."""
+    out = {f"joint_{i}": [theta_m] for i, theta_m in enumerate(layout.theta_m, start=1)}
+    for i, (q, theta_m, q_f) in enumerate(zip(layout.q, layout.theta_m, layout.q_f, strict=True), start=1):
+        rows = [*range(q_f.start, q_f.stop), *([q] if q != theta_m else [])]
+        if rows:
+            out[f"link_{i}"] = rows
+    if layout.n_base_speeds:
+        out["base"] = list(range(layout.n_base_speeds))
+    return out
+
+
+@dataclass(frozen=True)
+class RowResidual:
+    """Of one row type: whitened is the rms over the predicted deviation, limit what noise alone exceeds in one of
+    1 / FALSE_ALARM sessions."""
+
+    whitened: float
+    limit: float
+
+    @property
+    def beyond(self) -> bool:
+        """Whether it is more than noise."""
+        return self.whitened > self.limit
+
+
+class ResidualTest:
+    """Tests residuals (W, n_v), each row over its own predicted deviation, against noise alone.
+
+    Mean squares of rows that share noise have fewer degrees of freedom than there are rows. Source of the approximation:
+    Satterthwaite, Biometrics Bulletin 2 (1946) 110.
+    """
+
+    def __init__(self, rows: SessionRows) -> None:
+        self.types = row_types(rows.model.layout)
+        freedom = {name: rows.freedom(speeds) for name, speeds in self.types.items()}
+        level = FALSE_ALARM / len(self.types)
+        self.limit = {
+            name: float(np.sqrt(chi2.isf(level, nu) / nu)) * (1.0 + NOISE_KNOWN) for name, nu in freedom.items()
+        }
+
+    def of(self, residual: Array) -> dict[str, RowResidual]:
+        """By row type."""
+        return {
+            name: RowResidual(rms(residual[:, speeds]), self.limit[name]) for name, speeds in self.types.items()
+        }
+
+
+def whitened(rows: SessionRows, residual: Array, windows: NDArray[np.bool_]) -> dict[str, float]:
+    """rms by row type over some windows (W,)."""
+    return {name: rms(residual[windows][:, speeds]) for name, speeds in row_types(rows.model.layout).items()}
+
+
+def rms(values: Array | Sequence[float]) -> float:
+    """Root mean square."""
+    return float(np.sqrt(np.mean(np.square(values))))

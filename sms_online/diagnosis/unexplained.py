@@ -1,0 +1,108 @@
+"""What can be said of a residual that no known effect explains: where it is, and what it depends on."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.interpolate import BSpline
+
+from sms_online.diagnosis.evidence import basis, free_of, gain
+from sms_online.diagnosis.residuals import row_types
+from sms_online.diagnosis.rows import SessionRows
+from sms_online.diagnosis.weak_windows import Motion
+from sms_online.stream import Array
+
+# Cubic splines on so many intervals of a variable's range.
+INTERVALS = 8
+DEGREE = 3
+# Points at which a spline is reported.
+POINTS = 25
+
+Variable = Callable[[Motion], Array]
+
+
+@dataclass(frozen=True)
+class Unexplained:
+    """A force that stands in for what is not known.
+
+    row: row type with most of the residual; speed: the generalized speed in it. variable: what the force depends on most
+    clearly, with its unit. share: of the residual's excess over noise in all rows that it takes away. at, force
+    (POINTS,): the force over the variable's range, in N m (N).
+    """
+
+    row: str
+    speed: str
+    variable: str
+    share: float
+    at: Array
+    force: Array
+
+
+def describe_residual(rows: SessionRows, columns: Array, residual: Array) -> Unexplained:
+    """Find row and variable. columns (W, n_v, n): of the model with what was adopted; residual (W, n_v): what it leaves."""
+    layout = rows.model.layout
+    excess = np.sum(residual**2 - 1.0, axis=0)
+    by_type = {name: float(excess[speeds].sum()) for name, speeds in row_types(layout).items()}
+    row = max(by_type, key=lambda name: by_type[name])
+    speed = max(row_types(layout)[row], key=lambda k: excess[k])
+    Q = basis((columns / rows.std[..., None]).reshape(-1, columns.shape[2]))
+    r = free_of(Q, residual.reshape(-1, 1))[:, 0]
+    best = None
+    for name, variable in _variables(rows).items():
+        knots = _knots(rows, variable)
+        if knots is None:
+            continue
+        spline = _columns(rows, variable, knots, speed) / rows.std[..., None]
+        found = gain(Q, r, spline.reshape(-1, spline.shape[2]))
+        if best is None or found.gain > best[0].gain:
+            best = found, name, knots
+    assert best is not None
+    found, name, knots = best
+    at = np.linspace(knots[DEGREE], knots[-1 - DEGREE], POINTS)
+    share = min(1.0, found.gain / max(float(excess.sum()), float(np.finfo(np.float64).tiny)))
+    return Unexplained(row, layout.speed_names[speed], name, share, at, _design(at, knots) @ found.coefficients)
+
+
+def _variables(rows: SessionRows) -> dict[str, Variable]:
+    """What a force may depend on: positions and speeds, deflections of joints and their rates, torques, time."""
+    layout = rows.model.layout
+    offset = layout.n_base_positions - layout.n_base_speeds
+    out: dict[str, Variable] = {}
+    for k, name in enumerate(layout.position_names):
+        out[name] = lambda motion, k=k: motion.x[:, k]
+    for k, name in enumerate(layout.speed_names):
+        out[f"rate of {name}"] = lambda motion, k=k: motion.v[:, k]
+    for i, (q, theta_m) in enumerate(zip(layout.q, layout.theta_m, strict=True), start=1):
+        if q != theta_m:
+            out[f"deflection of joint_{i}"] = lambda motion, q=q, m=theta_m: motion.x[:, m + offset] - motion.x[:, q + offset]
+        out[f"torque of joint_{i}"] = lambda motion, i=i: motion.torque[:, i - 1]
+    rate = rows.model.system.sample_rate
+    out["time"] = lambda motion: (rows.segments[motion.segment].index[0] + motion.samples) / rate
+    return out
+
+
+def _knots(rows: SessionRows, variable: Variable) -> Array | None:
+    """Knots over the range that the variable goes through, None where it stands still."""
+    values = np.concatenate([variable(motion) for motion, _ in rows.weak.motions()])
+    low, high = float(values.min()), float(values.max())
+    if not high > low:
+        return None
+    inner = np.linspace(low, high, INTERVALS + 1)
+    return np.concatenate((np.full(DEGREE, low), inner, np.full(DEGREE, high)))
+
+
+def _design(values: Array, knots: Array) -> Array:
+    inside = np.clip(values, knots[0], knots[-1])
+    return np.asarray(BSpline.design_matrix(inside, knots, DEGREE).toarray())
+
+
+def _columns(rows: SessionRows, variable: Variable, knots: Array, speed: int) -> Array:
+    def weak(motion: Motion) -> tuple[None, Array]:
+        design = _design(variable(motion), knots)
+        G = np.zeros((len(design), rows.model.layout.n_v, design.shape[1]))
+        G[:, speed] = design
+        return None, G
+
+    return rows.weak.columns(weak)
