@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from fnmatch import fnmatchcase
 from itertools import product
 
 import numpy as np
@@ -18,10 +19,13 @@ from sms_online.model.model import Model
 from sms_online.model.parameters import Parameter
 from sms_online.stream import Array
 
-# Size of a channel's effect in the difference that makes its column: of an offset and an amplitude in rad (m), of a lag
-# the corner as a share of the sample rate, where it delays by a sample and a half.
-CHANNEL_STEP = 1e-4
-LAG_CORNER = 0.15
+# Linear coefficients of effects on channels: quantity, unit, what a unit of it adds to a reading, with its sign. A lag
+# of a delay T reads x - T ẋ, an eccentric disc x + a sin x + b cos x.
+LINEAR = {
+    "encoder_offset": (("offset", "rad", "one", -1.0),),
+    "encoder_eccentricity": (("sine", "rad", "sine", -1.0), ("cosine", "rad", "cosine", -1.0)),
+    "sensor_lag": (("delay", "s", "rate", 1.0),),
+}
 # Delay of a lag at least, s.
 SHORTEST_DELAY = 1e-5
 
@@ -39,8 +43,6 @@ class CandidateColumns:
         self.pi = rows.base.physical_values(rows.beta)
         self._own = {p.name for p in rows.model.parameters}
         self._states = InternalStates(rows)
-        self._dynamics = rows.model.dynamics(self.pi)
-        self._uncorrected: Array | None = None
 
     def within(self, weak: WeakWindows) -> CandidateColumns:
         """The same for other windows of the session."""
@@ -108,40 +110,21 @@ class CandidateColumns:
         return Candidate(effect, parameters, self._weak.columns(columns))
 
     def _channel(self, effect: Effect) -> Candidate:
-        """Columns that are differences: of rows from corrected samples and rows from the samples as they are."""
+        """What is added to readings, times the rows' response to it; in other windows than the rows' there is none.
+
+        An effect y = x + c d(x) on a reading y is taken off by y - c d, so rows of readings lack -c times the response.
+        """
+        layout = self.rows.model.layout
         columns, parameters = [], []
-        for quantity, unit, step, coefficients in _steps(effect.name, self.system.sample_rate):
-            moved = effect.model_copy(update={"coefficients": coefficients})
-            columns.append((self._momenta(moved) - self._momenta(None)) / step)
+        for quantity, unit, displacement, sign in LINEAR[effect.name]:
+            names = [self.rows.sensing.channels[k] for k in self.rows.sensing.position_columns]
+            acts = [k for k, name in enumerate(names) if fnmatchcase(name, effect.where)]
+            response = np.zeros((self._weak.count, layout.n_v))
+            if self._weak is self.rows.weak:
+                response = sign * self.rows.responses[displacement][:, :, acts].sum(axis=2)
+            columns.append(response)
             parameters.append(Parameter(f"{effect.name}@{effect.where}.{quantity}", quantity, unit, 0.0))
-        return Candidate(effect, tuple(parameters), np.concatenate(columns, axis=2))
-
-    def _momenta(self, effect: Effect | None) -> Array:
-        """Rows (W, n_v, 1) of the momentum and force of `pi` along the session, or along what a correction makes of it."""
-        if effect is None:
-            if self._uncorrected is None:
-                self._uncorrected = self._weak.columns(self._momentum)
-            return self._uncorrected
-        values = [corrected(self.rows.sensing.channels, s.values, effect, self.system) for s in self.rows.segments]
-        return self._weak.columns(self._momentum, values)
-
-    def _momentum(self, motion: Motion) -> tuple[Array | None, Array]:
-        p, g = self._dynamics.momentum_and_force(motion.x, motion.v, self.inputs(motion))
-        return p[..., None], g[..., None]
-
-
-def _steps(name: str, sample_rate: float) -> list[tuple[str, str, float, dict[str, float]]]:
-    """Linear coefficients of a channel's effect: quantity, unit, step, and the declaration of so much of it."""
-    match name:
-        case "encoder_offset":
-            return [("offset", "rad", CHANNEL_STEP, {"offset": CHANNEL_STEP})]
-        case "encoder_eccentricity":
-            phases = {"sine": 0.0, "cosine": 0.5 * np.pi}
-            return [(q, "rad", CHANNEL_STEP, {"amplitude": CHANNEL_STEP, "phase": p}) for q, p in phases.items()]
-        case "sensor_lag":
-            corner = LAG_CORNER * sample_rate
-            return [("delay", "s", delay_of(corner), {"corner": corner})]
-    raise ValueError(f"{name} is no effect on a channel")
+        return Candidate(effect, tuple(parameters), np.stack(columns, axis=2))
 
 
 def with_coefficients(effect: Effect, values: Array) -> Effect:

@@ -10,12 +10,12 @@ from numpy.typing import NDArray
 
 from sms_online.description.schema import Effect, System
 from sms_online.diagnosis.candidates import CandidateColumns, corrected, with_coefficients
-from sms_online.diagnosis.record import SampleRecord, Segment
+from sms_online.diagnosis.record import LONGEST, SampleRecord, Segment, excerpts
 from sms_online.diagnosis.relative import RelativeResiduals
 from sms_online.diagnosis.residuals import ResidualTest, RowResidual, whitened
 from sms_online.diagnosis.rows import SessionRows
 from sms_online.diagnosis.shape import refine
-from sms_online.diagnosis.trace import Finding, Ranked, Tracing
+from sms_online.diagnosis.trace import Candidate, Finding, Ranked, Tracing
 from sms_online.diagnosis.unexplained import Unexplained, describe_residual
 from sms_online.effects.catalogue import ENTRIES, places
 from sms_online.errors import InputError
@@ -29,8 +29,10 @@ FITTED = 2.0 / 3.0
 LARGEST_SHARE_LEFT = 0.1
 # Times that the constants of channels' effects are improved, each with samples corrected by those found before.
 CORRECTIONS = 3
-# Times that a search begins anew after channels have been corrected.
-ROUNDS = 2
+# Stretches of a session that is used in part, in window lengths.
+STRETCH = 5.0
+# Part of a session that tells which kinematics of links are nearer, and improves channels' constants, s.
+SOME = 8.0
 
 
 @dataclass(frozen=True)
@@ -98,9 +100,11 @@ class Attempt:
         held: Sequence[Segment],
         prior: PriorOf,
         beta: Array | None = None,
-        effects: Sequence[Effect] | None = None,
+        candidates: Sequence[Candidate] | Sequence[Effect] | None = None,
+        most: float = LONGEST,
     ) -> None:
-        """beta (n,): behind the noise of rows, those of the session unless given. effects: candidates, all by default."""
+        """beta (n,): behind the noise of rows, the session's unless given. candidates: all by default; columns made for
+        the same windows before serve to search. most: s of the session that are used."""
         self.system, self._session = system, session
         momentum = session.momentum
         assert momentum is not None
@@ -115,19 +119,26 @@ class Attempt:
                 beta = np.where(known.known, known.value, beta)
         noise = replace(noise, coordinates=estimator.sensing.coordinate_noise(noise.grid))
         channels = session.sensing.channels
-        values = [_without_channel_effects(system, channels, segment) for segment in (*segments, *held)]
+        length, most_samples = (
+            round(seconds * system.sample_rate) for seconds in (STRETCH * system.windows.momentum, most)
+        )
+        parts = [excerpts(each, length, most_samples) for each in (segments, held)]
+        values = [_without_channel_effects(system, channels, segment) for part in parts for segment in part]
         self.rows = SessionRows(estimator.model, estimator.base, estimator.sensing, noise, values, beta)
         if self.rows.count == 0:
             raise InputError(system.name, "", "no gapless stretch of a window's length", "more samples")
         self.make = CandidateColumns(self.rows, system)
         self.fixed = [effect for effect in system.effects if ENTRIES[effect.name].kind == "channel"]
-        self._fitting = len(segments)
+        self._fitting = len(parts[0])
         first, last = self.rows.time[0], self.rows.time[-1]
         self._split = np.inf if held else first + FITTED * (last - first)
         fitted = self._fitted(self.rows.time, self.rows.weak.windows.segment)
-        candidates = self.make.all() if effects is None else [self.make.of(effect) for effect in effects]
+        made = self.make.all() if candidates is None else [self._made(candidate) for candidate in candidates]
         fixed = [self.make.of(effect) for effect in self.fixed]
-        self.tracing = Tracing(self.rows, candidates, fitted, known, fixed)
+        self.tracing = Tracing(self.rows, made, fitted, known, fixed)
+
+    def _made(self, candidate: Candidate | Effect) -> Candidate:
+        return candidate if isinstance(candidate, Candidate) else self.make.of(candidate)
 
     def _fitted(self, time: Array, segment: NDArray[np.int64]) -> NDArray[np.bool_]:
         return np.asarray((segment < self._fitting) & (time < self._split))
@@ -196,6 +207,11 @@ def _without_channel_effects(system: System, channels: tuple[str, ...], segment:
     return Segment(segment.index, values)
 
 
+def _without(system: System, effects: Sequence[Effect]) -> System:
+    """The system without some of its effects."""
+    return system.model_copy(update={"effects": tuple(effect for effect in system.effects if effect not in effects)})
+
+
 def _exact(system: System) -> System | None:
     """The system with all its links exact, by effects that say so; None where there is no linear one."""
     links = places(system, ENTRIES["geometric_stiffening"].at)
@@ -229,38 +245,40 @@ def diagnose(
     chosen = attempt.tracing.run()
     ranking = attempt.tracing.ranking()
     bare = described.state([])
-    exact = _exact(system) if any(row.beyond for row in bare.test.values()) else None
-    if exact is not None:
+    exact = _exact(system)
+    if exact is not None and any(row.beyond for row in attempt.state(chosen).test.values()):
         progress("comparing exact links")
-        other = Attempt(exact, before, segments, held, prior, described.solution([])[: described.rows.base.n], [])
-        if other.excess([]) < described.excess(chosen[:1]):
-            attempt = Attempt(exact, before, segments, held, prior, other.solution([])[: other.rows.base.n])
+        beta = described.solution([])[: described.rows.base.n]
+        forces = [attempt.tracing.candidates[k].effect for k in chosen[:1]]
+        linear, other = (
+            Attempt(each, before, segments, held, prior, beta, effects, SOME).excess(range(len(effects)))
+            for each, effects in ((system, forces), (exact, []))
+        )
+        if other < linear:
+            attempt = Attempt(exact, before, segments, held, prior, beta)
             chosen = attempt.tracing.run()
-    for _ in range(ROUNDS):
-        refine(attempt.tracing, attempt.make, chosen)
-        if not any(ENTRIES[attempt.tracing.candidates[k].effect.name].kind == "channel" for k in chosen):
-            break
+    while any(attempt.tracing.candidates[k].of_channel for k in chosen):
         progress("correcting channels")
-        improved, beta = attempt.adopted(chosen, attempt.solution(chosen)), attempt.rows.beta
-        forces = [effect for effect in improved.effects if effect not in attempt.system.effects
-                  and ENTRIES[effect.name].kind != "channel"]
-        improved = improved.model_copy(update={"effects": tuple(e for e in improved.effects if e not in forces)})
+        solution, n = attempt.solution(chosen), attempt.rows.base.n
+        system_then, beta = attempt.adopted(chosen, solution), solution[:n]
+        forces = [attempt.tracing.candidates[k].effect for k in chosen if not attempt.tracing.candidates[k].of_channel]
+        improved = _without(system_then, forces)
         for _ in range(CORRECTIONS):
-            attempt = Attempt(improved, before, segments, held, prior, beta, forces)
-            solution = attempt.solution(range(len(forces)))
-            improved, beta = attempt.increments(solution), solution[: attempt.rows.base.n]
-        attempt = Attempt(improved, before, segments, held, prior, beta)
+            fewer = Attempt(improved, before, segments, held, prior, beta, forces, SOME)
+            solution = fewer.solution(range(len(forces)))
+            improved, beta = fewer.increments(solution), solution[:n]
+        corrected_keys = {(effect.name, effect.where) for effect in improved.effects}
+        others = [c for c in attempt.tracing.candidates if (c.effect.name, c.effect.where) not in corrected_keys]
+        attempt = Attempt(improved, before, segments, held, prior, beta, others)
         chosen = attempt.tracing.run()
+    refine(attempt.tracing, attempt.make, chosen)
     after = attempt.state(chosen)
     progress("fitting the model with what was found")
     named = bool(after.system.effects != system.effects)
     estimator_after = _session(after.system, blocks, source, prior)[0] if named else before
     left = max(0.0, after.excess) / max(bare.excess, 1.0)
     beyond = any(row.beyond for row in after.test.values())
-    if beyond and left > LARGEST_SHARE_LEFT:
-        verdict = "unexplained"
-    else:
-        verdict = "named" if named else "clean"
+    verdict = "unexplained" if beyond and left > LARGEST_SHARE_LEFT else "named" if named else "clean"
     unexplained = None
     if verdict == "unexplained":
         unexplained = describe_residual(attempt.rows, attempt.tracing.columns(chosen), after.residual)
@@ -268,9 +286,7 @@ def diagnose(
     return Diagnosis(verdict, findings, ranking, bare, after, before, estimator_after, unexplained)
 
 
-def _session(
-    system: System, blocks: Sequence[Block], source: str, prior: PriorOf
-) -> tuple[Estimator, SampleRecord]:
+def _session(system: System, blocks: Sequence[Block], source: str, prior: PriorOf) -> tuple[Estimator, SampleRecord]:
     estimator = Estimator(system, blocks[0].channels, source)
     record = SampleRecord(system.sample_rate)
     estimator.on_samples = record.add

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -47,3 +48,17 @@ class SampleRecord:
             index, values = (np.concatenate([getattr(piece, part) for piece in own]) for part in ("index", "values"))
             out.append(Segment(index, values))
         return out
+
+
+def excerpts(segments: Sequence[Segment], length: int, most: int) -> list[Segment]:
+    """Stretches of `length` samples, evenly spread over segments that hold more than `most`; else the segments."""
+    total = sum(segment.index.size for segment in segments)
+    if total <= most:
+        return list(segments)
+    out = []
+    for segment in segments:
+        size = segment.index.size
+        count = max(1, int(most * size / total) // length)
+        for start in np.linspace(0, max(0, size - length), count).astype(int).tolist():
+            out.append(Segment(segment.index[start : start + length], segment.values[start : start + length]))
+    return out

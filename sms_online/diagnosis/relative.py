@@ -1,4 +1,4 @@
-"""Residual of each joint relative to its measured torque or force, in the short windows that all sessions are judged by."""
+"""Residual of each joint relative to its measured torque or force, in the short windows that sessions are judged by."""
 
 from __future__ import annotations
 

@@ -48,8 +48,8 @@ class RowResidual:
 class ResidualTest:
     """Tests residuals (W, n_v), each row over its own predicted deviation, against noise alone.
 
-    Mean squares of rows that share noise have fewer degrees of freedom than there are rows. Source of the approximation:
-    Satterthwaite, Biometrics Bulletin 2 (1946) 110.
+    Mean squares of rows that share noise have fewer degrees of freedom than there are rows (Satterthwaite, Biometrics
+    Bulletin 2 (1946) 110).
     """
 
     def __init__(self, rows: SessionRows) -> None:
@@ -62,9 +62,7 @@ class ResidualTest:
 
     def of(self, residual: Array) -> dict[str, RowResidual]:
         """By row type."""
-        return {
-            name: RowResidual(rms(residual[:, speeds]), self.limit[name]) for name, speeds in self.types.items()
-        }
+        return {name: RowResidual(rms(residual[:, speeds]), self.limit[name]) for name, speeds in self.types.items()}
 
 
 def whitened(rows: SessionRows, residual: Array, windows: NDArray[np.bool_]) -> dict[str, float]:

@@ -6,7 +6,7 @@ them is a column Z: Y β + Z c = b. Columns pass the same test functions and the
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 import scipy.linalg
@@ -18,20 +18,24 @@ from sms_online.model.model import Model
 from sms_online.pipeline.joint_balance import EXPONENT as JOINT_EXPONENT
 from sms_online.pipeline.joint_balance import JointBalance
 from sms_online.pipeline.momentum_balance import EXPONENT, HOPS, INSTANTS, Instants, MomentumBalance, Window
-from sms_online.pipeline.row_noise import OWN_SHARE, RowNoise
+from sms_online.pipeline.row_noise import OWN_SHARE, STEPS, RowNoise
 from sms_online.pipeline.sensing import Sensing
 from sms_online.pipeline.sensitivity import Sensitivities
 from sms_online.pipeline.sensor_noise import FINEST, SensorNoise
-from sms_online.pipeline.smoothing import stride
+from sms_online.pipeline.smoothing import smooth, stride
 from sms_online.stream import Array
 
-# Windows that a diagnosis takes at most. Of more it takes runs of neighbours, five windows long and evenly spread.
-MOST_WINDOWS = 2500
-RUN = 5 * HOPS
 # Instants that the sensitivity to noise is told at in one call.
 TOLD = 64
 # The synthetic noise that tells what noise does beyond first order is the same in every diagnosis.
 SEED = 6
+# What channels' effects add to a reading y, for a unit of a coefficient: names of `SessionRows.responses`.
+DISPLACEMENTS = ("one", "sine", "cosine", "rate")
+
+
+def _displacements(readings: Array, rates: Array) -> Array:
+    """1, sin y, cos y and ẏ (4, T, sensors)."""
+    return np.stack((np.ones_like(readings), np.sin(readings), np.cos(readings), rates))
 
 
 class SessionRows:
@@ -52,12 +56,11 @@ class SessionRows:
     ) -> None:
         self.model, self.base, self.sensing, self.noise, self.beta = model, base, sensing, noise, beta
         self.segments = list(segments)
-        rate = model.system.sample_rate
+        self._rate = rate = model.system.sample_rate
         balance = MomentumBalance(model, base, rate, model.system.windows.momentum)
         self._random = np.random.default_rng(SEED)
         self._covariances: list[list[Array]] = []
-        total = sum(segment.index.size for segment in self.segments) // balance.hop
-        self._every = RUN * max(1.0, total / MOST_WINDOWS)  # windows from one run to the next
+        self._responses: list[Array] = []
         windows: list[tuple[int, Window]] = []
         rows: list[Array] = []
         for number, segment in enumerate(self.segments):
@@ -68,6 +71,8 @@ class SessionRows:
         stacked = np.array(rows).reshape(-1, n_v, base.n + 1)
         self.Y, self.b = stacked[..., :-1], stacked[..., -1]
         self.std = np.sqrt([np.diag(covariances[-1]) for covariances in self._covariances]).reshape(-1, n_v)
+        # Responses (W, n_v, sensors) of the rows to so much added to each position sensor's reading.
+        self.responses = dict(zip(DISPLACEMENTS, np.moveaxis(np.array(self._responses), 1, 0), strict=True))
         half = balance.width / 2 + balance.margin
         self.time = np.array([window.end - half for _, window in windows]) / rate
         where = Windows(
@@ -100,25 +105,42 @@ class SessionRows:
         sensitivities = self._sensitivities(instants, balance.span)
         row_noise = RowNoise(self.model.layout.theta_m, balance.span)
         bends, largest = np.empty((0, n_v)), np.zeros(n_v)
+        readings = self._readings(segment, int(np.median([window.half_width for window in windows])))
+        seconds = np.arange(STEPS + 1) * balance.span / STEPS
         out = []
-        for begin in np.round(np.arange(0.0, len(windows), self._every)).astype(int).tolist():
-            row_noise.begin_segment()
-            for window in windows[begin : begin + (RUN if self._every > RUN else len(windows))]:
-                covariances = row_noise.covariance(sensitivities.window(window.start), noise.sensors, noise.torque)
-                dense = np.zeros((len(copies), n_v, self.base.n + 1))
-                dense[:, balance.rows, balance.columns] = window.Y
-                dense[:, :, -1] = window.b
-                # What noise does beyond first order, and rounding, as in the fit.
-                residual = dense[..., -1] - dense[..., :-1] @ self.beta
-                bends = np.concatenate((bends[1 - HOPS :], (0.5 * (residual[1] + residual[2]) - residual[0])[None]))
-                largest = np.maximum(largest, np.abs(dense[0, :, :-1]) @ np.abs(self.beta) + np.abs(dense[0, :, -1]))
-                bent = np.maximum(np.mean(bends**2, axis=0), bends[-1] ** 2)
-                covariances[-1][np.diag_indices(n_v)] += bent + (FINEST * largest) ** 2 + np.finfo(np.float64).tiny
-                self._covariances.append(covariances)
-                out.append((window, dense[0]))
-            if self._every <= RUN:
-                break
+        for window in windows:
+            sensitivity = sensitivities.window(window.start)
+            covariances = row_noise.covariance(sensitivity, noise.sensors, noise.torque)
+            begin_s = (window.start * balance.half_hop + balance.margin) / self._rate
+            added = _displacements(*readings(begin_s + seconds))
+            kernel = row_noise.kernel(sensitivity) * (balance.span / STEPS)
+            self._responses.append(np.einsum("sij,dsj->dij", kernel, added))
+            dense = np.zeros((len(copies), n_v, self.base.n + 1))
+            dense[:, balance.rows, balance.columns] = window.Y
+            dense[:, :, -1] = window.b
+            # What noise does beyond first order, and rounding, as in the fit.
+            residual = dense[..., -1] - dense[..., :-1] @ self.beta
+            bends = np.concatenate((bends[1 - HOPS :], (0.5 * (residual[1] + residual[2]) - residual[0])[None]))
+            largest = np.maximum(largest, np.abs(dense[0, :, :-1]) @ np.abs(self.beta) + np.abs(dense[0, :, -1]))
+            bent = np.maximum(np.mean(bends**2, axis=0), bends[-1] ** 2)
+            covariances[-1][np.diag_indices(n_v)] += bent + (FINEST * largest) ** 2 + np.finfo(np.float64).tiny
+            self._covariances.append(covariances)
+            out.append((window, dense[0]))
         return out
+
+    def _readings(self, segment: Segment, half_width: int) -> Callable[[Array], tuple[Array, Array]]:
+        """Smoothed readings (T, sensors) of the position sensors, and their rates, at instants (T,) of a segment, s."""
+        values = segment.values[:, self.sensing.position_columns]
+        samples = np.arange(half_width, len(values) - half_width, max(1, half_width // 4))
+        smoothed, rates = smooth(values, samples, half_width, self._rate)
+
+        def at(seconds: Array) -> tuple[Array, Array]:
+            place = seconds * self._rate
+            return tuple(
+                np.stack([np.interp(place, samples, column) for column in part.T], axis=1) for part in (smoothed, rates)
+            )  # type: ignore[return-value]
+
+        return at
 
     def _sensitivities(self, instants: list[Instants], span: float) -> Sensitivities:
         out = Sensitivities(self.model, self.sensing.displacements, span / INSTANTS)

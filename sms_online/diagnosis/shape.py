@@ -1,4 +1,4 @@
-"""Shape constants of an effect that was found (a Stribeck velocity, a gap), refined between the values that were tried."""
+"""Shape constants of an effect that was found (a Stribeck velocity, a gap), refined between the values tried before."""
 
 from __future__ import annotations
 
@@ -25,31 +25,30 @@ def refine(tracing: Tracing, make: CandidateColumns, chosen: Sequence[int]) -> N
     """
     for k in chosen:
         effect = tracing.candidates[k].effect
-        shapes = [s for s in ENTRIES[effect.name].shapes if s in effect.coefficients and s not in COUNTED]
-        others = [other for other in chosen if other != k]
-        for shape in shapes:
-            tried = sorted(
-                c.effect.coefficients[shape] for c in tracing.candidates if c.key == tracing.candidates[k].key
-            )
-            here = tried.index(effect.coefficients[shape])
-            if len(tried) < 2 or tried[0] <= 0.0:
-                continue
-            low, high = tried[max(0, here - 1)], tried[min(len(tried) - 1, here + 1)]
-            # Beyond the ends of the grid by as much as to the next value inside.
-            low = low if here > 0 else tried[0] ** 2 / tried[1]
-            high = high if here < len(tried) - 1 else tried[-1] ** 2 / tried[-2]
-            best: dict[float, Candidate] = {}
+        for shape in ENTRIES[effect.name].shapes:
+            if shape in effect.coefficients and shape not in COUNTED:
+                _refine_one(tracing, make, chosen, k, shape)
 
-            def loss(log_value: float, shape: str = shape, k: int = k, best: dict[float, Candidate] = best) -> float:
-                declared = tracing.candidates[k].effect
-                moved = declared.coefficients | {shape: float(np.exp(log_value))}
-                candidate = make.of(declared.model_copy(update={"coefficients": moved}))
-                gain = tracing.gain_of(candidate, others).gain
-                best[-gain] = candidate
-                return -gain
 
-            minimize_scalar(
-                loss, bounds=(np.log(low), np.log(high)), method="bounded",
-                options={"xatol": TOLERANCE, "maxiter": EVALUATIONS},
-            )  # fmt: skip
-            tracing.put(k, best[min(best)])
+def _refine_one(tracing: Tracing, make: CandidateColumns, chosen: Sequence[int], k: int, shape: str) -> None:
+    effect, key = tracing.candidates[k].effect, tracing.candidates[k].key
+    others = [other for other in chosen if other != k]
+    tried = sorted({c.effect.coefficients[shape] for c in tracing.candidates if c.key == key})
+    if len(tried) < 2 or tried[0] <= 0.0:
+        return
+    here = tried.index(effect.coefficients[shape])
+    # Beyond the ends of the grid by as much as to the next value inside.
+    low = tried[here - 1] if here > 0 else tried[0] ** 2 / tried[1]
+    high = tried[here + 1] if here < len(tried) - 1 else tried[-1] ** 2 / tried[-2]
+    best: dict[float, Candidate] = {}
+
+    def loss(log_value: float) -> float:
+        moved = effect.coefficients | {shape: float(np.exp(log_value))}
+        candidate = make.of(effect.model_copy(update={"coefficients": moved}))
+        gain = tracing.gain_of(candidate, others).gain
+        best[-gain] = candidate
+        return -gain
+
+    options = {"xatol": TOLERANCE, "maxiter": EVALUATIONS}
+    minimize_scalar(loss, bounds=(np.log(low), np.log(high)), method="bounded", options=options)
+    tracing.put(k, best[min(best)])

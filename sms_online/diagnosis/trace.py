@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from sms_online.description.schema import Effect
 from sms_online.diagnosis.evidence import RANK_TOLERANCE, Gain, basis, free_of, gain, threshold
 from sms_online.diagnosis.rows import SessionRows
+from sms_online.effects.catalogue import ENTRIES
 from sms_online.model.parameters import Parameter
 from sms_online.stream import Array
 from sms_online.trackers.factor import prior_factor
@@ -56,6 +57,11 @@ class Candidate:
     def key(self) -> str:
         """name@where."""
         return f"{self.effect.name}@{self.effect.where}"
+
+    @property
+    def of_channel(self) -> bool:
+        """Whether it is a channel that the effect distorts: its columns are then a first approximation."""
+        return ENTRIES[self.effect.name].kind == "channel"
 
 
 @dataclass(frozen=True)
@@ -180,6 +186,9 @@ class Tracing:
                 refused.add(self.candidates[best].key)
                 continue
             chosen = self._revised([*chosen, best])
+            if self.candidates[best].of_channel:
+                # What it leaves while it is only approximately taken off must not be given to others.
+                break
         return chosen
 
     def _revised(self, chosen: list[int]) -> list[int]:
@@ -197,7 +206,7 @@ class Tracing:
         return chosen
 
     def improvement(self, chosen: Sequence[int], candidate: int) -> float:
-        """Share by which the rms of the held-out rows that a candidate acts on falls, when it is fitted to the others."""
+        """Share by which the rms of the held-out rows that a candidate acts on falls, fitted to the other windows."""
         before = self._held_out([*chosen], candidate)
         after = self._held_out([*chosen, candidate], candidate)
         return 1.0 - after / before if before > 0.0 else 0.0

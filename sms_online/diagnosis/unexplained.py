@@ -27,8 +27,8 @@ Variable = Callable[[Motion], Array]
 class Unexplained:
     """A force that stands in for what is not known.
 
-    row: row type with most of the residual; speed: the generalized speed in it. variable: what the force depends on most
-    clearly, with its unit. share: of the residual's excess over noise in all rows that it takes away. at, force
+    row: row type with most of the residual; speed: the generalized speed in it. variable: what the force depends on
+    most clearly. share: of the residual's excess over noise in all rows that it takes away. at, force
     (POINTS,): the force over the variable's range, in N m (N).
     """
 
@@ -41,7 +41,7 @@ class Unexplained:
 
 
 def describe_residual(rows: SessionRows, columns: Array, residual: Array) -> Unexplained:
-    """Find row and variable. columns (W, n_v, n): of the model with what was adopted; residual (W, n_v): what it leaves."""
+    """Find row and variable. columns (W, n_v, n): of the model with what was adopted; residual (W, n_v): of it."""
     layout = rows.model.layout
     excess = np.sum(residual**2 - 1.0, axis=0)
     by_type = {name: float(excess[speeds].sum()) for name, speeds in row_types(layout).items()}
@@ -76,7 +76,8 @@ def _variables(rows: SessionRows) -> dict[str, Variable]:
         out[f"rate of {name}"] = lambda motion, k=k: motion.v[:, k]
     for i, (q, theta_m) in enumerate(zip(layout.q, layout.theta_m, strict=True), start=1):
         if q != theta_m:
-            out[f"deflection of joint_{i}"] = lambda motion, q=q, m=theta_m: motion.x[:, m + offset] - motion.x[:, q + offset]
+            m, k = theta_m + offset, q + offset
+            out[f"deflection of joint_{i}"] = lambda motion, m=m, k=k: motion.x[:, m] - motion.x[:, k]
         out[f"torque of joint_{i}"] = lambda motion, i=i: motion.torque[:, i - 1]
     rate = rows.model.system.sample_rate
     out["time"] = lambda motion: (rows.segments[motion.segment].index[0] + motion.samples) / rate

@@ -39,7 +39,7 @@ class Windows:
     """Where windows are and how they see the motion.
 
     segment, start, half_width (W,): number of the segment, first sample in it, M of the filter. width: samples from
-    first to last. exponent: of the test function (1 - z²)^exponent. stride: from M to the samples taken, one in so many.
+    first to last. exponent: of the test function (1 - z²)^exponent. stride: gives for M to take one sample in so many.
     """
 
     segment: NDArray[np.int64]

@@ -205,10 +205,17 @@ def candidates(system: System) -> list[Effect]:
     return out
 
 
+# Channels that come together, beside those of a link's markers.
+DEVICES = ("r_S_*", "eps_*")
+
+
 def _groups(system: System, entry: Entry) -> Iterable[str]:
     """Channels, or patterns of channels, that one cause is likely to act on together."""
     if entry.name != SensorLag.entry.name:
         return places(system, "angle")
     positions = places(system, "position")
-    patterns = [pattern for sensor in system.sensors for pattern in sensor.channels] or list(positions)
-    return [p for p in patterns if any(fnmatchcase(channel, p) for channel in positions)]
+    # What one device delivers: an encoder its angle, a tracker the base's position, a camera a link's markers.
+    devices = [next((p for p in DEVICES if fnmatchcase(c, p)), c) for c in positions]
+    links = [f"{c.split('.')[0]}.*" if "." in c else c for c in devices]
+    patterns = [pattern for sensor in system.sensors for pattern in sensor.channels]
+    return dict.fromkeys([*links, *(p for p in patterns if any(fnmatchcase(c, p) for c in positions))])

@@ -18,7 +18,7 @@ from sms_online.stream import Array
 
 # Degree of the local polynomials that correct a lag, and their full width in periods of its corner: narrow enough for
 # what the low-pass lets through, wide enough that noise grows little.
-DEGREE, PERIODS = 4, 0.5
+DEGREE, PERIODS = 4, 1.0
 # Fixed-point steps from a reading back to the angle; the error falls by the amplitude (rad) each.
 INVERSIONS = 20
 

@@ -61,17 +61,20 @@ class RowNoise:
         self._before.clear()
         self._torque_before.clear()
 
+    def kernel(self, window: Sensitivity) -> Array:
+        """c (STEPS + 1, n_v, sensors): what a displacement n(t) of each sensor adds to the rows is ∫ c(t) n(t) dt."""
+        parts = (window.H, window.H_dot, window.P_x, window.G_v, window.G_x)
+        n_v, sensors = window.H.shape[1:]
+        stacked = np.concatenate(parts).reshape(-1, n_v * sensors)
+        return np.asarray((self._weights[window.offset] @ stacked).reshape(STEPS + 1, n_v, sensors))
+
     def covariance(self, window: Sensitivity, sensor_density: Array, torque_density: Array) -> list[Array]:
         """Covariances (n_v, n_v) with the windows before, oldest first, then the window's own; (N s)² and so on.
 
         sensor_density (sensors,): σ² T_s of each position sensor. torque_density (joints,): of n τ, (N m)² s.
         """
-        parts = (window.H, window.H_dot, window.P_x, window.G_v, window.G_x)
-        n_v, sensors = window.H.shape[1:]
-        stacked = np.concatenate(parts).reshape(-1, n_v * sensors)
-        c = (self._weights[window.offset] @ stacked).reshape(STEPS + 1, n_v, sensors)
-        c = (c * np.sqrt(self._step * sensor_density)).transpose(1, 0, 2)  # (n_v, STEPS + 1, sensors)
-        c = np.ascontiguousarray(c)
+        c = (self.kernel(window) * np.sqrt(self._step * sensor_density)).transpose(1, 0, 2)
+        c = np.ascontiguousarray(c)  # (n_v, STEPS + 1, sensors)
         out = []
         for k in range(len(self._before), -1, -1):
             other = c if k == 0 else self._before[-k]
