@@ -61,7 +61,7 @@ LAWS: dict[str, Law] = {
         M_1: -0.4 * np.sign(s.rate) / np.exp(s.rate * s.rate / 0.49)
     },
     "load_friction@joint_1:ratio=0.03": lambda s: {M_1: -0.03 * np.abs(K * s.delta) * np.sign(s.rate)},
-    "direction_friction@joint_1:plus=0.4,minus=0.7": lambda s: {M_1: np.where(s.rate > 0.0, -0.4, 0.7)},
+    "direction_friction@joint_1:plus=0.4,minus=0.7": lambda s: {M_1: -np.where(s.rate > 0.0, 0.4, 0.7) * s.rate},
     "torsional_hysteresis@joint_1:torque=0.4,width=0.02": lambda s: spring(-0.4 * s.z[:, 0] / 0.02),
     "cubic_stiffness@joint_1:stiffness=70": lambda s: spring(-70 * s.delta * s.delta**2),
     # What is left of the spring beyond the gap, less the spring itself.

@@ -3,18 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 from fnmatch import fnmatchcase
 from itertools import product
 
 import numpy as np
 
 from sms_online.description.schema import Effect, System
-from sms_online.diagnosis.internal_states import InternalStates
 from sms_online.diagnosis.rows import SessionRows
 from sms_online.diagnosis.trace import Candidate
 from sms_online.diagnosis.weak_windows import Motion, WeakWindows
 from sms_online.effects.base import Inputs, Ranges
-from sms_online.effects.catalogue import ENTRIES, candidates, channel_effects
+from sms_online.effects.catalogue import ENTRIES, candidates
 from sms_online.model.model import Model
 from sms_online.model.parameters import Parameter
 from sms_online.stream import Array
@@ -26,8 +26,6 @@ LINEAR = {
     "encoder_eccentricity": (("sine", "rad", "sine", -1.0), ("cosine", "rad", "cosine", -1.0)),
     "sensor_lag": (("delay", "s", "rate", 1.0),),
 }
-# Delay of a lag at least, s.
-SHORTEST_DELAY = 1e-5
 
 
 class CandidateColumns:
@@ -42,7 +40,6 @@ class CandidateColumns:
         self._weak = rows.weak if weak is None else weak
         self.pi = rows.base.physical_values(rows.beta)
         self._own = {p.name for p in rows.model.parameters}
-        self._states = InternalStates(rows)
 
     def within(self, weak: WeakWindows) -> CandidateColumns:
         """The same for other windows of the session."""
@@ -50,7 +47,10 @@ class CandidateColumns:
 
     def inputs(self, motion: Motion) -> Inputs:
         """What the effects that the system declares need beside the motion."""
-        return Inputs(motion.torque, self._states.of_model(motion))
+        return self._inputs(self.rows.model, motion)
+
+    def _inputs(self, model: Model, motion: Motion) -> Inputs:
+        return Inputs(motion.torque, self.rows.followed.states(model, motion.segment, motion.samples))
 
     def all(self) -> list[Candidate]:
         """Each effect at each place, with each shape constant of its grid; those that leave no trace left out."""
@@ -103,7 +103,8 @@ class CandidateColumns:
         force = model.effects[-1]
 
         def columns(motion: Motion) -> tuple[Array | None, Array]:
-            inputs = Inputs(motion.torque, self._states.along(force, motion))
+            inputs = self._inputs(model, motion)
+            inputs = replace(inputs, states=inputs.states[:, model.state_slices[-1]])
             P = force.momentum(model.layout, motion.x, motion.v, inputs)
             return P, force.force(model.layout, motion.x, motion.v, inputs)
 
@@ -125,37 +126,3 @@ class CandidateColumns:
             columns.append(response)
             parameters.append(Parameter(f"{effect.name}@{effect.where}.{quantity}", quantity, unit, 0.0))
         return Candidate(effect, tuple(parameters), np.stack(columns, axis=2))
-
-
-def with_coefficients(effect: Effect, values: Array) -> Effect:
-    """A channel's effect with its constants changed by linear coefficients, of the session corrected by it so far."""
-    c = effect.coefficients
-    match effect.name:
-        case "encoder_offset":
-            changed = {"offset": c.get("offset", 0.0) + float(values[0])}
-        case "encoder_eccentricity":
-            a, phi = c.get("amplitude", 0.0), c.get("phase", 0.0)
-            sine, cosine = a * np.cos(phi) + values[0], a * np.sin(phi) + values[1]
-            changed = {"amplitude": float(np.hypot(sine, cosine)), "phase": float(np.arctan2(cosine, sine))}
-        case "sensor_lag":
-            # A lag that the data make negative is none: the others lag, or nothing does.
-            delay = max(SHORTEST_DELAY, (delay_of(c["corner"]) if "corner" in c else 0.0) + float(values[0]))
-            changed = {"corner": delay_of(delay)}
-        case _:
-            raise ValueError(f"{effect.name} is no effect on a channel")
-    return effect.model_copy(update={"coefficients": changed})
-
-
-def delay_of(corner: float) -> float:
-    """Delay, s, of a second-order Butterworth low-pass with a corner in Hz, far below it: √2 / ω. Its own inverse."""
-    return float(np.sqrt(2.0) / (2.0 * np.pi * corner))
-
-
-def corrected(channels: tuple[str, ...], values: Array, effect: Effect, system: System) -> Array:
-    """Samples (N, channels) without a channel's effect."""
-    correction = channel_effects(system.model_copy(update={"effects": (effect,)}))[0]
-    out = values.copy()
-    for k, channel in enumerate(channels):
-        if correction.acts_on(channel):
-            out[:, k] = correction.correct(values[:, k], system.sample_rate)
-    return out

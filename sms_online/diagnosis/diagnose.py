@@ -9,7 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sms_online.description.schema import Effect, System
-from sms_online.diagnosis.candidates import CandidateColumns, corrected, with_coefficients
+from sms_online.diagnosis.candidates import CandidateColumns
+from sms_online.diagnosis.constants import applied, corrected, improved, is_constant
 from sms_online.diagnosis.record import LONGEST, SampleRecord, Segment, excerpts
 from sms_online.diagnosis.relative import RelativeResiduals
 from sms_online.diagnosis.residuals import ResidualTest, RowResidual, whitened
@@ -20,6 +21,7 @@ from sms_online.diagnosis.unexplained import Unexplained, describe_residual
 from sms_online.effects.catalogue import ENTRIES, places
 from sms_online.errors import InputError
 from sms_online.pipeline.estimator import Estimator
+from sms_online.pipeline.sensor_noise import SensorNoise
 from sms_online.stream import Array, Block
 from sms_online.trackers.interface import Prior
 
@@ -71,13 +73,17 @@ class State:
 class Diagnosis:
     """What was found.
 
-    verdict: "clean", "named" or "unexplained". findings: with their candidates' columns in the rows of `after`.
+    verdict: "clean", "named" or "unexplained". findings: constants first, then the effects that are unknowns of π.
+    described, attempt: first and last description against the samples; chosen: of the last one's candidates.
     estimator_before, estimator_after: sessions of the two systems over the whole capture.
     """
 
     verdict: str
     findings: list[Finding]
     ranking: list[Ranked]
+    described: Attempt
+    attempt: Attempt
+    chosen: list[int]
     before: State
     after: State
     estimator_before: Estimator
@@ -89,59 +95,72 @@ class Diagnosis:
 PriorOf = Callable[[Estimator], Prior | None]
 
 
+@dataclass(frozen=True)
+class Case:
+    """A capture to be diagnosed: its session with the system as described, samples, and those held out."""
+
+    source: str
+    session: Estimator
+    noise: SensorNoise
+    segments: Sequence[Segment]
+    held: Sequence[Segment]
+    prior: PriorOf
+
+
 class Attempt:
-    """One description of the system against the samples of the session."""
+    """One description of the system against the samples of a session."""
 
     def __init__(
         self,
+        case: Case,
         system: System,
-        session: Estimator,
-        segments: Sequence[Segment],
-        held: Sequence[Segment],
-        prior: PriorOf,
+        constants: Sequence[Effect] = (),
         beta: Array | None = None,
         candidates: Sequence[Candidate] | Sequence[Effect] | None = None,
         most: float = LONGEST,
     ) -> None:
-        """beta (n,): behind the noise of rows, the session's unless given. candidates: all by default; columns made for
-        the same windows before serve to search. most: s of the session that are used."""
-        self.system, self._session = system, session
-        momentum = session.momentum
-        assert momentum is not None
-        noise = momentum.sensor_noise
-        assert noise is not None
-        estimator = Estimator(system, session.sensing.channels, "") if system is not session.system else session
-        known = prior(estimator)
+        """constants: see that module. beta (n,): behind the noise of rows, the session's unless given. candidates: all
+        by default; columns made for the same windows before serve to search. most: s of the session that are used.
+        """
+        self.system, self.constants = system, list(constants)
+        session = case.session
+        described = applied(system, constants)
+        same = described == session.system
+        estimator = session if same else Estimator(described, session.sensing.channels, case.source)
+        known = case.prior(estimator)
         if beta is None:
             beta = session.estimate().pi
             if known is not None and not session.by_momentum:
                 # A fit that leaves half of the torques bends everything; what was known before is nearer.
                 beta = np.where(known.known, known.value, beta)
-        noise = replace(noise, coordinates=estimator.sensing.coordinate_noise(noise.grid))
+        noise = replace(case.noise, coordinates=estimator.sensing.coordinate_noise(case.noise.grid))
+        span = system.windows.momentum
+        length, longest = (round(seconds * system.sample_rate) for seconds in (STRETCH * span, most))
+        fitting, held = (excerpts(each, length, longest) for each in (case.segments, case.held))
         channels = session.sensing.channels
-        length, most_samples = (
-            round(seconds * system.sample_rate) for seconds in (STRETCH * system.windows.momentum, most)
-        )
-        parts = [excerpts(each, length, most_samples) for each in (segments, held)]
-        values = [_without_channel_effects(system, channels, segment) for part in parts for segment in part]
+        values = [corrected(described, channels, segment) for segment in (*fitting, *held)]
         self.rows = SessionRows(estimator.model, estimator.base, estimator.sensing, noise, values, beta)
         if self.rows.count == 0:
-            raise InputError(system.name, "", "no gapless stretch of a window's length", "more samples")
-        self.make = CandidateColumns(self.rows, system)
-        self.fixed = [effect for effect in system.effects if ENTRIES[effect.name].kind == "channel"]
-        self._fitting = len(parts[0])
+            expected = f"{span:g} s and more of samples without a gap"
+            raise InputError(case.source, "", "no stretch as long as a window", expected)
+        self.make = CandidateColumns(self.rows, described)
+        self._fitting = len(fitting)
         first, last = self.rows.time[0], self.rows.time[-1]
         self._split = np.inf if held else first + FITTED * (last - first)
         fitted = self._fitted(self.rows.time, self.rows.weak.windows.segment)
         made = self.make.all() if candidates is None else [self._made(candidate) for candidate in candidates]
-        fixed = [self.make.of(effect) for effect in self.fixed]
-        self.tracing = Tracing(self.rows, made, fitted, known, fixed)
+        self.fixed = [self.make.of(effect) for effect in self.constants]
+        self.tracing = Tracing(self.rows, made, fitted, known, self.fixed)
 
     def _made(self, candidate: Candidate | Effect) -> Candidate:
         return candidate if isinstance(candidate, Candidate) else self.make.of(candidate)
 
     def _fitted(self, time: Array, segment: NDArray[np.int64]) -> NDArray[np.bool_]:
         return np.asarray((segment < self._fitting) & (time < self._split))
+
+    def search(self) -> list[int]:
+        """Numbers of the candidates found."""
+        return self.tracing.run(lambda chosen, k: refine(self.tracing, self.make, chosen, k))
 
     def solution(self, chosen: Sequence[int]) -> Array:
         """Parameters and coefficients from all windows."""
@@ -152,31 +171,31 @@ class Attempt:
         residual = self.tracing.residual(chosen, self.solution(chosen))
         return float(np.sum(residual**2) - residual.size)
 
-    def increments(self, solution: Array) -> System:
-        """The system with the constants of its channels' effects improved by a solution's coefficients."""
-        return self._with_constants(self.fixed, solution[self.rows.base.n :])
+    def improved(self, solution: Array) -> list[Effect]:
+        """The constants improved by a solution."""
+        return self._improved(self.fixed, solution[self.rows.base.n :])
 
-    def adopted(self, chosen: Sequence[int], solution: Array) -> System:
-        """The system with the effects chosen; those of channels with their constants."""
-        effects = [self.tracing.candidates[k].effect for k in chosen]
-        fixed = sum(len(self.make.of(effect).parameters) for effect in self.fixed)
-        system = self.system.model_copy(update={"effects": (*self.system.effects, *effects)})
-        at, out = self.rows.base.n + fixed, list(system.effects)
-        for k in chosen:
-            candidate = self.tracing.candidates[k]
-            values = solution[at : at + len(candidate.parameters)]
+    def found(self, chosen: Sequence[int], solution: Array) -> tuple[list[Effect], list[Effect]]:
+        """Of the effects chosen, those that become constants, with their values, and the others."""
+        size = sum(len(candidate.parameters) for candidate in self.fixed)
+        candidates = [self.tracing.candidates[k] for k in chosen]
+        everything = self._improved(candidates, solution[self.rows.base.n + size :])
+        return [e for e in everything if is_constant(e)], [e for e in everything if not is_constant(e)]
+
+    @staticmethod
+    def _improved(candidates: Sequence[Candidate], values: Array) -> list[Effect]:
+        out, at = [], 0
+        for candidate in candidates:
+            own = values[at : at + len(candidate.parameters)]
             at += len(candidate.parameters)
-            if ENTRIES[candidate.effect.name].kind == "channel":
-                out[out.index(candidate.effect)] = with_coefficients(candidate.effect, values)
-        return system.model_copy(update={"effects": tuple(out)})
+            out.append(improved(candidate.effect, own) if candidate.constant else candidate.effect)
+        return out
 
-    def _with_constants(self, effects: Sequence[Effect], values: Array) -> System:
-        out, at = list(self.system.effects), 0
-        for effect in effects:
-            size = len(self.make.of(effect).parameters)
-            out[out.index(effect)] = with_coefficients(effect, values[at : at + size])
-            at += size
-        return self.system.model_copy(update={"effects": tuple(out)})
+    def adopted(self, chosen: Sequence[int]) -> System:
+        """The described system with everything that was found."""
+        described = applied(self.system, self.constants)
+        effects = [self.tracing.candidates[k].effect for k in chosen]
+        return described.model_copy(update={"effects": (*described.effects, *effects)})
 
     def state(self, chosen: Sequence[int]) -> State:
         """Residuals of the model with the effects chosen."""
@@ -185,10 +204,10 @@ class Attempt:
         solution = tracing.solution(chosen, fitted)
         residual = tracing.residual(chosen, solution)
         joints = RelativeResiduals(rows, self.make)
-        joints.declare([*self.fixed, *(tracing.candidates[k].effect for k in chosen)])
+        joints.declare([*self.constants, *(tracing.candidates[k].effect for k in chosen)])
         early = self._fitted(joints.times, joints.segment)
         return State(
-            system=self.adopted(chosen, solution),
+            system=self.adopted(chosen),
             solution=solution,
             residual=residual,
             time=rows.time,
@@ -197,19 +216,6 @@ class Attempt:
             holdout=Part(whitened(rows, residual, ~fitted), joints.of(solution, ~early)),
             test=ResidualTest(rows).of(residual),
         )
-
-
-def _without_channel_effects(system: System, channels: tuple[str, ...], segment: Segment) -> Segment:
-    values = segment.values
-    for effect in system.effects:
-        if ENTRIES[effect.name].kind == "channel":
-            values = corrected(channels, values, effect, system)
-    return Segment(segment.index, values)
-
-
-def _without(system: System, effects: Sequence[Effect]) -> System:
-    """The system without some of its effects."""
-    return system.model_copy(update={"effects": tuple(effect for effect in system.effects if effect not in effects)})
 
 
 def _exact(system: System) -> System | None:
@@ -238,43 +244,42 @@ def diagnose(
     before, record = _session(system, blocks, source, prior)
     if before.momentum is None or before.momentum.sensor_noise is None:
         raise InputError(source, "", "too few samples to tell the sensors' noise", "a longer capture")
-    segments = record.segments()
     held = _session(system, holdout, source, prior)[1].segments() if holdout else []
+    case = Case(source, before, before.momentum.sensor_noise, record.segments(), held, prior)
     progress("tracing what it leaves")
-    attempt = described = Attempt(system, before, segments, held, prior)
-    chosen = attempt.tracing.run()
+    attempt = described = Attempt(case, system)
+    n = described.rows.base.n
+    chosen = attempt.search()
     ranking = attempt.tracing.ranking()
     bare = described.state([])
     exact = _exact(system)
     if exact is not None and any(row.beyond for row in attempt.state(chosen).test.values()):
         progress("comparing exact links")
-        beta = described.solution([])[: described.rows.base.n]
-        forces = [attempt.tracing.candidates[k].effect for k in chosen[:1]]
-        linear, other = (
-            Attempt(each, before, segments, held, prior, beta, effects, SOME).excess(range(len(effects)))
-            for each, effects in ((system, forces), (exact, []))
-        )
-        if other < linear:
-            attempt = Attempt(exact, before, segments, held, prior, beta)
-            chosen = attempt.tracing.run()
-    while any(attempt.tracing.candidates[k].of_channel for k in chosen):
-        progress("correcting channels")
-        solution, n = attempt.solution(chosen), attempt.rows.base.n
-        system_then, beta = attempt.adopted(chosen, solution), solution[:n]
-        forces = [attempt.tracing.candidates[k].effect for k in chosen if not attempt.tracing.candidates[k].of_channel]
-        improved = _without(system_then, forces)
+        beta = described.solution([])[:n]
+        first = [attempt.tracing.candidates[k].effect for k in chosen[:1]]
+        linear = Attempt(case, system, (), beta, first, SOME).excess(range(len(first)))
+        if Attempt(case, exact, (), beta, (), SOME).excess(()) < linear:
+            attempt = Attempt(case, exact, (), beta)
+            chosen = attempt.search()
+    findings: list[Finding] = []
+    while any(attempt.tracing.candidates[k].constant for k in chosen):
+        progress("improving constants")
+        findings += [attempt.tracing.finding(chosen, k) for k in chosen if attempt.tracing.candidates[k].constant]
+        solution = attempt.solution(chosen)
+        fresh, forces = attempt.found(chosen, solution)
+        constants, beta = [*attempt.constants, *fresh], solution[:n]
         for _ in range(CORRECTIONS):
-            fewer = Attempt(improved, before, segments, held, prior, beta, forces, SOME)
+            fewer = Attempt(case, attempt.system, constants, beta, forces, SOME)
             solution = fewer.solution(range(len(forces)))
-            improved, beta = fewer.increments(solution), solution[:n]
-        corrected_keys = {(effect.name, effect.where) for effect in improved.effects}
-        others = [c for c in attempt.tracing.candidates if (c.effect.name, c.effect.where) not in corrected_keys]
-        attempt = Attempt(improved, before, segments, held, prior, beta, others)
-        chosen = attempt.tracing.run()
-    refine(attempt.tracing, attempt.make, chosen)
+            constants, beta = fewer.improved(solution), solution[:n]
+        keys = {(effect.name, effect.where) for effect in constants}
+        others = [c for c in attempt.tracing.candidates if (c.effect.name, c.effect.where) not in keys]
+        attempt = Attempt(case, attempt.system, constants, beta, others)
+        chosen = attempt.search()
+    findings += [attempt.tracing.finding(chosen, k) for k in chosen]
     after = attempt.state(chosen)
     progress("fitting the model with what was found")
-    named = bool(after.system.effects != system.effects)
+    named = after.system != system
     estimator_after = _session(after.system, blocks, source, prior)[0] if named else before
     left = max(0.0, after.excess) / max(bare.excess, 1.0)
     beyond = any(row.beyond for row in after.test.values())
@@ -282,8 +287,9 @@ def diagnose(
     unexplained = None
     if verdict == "unexplained":
         unexplained = describe_residual(attempt.rows, attempt.tracing.columns(chosen), after.residual)
-    findings = [attempt.tracing.finding(chosen, k) for k in chosen]
-    return Diagnosis(verdict, findings, ranking, bare, after, before, estimator_after, unexplained)
+    return Diagnosis(
+        verdict, findings, ranking, described, attempt, chosen, bare, after, before, estimator_after, unexplained
+    )
 
 
 def _session(system: System, blocks: Sequence[Block], source: str, prior: PriorOf) -> tuple[Estimator, SampleRecord]:

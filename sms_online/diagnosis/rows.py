@@ -11,6 +11,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 import scipy.linalg
 
+from sms_online.diagnosis.followed import FollowedMotion
 from sms_online.diagnosis.record import Segment
 from sms_online.diagnosis.weak_windows import WeakWindows, Windows
 from sms_online.model.base_parameters import BaseParameters
@@ -63,8 +64,9 @@ class SessionRows:
         self._responses: list[Array] = []
         windows: list[tuple[int, Window]] = []
         rows: list[Array] = []
+        self.followed = FollowedMotion(sensing, self.segments, rate)
         for number, segment in enumerate(self.segments):
-            for window, dense in self._of_segment(balance, segment):
+            for window, dense in self._of_segment(balance, number, segment):
                 windows.append((number, window))
                 rows.append(dense)
         n_v = model.layout.n_v
@@ -87,7 +89,7 @@ class SessionRows:
         self.weak = WeakWindows(where, model.layout, sensing, self.segments, rate)
         self.whiten(np.zeros(n_v))
 
-    def _of_segment(self, balance: MomentumBalance, segment: Segment) -> list[tuple[Window, Array]]:
+    def _of_segment(self, balance: MomentumBalance, number: int, segment: Segment) -> list[tuple[Window, Array]]:
         """Windows of one segment with their rows [Y b] (n_v, n + 1); their covariances are appended to the others."""
         noise, n_v = self.noise, self.model.layout.n_v
         balance.begin_segment()
@@ -99,7 +101,8 @@ class SessionRows:
             added[:, columns] = self._random.standard_normal((len(x), len(columns))) * noise.grid
             copies[1:] = [self.sensing.coordinates(segment.values + sign * added) for sign in (1.0, -1.0)]
         torque = self.sensing.joint_torque(segment.values)
-        windows, instants = balance.push(segment.index, copies, torque, noise.coordinates)
+        signals = np.concatenate((torque, self.followed.states(self.model, number)), axis=1)
+        windows, instants = balance.push(segment.index, copies, signals, noise.coordinates)
         if not windows:
             return []
         sensitivities = self._sensitivities(instants, balance.span)
@@ -145,7 +148,7 @@ class SessionRows:
     def _sensitivities(self, instants: list[Instants], span: float) -> Sensitivities:
         out = Sensitivities(self.model, self.sensing.displacements, span / INSTANTS)
         pi = self.base.physical_values(self.beta)
-        parts = [np.concatenate([getattr(piece, part) for piece in instants]) for part in ("x", "v", "torque")]
+        parts = [np.concatenate([getattr(piece, part) for piece in instants]) for part in ("x", "v", "signals")]
         for start in range(0, len(parts[0]), TOLD):
             out.tell(pi, *(part[start : start + TOLD] for part in parts))
         return out

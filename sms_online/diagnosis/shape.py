@@ -18,16 +18,14 @@ EVALUATIONS = 25
 COUNTED = ("order",)
 
 
-def refine(tracing: Tracing, make: CandidateColumns, chosen: Sequence[int]) -> None:
-    """Move the shape constants of the chosen candidates to where they take most, one after the other.
+def refine(tracing: Tracing, make: CandidateColumns, chosen: Sequence[int], k: int) -> None:
+    """Move the shape constants of candidate k, one of those chosen, to where it takes most, one after the other.
 
     Source of the search: Brent, Algorithms for Minimization without Derivatives, 1973, chapter 5.
     """
-    for k in chosen:
-        effect = tracing.candidates[k].effect
-        for shape in ENTRIES[effect.name].shapes:
-            if shape in effect.coefficients and shape not in COUNTED:
-                _refine_one(tracing, make, chosen, k, shape)
+    for shape in ENTRIES[tracing.candidates[k].effect.name].shapes:
+        if shape in tracing.candidates[k].effect.coefficients and shape not in COUNTED:
+            _refine_one(tracing, make, chosen, k, shape)
 
 
 def _refine_one(tracing: Tracing, make: CandidateColumns, chosen: Sequence[int], k: int, shape: str) -> None:

@@ -9,19 +9,19 @@ Source of the selection: Pati, Rezaiifar and Krishnaprasad, Asilomar Conf. Signa
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from sms_online.description.schema import Effect
+from sms_online.diagnosis.constants import is_constant
 from sms_online.diagnosis.evidence import RANK_TOLERANCE, Gain, basis, free_of, gain, threshold
 from sms_online.diagnosis.rows import SessionRows
-from sms_online.effects.catalogue import ENTRIES
 from sms_online.model.parameters import Parameter
 from sms_online.stream import Array
-from sms_online.trackers.factor import prior_factor
+from sms_online.trackers.factor import prior_factor, solve
 from sms_online.trackers.interface import Prior
 
 # Probability that a session without any effect beyond the model shows one.
@@ -59,9 +59,9 @@ class Candidate:
         return f"{self.effect.name}@{self.effect.where}"
 
     @property
-    def of_channel(self) -> bool:
-        """Whether it is a channel that the effect distorts: its columns are then a first approximation."""
-        return ENTRIES[self.effect.name].kind == "channel"
+    def constant(self) -> bool:
+        """Whether its coefficients become constants of the description, no unknowns of π: see `constants`."""
+        return is_constant(self.effect)
 
 
 @dataclass(frozen=True)
@@ -172,8 +172,11 @@ class Tracing:
         candidate = self.candidates[k]
         return max(candidate.columns.shape[2], len(candidate.effect.coefficients))
 
-    def run(self) -> list[int]:
-        """Numbers of the candidates found, in the order of what they explain."""
+    def run(self, refine: Callable[[Sequence[int], int], None]) -> list[int]:
+        """Numbers of the candidates found, in the order of what they explain.
+
+        refine: improves the shape constants of one of those chosen, before what it leaves is given to others.
+        """
         chosen: list[int] = []
         refused: set[str] = set()
         while len(chosen) < MOST_EFFECTS:
@@ -185,8 +188,9 @@ class Tracing:
             if self.improvement(chosen, best) < LEAST_IMPROVEMENT:
                 refused.add(self.candidates[best].key)
                 continue
+            refine([*chosen, best], best)
             chosen = self._revised([*chosen, best])
-            if self.candidates[best].of_channel:
+            if self.candidates[best].constant:
                 # What it leaves while it is only approximately taken off must not be given to others.
                 break
         return chosen
@@ -259,6 +263,11 @@ class Tracing:
         size = np.linalg.norm(columns, axis=0)
         size[size == 0.0] = 1.0
         return np.asarray(np.linalg.lstsq(columns / size, self._b[use], rcond=RANK_TOLERANCE)[0] / size)
+
+    def covariance(self, chosen: Sequence[int]) -> Array:
+        """Of the solution (n + c, n + c) from all windows, infinite where they tell nothing."""
+        columns = self._columns(chosen)
+        return solve(np.column_stack((columns, self._b))).covariance()
 
     def residual(self, chosen: Sequence[int], solution: Array) -> Array:
         """What is left of every row (W, n_v) over its own deviation."""

@@ -129,23 +129,23 @@ class LoadFriction(MotorSide):
 
 
 class DirectionFriction(MotorSide):
-    """Coulomb friction with a torque for each direction: f = -c_+ for θ̇_m > 0 and +c_- for θ̇_m < 0, N m.
+    """Viscous friction that depends on the direction of travel: f = -c_± θ̇_m, c_+ for θ̇_m > 0, in N m s/rad.
 
-    Equal coefficients `plus` and `minus` are Coulomb friction; the steps are as smooth.
-    Limitations: those of Coulomb friction; a torque offset looks the same and is half the difference.
+    Equal coefficients `plus` and `minus` are viscous friction. Coulomb friction with a torque for each direction is
+    Coulomb friction and a torque offset, of which no motion can tell it.
     """
 
     entry = Entry(
-        "direction_friction", "force", "joint", {"plus": "N m", "minus": "N m"},
-        "standstill under a known torque, and both directions: a torque offset acts at rest too",
+        "direction_friction", "force", "joint", {"plus": "N m s/rad", "minus": "N m s/rad"},
+        "two speeds in both directions",
     )  # fmt: skip
 
     def __init__(self, site: Site, given: Mapping[str, float]) -> None:
         i = site.index
-        linear = {side: (f"c_{mark}{i}", "N m", given.get(side, 0.0)) for side, mark in (("plus", "+"), ("minus", "-"))}
-        super().__init__(site, linear)
+        sides = (("plus", "+"), ("minus", "-"))
+        super().__init__(site, {side: (f"d_{mark}{i}", "N m s/rad", given.get(side, 0.0)) for side, mark in sides})
 
     def along(self, layout: Layout, x: Array, v: Array, inputs: Inputs | None) -> Array:
-        """-1 forwards, +1 backwards."""
-        s = sign(self.rate(layout, v))
-        return np.stack((-np.maximum(s, 0.0), -np.minimum(s, 0.0)), axis=1)
+        """-θ̇_m forwards and backwards."""
+        rate = self.rate(layout, v)
+        return -np.stack((np.maximum(rate, 0.0), np.minimum(rate, 0.0)), axis=1)

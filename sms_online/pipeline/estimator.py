@@ -209,12 +209,12 @@ class Estimator:
             self._condition(piece)
 
     def _condition(self, piece: GridSamples) -> None:
+        if self.on_samples is not None:
+            self.on_samples(piece)
         for corrected in self._conditioning.push(piece):
             self._differentiate(corrected)
 
     def _differentiate(self, piece: GridSamples) -> None:
-        if self.on_samples is not None:
-            self.on_samples(piece)
         signals = np.concatenate(
             (self.sensing.coordinates(piece.values), self.sensing.joint_torque(piece.values)), axis=1
         )

@@ -73,7 +73,7 @@ def _parser() -> Parser:
     )
     verbs = parser.add_subparsers(metavar="VERB", required=True)
     verb_parsers = (
-        _add_demo, _add_live, _add_record, _add_simulate, _add_replay, _add_import, _add_markers, _add_bound,
+        _add_demo, _add_live, _add_record, _add_simulate, _add_replay, _add_diagnose, _add_import, _add_markers, _add_bound,
     )  # fmt: skip
     for add in verb_parsers:
         add(verbs)
@@ -169,6 +169,16 @@ def _add_replay(verbs: Verbs) -> None:
     )
     _add_system(parser)
     _add_out(parser)
+    _add_part(parser)
+    text = "the Cramér-Rao bound of every parameter too, as the yardstick of its estimate"
+    parser.add_argument("--bound", action="store_true", help=text)
+    text = "as fast as it goes, or in step with the recorded time"
+    parser.add_argument("--speed", choices=("max", "1"), default="max", help=text)
+    _add_view(parser)
+
+
+def _add_part(parser: Parser) -> None:
+    """Which part of a capture, and what is known beforehand."""
     parser.add_argument("-ss", dest="start", metavar="SECONDS", type=_seconds(), help="leave out what is before")
     parser.add_argument("-to", dest="stop", metavar="SECONDS", type=_seconds(positive=True), help="and what is after")
     text = (
@@ -176,11 +186,20 @@ def _add_replay(verbs: Verbs) -> None:
         "priors that the file itself states hold with and without it"
     )
     parser.add_argument("--prior", action="store_true", help=text)
-    text = "the Cramér-Rao bound of every parameter too, as the yardstick of its estimate"
-    parser.add_argument("--bound", action="store_true", help=text)
-    text = "as fast as it goes, or in step with the recorded time"
-    parser.add_argument("--speed", choices=("max", "1"), default="max", help=text)
-    _add_view(parser)
+
+
+def _add_diagnose(verbs: Verbs) -> None:
+    text = "Find what a recorded session holds that its system file does not describe, and describe it."
+    parser = _add_verb(verbs, "diagnose", "diagnose", text)
+    parser.add_argument("capture", metavar="CAPTURE", type=Path, help="a capture, log or recording, as for replay")
+    _add_system(parser)
+    _add_out(parser)
+    _add_part(parser)
+    text = (
+        "check what is found on this capture; the same one stands for what comes after -to. "
+        "Without it the last third of the capture is held out"
+    )
+    parser.add_argument("--holdout", metavar="CAPTURE", type=Path, help=text)
 
 
 def _add_import(verbs: Verbs) -> None:

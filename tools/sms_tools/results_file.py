@@ -53,10 +53,14 @@ def _finite(value: Any) -> Any:
 
 def write_results(directory: Path, document: dict[str, Any]) -> Path:
     """Write results.json into the directory, which is made; InputError where that fails."""
-    path = directory / NAME
-    part = directory / (NAME + ".part")
+    return write_document(directory / NAME, document)
+
+
+def write_document(path: Path, document: dict[str, Any]) -> Path:
+    """Write a document as a whole or not at all; its directory is made. InputError where that fails."""
+    part = path.with_name(path.name + ".part")
     try:
-        directory.mkdir(parents=True, exist_ok=True)
+        path.parent.mkdir(parents=True, exist_ok=True)
         part.write_text(to_json(document) + "\n", encoding="utf-8")
         part.replace(path)
     except OSError as error:

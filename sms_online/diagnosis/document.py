@@ -1,0 +1,171 @@
+"""A diagnosis as one document, diagnosis.json: verdict, effects with their doubt, residuals before and after."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from sms_online.diagnosis.constants import deviations
+from sms_online.diagnosis.diagnose import Diagnosis, Part
+from sms_online.diagnosis.trace import Finding
+from sms_online.effects.base import report
+from sms_online.effects.catalogue import ENTRIES, declarable
+from sms_online.results import results_document, standard_deviation
+from sms_online.stream import Array
+
+SCHEMA = "sms-online/diagnosis/1"
+
+# Reported coefficients: name to estimate and standard deviation, None where there is none.
+Coefficients = dict[str, tuple[float, float | None]]
+
+
+def diagnosis_document(diagnosis: Diagnosis, warnings: list[str], truth: dict[str, float] | None) -> dict[str, Any]:
+    """diagnosis.json.
+
+    truth: true values of physical parameters by name, of a simulated capture; they enter this report alone.
+    """
+    before, after = diagnosis.before, diagnosis.after
+    sessions = {"before": diagnosis.estimator_before, "after": diagnosis.estimator_after}
+    results = {name: results_document(session, 0.0, [], truth) for name, session in sessions.items()}
+    unexplained = diagnosis.unexplained
+    return {
+        "schema": SCHEMA,
+        "verdict": diagnosis.verdict,
+        "summary": summary(diagnosis),
+        "effects": [_effect(diagnosis, finding) for finding in diagnosis.findings] + _kinematics(diagnosis),
+        **{
+            name: {
+                "fit": _part(state.fit),
+                "holdout": _part(state.holdout),
+                "limit": {row: test.limit for row, test in state.test.items()},
+                "parameters": results[name]["parameters"],
+            }
+            for name, state in (("before", before), ("after", after))
+        },
+        "unexplained": None
+        if unexplained is None
+        else {
+            "row": unexplained.row,
+            "speed": unexplained.speed,
+            "variable": unexplained.variable,
+            "share": unexplained.share,
+            "at": unexplained.at.tolist(),
+            "force": unexplained.force.tolist(),
+        },
+        "candidates": [
+            {
+                "name": ranked.candidate.effect.name,
+                "where": ranked.candidate.effect.where,
+                "gain": ranked.gain,
+                "share": ranked.share,
+            }
+            for ranked in diagnosis.ranking
+        ],
+        "warnings": [*warnings, *results["after"]["warnings"]],
+    }
+
+
+def summary(diagnosis: Diagnosis) -> str:
+    """The verdict in a sentence."""
+    if diagnosis.verdict == "clean":
+        return "Nothing but noise is left: the model explains the capture."
+    keys = [f"{effect['name']} at {effect['where']}" for effect in _named(diagnosis)]
+    before, after = diagnosis.before, diagnosis.after
+    row = max(before.test, key=lambda name: before.test[name].whitened)
+    fall = f"from {before.test[row].whitened:.3g} to {after.test[row].whitened:.3g} times noise"
+    falls = f"the residual of {row} falls {fall}"
+    if diagnosis.verdict == "named":
+        return f"The model lacks {', '.join(keys)}: with it {falls}."
+    unexplained = diagnosis.unexplained
+    assert unexplained is not None
+    left = max(0.0, after.excess) / max(before.excess, 1.0)
+    tried = f" The nearest known effects ({', '.join(keys)}) leave {100.0 * left:.0f} % of it." if keys else ""
+    return (
+        f"The model lacks something that no known effect explains: most of it acts on {unexplained.row} "
+        f"({unexplained.speed}) and depends on {unexplained.variable}.{tried}"
+    )
+
+
+def _named(diagnosis: Diagnosis) -> list[dict[str, str]]:
+    found = [{"name": f.candidate.effect.name, "where": f.candidate.effect.where} for f in diagnosis.findings]
+    return [{"name": each["name"], "where": each["where"]} for each in _kinematics(diagnosis)] + found
+
+
+def _part(part: Part) -> dict[str, dict[str, float | None]]:
+    return {row: {"relative": part.relative.get(row), "whitened": whitened} for row, whitened in part.whitened.items()}
+
+
+def _effect(diagnosis: Diagnosis, finding: Finding) -> dict[str, Any]:
+    effect = finding.candidate.effect
+    units = declarable(ENTRIES[effect.name], diagnosis.after.system)
+    return {
+        "name": effect.name,
+        "where": effect.where,
+        "coefficients": {
+            name: {"estimate": value, "std": std, "unit": units.get(name, "")}
+            for name, (value, std) in coefficients(diagnosis, finding).items()
+        },
+        "ambiguous_with": list(finding.ambiguous),
+        "separated_by": ENTRIES[effect.name].separated_by if finding.ambiguous else None,
+        "evidence": {
+            "gain": finding.gain.gain,
+            "limit": finding.limit,
+            "held_out_improvement": finding.improvement,
+        },
+    }
+
+
+def _kinematics(diagnosis: Diagnosis) -> list[dict[str, Any]]:
+    """Effects that changed the kinematics of links: they have no coefficients and replace the rows."""
+    described, adopted = diagnosis.described.system, diagnosis.attempt.system
+    left = max(0.0, diagnosis.after.excess) / max(diagnosis.before.excess, 1.0)
+    return [
+        {
+            "name": effect.name,
+            "where": effect.where,
+            "coefficients": {},
+            "ambiguous_with": [],
+            "separated_by": None,
+            "evidence": {"gain": diagnosis.before.excess * (1.0 - left), "limit": 0.0, "held_out_improvement": None},
+        }
+        for effect in adopted.effects
+        if effect not in described.effects
+    ]
+
+
+def coefficients(diagnosis: Diagnosis, finding: Finding) -> Coefficients:
+    """What a person reads of an effect, from the session after where it is an unknown of π."""
+    effect, attempt = finding.candidate.effect, diagnosis.attempt
+    for constant, candidate in zip(attempt.constants, attempt.fixed, strict=True):
+        if (constant.name, constant.where) == (effect.name, effect.where):
+            at = attempt.rows.base.n
+            for other in attempt.fixed[: attempt.fixed.index(candidate)]:
+                at += len(other.parameters)
+            own = slice(at, at + len(candidate.parameters))
+            covariance = attempt.tracing.covariance(diagnosis.chosen)[own, own]
+            stds = deviations(constant, covariance)
+            return {name: (value, stds.get(name)) for name, value in constant.coefficients.items()}
+    session = diagnosis.estimator_after
+    names, values, covariance = _estimate(diagnosis)
+    for force in session.model.effects:
+        if (force.name, force.where) == (effect.name, effect.where):
+            told = report(force, names, values, covariance)
+            return {name: (value, None if name in force.shapes else std) for name, (value, std) in told.items()}
+    own_names = [p.name for p in finding.candidate.parameters]
+    return {
+        name.rsplit(".", 1)[1]: (float(values[k]), float(np.sqrt(covariance[k, k])))
+        for k, name in enumerate(names)
+        if name in own_names
+    }
+
+
+def _estimate(diagnosis: Diagnosis) -> tuple[list[str], Array, Array]:
+    """Names, values and covariance of the parameters after, its deviations those of the results."""
+    session = diagnosis.estimator_after
+    estimate, std = session.estimate(), standard_deviation(session)
+    stated = np.sqrt(np.diag(estimate.covariance))
+    ratio = np.divide(std, stated, out=np.ones_like(std), where=np.isfinite(stated) & (stated > 0.0))
+    known = np.isfinite(stated)
+    covariance = np.where(np.outer(known, known), estimate.covariance, 0.0) * np.outer(ratio, ratio)
+    return [p.name for p in session.base.parameters], estimate.pi, covariance

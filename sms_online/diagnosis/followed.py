@@ -1,0 +1,46 @@
+"""Internal states of effects (hysteresis, sloshing liquid) along the measured motion of a whole session."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from sms_online.diagnosis.record import Segment
+from sms_online.model.model import Model
+from sms_online.pipeline.internal_states import InternalStates
+from sms_online.pipeline.sensing import Sensing
+from sms_online.pipeline.smoothing import smooth
+from sms_online.stream import Array
+
+# States are advanced once in so many samples: at 1 kHz the trapezoidal rule is off by 5e-4 of what changes at 3 Hz.
+STEP = 4
+# Half width of the filter of the motion behind them: passes 70 Hz at 1 kHz.
+HALF_WIDTH = 28
+
+
+class FollowedMotion:
+    """The smoothed motion of each segment, once in STEP samples, for any model's internal states."""
+
+    def __init__(self, sensing: Sensing, segments: Sequence[Segment], sample_rate: float) -> None:
+        self._rate = sample_rate
+        layout = sensing.model.layout
+        self._motions = []
+        self._sizes = [segment.index.size for segment in segments]
+        for segment in segments:
+            x = sensing.coordinates(segment.values)
+            samples = np.arange(HALF_WIDTH, len(x) - HALF_WIDTH, STEP)
+            smoothed, rates = smooth(x, samples, HALF_WIDTH, sample_rate)
+            self._motions.append((samples, smoothed, layout.speeds(smoothed, rates)))
+
+    def states(self, model: Model, number: int, at: Array | None = None) -> Array:
+        """Internal states (K, n_states) of a model at samples `at` (K,) of a segment, at all of them unless given.
+
+        They begin at rest with the segment, and stay as they are at its ends, where the motion is not known.
+        """
+        at = np.arange(self._sizes[number], dtype=float) if at is None else at
+        if model.n_states == 0:
+            return np.zeros((len(at), 0))
+        samples, x, v = self._motions[number]
+        z = InternalStates(model, self._rate / STEP).push(x, v)
+        return np.stack([np.interp(at, samples, column) for column in z.T], axis=1)

@@ -1,0 +1,46 @@
+"""The system file of a rig with the effects that a diagnosis has found: the file as it was, and what comes to it."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+from sms_online.description.parse import shipped_systems, shipped_text
+from sms_online.description.schema import System
+from sms_online.errors import InputError
+
+NAME = "system.toml"
+
+
+def adopted_text(described: str, before: System, after: System) -> str:
+    """TOML of the system `after` from the text or name `described` of the system `before`, whose lines stay as they are."""
+    text = shipped_text(described) if described in shipped_systems() else Path(described).read_text(encoding="utf-8")
+    lines = text.rstrip().splitlines()
+    if after.gravity != before.gravity:
+        stated = [k for k, line in enumerate(lines) if re.match(r"\s*gravity\s*=", line)]
+        gravity = (
+            f"gravity = [{', '.join(f'{g:.9g}' for g in after.gravity)}] # m/s², of the tilted table that was found"
+        )
+        if stated:
+            lines[stated[0]] = gravity
+        else:
+            first_table = next((k for k, line in enumerate(lines) if line.startswith("[")), len(lines))
+            lines[first_table:first_table] = [gravity, ""]
+    for effect in after.effects:
+        if effect not in before.effects:
+            lines += ["", "[[effect]]", f'name = "{effect.name}"', f'where = "{effect.where}"']
+            if effect.coefficients:
+                inside = ", ".join(f"{name} = {value:.9g}" for name, value in effect.coefficients.items())
+                lines.append(f"coefficients = {{ {inside} }}")
+    return "\n".join(lines) + "\n"
+
+
+def write_adopted(directory: Path, text: str) -> Path:
+    """Write DIR/system.toml; InputError where that fails."""
+    path = directory / NAME
+    try:
+        directory.mkdir(parents=True, exist_ok=True)
+        path.write_text(text, encoding="utf-8")
+    except OSError as error:
+        raise InputError(str(path), "", error.strerror or str(error), "a file that can be written") from None
+    return path

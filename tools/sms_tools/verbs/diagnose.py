@@ -1,0 +1,115 @@
+"""diagnose: what a capture holds that its system file does not describe."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import Any
+
+from rich.table import Table
+
+from sms_adapters.sources import open_source
+from sms_adapters.truth import read_truth
+from sms_online.description.schema import System
+from sms_online.diagnosis.diagnose import diagnose
+from sms_online.diagnosis.document import diagnosis_document
+from sms_online.errors import InputError
+from sms_online.pipeline.estimator import Estimator
+from sms_online.stream import Block
+from sms_online.trackers.interface import Prior
+from sms_tools.adopted_system import adopted_text, write_adopted
+from sms_tools.exit_codes import NOTHING_DETERMINED, OK
+from sms_tools.priors import base_prior
+from sms_tools.report import Document, parameter_table, report_console, show
+from sms_tools.results_file import results_directory, to_json, write_document
+from sms_tools.session import described_system
+
+NAME = "diagnosis.json"
+# Ambiguous and ranked candidates that people are shown.
+SHOWN = 8
+
+
+def run(args: argparse.Namespace) -> int:
+    """Diagnose a capture; 0, or 3 where nothing is determined."""
+    if args.stop is not None and args.start is not None and args.stop <= args.start:
+        raise InputError("-to", "", f"{args.stop:g} s", f"a time after -ss {args.start:g} s")
+    system, folder = described_system(args)
+    directory = results_directory(args.out)
+    console = report_console(args.json)
+    blocks, warnings = _samples(args.capture, system, args.start, args.stop, folder)
+    holdout: list[Block] = []
+    if args.holdout is not None:
+        start = None
+        if args.holdout == args.capture:
+            if args.stop is None:
+                expected = "-to SECONDS beside it: what comes after is held out then"
+                raise InputError("--holdout", "", "the capture itself", expected)
+            start = args.stop
+        holdout, more = _samples(args.holdout, system, start, None, folder)
+        warnings += more
+        if holdout[0].channels != blocks[0].channels:
+            raise InputError(str(args.holdout), "header", ", ".join(holdout[0].channels), ", ".join(blocks[0].channels))
+    truth = read_truth(args.capture)
+
+    def prior(estimator: Estimator) -> Prior | None:
+        return base_prior(system, estimator.base, args.prior) if args.prior or system.priors else None
+
+    def progress(message: str) -> None:
+        console.print(f"{message} …", markup=False, style="dim")
+
+    diagnosis = diagnose(system, blocks, str(args.capture), prior, holdout, progress)
+    document = diagnosis_document(diagnosis, warnings, None if truth is None else truth["parameters"])
+    lines: list[Table | str] = ["", document["summary"], ""]
+    if document["effects"]:
+        lines += [_effects(document), ""]
+    lines += [_residuals(document), "", parameter_table(document["after"], console.width, title="after"), ""]
+    lines += [f"warning: {warning}" for warning in document["warnings"]]
+    path = write_document(directory / NAME, document)
+    if diagnosis.after.system != system:
+        text = adopted_text(args.system, system, diagnosis.after.system)
+        lines.append(f"system file with what was found: {write_adopted(directory, text)}")
+    show(console, *lines, f"diagnosis: {path}")
+    if args.json:
+        print(to_json(document))
+    return OK if any(p["identifiable"] for p in document["after"]["parameters"]) else NOTHING_DETERMINED
+
+
+def _samples(
+    capture: Path, system: System, start: float | None, stop: float | None, folder: Path | None
+) -> tuple[list[Block], list[str]]:
+    source = open_source(capture, system, start, stop, None, folder)
+    blocks = list(source)
+    if not blocks:
+        raise InputError(str(capture), "", "no samples", "a capture with samples in the time asked for")
+    return blocks, list(source.warnings)
+
+
+def _effects(document: Document) -> Table:
+    table = Table(title="effects", title_justify="left", box=None, header_style="bold", pad_edge=False)
+    for heading in ("effect", "coefficient", "estimate", "± std", "unit", "cannot be told from"):
+        table.add_column(heading, justify="right" if heading in ("estimate", "± std") else "left", overflow="fold")
+    for effect in document["effects"]:
+        others = ", ".join(effect["ambiguous_with"][:SHOWN])
+        first = True
+        for name, value in effect["coefficients"].items() or [("", None)]:
+            cells = ["", "", ""] if value is None else _cells(value)
+            table.add_row(f"{effect['name']}@{effect['where']}" if first else "", name, *cells, others if first else "")
+            first = False
+    return table
+
+
+def _cells(value: dict[str, Any]) -> list[str]:
+    std = value["std"]
+    return [f"{value['estimate']:.5g}", "" if std is None else f"{std:.2g}", value["unit"]]
+
+
+def _residuals(document: Document) -> Table:
+    table = Table(title="residual", title_justify="left", box=None, header_style="bold", pad_edge=False)
+    for heading in ("rows", "× noise before", "after", "after, held out", "share of torque before", "after, held out"):
+        table.add_column(heading, justify="left" if heading == "rows" else "right")
+    before, after = document["before"], document["after"]
+    for row, fit in before["fit"].items():
+        whitened = [part[row]["whitened"] for part in (before["fit"], after["fit"], after["holdout"])]
+        relative = [fit["relative"], after["holdout"][row]["relative"]]
+        table.add_row(row, *(f"{w:.3g}" for w in whitened), *("" if r is None else f"{r:.3g}" for r in relative))
+    return table
