@@ -70,7 +70,16 @@ class CandidateColumns:
             grids = {s: values for s, values in grids.items() if s in effect.coefficients}
             for values in product(*grids.values()):
                 shapes = dict(zip(grids, values, strict=True))
+                if "order" in shapes and not self._turns(effect.where, shapes["order"]):
+                    continue
                 yield effect.model_copy(update={"coefficients": effect.coefficients | shapes})
+
+    def _turns(self, where: str, order: float) -> bool:
+        """Whether an effect of so many periods a motor turn goes through one: less of it is a constant or a gain."""
+        layout, i = self.rows.model.layout, int(where.removeprefix("joint_")) - 1
+        theta_m = layout.theta_m[i] + layout.n_base_positions - layout.n_base_speeds
+        angles = np.concatenate([motion.x[:, theta_m] for motion, _ in self.rows.weak.motions()])
+        return bool(order * self.system.joints[i].gear_ratio * np.ptp(angles) > 2.0 * np.pi)
 
     def ranges(self, where: str) -> Ranges:
         """How far the session goes at a place."""

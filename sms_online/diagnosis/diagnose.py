@@ -21,6 +21,7 @@ from sms_online.diagnosis.unexplained import Unexplained, describe_residual
 from sms_online.effects.catalogue import ENTRIES, places
 from sms_online.errors import InputError
 from sms_online.pipeline.estimator import Estimator
+from sms_online.pipeline.momentum_balance import HOPS
 from sms_online.pipeline.sensor_noise import SensorNoise
 from sms_online.stream import Array, Block
 from sms_online.trackers.interface import Prior
@@ -31,6 +32,8 @@ FITTED = 2.0 / 3.0
 LARGEST_SHARE_LEFT = 0.1
 # Times that the constants of channels' effects are improved, each with samples corrected by those found before.
 CORRECTIONS = 3
+# Windows that a session is judged by at most: of a longer one stretches are taken.
+MOST_WINDOWS = 2500
 # Stretches of a session that is used in part, in window lengths.
 STRETCH = 5.0
 # Part of a session that tells which kinematics of links are nearer, and improves channels' constants, s.
@@ -135,6 +138,7 @@ class Attempt:
                 beta = np.where(known.known, known.value, beta)
         noise = replace(case.noise, coordinates=estimator.sensing.coordinate_noise(case.noise.grid))
         span = system.windows.momentum
+        most = min(most, MOST_WINDOWS * span / HOPS)
         length, longest = (round(seconds * system.sample_rate) for seconds in (STRETCH * span, most))
         fitting, held = (excerpts(each, length, longest) for each in (case.segments, case.held))
         channels = session.sensing.channels

@@ -150,7 +150,10 @@ def coefficients(diagnosis: Diagnosis, finding: Finding) -> Coefficients:
     names, values, covariance = _estimate(diagnosis)
     for force in session.model.effects:
         if (force.name, force.where) == (effect.name, effect.where):
-            told = report(force, names, values, covariance)
+            # What only a combination of parameters is known of counts as zero in the others' favour.
+            absent = [p.name for p in force.parameters if p.name not in names]
+            grown = np.pad(covariance, (0, len(absent)))
+            told = report(force, [*names, *absent], np.pad(values, (0, len(absent))), grown)
             return {name: (value, None if name in force.shapes else std) for name, (value, std) in told.items()}
     own_names = [p.name for p in finding.candidate.parameters]
     return {

@@ -13,7 +13,7 @@ NAME = "system.toml"
 
 
 def adopted_text(described: str, before: System, after: System) -> str:
-    """TOML of the system `after` from the text or name `described` of the system `before`, whose lines stay as they are."""
+    """TOML of the system `after`: the text of `described`, file or name of the system `before`, and what is new."""
     text = shipped_text(described) if described in shipped_systems() else Path(described).read_text(encoding="utf-8")
     lines = text.rstrip().splitlines()
     if after.gravity != before.gravity:

@@ -73,7 +73,8 @@ def _parser() -> Parser:
     )
     verbs = parser.add_subparsers(metavar="VERB", required=True)
     verb_parsers = (
-        _add_demo, _add_live, _add_record, _add_simulate, _add_replay, _add_diagnose, _add_import, _add_markers, _add_bound,
+        _add_demo, _add_live, _add_record, _add_simulate, _add_replay, _add_diagnose, _add_import, _add_markers,
+        _add_bound,
     )  # fmt: skip
     for add in verb_parsers:
         add(verbs)
