@@ -36,6 +36,8 @@ CORRECTIONS = 3
 MOST_WINDOWS = 2500
 # Stretches of a session that is used in part, in window lengths.
 STRETCH = 5.0
+# Times that rows are weighed anew where the session's own fit could not weigh them.
+REWEIGHED = 2
 # Part of a session that tells which kinematics of links are nearer, and improves channels' constants, s.
 SOME = 8.0
 
@@ -254,6 +256,11 @@ def diagnose(
     attempt = described = Attempt(case, system)
     n = described.rows.base.n
     chosen = attempt.search()
+    for _ in range(0 if before.by_momentum else REWEIGHED):
+        # Nothing was known of the rows' noise that was worth the name, for nothing explained the torques.
+        beta = attempt.solution(chosen)[:n]
+        attempt = described = Attempt(case, system, (), beta, attempt.tracing.candidates)
+        chosen = attempt.search()
     ranking = attempt.tracing.ranking()
     bare = described.state([])
     exact = _exact(system)

@@ -10,7 +10,7 @@ Source of the selection: Pati, Rezaiifar and Krishnaprasad, Asilomar Conf. Signa
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from sms_online.description.schema import Effect
 from sms_online.diagnosis.constants import is_constant
 from sms_online.diagnosis.evidence import RANK_TOLERANCE, Gain, basis, free_of, gain, threshold
+from sms_online.diagnosis.plausible import plausible
 from sms_online.diagnosis.rows import SessionRows
 from sms_online.model.parameters import Parameter
 from sms_online.stream import Array
@@ -37,6 +38,8 @@ ACTS = 0.01
 # Rows whose mean square exceeds their variance by more than this although everything that is known of has been
 # subtracted have an error of their own: friction is never quite its model.
 LARGEST_RATIO = 1.5
+# Effects that contain a simpler one, which is to be tried first: fewest coefficients win.
+EXTENDS = {"direction_friction": "viscous_friction"}
 # At most so many effects are looked for in turn.
 MOST_EFFECTS = 8
 
@@ -57,6 +60,12 @@ class Candidate:
     def key(self) -> str:
         """name@where."""
         return f"{self.effect.name}@{self.effect.where}"
+
+    @property
+    def extends(self) -> str | None:
+        """Key of a simpler effect that it contains."""
+        simpler = EXTENDS.get(self.effect.name)
+        return None if simpler is None else f"{simpler}@{self.effect.where}"
 
     @property
     def constant(self) -> bool:
@@ -135,12 +144,17 @@ class Tracing:
         """What each candidate would take beside those chosen."""
         Q = basis(self._columns(chosen))
         r = free_of(Q, self._b[:, None])[:, 0]
-        return [gain(Q, r, Z) for Z in self._Z]
+        return [self._plausible(c, gain(Q, r, Z)) for c, Z in zip(self.candidates, self._Z, strict=True)]
+
+    @staticmethod
+    def _plausible(candidate: Candidate, found: Gain) -> Gain:
+        """The gain, none where the effect cannot have the coefficients."""
+        return found if plausible(candidate.effect.name, found.coefficients) else replace(found, gain=0.0)
 
     def gain_of(self, candidate: Candidate, chosen: Sequence[int]) -> Gain:
         """What any candidate would take beside those chosen."""
         Q = basis(self._columns(chosen))
-        return gain(Q, free_of(Q, self._b[:, None])[:, 0], self._whitened(candidate))
+        return self._plausible(candidate, gain(Q, free_of(Q, self._b[:, None])[:, 0], self._whitened(candidate)))
 
     def put(self, k: int, candidate: Candidate) -> None:
         """Put another form of an effect in the place of a candidate."""
@@ -180,9 +194,7 @@ class Tracing:
         chosen: list[int] = []
         refused: set[str] = set()
         while len(chosen) < MOST_EFFECTS:
-            taken = {self.candidates[k].key for k in chosen} | refused
-            allowed = [k for k, candidate in enumerate(self.candidates) if candidate.key not in taken]
-            best = self._preferred(self.gains(chosen), allowed)
+            best = self._preferred(self.gains(chosen), self._eligible(chosen, refused))
             if best is None:
                 break
             if self.improvement(chosen, best) < LEAST_IMPROVEMENT:
@@ -195,15 +207,23 @@ class Tracing:
                 break
         return chosen
 
+    def _eligible(self, chosen: Sequence[int], refused: set[str]) -> list[int]:
+        """Candidates that may come to those chosen; one that extends another comes after it, and then replaces it."""
+        taken = {self.candidates[k].key for k in chosen}
+        held = taken | {f"{effect.name}@{effect.where}" for effect in self.rows.model.system.effects}
+        return [
+            k
+            for k, candidate in enumerate(self.candidates)
+            if candidate.key not in taken | refused and (candidate.extends is None or candidate.extends in held)
+        ]
+
     def _revised(self, chosen: list[int]) -> list[int]:
         """The same effects without those that the last one has made superfluous, each in its best form beside them."""
         for k in list(chosen):
             others = [other for other in chosen if other != k]
-            taken = {self.candidates[other].key for other in others}
             gains = self.gains(others)
-            free = [j for j, candidate in enumerate(self.candidates) if candidate.key not in taken]
-            best = self._preferred(gains, free)
-            if best is None:
+            best = self._preferred(gains, self._eligible(others, set()))
+            if best is None or self._excess(k, gains[k]) <= 0.0:
                 chosen = others
             elif best != k and not self._near(gains[k].gain, gains[best].gain):
                 chosen = [best if other == k else other for other in chosen]
