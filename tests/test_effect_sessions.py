@@ -12,16 +12,19 @@ from numpy.testing import assert_allclose
 from scipy.integrate import solve_ivp
 
 from sms_adapters.truth import read_truth
+from sms_online.bound import Motion, cramer_rao_bound
 from sms_online.description.parse import parse_system, shipped_text
 from sms_online.description.schema import System
 from sms_online.effects.base import report
 from sms_online.effects.catalogue import channel_effects, parse_effect
 from sms_online.effects.channel import EncoderEccentricity, SensorLag
 from sms_online.errors import InputError
+from sms_online.model.base_parameters import find_base_parameters
 from sms_online.model.model import Model
 from sms_online.pipeline.conditioning import Conditioning
 from sms_online.pipeline.estimator import Estimator
 from sms_online.pipeline.synchronise import GridSamples
+from sms_online.sensor_set import sensor_set
 from sms_online.stream import Array
 from sms_sim.plant import Plant
 from sms_sim.realtime import RealTimeStepper
@@ -209,6 +212,18 @@ def test_effects_with_internal_states_are_identified_and_survive_a_restart() -> 
 def test_a_tilt_is_refused_where_masses_are_unknown(clean_motion: Simulation) -> None:
     with pytest.raises(InputError, match="effect table_tilt@base"):
         Estimator(declaring("table_tilt@base"), clean_motion.plant.channels, "session")
+
+
+@pytest.mark.parametrize("text", ["torque_gain@joint_2:ratio=0.1", "slosh@base:mass=20"])
+def test_a_bound_knows_no_torques_and_no_internal_states(text: str) -> None:
+    plant = Plant(declaring(text))
+    base, rest = find_base_parameters(plant.model), np.zeros((3, plant.model.layout.n_x))
+    motion = Motion(np.arange(3) * 1e-3, rest, rest)
+    sensors = sensor_set(
+        plant.model, plant.channels, np.full(len(plant.channels), 1e-4), np.full(len(plant.channels), 1e3)
+    )
+    with pytest.raises(InputError, match=text.split(":")[0]):
+        cramer_rao_bound(plant.dynamics, base, [motion], sensors)
 
 
 # Channels
