@@ -72,13 +72,15 @@ class Estimator:
     """Streams one session of a described system.
 
     channels: what the source's blocks hold. source: its name, for messages. Raises InputError when a channel is missing
-    that the model needs, or where the system declares an effect that a stream of samples cannot identify.
+    that the model needs, or where the system declares a tilt of the table and there is no reference.
+    reference: π (n_pi,) of the system whose masses that tilt pulls at, from an estimate without it or from weighing.
     """
 
-    def __init__(self, system: System, channels: tuple[str, ...], source: str) -> None:
+    def __init__(self, system: System, channels: tuple[str, ...], source: str, reference: Array | None = None) -> None:
         self.system = system
-        self._model = model = Model(system)
-        _refuse_unknown_masses(model)
+        self._model = model = Model(system, reference)
+        if reference is None:
+            _refuse_unknown_masses(model)
         self._base = base = find_base_parameters(model)
         self.sensing = Sensing(model, channels, source)
         self.samples = 0
