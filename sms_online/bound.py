@@ -23,6 +23,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from sms_online.errors import InputError
 from sms_online.model.base_parameters import BaseParameters
 from sms_online.model.dynamics import Dynamics
 from sms_online.model.model import Model
@@ -99,12 +100,12 @@ def session_bound(estimator: Estimator, record: MotionRecord) -> Array | None:
     """Bound (n,) of a finished session at its own estimate, with the noise that it has used of its sensors.
 
     None where there is none: no noise known or no noise at all, no motion, parameters not determined, or estimates that
-    are no mechanism, with a mass matrix that is not positive definite; nor where an effect needs the torques, which a
-    motion does not hold.
+    are no mechanism, with a mass matrix that is not positive definite; nor where an effect needs more than a motion
+    holds.
     """
     noise = None if estimator.momentum is None else estimator.momentum.sensor_noise
     estimate, motions = estimator.estimate(), record.motions
-    if noise is None or noise.exact or not motions or not estimate.determined.all() or estimator.model.needs_torque:
+    if noise is None or noise.exact or not motions or not estimate.determined.all() or _followed(estimator.model):
         return None
     dynamics = estimator.model.dynamics(estimator.base.physical_values(estimate.pi))
     try:
@@ -138,8 +139,11 @@ def cramer_rao_bound(dynamics: Dynamics, base: BaseParameters, motions: Sequence
     against what an estimator averages over. It has to follow the motion, though, see STEP.
     Limitations: a sensor slower than the motion is taken for one of as much density that is not. Where x and v are
     estimates themselves, their noise counts as excitation: bounds of more than some percent come out low.
-    Raises ValueError where a motion has no uniform step, InputError where a reading is unknown.
+    Raises ValueError where a motion has no uniform step, InputError where a reading is unknown or where an effect needs
+    torques or internal states, which a motion does not hold.
     """
+    if followed := _followed(dynamics.model):
+        raise InputError(dynamics.model.system.name, "effect", followed[0], "effects of positions and speeds alone")
     readings = Readings(dynamics.model, sensors.channels)
     n_v, joints = dynamics.model.layout.n_v, len(dynamics.model.layout.q)
     information = Information(n_v, base.n)
@@ -159,6 +163,11 @@ def cramer_rao_bound(dynamics: Dynamics, base: BaseParameters, motions: Sequence
             Gamma, B = driven[..., :joints] * drive, driven[..., joints:]
             information.add(linear.C[:-1] / noise, linear.D[:-1] / noise, Phi, Gamma, B)
     return information.standard_deviations()
+
+
+def _followed(model: Model) -> list[str]:
+    """Effects that need torques or internal states."""
+    return [f"{effect.name}@{effect.where}" for effect in model.effects if effect.needs_torque or effect.n_states]
 
 
 def _middle(samples: Array) -> Array:

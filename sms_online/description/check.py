@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Iterable
+from fnmatch import fnmatchcase
 
 import numpy as np
 
@@ -166,10 +167,13 @@ def _check_effects(system: System, names: tuple[str, ...], source: str) -> None:
     places = ("base", *numbered, "tip")
     seen: set[tuple[str, str]] = set()
     for k, effect in enumerate(system.effects, start=1):
-        if effect.where not in (*places, *names):
+        if effect.where not in places and not any(fnmatchcase(name, effect.where) for name in names):
             near = nearest(effect.where, (*places, *names))
             raise InputError(
-                source, f"effect {k}.where", repr(effect.where), f"{', '.join(places)} or a channel{hint(near)}"
+                source,
+                f"effect {k}.where",
+                repr(effect.where),
+                f"{', '.join(places)}, a channel or a pattern of channels{hint(near)}",
             )
         if (effect.name, effect.where) in seen:
             raise InputError(

@@ -144,6 +144,13 @@ class Model:
                 springs.append(Spring(len(parameters), ends, np.array([[1.0, -1.0], [-1.0, 1.0]])))
                 parameters.append(Parameter(f"joint_{i}.{kind}", f"{symbol}_{i}", unit, getattr(joint, kind)))
 
+    def of(self, system: System) -> Model:
+        """Model of a changed system, with the reference of this one by the parameters' names; what is new weighs 0."""
+        reference = dict(zip((p.name for p in self.parameters), self.reference, strict=True))
+        other = Model(system)
+        other.reference = np.array([reference.get(p.name, 0.0) for p in other.parameters])
+        return other
+
     @property
     def dissipative(self) -> list[int]:
         """Parameters that take power out: indices whose column in `power_columns` is not always zero."""

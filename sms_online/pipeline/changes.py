@@ -113,7 +113,7 @@ class Changes:
         alarm = self.detector.alarm
         if alarm is None or self.windows_after < (LEAST_DECISION if last else self._wanted):
             return None
-        whole = Model(everything(self._system))
+        whole = self.model.of(everything(self._system))
         names = additional(self._system, whole, self.base)
         base = extended(self._described, whole, [*self._added, *names])
         onset = self.detector.onset - MARGIN
@@ -222,7 +222,7 @@ class Changes:
     def _extend(self) -> None:
         """Model and base with the parameters that events have added."""
         if self._added:
-            self.model = Model(restricted(self._system, self._added))
+            self.model = self.model.of(restricted(self._system, self._added))
             self.base = extended(self._described, self.model, self._added)
 
     def state(self) -> dict[str, Any]:

@@ -74,13 +74,15 @@ class Estimator:
     """Streams one session of a described system.
 
     channels: what the source's blocks hold. source: its name, for messages. Raises InputError when a channel is missing
-    that the model needs, or where the system declares an effect that a stream of samples cannot identify.
+    that the model needs, or where the system declares a tilt of the table and there is no reference.
+    reference: π (n_pi,) of the system whose masses that tilt pulls at, from an estimate without it or from weighing.
     """
 
-    def __init__(self, system: System, channels: tuple[str, ...], source: str) -> None:
+    def __init__(self, system: System, channels: tuple[str, ...], source: str, reference: Array | None = None) -> None:
         self.system = system
-        self._model = model = Model(system)
-        _refuse_unknown_masses(model)
+        self._model = model = Model(system, reference)
+        if reference is None:
+            _refuse_unknown_masses(model)
         self._base = base = find_base_parameters(model)
         self.sensing = Sensing(model, channels, source)
         self.samples = 0
@@ -98,7 +100,8 @@ class Estimator:
         self._rates = RatesStage(system.sample_rate, range(layout.n_x), self.sensing.noise)
         self._followed = FollowedStates(model, system.sample_rate, len(self.sensing.channels))
         self._energy = EnergyBalance(model, base, system.sample_rate)
-        self.momentum = None if system.balance == "energy" else Momentum(model, base, self.sensing)
+        gain = self._conditioning.noise_gain
+        self.momentum = None if system.balance == "energy" else Momentum(model, base, self.sensing, gain)
         self.energy_tracker: Tracker = RecursiveLeastSquares(base.n)
         self._begin_joints()
         self._segment = -1
