@@ -118,7 +118,7 @@ class Tracing:
         self._model = np.concatenate([rows.Y, *(candidate.columns for candidate in fixed)], axis=2)
         self._plain_model = self._model / rows.std[..., None]
         self._plain = [candidate.columns / rows.std[..., None] for candidate in self.candidates]
-        self.floor = self._floor()
+        self.floor = self._floor(prior)
         rows.whiten(self.floor)
         # What is known beforehand are rows too, of parameters alone.
         known = prior_factor(prior, rows.base.n)
@@ -128,11 +128,20 @@ class Tracing:
         self._Z = [self._whitened(candidate) for candidate in self.candidates]
         self.trials = len(self.candidates)
 
-    def _floor(self) -> Array:
-        """Excess of each speed's rows over their variance, (n_v,), that all candidates together leave."""
-        plain = [self._plain_model, *self._plain]
-        stacked = np.concatenate(plain, axis=2).reshape(-1, sum(part.shape[2] for part in plain))
+    def _floor(self, prior: Prior | None) -> Array:
+        """Excess of each speed's rows over their variance, (n_v,), that all candidates together leave.
+
+        Parameters that are known beforehand keep their values here: where a model lacks much, parameters that shrink to
+        zero would explain rows without a torque.
+        """
+        free = np.ones(self._plain_model.shape[2], dtype=bool)
         b = self.rows.b / self.rows.std
+        if prior is not None:
+            known = np.flatnonzero(prior.known)
+            free[known] = False
+            b = b - self._plain_model[..., known] @ prior.value[known]
+        plain = [self._plain_model[..., free], *self._plain]
+        stacked = np.concatenate(plain, axis=2).reshape(-1, sum(part.shape[2] for part in plain))
         left = free_of(basis(stacked), b.reshape(-1, 1)).reshape(b.shape)
         ratio = np.mean(left**2, axis=0)
         return np.where(ratio > LARGEST_RATIO, ratio - 1.0, 0.0)

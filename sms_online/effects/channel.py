@@ -16,10 +16,10 @@ from scipy.ndimage import correlate1d
 from sms_online.effects.base import Entry, Ranges, Shape
 from sms_online.stream import Array
 
-# A lag is taken back up to so many times its corner, and up to this share of the sample rate: a tenth of the signal is
-# left there. NOISE_WEIGHT, of the sum of squared weights against squared relative errors, keeps noise from growing more
-# than three times (corner 30 Hz at 1 kHz) and leaves 4e-4 of the signal below the passband's end.
-PASSBAND, HIGHEST, NOISE_WEIGHT = 3.0, 0.4, 1e-6
+# A lag is taken back up to so many times its corner, and up to this share of the sample rate; with three times, noise
+# grows so far that squares of it bias a fit (links' rows of the planar example leave five times their deviation).
+# NOISE_WEIGHT is that of the sum of squared weights against squared relative errors.
+PASSBAND, HIGHEST, NOISE_WEIGHT = 1.0, 0.4, 1e-6
 # Frequencies that are compared for each sample of the half width.
 FREQUENCIES = 20
 # Fixed-point steps from a reading back to the angle; the error falls by the amplitude (rad) each.
