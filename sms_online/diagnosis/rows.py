@@ -108,7 +108,7 @@ class SessionRows:
         sensitivities = self._sensitivities(instants, balance.span)
         row_noise = RowNoise(self.model.layout.theta_m, balance.span)
         bends, largest = np.empty((0, n_v)), np.zeros(n_v)
-        readings = self._readings(segment, int(np.median([window.half_width for window in windows])))
+        readings = self._readings(segment, _middle([window.half_width for window in windows]))
         seconds = np.arange(STEPS + 1) * balance.span / STEPS
         out = []
         for window in windows:
@@ -202,11 +202,16 @@ class SessionRows:
         return (self.count * len(speeds)) ** 2 / total
 
 
+def _middle(half_widths: list[int]) -> int:
+    """Upper median of filters' half widths, which is one of them."""
+    return sorted(half_widths)[len(half_widths) // 2]
+
+
 def joint_windows(rows: SessionRows) -> WeakWindows:
     """The windows of the relative residual over the same session: those of `JointBalance`, all samples seen."""
     system = rows.model.system
     balance = JointBalance(rows.model, rows.base, system.sample_rate)
-    M = int(np.median(rows.weak.windows.half_width))
+    M = _middle(rows.weak.windows.half_width.tolist())
     starts = [
         np.arange(M, segment.index.size - M - balance.width - 1, balance.hop, dtype=np.int64)
         for segment in rows.segments

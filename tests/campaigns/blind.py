@@ -1,0 +1,299 @@
+"""Blind cases of the diagnosis: sessions of the planar example with an effect that its description lacks.
+
+    python -m tests.campaigns.blind run RESULTS.jsonl --seeds 4
+    python -m tests.campaigns.blind clean RESULTS.jsonl --seeds 100
+    python -m tests.campaigns.blind summary RESULTS.jsonl
+
+Place, size and shape constants of each effect are drawn by the seed: it is worth 2 to 20 % of the rms of the rows that
+it acts on. The diagnosis sees a capture with noise of grade B and a description with other nominal values; what was
+drawn is compared afterwards. `run` also strikes the true effect, and those whose columns are within 10° of it, out of
+the catalogue and diagnoses again. Every case is a line of RESULTS.jsonl; a stopped campaign goes on where it was.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import zlib
+from collections.abc import Iterator
+from pathlib import Path
+from time import process_time
+from typing import Any
+from unittest.mock import patch
+
+import numpy as np
+
+from sms_adapters.system_file import load_system
+from sms_online.description.schema import Effect, System
+from sms_online.diagnosis.candidates import CandidateColumns
+from sms_online.diagnosis.constants import delay_of
+from sms_online.diagnosis.diagnose import Diagnosis, diagnose
+from sms_online.diagnosis.document import coefficients
+from sms_online.diagnosis.evidence import angle, basis
+from sms_online.diagnosis.record import SampleRecord
+from sms_online.diagnosis.rows import SessionRows
+from sms_online.effects.catalogue import ENTRIES, candidates
+from sms_online.pipeline.estimator import Estimator
+from sms_online.stream import Array, Block
+from sms_sim.simulate import sampled_blocks, simulate
+from tests.campaigns.accuracy import read
+from tests.campaigns.sessions import disguised, exact_session, noisy_session, true_parameters
+
+SYSTEM = "paper-planar"
+GRADE = "B"
+# Worth of an effect, share of the rms of the rows it acts on.
+WORTH = (0.02, 0.2)
+# Columns nearer than this, rad, are not told apart.
+SAME_ANGLE = np.deg2rad(10.0)
+# Noise of grade B is 1e-4 m and rad: motions are simulated to a ten-thousandth of it.
+TOLERANCE = 1e-8
+
+Record = dict[str, Any]
+
+
+class Draw:
+    """Draws effects for the planar example from its own clean motion."""
+
+    def __init__(self, system: System, cache: Path) -> None:
+        self.system = system
+        exact = exact_session(system, cache)
+        block = noisy_session(system, exact, GRADE, 0)
+        estimator = Estimator(system, block.channels, "clean")
+        record = SampleRecord(system.sample_rate)
+        estimator.on_samples = record.add
+        estimator.push(block)
+        estimator.finish()
+        assert estimator.momentum is not None
+        assert estimator.momentum.sensor_noise is not None
+        beta = true_parameters(system)
+        parts = (estimator.model, estimator.base, estimator.sensing, estimator.momentum.sensor_noise)
+        self.rows = SessionRows(*parts, record.segments(), beta)
+        self.make = CandidateColumns(self.rows, system)
+        # Size of each speed's rows: of all its terms together.
+        self._size = np.sqrt(np.mean(np.sum((self.rows.Y * beta) ** 2, axis=2), axis=0))
+
+    def effect(self, name: str, seed: int) -> Effect:
+        """An effect of a name at a place and of a size that the seed chooses, coefficients as `simulate` takes them."""
+        rng = np.random.default_rng([seed, zlib.crc32(name.encode())])
+        places = [effect for effect in candidates(self.system) if effect.name == name]
+        drawn = places[rng.integers(len(places))]
+        if ENTRIES[name].kind == "kinematics":
+            return drawn
+        wanted = float(np.exp(rng.uniform(*np.log(WORTH))))
+        shapes = {}
+        for shape, told in ENTRIES[name].shapes.items():
+            grid = told.grid(self.make.ranges(drawn.where))
+            if shape in drawn.coefficients and name != "sensor_lag":
+                counted = shape == "order" or min(grid) <= 0.0
+                between = np.log([grid[0], grid[-1]]) if not counted else (0.0, 0.0)
+                shapes[shape] = float(rng.choice(grid) if counted else np.exp(rng.uniform(*between)))
+        plain = drawn.model_copy(update={"coefficients": {} if ENTRIES[name].kind == "channel" else shapes})
+        candidate = self.make.of(plain)
+        direction = rng.uniform(0.5, 1.0, candidate.columns.shape[2])
+        if candidate.columns.shape[2] > 1 and name != "direction_friction":
+            direction = rng.standard_normal(candidate.columns.shape[2])
+        added = np.sqrt(np.mean((candidate.columns @ direction) ** 2, axis=0))
+        worth = float(np.max(added / self._size))
+        linear = direction * wanted / worth
+        return plain.model_copy(update={"coefficients": self._stated(name, drawn.where, linear, shapes)})
+
+    def _stated(self, name: str, where: str, linear: Array, shapes: dict[str, float]) -> dict[str, float]:
+        """The coefficients that give these linear ones."""
+        joint = self.system.joints[int(where.removeprefix("joint_")) - 1] if where.startswith("joint_") else None
+        link = self.system.links[int(where.removeprefix("link_")) - 1] if where in ("link_1", "link_2") else None
+        value = float(linear[0])
+        size, phase = float(np.hypot(*linear[:2])) if linear.size > 1 else 0.0, 0.0
+        if linear.size > 1:
+            phase = float(np.arctan2(linear[1], linear[0]))
+        match name:
+            case "kinematic_error":
+                assert joint is not None
+                return {"amplitude": size / joint.stiffness, "phase": phase, **shapes}
+            case "cogging" | "torque_ripple" | "encoder_eccentricity":
+                return {"amplitude": size, "phase": phase, **shapes}
+            case "load_friction":
+                assert joint is not None
+                return {"ratio": value / joint.stiffness}
+            case "link_damping":
+                return {"time": value / link.flexural_rigidity_z}  # type: ignore[union-attr]
+            case "link_mass_damping":
+                return {"rate": value / link.mass_per_length}  # type: ignore[union-attr]
+            case "backlash":
+                # The gap is what is drawn: the stiffness inside is the joint's own.
+                assert joint is not None
+                return {"gap": shapes["gap"] * min(1.0, value / joint.stiffness)}
+            case "slosh":
+                return {"stiffness": value, "mass": value / shapes["frequency"] ** 2}
+            case "sensor_lag":
+                return {"corner": delay_of(value)}
+        names = [n for n in ENTRIES[name].coefficients if n not in shapes]
+        return dict(zip(names, linear.tolist(), strict=False)) | shapes
+
+
+def run(results: Path, cache: Path, seeds: int, names: list[str]) -> None:
+    """Append the cases that `results` lacks, seed by seed."""
+    system = load_system(SYSTEM)
+    draw = Draw(system, cache)
+    done = {(r["kind"], r["name"], r["seed"]) for r in read(results)} if results.exists() else set()
+    for seed in range(seeds):
+        for name in names:
+            if ("single", name, seed) in done:
+                continue
+            effect = draw.effect(name, seed)
+            exact = simulate(system.model_copy(update={"effects": (effect,)}), position_tolerance=TOLERANCE)
+            block = _joined(sampled_blocks(exact, GRADE, seed))
+            record = _case(system, block, effect)
+            _append(results, {"kind": "single", "seed": seed, **record})
+            if ENTRIES[name].kind != "kinematics":
+                _append(results, {"kind": "struck", "seed": seed, **_struck(system, block, effect, draw)})
+
+
+def clean(results: Path, cache: Path, seeds: int) -> None:
+    """Append clean sessions of all grades."""
+    system = load_system(SYSTEM)
+    exact = exact_session(system, cache)
+    done = {(r["name"], r["seed"]) for r in read(results) if r["kind"] == "clean"} if results.exists() else set()
+    for seed in range(seeds):
+        for grade in ("A", "B", "C"):
+            if (grade, seed) not in done:
+                found = diagnose(disguised(system), [noisy_session(system, exact, grade, seed)], "case", lambda _: None)
+                record = {"kind": "clean", "name": grade, "seed": seed, "verdict": found.verdict, "found": _keys(found)}
+                _append(results, record)
+
+
+def _joined(blocks: Iterator[Block]) -> Block:
+    parts = list(blocks)
+    t, values = (np.concatenate([getattr(block, part) for block in parts]) for part in ("t", "values"))
+    return Block(t, parts[0].channels, values)
+
+
+def _append(results: Path, record: Record) -> None:
+    with results.open("a", encoding="utf-8") as file:
+        file.write(json.dumps(record) + "\n")
+
+
+def _keys(found: Diagnosis) -> list[str]:
+    exact = [e for e in found.attempt.system.effects if e not in found.described.system.effects]
+    return [f"{e.name}@{e.where}" for e in exact] + [finding.candidate.key for finding in found.findings]
+
+
+def _case(system: System, block: Block, effect: Effect) -> Record:
+    start = process_time()
+    found = diagnose(disguised(system), [block], "case", lambda _: None)
+    seconds = process_time() - start
+    told = {
+        finding.candidate.key: {name: value for name, (value, _) in coefficients(found, finding).items()}
+        for finding in found.findings
+    }
+    truth = dict(zip([p.name for p in found.estimator_before.base.parameters], true_parameters(system), strict=True))
+    after = found.estimator_after
+    errors = {
+        p.name: float(value / truth[p.name] - 1.0)
+        for p, value in zip(after.base.parameters, after.estimate().pi, strict=True)
+        if p.name in truth
+    }
+    return {
+        "name": effect.name,
+        "where": effect.where,
+        "true": effect.coefficients,
+        "verdict": found.verdict,
+        "found": _keys(found),
+        "told": told,
+        "ambiguous": {finding.candidate.key: list(finding.ambiguous) for finding in found.findings},
+        "before": {row: test.whitened for row, test in found.before.test.items()},
+        "after": {row: test.whitened for row, test in found.after.test.items()},
+        "holdout": found.after.holdout.whitened,
+        "errors": errors,
+        "seconds": seconds,
+    }
+
+
+def _struck(system: System, block: Block, effect: Effect, draw: Draw) -> Record:
+    """The same without the true effect, and without those that say the same."""
+    rows = draw.rows
+    Q = basis(rows.white(rows.Y))
+    columns = {}
+    for each in draw.make.effects():
+        columns.setdefault(f"{each.name}@{each.where}", []).append(rows.white(draw.make.of(each).columns))
+    key = f"{effect.name}@{effect.where}"
+    own = columns.get(key, [])
+    near = {
+        other
+        for other, forms in columns.items()
+        if other == key
+        or any(np.any(mine) and np.any(form) and angle(Q, mine, form) < SAME_ANGLE for mine in own for form in forms)
+    }
+    inner = CandidateColumns.effects
+
+    def allowed(self: CandidateColumns) -> Iterator[Effect]:
+        return (e for e in inner(self) if f"{e.name}@{e.where}" not in near)
+
+    with patch.object(CandidateColumns, "effects", allowed):
+        found = diagnose(disguised(system), [block], "case", lambda _: None)
+    worst = max(found.before.test, key=lambda row: found.before.test[row].whitened)
+    return {
+        "name": effect.name,
+        "where": effect.where,
+        "struck": sorted(near),
+        "verdict": found.verdict,
+        "found": _keys(found),
+        "row": None if found.unexplained is None else found.unexplained.row,
+        "worst": worst,
+    }
+
+
+def summary(records: list[Record]) -> str:
+    """Shares of cases named rightly, inside the ambiguity group, unexplained when struck, and clean."""
+    lines = []
+    singles = [r for r in records if r["kind"] == "single"]
+    right = group = 0
+    ratios: dict[str, list[float]] = {}
+    for r in singles:
+        key = f"{r['name']}@{r['where']}"
+        first = r["found"][:1] == [key]
+        inside = first or any(key in r["ambiguous"].get(found, []) for found in r["found"][:1])
+        right, group = right + first, group + inside
+        for coefficient, value in r["told"].get(key, {}).items():
+            if r["true"].get(coefficient):
+                ratios.setdefault(r["name"], []).append(abs(value / r["true"][coefficient] - 1.0))
+        told = r["told"].get(key, {})
+        lines.append(f"{'ok ' if first else 'grp' if inside else 'BAD'} {key:36} {r['true']} → {r['found']} {told}")
+    if singles:
+        n = len(singles)
+        lines.append(f"{n} single: right first {100 * right / n:.1f} %, inside the group {100 * group / n:.1f} %")
+        medians = {name: round(float(np.median(values)), 4) for name, values in ratios.items()}
+        lines.append(f"median relative error of coefficients: {medians}")
+        held = [max(r["holdout"].values()) for r in singles]
+        lines.append(f"held-out residual: median {np.median(held):.2f}, worst {max(held):.2f} times the predicted noise")
+        lines.append(f"seconds: median {np.median([r['seconds'] for r in singles]):.1f}")
+    struck = [r for r in records if r["kind"] == "struck"]
+    if struck:
+        unexplained = [r for r in struck if r["verdict"] == "unexplained"]
+        right_row = sum(r["row"] == r["worst"] for r in unexplained)
+        lines.append(f"{len(struck)} struck: unexplained {len(unexplained)}, right row {right_row}")
+        lines += [f"   {r['name']}@{r['where']}: {r['verdict']} {r['found']}" for r in struck if r not in unexplained]
+    cleans = [r for r in records if r["kind"] == "clean"]
+    if cleans:
+        lines.append(f"{len(cleans)} clean: {sum(r['verdict'] != 'clean' for r in cleans)} more than noise")
+    return "\n".join(lines)
+
+
+def main() -> None:
+    """Command line of the campaign."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("what", choices=("run", "clean", "summary"))
+    parser.add_argument("results", type=Path)
+    parser.add_argument("--seeds", type=int, default=4)
+    parser.add_argument("--cache", type=Path, default=Path("runs/blind-clean.npz"))
+    parser.add_argument("--names", nargs="*", default=list(ENTRIES))
+    args = parser.parse_args()
+    if args.what == "run":
+        run(args.results, args.cache, args.seeds, args.names)
+    elif args.what == "clean":
+        clean(args.results, args.cache, args.seeds)
+    else:
+        print(summary(read(args.results)))
+
+
+if __name__ == "__main__":
+    main()
