@@ -70,6 +70,18 @@ def test_white_noise_is_found_under_motion_up_to_30_hz(sigma: float) -> None:
     assert np.abs(estimate - 1.0).max() < 0.15
 
 
+@pytest.mark.parametrize("sigma", [1e-6, 1e-4, 1e-2])
+def test_white_noise_is_found_where_samples_come_at_unequal_steps(sigma: float) -> None:
+    """Steps of half to one and a half milliseconds and a gap of ten seconds."""
+    steps = np.random.default_rng(4).uniform(0.5, 1.5, 2000) / RATE
+    steps[700] = 10.0
+    t = np.cumsum(steps)
+    values = np.sin(2 * np.pi * np.outer(t, np.linspace(0.5, 10.0, 60))) + noise(2000, sigma, 1, 60)
+    estimate = noise_std(values, t) / sigma
+    assert np.median(estimate) == pytest.approx(1.0, abs=0.02)
+    assert np.abs(estimate - 1.0).max() < 0.15
+
+
 def test_without_noise_the_estimate_is_rounding() -> None:
     t = np.arange(1000) / RATE
     assert noise_std(np.sin(2 * np.pi * np.outer(t, np.linspace(0.5, 30.0, 20)))).max() < 1e-14

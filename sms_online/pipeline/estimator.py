@@ -197,7 +197,7 @@ class Estimator:
     def _synchronise(self, t: Array, values: Array) -> None:
         block = self._attitude.restore(Block(t, self.sensing.channels, values))
         if self.momentum is not None:
-            self.momentum.observe(block.values)
+            self.momentum.observe(block.t, block.values)
         for piece in self._synchroniser.push(block):
             self._differentiate(piece)
 

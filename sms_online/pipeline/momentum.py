@@ -94,9 +94,9 @@ class Momentum:
         estimate = self.estimate()
         return np.where(estimate.determined, estimate.pi, np.nan)
 
-    def observe(self, values: Array) -> None:
-        """Take the channels' own samples (B, channels), NaN where there is none, to tell their noise."""
-        self._estimate.push(values)
+    def observe(self, t: Array, values: Array) -> None:
+        """Take the channels' own samples (B, channels) at t (B,), NaN where there is none, to tell their noise."""
+        self._estimate.push(t, values)
 
     def push(self, piece: GridSamples, start_time: float, periods: Array) -> None:
         """Take grid samples of the channels; start_time: s of grid index 0; periods (channels,): sample periods, s."""

@@ -68,33 +68,30 @@ class NoiseEstimate:
         self._sensing = sensing
         self._sample_rate = sample_rate
         count = len(sensing.channels)
-        self._samples = [np.empty(0) for _ in range(count)]
+        self._samples = [np.empty((2, 0)) for _ in range(count)]  # instants and values
         self._largest = np.zeros(count)
 
-    def push(self, values: Array) -> None:
-        """Take samples (B, channels), NaN where a channel has none."""
-        if not np.isnan(values).any():
-            self._largest = np.maximum(self._largest, np.abs(values).max(axis=0, initial=0.0))
-            self._samples = [
-                np.concatenate((kept, column))[-SAMPLES:] for kept, column in zip(self._samples, values.T, strict=True)
-            ]
-            return
+    def push(self, t: Array, values: Array) -> None:
+        """Take samples (B, channels) at instants t (B,), NaN where a channel has none."""
         for k, column in enumerate(values.T):
-            own = column[np.isfinite(column)]
-            self._largest[k] = max(self._largest[k], np.abs(own).max(initial=0.0))
-            self._samples[k] = np.concatenate((self._samples[k], own))[-SAMPLES:]
+            fresh = np.stack((t, column))[:, np.isfinite(column)]
+            last = self._samples[k][0, -1:] if self._samples[k].size else -np.inf
+            fresh = fresh[:, np.diff(fresh[0], prepend=last) > 0.0]  # duplicates tell nothing
+            self._largest[k] = max(self._largest[k], np.abs(fresh[1]).max(initial=0.0))
+            self._samples[k] = np.concatenate((self._samples[k], fresh), axis=1)[:, -SAMPLES:]
 
     @property
     def ready(self) -> bool:
         """Whether every channel has samples enough."""
-        return all(kept.size >= FEWEST_SAMPLES for kept in self._samples)
+        return all(kept.shape[1] >= FEWEST_SAMPLES for kept in self._samples)
 
     def noise(self, periods: Array) -> SensorNoise:
         """Noise from what is stated and, where nothing is, from the samples so far; periods (channels,): s, or NaN."""
         sigma = self._sensing.stated_noise
         silent = np.flatnonzero(np.isnan(sigma))
         for k in silent:
-            sigma[k] = noise_std(self._samples[k][:, None])[0]
+            times, samples = self._samples[k]
+            sigma[k] = noise_std(samples[:, None], times)[0]
         floor = FINEST * self._largest + np.finfo(np.float64).tiny
         positions = self._sensing.position_columns
         exact = bool(np.all(sigma[positions] <= ROUGHLY_EXACT * floor[positions]))
@@ -107,10 +104,10 @@ class NoiseEstimate:
 
     def state(self) -> dict[str, Any]:
         """What `restore` needs to continue."""
-        sizes = np.array([kept.size for kept in self._samples])
-        return {"samples": np.concatenate(self._samples), "sizes": sizes, "largest": self._largest}
+        sizes = np.array([kept.shape[1] for kept in self._samples])
+        return {"samples": np.concatenate(self._samples, axis=1), "sizes": sizes, "largest": self._largest}
 
     def restore(self, state: Mapping[str, NDArray[Any]]) -> None:
         """Continue from a saved state."""
-        self._samples = np.split(np.array(state["samples"]), np.cumsum(state["sizes"])[:-1])
+        self._samples = np.split(np.array(state["samples"]), np.cumsum(state["sizes"])[:-1], axis=1)
         self._largest = np.array(state["largest"])
