@@ -15,7 +15,7 @@ from sms_online.description.parse import parse_system
 from sms_online.description.schema import System
 from sms_online.model.base_parameters import find_base_parameters
 from sms_online.model.model import Model
-from sms_online.pipeline.momentum_balance import HOPS, INSTANTS, MomentumBalance, Window
+from sms_online.pipeline.momentum_balance import COPIES, HOPS, INSTANTS, MomentumBalance, Window
 from sms_online.pipeline.row_noise import OWN_SHARE, RowNoise, Whitener
 from sms_online.pipeline.sensing import Sensing
 from sms_online.pipeline.sensitivity import Sensitivities
@@ -80,8 +80,7 @@ def scatter(system: System, draws: int, seed: int) -> Scatter:
 
     def windows(values: Array) -> tuple[list[Window], Sensitivities]:
         balance = MomentumBalance(model, base, system.sample_rate, SPAN)
-        x = sensing.coordinates(values)
-        found, instants = balance.push(np.arange(len(x)), [x, x, x], sensing.joint_torque(values), coordinates)
+        found, instants = balance.push(np.arange(len(values)), [sensing.motion(values)] * COPIES, coordinates)
         told = Sensitivities(model, sensing.displacements, balance.span / INSTANTS)
         for piece in instants if values is exact else []:
             told.tell(model.nominal, piece.x, piece.v)

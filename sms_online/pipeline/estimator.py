@@ -202,10 +202,7 @@ class Estimator:
             self._differentiate(piece)
 
     def _differentiate(self, piece: GridSamples) -> None:
-        signals = np.concatenate(
-            (self.sensing.coordinates(piece.values), self.sensing.joint_torque(piece.values)), axis=1
-        )
-        for rates in self._rates.push(GridSamples(piece.index, signals, piece.segment)):
+        for rates in self._rates.push(GridSamples(piece.index, self.sensing.motion(piece.values), piece.segment)):
             self._balance(rates)
         if self.momentum is not None:
             events = len(self.events)

@@ -13,7 +13,7 @@ from sms_online.model.base_parameters import BaseParameters
 from sms_online.model.model import Model
 from sms_online.pipeline.changes import Adoption, Changes
 from sms_online.pipeline.errors_in_variables import NoiseBias
-from sms_online.pipeline.momentum_balance import MomentumBalance
+from sms_online.pipeline.momentum_balance import COPIES, MomentumBalance
 from sms_online.pipeline.momentum_fit import MomentumFit, WhiteRows
 from sms_online.pipeline.sensing import Sensing
 from sms_online.pipeline.sensor_noise import NoiseEstimate, SensorNoise, noise_from_state, noise_state
@@ -87,7 +87,8 @@ class Momentum:
         estimate = self.tracker.estimate()
         if estimate.scale is not None:
             return estimate
-        return replace(estimate, pi=estimate.pi + self.bias.shift(estimate.determined))
+        shift, covariance = self.bias.correction(estimate.determined)
+        return replace(estimate, pi=estimate.pi + shift, covariance=estimate.covariance + covariance)
 
     def _solved(self) -> Array:
         """β where the rows determine it, else NaN."""
@@ -124,9 +125,7 @@ class Momentum:
         self._decide(noise, last=False)
 
     def _process(self, piece: GridSamples, noise: SensorNoise) -> None:
-        windows, instants = self._balance.push(
-            piece.index, self._copies(piece.values, noise), self.sensing.joint_torque(piece.values), noise.coordinates
-        )
+        windows, instants = self._balance.push(piece.index, self._copies(piece.values, noise), noise.coordinates)
         self._absorb(self._fit.push(windows, instants, noise))
 
     def _decide(self, noise: SensorNoise, last: bool) -> None:
@@ -148,14 +147,14 @@ class Momentum:
             self._process(adoption.samples, noise)
 
     def _copies(self, values: Array, noise: SensorNoise) -> list[Array]:
-        """Coordinates as measured, and with synthetic noise added and subtracted."""
-        x = self.sensing.coordinates(values)
+        """Coordinates and joint torques as measured, and with synthetic noise added and subtracted."""
+        measured = self.sensing.motion(values)
         if noise.exact:
-            return [x, x, x]
+            return [measured] * COPIES
         added = np.zeros_like(values)
-        columns = self.sensing.position_columns
+        columns = [*self.sensing.position_columns, *self.sensing.torque_columns]
         added[:, columns] = self._random.standard_normal((values.shape[0], len(columns))) * noise.grid
-        return [x, self.sensing.coordinates(values + added), self.sensing.coordinates(values - added)]
+        return [measured, self.sensing.motion(values + added), self.sensing.motion(values - added)]
 
     def finish(self, periods: Array) -> None:
         """End of the session: fit what is still held back."""

@@ -30,7 +30,8 @@ class SensorNoise:
 
     sensors (n_x,), torque (joints,): densities σ² T_s of each position sensor, in the order of the coordinates, and of
     n τ. coordinates (n_x,): 1σ of the coordinates x a grid sample, had they white noise of those densities. grid
-    (n_x,): the same of the position sensors. exact: positions have none, but for rounding.
+    (n_x + joints,): the same of the readings of position sensors and of torques. exact: positions have none, but for
+    rounding.
     """
 
     sensors: Array
@@ -99,8 +100,10 @@ class NoiseEstimate:
         density = np.maximum(sigma, floor) ** 2 * period
         sensors = density[positions]
         torque = self._sensing.joint_torque(np.sqrt(density)[None])[0] ** 2
-        grid = np.sqrt(sensors * self._sample_rate)
-        return SensorNoise(sensors, torque, self._sensing.coordinate_noise(grid), grid, exact)
+        columns = [*positions, *self._sensing.torque_columns]
+        grid = np.sqrt(density[columns] * self._sample_rate)
+        coordinates = self._sensing.coordinate_noise(grid[: len(positions)])
+        return SensorNoise(sensors, torque, coordinates, grid, exact)
 
     def state(self) -> dict[str, Any]:
         """What `restore` needs to continue."""
