@@ -16,7 +16,6 @@ from sms_online.pipeline.rates import (
     RatesStage,
     choose_half_width,
     coefficients,
-    noise_gain,
     smooth_and_differentiate,
 )
 from sms_online.pipeline.synchronise import GridSamples
@@ -54,6 +53,13 @@ def joined(pieces: list[RateSamples]) -> tuple[NDArray[np.int64], Array, Array, 
         np.concatenate([p.rates for p in pieces]),
         np.concatenate([np.full(p.index.size, p.half_width) for p in pieces]),
     )
+
+
+def noise_gain(half_width: int, sample_rate: float) -> tuple[float, float]:
+    """1σ of value and of rate (1/s) that white noise of 1σ = 1 per sample leaves behind the filter: ‖h_0‖, ‖h_1‖."""
+    value, slope = coefficients(half_width)
+    value_gain = 1.0 if half_width == HALF_WIDTHS[0] else float(np.linalg.norm(value))
+    return value_gain, float(np.linalg.norm(slope)) * sample_rate
 
 
 # --- noise
