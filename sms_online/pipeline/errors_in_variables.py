@@ -22,6 +22,9 @@ from sms_online.stream import Array
 CLUSTER = 20
 # A shift counts from so many of its standard deviations on.
 EVIDENCE = 2.0
+# A column of whose square noise makes this share or more holds nothing that an expansion about its exact value could
+# correct.
+LARGEST_SHARE = 0.5
 # When there are so many clusters, neighbours merge.
 MOST_CLUSTERS = 128
 
@@ -57,10 +60,11 @@ class NoiseBias:
         errors e = l + q of first and of second order, Yᵀ e holds Y₀ᵀ q + Lᵀ l besides Y₀ᵀ l, and the pair changes the
         score by the same function of a noise of the same law. Even orders of Gaussian noise do not correlate with odd
         ones, so the variances add: that of the second order to that of the first, and to both that of the shift.
-        Zero where nothing is determined.
+        Zero where nothing is determined, and for columns that are noise.
         """
         shift, covariance = np.zeros(determined.size), np.zeros((determined.size, determined.size))
-        kept = np.flatnonzero(determined)
+        changed = np.diag(self._clusters.sum(axis=0))[:-1]
+        kept = np.flatnonzero(determined & (changed < LARGEST_SHARE * np.diag(self._gram)[:-1]))
         rows = np.append(kept, determined.size)
         size = np.sqrt(np.diag(self._gram)[rows])
         if kept.size == 0 or not (size > 0.0).all():
