@@ -118,7 +118,7 @@ def pulled(estimator: Estimator) -> list[str]:
     if estimator.momentum is None or not estimator.by_momentum:
         return []
     estimate = estimator.estimate()
-    shift = np.abs(estimator.momentum.bias.shift(estimate.determined))
+    shift = np.abs(estimator.momentum.bias.correction(estimate.determined)[0])
     std = _standard_deviation(estimator, estimate)
     return [p.name for p, s, d in zip(estimator.base.parameters, shift, std, strict=True) if s > LARGEST_PULL * d]
 

@@ -21,13 +21,10 @@ from scipy.io import savemat
 from sms_adapters.system_file import load_system
 from sms_adapters.truth import truth_path, write_truth
 from sms_online.description.parse import parse_system, shipped_text
-from sms_online.description.schema import Sensor
 from sms_online.model.base_parameters import find_base_parameters
 from sms_online.model.model import Model
 from sms_online.pipeline.estimator import Estimator
 from sms_online.stream import Block
-from sms_sim.live import LivePlant
-from sms_sim.simulate import sampled_blocks, simulate
 from sms_tools.cli import main
 from sms_tools.priors import base_prior
 
@@ -255,18 +252,6 @@ def test_the_seed_decides_the_capture(bench: Path) -> None:
 
     assert capture("1") == capture("1")
     assert capture("1") != capture("2")
-
-
-def test_the_live_plant_moves_as_the_exact_one_with_its_sensors_rates_and_latencies() -> None:
-    sensors = (Sensor(channels=("q_1",), latency=0.013), Sensor(channels=("force_1",), rate=50.0))
-    system = parse_system(MOVED.replace("duration = 6.0", "duration = 1.0"), "moved.toml")
-    system = system.model_copy(update={"sensors": sensors})
-    live = list(LivePlant(system, None, 0))
-    exact = list(sampled_blocks(simulate(system)))
-    assert np.concatenate([block.t for block in live]).tolist() == np.concatenate([block.t for block in exact]).tolist()
-    values, expected = (np.concatenate([block.values for block in blocks]) for blocks in (live, exact))
-    assert np.isnan(values[:, live[0].channels.index("force_1")]).sum() == 150
-    np.testing.assert_allclose(values, expected, rtol=0, atol=1e-6)
 
 
 def test_the_demo_shows_the_papers_parameters_converge(bench: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -14,7 +14,7 @@ from sms_online.description.schema import System
 from sms_online.model.base_parameters import find_base_parameters
 from sms_online.model.model import Model
 from sms_online.pipeline.estimator import Estimator
-from sms_online.pipeline.momentum_balance import EXPONENT, MomentumBalance, Window
+from sms_online.pipeline.momentum_balance import COPIES, EXPONENT, MomentumBalance, Window
 from sms_online.pipeline.weak_form import test_function as weak_test_function
 from sms_online.results import results_document
 from sms_online.stream import Array, Block
@@ -39,7 +39,8 @@ all_systems = pytest.mark.parametrize("system", SYSTEMS.values(), ids=SYSTEMS.ke
 
 def windows_of(balance: MomentumBalance, x: Array, torque: Array, sigma: float) -> list[Window]:
     """Rows of positions x (B, n_x) and n τ (B, joints), samples 0 … B - 1."""
-    windows, _ = balance.push(np.arange(len(x)), [x, x, x], torque, np.full(x.shape[1], sigma))
+    motion = np.concatenate((x, torque), axis=1)
+    windows, _ = balance.push(np.arange(len(x)), [motion] * COPIES, np.full(x.shape[1], sigma))
     return windows
 
 
@@ -133,8 +134,8 @@ def test_windows_follow_one_another_without_a_gap_and_stay_in_their_segment() ->
         balance.begin_segment()
         windows = []
         for block in np.array_split(np.arange(len(motion.t)), 7):
-            x = motion.x[block]
-            windows += balance.push(begin + block, [x, x, x], torque[block], np.zeros(model.layout.n_x))[0]
+            samples = np.concatenate((motion.x[block], torque[block]), axis=1)
+            windows += balance.push(begin + block, [samples] * COPIES, np.zeros(model.layout.n_x))[0]
         assert len(windows) == expected
         ends = np.array([window.end for window in windows])
         np.testing.assert_array_equal(ends, begin + balance.margin + balance.width + balance.hop * np.arange(expected))

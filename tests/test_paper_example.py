@@ -6,6 +6,7 @@ import json
 
 import numpy as np
 import pytest
+from keeping_tracker import KeepingTracker
 
 from sms_adapters.checkpoint import load_checkpoint, save_checkpoint
 from sms_adapters.system_file import load_system
@@ -16,8 +17,6 @@ from sms_online.reconstruction import reconstruct
 from sms_online.results import results_document, standard_deviation
 from sms_online.stream import Array, Block
 from sms_online.trackers.batch import batch_least_squares
-from sms_online.trackers.interface import Rows
-from sms_online.trackers.square_root import RecursiveLeastSquares
 from sms_sim.simulate import Simulation, exact_states, simulate
 
 NAMES = (
@@ -82,20 +81,9 @@ def test_streamed_positions_and_torques_give_all_but_one_to_a_hundredth_percent(
 
 
 def test_recursive_equals_batch(planar_block: Block) -> None:
-    class Recorder(RecursiveLeastSquares):
-        """A tracker that keeps the rows too."""
-
-        def __init__(self, n: int) -> None:
-            super().__init__(n)
-            self.kept: list[Rows] = []
-
-        def update(self, rows: Rows) -> None:
-            self.kept.append(rows)
-            super().update(rows)
-
     estimator = Estimator(load_system("paper-planar"), planar_block.channels, "simulation")
     assert estimator.momentum is not None
-    recorder = estimator.momentum.tracker = Recorder(estimator.base.n)
+    recorder = estimator.momentum.tracker = KeepingTracker(estimator.base.n)
     estimator.push(planar_block)
     estimator.finish()
     Y = np.concatenate([rows.Y for rows in recorder.kept])

@@ -16,7 +16,6 @@ from sms_online.pipeline.rates import (
     RatesStage,
     choose_half_width,
     coefficients,
-    noise_gain,
     smooth_and_differentiate,
 )
 from sms_online.pipeline.synchronise import GridSamples
@@ -56,6 +55,13 @@ def joined(pieces: list[RateSamples]) -> tuple[NDArray[np.int64], Array, Array, 
     )
 
 
+def noise_gain(half_width: int, sample_rate: float) -> tuple[float, float]:
+    """1σ of value and of rate (1/s) that white noise of 1σ = 1 per sample leaves behind the filter: ‖h_0‖, ‖h_1‖."""
+    value, slope = coefficients(half_width)
+    value_gain = 1.0 if half_width == HALF_WIDTHS[0] else float(np.linalg.norm(value))
+    return value_gain, float(np.linalg.norm(slope)) * sample_rate
+
+
 # --- noise
 
 
@@ -67,6 +73,18 @@ def test_white_noise_is_found_under_motion_up_to_30_hz(sigma: float) -> None:
     assert np.median(estimate) == pytest.approx(1.0, abs=0.02)
     # Scatter of one channel 3.5 %, four of which no channel of sixty exceeds.
     assert estimate.std() < 0.05
+    assert np.abs(estimate - 1.0).max() < 0.15
+
+
+@pytest.mark.parametrize("sigma", [1e-6, 1e-4, 1e-2])
+def test_white_noise_is_found_where_samples_come_at_unequal_steps(sigma: float) -> None:
+    """Steps of half to one and a half milliseconds and a gap of ten seconds."""
+    steps = np.random.default_rng(4).uniform(0.5, 1.5, 2000) / RATE
+    steps[700] = 10.0
+    t = np.cumsum(steps)
+    values = np.sin(2 * np.pi * np.outer(t, np.linspace(0.5, 10.0, 60))) + noise(2000, sigma, 1, 60)
+    estimate = noise_std(values, t) / sigma
+    assert np.median(estimate) == pytest.approx(1.0, abs=0.02)
     assert np.abs(estimate - 1.0).max() < 0.15
 
 

@@ -15,7 +15,7 @@ from sms_online.description.parse import parse_system
 from sms_online.description.schema import System
 from sms_online.model.base_parameters import find_base_parameters
 from sms_online.model.model import Model
-from sms_online.pipeline.momentum_balance import HOPS, INSTANTS, MomentumBalance, Window
+from sms_online.pipeline.momentum_balance import COPIES, HOPS, INSTANTS, MomentumBalance, Window
 from sms_online.pipeline.row_noise import OWN_SHARE, RowNoise, Whitener
 from sms_online.pipeline.sensing import Sensing
 from sms_online.pipeline.sensitivity import Sensitivities
@@ -80,8 +80,7 @@ def scatter(system: System, draws: int, seed: int) -> Scatter:
 
     def windows(values: Array) -> tuple[list[Window], Sensitivities]:
         balance = MomentumBalance(model, base, system.sample_rate, SPAN)
-        x = sensing.coordinates(values)
-        found, instants = balance.push(np.arange(len(x)), [x, x, x], sensing.joint_torque(values), coordinates)
+        found, instants = balance.push(np.arange(len(values)), [sensing.motion(values)] * COPIES, coordinates)
         told = Sensitivities(model, sensing.displacements, balance.span / INSTANTS)
         for piece in instants if values is exact else []:
             told.tell(model.nominal, piece.x, piece.v, piece.signals)
@@ -171,17 +170,7 @@ def test_whitening_after_a_break_does_not_remember_what_was_before() -> None:
 
 @pytest.mark.parametrize(
     ("rate", "grid"),
-    [
-        (1000.0, 1000.0),
-        (240.0, 240.0),
-        (250.0, 1000.0),
-        pytest.param(
-            *(240.0, 1000.0),
-            marks=pytest.mark.xfail(
-                strict=True, reason="steps of 4 and 5 ms are taken for equal: motion becomes noise"
-            ),
-        ),
-    ],
+    [(1000.0, 1000.0), (240.0, 240.0), (250.0, 1000.0), (240.0, 1000.0)],
     ids=lambda rate: f"{rate:g} Hz",
 )
 def test_noise_is_told_from_a_sensors_own_samples_however_slow_it_is(rate: float, grid: float) -> None:
@@ -197,8 +186,9 @@ def test_noise_is_told_from_a_sensors_own_samples_however_slow_it_is(rate: float
     q = np.sin(2.0 * t) + 0.3 * np.sin(5.0 * t) + sigma * rng.standard_normal(t.size)
     own = np.diff(np.floor(t * rate + 1e-9), prepend=-1.0) > 0.0
     read = {"force_1": 0.5 * rng.standard_normal(t.size), "q_1": np.where(own, q, np.nan)}
-    for block in np.array_split(np.stack([read[name] for name in sensing.channels], axis=1), 40):
-        estimate.push(block)
+    rows = np.stack([read[name] for name in sensing.channels], axis=1)
+    for times, block in zip(np.array_split(t, 40), np.array_split(rows, 40), strict=True):
+        estimate.push(times, block)
     assert estimate.ready
     rates = {"force_1": grid, "q_1": rate}
     noise = estimate.noise(np.array([1.0 / rates[name] for name in sensing.channels]))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -165,18 +165,8 @@ def sampled_blocks(simulation: Simulation, grade: str | None = None, seed: int =
     grade: a noise grade (`sensors.GRADES`) in place of the described sensors. seed: of the noise. Raises InputError on
     an unknown grade.
     """
-    plant = simulation.plant
+    plant, duration = simulation.plant, simulation.duration
     sensors = Sensors(plant.system, plant.channels, grade, seed)
-    yield from read_blocks(plant, sensors, simulation.duration, lambda t: simulation.solution, BLOCK_SAMPLES)
-
-
-def read_blocks(
-    plant: Plant, sensors: Sensors, duration: float, solution_until: Callable[[float], Dense], at_once: int
-) -> Iterator[Block]:
-    """What sensors record of a motion over `duration` s, `at_once` samples a block.
-
-    solution_until: gives the motion up to an instant, back to the longest latency before the last block.
-    """
     rate = plant.system.sample_rate
     columns = [plant.channels.index(channel) for channel in sensors.channels]
     # Half a sample of slack: duration times rate may fall short of a whole number by rounding.
@@ -185,20 +175,19 @@ def read_blocks(
     distortion = Distortion(plant.system, sensors.channels)
     many = distortion.oversampling
 
-    def exact(t: Array, solution: Dense) -> Array:
+    def exact(t: Array) -> Array:
         """Exact values (B, C) at instants t (B,); before the start the system rests."""
         inside = np.clip(t, 0.0, duration)
-        y = solution(inside)
+        y = simulation.solution(inside)
         torque = np.where(t[:, None] < 0.0, 0.0, plant.torque(inside, y))
         return plant.channel_values(torque, plant.split(y)[0])[:, columns]
 
-    for first in range(0, samples, at_once):
-        end = min(first + at_once, samples)
+    for first in range(0, samples, BLOCK_SAMPLES):
+        end = min(first + BLOCK_SAMPLES, samples)
         fine = np.arange(max(0, many * (first - 1) + 1), many * (end - 1) + 1) / (many * rate)
         t = np.arange(first, end) / rate
-        solution = solution_until(min(float(t[-1]), duration))
         values = np.empty((fine.size, len(columns)))
         for latency in np.unique(sensors.latency):
             late = sensors.latency == latency
-            values[:, late] = exact(fine - latency, solution)[:, late]
+            values[:, late] = exact(fine - latency)[:, late]
         yield Block(t, sensors.channels, sensors.read(first, distortion(values)))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -138,7 +139,8 @@ class Attempt:
             if known is not None and not session.by_momentum:
                 # A fit that leaves half of the torques bends everything; what was known before is nearer.
                 beta = np.where(known.known, known.value, beta)
-        noise = replace(case.noise, coordinates=estimator.sensing.coordinate_noise(case.noise.grid))
+        positions = case.noise.grid[: len(estimator.sensing.position_columns)]
+        noise = replace(case.noise, coordinates=estimator.sensing.coordinate_noise(positions))
         span = system.windows.momentum
         most = min(most, MOST_WINDOWS * span / HOPS)
         length, longest = (round(seconds * system.sample_rate) for seconds in (STRETCH * span, most))
@@ -161,7 +163,7 @@ class Attempt:
     def _made(self, candidate: Candidate | Effect) -> Candidate:
         return candidate if isinstance(candidate, Candidate) else self.make.of(candidate)
 
-    def _fitted(self, time: Array, segment: NDArray[np.int64]) -> NDArray[np.bool_]:
+    def _fitted(self, time: NDArray[np.floating[Any]], segment: NDArray[np.int64]) -> NDArray[np.bool_]:
         return np.asarray((segment < self._fitting) & (time < self._split))
 
     def search(self) -> list[int]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
+from numpy.typing import NDArray
 
 from sms_online.diagnosis.record import Segment
 from sms_online.model.model import Model
@@ -33,12 +34,12 @@ class FollowedMotion:
             smoothed, rates = smooth(x, samples, HALF_WIDTH, sample_rate)
             self._motions.append((samples, smoothed, layout.speeds(smoothed, rates)))
 
-    def states(self, model: Model, number: int, at: Array | None = None) -> Array:
+    def states(self, model: Model, number: int, at: NDArray[np.int64] | None = None) -> Array:
         """Internal states (K, n_states) of a model at samples `at` (K,) of a segment, at all of them unless given.
 
         They begin at rest with the segment, and stay as they are at its ends, where the motion is not known.
         """
-        at = np.arange(self._sizes[number], dtype=float) if at is None else at
+        at = np.arange(self._sizes[number]) if at is None else at
         if model.n_states == 0:
             return np.zeros((len(at), 0))
         samples, x, v = self._motions[number]

@@ -18,7 +18,7 @@ from sms_online.model.base_parameters import BaseParameters
 from sms_online.model.model import Model
 from sms_online.pipeline.joint_balance import EXPONENT as JOINT_EXPONENT
 from sms_online.pipeline.joint_balance import JointBalance
-from sms_online.pipeline.momentum_balance import EXPONENT, HOPS, INSTANTS, Instants, MomentumBalance, Window
+from sms_online.pipeline.momentum_balance import COPIES, EXPONENT, INSTANTS, Instants, MomentumBalance, Window
 from sms_online.pipeline.row_noise import OWN_SHARE, STEPS, RowNoise
 from sms_online.pipeline.sensing import Sensing
 from sms_online.pipeline.sensitivity import Sensitivities
@@ -93,43 +93,51 @@ class SessionRows:
         """Windows of one segment with their rows [Y b] (n_v, n + 1); their covariances are appended to the others."""
         noise, n_v = self.noise, self.model.layout.n_v
         balance.begin_segment()
-        x = self.sensing.coordinates(segment.values)
-        copies = [x, x, x]
+        followed = self.followed.states(self.model, number)
+        measured = self.sensing.motion(np.concatenate((segment.values, followed), axis=1))
+        copies = [measured] * COPIES
         if not noise.exact:
             added = np.zeros_like(segment.values)
-            columns = self.sensing.position_columns
-            added[:, columns] = self._random.standard_normal((len(x), len(columns))) * noise.grid
-            copies[1:] = [self.sensing.coordinates(segment.values + sign * added) for sign in (1.0, -1.0)]
-        torque = self.sensing.joint_torque(segment.values)
-        signals = np.concatenate((torque, self.followed.states(self.model, number)), axis=1)
-        windows, instants = balance.push(segment.index, copies, signals, noise.coordinates)
+            columns = [*self.sensing.position_columns, *self.sensing.torque_columns]
+            added[:, columns] = self._random.standard_normal((len(measured), len(columns))) * noise.grid
+            copies[1:] = [
+                self.sensing.motion(np.concatenate((segment.values + sign * added, followed), axis=1))
+                for sign in (1.0, -1.0)
+            ]
+        windows, instants = balance.push(segment.index, copies, noise.coordinates)
         if not windows:
             return []
         sensitivities = self._sensitivities(instants, balance.span)
         row_noise = RowNoise(self.model.layout.theta_m, balance.span)
-        bends, largest = np.empty((0, n_v)), np.zeros(n_v)
         readings = self._readings(segment, _middle([window.half_width for window in windows]))
         seconds = np.arange(STEPS + 1) * balance.span / STEPS
-        out = []
-        for window in windows:
+        dense = np.zeros((len(windows), COPIES, n_v, self.base.n + 1))
+        for rows, window in zip(dense, windows, strict=True):
+            rows[:, balance.rows, balance.columns] = window.Y
+            rows[:, :, -1] = window.b
+        extra = self._beyond_first_order(dense, [window.half_width for window in windows])
+        for window, variance in zip(windows, extra, strict=True):
             sensitivity = sensitivities.window(window.start)
             covariances = row_noise.covariance(sensitivity, noise.sensors, noise.torque)
+            covariances[-1][np.diag_indices(n_v)] += variance
+            self._covariances.append(covariances)
             begin_s = (window.start * balance.half_hop + balance.margin) / self._rate
             added = _displacements(*readings(begin_s + seconds))
             kernel = row_noise.kernel(sensitivity) * (balance.span / STEPS)
             self._responses.append(np.einsum("sij,dsj->dij", kernel, added))
-            dense = np.zeros((len(copies), n_v, self.base.n + 1))
-            dense[:, balance.rows, balance.columns] = window.Y
-            dense[:, :, -1] = window.b
-            # What noise does beyond first order, and rounding, as in the fit.
-            residual = dense[..., -1] - dense[..., :-1] @ self.beta
-            bends = np.concatenate((bends[1 - HOPS :], (0.5 * (residual[1] + residual[2]) - residual[0])[None]))
-            largest = np.maximum(largest, np.abs(dense[0, :, :-1]) @ np.abs(self.beta) + np.abs(dense[0, :, -1]))
-            bent = np.maximum(np.mean(bends**2, axis=0), bends[-1] ** 2)
-            covariances[-1][np.diag_indices(n_v)] += bent + (FINEST * largest) ** 2 + np.finfo(np.float64).tiny
-            self._covariances.append(covariances)
-            out.append((window, dense[0]))
-        return out
+        return list(zip(windows, dense[:, 0], strict=True))
+
+    def _beyond_first_order(self, dense: Array, half_widths: list[int]) -> Array:
+        """Variance (W, n_v) of what noise does beyond first order, by filter width, and of rounding, as in the fit."""
+        residual = dense[..., -1] - dense[..., :-1] @ self.beta
+        squares = (0.5 * (residual[:, 1] + residual[:, 2]) - residual[:, 0]) ** 2
+        widths = np.array(half_widths)
+        means = {M: squares[widths == M].mean(axis=0) for M in set(half_widths)}
+        # A narrow filter lets through no less than the wide ones do, however few windows it has been used for.
+        bent = {M: np.max([mean for wide, mean in means.items() if wide >= M], axis=0) for M in means}
+        size = np.abs(dense[:, 0, :, :-1]) @ np.abs(self.beta) + np.abs(dense[:, 0, :, -1])
+        rounding = (FINEST * np.maximum.accumulate(size, axis=0)) ** 2 + np.finfo(np.float64).tiny
+        return np.array([bent[M] for M in half_widths]) + rounding
 
     def _readings(self, segment: Segment, half_width: int) -> Callable[[Array], tuple[Array, Array]]:
         """Smoothed readings (T, sensors) of the position sensors, and their rates, at instants (T,) of a segment, s."""

@@ -47,6 +47,6 @@ def _refine_one(tracing: Tracing, make: CandidateColumns, chosen: Sequence[int],
         best[-gain] = candidate
         return -gain
 
-    options = {"xatol": TOLERANCE, "maxiter": EVALUATIONS}
-    minimize_scalar(loss, bounds=(np.log(low), np.log(high)), method="bounded", options=options)
+    bounds = (float(np.log(low)), float(np.log(high)))
+    minimize_scalar(loss, bounds=bounds, method="bounded", options={"xatol": TOLERANCE, "maxiter": EVALUATIONS})
     tracing.put(k, best[min(best)])

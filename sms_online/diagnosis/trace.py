@@ -193,7 +193,7 @@ class Tracing:
 
     def _constants(self, k: int) -> int:
         candidate = self.candidates[k]
-        return max(candidate.columns.shape[2], len(candidate.effect.coefficients))
+        return max(len(candidate.parameters), len(candidate.effect.coefficients))
 
     def run(self, refine: Callable[[Sequence[int], int], None]) -> list[int]:
         """Numbers of the candidates found, in the order of what they explain.

@@ -71,17 +71,32 @@ def _variables(rows: SessionRows) -> dict[str, Variable]:
     offset = layout.n_base_positions - layout.n_base_speeds
     out: dict[str, Variable] = {}
     for k, name in enumerate(layout.position_names):
-        out[name] = lambda motion, k=k: motion.x[:, k]
+        out[name] = _position(k)
     for k, name in enumerate(layout.speed_names):
-        out[f"rate of {name}"] = lambda motion, k=k: motion.v[:, k]
-    for i, (q, theta_m) in enumerate(zip(layout.q, layout.theta_m, strict=True), start=1):
+        out[f"rate of {name}"] = _speed(k)
+    for i, (q, theta_m) in enumerate(zip(layout.q, layout.theta_m, strict=True)):
         if q != theta_m:
-            m, k = theta_m + offset, q + offset
-            out[f"deflection of joint_{i}"] = lambda motion, m=m, k=k: motion.x[:, m] - motion.x[:, k]
-        out[f"torque of joint_{i}"] = lambda motion, i=i: motion.torque[:, i - 1]
+            out[f"deflection of joint_{i + 1}"] = _difference(theta_m + offset, q + offset)
+        out[f"torque of joint_{i + 1}"] = _torque(i)
     rate = rows.model.system.sample_rate
     out["time"] = lambda motion: (rows.segments[motion.segment].index[0] + motion.samples) / rate
     return out
+
+
+def _position(k: int) -> Variable:
+    return lambda motion: motion.x[:, k]
+
+
+def _speed(k: int) -> Variable:
+    return lambda motion: motion.v[:, k]
+
+
+def _difference(k: int, minus: int) -> Variable:
+    return lambda motion: motion.x[:, k] - motion.x[:, minus]
+
+
+def _torque(i: int) -> Variable:
+    return lambda motion: motion.torque[:, i]
 
 
 def _knots(rows: SessionRows, variable: Variable) -> Array | None:

@@ -144,9 +144,7 @@ class Changes:
         after = self._index >= start
         values = self._values[after]
         balance = MomentumBalance(model, base, self._system.sample_rate, self._system.windows.momentum)
-        x = self._sensing.coordinates(values)
-        signals = self._sensing.signals(values)
-        windows, instants = balance.push(self._index[after], [x] * COPIES, signals, noise.coordinates)
+        windows, instants = balance.push(self._index[after], [self._sensing.motion(values)] * COPIES, noise.coordinates)
         weights = np.zeros(base.n)
         weights[:n] = solve(before.factor).pi
         # What the rows before left decides, where it is more than noise.

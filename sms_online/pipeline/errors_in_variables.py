@@ -22,12 +22,15 @@ from sms_online.stream import Array
 CLUSTER = 20
 # A shift counts from so many of its standard deviations on.
 EVIDENCE = 2.0
+# A column of whose square noise makes this share or more holds nothing that an expansion about its exact value could
+# correct.
+LARGEST_SHARE = 0.5
 # When there are so many clusters, neighbours merge.
 MOST_CLUSTERS = 128
 
 
 class NoiseBias:
-    """Gathers normal equations with and without additional noise."""
+    """Gathers normal equations with and without additional noise, in columns and right-hand sides."""
 
     def __init__(self, n: int) -> None:
         self._gram = np.zeros((n + 1, n + 1))
@@ -47,30 +50,43 @@ class NoiseBias:
         self._clusters[-1] += 0.5 * (noisy[0].T @ noisy[0] + noisy[1].T @ noisy[1]) - gram
         self._open = (self._open + 1) % self._length
 
-    def shift(self, determined: NDArray[np.bool_]) -> Array:
-        """What to add to the least-squares estimate (n,) to free it of this bias; zero where nothing is determined.
+    def correction(self, determined: NDArray[np.bool_]) -> tuple[Array, Array]:
+        """What to add to the least-squares estimate (n,) to free it of this bias, and to its covariance (n, n).
 
-        The synthetic noise is one sample, so the answer scatters. As much of it is given as is no scatter: a bias that
+        The synthetic noise is one sample, so the shift scatters. As much of it is given as is no scatter: a bias that
         many clusters agree on counts, one that few of them make shrinks to zero as James and Stein's estimate does.
+
+        The scatter is also what the session's own noise does to the estimate in second order. With Y = Y₀ + L and
+        errors e = l + q of first and of second order, Yᵀ e holds Y₀ᵀ q + Lᵀ l besides Y₀ᵀ l, and the pair changes the
+        score by the same function of a noise of the same law. Even orders of Gaussian noise do not correlate with odd
+        ones, so the variances add: that of the second order to that of the first, and to both that of the shift.
+        Zero where nothing is determined, and for columns that are noise.
         """
-        out = np.zeros(determined.size)
-        kept = np.flatnonzero(determined)
+        shift, covariance = np.zeros(determined.size), np.zeros((determined.size, determined.size))
+        changed = np.diag(self._clusters.sum(axis=0))[:-1]
+        kept = np.flatnonzero(determined & (changed < LARGEST_SHARE * np.diag(self._gram)[:-1]))
         rows = np.append(kept, determined.size)
         size = np.sqrt(np.diag(self._gram)[rows])
         if kept.size == 0 or not (size > 0.0).all():
-            return out
+            return shift, covariance
         scale = np.outer(size, size)
         gram = self._gram[np.ix_(rows, rows)] / scale
         clusters = self._clusters[:, rows[:, None], rows] / scale
         corrected = gram - clusters.sum(axis=0)
         biased = np.linalg.solve(gram[:-1, :-1], gram[:-1, -1])
-        shift = np.linalg.solve(corrected[:-1, :-1], corrected[:-1, -1]) - biased
+        whole = np.linalg.solve(corrected[:-1, :-1], corrected[:-1, -1]) - biased
         # Each cluster's part of it, to first order.
         parts = np.linalg.solve(gram[:-1, :-1], (clusters[:, :-1] @ np.append(biased, -1.0)).T)
         scatter = np.sum(parts**2, axis=1)
-        certain = np.maximum(0.0, 1.0 - EVIDENCE**2 * scatter / np.maximum(shift**2, np.finfo(np.float64).tiny))
-        out[kept] = certain * shift * size[-1] / size[:-1]
-        return out
+        certain = np.maximum(0.0, 1.0 - EVIDENCE**2 * scatter / np.maximum(whole**2, np.finfo(np.float64).tiny))
+        unit = size[-1] / size[:-1]
+        shift[kept] = certain * whole * unit
+        count = parts.shape[1]
+        if count > 1:
+            parts = (parts - parts.mean(axis=1, keepdims=True)) * np.sqrt(count / (count - 1.0))
+        parts = np.concatenate((parts, certain[:, None] * parts), axis=1) * unit[:, None]
+        covariance[np.ix_(kept, kept)] = parts @ parts.T
+        return shift, covariance
 
     @property
     def parameters(self) -> int:

@@ -17,8 +17,10 @@ from sms_online.stream import Array
 
 # Half width of the filter, samples: that of a motion with a jolt in it.
 HALF_WIDTH = 20
-# Instants a half hop that are compared; a parabola finds the best between them.
+# Instants a half hop that are compared; a parabola finds the best between them, through so many on either side: single
+# ones scatter, since windows differ by what their few filtered samples around the event do.
 STEPS_A_HALF_HOP = 5
+NEIGHBOURS = 4
 
 
 def event_instant(
@@ -80,9 +82,11 @@ def event_instant(
 
 
 def _lowest(values: Array) -> float:
-    """Place of the minimum of equidistant values, by the parabola through the least and its neighbours."""
+    """Place of the minimum of equidistant values, by the parabola that fits the least and its neighbours best."""
     k = int(np.argmin(values))
     if k in (0, values.size - 1):
         return float(k)
-    before, here, after = values[k - 1 : k + 2]
-    return k + 0.5 * float(before - after) / float(before - 2.0 * here + after)
+    near = np.arange(max(0, k - NEIGHBOURS), min(values.size, k + NEIGHBOURS + 1))
+    curvature, slope, _ = np.polyfit(near - k, values[near], 2)
+    # A minimum at the edge may have a neighbour as low.
+    return float(np.clip(k - 0.5 * slope / curvature, near[0], near[-1])) if curvature > 0.0 else float(k)

@@ -13,7 +13,7 @@ from sms_online.model.base_parameters import BaseParameters
 from sms_online.model.model import Model
 from sms_online.pipeline.changes import Adoption, Changes
 from sms_online.pipeline.errors_in_variables import NoiseBias
-from sms_online.pipeline.momentum_balance import MomentumBalance
+from sms_online.pipeline.momentum_balance import COPIES, MomentumBalance
 from sms_online.pipeline.momentum_fit import MomentumFit, WhiteRows
 from sms_online.pipeline.sensing import Sensing
 from sms_online.pipeline.sensor_noise import NoiseEstimate, SensorNoise, noise_from_state, noise_state
@@ -31,9 +31,9 @@ NOISE_RENEWED = 1.0
 class Momentum:
     """Balance, weights and tracker of one session.
 
-    tracker: square-root RLS, fed with rows of unit variance. bias: what noise in the columns does to the estimate.
-    noise_gain (channels,): see `NoiseEstimate`. windows: how many it took since the last event. changes: events, and
-    the model and parameters that the session goes on with after them.
+    tracker: square-root RLS, fed with rows of unit variance. bias: what noise in the columns does to the estimate. fit:
+    what makes rows independent, and its sums. noise_gain (channels,): see `NoiseEstimate`. windows: how many it took
+    since the last event. changes: events, and the model and parameters that the session goes on with after them.
     """
 
     def __init__(self, model: Model, base: BaseParameters, sensing: Sensing, noise_gain: Array) -> None:
@@ -60,7 +60,7 @@ class Momentum:
         self.bias = NoiseBias(base.n)
         self.windows = 0
         self._balance = MomentumBalance(model, base, self._sample_rate, self._span)
-        self._fit = MomentumFit(model, base, self._balance, self.sensing.displacements, self._solved)
+        self.fit = MomentumFit(model, base, self._balance, self.sensing.displacements, self._solved)
         self.tracker: Tracker = self._new_tracker()
 
     def _new_tracker(self) -> RecursiveLeastSquares:
@@ -75,28 +75,29 @@ class Momentum:
     @property
     def started(self) -> bool:
         """Whether weights are known and rows come."""
-        return self._fit.weights is not None
+        return self.fit.weights is not None
 
     @property
     def misfit(self) -> bool:
         """Whether rows leave clearly more than the sensors' noise."""
-        return bool(self._fit.misfit.any())
+        return bool(self.fit.misfit.any())
 
     def estimate(self) -> Estimate:
         """The base parameters as known now, free of what noise in the columns does; with a prior, as the rows say."""
         estimate = self.tracker.estimate()
         if estimate.scale is not None:
             return estimate
-        return replace(estimate, pi=estimate.pi + self.bias.shift(estimate.determined))
+        shift, covariance = self.bias.correction(estimate.determined)
+        return replace(estimate, pi=estimate.pi + shift, covariance=estimate.covariance + covariance)
 
     def _solved(self) -> Array:
         """β where the rows determine it, else NaN."""
         estimate = self.estimate()
         return np.where(estimate.determined, estimate.pi, np.nan)
 
-    def observe(self, values: Array) -> None:
-        """Take the channels' own samples (B, channels), NaN where there is none, to tell their noise."""
-        self._estimate.push(values)
+    def observe(self, t: Array, values: Array) -> None:
+        """Take the channels' own samples (B, channels) at t (B,), NaN where there is none, to tell their noise."""
+        self._estimate.push(t, values)
 
     def push(self, piece: GridSamples, start_time: float, periods: Array) -> None:
         """Take grid samples of the channels, followed by internal states of effects.
@@ -118,7 +119,7 @@ class Momentum:
     def _advance(self, piece: GridSamples, noise: SensorNoise) -> None:
         if piece.segment != self._segment:
             if self._segment >= 0:
-                self._absorb(self._fit.end_segment(noise))
+                self._absorb(self.fit.end_segment(noise))
                 self._decide(noise, last=True)
             self._balance.begin_segment()
             self._segment = piece.segment
@@ -127,10 +128,8 @@ class Momentum:
         self._decide(noise, last=False)
 
     def _process(self, piece: GridSamples, noise: SensorNoise) -> None:
-        windows, instants = self._balance.push(
-            piece.index, self._copies(piece.values, noise), self.sensing.signals(piece.values), noise.coordinates
-        )
-        self._absorb(self._fit.push(windows, instants, noise))
+        windows, instants = self._balance.push(piece.index, self._copies(piece.values, noise), noise.coordinates)
+        self._absorb(self.fit.push(windows, instants, noise))
 
     def _decide(self, noise: SensorNoise, last: bool) -> None:
         """Where rows are held back for an event: decide on it, when there is enough to tell, and go on."""
@@ -146,26 +145,26 @@ class Momentum:
         self.bias = bias
         rows = float(adoption.windows * adoption.model.layout.n_v)
         self.tracker.restore({**self.tracker.state(), "factor": adoption.factor, "rows": rows})
-        self._fit.go_on(adoption.weights, noise)
+        self.fit.go_on(adoption.weights, noise)
         if adoption.samples.index.size:
             self._process(adoption.samples, noise)
 
     def _copies(self, values: Array, noise: SensorNoise) -> list[Array]:
-        """Coordinates as measured, and with synthetic noise added and subtracted."""
-        x = self.sensing.coordinates(values)
+        """Coordinates and joint torques as measured, and with synthetic noise added and subtracted."""
+        measured = self.sensing.motion(values)
         if noise.exact:
-            return [x, x, x]
+            return [measured] * COPIES
         added = np.zeros_like(values)
-        columns = self.sensing.position_columns
+        columns = [*self.sensing.position_columns, *self.sensing.torque_columns]
         added[:, columns] = self._random.standard_normal((values.shape[0], len(columns))) * noise.grid
-        return [x, self.sensing.coordinates(values + added), self.sensing.coordinates(values - added)]
+        return [measured, self.sensing.motion(values + added), self.sensing.motion(values - added)]
 
     def finish(self, periods: Array) -> None:
         """End of the session: fit what is still held back."""
         if self.sensor_noise is None and self._waiting and self._estimate.ready:
             self.sensor_noise = self._estimate.noise(periods)
         if self.sensor_noise is not None:
-            self._absorb(self._fit.end_segment(self.sensor_noise))
+            self._absorb(self.fit.end_segment(self.sensor_noise))
             self._decide(self.sensor_noise, last=True)
             adoption = self.changes.abandon(self._start_time)
             if adoption is not None:
@@ -187,7 +186,7 @@ class Momentum:
 
     def whitened(self, rows: list[int], beta: Array) -> float | None:
         """rms of the residual of some generalized speeds' rows over its predicted standard deviation, for β (n,)."""
-        return self._fit.whitened(rows, beta)
+        return self.fit.whitened(rows, beta)
 
     def state(self) -> dict[str, dict[str, Any]]:
         """Everything that `restore` needs to continue to the same bits."""
@@ -210,7 +209,7 @@ class Momentum:
             },
             "momentum_noise": self._estimate.state(),
             "momentum_balance": self._balance.state(),
-            "momentum_fit": self._fit.state(),
+            "momentum_fit": self.fit.state(),
             "momentum_changes": self.changes.state(),
             "momentum_tracker": dict(self.tracker.state()),
         }
@@ -234,5 +233,5 @@ class Momentum:
         self.bias.restore(state)
         self._estimate.restore(saved["momentum_noise"])
         self._balance.restore(saved["momentum_balance"])
-        self._fit.restore(saved["momentum_fit"])
+        self.fit.restore(saved["momentum_fit"])
         self.tracker.restore(saved["momentum_tracker"])

@@ -31,7 +31,7 @@ INSTANTS = 2 * HOPS
 PATTERN_STATES = 8
 # A hop compares the widths of the filter at so many instants.
 COMPARED = 5
-# Copies of the motion: as measured, and with synthetic noise added and subtracted.
+# Copies of motion and torques: as measured, and with synthetic noise added and subtracted.
 COPIES = 3
 # Half widths of the filter are at most this share of a window: what a row takes in must pass the filter untouched, for
 # its noise is propagated as if there were none.
@@ -59,7 +59,7 @@ class Window:
 
     start: its first instant, in half hops since the segment began. end: grid index of its last sample. Y (copies,
     nonzero): columns of the base parameters where the model has any (`MomentumBalance.rows`, `.columns`); b (copies,
-    n_v). The first copy is that of the measured positions, the others those of the positions with noise added.
+    n_v). The first copy is that of the samples as measured, the others those of the samples with noise added.
     half_width: M of the filter.
     """
 
@@ -121,22 +121,20 @@ class MomentumBalance:
     def begin_segment(self) -> None:
         """Forget the samples before a gap."""
         layout = self.model.layout
-        self._samples = np.empty((0, COPIES * layout.n_x + len(layout.q) + self.model.n_states))
+        self._samples = np.empty((0, COPIES * (layout.n_x + len(layout.q) + self.model.n_states)))
         self._first = 0  # number in the segment of the buffer's first sample
         self._window = 0  # number of the next window's first sample
         self._told = 0  # number of the next instant, in half hops
         self._compared: list[Array] = []  # squares of the hops from the next window on
         self._smoothed: dict[int, _Smoothed] = {}
 
-    def push(
-        self, index: NDArray[np.int64], copies: list[Array], signals: Array, sigma: Array
-    ) -> tuple[list[Window], list[Instants]]:
+    def push(self, index: NDArray[np.int64], copies: list[Array], sigma: Array) -> tuple[list[Window], list[Instants]]:
         """Windows that B consecutive samples complete, and the states at their instants.
 
-        index (B,): grid index. copies: x (B, n_x) as measured, then with noise added and with the same subtracted.
-        signals (B, joints + n_states): n τ, then internal states of effects. sigma (n_x,): noise of x, 1σ per sample.
+        index (B,): grid index. copies: x, n τ and internal states of effects side by side (B, n_x + joints + n_states)
+        as measured, then with noise added and with the same subtracted. sigma (n_x,): noise of x, 1σ per sample.
         """
-        self._samples = np.concatenate((self._samples, np.concatenate((*copies, signals), axis=1)))
+        self._samples = np.concatenate((self._samples, np.concatenate(copies, axis=1)))
         grid = int(index[-1]) - (self._first + self._samples.shape[0] - 1)
         chosen: list[tuple[int, int]] = []  # first sample and half width of each window
         while self._window + self.width + 2 * self.margin < self._first + self._samples.shape[0]:
@@ -170,16 +168,16 @@ class MomentumBalance:
             return []
         x, v, signals = self._states(numbers * self.half_hop, half_width)
         self._told = last + 1
-        return [Instants(int(numbers[0]), x[0], v[0], signals)]
+        return [Instants(int(numbers[0]), x[0], v[0], signals[0])]
 
     def _states(self, samples: NDArray[np.int64], half_width: int) -> tuple[Array, Array, Array]:
-        """x (copies, K, n_x), v (copies, K, n_v) and signals (K, joints + n_states) at K samples of the segment."""
+        """x (copies, K, n_x), v (copies, K, n_v) and signals (copies, K, joints + n_states) at K samples."""
         layout = self.model.layout
         values, rates = smooth(self._samples, samples - self._first + self.margin, half_width, self.sample_rate)
-        end = COPIES * layout.n_x
-        x, x_dot = (part[:, :end].reshape(-1, COPIES, layout.n_x).swapaxes(0, 1) for part in (values, rates))
+        values, rates = (part.reshape(len(samples), COPIES, -1).swapaxes(0, 1) for part in (values, rates))
+        x, x_dot = values[..., : layout.n_x], rates[..., : layout.n_x]
         v = layout.speeds(x.reshape(-1, layout.n_x), x_dot.reshape(-1, layout.n_x))
-        return x, v.reshape(COPIES, -1, layout.n_v), values[:, end:]
+        return x, v.reshape(COPIES, -1, layout.n_v), values[..., layout.n_x :]
 
     def _rows(self, half_width: int, windows: list[int], grid: int) -> list[Window]:
         s = stride(half_width, self.hop)
@@ -200,7 +198,7 @@ class MomentumBalance:
             begin = (window - smoothed.first) // s
             values = smoothed.columns[begin : begin + phi.size]
             weak = -(phi_dot @ values[:, :width] + phi @ values[:, width : 2 * width]).reshape(COPIES, -1)
-            b = phi @ values[:, 2 * width :] - weak[:, self.rows.size :]
+            b = (phi @ values[:, 2 * width :]).reshape(COPIES, -1) - weak[:, self.rows.size :]
             end = grid + window + self.width + self.margin
             out.append(Window(window // self.half_hop, end, weak[:, : self.rows.size], b, half_width))
         return out
@@ -208,22 +206,24 @@ class MomentumBalance:
     @property
     def _entries(self) -> int:
         n_v = self.model.layout.n_v
-        return 2 * COPIES * (self.rows.size + n_v) + n_v
+        return COPIES * (2 * self.rows.size + 3 * n_v)
 
     def _columns(self, x: Array, v: Array, signals: Array) -> Array:
-        """P and G, each of the base parameters, packed, and of what is known, for every copy; Q: (K, entries)."""
-        K = signals.shape[0]
+        """P and G, each of the base parameters, packed, and of what is known, and Q, for every copy: (K, entries)."""
+        K = signals.shape[1]
         # Without noise all copies are one.
         distinct = COPIES if np.any(x[1] != x[0]) else 1
         packed = []
-        inputs = self.model.inputs(np.tile(signals, (distinct, 1)))
+        inputs = self.model.inputs(signals[:distinct].reshape(-1, signals.shape[2]))
         for part in self.model.momentum_columns(
             x[:distinct].reshape(-1, x.shape[2]), v[:distinct].reshape(-1, v.shape[2]), inputs=inputs
         ):
             both = np.concatenate((part[:, self.rows, self._physical], self.base.known_part(part)), axis=1)
             both = both.reshape(distinct, K, -1).swapaxes(0, 1)
             packed.append(np.broadcast_to(both, (K, COPIES, both.shape[2])).reshape(K, -1))
-        return np.concatenate((*packed, self.model.generalized_force(signals[:, : len(self.model.layout.q)])), axis=1)
+        torque = signals[..., : len(self.model.layout.q)]
+        force = self.model.generalized_force(torque.swapaxes(0, 1).reshape(-1, torque.shape[2]))
+        return np.concatenate((*packed, force.reshape(K, -1)), axis=1)
 
     def state(self) -> dict[str, Any]:
         """What `restore` needs to continue."""

@@ -24,6 +24,7 @@ from sms_online.pipeline.momentum_balance import COPIES, HOPS, INSTANTS, Instant
 from sms_online.pipeline.row_noise import RowNoise, Whitener
 from sms_online.pipeline.sensitivity import Sensitivities
 from sms_online.pipeline.sensor_noise import FINEST, SensorNoise, noise_from_state, noise_state
+from sms_online.pipeline.smoothing import HALF_WIDTHS
 from sms_online.stream import Array
 
 # Motion before weights are made, s: at the usual width, four windows side by side.
@@ -42,6 +43,9 @@ LARGEST_RATIO = 2.0
 # Multiple of the square of one sample of what noise does beyond first order in a row that stands for its variance in
 # the row's own covariance.
 UNSTEADY = 4.0
+# Windows of one filter's width over which the square of such a sample is averaged. The samples of windows that overlap
+# are nearly one, so a mean over few of them follows its own luck: rows in which it is low would be trusted too much.
+BENDS = 100
 # Share of a joint's torque that a fit may leave for its weights to be used.
 LARGEST_UNEXPLAINED = 0.5
 # Time from one renewal of the weights to the next, s: it doubles from the first to the latest.
@@ -93,7 +97,9 @@ class MomentumFit:
         self._moving = 0
         self._renewal = 0  # windows from one renewal to the next
         self._sensor_noise: SensorNoise | None = None  # behind the weights
-        self._bends = np.empty((0, model.layout.n_v))
+        # Mean squares of what noise does beyond first order, by the filter's width, and of how many windows.
+        self._bends = {half_width: np.zeros(model.layout.n_v) for half_width in HALF_WIDTHS}
+        self._bent = dict.fromkeys(HALF_WIDTHS, 0)
         self._largest = np.zeros(model.layout.n_v)  # largest sum of a row's terms
         # Gram matrices of rows [Y b] over their own standard deviations, by generalized speed, and how many windows.
         self.plain_gram = np.zeros((model.layout.n_v, base.n + 1, base.n + 1))
@@ -121,7 +127,6 @@ class MomentumFit:
     def _forget_rows(self) -> None:
         self._noise.begin_segment()
         self._whitener.begin_segment()
-        self._bends = self._bends[:0]
 
     def push(self, windows: list[Window], instants: list[Instants], noise: SensorNoise) -> list[WhiteRows]:
         """Rows of the windows that a push completed, and of those held back before."""
@@ -215,13 +220,13 @@ class MomentumFit:
         self._judge()
         self._since = 0
         self._renewal = min(2 * self._renewal, self._count(LATEST_RENEWAL))
-        counted = self.plain_gram.copy(), self.plain_windows
+        counted = self.plain_gram.copy(), self.plain_windows, dict(self._bends), dict(self._bent)
         self._sensitivities.forget(self._first)
         self._forget_rows()
         self._tell()
         for window in self._recent:
             self._white(window)
-        self.plain_gram, self.plain_windows = counted
+        self.plain_gram, self.plain_windows, self._bends, self._bent = counted
 
     def _judge(self) -> None:
         """What rows leave beyond their predicted variance so far, where that is no accident."""
@@ -235,6 +240,7 @@ class MomentumFit:
         """Work off the windows held back from the first one on."""
         self.plain_gram[:] = 0.0
         self.plain_windows = 0
+        self._bent = dict.fromkeys(HALF_WIDTHS, 0)
         self._sensitivities.forget(self._first)
         self._forget_rows()
         self._tell()
@@ -261,13 +267,15 @@ class MomentumFit:
         residual = rows[..., -1] - rows[..., :-1] @ self._known_weights
         # What noise does beyond first order, which nothing propagates: a sample of it for every row.
         bend = 0.5 * (residual[1] + residual[2]) - residual[0]
-        self._bends = np.concatenate((self._bends[1 - HOPS :], bend[None]))
+        M = window.half_width
+        self._bent[M] = min(self._bent[M] + 1, BENDS)
+        self._bends[M] = self._bends[M] + (bend**2 - self._bends[M]) / self._bent[M]
         # A row whose coordinate has no noise, as far as the weights know, is exact to rounding only.
         size = np.abs(rows[0, :, :-1]) @ np.abs(self._known_weights) + np.abs(rows[0, :, -1])
         self._largest = np.maximum(self._largest, size)
         rounding = (FINEST * self._largest) ** 2 + np.finfo(np.float64).tiny
-        # A filter that has just become narrow lets through more than the windows before tell.
-        bent = np.maximum(np.mean(self._bends**2, axis=0), bend**2)
+        # A narrow filter lets through no less than the wide ones do, however few windows it has been used for.
+        bent = np.max([mean for wide, mean in self._bends.items() if wide >= M], axis=0)
         covariances[-1][np.diag_indices(n_v)] += bent + rounding
         variance = np.diag(covariances[-1]).copy()
         plain = rows[0] / np.sqrt(variance)[:, None]
@@ -294,7 +302,8 @@ class MomentumFit:
         return {
             "weights": np.empty(0) if self.weights is None else self.weights, "since": self._since,
             "moving": self._moving, "first": self._first, "x": self._x, "v": self._v, "signals": self._signals,
-            "bends": self._bends, "largest": self._largest, "misfit": self.misfit, "plain_gram": self.plain_gram.copy(),
+            "bends": np.array([*self._bends.values()]), "bent": np.array([*self._bent.values()]),
+            "largest": self._largest, "misfit": self.misfit, "plain_gram": self.plain_gram.copy(),
             "plain_windows": self.plain_windows, "renewal": self._renewal, **self._noise.state(),
             **self._whitener.state(), **self._sensitivities.state(), **_packed("held", self._held),
             **_packed("recent", self._recent), **noise_state("steady", self._sensor_noise),
@@ -307,7 +316,9 @@ class MomentumFit:
         self._x, self._v, self._signals = (np.array(state[name]) for name in ("x", "v", "signals"))
         self._sensitivities.restore(state)
         self._largest = np.array(state["largest"])
-        self._bends, self.misfit = np.array(state["bends"]), np.array(state["misfit"])
+        self._bends = dict(zip(HALF_WIDTHS, np.array(state["bends"]), strict=True))
+        self._bent = dict(zip(HALF_WIDTHS, state["bent"].tolist(), strict=True))
+        self.misfit = np.array(state["misfit"])
         self.plain_gram, self.plain_windows = np.array(state["plain_gram"]), int(state["plain_windows"])
         self._held, self._recent = _unpacked("held", state), _unpacked("recent", state)
         self._renewal = int(state["renewal"])

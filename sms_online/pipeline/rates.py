@@ -91,13 +91,6 @@ def coefficients(half_width: int) -> tuple[Array, Array]:
     return (value + value[::-1]) / 2.0, (slope - slope[::-1]) / (2.0 * half_width)
 
 
-def noise_gain(half_width: int, sample_rate: float) -> tuple[float, float]:
-    """1σ of value and of rate (1/s) that white noise of 1σ = 1 per sample leaves behind the filter: ‖h_0‖, ‖h_1‖."""
-    value, slope = coefficients(half_width)
-    value_gain = 1.0 if half_width == HALF_WIDTHS[0] else float(np.linalg.norm(value))
-    return value_gain, float(np.linalg.norm(slope)) * sample_rate
-
-
 def smooth_and_differentiate(values: Array, half_width: int, sample_rate: float) -> tuple[Array, Array]:
     """Smoothed values and rates (B - 2M, C) of samples (B, C), for the centres that have M samples on either side.
 

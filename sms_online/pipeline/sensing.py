@@ -18,7 +18,8 @@ EULER_PARAMETERS = ("eps_x", "eps_y", "eps_z", "eta")
 class Sensing:
     """Which of a source's channels give each coordinate and torque of a model.
 
-    Raises InputError, naming the source, when a channel that the model needs is not there.
+    channels: those it takes, in an order of its own. torque_columns: the torques' among them, joint by joint. unused:
+    the source's others. Raises InputError, naming the source, when a channel that the model needs is not there.
     """
 
     def __init__(self, model: Model, available: Sequence[str], source: str) -> None:
@@ -48,12 +49,12 @@ class Sensing:
             if kinematics is not None
         ]
         self._flexible = [kinematics for kinematics in model.chain.flexible if kinematics is not None]
-        self._torque = [need(f"tau_{i}", f"force_{i}") for i in joints]
+        self.torque_columns = [need(f"tau_{i}", f"force_{i}") for i in joints]
         # tau_i is measured at the motor shaft, before the gear; force_i acts on the joint.
         self._ratio = np.array(
             [
                 joint.gear_ratio if channels[column].startswith("tau_") else 1.0
-                for joint, column in zip(model.system.joints, self._torque, strict=True)
+                for joint, column in zip(model.system.joints, self.torque_columns, strict=True)
             ]
         )
         self.channels = tuple(channels)
@@ -81,7 +82,7 @@ class Sensing:
             stated[columns] if isinstance(kinematics, LinearLink) else np.full(kinematics.n_f, np.nan)
             for kinematics, columns in zip(self._flexible, self._markers, strict=True)
         ]
-        joints = stated[self._torque] * self._ratio
+        joints = stated[self.torque_columns] * self._ratio
         return np.concatenate((stated[self._base], stated[self._q], stated[self._theta_m], *markers, joints))
 
     @property
@@ -122,9 +123,13 @@ class Sensing:
             parts.append(kinematics.coordinates(values[:, columns]))
         return np.concatenate(parts, axis=1)
 
+    def motion(self, values: Array) -> Array:
+        """x, n τ and internal states side by side (B, n_x + joints + n_states) of samples (B, channels + n_states)."""
+        return np.concatenate((self.coordinates(values), self.signals(values)), axis=1)
+
     def joint_torque(self, values: Array) -> Array:
         """Torque after the gear n τ (B, joints), N m (N)."""
-        return np.asarray(values[:, self._torque] * self._ratio)
+        return np.asarray(values[:, self.torque_columns] * self._ratio)
 
     def signals(self, values: Array) -> Array:
         """n τ (B, joints), and what samples (B, channels + n_states) hold beyond the channels."""

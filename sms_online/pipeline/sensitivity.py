@@ -47,15 +47,16 @@ def derivatives(dynamics: Dynamics, x: Array, v: Array, signals: Array | None = 
     x_n, v_n = np.repeat(x, n_v, axis=0), np.repeat(v, n_v, axis=0)
     moved = DIFFERENCE * np.tile(np.eye(n_v), (K, 1))
     shifted = x_n + dynamics.model.position_rate(x_n, moved)
-    alone = repeated = None
+    # All in one call: a session asks for few instants at a time, and then a call costs more than its states.
+    every = np.concatenate((x, shifted, x_n)), np.concatenate((v, v_n, v_n + moved))
+    inputs = None
     if signals is not None:
-        inputs = dynamics.model.inputs
-        alone, repeated = inputs(signals), inputs(np.repeat(signals, n_v, axis=0))
-    p, g = (part[:, None] for part in dynamics.momentum_and_force(x, v, alone))
-    p_x, g_x = (part.reshape(K, n_v, n_v) for part in dynamics.momentum_and_force(shifted, v_n, repeated))
-    g_v = dynamics.momentum_and_force(x_n, v_n + moved, repeated)[1].reshape(K, n_v, n_v)
-    out = np.concatenate((p_x - p, g_v - g, g_x - g), axis=1) / DIFFERENCE
-    return np.asarray(out.swapaxes(1, 2))
+        repeated = np.repeat(signals, n_v, axis=0)
+        inputs = dynamics.model.inputs(np.concatenate((signals, repeated, repeated)))
+    p, g = dynamics.momentum_and_force(*every, inputs)
+    (p_0, p_x, _), (g_0, g_x, g_v) = (np.split(part, [K, K + K * n_v]) for part in (p, g))
+    of = [part.reshape(K, n_v, n_v) - at[:, None] for part, at in ((p_x, p_0), (g_v, g_0), (g_x, g_0))]
+    return np.asarray((np.concatenate(of, axis=1) / DIFFERENCE).swapaxes(1, 2))
 
 
 def nodes(offset: int) -> NDArray[np.int64]:

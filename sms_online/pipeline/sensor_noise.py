@@ -30,7 +30,8 @@ class SensorNoise:
 
     sensors (n_x,), torque (joints,): densities σ² T_s of each position sensor, in the order of the coordinates, and of
     n τ. coordinates (n_x,): 1σ of the coordinates x a grid sample, had they white noise of those densities. grid
-    (n_x,): the same of the position sensors. exact: positions have none, but for rounding.
+    (n_x + joints,): the same of the readings of position sensors and of torques. exact: positions have none, but for
+    rounding.
     """
 
     sensors: Array
@@ -70,33 +71,30 @@ class NoiseEstimate:
         self._gain = np.ones(len(sensing.channels)) if gain is None else gain
         self._sample_rate = sample_rate
         count = len(sensing.channels)
-        self._samples = [np.empty(0) for _ in range(count)]
+        self._samples = [np.empty((2, 0)) for _ in range(count)]  # instants and values
         self._largest = np.zeros(count)
 
-    def push(self, values: Array) -> None:
-        """Take samples (B, channels), NaN where a channel has none."""
-        if not np.isnan(values).any():
-            self._largest = np.maximum(self._largest, np.abs(values).max(axis=0, initial=0.0))
-            self._samples = [
-                np.concatenate((kept, column))[-SAMPLES:] for kept, column in zip(self._samples, values.T, strict=True)
-            ]
-            return
+    def push(self, t: Array, values: Array) -> None:
+        """Take samples (B, channels) at instants t (B,), NaN where a channel has none."""
         for k, column in enumerate(values.T):
-            own = column[np.isfinite(column)]
-            self._largest[k] = max(self._largest[k], np.abs(own).max(initial=0.0))
-            self._samples[k] = np.concatenate((self._samples[k], own))[-SAMPLES:]
+            fresh = np.stack((t, column))[:, np.isfinite(column)]
+            last = self._samples[k][0, -1:] if self._samples[k].size else -np.inf
+            fresh = fresh[:, np.diff(fresh[0], prepend=last) > 0.0]  # duplicates tell nothing
+            self._largest[k] = max(self._largest[k], np.abs(fresh[1]).max(initial=0.0))
+            self._samples[k] = np.concatenate((self._samples[k], fresh), axis=1)[:, -SAMPLES:]
 
     @property
     def ready(self) -> bool:
         """Whether every channel has samples enough."""
-        return all(kept.size >= FEWEST_SAMPLES for kept in self._samples)
+        return all(kept.shape[1] >= FEWEST_SAMPLES for kept in self._samples)
 
     def noise(self, periods: Array) -> SensorNoise:
         """Noise from what is stated and, where nothing is, from the samples so far; periods (channels,): s, or NaN."""
         sigma = self._sensing.stated_noise
         silent = np.flatnonzero(np.isnan(sigma))
         for k in silent:
-            sigma[k] = noise_std(self._samples[k][:, None])[0]
+            times, samples = self._samples[k]
+            sigma[k] = noise_std(samples[:, None], times)[0]
         sigma *= self._gain
         floor = FINEST * self._largest + np.finfo(np.float64).tiny
         positions = self._sensing.position_columns
@@ -105,15 +103,17 @@ class NoiseEstimate:
         density = np.maximum(sigma, floor) ** 2 * period
         sensors = density[positions]
         torque = self._sensing.joint_torque(np.sqrt(density)[None])[0] ** 2
-        grid = np.sqrt(sensors * self._sample_rate)
-        return SensorNoise(sensors, torque, self._sensing.coordinate_noise(grid), grid, exact)
+        columns = [*positions, *self._sensing.torque_columns]
+        grid = np.sqrt(density[columns] * self._sample_rate)
+        coordinates = self._sensing.coordinate_noise(grid[: len(positions)])
+        return SensorNoise(sensors, torque, coordinates, grid, exact)
 
     def state(self) -> dict[str, Any]:
         """What `restore` needs to continue."""
-        sizes = np.array([kept.size for kept in self._samples])
-        return {"samples": np.concatenate(self._samples), "sizes": sizes, "largest": self._largest}
+        sizes = np.array([kept.shape[1] for kept in self._samples])
+        return {"samples": np.concatenate(self._samples, axis=1), "sizes": sizes, "largest": self._largest}
 
     def restore(self, state: Mapping[str, NDArray[Any]]) -> None:
         """Continue from a saved state."""
-        self._samples = np.split(np.array(state["samples"]), np.cumsum(state["sizes"])[:-1])
+        self._samples = np.split(np.array(state["samples"]), np.cumsum(state["sizes"])[:-1], axis=1)
         self._largest = np.array(state["largest"])

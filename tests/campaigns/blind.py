@@ -264,7 +264,7 @@ def summary(records: list[Record]) -> str:
         medians = {name: round(float(np.median(values)), 4) for name, values in ratios.items()}
         lines.append(f"median relative error of coefficients: {medians}")
         held = [max(r["holdout"].values()) for r in singles]
-        lines.append(f"held-out residual: median {np.median(held):.2f}, worst {max(held):.2f} times the predicted noise")
+        lines.append(f"held-out residual: median {np.median(held):.2f}, worst {max(held):.2f} times predicted noise")
         lines.append(f"seconds: median {np.median([r['seconds'] for r in singles]):.1f}")
     struck = [r for r in records if r["kind"] == "struck"]
     if struck:

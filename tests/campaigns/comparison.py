@@ -27,11 +27,10 @@ from sms_online.pipeline.sensing import Sensing
 from sms_online.pipeline.smoothing import smooth
 from sms_online.stream import Array, Block
 from sms_online.trackers.batch import batch_least_squares
-from sms_online.trackers.interface import Rows
-from sms_online.trackers.square_root import RecursiveLeastSquares
 from sms_sim.sensors import GRADES
 from tests.campaigns.output_error import OutputError
 from tests.campaigns.sessions import disguised, exact_session, noisy_session, true_parameters
+from tests.keeping_tracker import KeepingTracker
 
 SYSTEM, GRADE = "paper-planar", "B"
 # As many measurements as the paper takes.
@@ -46,19 +45,6 @@ START_ERROR = 0.1
 ABOVE = ("stiffness", "damping", "rigidity")
 # Half width of the filter that gives its first initial states, samples.
 HALF_WIDTH = 40
-
-
-class Recorder(RecursiveLeastSquares):
-    """A tracker that keeps the rows too."""
-
-    def __init__(self, n: int) -> None:
-        super().__init__(n)
-        self.kept: list[Rows] = []
-
-    def update(self, rows: Rows) -> None:
-        """Take in rows, and keep them."""
-        self.kept.append(rows)
-        super().update(rows)
 
 
 def momentum(system: System, block: Block) -> Array:
@@ -92,7 +78,7 @@ def paper(system: System, block: Block) -> Array:
 
 def _energy_rows(system: System, block: Block) -> tuple[Array, Array]:
     estimator = Estimator(system.model_copy(update={"balance": "energy"}), block.channels, "comparison")
-    recorder = estimator.energy_tracker = Recorder(estimator.base.n)
+    recorder = estimator.energy_tracker = KeepingTracker(estimator.base.n)
     estimator.push(block)
     estimator.finish()
     return np.concatenate([rows.Y for rows in recorder.kept]), np.concatenate([rows.b for rows in recorder.kept])

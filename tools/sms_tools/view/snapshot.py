@@ -59,7 +59,7 @@ def take(estimator: Estimator) -> Snapshot:
 
 
 def _take_momentum(momentum: Momentum) -> MomentumSnapshot:
-    fit = momentum._fit
+    fit = momentum.fit
     return MomentumSnapshot(
         windows=momentum.windows,
         dropped_windows=momentum.dropped_windows,
@@ -85,6 +85,6 @@ def apply(snapshot: Snapshot, replica: Estimator) -> None:
         momentum.windows, momentum.dropped_windows = known.windows, known.dropped_windows
         momentum.tracker.restore(known.tracker)
         momentum.bias.restore(known.bias)
-        fit = momentum._fit
+        fit = momentum.fit
         fit.weights, fit.misfit = known.weights, known.misfit
         fit.plain_gram, fit.plain_windows = known.plain_gram, known.plain_windows
