@@ -231,18 +231,21 @@ class LineDecoder(_SerialDecoder):
         if self._checked:
             parts = _XOR.fullmatch(line.rstrip(b"\r"))
             if parts is None or int(np.bitwise_xor.reduce(np.frombuffer(parts[1], np.uint8))) != int(parts[2], 16):
-                self.counters["crc"] += 1
+                self._skip(line, "crc")
                 return None
             line = parts[1]
         if self._line.fullmatch(line) is None:
-            try:
-                line.decode()
-            except UnicodeDecodeError:
-                self.counters["non_utf8"] += 1
-            else:
-                self.counters["bad_number"] += 1
+            self._skip(line, "bad_number")
             return None
         return [float(cell) for cell in line.split(self._separator)]
+
+    def _skip(self, line: bytes, kind: str) -> None:
+        """Count a line that is skipped, as text of this kind or as none."""
+        try:
+            line.decode()
+        except UnicodeDecodeError:
+            kind = "non_utf8"
+        self.counters[kind] += 1
 
 
 def frame_layout(fields: Iterable[FrameField]) -> np.dtype[np.void]:
