@@ -127,7 +127,9 @@ def half_frames(s: Session) -> None:
 
 def not_text(s: Session) -> None:
     lines = [SerialChunk(chunk.arrival, b"\xff\xfe" + chunk.data) for chunk in s.encoder[1:]]
-    s.encoder[1:] = [line if k % 50 == 7 else chunk for k, (line, chunk) in enumerate(zip(lines, s.encoder[1:]))]
+    s.encoder[1:] = [
+        line if k % 50 == 7 else chunk for k, (line, chunk) in enumerate(zip(lines, s.encoder[1:], strict=True))
+    ]
 
 
 def not_a_number(s: Session) -> None:
