@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sms_adapters.can_signals import WantedMessage, decode_signal, raw_word
-from sms_adapters.conversion import Conversion, FrameCounter, counters_state, restore_counters
-from sms_adapters.raw import ERROR_FRAME, REMOTE_FRAME, CanFrames, DecodedSamples, DecoderState, Raw
+from sms_adapters.conversion import Conversions, FrameCounter, counters_state, restore_counters
+from sms_adapters.raw import ERROR_FRAME, REMOTE_FRAME, CanFrames, DecodedSamples, DecoderState, Raw, concatenate_frames
 from sms_online.description.schema import Signal
 
 # Unknown identifiers that are remembered, to name them.
@@ -30,17 +30,24 @@ class CanDecoder:
         self.unknown_ids: list[int] = []  # the first of them
         self.messages = tuple(messages)
         self._ids = np.array([message.id for message in messages], dtype=np.uint32)
-        self._conversions = [Conversion(signal, self.counters) for signal in signals]
+        self._columns = [list(message.columns) for message in messages]
+        self._conversions = [
+            Conversions([signals[column] for column in message.columns], self.counters) for message in messages
+        ]
         self._sequences = [
             None if message.counter is None else FrameCounter(1 << message.counter.length, self.counters)
             for message in messages
         ]
         self._last_stamp = np.full(len(messages), np.nan)
 
-    def push(self, raw: Raw) -> DecodedSamples:
+    def push(self, *items: Raw) -> DecodedSamples:
         """The samples in some frames; (M, C) values with NaN in the channels of other messages."""
-        if not isinstance(raw, CanFrames):
-            raise TypeError(f"{type(raw).__name__} pushed into a decoder of CAN frames")
+        parts: list[CanFrames] = []
+        for item in items:
+            if not isinstance(item, CanFrames):
+                raise TypeError(f"{type(item).__name__} pushed into a decoder of CAN frames")
+            parts.append(item)
+        raw = parts[0] if len(parts) == 1 else concatenate_frames(parts)
         values = np.full((len(raw), len(self.channels)), np.nan)
         used = np.zeros(len(raw), dtype=np.bool_)
         plain = self._plain(raw)
@@ -49,8 +56,8 @@ class CanDecoder:
             if not rows.size:
                 continue
             words = raw.data[:, : message.length][rows]
-            for signal, column in zip(message.signals, message.columns, strict=True):
-                values[rows, column] = self._conversions[column](decode_signal(signal, words))
+            numbers = np.stack([decode_signal(signal, words) for signal in message.signals], axis=1)
+            values[rows[:, None], self._columns[k]] = self._conversions[k](numbers)
             used[rows] = True
         # A frame whose every value was refused is no sample.
         used &= ~np.isnan(values).all(axis=1)
