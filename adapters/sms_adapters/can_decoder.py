@@ -55,7 +55,7 @@ class CanDecoder:
             rows = self._admitted(k, message, raw, np.flatnonzero(plain & (raw.id == message.id)))
             if not rows.size:
                 continue
-            words = raw.data[:, : message.length][rows]
+            words = message.words(raw.data, rows)
             numbers = np.stack([decode_signal(signal, words) for signal in message.signals], axis=1)
             values[rows[:, None], self._columns[k]] = self._conversions[k](numbers)
             used[rows] = True
@@ -90,7 +90,7 @@ class CanDecoder:
         admitted: NDArray[np.intp] = whole[fresh]
         sequence = self._sequences[k]
         if sequence is not None and message.counter is not None:
-            counts = raw_word(message.counter, raw.data[:, : message.length][admitted]).astype(np.int64)
+            counts = raw_word(message.counter, message.words(raw.data, admitted)).astype(np.int64)
             admitted = admitted[sequence.admit(counts)]
         return admitted
 

@@ -100,7 +100,7 @@ class SourceLane:
         for id_, (message, time) in self._counted.items():
             assert message.counter is not None
             rows = np.flatnonzero((frames.id == id_) & (frames.length == message.length) & (frames.flags & 3 == 0))
-            counts = raw_word(message.counter, frames.data[:, : message.length][rows]).astype(np.int64)
+            counts = raw_word(message.counter, message.words(frames.data, rows)).astype(np.int64)
             stamp[rows] = time(counts, frames.arrival[rows])
         return CanFrames(frames.arrival, stamp, frames.id, frames.length, frames.data, frames.flags)
 
