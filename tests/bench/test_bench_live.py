@@ -175,19 +175,16 @@ def test_hours_at_full_speed(tmp_path: Path) -> None:
     print("\n".join(merger.warnings))
 
 
-# Samples of a period of the axis: its messages count to 65536, so that frames repeat with it, arrivals apart.
+# Samples of a period of the axis: its message counts to 65536, so that frames repeat with it, arrivals apart.
 ROUND = 1 << 16
 AXIS_DBC = """VERSION ""
 NS_ :
 BS_:
 BU_: ARM
 
-BO_ 256 DRIVE: 8 ARM
- SG_ VALUE : 0|32@1- (1E-06,0) [0|0] "" Vector__XXX
- SG_ COUNT : 48|16@1+ (1,0) [0|0] "" Vector__XXX
-
-BO_ 257 ENCODER: 8 ARM
- SG_ VALUE : 0|32@1- (1E-06,0) [0|0] "" Vector__XXX
+BO_ 256 AXIS: 8 ARM
+ SG_ FORCE : 0|24@1- (1E-05,0) [0|0] "" Vector__XXX
+ SG_ ANGLE : 24|24@1- (1E-06,0) [0|0] "" Vector__XXX
  SG_ COUNT : 48|16@1+ (1,0) [0|0] "" Vector__XXX
 """
 AXIS_SOURCE = """
@@ -196,8 +193,8 @@ kind = "can"
 name = "bus"
 dbc = "axis.dbc"
 interface = "virtual"
-signals = { "DRIVE.VALUE" = "force_1", "ENCODER.VALUE" = "q_1" }
-counters = ["DRIVE.COUNT", "ENCODER.COUNT"]
+signals = { "AXIS.FORCE" = "force_1", "AXIS.ANGLE" = "q_1" }
+counters = ["AXIS.COUNT"]
 """
 # Ticks worked off at once, so that a day takes minutes: still less than what a session waits for a source.
 TICKS = 10
@@ -209,27 +206,25 @@ def axis_round(random: np.random.Generator) -> CanFrames:
     phase = np.arange(ROUND)[:, None] / 1000.0 * w
     q = np.sin(phase) @ [1.0, 0.3]
     torque = np.cos(phase) @ (DAMPING * w * [1.0, 0.3]) - np.sin(phase) @ (INERTIA * w**2 * [1.0, 0.3])
-    parts = []
-    for id_, values, noise in ((256, torque, 0.01), (257, q, 1e-4)):
-        words = np.zeros(ROUND, dtype=[("value", "<i4"), ("unused", "<u2"), ("count", "<u2")])
-        words["value"] = np.rint((values + noise * random.standard_normal(ROUND)) / 1e-6)
-        words["count"] = np.arange(ROUND)
-        data = np.zeros((ROUND, 64), dtype=np.uint8)
-        data[:, :8] = words.view(np.uint8).reshape(ROUND, 8)
-        t = np.arange(ROUND) * 1e-3 * (1.0 + 5e-5)
-        arrival = np.maximum.accumulate(t + random.uniform(0.0, 2e-3, ROUND))
-        plain = np.zeros(ROUND, dtype=np.uint8)
-        parts.append(
-            CanFrames(arrival, np.full(ROUND, np.nan), np.full(ROUND, id_, np.uint32), plain + np.uint8(8), data, plain)
-        )
-    together = concatenate_frames(parts)
-    return together[np.argsort(together.arrival, kind="stable")]
+    word = np.arange(ROUND, dtype=np.uint64) << np.uint64(48)
+    for values, noise, step, start in ((torque, 0.01, 1e-5, 0), (q, 1e-4, 1e-6, 24)):
+        counts = np.rint((values + noise * random.standard_normal(ROUND)) / step).astype(np.int64) & 0xFFFFFF
+        word |= counts.astype(np.uint64) << np.uint64(start)
+    data = np.zeros((ROUND, 64), dtype=np.uint8)
+    data[:, :8] = word.astype("<u8").view(np.uint8).reshape(ROUND, 8)
+    t = np.arange(ROUND) * 1e-3 * (1.0 + 5e-5)
+    arrival = np.maximum.accumulate(t + random.uniform(0.0, 2e-3, ROUND))
+    plain = np.zeros(ROUND, dtype=np.uint8)
+    id_ = np.full(ROUND, 256, np.uint32)
+    return CanFrames(arrival, np.full(ROUND, np.nan), id_, plain + np.uint8(8), data, plain)
 
 
-def test_a_day_at_full_speed(tmp_path: Path) -> None:
+@pytest.mark.parametrize("balance", ["energy", "both"])
+def test_a_day_at_full_speed(tmp_path: Path, balance: str) -> None:
     """Memory and π over a day of one axis at 1 kHz, with history and checkpoints; HOURS as above, 24 by default."""
     (tmp_path / "axis.dbc").write_text(AXIS_DBC)
-    (tmp_path / "axis.toml").write_text(AXIS.replace("sample_rate = 200.0", "sample_rate = 1000.0") + AXIS_SOURCE)
+    described = f'balance = "{balance}"\n' + AXIS.replace("sample_rate = 200.0", "sample_rate = 1000.0")
+    (tmp_path / "axis.toml").write_text(described + AXIS_SOURCE)
     system = load_system(str(tmp_path / "axis.toml"))
     frames = axis_round(np.random.default_rng(1))
     merger = Merger(lanes(system, tmp_path))
