@@ -155,7 +155,8 @@ def _projection_warning(projection: Projection | None) -> list[str]:
     return [f"no real bodies have these parameters, because of {names}: the nearest that some have are {distance} away"]
 
 
-def _event(event: Event) -> dict[str, Any]:
+def event_document(event: Event) -> dict[str, Any]:
+    """An event as results.json holds it."""
     jumps = zip(event.parameters, event.units, event.sizes, event.stds, strict=True)
     return {
         "time": event.time,
@@ -212,7 +213,7 @@ def results_document(
         "samples": estimator.samples,
         "duration_s": estimator.duration,
         "parameters": parameters,
-        "events": [_event(event) for event in estimator.events],
+        "events": [event_document(event) for event in estimator.events],
         "residual": residual,
         "physical": None
         if projection is None

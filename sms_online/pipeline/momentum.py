@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -13,6 +13,7 @@ from sms_online.model.base_parameters import BaseParameters
 from sms_online.model.model import Model
 from sms_online.pipeline.changes import Adoption, Changes
 from sms_online.pipeline.errors_in_variables import NoiseBias
+from sms_online.pipeline.events import Event
 from sms_online.pipeline.momentum_balance import MomentumBalance
 from sms_online.pipeline.momentum_fit import MomentumFit, WhiteRows
 from sms_online.pipeline.sensing import Sensing
@@ -71,6 +72,13 @@ class Momentum:
         """Weigh the rows against what is known of the base parameters beforehand; before the first sample."""
         self._prior = prior
         self.tracker = self._new_tracker()
+
+    def follow(self, events: Sequence[Event], added: Sequence[str]) -> None:
+        """Have the parameters of a session of the same system with these events, knowing nothing of them yet."""
+        new = tuple(added) != self.changes.added
+        self.changes.follow(events, added)
+        if new:
+            self._build()
 
     @property
     def started(self) -> bool:
