@@ -32,7 +32,7 @@ class ClusterFactors:
     """Factors of consecutive clusters of blocks; when they become too many, neighbours merge and the length doubles."""
 
     def __init__(self, n: int) -> None:
-        # Rows are written once, so that a state shares them: those of a large arm are 14 MB, too much to be copied often.
+        # Written once and shared with saved states: those of a large arm are 14 MB, too much to be copied often.
         self._closed = np.zeros((MAX_CLUSTERS, n + 1, n + 1))
         self._count = 0
         self._length = 1  # blocks per cluster

@@ -143,7 +143,7 @@ class LiveSession:
             return
         now = self._clock()
         estimate = self._estimator.estimate()
-        std = standard_deviation(self._estimator)
+        std = standard_deviation(self._estimator, estimate)
         relative = std / np.maximum(np.abs(estimate.pi), np.finfo(float).tiny)
         best = [k for k in np.argsort(relative)[:LEADING].tolist() if np.isfinite(std[k])]
         parameters = self._estimator.base.parameters

@@ -138,7 +138,8 @@ class Recorder:
         estimator = self._estimator
         apply(state, estimator)
         self._follow_events()
-        estimate, std = estimator.estimate().pi, standard_deviation(estimator)
+        now = estimator.estimate()
+        estimate, std = now.pi, standard_deviation(estimator, now)
         determined = std <= LARGEST_RELATIVE_STD * np.abs(estimate)
         self._parameters.add(t, estimate, std, determined)
         self._residual = self._recent.push(t, estimator, estimate)
