@@ -14,6 +14,7 @@ from sms_online.model.model import Model
 from sms_online.pipeline.changes import Adoption, Changes
 from sms_online.pipeline.errors_in_variables import NoiseBias
 from sms_online.pipeline.events import Event
+from sms_online.pipeline.latency import Latencies, source_groups
 from sms_online.pipeline.momentum_balance import MomentumBalance
 from sms_online.pipeline.momentum_fit import MomentumFit, WhiteRows
 from sms_online.pipeline.sensing import Sensing
@@ -33,8 +34,8 @@ class Momentum:
     """Balance, weights and tracker of one session.
 
     tracker: square-root RLS, fed with rows of unit variance. bias: what noise in the columns does to the estimate.
-    windows: how many it took since the last event. changes: events, and the model and parameters that the session goes
-    on with after them.
+    windows: how many it took since the last event. latencies: of the sources, since then too. changes: events, and the
+    model and parameters that the session goes on with after them.
     """
 
     def __init__(self, model: Model, base: BaseParameters, sensing: Sensing) -> None:
@@ -48,6 +49,7 @@ class Momentum:
         self._estimate = NoiseEstimate(sensing, system.sample_rate)
         self._span = system.windows.momentum
         self._prior: Prior | None = None
+        self._sources = source_groups(sensing)
         self._build()
         self._random = np.random.default_rng(SEED)
         self._segment = -1
@@ -61,7 +63,8 @@ class Momentum:
         self.bias = NoiseBias(base.n)
         self.windows = 0
         self._balance = MomentumBalance(model, base, self._sample_rate, self._span)
-        self._fit = MomentumFit(model, base, self._balance, self.sensing.displacements, self._solved)
+        self.latencies = Latencies(self._sources, base.n)
+        self._fit = MomentumFit(model, base, self._balance, self.sensing.displacements, self._solved, self._sources)
         self.tracker: Tracker = self._new_tracker()
 
     def _new_tracker(self) -> RecursiveLeastSquares:
@@ -188,6 +191,7 @@ class Momentum:
             self.tracker.update(Rows(rows.Y[:, :-1], rows.Y[:, -1], np.ones(M), np.full(M, t)))
             self.newest_row = t
             self.bias.add(rows.Y, rows.noisy)
+            self.latencies.add(rows.Y, rows.late)
             self.windows += 1
 
     def whitened(self, rows: list[int], beta: Array) -> float | None:
@@ -213,6 +217,7 @@ class Momentum:
                 "waiting_segment": np.repeat([p.segment for p in waiting], [p.index.size for p in waiting]),
                 **noise_state("noise", self.sensor_noise),
                 **self.bias.state(),
+                **self.latencies.state(),
             },
             "momentum_noise": self._estimate.state(),
             "momentum_balance": self._balance.state(),
@@ -238,6 +243,7 @@ class Momentum:
         index, values = np.array(state["waiting_index"]), np.array(state["waiting_values"])
         self._waiting = [GridSamples(index[segments == k], values[segments == k], int(k)) for k in np.unique(segments)]
         self.bias.restore(state)
+        self.latencies.restore(state)
         self._estimate.restore(saved["momentum_noise"])
         self._balance.restore(saved["momentum_balance"])
         self._fit.restore(saved["momentum_fit"])

@@ -81,6 +81,15 @@ def conclude(args: argparse.Namespace, document: Document, directory: Path, inte
     return OK if any(p["identifiable"] for p in document["parameters"]) else NOTHING_DETERMINED
 
 
+def unstated_latency(estimator: Estimator) -> list[str]:
+    """That a source is late against the others by more than the system file says, if one is."""
+    found = None if estimator.momentum is None else estimator.momentum.latencies.found
+    if found is None:
+        return []
+    late = f"{1e3 * found.size:.3g} ± {1e3 * found.std:.2g} ms"
+    return [f"{found.source}: {late} later than its stated latency ({', '.join(found.effects)})"]
+
+
 def document_of(
     estimator: Estimator,
     throughput: float,
@@ -106,6 +115,7 @@ def document_of(
         noticed.append(f"{counters.gaps} gaps too long to bridge; each begins a new window of the balance")
     if counters.interpolated_cells:
         noticed.append(f"{counters.interpolated_cells} cells interpolated")
+    noticed += unstated_latency(estimator)
     if estimator.sensing.unused:
         noticed.append(f"channels not used: {', '.join(estimator.sensing.unused)}")
     names = [parameter.name for parameter in estimator.base.physical]
