@@ -23,6 +23,10 @@ from sms_tools.report import Document, parameter_table, report_console, show, tr
 from sms_tools.results_file import to_json, write_results
 
 
+# Effects of one cause that a warning names.
+NAMED = 4
+
+
 def described_system(args: argparse.Namespace) -> tuple[System, Path | None]:
     """The system asked for, and the directory of its file, where its DBC stands too; None for a shipped one."""
     system = load_system(args.system)
@@ -87,7 +91,9 @@ def unstated_latency(estimator: Estimator) -> list[str]:
     if found is None:
         return []
     late = f"{1e3 * found.size:.3g} ± {1e3 * found.std:.2g} ms"
-    return [f"{found.source}: {late} later than its stated latency ({', '.join(found.effects)})"]
+    more = [f"{len(found.effects) - NAMED} more"] if len(found.effects) > NAMED else []
+    effects = ", ".join([*found.effects[:NAMED], *more])
+    return [f"{found.source}: {late} later than its stated latency ({effects})"]
 
 
 def document_of(
