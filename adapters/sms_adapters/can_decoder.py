@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from sms_adapters.can_signals import WantedMessage, decode_signal, raw_word
 from sms_adapters.conversion import Conversions, FrameCounter, counters_state, restore_counters
+from sms_adapters.increments import increments
 from sms_adapters.raw import ERROR_FRAME, REMOTE_FRAME, CanFrames, DecodedSamples, DecoderState, Raw, concatenate_frames
 from sms_online.description.schema import Signal
 
@@ -83,7 +84,7 @@ class CanDecoder:
         whole = rows[raw.length[rows] == message.length]
         self.counters["wrong_length"] += rows.size - whole.size
         stamps = raw.stamp[whole]
-        fresh = np.diff(stamps, prepend=self._last_stamp[k]) != 0  # true where there is no stamp
+        fresh = increments(stamps, self._last_stamp[k]) != 0  # true where there is no stamp
         if stamps.size:
             self._last_stamp[k] = stamps[-1]
         self.counters["repeated_time"] += int(np.count_nonzero(~fresh))

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from sms_adapters.increments import increments
 from sms_adapters.raw import DecoderState
 from sms_online.description.schema import SerialField, Signal
 from sms_online.stream import Array
@@ -31,7 +32,7 @@ class Turns:
             return numbers
         first = numbers[0] if np.isnan(self._last) else self._last
         # Whole numbers, so that the sum is exact and the same however the samples are grouped.
-        steps = np.floor(np.diff(numbers, prepend=first) / self.wrap + 0.5)
+        steps = np.floor(increments(numbers, first) / self.wrap + 0.5)
         turns = self._turns - np.cumsum(steps)
         self._last, self._turns = float(numbers[-1]), float(turns[-1])
         return turns
@@ -112,7 +113,7 @@ class FrameCounter:
         if not counts.size:
             return admitted
         before = counts[0] - 1 if self._last < 0 else self._last
-        steps = np.diff(counts, prepend=before) % self._modulus
+        steps = increments(counts, before) % self._modulus
         if np.all((steps > 0) & (steps <= self._modulus // 2)):
             self._counters["lost_counter"] += int(steps.sum()) - counts.size
             self._last, self._late = int(counts[-1]), -1

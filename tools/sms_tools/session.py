@@ -22,7 +22,6 @@ from sms_tools.priors import base_prior
 from sms_tools.report import Document, parameter_table, report_console, show, trust_lines
 from sms_tools.results_file import to_json, write_results
 
-
 # Effects of one cause that a warning names.
 NAMED = 4
 
