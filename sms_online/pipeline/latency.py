@@ -41,7 +41,10 @@ class SourceGroup:
 
 @dataclass(frozen=True)
 class Latency:
-    """A source whose samples are `size` ± `std` s later than the system file says; effects: it is known as these."""
+    """A source whose samples are `size` ± `std` s later than the system file says; effects: it is known as these.
+
+    Less than zero where all others are late by the same, which nobody can tell from one source that is early.
+    """
 
     source: str
     size: float

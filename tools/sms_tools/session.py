@@ -89,7 +89,9 @@ def unstated_latency(estimator: Estimator) -> list[str]:
     found = None if estimator.momentum is None else estimator.momentum.latencies.found
     if found is None:
         return []
-    late = f"{1e3 * found.size:.3g} ± {1e3 * found.std:.2g} ms"
+    late = f"{1e3 * abs(found.size):.3g} ± {1e3 * found.std:.2g} ms"
+    if found.size < 0.0:
+        return [f"all sources but {found.source}: {late} later than their stated latencies"]
     more = [f"{len(found.effects) - NAMED} more"] if len(found.effects) > NAMED else []
     effects = ", ".join([*found.effects[:NAMED], *more])
     return [f"{found.source}: {late} later than its stated latency ({effects})"]
