@@ -29,9 +29,10 @@ LARGEST_PULL = 1.0
 POSITIVE = ("mass", "mass_per_length", "stiffness", "damping", "rotor_inertia", "rigidity", "rigidity_y", "rigidity_z")
 
 
-def standard_deviation(estimator: Estimator) -> Array:
+def standard_deviation(estimator: Estimator, estimate: Estimate | None = None) -> Array:
     """1σ of each parameter (n,) as known now, inf where the data determine nothing.
 
+    estimate: the estimator's own of now, where it is at hand: to make it costs milliseconds.
     Rows of the momentum balance have a predicted variance. While the residual agrees with it, the estimate's covariance
     follows from it; where rows leave more, the model lacks something and the residual decides, as it does for rows of
     the energy balance.
@@ -40,10 +41,8 @@ def standard_deviation(estimator: Estimator) -> Array:
     energy window share, which least squares absorbs and no residual shows; it is known while no row is forgotten. Where
     rows have been weighed against a prior, the posterior's own covariance holds.
     """
-    return _standard_deviation(estimator, estimator.estimate())
-
-
-def _standard_deviation(estimator: Estimator, estimate: Estimate) -> Array:
+    if estimate is None:
+        estimate = estimator.estimate()
     std = np.full(estimate.pi.shape, np.inf)
     if estimate.dof <= 0.0:
         return std
@@ -68,7 +67,7 @@ def _standard_deviation(estimator: Estimator, estimate: Estimate) -> Array:
 def identifiable(estimator: Estimator) -> NDArray[np.bool_]:
     """Which parameters (n,) the data determine: in the span of the rows, and three standard deviations from zero."""
     estimate = estimator.estimate()
-    return _identifiable(estimate, _standard_deviation(estimator, estimate))
+    return _identifiable(estimate, standard_deviation(estimator, estimate))
 
 
 def _identifiable(estimate: Estimate, std: Array) -> NDArray[np.bool_]:
@@ -119,7 +118,7 @@ def pulled(estimator: Estimator) -> list[str]:
         return []
     estimate = estimator.estimate()
     shift = np.abs(estimator.momentum.bias.correction(estimate.determined)[0])
-    std = _standard_deviation(estimator, estimate)
+    std = standard_deviation(estimator, estimate)
     return [p.name for p, s, d in zip(estimator.base.parameters, shift, std, strict=True) if s > LARGEST_PULL * d]
 
 
@@ -155,7 +154,8 @@ def _projection_warning(projection: Projection | None) -> list[str]:
     return [f"no real bodies have these parameters, because of {names}: the nearest that some have are {distance} away"]
 
 
-def _event(event: Event) -> dict[str, Any]:
+def event_document(event: Event) -> dict[str, Any]:
+    """An event as results.json holds it."""
     jumps = zip(event.parameters, event.units, event.sizes, event.stds, strict=True)
     return {
         "time": event.time,
@@ -183,7 +183,7 @@ def results_document(
     true = None
     if truth is not None and all(p.name in truth for p in base.physical):
         true = base.values(np.array([truth[p.name] for p in base.physical]))
-    deviations = _standard_deviation(estimator, estimate)
+    deviations = standard_deviation(estimator, estimate)
     flags = _identifiable(estimate, deviations)
     projection = projected(estimator, estimate, deviations)
     parameters = []
@@ -212,7 +212,7 @@ def results_document(
         "samples": estimator.samples,
         "duration_s": estimator.duration,
         "parameters": parameters,
-        "events": [_event(event) for event in estimator.events],
+        "events": [event_document(event) for event in estimator.events],
         "residual": residual,
         "physical": None
         if projection is None

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import functools
 import itertools
+import operator
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -39,7 +41,7 @@ kind = "can"
 name = "drive"
 dbc = "axis.dbc"
 interface = "virtual"
-signals = { "DRIVE.TORQUE" = "force_1" }
+signals = { "DRIVE.TORQUE" = { channel = "force_1", minimum = -6.0, maximum = 6.0 } }
 counters = ["DRIVE.COUNT"]
 latency = 0.003
 
@@ -51,6 +53,9 @@ format = "frames"
 latency = 0.005
 fields = [{ type = "u32", tick = 1e-6 }, { type = "f64", channel = "q_1" }]
 """
+# The same encoder, printing its numbers.
+LINES = SOURCES.replace("frames", "lines").replace('type = "u32", tick = 1e-6', "tick = 1e-6, wrap = 4294967296")
+LINES = LINES.replace('type = "f64", ', "") + 'checksum = "xor"\n'
 LATENCY = {"drive": 0.003, "encoder": 0.005}
 
 
@@ -113,15 +118,23 @@ class AxisBus:
         return CanFrames(self.drive_arrival, np.full(n, np.nan), id_, plain + np.uint8(8), data, plain)
 
     def encoder(self, system: System) -> list[SerialChunk]:
-        """The encoder's frames, a chunk each."""
+        """The encoder's frames, or lines, a chunk each."""
         source = system.sources[1]
-        assert isinstance(source, SerialFrames)
-        words = np.zeros(self.angle.size, dtype=frame_layout(source.fields))
-        words["f0"] = np.mod(np.rint(self.ticks * 1e6), 2.0**32)
-        words["f1"] = self.angle
-        frames = encode_frames(words)
-        chunks = [SerialChunk(t, frame) for t, frame in zip(self.encoder_arrival.tolist(), frames, strict=True)]
-        return [SerialChunk(0.0, b"\0"), *chunks]  # an end, so that the first frame is known to be whole
+        ticks = np.mod(np.rint(self.ticks * 1e6), 2.0**32)
+        if isinstance(source, SerialFrames):
+            words = np.zeros(self.angle.size, dtype=frame_layout(source.fields))
+            words["f0"], words["f1"] = ticks, self.angle
+            sent, end = encode_frames(words), b"\0"
+        else:
+            rows = zip(ticks.astype(np.int64).tolist(), self.angle.tolist(), strict=True)
+            sent, end = [checked(f"{tick},{angle!r}".encode()) for tick, angle in rows], b"\n"
+        chunks = [SerialChunk(t, data) for t, data in zip(self.encoder_arrival.tolist(), sent, strict=True)]
+        return [SerialChunk(0.0, end), *chunks]  # an end, so that the first frame is known to be whole
+
+
+def checked(text: bytes) -> bytes:
+    """A line with its checksum."""
+    return b"%s*%02X\n" % (text, functools.reduce(operator.xor, text))
 
 
 def in_order(arrival: Array) -> Array:

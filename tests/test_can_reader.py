@@ -77,6 +77,16 @@ def test_frames_come_as_they_were_sent(bus: tuple[CanReader, can.BusABC]) -> Non
     assert abs(frames.stamp[0] - time.time()) < 60.0
 
 
+def test_a_frame_that_waited_for_its_reader_arrived_when_it_was_stamped(bus: tuple[CanReader, can.BusABC]) -> None:
+    reader, node = bus
+    sent = time.monotonic()
+    node.send(can.Message(arbitration_id=0x123, is_extended_id=False, data=b"\x01"))
+    time.sleep(0.3)
+    frames = received(reader, 1)
+    assert time.monotonic() - sent > 0.3
+    assert frames.arrival[0] - sent < 0.2
+
+
 def test_a_silent_bus_gives_nothing_and_a_flooded_one_bounded_pieces(bus: tuple[CanReader, can.BusABC]) -> None:
     reader, node = bus
     assert reader.read(0.01) == []

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from axis import AXIS
 
 from sms_adapters.system_file import load_system
 from sms_online.description.channels import channels, drive_channel, sensed_channels
@@ -119,6 +120,11 @@ def test_a_file_becomes_a_description_with_its_defaults() -> None:
     assert [len(series) for series in system.trajectory.joints] == [1, 2]
     assert system.windows.relative == 0.2
     assert system.sample_rate == 1000.0
+
+
+def test_a_file_may_ask_for_one_balance() -> None:
+    from_text = parse_system(f'balance = "energy"\n{AXIS}', "axis.toml")
+    assert (from_text.balance, parse_system(AXIS, "axis.toml").balance) == ("energy", "both")
 
 
 def test_a_description_survives_its_own_json() -> None:

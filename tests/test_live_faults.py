@@ -4,15 +4,16 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 from axis import DAMPING, INERTIA
-from bus_streams import AxisBus, axis_testbed, estimated, in_order, merged
+from bus_streams import LINES, SOURCES, AxisBus, axis_testbed, estimated, in_order, merged
 from numpy.typing import NDArray
 
+from sms_adapters.can_reader import BUS_OFF
 from sms_adapters.raw import ERROR_FRAME, CanFrames, SerialChunk, concatenate_frames
 from sms_online.description.schema import System
 
@@ -75,6 +76,14 @@ def spoilt(s: Session, chunk: SerialChunk) -> SerialChunk:
     return SerialChunk(chunk.arrival, bytes(data))
 
 
+def corrupt_words(s: Session) -> None:
+    # A sender that now and then fills a frame with anything, its counter included.
+    data = s.drive.data.copy()
+    rows = np.flatnonzero(s.random.uniform(size=len(s.drive)) < 0.005)
+    data[rows, :8] = s.random.integers(0, 256, (rows.size, 8))
+    s.drive = replace(s.drive, data=data)
+
+
 def wrong_length(s: Session) -> None:
     s.drive.length[s.random.integers(0, len(s.drive), 100)] = 5
 
@@ -93,6 +102,13 @@ def error_frames(s: Session) -> None:
     s.drive = both[np.argsort(both.arrival, kind="stable")]
 
 
+def bus_off(s: Session) -> None:
+    # The controller gives up, and is started again a second later.
+    last = s.drive[s.drive.arrival < 9.0][-1:]
+    said = replace(last, id=np.array([BUS_OFF], dtype=np.uint32), flags=np.array([ERROR_FRAME], dtype=np.uint8))
+    s.drive = concatenate_frames([s.drive[s.drive.arrival < 9.0], said, s.drive[s.drive.arrival > 10.2]])
+
+
 def unplugged(s: Session) -> None:
     # Out for three seconds, in the middle of a frame; the port then begins with a break.
     t = arrivals(s)
@@ -106,6 +122,13 @@ def half_frames(s: Session) -> None:
     s.encoder = [
         SerialChunk(chunk.arrival, chunk.data[:7]) if 100 < k < 2000 and k % 40 == 0 else chunk
         for k, chunk in enumerate(s.encoder)
+    ]
+
+
+def not_text(s: Session) -> None:
+    lines = [SerialChunk(chunk.arrival, b"\xff\xfe" + chunk.data) for chunk in s.encoder[1:]]
+    s.encoder[1:] = [
+        line if k % 50 == 7 else chunk for k, (line, chunk) in enumerate(zip(lines, s.encoder[1:], strict=True))
     ]
 
 
@@ -165,18 +188,26 @@ FAULTS: dict[Callable[[Session], None], str] = {
     clock_jump: r"encoder: 1 jumps of its clock, the last by \+2.000 s",
     device_restarts: "encoder: 1 jumps of its clock, the last by",
     transport_stalls: "",
+    corrupt_words: "drive: 5 values skipped, outside the limits of their channel",
+    bus_off: "drive: 1 error frames, the bus or its controller reports trouble",
+}
+# Of an encoder that prints lines.
+LINE_FAULTS: dict[Callable[[Session], None], str] = {
+    not_text: "encoder: 80 lines skipped, they are not text",
+    half_frames: "encoder: 47 frames skipped, their checksum is wrong",
+    corrupt_payload: "encoder: .* frames skipped, their checksum is wrong",
 }
 
 
 # First what changes the measured values, then what happens to the frames.
 TOGETHER = (
-    torque_saturates, stuck_sensor, clock_jump, not_a_number, transport_stalls, unplugged, bursts_lost, frames_lost,
-    reordering, duplicates, corrupt_payload, wrong_length, unknown_ids, error_frames,
+    torque_saturates, stuck_sensor, clock_jump, not_a_number, transport_stalls, unplugged, bursts_lost, bus_off,
+    frames_lost, reordering, duplicates, corrupt_words, corrupt_payload, wrong_length, unknown_ids, error_frames,
 )  # fmt: skip
 
 
-def session(folder: Path) -> Session:
-    system = axis_testbed(folder)
+def session(folder: Path, sources: str = SOURCES) -> Session:
+    system = axis_testbed(folder, sources)
     bus = AxisBus(seconds=SECONDS, drift=(2e-5, -3e-5), offset=0.3)
     return Session(bus, system, np.random.default_rng(11), bus.drive(), bus.encoder(system))
 
@@ -188,24 +219,39 @@ def outcome(s: Session, folder: Path) -> tuple[list[str], NDArray[np.float64], N
     return merger.warnings, (pi - [INERTIA, DAMPING]) / std, std
 
 
-@pytest.mark.parametrize("fault", FAULTS, ids=lambda fault: fault.__name__)
-def test_each_fault_alone(tmp_path: Path, fault: Callable[[Session], None]) -> None:
-    s = session(tmp_path)
-    fault(s)
-    warnings, errors, std = outcome(s, tmp_path)
-    if FAULTS[fault]:
-        assert any(re.match(FAULTS[fault], warning) for warning in warnings), warnings
+def check(s: Session, folder: Path, expected: str) -> None:
+    """The fault is named, and π stays within its error bars."""
+    warnings, errors, std = outcome(s, folder)
+    if expected:
+        assert any(re.match(expected, warning) for warning in warnings), warnings
     else:
         assert warnings == []
     assert (np.abs(errors) < 4.0).all(), (errors, std)
     assert (std < [0.01, 0.01]).all()
 
 
-def test_all_faults_together(tmp_path: Path) -> None:
+@pytest.mark.parametrize("fault", FAULTS, ids=lambda fault: fault.__name__)
+def test_each_fault_alone(tmp_path: Path, fault: Callable[[Session], None]) -> None:
     s = session(tmp_path)
-    for fault in TOGETHER:
+    fault(s)
+    check(s, tmp_path, FAULTS[fault])
+
+
+@pytest.mark.parametrize("fault", LINE_FAULTS, ids=lambda fault: fault.__name__)
+def test_each_fault_of_an_encoder_that_prints_lines(tmp_path: Path, fault: Callable[[Session], None]) -> None:
+    s = session(tmp_path, LINES)
+    fault(s)
+    check(s, tmp_path, LINE_FAULTS[fault])
+
+
+@pytest.mark.parametrize(
+    ("sources", "further"), [(SOURCES, (half_frames,)), (LINES, (not_text, half_frames))], ids=["frames", "lines"]
+)
+def test_all_faults_together(tmp_path: Path, sources: str, further: tuple[Callable[[Session], None], ...]) -> None:
+    s = session(tmp_path, sources)
+    for fault in (*TOGETHER, *further):
         fault(s)
     warnings, errors, std = outcome(s, tmp_path)
-    assert len(warnings) >= 10
+    assert len(warnings) >= 12
     assert (np.abs(errors) < 4.0).all(), (errors, std)
     assert (std < [0.01, 0.01]).all()

@@ -10,6 +10,7 @@ from sms_online.model.base_parameters import find_base_parameters
 from sms_online.model.model import Model
 from sms_online.model.parameters import Parameter
 from sms_online.pipeline.estimator import SquaredResidual
+from sms_online.pipeline.events import Event
 from sms_tools.view.frames import Reference
 from sms_tools.view.parameter_groups import MOST_LINES, parameter_groups, shortened
 from sms_tools.view.residuals import RecentResidual
@@ -69,6 +70,7 @@ class Watched:
 
     def __init__(self) -> None:
         self.joint_residuals = [SquaredResidual(np.zeros((2, 2)))]
+        self.events: list[Event] = []
 
 
 def test_the_recent_residual_forgets_what_is_over() -> None:

@@ -8,8 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sms_adapters.can_signals import WantedMessage, decode_signal, raw_word
-from sms_adapters.conversion import Conversion, FrameCounter, counters_state, restore_counters
-from sms_adapters.raw import ERROR_FRAME, REMOTE_FRAME, CanFrames, DecodedSamples, DecoderState, Raw
+from sms_adapters.conversion import Conversions, FrameCounter, counters_state, restore_counters
+from sms_adapters.increments import increments
+from sms_adapters.raw import ERROR_FRAME, REMOTE_FRAME, CanFrames, DecodedSamples, DecoderState, Raw, concatenate_frames
 from sms_online.description.schema import Signal
 
 # Unknown identifiers that are remembered, to name them.
@@ -30,17 +31,24 @@ class CanDecoder:
         self.unknown_ids: list[int] = []  # the first of them
         self.messages = tuple(messages)
         self._ids = np.array([message.id for message in messages], dtype=np.uint32)
-        self._conversions = [Conversion(signal, self.counters) for signal in signals]
+        self._columns = [list(message.columns) for message in messages]
+        self._conversions = [
+            Conversions([signals[column] for column in message.columns], self.counters) for message in messages
+        ]
         self._sequences = [
             None if message.counter is None else FrameCounter(1 << message.counter.length, self.counters)
             for message in messages
         ]
         self._last_stamp = np.full(len(messages), np.nan)
 
-    def push(self, raw: Raw) -> DecodedSamples:
+    def push(self, *items: Raw) -> DecodedSamples:
         """The samples in some frames; (M, C) values with NaN in the channels of other messages."""
-        if not isinstance(raw, CanFrames):
-            raise TypeError(f"{type(raw).__name__} pushed into a decoder of CAN frames")
+        parts: list[CanFrames] = []
+        for item in items:
+            if not isinstance(item, CanFrames):
+                raise TypeError(f"{type(item).__name__} pushed into a decoder of CAN frames")
+            parts.append(item)
+        raw = parts[0] if len(parts) == 1 else concatenate_frames(parts)
         values = np.full((len(raw), len(self.channels)), np.nan)
         used = np.zeros(len(raw), dtype=np.bool_)
         plain = self._plain(raw)
@@ -48,9 +56,9 @@ class CanDecoder:
             rows = self._admitted(k, message, raw, np.flatnonzero(plain & (raw.id == message.id)))
             if not rows.size:
                 continue
-            words = raw.data[:, : message.length][rows]
-            for signal, column in zip(message.signals, message.columns, strict=True):
-                values[rows, column] = self._conversions[column](decode_signal(signal, words))
+            words = message.words(raw.data, rows)
+            numbers = np.stack([decode_signal(signal, words) for signal in message.signals], axis=1)
+            values[rows[:, None], self._columns[k]] = self._conversions[k](numbers)
             used[rows] = True
         # A frame whose every value was refused is no sample.
         used &= ~np.isnan(values).all(axis=1)
@@ -76,14 +84,14 @@ class CanDecoder:
         whole = rows[raw.length[rows] == message.length]
         self.counters["wrong_length"] += rows.size - whole.size
         stamps = raw.stamp[whole]
-        fresh = np.diff(stamps, prepend=self._last_stamp[k]) != 0  # true where there is no stamp
+        fresh = increments(stamps, self._last_stamp[k]) != 0  # true where there is no stamp
         if stamps.size:
             self._last_stamp[k] = stamps[-1]
         self.counters["repeated_time"] += int(np.count_nonzero(~fresh))
         admitted: NDArray[np.intp] = whole[fresh]
         sequence = self._sequences[k]
         if sequence is not None and message.counter is not None:
-            counts = raw_word(message.counter, raw.data[:, : message.length][admitted]).astype(np.int64)
+            counts = raw_word(message.counter, message.words(raw.data, admitted)).astype(np.int64)
             admitted = admitted[sequence.admit(counts)]
         return admitted
 

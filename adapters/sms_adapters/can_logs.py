@@ -15,7 +15,7 @@ import numpy as np
 
 from sms_adapters.can_reader import frames_of
 from sms_adapters.candump import LoggedFrames
-from sms_adapters.lines import LineReader
+from sms_adapters.lines import LineLog, LineReader
 from sms_adapters.raw import MOST_BYTES, CanFrames, one_line
 from sms_online.errors import InputError
 
@@ -27,7 +27,7 @@ _EXPANSION, _OBJECT = 1032, 16
 CSV_HEADER = "timestamp,arbitration_id,extended,remote,error,dlc,data"
 
 
-class TextLog:
+class TextLog(LineLog):
     """A log of lines, .asc, .trc or .csv, each also as .gz; iterations start from its beginning.
 
     Lines that hold no frame are passed over, as python-can does. Raises InputError for a line that cannot be read, a
@@ -35,15 +35,8 @@ class TextLog:
     """
 
     def __init__(self, path: Path, on_bytes: Callable[[int], None] | None = None) -> None:
-        self._path = path
+        super().__init__(path, on_bytes)
         self._ending = Path(path.name.removesuffix(".gz")).suffix
-        self._lines = LineReader(path, on_bytes)
-        self._lines.first_line()
-
-    @property
-    def warnings(self) -> list[str]:
-        """What the current iteration has left out."""
-        return self._lines.warnings
 
     def __iter__(self) -> Iterator[LoggedFrames]:
         """The frames, some thousands at a time."""

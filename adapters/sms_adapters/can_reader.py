@@ -6,6 +6,7 @@ import os
 import socket
 import time
 from collections.abc import Sequence
+from dataclasses import replace
 
 import can
 import numpy as np
@@ -25,9 +26,11 @@ from sms_adapters.raw import (
 from sms_online.description.schema import CanBus
 from sms_online.stream import Array
 
-# Shortest time between two reads, s: frames that come meanwhile wait in the driver, so that a busy bus costs a thousand
-# wake-ups a second and not one a frame. Kernel and hardware stamp them all the same.
-READ_INTERVAL = 1e-3
+# Shortest time between two reads, s: frames that come meanwhile wait in the driver, so that a busy bus costs some
+# hundred wake-ups a second and not one a frame. It is a fifth of a tick of the session, which waits anyway.
+READ_INTERVAL = 4e-3
+# Where nothing but the reading tells when a frame arrived, it must not wait so long, s.
+PROMPT_INTERVAL = 1e-3
 # Bytes that UDP multicast may hold back; the usual 212 kB overflow within a tenth of a second of a busy bus.
 RECEIVE_BUFFER = 4 << 20
 # Most frames of one read, which bounds what a flooded bus can keep in memory.
@@ -37,6 +40,10 @@ MOST_GARBLED = 100
 # CAN_ERR_BUSOFF of linux/can/error.h, in the identifier of an error frame, on interfaces that speak as socketcan does.
 BUS_OFF = 0x40
 SOCKETCAN_FRAMES = ("socketcan", "udp_multicast", "virtual")
+# Interfaces whose stamps are the host's own clock (UTC) when a frame arrived, and how long a frame may have waited for
+# the reader, s, until its stamp is not believed: somebody may have set that clock.
+HOST_STAMPED = SOCKETCAN_FRAMES
+LONGEST_WAIT = 1.0
 
 
 def open_bus(source: CanBus) -> can.BusABC:
@@ -63,7 +70,9 @@ class CanReader:
         self._clock = clock
         self._bus: can.BusABC | None = None
         self._garbled = 0
+        self._host_stamped = source.interface in HOST_STAMPED
         self._last_read = -np.inf
+        self._last_arrival = -np.inf
         self._lost: LostDevice | None = None  # found while frames were at hand, to be told after them
 
     def open(self) -> None:
@@ -80,7 +89,8 @@ class CanReader:
         """All frames that have come, at most MOST_FRAMES, waiting at most `timeout` s for the first."""
         if self._bus is None:
             raise LostDevice(self.name, "it is not open")
-        wait = READ_INTERVAL - (time.monotonic() - self._last_read)
+        interval = READ_INTERVAL if self._host_stamped else PROMPT_INTERVAL
+        wait = interval - (time.monotonic() - self._last_read)
         if wait > 0:
             time.sleep(wait)
         messages: list[can.Message] = []
@@ -93,10 +103,22 @@ class CanReader:
             arrivals.append(self._clock())
         self._last_read = time.monotonic()
         if messages:
-            return [frames_of(messages, np.array(arrivals))]
+            frames = frames_of(messages, np.array(arrivals))
+            return [self._as_stamped(frames) if self._host_stamped else frames]
         if self._lost is not None:
             raise self._lost
         return []
+
+    def _as_stamped(self, frames: CanFrames) -> CanFrames:
+        """The frames with arrivals by the host's stamps, which no waiting for this thread delays."""
+        now = self._clock()
+        waited = time.time() - frames.stamp
+        believed = (waited >= 0.0) & (waited <= LONGEST_WAIT)
+        arrival = np.where(believed, now - waited, frames.arrival)
+        # In order, as they were received.
+        arrival = np.maximum.accumulate(np.concatenate(([self._last_arrival], arrival)))[1:]
+        self._last_arrival = float(arrival[-1])
+        return replace(frames, arrival=arrival)
 
     def _receive(self, bus: can.BusABC, timeout: float) -> can.Message | None:
         """The next frame, None where there is none, or where the device turns out to be lost."""

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cache
 from importlib import resources
 from pathlib import Path
 
@@ -22,6 +23,7 @@ from sms_online.description.schema import CanSource
 from sms_online.errors import InputError
 from sms_online.stream import Array
 
+CLASSIC_BYTES = 8  # of a frame that is not CAN FD
 _MOST_BITS = 32  # of a counter
 _FLOATS = {16: np.float16, 32: np.float32, 64: np.float64}
 
@@ -40,6 +42,10 @@ class WantedMessage:
     signals: tuple[Signal, ...]
     columns: tuple[int, ...]
     counter: Signal | None = None
+
+    def words(self, frames: NDArray[np.uint8], rows: NDArray[np.intp]) -> NDArray[np.uint8]:
+        """Bytes of those rows of frames (N, 64) that are this message's: a classic frame's whole word at least."""
+        return frames[rows, : max(self.length, CLASSIC_BYTES)]
 
 
 def wanted_messages(source: CanSource, directory: Path | None) -> list[WantedMessage]:
@@ -98,13 +104,22 @@ def decode_signal(signal: Signal, frames: NDArray[np.uint8]) -> Array:
 
 def raw_word(signal: Signal, frames: NDArray[np.uint8]) -> NDArray[np.uint64]:
     """(B,) bits of a signal from frames (B, bytes), as an unsigned number."""
+    pieces = _pieces(signal)
+    if frames.shape[1] >= CLASSIC_BYTES and max(byte for byte, _, _ in pieces) < CLASSIC_BYTES:
+        # Within the bytes of a classic frame, which are one word.
+        byte, low, _ = pieces[-1]
+        little = signal.byte_order == "little_endian"
+        whole = np.ascontiguousarray(frames[:, :CLASSIC_BYTES]).view("<u8" if little else ">u8").ravel()
+        down = 8 * (byte if little else CLASSIC_BYTES - 1 - byte) + low
+        return (whole.astype(np.uint64) >> np.uint64(down)) & np.uint64((1 << signal.length) - 1)
     raw = np.zeros(len(frames), dtype=np.uint64)
-    for byte, low, width in _pieces(signal):
+    for byte, low, width in pieces:
         piece = (frames[:, byte] >> np.uint8(low)) & np.uint8((1 << width) - 1)
         raw = (raw << np.uint64(width)) | piece
     return raw
 
 
+@cache
 def _pieces(signal: Signal) -> list[tuple[int, int, int]]:
     """(byte, lowest bit, width) of the runs of bits that make up a signal, the most significant run first.
 

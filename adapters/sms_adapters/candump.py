@@ -7,14 +7,13 @@ the log holds whole microseconds.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from sms_adapters.lines import LineReader, sampled_line
+from sms_adapters.lines import LineLog, sampled_line
 from sms_adapters.raw import ERROR_FRAME, EXTENDED, FD_FRAME, MOST_BYTES, REMOTE_FRAME, CanFrames
 from sms_online.errors import InputError
 
@@ -46,22 +45,12 @@ class LoggedFrames:
     buses: tuple[str, ...]
 
 
-class CandumpLog:
+class CandumpLog(LineLog):
     """A candump log, .log or .log.gz; each iteration starts from its beginning.
 
     Lines are `(seconds.fraction) interface id#data`, with the variants of the format: ##flags for CAN FD, R for a
     remote frame, a direction at the end. Raises InputError for a malformed line and a time that goes back.
     """
-
-    def __init__(self, path: Path, on_bytes: Callable[[int], None] | None = None) -> None:
-        self._path = path
-        self._lines = LineReader(path, on_bytes)
-        self._lines.first_line()
-
-    @property
-    def warnings(self) -> list[str]:
-        """What the current iteration has left out."""
-        return self._lines.warnings
 
     def __iter__(self) -> Iterator[LoggedFrames]:
         """The frames, a chunk of text at a time."""

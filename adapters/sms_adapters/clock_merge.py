@@ -75,10 +75,8 @@ class SourceLane:
         """Times (K,) and values (K, C) of the samples whose time has become known with these items."""
         samples = self._decode(items)
         t, values = [np.empty(0)], [np.empty((0, len(self.decoder.channels)))]
-        if samples:
-            arrival = np.concatenate([part.t_arrival for part in samples])
-            device = np.concatenate([part.t_device for part in samples])
-            rows = np.concatenate([part.values for part in samples])
+        if samples.t_arrival.size:
+            arrival, device, rows = samples.t_arrival, samples.t_device, samples.values
             stream = self._stream_of[np.argmin(np.isnan(rows), axis=1)]
             for k in np.unique(stream).tolist():
                 mine = stream == k
@@ -87,14 +85,12 @@ class SourceLane:
                 values.append(timed)
         return np.concatenate(t), np.concatenate(values)
 
-    def _decode(self, items: Sequence[Raw]) -> list[DecodedSamples]:
-        """Samples of all items; frames together, as arrays are for many."""
+    def _decode(self, items: Sequence[Raw]) -> DecodedSamples:
+        """Samples of all items, together, as arrays are for many."""
         frames = [item for item in items if isinstance(item, CanFrames)]
-        chunks: list[Raw] = [item for item in items if not isinstance(item, CanFrames)]
         if frames:
-            chunks.append(self._stamped(concatenate_frames(frames)))
-        decoded = [self.decoder.push(chunk) for chunk in chunks]
-        return [part for part in decoded if part.t_arrival.size]
+            return self.decoder.push(self._stamped(concatenate_frames(frames)))
+        return self.decoder.push(*items)
 
     def _stamped(self, frames: CanFrames) -> CanFrames:
         """Frames of senders that count them, with stamps by their count, which knows no jitter as a kernel's does."""
@@ -104,7 +100,7 @@ class SourceLane:
         for id_, (message, time) in self._counted.items():
             assert message.counter is not None
             rows = np.flatnonzero((frames.id == id_) & (frames.length == message.length) & (frames.flags & 3 == 0))
-            counts = raw_word(message.counter, frames.data[:, : message.length][rows]).astype(np.int64)
+            counts = raw_word(message.counter, message.words(frames.data, rows)).astype(np.int64)
             stamp[rows] = time(counts, frames.arrival[rows])
         return CanFrames(frames.arrival, stamp, frames.id, frames.length, frames.data, frames.flags)
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from sms_adapters.increments import increments
 from sms_online.stream import Array
 
 # Samples that come further apart than this, s, have a hole between them whatever the delays of a bus.
@@ -31,8 +32,8 @@ class CountedTime:
         count, before = (int(counts[0]), float(arrival[0])) if self._last is None else self._last
         half = self._modulus // 2
         # Steps back are frames that overtook each other, so a step is the smaller way round.
-        step = (np.diff(counts, prepend=count) + half) % self._modulus - half
-        elapsed = np.diff(arrival, prepend=before) / self._period
+        step = (increments(counts, count) + half) % self._modulus - half
+        elapsed = increments(arrival, before) / self._period
         step += self._modulus * np.rint((elapsed - step) / self._modulus).astype(np.int64)
         whole = self._whole + np.cumsum(step)
         self._whole, self._last = int(whole[-1]), (int(counts[-1]), float(arrival[-1]))

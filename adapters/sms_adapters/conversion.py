@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from numpy.typing import NDArray
 
+from sms_adapters.increments import increments
 from sms_adapters.raw import DecoderState
 from sms_online.description.schema import SerialField, Signal
 from sms_online.stream import Array
@@ -29,7 +32,7 @@ class Turns:
             return numbers
         first = numbers[0] if np.isnan(self._last) else self._last
         # Whole numbers, so that the sum is exact and the same however the samples are grouped.
-        steps = np.floor(np.diff(numbers, prepend=first) / self.wrap + 0.5)
+        steps = np.floor(increments(numbers, first) / self.wrap + 0.5)
         turns = self._turns - np.cumsum(steps)
         self._last, self._turns = float(numbers[-1]), float(turns[-1])
         return turns
@@ -43,49 +46,48 @@ class Turns:
         self._last, self._turns = (float(x) for x in state)
 
 
-class Conversion:
-    """A device's number to its channel, as `Signal` describes it; what is not finite or not plausible becomes NaN.
+class Conversions:
+    """A device's numbers to channels, as `Signal` describes each; what is not finite or not plausible becomes NaN.
 
-    counters: non_finite and out_of_range are counted there.
+    signals: of K channels that are sampled together. counters: non_finite and out_of_range are counted there.
     """
 
-    def __init__(self, signal: Signal | SerialField, counters: Counters) -> None:
-        self._signal = signal
+    def __init__(self, signals: Sequence[Signal | SerialField], counters: Counters) -> None:
         self._counters = counters
-        self._turns = None if signal.wrap is None else Turns(signal.wrap)
+        self._scale = np.array([signal.scale for signal in signals])
+        self._offset = np.array([signal.offset for signal in signals])
+        self._minimum = np.array([-np.inf if signal.minimum is None else signal.minimum for signal in signals])
+        self._maximum = np.array([np.inf if signal.maximum is None else signal.maximum for signal in signals])
+        self._turns = {k: Turns(signal.wrap) for k, signal in enumerate(signals) if signal.wrap is not None}
 
     def __call__(self, numbers: Array) -> Array:
-        """(B,) channel values of the numbers (B,) of consecutive samples."""
-        signal = self._signal
+        """(B, K) channel values of the numbers (B, K) of consecutive samples."""
         with np.errstate(over="ignore", invalid="ignore"):
-            values = numbers * signal.scale + signal.offset
+            values: Array = numbers * self._scale + self._offset
         finite = np.isfinite(values)
+        # NaN compares false, so that no value is counted twice.
+        outside = (values < self._minimum) | (values > self._maximum)
         if not finite.all():
+            outside &= finite
             self._counters["non_finite"] += int(np.count_nonzero(~finite))
             values[~finite] = np.nan
-        # NaN compares false, so that no value is counted twice.
-        outside = np.zeros(values.size, dtype=np.bool_)
-        if signal.minimum is not None:
-            outside |= values < signal.minimum
-        if signal.maximum is not None:
-            outside |= values > signal.maximum
         if outside.any():
             self._counters["out_of_range"] += int(np.count_nonzero(outside))
             values[outside] = np.nan
-        if self._turns is not None:
+        for k, turns in self._turns.items():
             # After the limits: one wrong word must not count as a turn.
-            good = ~np.isnan(values)
-            values[good] += self._turns.count(numbers[good]) * (self._turns.wrap * signal.scale)
+            good = ~np.isnan(values[:, k])
+            values[good, k] += turns.count(numbers[good, k]) * (turns.wrap * self._scale[k])
         return values
 
     def state(self) -> Array:
-        """The state of its turns, empty for a number that does not wrap."""
-        return np.empty(0) if self._turns is None else self._turns.state()
+        """The state of the turns (channels that wrap, 2)."""
+        return np.array([turns.state() for turns in self._turns.values()]).reshape(-1, 2)
 
     def restore(self, state: Array) -> None:
         """Go on from a saved state."""
-        if self._turns is not None:
-            self._turns.restore(state)
+        for turns, saved in zip(self._turns.values(), state, strict=True):
+            turns.restore(saved)
 
 
 class FrameCounter:
@@ -111,7 +113,7 @@ class FrameCounter:
         if not counts.size:
             return admitted
         before = counts[0] - 1 if self._last < 0 else self._last
-        steps = np.diff(counts, prepend=before) % self._modulus
+        steps = increments(counts, before) % self._modulus
         if np.all((steps > 0) & (steps <= self._modulus // 2)):
             self._counters["lost_counter"] += int(steps.sum()) - counts.size
             self._last, self._late = int(counts[-1]), -1

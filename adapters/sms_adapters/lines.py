@@ -110,6 +110,23 @@ class LineReader:
         return InputError(str(self.path), "", "an empty file", "lines of text")
 
 
+class LineLog:
+    """What logs of lines have in common: the file, opened once to see that it is one, and what was left out of it.
+
+    on_bytes: see LineReader, whose InputErrors are raised.
+    """
+
+    def __init__(self, path: Path, on_bytes: Callable[[int], None] | None = None) -> None:
+        self._path = path
+        self._lines = LineReader(path, on_bytes)
+        self._lines.first_line()
+
+    @property
+    def warnings(self) -> list[str]:
+        """What the current iteration has left out."""
+        return self._lines.warnings
+
+
 def sampled_line(line: int, chunk: memoryview, row: int) -> tuple[int, str]:
     """Number and text of the line that holds a row; the chunk begins at the line given, and blank lines hold no row."""
     lines = [(line + k, text) for k, text in enumerate(bytes(chunk).splitlines()) if text]

@@ -127,8 +127,8 @@ class Decoder(Protocol):
     channels: tuple[str, ...]
     counters: dict[str, int]
 
-    def push(self, raw: Raw) -> DecodedSamples:
-        """The samples that an item completes, M from 0 up. Whatever the bytes, it counts and never raises."""
+    def push(self, *items: Raw) -> DecodedSamples:
+        """The samples that one or more items complete, M from 0 up. Whatever the bytes, it counts and never raises."""
 
     def state(self) -> DecoderState:
         """What later samples depend on, counters included, for a checkpoint."""

@@ -11,7 +11,7 @@ import numpy as np
 from cobs import cobs
 from numpy.typing import NDArray
 
-from sms_adapters.conversion import Conversion, FrameCounter, Turns, counters_state, restore_counters
+from sms_adapters.conversion import Conversions, FrameCounter, Turns, counters_state, restore_counters
 from sms_adapters.raw import DecodedSamples, DecoderState, Raw, SerialChunk
 from sms_online.description.schema import FrameField, SerialField, SerialFrames, SerialLines
 from sms_online.stream import Array
@@ -81,49 +81,51 @@ class Fields:
 
     def __init__(self, fields: Iterable[SerialField], moduli: Iterable[int], counters: dict[str, int]) -> None:
         self._counters = counters
-        self._channels: list[tuple[int, Conversion]] = []
         self._counter: tuple[int, FrameCounter] | None = None
         self._time: tuple[int, float, Turns] | None = None
         self._wraps: list[tuple[int, int]] = []  # of the columns that count
-        names = []
+        described = []
+        self._columns: list[int] = []  # of the numbers, those of the channels
         for k, (field, modulus) in enumerate(zip(fields, moduli, strict=True)):
             wrap = int(field.wrap or modulus or _NEVER)
             if field.channel is not None:
-                names.append(field.channel)
-                self._channels.append((k, Conversion(field, counters)))
+                described.append(field)
+                self._columns.append(k)
             if field.counter:
                 self._counter = (k, FrameCounter(wrap, counters))
             if field.tick is not None:
                 self._time = (k, field.tick, Turns(wrap))
             if field.counter or field.tick is not None:
                 self._wraps.append((k, wrap))
-        self.channels = tuple(names)
+        self.channels = tuple(field.channel for field in described if field.channel is not None)
+        self._conversions = Conversions(described, counters)
 
-    def samples(self, arrival: float, numbers: Array) -> DecodedSamples:
-        """Samples from numbers (M, fields) that came together; a count that is no count is a bad_number."""
+    def samples(self, arrival: Array, numbers: Array) -> DecodedSamples:
+        """Samples from numbers (M, fields) that came at (M,), s; a count that is no count is a bad_number."""
         good = np.ones(len(numbers), dtype=np.bool_)
         for k, wrap in self._wraps:
             count = numbers[:, k]
             good &= (count >= 0) & (count < wrap) & (count == np.floor(count))
-        self._counters["bad_number"] += int(np.count_nonzero(~good))
-        numbers = numbers[good]
+        if not good.all():
+            self._counters["bad_number"] += int(np.count_nonzero(~good))
+            arrival, numbers = arrival[good], numbers[good]
         if self._counter is not None:
             k, sequence = self._counter
-            numbers = numbers[sequence.admit(numbers[:, k].astype(np.int64))]
+            admitted = sequence.admit(numbers[:, k].astype(np.int64))
+            if not admitted.all():
+                arrival, numbers = arrival[admitted], numbers[admitted]
         t_device = np.full(len(numbers), np.nan)
         if self._time is not None:
             k, tick, turns = self._time
             t_device = (numbers[:, k] + turns.count(numbers[:, k]) * turns.wrap) * tick
-        values = np.empty((len(numbers), len(self._channels)))
-        for column, (k, conversion) in enumerate(self._channels):
-            values[:, column] = conversion(numbers[:, k])
+        values = self._conversions(numbers[:, self._columns])
         # A frame whose every value was refused is no sample.
         used = ~np.isnan(values).all(axis=1)
-        return DecodedSamples(np.full(int(used.sum()), arrival), t_device[used], values[used])
+        return DecodedSamples(arrival[used], t_device[used], values[used])
 
     def state(self) -> DecoderState:
         """Turns and counts."""
-        state: DecoderState = {f"turns.{k}": conversion.state() for k, conversion in self._channels}
+        state: DecoderState = {"turns": self._conversions.state()}
         if self._counter is not None:
             state["sequence"] = self._counter[1].state()
         if self._time is not None:
@@ -132,8 +134,7 @@ class Fields:
 
     def restore(self, state: DecoderState) -> None:
         """Go on from a saved state."""
-        for k, conversion in self._channels:
-            conversion.restore(state[f"turns.{k}"])
+        self._conversions.restore(state["turns"])
         if self._counter is not None:
             self._counter[1].restore(state["sequence"])
         if self._time is not None:
@@ -149,15 +150,22 @@ class _SerialDecoder(ABC):
         self._items = items
         self._fields = fields
 
-    def push(self, raw: Raw) -> DecodedSamples:
-        """The samples that a chunk completes; t_arrival is that of the chunk with the last byte."""
-        if not isinstance(raw, SerialChunk):
-            raise TypeError(f"{type(raw).__name__} pushed into a decoder of bytes")
-        return self._fields.samples(raw.arrival, self._numbers(self._items.push(raw.data)))
+    def push(self, *items: Raw) -> DecodedSamples:
+        """The samples that chunks complete; t_arrival is that of the chunk with the last byte."""
+        pieces: list[bytes] = []
+        arrival: list[float] = []
+        for item in items:
+            if not isinstance(item, SerialChunk):
+                raise TypeError(f"{type(item).__name__} pushed into a decoder of bytes")
+            complete = self._items.push(item.data)
+            pieces += complete
+            arrival += [item.arrival] * len(complete)
+        good, numbers = self._numbers(pieces)
+        return self._fields.samples(np.array(arrival, dtype=np.float64)[good], numbers)
 
     @abstractmethod
-    def _numbers(self, pieces: list[bytes]) -> Array:
-        """Numbers (M, fields) of the pieces that are as described; the others are counted."""
+    def _numbers(self, pieces: list[bytes]) -> tuple[list[int], Array]:
+        """Which of the pieces are as described, and their numbers (M, fields); the others are counted."""
 
     def state(self) -> DecoderState:
         """The unfinished piece, turns, counts and counters."""
@@ -178,15 +186,19 @@ class FrameDecoder(_SerialDecoder):
 
     def __init__(self, source: SerialFrames) -> None:
         counters = dict.fromkeys(("cut_line", "too_long", "framing", "crc", *Fields.KINDS), 0)
-        self._layout = frame_layout(source.fields)
-        self._size = self._layout.itemsize + _CRC_BYTES
+        layout = frame_layout(source.fields)
+        self._names = layout.names or ()
+        # The checksum stays on, so that no frame is copied for it.
+        self._layout = np.dtype([*((name, layout[name]) for name in self._names), ("crc", f"V{_CRC_BYTES}")])
+        self._size = self._layout.itemsize
         moduli = [1 << int(field.type[1:]) if field.type[0] == "u" else 0 for field in source.fields]
         longest = self._size + self._size // _COBS_RUN + 1
         super().__init__(Items(b"\0", longest, counters), Fields(source.fields, moduli, counters), counters)
 
-    def _numbers(self, pieces: list[bytes]) -> Array:
-        good = []
-        for piece in pieces:
+    def _numbers(self, pieces: list[bytes]) -> tuple[list[int], Array]:
+        good: list[int] = []
+        frames: list[bytes] = []
+        for k, piece in enumerate(pieces):
             try:
                 frame = cobs.decode(piece)
             except cobs.DecodeError:
@@ -196,11 +208,12 @@ class FrameDecoder(_SerialDecoder):
             elif zlib.crc32(frame) != _CRC_RESIDUE:
                 self.counters["crc"] += 1
             else:
-                good.append(frame[:-_CRC_BYTES])
-        words = np.frombuffer(b"".join(good), self._layout)
+                good.append(k)
+                frames.append(frame)
+        words = np.frombuffer(b"".join(frames), self._layout)
         # A signalling NaN is counted as non_finite like any other.
         with np.errstate(invalid="ignore"):
-            return np.stack([words[name].astype(np.float64) for name in self._layout.names or ()], axis=1)
+            return good, np.stack([words[name].astype(np.float64) for name in self._names], axis=1)
 
 
 class LineDecoder(_SerialDecoder):
@@ -221,9 +234,9 @@ class LineDecoder(_SerialDecoder):
         fields = Fields(source.fields, [0] * self._count, counters)
         super().__init__(Items(b"\n", LONGEST_LINE, counters), fields, counters)
 
-    def _numbers(self, pieces: list[bytes]) -> Array:
-        rows = [row for piece in pieces if (row := self._row(piece)) is not None]
-        return np.array(rows, dtype=np.float64).reshape(-1, self._count)
+    def _numbers(self, pieces: list[bytes]) -> tuple[list[int], Array]:
+        rows = [(k, row) for k, piece in enumerate(pieces) if (row := self._row(piece)) is not None]
+        return [k for k, _ in rows], np.array([row for _, row in rows], dtype=np.float64).reshape(-1, self._count)
 
     def _row(self, line: bytes) -> list[float] | None:
         if not line.strip():
@@ -231,18 +244,21 @@ class LineDecoder(_SerialDecoder):
         if self._checked:
             parts = _XOR.fullmatch(line.rstrip(b"\r"))
             if parts is None or int(np.bitwise_xor.reduce(np.frombuffer(parts[1], np.uint8))) != int(parts[2], 16):
-                self.counters["crc"] += 1
+                self._skip(line, "crc")
                 return None
             line = parts[1]
         if self._line.fullmatch(line) is None:
-            try:
-                line.decode()
-            except UnicodeDecodeError:
-                self.counters["non_utf8"] += 1
-            else:
-                self.counters["bad_number"] += 1
+            self._skip(line, "bad_number")
             return None
         return [float(cell) for cell in line.split(self._separator)]
+
+    def _skip(self, line: bytes, kind: str) -> None:
+        """Count a line that is skipped, as text of this kind or as none."""
+        try:
+            line.decode()
+        except UnicodeDecodeError:
+            kind = "non_utf8"
+        self.counters[kind] += 1
 
 
 def frame_layout(fields: Iterable[FrameField]) -> np.dtype[np.void]:

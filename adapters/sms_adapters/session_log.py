@@ -15,7 +15,7 @@ from __future__ import annotations
 import json
 import tomllib
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import repeat
 from pathlib import Path
 from typing import Any, Literal
@@ -238,9 +238,10 @@ def _ranges(path: Path) -> list[tuple[int, int]]:
 
 
 def quantised(frames: CanFrames, not_before: float) -> CanFrames:
-    """Frames with arrivals of at least `not_before`, and stamps in whole µs as a recording holds them."""
+    """Frames with arrivals of at least `not_before`; these and stamps in whole µs, as a recording holds them."""
+    arrival: Array = np.rint(frames.arrival / MICROSECOND) * MICROSECOND
     stamp: Array = np.rint(frames.stamp / MICROSECOND) * MICROSECOND
-    return CanFrames(np.maximum(frames.arrival, not_before), stamp, frames.id, frames.length, frames.data, frames.flags)
+    return replace(frames, arrival=np.maximum(arrival, not_before), stamp=stamp)
 
 
 def number_of_items(items: Iterable[Raw]) -> int:

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from sms_adapters.increments import increments
 from sms_online.stream import Array
 
 # Chance that a healthy sensor repeats itself so many times in a row, given how often it has repeated itself so far.
@@ -51,7 +52,7 @@ class StuckGuard:
             if rows.size == 0:
                 continue
             whole = np.count_nonzero(present) == rows.size * group.size
-            changes = np.abs(np.diff(values[rows[:, None], group], axis=0, prepend=self._last[None, group]))
+            changes = np.abs(increments(values[rows[:, None], group], self._last[None, group]))
             if whole and changes.all():
                 # Everything moved all the time, NaN before the first sample included.
                 self._quantum[group] = np.fmin(self._quantum[group], np.fmin.reduce(changes, axis=0))
@@ -66,7 +67,7 @@ class StuckGuard:
         if rows.size == 0:
             return
         samples = column[rows]
-        change = np.abs(np.diff(samples, prepend=self._last[channel]))
+        change = np.abs(increments(samples, self._last[channel]))
         same = change == 0.0
         moved = change[change > 0.0]
         self._quantum[channel] = min(self._quantum[channel], moved.min(initial=np.inf))

@@ -19,6 +19,7 @@ import tty
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from multiprocessing.connection import Connection
+from multiprocessing.process import BaseProcess
 from pathlib import Path
 from typing import Any
 
@@ -257,13 +258,22 @@ class Bus:
 
 
 def in_own_process(arm: MovingArm) -> Iterator[Block]:
-    """An arm's blocks, solved in a process of its own: beside it, this one is always there to send what is due."""
-    receiver, sender = multiprocessing.Pipe(duplex=False)
-    process = multiprocessing.Process(target=_solve, args=(arm, sender), daemon=True)
+    """An arm's blocks, solved in a process of its own: beside it, this one is always there to send what is due.
+
+    The process is forked at once, before there are ports and buses that it would hold open after the end of this one,
+    and begins to solve when the first block is asked for.
+    """
+    ours, theirs = multiprocessing.Pipe()
+    process = multiprocessing.get_context("fork").Process(target=_solve, args=(arm, theirs, ours), daemon=True)
     process.start()
-    sender.close()
+    theirs.close()
+    return _solved(process, ours)
+
+
+def _solved(process: BaseProcess, pipe: Connection) -> Iterator[Block]:
     try:
-        while isinstance(item := receiver.recv(), Block):
+        pipe.send(None)
+        while isinstance(item := pipe.recv(), Block):
             yield item
         raise item
     except EOFError:
@@ -272,16 +282,18 @@ def in_own_process(arm: MovingArm) -> Iterator[Block]:
         process.terminate()
 
 
-def _solve(arm: MovingArm, sender: Connection) -> None:
+def _solve(arm: MovingArm, pipe: Connection, others: Connection) -> None:
+    others.close()  # or the death of the process that reads would go unnoticed
     try:
+        pipe.recv()
         for block in arm:
-            sender.send(block)
+            pipe.send(block)
     except InputError as error:
-        sender.send(error)
-    except (BrokenPipeError, KeyboardInterrupt):
+        pipe.send(error)
+    except (EOFError, ConnectionError, KeyboardInterrupt):
         return
     finally:
-        sender.close()
+        pipe.close()
 
 
 def capture_blocks(path: Path, duration: float, rows: int = 64) -> Iterator[Block]:

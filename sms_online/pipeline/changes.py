@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -234,11 +234,20 @@ class Changes:
             **self.detector.state(),
         }
 
+    @property
+    def added(self) -> tuple[str, ...]:
+        """Names of the parameters that events have added, in their order."""
+        return tuple(self._added)
+
+    def follow(self, events: Iterable[Event], added: Iterable[str]) -> None:
+        """Know of these events, which have added these parameters."""
+        self.events, self._added = list(events), list(added)
+        self._extend()
+
     def restore(self, state: Mapping[str, NDArray[Any]]) -> None:
         """Continue from a saved state."""
-        self.events = [Event.from_saved(entry) for entry in json.loads(str(state["events"]))]
-        self._added = json.loads(str(state["added"]))
-        self._extend()
+        events = [Event.from_saved(entry) for entry in json.loads(str(state["events"]))]
+        self.follow(events, json.loads(str(state["added"])))
         self._segment, self._clear, self._wanted = (int(number) for number in state["place"])
         self._index, self._values = np.array(state["index"]), np.array(state["values"])
         self.detector = self._new_detector()

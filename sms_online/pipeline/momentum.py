@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -13,6 +13,8 @@ from sms_online.model.base_parameters import BaseParameters
 from sms_online.model.model import Model
 from sms_online.pipeline.changes import Adoption, Changes
 from sms_online.pipeline.errors_in_variables import NoiseBias
+from sms_online.pipeline.events import Event
+from sms_online.pipeline.latency import Latencies, source_groups
 from sms_online.pipeline.momentum_balance import COPIES, MomentumBalance
 from sms_online.pipeline.momentum_fit import MomentumFit, WhiteRows
 from sms_online.pipeline.sensing import Sensing
@@ -33,7 +35,8 @@ class Momentum:
 
     tracker: square-root RLS, fed with rows of unit variance. bias: what noise in the columns does to the estimate. fit:
     what makes rows independent, and its sums. noise_gain (channels,): see `NoiseEstimate`. windows: how many it took
-    since the last event. changes: events, and the model and parameters that the session goes on with after them.
+    since the last event. latencies: of the sources, since then too. changes: events, and the model and parameters that
+    the session goes on with after them.
     """
 
     def __init__(self, model: Model, base: BaseParameters, sensing: Sensing, noise_gain: Array) -> None:
@@ -47,6 +50,7 @@ class Momentum:
         self._estimate = NoiseEstimate(sensing, system.sample_rate, noise_gain)
         self._span = system.windows.momentum
         self._prior: Prior | None = None
+        self._sources = source_groups(sensing)
         self._build()
         self._random = np.random.default_rng(SEED)
         self._segment = -1
@@ -60,7 +64,8 @@ class Momentum:
         self.bias = NoiseBias(base.n)
         self.windows = 0
         self._balance = MomentumBalance(model, base, self._sample_rate, self._span)
-        self.fit = MomentumFit(model, base, self._balance, self.sensing.displacements, self._solved)
+        self.latencies = Latencies(self._sources, base.n)
+        self.fit = MomentumFit(model, base, self._balance, self.sensing.displacements, self._solved, self._sources)
         self.tracker: Tracker = self._new_tracker()
 
     def _new_tracker(self) -> RecursiveLeastSquares:
@@ -71,6 +76,13 @@ class Momentum:
         """Weigh the rows against what is known of the base parameters beforehand; before the first sample."""
         self._prior = prior
         self.tracker = self._new_tracker()
+
+    def follow(self, events: Sequence[Event], added: Sequence[str]) -> None:
+        """Have the parameters of a session of the same system with these events, knowing nothing of them yet."""
+        new = tuple(added) != self.changes.added
+        self.changes.follow(events, added)
+        if new:
+            self._build()
 
     @property
     def started(self) -> bool:
@@ -182,6 +194,7 @@ class Momentum:
             self.tracker.update(Rows(rows.Y[:, :-1], rows.Y[:, -1], np.ones(M), np.full(M, t)))
             self.newest_row = t
             self.bias.add(rows.Y, rows.noisy)
+            self.latencies.add(rows.Y, rows.late)
             self.windows += 1
 
     def whitened(self, rows: list[int], beta: Array) -> float | None:
@@ -206,6 +219,7 @@ class Momentum:
                 "waiting_segment": np.repeat([p.segment for p in waiting], [p.index.size for p in waiting]),
                 **noise_state("noise", self.sensor_noise),
                 **self.bias.state(),
+                **self.latencies.state(),
             },
             "momentum_noise": self._estimate.state(),
             "momentum_balance": self._balance.state(),
@@ -231,6 +245,7 @@ class Momentum:
         index, values = np.array(state["waiting_index"]), np.array(state["waiting_values"])
         self._waiting = [GridSamples(index[segments == k], values[segments == k], int(k)) for k in np.unique(segments)]
         self.bias.restore(state)
+        self.latencies.restore(state)
         self._estimate.restore(saved["momentum_noise"])
         self._balance.restore(saved["momentum_balance"])
         self.fit.restore(saved["momentum_fit"])

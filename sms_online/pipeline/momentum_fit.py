@@ -11,7 +11,7 @@ row's own.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 
 from sms_online.model.base_parameters import BaseParameters
 from sms_online.model.model import Model
+from sms_online.pipeline.latency import LatencyColumns, SourceGroup
 from sms_online.pipeline.momentum_balance import COPIES, HOPS, INSTANTS, Instants, MomentumBalance, Window
 from sms_online.pipeline.row_noise import RowNoise, Whitener
 from sms_online.pipeline.sensitivity import Sensitivities
@@ -60,7 +61,8 @@ class WhiteRows:
     """Rows of one window, n_v of them: Y (n_v, n + 1) with b as its last column, independent, errors of unit variance.
 
     noisy (2, n_v, n + 1): the same with synthetic noise added and subtracted. raw (n_v, n + 1): the rows as they were,
-    with their own covariance (n_v, n_v). end: grid index of the window's last sample.
+    with their own covariance (n_v, n_v). end: grid index of the window's last sample. late (n_v, G): columns of the
+    sources' latencies, independent like Y.
     """
 
     Y: Array
@@ -68,13 +70,14 @@ class WhiteRows:
     raw: Array
     covariance: Array
     end: int
+    late: Array
 
 
 class MomentumFit:
     """Whitens the windows of a session, segment by segment.
 
     solve: gives the estimate of β so far (n,), NaN where nothing is known of it. readings: x (K, n_x) to the
-    displacements (K, n_v, sensors) that unit noise of each position sensor makes.
+    displacements (K, n_v, sensors) that unit noise of each position sensor makes. sources: whose latencies are told.
     """
 
     def __init__(
@@ -84,6 +87,7 @@ class MomentumFit:
         balance: MomentumBalance,
         readings: Callable[[Array], Array],
         solve: Callable[[], Array],
+        sources: Sequence[SourceGroup] = (),
     ) -> None:
         self.model = model
         self.base = base
@@ -91,7 +95,8 @@ class MomentumFit:
         self._solve = solve
         self._sensitivities = Sensitivities(model, readings, balance.span / INSTANTS)
         self._noise = RowNoise(model.layout.theta_m, balance.span)
-        self._whitener = Whitener(model.layout.n_v, COPIES * (base.n + 1))
+        self._late = LatencyColumns(sources)
+        self._whitener = Whitener(model.layout.n_v, COPIES * (base.n + 1) + len(sources))
         self.weights: Array | None = None  # β (n,) behind the weights
         self._since = 0  # windows since they were renewed
         self._moving = 0
@@ -283,9 +288,19 @@ class MomentumFit:
         self.plain_windows += 1
         covariances[-1][np.diag_indices(n_v)] += self.misfit * variance
         side_by_side = rows.swapaxes(0, 1).reshape(n_v, -1)
-        white = self._whitener.push(covariances, side_by_side).reshape(n_v, COPIES, -1).swapaxes(0, 1)
+        if len(self._late):
+            side_by_side = np.concatenate((side_by_side, self._late_columns(window.start, noise)), axis=1)
+        whitened = self._whitener.push(covariances, side_by_side)
+        late = whitened[:, COPIES * rows.shape[2] :]
+        white = whitened[:, : COPIES * rows.shape[2]].reshape(n_v, COPIES, -1).swapaxes(0, 1)
         own = covariances[-1] + np.diag(UNSTEADY * bend**2)
-        return WhiteRows(white[0], white[1:], rows[0], own, window.end)
+        return WhiteRows(white[0], white[1:], rows[0], own, window.end, late)
+
+    def _late_columns(self, start: int, noise: SensorNoise) -> Array:
+        """Columns (n_v, G) of the latencies in the window's rows."""
+        inside = slice(start - self._first, start - self._first + INSTANTS + 1)
+        c = self._noise.reading_weights(noise.sensors)
+        return self._late.of(c, self._sensitivities.readings(start), self._v[inside])
 
     def _forget_instants(self) -> None:
         """Drop the states that no window to come asks for."""

@@ -88,6 +88,15 @@ class RowNoise:
         self._torque_before.append(torque_density)
         return out
 
+    def reading_weights(self, sensor_density: Array) -> Array:
+        """c dt (n_v, INSTANTS + 1, sensors) of the last window: what a unit of each reading adds to a row."""
+        steps = self._before[-1] * np.sqrt(self._step / sensor_density)
+        # Every other step stands between two instants and counts half for each.
+        weights = steps[:, ::2].copy()
+        weights[:, :-1] += 0.5 * steps[:, 1::2]
+        weights[:, 1:] += 0.5 * steps[:, 1::2]
+        return np.asarray(weights)
+
     def state(self) -> dict[str, Array]:
         """What `restore` needs to continue."""
         return {"before": np.array(self._before), "torque_before": np.array(self._torque_before)}

@@ -118,6 +118,11 @@ class Sensitivities:
         P_x, G_v, G_x = (told[:, :, k * n_v : (k + 1) * n_v] @ readings[nodes(offset)] for k in range(3))
         return Sensitivity(H @ readings, H_dot @ readings, P_x, G_v, G_x, offset)
 
+    def readings(self, start: int) -> Array:
+        """Displacements (INSTANTS + 1, n_v, sensors) that units of the sensors make, at the instants from `start`."""
+        inside = slice(start - self._first, start - self._first + INSTANTS + 1)
+        return self._dense[inside, :, self.model.layout.n_v :]
+
     def drop(self, before: int) -> None:
         """Forget instants with smaller numbers."""
         self._dense = self._dense[before - self._first :]

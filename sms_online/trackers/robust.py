@@ -32,6 +32,7 @@ class ClusterFactors:
     """Factors of consecutive clusters of blocks; when they become too many, neighbours merge and the length doubles."""
 
     def __init__(self, n: int) -> None:
+        # Written once and shared with saved states: those of a large arm are 14 MB, too much to be copied often.
         self._closed = np.zeros((MAX_CLUSTERS, n + 1, n + 1))
         self._count = 0
         self._length = 1  # blocks per cluster
@@ -49,7 +50,9 @@ class ClusterFactors:
         self._open_blocks = 0
         if self._count == MAX_CLUSTERS:
             self._count //= 2
-            self._closed[: self._count] = merge_neighbours(self._closed, 2)
+            merged = merge_neighbours(self._closed, 2)
+            self._closed = np.zeros_like(self._closed)
+            self._closed[: self._count] = merged
             self._length *= 2
 
     def stack(self, pending: Array) -> Array:
@@ -58,11 +61,11 @@ class ClusterFactors:
         return np.concatenate((self._closed[: self._count], last[None]))
 
     def state(self) -> State:
-        """What continues the clusters bit for bit."""
+        """What continues the clusters bit for bit; it does not change when they go on."""
         return {
-            "clusters": self._closed[: self._count].copy(),
+            "clusters": self._closed[: self._count],
             "cluster_blocks": float(self._length),
-            "open_cluster": self._open.copy(),
+            "open_cluster": self._open,
             "open_cluster_blocks": float(self._open_blocks),
         }
 
@@ -76,6 +79,7 @@ class ClusterFactors:
         self._length = int(saved_number(state, "cluster_blocks"))
         self._open_blocks = int(saved_number(state, "open_cluster_blocks"))
         self._count = len(closed)
+        self._closed = np.zeros_like(self._closed)
         self._closed[: self._count] = closed
 
 

@@ -1,4 +1,4 @@
-"""A minute live on the simulated bus, clocks, overload and hours of simulated time. Run on demand.
+"""A minute live on the simulated bus, hours of the arm and a day of one axis at full speed. Run on demand.
 
 pytest tests/bench/test_bench_live.py --override-ini addopts= -s
 """
@@ -12,14 +12,18 @@ import resource
 import subprocess
 import sys
 import time
+from collections.abc import Iterator
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 from time import perf_counter
 
 import numpy as np
 import pytest
+from axis import AXIS, DAMPING, INERTIA
 
 from sms_adapters.capture import CaptureWriter
+from sms_adapters.checkpoint import save_checkpoint
 from sms_adapters.clock_lanes import lanes
 from sms_adapters.clock_merge import TICK, Merger
 from sms_adapters.raw import CanFrames, Raw, SerialChunk, concatenate_frames
@@ -35,6 +39,7 @@ from sms_sim.bus_layout import messages
 from sms_sim.bus_motion import MovingArm
 from sms_sim.plant import Plant
 from sms_sim.sensors import Sensors
+from sms_tools.html_report.history import History
 from sms_tools.live.simulated import SimulatedArm, write_testbed
 
 # Length of a repetition, s: 20 s of motion and a pause.
@@ -161,9 +166,101 @@ def test_hours_at_full_speed(tmp_path: Path) -> None:
             if block is not None:
                 estimator.push(block)
         if k % max(1, rounds // 12) == 0 or k == rounds - 1:
-            hours, peak = (k + 1) * PERIOD / 3600.0, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+            hours = (k + 1) * PERIOD / 3600.0
             pi, std = estimator.estimate().pi, standard_deviation(estimator)
             shown = ", ".join(f"{estimator.base.parameters[j].name} {pi[j]:.6g} ± {std[j]:.2g}" for j in (8, 10, 12))
-            print(f"\n{hours:6.2f} h in {perf_counter() - began:6.0f} s, peak {peak:.0f} MB, {shown}", end="")
+            took = perf_counter() - began
+            print(f"\n{hours:6.2f} h in {took:6.0f} s, resident {resident():.1f} MB, {shown}", end="", flush=True)
     print()
     print("\n".join(merger.warnings))
+
+
+# Samples of a period of the axis: its message counts to 65536, so that frames repeat with it, arrivals apart.
+ROUND = 1 << 16
+AXIS_DBC = """VERSION ""
+NS_ :
+BS_:
+BU_: ARM
+
+BO_ 256 AXIS: 8 ARM
+ SG_ FORCE : 0|24@1- (1E-05,0) [0|0] "" Vector__XXX
+ SG_ ANGLE : 24|24@1- (1E-06,0) [0|0] "" Vector__XXX
+ SG_ COUNT : 48|16@1+ (1,0) [0|0] "" Vector__XXX
+"""
+AXIS_SOURCE = """
+[[source]]
+kind = "can"
+name = "bus"
+dbc = "axis.dbc"
+interface = "virtual"
+signals = { "AXIS.FORCE" = "force_1", "AXIS.ANGLE" = "q_1" }
+counters = ["AXIS.COUNT"]
+"""
+# Ticks worked off at once, so that a day takes minutes: still less than what a session waits for a source.
+TICKS = 10
+
+
+def axis_round(random: np.random.Generator) -> CanFrames:
+    """What an axis sends in a period of its motion, 65.536 s, with noise, drift of its clock and delays."""
+    w = 2.0 * np.pi * np.array([21.0, 52.0]) / ROUND * 1000.0  # rad/s, some 2 and 5
+    phase = np.arange(ROUND)[:, None] / 1000.0 * w
+    q = np.sin(phase) @ [1.0, 0.3]
+    torque = np.cos(phase) @ (DAMPING * w * [1.0, 0.3]) - np.sin(phase) @ (INERTIA * w**2 * [1.0, 0.3])
+    word = np.arange(ROUND, dtype=np.uint64) << np.uint64(48)
+    for values, noise, step, start in ((torque, 0.01, 1e-5, 0), (q, 1e-4, 1e-6, 24)):
+        counts = np.rint((values + noise * random.standard_normal(ROUND)) / step).astype(np.int64) & 0xFFFFFF
+        word |= counts.astype(np.uint64) << np.uint64(start)
+    data = np.zeros((ROUND, 64), dtype=np.uint8)
+    data[:, :8] = word.astype("<u8").view(np.uint8).reshape(ROUND, 8)
+    t = np.arange(ROUND) * 1e-3 * (1.0 + 5e-5)
+    arrival = np.maximum.accumulate(t + random.uniform(0.0, 2e-3, ROUND))
+    plain = np.zeros(ROUND, dtype=np.uint8)
+    id_ = np.full(ROUND, 256, np.uint32)
+    return CanFrames(arrival, np.full(ROUND, np.nan), id_, plain + np.uint8(8), data, plain)
+
+
+@pytest.mark.parametrize("balance", ["energy", "both"])
+def test_a_day_at_full_speed(tmp_path: Path, balance: str) -> None:
+    """Memory and π over a day of one axis at 1 kHz, with history and checkpoints; HOURS as above, 24 by default."""
+    (tmp_path / "axis.dbc").write_text(AXIS_DBC)
+    described = f'balance = "{balance}"\n' + AXIS.replace("sample_rate = 200.0", "sample_rate = 1000.0")
+    (tmp_path / "axis.toml").write_text(described + AXIS_SOURCE)
+    system = load_system(str(tmp_path / "axis.toml"))
+    frames = axis_round(np.random.default_rng(1))
+    merger = Merger(lanes(system, tmp_path))
+    estimator = Estimator(system, merger.channels, "bench")
+    history = History(estimator, merger.channels)
+    rounds = round(float(os.environ.get("HOURS", "24")) * 3600.0 / (ROUND * 1e-3))
+
+    def blocks() -> Iterator[Block]:
+        tick = 0
+        for k in range(rounds):
+            arrival = frames.arrival + k * ROUND * 1e-3 * (1.0 + 5e-5)
+            now = replace(frames, arrival=arrival)
+            steps = np.arange(tick, int(arrival[-1] / TICK), TICKS)[1:]
+            edges = np.searchsorted(arrival, [tick_time(int(step)) for step in steps])
+            for step, a, b in zip(steps.tolist(), [0, *edges[:-1].tolist()], edges.tolist(), strict=True):
+                block = merger.advance(tick_time(step), [[now[a:b]] if b > a else []])
+                if block is not None:
+                    yield block
+            tick = int(steps[-1])
+            block = merger.advance(tick_time(tick), [[now[int(edges[-1]) :]]])
+            if block is not None:
+                yield block
+            save_checkpoint(tmp_path / "checkpoint.npz", estimator)
+            if k % max(1, rounds // 24) == 0 or k == rounds - 1:
+                hours, pi, std = (k + 1) * ROUND / 3.6e6, estimator.estimate().pi, standard_deviation(estimator)
+                shown = ", ".join(f"{p:.6f} ± {2 * s:.6f}" for p, s in zip(pi, std, strict=True))
+                took = perf_counter() - began
+                print(f"\n{hours:6.2f} h in {took:6.0f} s, resident {resident():.1f} MB, {shown}", end="", flush=True)
+
+    began = perf_counter()
+    for block in history.watch(blocks()):
+        estimator.push(block)
+    print()
+    print("\n".join(merger.warnings), f"events {len(estimator.events)}, lost {estimator.counters.lost_samples}")
+
+
+def resident() -> float:
+    """Memory of this process now, MB."""
+    return int(Path("/proc/self/statm").read_text().split()[1]) * resource.getpagesize() / 1e6

@@ -5,6 +5,7 @@ pytest tests/bench/test_bench_view.py --override-ini addopts= -s
 
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -20,7 +21,8 @@ from sms_online.stream import Block
 from sms_sim.simulate import sampled_blocks, simulate
 from sms_tools.view.session import View, open_view
 
-HOUR = 3_600_000
+# Of the long replay: MINUTES in the environment, an hour by default, which takes nine minutes twice.
+ROWS = round(float(os.environ.get("MINUTES", "60")) * 60_000)
 GAP = 0.1  # s between repetitions of a motion, a gap that the synchroniser sees
 # Samples that a live source delivers at a time.
 DELIVERED = 10
@@ -64,12 +66,12 @@ def test_hand_over(tmp_path: Path, name: str, monkeypatch: pytest.MonkeyPatch) -
 
 
 def test_an_hour(tmp_path: Path) -> None:
-    """3.6 million rows with a recording and without: time, memory of both processes, size of the file."""
+    """An hour at 1 kHz with a recording and without: time, memory of both processes, size of the file."""
     system = load_system("paper-planar")
     blocks = list(sampled_blocks(simulate(system, 20.0), "B", seed=1))
     capture = tmp_path / "hour.csv"
     with CaptureWriter(capture, blocks[0].channels) as writer:
-        for k in range(-(-HOUR // sum(block.t.size for block in blocks))):
+        for k in range(-(-ROWS // sum(block.t.size for block in blocks))):
             for block in blocks:
                 writer.write(Block(block.t + k * (20.0 + GAP), block.channels, block.values))
     wall = {}

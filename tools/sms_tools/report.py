@@ -83,7 +83,7 @@ def _error(p: Document) -> str:
     return f"{100.0 * (p['estimate'] / p['true'] - 1.0):+.2g}"
 
 
-def _event_line(event: Document) -> str:
+def event_line(event: Document) -> str:
     """What changed and when; parameters and residuals hold since the last such line."""
     jumps = [f"{p['name']} {p['size']:+.4g} ± {p['std']:.2g} {p['unit']}" for p in event["parameters"]]
     return f"event at {event['time']:.3f} s: {event['kind']} {', '.join(jumps)}".rstrip()
@@ -91,7 +91,7 @@ def _event_line(event: Document) -> str:
 
 def trust_lines(document: Document) -> list[str]:
     """Events, residual, condition number, amount of data, throughput and warnings, a line each."""
-    lines = [_event_line(event) for event in document["events"]]
+    lines = [event_line(event) for event in document["events"]]
     for rows, residual in document["residual"].items():
         if residual["relative"] is not None:
             lines.append(f"residual {rows}: {residual['relative']:.3g} of the measured torque or force")

@@ -22,6 +22,9 @@ from sms_tools.priors import base_prior
 from sms_tools.report import Document, parameter_table, report_console, show, trust_lines
 from sms_tools.results_file import to_json, write_results
 
+# Effects of one cause that a warning names.
+NAMED = 4
+
 
 def described_system(args: argparse.Namespace) -> tuple[System, Path | None]:
     """The system asked for, and the directory of its file, where its DBC stands too; None for a shipped one."""
@@ -81,6 +84,19 @@ def conclude(args: argparse.Namespace, document: Document, directory: Path, inte
     return OK if any(p["identifiable"] for p in document["parameters"]) else NOTHING_DETERMINED
 
 
+def unstated_latency(estimator: Estimator) -> list[str]:
+    """That a source is late against the others by more than the system file says, if one is."""
+    found = None if estimator.momentum is None else estimator.momentum.latencies.found
+    if found is None:
+        return []
+    late = f"{1e3 * abs(found.size):.3g} ± {1e3 * found.std:.2g} ms"
+    if found.size < 0.0:
+        return [f"all sources but {found.source}: {late} later than their stated latencies"]
+    more = [f"{len(found.effects) - NAMED} more"] if len(found.effects) > NAMED else []
+    effects = ", ".join([*found.effects[:NAMED], *more])
+    return [f"{found.source}: {late} later than its stated latency ({effects})"]
+
+
 def document_of(
     estimator: Estimator,
     throughput: float,
@@ -106,6 +122,7 @@ def document_of(
         noticed.append(f"{counters.gaps} gaps too long to bridge; each begins a new window of the balance")
     if counters.interpolated_cells:
         noticed.append(f"{counters.interpolated_cells} cells interpolated")
+    noticed += unstated_latency(estimator)
     if estimator.sensing.unused:
         noticed.append(f"channels not used: {', '.join(estimator.sensing.unused)}")
     names = [parameter.name for parameter in estimator.base.physical]

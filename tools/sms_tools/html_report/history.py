@@ -77,11 +77,12 @@ class History:
 
     def _add(self) -> None:
         estimator = self._estimator
-        estimate = estimator.estimate().pi
+        now = estimator.estimate()
+        estimate = now.pi
         residual = self._recent.push(self._t, estimator, estimate)
         x = np.full(estimator.model.layout.n_x, np.nan)
         if np.isfinite(self._last).all():
             x = estimator.sensing.coordinates(self._last[None])[0]
-        std = standard_deviation(estimator)
+        std = standard_deviation(estimator, now)
         determined = std <= LARGEST_RELATIVE_STD * np.abs(estimate)
         self.instants.append(Instant(self._t, estimate, std, determined, residual, x))

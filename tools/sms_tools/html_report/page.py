@@ -148,13 +148,17 @@ def _convergence(estimator: Estimator, history: History, references: Sequence[Re
     if not instants:
         return ["<p>No samples.</p>"]
     t = np.array([instant.t for instant in instants])
-    determined = np.array([instant.determined for instant in instants])
-    estimate = np.where(determined, np.array([instant.estimate for instant in instants]), np.nan)
-    std = np.where(determined, np.array([instant.std for instant in instants]), np.nan)
-    return [_group_chart(group, t, estimate, std) for group in parameter_groups(estimator.base.parameters, references)]
+    estimate, std = np.full((2, len(instants), estimator.base.n), np.nan)
+    for k, instant in enumerate(instants):
+        # Fewer before an event has added some.
+        known = np.flatnonzero(instant.determined)
+        estimate[k, known], std[k, known] = instant.estimate[known], instant.std[known]
+    marks = [event.time for event in estimator.events]
+    groups = parameter_groups(estimator.base.parameters, references)
+    return [_group_chart(group, t, estimate, std, marks) for group in groups]
 
 
-def _group_chart(group: Group, t: Array, estimate: Array, std: Array) -> str:
+def _group_chart(group: Group, t: Array, estimate: Array, std: Array, marks: Sequence[float]) -> str:
     drawn = (estimate[:, group.indices] - group.zero) / group.scale
     width = BOUNDS * std[:, group.indices] / group.scale
     series = [
@@ -162,7 +166,7 @@ def _group_chart(group: Group, t: Array, estimate: Array, std: Array) -> str:
         for k, label in enumerate(group.labels)
     ]
     y_range = None if group.half_range is None else (-group.half_range, group.half_range)
-    return chart(group.title, t, series, "time, s", y_range)
+    return chart(group.title, t, series, "time, s", y_range, marks)
 
 
 def _residual(document: Document, history: History) -> list[str]:

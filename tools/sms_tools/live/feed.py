@@ -79,7 +79,7 @@ class Feed:
         with self._lock:
             self._earliest = max(self._earliest, tick)
             early, self._queue = split(self._queue, tick)
-            self._waiting = number_of_items(self._queue)
+            self._waiting -= number_of_items(early)
         return early
 
     def _run(self) -> None:

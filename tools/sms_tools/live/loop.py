@@ -19,6 +19,7 @@ from sms_tools.interruption import Interruption
 from sms_tools.live.feed import Feed, SessionClock
 from sms_tools.live.latency import Latencies
 from sms_tools.live.status import Leading, News, StatusWriter
+from sms_tools.session import unstated_latency
 
 # A session that is killed loses no more of the estimate than this, s; its raw items are on disk all the same.
 CHECKPOINT_INTERVAL = 5.0
@@ -143,7 +144,7 @@ class LiveSession:
             return
         now = self._clock()
         estimate = self._estimator.estimate()
-        std = standard_deviation(self._estimator)
+        std = standard_deviation(self._estimator, estimate)
         relative = std / np.maximum(np.abs(estimate.pi), np.finfo(float).tiny)
         best = [k for k in np.argsort(relative)[:LEADING].tolist() if np.isfinite(std[k])]
         parameters = self._estimator.base.parameters
@@ -162,7 +163,7 @@ class LiveSession:
             leading=[
                 Leading(parameters[k].name, parameters[k].unit, float(estimate.pi[k]), float(std[k])) for k in best
             ],
-            troubles=[*troubles, *self._merger.warnings, *self.warnings],
+            troubles=[*troubles, *self._merger.warnings, *self.warnings, *unstated_latency(self._estimator)],
         )
         self._said, self._said_samples = now, self._estimator.samples
         self._status.publish(news)

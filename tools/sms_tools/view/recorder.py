@@ -10,8 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sms_online.pipeline.estimator import Estimator
-from sms_online.results import LARGEST_RELATIVE_STD, residuals, results_document, standard_deviation
+from sms_online.results import LARGEST_RELATIVE_STD, event_document, residuals, results_document, standard_deviation
 from sms_online.stream import Array
+from sms_tools.report import event_line
 from sms_tools.view import style
 from sms_tools.view.arm_log import ArmLog
 from sms_tools.view.blueprint import layout
@@ -52,6 +53,7 @@ class Recorder:
         self._arm: list[tuple[Array, Array, Array]] = []  # t, x, relative residual of each link's rows
         self._residual = np.full(len(system.joints), np.nan)
         self._recent = RecentResidual()
+        self._events = 0  # marked and told so far
         self._determined: NDArray[np.bool_] = np.zeros(estimator.base.n, dtype=bool)
         self._gaps = 0
         self._slow_due = -np.inf
@@ -61,7 +63,8 @@ class Recorder:
         """Begin to log: the layout looks at where the arm is first seen."""
         if self._opened is None:
             return
-        self._opened(self._sink.open(layout(self._scene, self._groups, self._scene.draw(x[:1]))))
+        self._first = self._scene.draw(x[:1])
+        self._opened(self._sink.open(layout(self._scene, self._groups, self._first)))
         self._opened = None
         stream = self._sink.stream
         self._arm_log = ArmLog(stream, self._scene)
@@ -134,7 +137,9 @@ class Recorder:
     def _take(self, t: float, state: Snapshot) -> None:
         estimator = self._estimator
         apply(state, estimator)
-        estimate, std = estimator.estimate().pi, standard_deviation(estimator)
+        self._follow_events()
+        now = estimator.estimate()
+        estimate, std = now.pi, standard_deviation(estimator, now)
         determined = std <= LARGEST_RELATIVE_STD * np.abs(estimate)
         self._parameters.add(t, estimate, std, determined)
         self._residual = self._recent.push(t, estimator, estimate)
@@ -145,6 +150,22 @@ class Recorder:
             self._numbers.table(t, markdown_table(parameters, self._references, estimate, std, determined))
             self._whole_residuals(t, estimate)
             self._slow_due = t + SLOW_INTERVAL
+
+    def _follow_events(self) -> None:
+        """Mark and tell new events; the plots take in the parameters that they have added."""
+        base = self._estimator.base
+        more = base.n - len(self._references)
+        if more > 0:
+            self._references = (*self._references, *[None] * more)
+            self._determined = np.append(self._determined, np.zeros(more, dtype=bool))
+            self._groups = parameter_groups(base.parameters, self._references)
+            self._parameters = ParameterLog(self._numbers, self._groups)
+            self._sink.arrange(layout(self._scene, self._groups, self._first))
+        events = self._estimator.events
+        for event in events[self._events :]:
+            self._parameters.mark(event.time)
+            self._numbers.tell(event.time, event_line(event_document(event)), warning=True)
+        self._events = len(events)
 
     def _whole_residuals(self, t: float, estimate: Array) -> None:
         """Residuals of all rows so far: over their predicted deviation, and of the energy balance."""

@@ -18,10 +18,15 @@ class RecentResidual:
 
     def __init__(self) -> None:
         self._past: deque[tuple[float, list[SquaredResidual]]] = deque()
+        self._events = 0
 
     def push(self, t: float, estimator: Estimator, beta: Array) -> Array:
         """Shares (joints,) of the measured torque or force that are not explained; NaN where nothing was measured."""
         now = estimator.joint_residuals
+        if len(estimator.events) > self._events:
+            # The sums begin anew, with what the event has added.
+            self._events = len(estimator.events)
+            self._past.clear()
         self._past.append((t, [SquaredResidual(r.gram.copy(), r.signal) for r in now]))
         while len(self._past) > 1 and self._past[1][0] <= t - SPAN:
             self._past.popleft()

@@ -63,6 +63,10 @@ class Sink:
         # rerun binds both servers to all interfaces and offers no other choice.
         return f"in the browser: http://127.0.0.1:{port}/?url={quote(server, safe='')} (open to the whole network)"
 
+    def arrange(self, blueprint: rrb.Blueprint) -> None:
+        """Show in another layout from now on."""
+        self.stream.send_blueprint(blueprint)
+
     def flush(self) -> None:
         """Wait until the data are out; TroubleError where they do not get there."""
         try:

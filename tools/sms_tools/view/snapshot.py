@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from sms_online.pipeline.estimator import Estimator, SquaredResidual
+from sms_online.pipeline.events import Event
 from sms_online.pipeline.momentum import Momentum
 from sms_online.pipeline.synchronise import SyncCounters
 from sms_online.stream import Array
@@ -18,8 +19,13 @@ from sms_online.trackers.interface import State
 
 @dataclass(frozen=True)
 class MomentumSnapshot:
-    """Of the momentum balance: its tracker, the bias of noisy columns, and the sums behind whitened residuals."""
+    """Of the momentum balance: its tracker, the bias of noisy columns, and the sums behind whitened residuals.
 
+    added: names of the parameters that events have added.
+    """
+
+    events: tuple[Event, ...]
+    added: tuple[str, ...]
     windows: int
     dropped_windows: int
     tracker: State
@@ -61,6 +67,8 @@ def take(estimator: Estimator) -> Snapshot:
 def _take_momentum(momentum: Momentum) -> MomentumSnapshot:
     fit = momentum.fit
     return MomentumSnapshot(
+        events=tuple(momentum.changes.events),
+        added=momentum.changes.added,
         windows=momentum.windows,
         dropped_windows=momentum.dropped_windows,
         tracker=momentum.tracker.state(),
@@ -82,6 +90,7 @@ def apply(snapshot: Snapshot, replica: Estimator) -> None:
     replica.joint_residuals = snapshot.joint_residuals
     known, momentum = snapshot.momentum, replica.momentum
     if known is not None and momentum is not None:
+        momentum.follow(known.events, known.added)
         momentum.windows, momentum.dropped_windows = known.windows, known.dropped_windows
         momentum.tracker.restore(known.tracker)
         momentum.bias.restore(known.bias)

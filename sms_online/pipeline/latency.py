@@ -1,0 +1,151 @@
+"""Constant latencies of sources that a system file does not state, told by the momentum balance.
+
+Samples that are δ later than their times say read x - ẋ δ, so a row's residual changes by δ ∫ c ẋ dt, with the c of
+`row_noise`. Such a column beside those of the parameters gives δ with an error bar. When all sources are equally late
+nothing changes, so that a source is late against the others, and the column of the one that delivers the torque is that
+of all the others with its sign changed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sms_online.description.schema import SerialFrames, SerialLines, Source
+from sms_online.pipeline.sensing import Sensing
+from sms_online.stream import Array
+from sms_online.trackers.factor import triangular_factor
+
+# A latency is reported from so many of its standard deviations on: no accident in any number of sessions, and what rows
+# leave for other reasons is rarely so large a part of them.
+EVIDENCE = 6.0
+# And from here on, s: what clocks are off by at worst is less, and what it does to the parameters too.
+LEAST = 2e-4
+# Two sources of which either may be late explain the rows alike, up to rounding: then nobody is early.
+ALIKE = 0.99
+
+
+@dataclass(frozen=True)
+class SourceGroup:
+    """Position sensors (indices) and torques (joints from 1) that come from one source. channels: those used."""
+
+    name: str
+    sensors: tuple[int, ...]
+    joints: tuple[int, ...]
+    channels: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class Latency:
+    """A source whose samples are `size` ± `std` s later than the system file says; effects: it is known as these.
+
+    Less than zero where all others are late by the same, which nobody can tell from one source that is early.
+    """
+
+    source: str
+    size: float
+    std: float
+    effects: tuple[str, ...]
+
+
+def source_channels(source: Source) -> list[str]:
+    """Channels that a source delivers."""
+    if isinstance(source, SerialFrames | SerialLines):
+        return [field.channel for field in source.fields if field.channel is not None]
+    return [signal.channel for signal in source.signals.values()]
+
+
+def source_groups(sensing: Sensing) -> tuple[SourceGroup, ...]:
+    """The sources of a session whose latencies can be told apart; none where not exactly one delivers torques."""
+    groups = []
+    positions = [sensing.channels[column] for column in sensing.position_columns]
+    for source in sensing.model.system.sources:
+        mine = [name for name in source_channels(source) if name in sensing.channels]
+        sensors = tuple(positions.index(name) for name in mine if name in positions)
+        joints = tuple(int(name.rsplit("_", 1)[1]) for name in mine if name.startswith(("tau_", "force_")))
+        if sensors or joints:
+            groups.append(SourceGroup(source.name, sensors, joints, tuple(mine)))
+    whole = sorted(index for group in groups for index in group.sensors) == list(range(len(positions)))
+    if len(groups) < 2 or not whole or sum(bool(group.joints) for group in groups) != 1:
+        return ()
+    return tuple(groups)
+
+
+class Latencies:
+    """Information on the latency of each of G sources, beside that on n parameters."""
+
+    def __init__(self, groups: Sequence[SourceGroup], n: int) -> None:
+        self.groups = tuple(groups)
+        self._factor = np.zeros((n + len(groups) + 1, n + len(groups) + 1))
+        self._rows = 0
+
+    def add(self, Y: Array, columns: Array) -> None:
+        """Take in white rows [Y b] (M, n + 1) with the columns (M, G) of the latencies."""
+        if self.groups:
+            self._factor = triangular_factor(self._factor, np.concatenate((Y[:, :-1], columns, Y[:, -1:]), axis=1))
+            self._rows += len(Y)
+
+    @property
+    def found(self) -> Latency | None:
+        """The source that is late against the others, the most certain one; None where there is none."""
+        G = len(self.groups)
+        n = len(self._factor) - G - 1
+        freedom = self._rows - n - 1
+        if not G or freedom <= 0:
+            return None
+        # What the parameters leave of the columns and of the right-hand side.
+        left = self._factor[n:, n:]
+        information = np.sum(left[:, :G] ** 2, axis=0)
+        known = information > 0.0
+        size = np.divide(left[:, :G].T @ left[:, -1], information, out=np.zeros(G), where=known)
+        gain = size**2 * information
+        # Where rows leave more than noise for other reasons, the answer is less certain by as much.
+        excess = np.maximum(1.0, (np.sum(left[:, -1] ** 2) - gain) / freedom)
+        std = np.sqrt(np.divide(excess, information, out=np.full(G, np.inf), where=known))
+        certain = (np.abs(size) > EVIDENCE * std) & (np.abs(size) > LEAST)
+        if not certain.any():
+            return None
+        best = np.flatnonzero(certain & (gain >= ALIKE * gain[certain].max()))
+        k = int(best[np.argmax(size[best])])
+        group = self.groups[k]
+        effects = [f"torque_delay@joint_{joint}" for joint in group.joints]
+        effects += [f"sensor_lag@{name}" for name in group.channels if not name.startswith(("tau_", "force_"))]
+        return Latency(group.name, float(size[k]), float(std[k]), tuple(effects))
+
+    def state(self) -> dict[str, Any]:
+        """What `restore` needs to continue."""
+        return {"latency_factor": self._factor, "latency_rows": self._rows}
+
+    def restore(self, state: Mapping[str, NDArray[Any]]) -> None:
+        """Continue from a saved state."""
+        self._factor, self._rows = np.array(state["latency_factor"]), int(state["latency_rows"])
+
+
+class LatencyColumns:
+    """Columns of rows for the latencies of groups of sensors."""
+
+    def __init__(self, groups: Sequence[SourceGroup]) -> None:
+        self._sensors = [list(group.sensors) for group in groups]
+        self._torque = [k for k, group in enumerate(groups) if group.joints]
+
+    def __len__(self) -> int:
+        return len(self._sensors)
+
+    def of(self, c: Array, readings: Array, v: Array) -> Array:
+        """Columns (n_v, G) of a window's rows.
+
+        c (n_v, K, sensors): what a reading adds to each row, at K instants. readings (K, n_v, sensors): displacement
+        along the speeds that it stands for. v (K, n_v): speeds.
+        """
+        n_v, sensors = readings.shape[1:]
+        # The rates of the readings themselves, of which Euler parameters are one more than speeds.
+        inverse = np.linalg.inv(readings) if n_v == sensors else np.linalg.pinv(readings)
+        by_sensor = np.einsum("vks,ks->vs", c, (inverse @ v[:, :, None])[:, :, 0])
+        columns = np.stack([by_sensor[:, own].sum(axis=1) for own in self._sensors], axis=1)
+        for k in self._torque:
+            columns[:, k] = -np.delete(columns, k, axis=1).sum(axis=1)
+        return columns

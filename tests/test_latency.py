@@ -1,0 +1,115 @@
+"""A source that is later than its system file says: found, named and sized, whichever it is."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from bus_streams import AxisBus, axis_testbed, merged
+
+from sms_online.description.schema import System
+from sms_online.model.model import Model
+from sms_online.pipeline.estimator import Estimator
+from sms_online.pipeline.latency import Latencies, LatencyColumns, SourceGroup, source_groups
+from sms_online.pipeline.sensing import Sensing
+from sms_online.stream import Block
+from sms_tools.session import document_of
+
+
+def session(folder: Path, drive: float, encoder: float) -> tuple[System, list[Block]]:
+    """20 s of the axis with its devices later than stated, s; seed 2."""
+    system = axis_testbed(folder)
+    bus = AxisBus(seed=2, drift=(2e-5, -3e-5), offset=0.3)
+    bus.drive_arrival = bus.drive_arrival + drive
+    bus.encoder_arrival = bus.encoder_arrival + encoder
+    return system, merged(system, folder, bus.drive(), bus.encoder(system))[1]
+
+
+def estimator_of(system: System, blocks: list[Block]) -> Estimator:
+    estimator = Estimator(system, blocks[0].channels, "made up")
+    for block in blocks:
+        estimator.push(block)
+    estimator.finish()
+    return estimator
+
+
+@pytest.mark.parametrize(
+    ("drive", "encoder", "source", "effect"),
+    [
+        (0.0, 0.002, "encoder", "sensor_lag@q_1"),
+        (0.0, 0.0005, "encoder", "sensor_lag@q_1"),
+        (0.001, 0.0, "drive", "torque_delay@joint_1"),
+    ],
+)
+def test_a_latency_that_is_not_stated_is_reported(
+    tmp_path: Path, drive: float, encoder: float, source: str, effect: str
+) -> None:
+    estimator = estimator_of(*session(tmp_path, drive, encoder))
+    assert estimator.momentum is not None
+    found = estimator.momentum.latencies.found
+    assert found is not None
+    assert (found.source, found.effects) == (source, (effect,))
+    assert found.size == pytest.approx(drive + encoder, abs=4.0 * found.std)
+    assert found.std < 1e-4
+    (warning,) = (w for w in document_of(estimator, 0.0, [], None)["warnings"] if "stated latency" in w)
+    assert warning.startswith(f"{source}: ")
+    assert warning.endswith(f"later than its stated latency ({effect})")
+
+
+@pytest.mark.parametrize("late", [0.0, 0.003])
+def test_nothing_is_reported_where_all_are_as_late_as_stated_or_later_by_the_same(tmp_path: Path, late: float) -> None:
+    estimator = estimator_of(*session(tmp_path, late, late))
+    assert estimator.momentum is not None
+    assert estimator.momentum.latencies.found is None
+
+
+def test_what_is_known_of_latencies_is_saved_with_the_session(tmp_path: Path) -> None:
+    system, blocks = session(tmp_path, 0.001, 0.0)
+    half = len(blocks) // 2
+    whole = Estimator(system, blocks[0].channels, "made up")
+    for block in blocks[:half]:
+        whole.push(block)
+    continued = Estimator(system, blocks[0].channels, "made up")
+    continued.restore(whole.state())
+    for estimator in (whole, continued):
+        for block in blocks[half:]:
+            estimator.push(block)
+        estimator.finish()
+        assert estimator.momentum is not None
+    assert whole.momentum is not None
+    assert continued.momentum is not None
+    assert whole.momentum.latencies.found == continued.momentum.latencies.found
+
+
+def test_one_source_has_nobody_to_be_late_against(tmp_path: Path) -> None:
+    system = axis_testbed(tmp_path)
+    alone = system.model_copy(update={"sources": system.sources[:1]})
+    assert source_groups(Sensing(Model(alone), ("force_1", "q_1"), "test")) == ()
+
+
+def test_a_column_is_what_a_reading_adds_times_its_rate() -> None:
+    """Against a direct sum, with the torque's source as all the others turned round; random numbers, seed 4."""
+    random = np.random.default_rng(4)
+    groups = (SourceGroup("drive", (), (1,), ()), SourceGroup("a", (0, 2), (), ()), SourceGroup("b", (1,), (), ()))
+    c, v = random.standard_normal((3, 5, 3)), random.standard_normal((5, 3))
+    columns = LatencyColumns(groups).of(c, np.broadcast_to(np.eye(3), (5, 3, 3)), v)
+    expected = [sum(c[:, k, s] * v[k, s] for k in range(5) for s in sensors) for sensors in ((0, 2), (1,))]
+    np.testing.assert_allclose(columns[:, 1:].T, expected, rtol=1e-12)
+    np.testing.assert_allclose(columns[:, 0], -columns[:, 1] - columns[:, 2], rtol=1e-12)
+
+
+def test_latencies_are_told_from_white_rows() -> None:
+    """Least squares on rows of unit noise: size and error bar; seed 6."""
+    random = np.random.default_rng(6)
+    groups = (SourceGroup("drive", (), (1,), ()), SourceGroup("encoder", (0,), (), ("q_1",)))
+    latencies = Latencies(groups, 2)
+    for _ in range(100):
+        Y, late = random.standard_normal((3, 2)), 1e4 * random.standard_normal((3, 1))
+        b = Y @ [2.0, -1.0] + 1e-3 * late[:, 0] + random.standard_normal(3)
+        latencies.add(np.column_stack((Y, b)), np.column_stack((-late, late)))
+    found = latencies.found
+    assert found is not None
+    assert found.source == "encoder"
+    assert found.std == pytest.approx(1e-4 / np.sqrt(300), rel=0.15)
+    assert found.size == pytest.approx(1e-3, abs=4.0 * found.std)

@@ -1,0 +1,78 @@
+"""A session in which something changes, as people see it: plots, table, log and page go on with the new parameters."""
+
+from __future__ import annotations
+
+import json
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+from axis import AXIS, DAMPING, INERTIA
+from rerun.chunk import RrdReader
+
+from sms_adapters.capture import CaptureWriter
+from sms_online.description.parse import parse_system
+from sms_online.pipeline.estimator import Estimator
+from sms_online.results import results_document
+from sms_online.stream import Block
+from sms_tools.cli import main
+from sms_tools.view import snapshot
+
+RATE, CHANGE, SECONDS = 200.0, 10.0, 20.0
+SYSTEM = parse_system(AXIS, "axis.toml")
+
+
+@pytest.fixture(scope="module")
+def session() -> Block:
+    """An axis that takes hold of a tenth of its inertia more at CHANGE; seed 5."""
+    t = np.arange(round(SECONDS * RATE)) / RATE
+    q = np.sin(2 * t) + 0.3 * np.sin(5 * t)
+    rate, acceleration = 2 * np.cos(2 * t) + 1.5 * np.cos(5 * t), -4 * np.sin(2 * t) - 7.5 * np.sin(5 * t)
+    torque = np.where(t > CHANGE, 1.1, 1.0) * INERTIA * acceleration + DAMPING * rate
+    noise = np.random.default_rng(5).standard_normal((t.size, 2)) * [0.05, 1e-4]
+    return Block(t, ("force_1", "q_1"), np.stack((torque, q), axis=1) + noise)
+
+
+@pytest.fixture(scope="module")
+def shown(session: Block, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The directory of its replay with a recording."""
+    folder = tmp_path_factory.mktemp("changed")
+    (folder / "axis.toml").write_text(AXIS)
+    with CaptureWriter(folder / "run.csv", session.channels) as writer:
+        writer.write(session)
+    arguments = ["replay", str(folder / "run.csv"), "--system", str(folder / "axis.toml"), "--out", str(folder)]
+    assert main([*arguments, "--rerun", "save"]) == 0
+    return folder
+
+
+def test_a_replica_follows_an_event(session: Block) -> None:
+    estimator, replica = (Estimator(SYSTEM, session.channels, "test") for _ in range(2))
+    estimator.push(session)
+    estimator.finish()
+    assert estimator.base.n == 3
+    snapshot.apply(snapshot.take(estimator), replica)
+    assert results_document(replica, 0.0, []) == results_document(estimator, 0.0, [])
+
+
+def test_the_recording_goes_on_with_the_parameter_that_an_event_has_added(shown: Path) -> None:
+    results = json.loads((shown / "results.json").read_text())
+    assert not any("view" in warning for warning in results["warnings"])
+    found = {p["name"]: p["estimate"] for p in results["parameters"]}
+    assert "payload.inertia" in found
+    last: dict[str, float] = {}
+    told: list[str] = []
+    for chunk in RrdReader(str(shown / "session.rrd")).stream():
+        for row in chunk.to_record_batch().to_pylist():
+            if chunk.entity_path.endswith("/estimate") and row.get("Scalars:scalars"):
+                last[chunk.entity_path] = row["Scalars:scalars"][0]
+            told += row.get("TextLog:text") or []
+    (payload,) = (value for path, value in last.items() if path.startswith("/parameters/payload"))
+    assert payload == found["payload.inertia"]
+    assert any(re.match(r"event at 10\.0\d+ s: payload payload.inertia", text) for text in told)
+
+
+def test_the_page_draws_all_parameters_of_a_changed_session(shown: Path) -> None:
+    page = (shown / "report.html").read_text()
+    assert "payload: estimate ± 2σ" in page
+    assert 'class="mark"' in page
