@@ -354,15 +354,6 @@ coefficients = { corner = 25.0 }
         parse_system(text.replace("link_1.marker_*", "link_3.*"), "file")
 
 
-def test_the_noise_of_a_corrected_channel_is_told() -> None:
-    """White noise behind the correction: its deviation from 40000 samples is known to 0.4 % (seed 9)."""
-    stage = Conditioning(declaring("sensor_lag@q_1:corner=30"), ("q_1", "q_2"))
-    noise = np.random.default_rng(9).normal(size=(40000, 2))
-    (out,) = stage.push(GridSamples(np.arange(40000), noise, 0))
-    assert_allclose(out.values.std(axis=0), stage.noise_gain, rtol=0.02)
-    assert stage.noise_gain[1] == 1.0
-
-
 def test_undeclared_effects_leave_no_stage_in_the_way() -> None:
     stage = Conditioning(declaring(), ("q_1",))
     values = np.arange(5.0)[:, None]

@@ -26,9 +26,6 @@ class Conditioning:
         effects = [(k, e) for e in channel_effects(system) for k, channel in enumerate(channels) if e.acts_on(channel)]
         self._lags = [(k, e.kernel(system.sample_rate)) for k, e in effects if isinstance(e, SensorLag)]
         self._of_value = [(k, effect) for k, effect in effects if not isinstance(effect, SensorLag)]
-        self.noise_gain = np.ones(len(channels))  # of white noise: a lag's correction raises it
-        for column, kernel in self._lags:
-            self.noise_gain[column] *= np.linalg.norm(kernel)
         self.margin = max((kernel.size // 2 for _, kernel in self._lags), default=0)
         self._values = np.empty((0, len(channels)))
         self._segment = -1

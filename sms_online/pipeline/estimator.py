@@ -102,8 +102,7 @@ class Estimator:
         self._rates = RatesStage(system.sample_rate, range(layout.n_x), self.sensing.noise)
         self._followed = FollowedStates(model, system.sample_rate, len(self.sensing.channels))
         self._energy = EnergyBalance(model, base, system.sample_rate)
-        gain = self._conditioning.noise_gain
-        self.momentum = None if system.balance == "energy" else Momentum(model, base, self.sensing, gain)
+        self.momentum = None if system.balance == "energy" else Momentum(model, base, self.sensing)
         self.energy_tracker: Tracker = RecursiveLeastSquares(base.n)
         self._begin_joints()
         self._block = ENERGY_BLOCK if self.momentum is None else BLOCK

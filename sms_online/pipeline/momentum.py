@@ -34,12 +34,12 @@ class Momentum:
     """Balance, weights and tracker of one session.
 
     tracker: square-root RLS, fed with rows of unit variance. bias: what noise in the columns does to the estimate. fit:
-    what makes rows independent, and its sums. noise_gain (channels,): see `NoiseEstimate`. windows: how many it took
+    what makes rows independent, and its sums. windows: how many it took
     since the last event. latencies: of the sources, since then too. changes: events, and the model and parameters that
     the session goes on with after them.
     """
 
-    def __init__(self, model: Model, base: BaseParameters, sensing: Sensing, noise_gain: Array) -> None:
+    def __init__(self, model: Model, base: BaseParameters, sensing: Sensing) -> None:
         system = model.system
         self.sensing = sensing
         self.changes = Changes(model, base, sensing)
@@ -47,7 +47,7 @@ class Momentum:
         self.newest_row = -np.inf  # time of the last window's end, s
         self.sensor_noise: SensorNoise | None = None
         self._sample_rate = system.sample_rate
-        self._estimate = NoiseEstimate(sensing, system.sample_rate, noise_gain)
+        self._estimate = NoiseEstimate(sensing, system.sample_rate)
         self._span = system.windows.momentum
         self._prior: Prior | None = None
         self._sources = source_groups(sensing)

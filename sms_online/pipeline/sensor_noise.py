@@ -62,13 +62,11 @@ def noise_from_state(name: str, state: Mapping[str, NDArray[Any]]) -> SensorNois
 class NoiseEstimate:
     """Collects each channel's own samples, which are not interpolated, and tells the noise of all.
 
-    sample_rate: of the grid, Hz. gain (channels,): what a correction of the channels does to their noise; one by
-    default.
+    sample_rate: of the grid, Hz.
     """
 
-    def __init__(self, sensing: Sensing, sample_rate: float, gain: Array | None = None) -> None:
+    def __init__(self, sensing: Sensing, sample_rate: float) -> None:
         self._sensing = sensing
-        self._gain = np.ones(len(sensing.channels)) if gain is None else gain
         self._sample_rate = sample_rate
         count = len(sensing.channels)
         self._samples = [np.empty((2, 0)) for _ in range(count)]  # instants and values
@@ -95,7 +93,6 @@ class NoiseEstimate:
         for k in silent:
             times, samples = self._samples[k]
             sigma[k] = noise_std(samples[:, None], times)[0]
-        sigma *= self._gain
         floor = FINEST * self._largest + np.finfo(np.float64).tiny
         positions = self._sensing.position_columns
         exact = bool(np.all(sigma[positions] <= ROUGHLY_EXACT * floor[positions]))
