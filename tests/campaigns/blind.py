@@ -6,8 +6,8 @@
 
 Place, size and shape constants of each effect are drawn by the seed: it is worth 2 to 20 % of the rms of the rows that
 it acts on. The diagnosis sees a capture with noise of grade B and a description with other nominal values; what was
-drawn is compared afterwards. `run` also strikes the true effect, and those whose columns are within 10° of it, out of
-the catalogue and diagnoses again. Every case is a line of RESULTS.jsonl; a stopped campaign goes on where it was.
+drawn is compared afterwards. The first seed's are also
+diagnosed with the true effect, and those whose columns are within 10° of it, struck out of the catalogue. Every case is a line of RESULTS.jsonl; a stopped campaign goes on where it was.
 """
 
 from __future__ import annotations
@@ -69,8 +69,10 @@ class Draw:
         parts = (estimator.model, estimator.base, estimator.sensing, estimator.momentum.sensor_noise)
         self.rows = SessionRows(*parts, record.segments(), beta)
         self.make = CandidateColumns(self.rows, system)
-        # Size of each speed's rows: of all its terms together.
-        self._size = np.sqrt(np.mean(np.sum((self.rows.Y * beta) ** 2, axis=2), axis=0))
+        # Size of each speed's rows: of the torque where there is one, else of all its terms together.
+        torque = np.sqrt(np.mean(self.rows.b**2, axis=0))
+        terms = np.sqrt(np.mean(np.sum((self.rows.Y * beta) ** 2, axis=2), axis=0))
+        self._size = np.where(torque > 0.0, torque, terms)
 
     def effect(self, name: str, seed: int) -> Effect:
         """An effect of a name at a place and of a size that the seed chooses, coefficients as `simulate` takes them."""
@@ -144,7 +146,7 @@ def run(results: Path, cache: Path, seeds: int, names: list[str]) -> None:
             block = _joined(sampled_blocks(exact, GRADE, seed))
             record = _case(system, block, effect)
             _append(results, {"kind": "single", "seed": seed, **record})
-            if ENTRIES[name].kind != "kinematics":
+            if seed == 0 and ENTRIES[name].kind != "kinematics":
                 _append(results, {"kind": "struck", "seed": seed, **_struck(system, block, effect, draw)})
 
 
