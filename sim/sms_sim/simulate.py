@@ -156,13 +156,13 @@ def exact_states(simulation: Simulation, t: Array) -> ExactStates:
 
 
 def sampled_blocks(simulation: Simulation, grade: str | None = None, seed: int = 0) -> Iterator[Block]:
-    """What the sensors record at the system's rate, in blocks: drives and position channels, no rates.
+    """What the sensors record at the system's rate, in blocks: drives, position channels, and rates that are described.
 
     grade: a noise grade (`sensors.GRADES`) in place of the described sensors. seed: of the noise. Raises InputError on
     an unknown grade.
     """
     plant = simulation.plant
-    sensors = Sensors(plant.system, plant.channels, grade, seed)
+    sensors = Sensors(plant.system, plant.recordable, grade, seed)
     yield from read_blocks(plant, sensors, simulation.duration, lambda t: simulation.solution, BLOCK_SAMPLES)
 
 
@@ -174,7 +174,7 @@ def read_blocks(
     solution_until: gives the motion up to an instant, back to the longest latency before the last block.
     """
     rate = plant.system.sample_rate
-    columns = [plant.channels.index(channel) for channel in sensors.channels]
+    columns = [plant.recordable.index(channel) for channel in sensors.channels]
     # Half a sample of slack: duration times rate may fall short of a whole number by rounding.
     samples = int(duration * rate + 0.5) + 1
 
@@ -183,7 +183,8 @@ def read_blocks(
         inside = np.clip(t, 0.0, duration)
         y = solution(inside)
         torque = np.where(t[:, None] < 0.0, 0.0, plant.torque(inside, y))
-        return plant.channel_values(torque, plant.split(y)[0])[:, columns]
+        x, v = plant.split(y)
+        return np.concatenate((plant.channel_values(torque, x), plant.rate_values(x, v)), axis=1)[:, columns]
 
     for first in range(0, samples, at_once):
         t = np.arange(first, min(first + at_once, samples)) / rate

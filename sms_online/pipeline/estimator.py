@@ -3,6 +3,8 @@
 The momentum balance gives the estimate as soon as its weights are known. Until then, and where a system asks for
 nothing else, it comes from the energy balance. The two are never added up: both are functions of the same samples, so
 their errors are not independent, and the momentum rows hold what the energy rows hold (power is force times speed).
+Where a link has fewer sensors than coordinates both see a static shape, and are the first fit of a smoother that knows
+the dynamics; it gives the estimate as soon as its first span is through.
 """
 
 from __future__ import annotations
@@ -24,6 +26,7 @@ from sms_online.pipeline.momentum import Momentum
 from sms_online.pipeline.rates import RateSamples, RatesStage
 from sms_online.pipeline.sensing import AttitudeContinuity, Sensing
 from sms_online.pipeline.synchronise import GridSamples, SyncCounters, Synchroniser
+from sms_online.smoother.session import Smoother
 from sms_online.stream import Array, Block
 from sms_online.trackers.interface import Estimate, Prior, Rows, Tracker
 from sms_online.trackers.square_root import RecursiveLeastSquares
@@ -81,7 +84,12 @@ class Estimator:
         self.duration = 0.0
         self._newest_energy_row = -np.inf
         self.on_motion: MotionSink | None = None
-        self._columns = [channels.index(name) for name in self.sensing.channels]
+        self.smoother: Smoother | None = None
+        if self.sensing.missing or system.balance == "smoother":
+            self.smoother = Smoother(model, base, self.sensing, channels)
+        self.channels = tuple(dict.fromkeys((*self.sensing.channels, *self._smoothed_channels)))
+        self._columns = [channels.index(name) for name in self.channels]
+        self._smoothed_columns = [self.channels.index(name) for name in self._smoothed_channels]
         self._attitude = AttitudeContinuity()
         self._synchroniser = Synchroniser(self.sensing.channels, system.sample_rate)
         layout = model.layout
@@ -101,6 +109,17 @@ class Estimator:
         self.energy_tracker = RecursiveLeastSquares(self.base.n, prior=prior, scaled_by_residual=True)
         if self.momentum is not None:
             self.momentum.set_prior(prior)
+        if self.smoother is not None:
+            self.smoother.set_prior(prior)
+
+    @property
+    def _smoothed_channels(self) -> tuple[str, ...]:
+        return () if self.smoother is None else self.smoother.channels
+
+    @property
+    def unused(self) -> tuple[str, ...]:
+        """Channels of the source that play no part."""
+        return tuple(name for name in self.sensing.unused if name not in self.channels)
 
     @property
     def model(self) -> Model:
@@ -126,14 +145,23 @@ class Estimator:
     @property
     def newest_row(self) -> float:
         """Time of the newest sample behind the estimate, s; -inf where there is none."""
+        if self.smoother is not None and self.by_smoother:
+            return self.smoother.end
         if self.momentum is not None and self.by_momentum:
             return self.momentum.newest_row
         return self._newest_energy_row
 
     @property
+    def by_smoother(self) -> bool:
+        """Whether the estimate comes from the smoother, which holds as long as nothing changes."""
+        return self.smoother is not None and self.smoother.spans > 0 and not self.events
+
+    @property
     def by_momentum(self) -> bool:
         """Whether the estimate comes from the momentum balance."""
-        return self.momentum is not None and (self.momentum.started or self.system.balance == "momentum")
+        if self.momentum is None or self.by_smoother:
+            return False
+        return self.momentum.started or self.system.balance == "momentum"
 
     @property
     def misfit(self) -> bool:
@@ -189,13 +217,21 @@ class Estimator:
             self.momentum.finish(self.periods)
             if len(self.events) > events:
                 self._begin_joints()
+        if self.smoother is not None:
+            self.smoother.work(self._balanced, last=True)
 
     def _synchronise(self, t: Array, values: Array) -> None:
-        block = self._attitude.restore(Block(t, self.sensing.channels, values))
+        if self.smoother is not None:
+            torque = self.sensing.joint_torque(values[:, : len(self.sensing.channels)])
+            self.smoother.push(t, torque, values[:, self._smoothed_columns])
+        block = Block(t, self.sensing.channels, values[:, : len(self.sensing.channels)])
+        block = self._attitude.restore(block)
         if self.momentum is not None:
             self.momentum.observe(block.values)
         for piece in self._synchroniser.push(block):
             self._differentiate(piece)
+        if self.smoother is not None:
+            self.smoother.work(self._balanced)
 
     def _differentiate(self, piece: GridSamples) -> None:
         signals = np.concatenate(
@@ -217,6 +253,8 @@ class Estimator:
         n_x = self.model.layout.n_x
         x, torque = rates.values[:, :n_x], rates.values[:, n_x:]
         v = self.model.layout.speeds(x, rates.rates[:, :n_x])
+        if self.smoother is not None:
+            self.smoother.move(rates.index, x, v)
         if self.on_motion is not None:
             self.on_motion(rates.index, rates.segment, x, v)
         rows = self._energy.push(rates.index, x, v, torque, self._rates.sigma[n_x:])
@@ -237,6 +275,12 @@ class Estimator:
 
     def estimate(self) -> Estimate:
         """The base parameters as they are known now."""
+        if self.smoother is not None and self.by_smoother:
+            return self.smoother.estimate()
+        return self._balanced()
+
+    def _balanced(self) -> Estimate:
+        """What the balances tell of the base parameters."""
         if self.momentum is not None and self.by_momentum:
             return self.momentum.estimate()
         return self.energy_tracker.estimate()
@@ -263,6 +307,7 @@ class Estimator:
             "joints": dict(self._joints.state()),
             "tracker": dict(self.energy_tracker.state()),
             **({} if self.momentum is None else self.momentum.state()),
+            **({} if self.smoother is None else self.smoother.state()),
         }
 
     def restore(self, state: SessionState) -> None:
@@ -271,6 +316,8 @@ class Estimator:
         if self.momentum is not None:
             self.momentum.restore(state)
             self._begin_joints()
+        if self.smoother is not None:
+            self.smoother.restore(state)
         self.samples, self.duration = int(session["samples"]), float(session["duration"])
         self._first_time, self._segment = float(session["first_time"]), int(session["segment"])
         self._attitude.last = np.array(session["attitude"])

@@ -21,7 +21,7 @@ def run(args: argparse.Namespace) -> int:
     """Simulate a session and write FILE.csv and FILE.csv.truth.json."""
     system, _ = described_system(args)
     capture: Path = args.capture
-    channels = Sensors(system, Plant(system).channels, args.grade, args.seed).channels
+    channels = Sensors(system, Plant(system).recordable, args.grade, args.seed).channels
     # The writer comes first: a name that cannot be written is known before a long simulation.
     with CaptureWriter(capture, channels) as writer:
         try:

@@ -1,0 +1,242 @@
+"""Parameters and states of a span together: Gauss-Newton on all samples at once, with the equations as constraints.
+
+Only the torques are uncertain in the end. The way there leads over equations that hold roughly: white forces of a level
+that falls step by step act on every coordinate, so that at first the motion follows the samples and the parameters
+follow the motion, as in a fit of the balance; a start that is tens of percent off then suffices. Where the samples
+refute exact equations, the least level stays that they agree with.
+Source: Ramsay, Hooker, Campbell, Cao, J. Royal Statistical Society B 69 (2007) 741, for the path from loose to tight
+equations; Bell, SIAM J. Optimization 4 (1994) 626, for the iterated smoother as Gauss-Newton.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from sms_online.linearised import linearise
+from sms_online.model.base_parameters import BaseParameters
+from sms_online.model.model import Dynamics, Model
+from sms_online.physical import PhysicalSet
+from sms_online.sensor_set import Readings
+from sms_online.smoother.collocation import Trajectory, defects, forces, speeds, transitions
+from sms_online.smoother.filter import FixedIntervalSmoother
+from sms_online.smoother.span import Innovations, Span, interpolated
+from sms_online.stream import Array
+from sms_online.trackers.factor import Solution, solve, triangular_factor
+
+# Levels of the white forces on the way, as shares of each coordinate's usual force. From one to the next the answer
+# moves by a fraction of what the first fit is off.
+LEVELS = (0.3, 0.1, 0.03, 0.01, 0.003, 0.001)
+# Those that a span begins with whose parameters are known from the spans before it.
+LATER_LEVELS = (0.01, 0.001)
+# Time within which forces of a level change, s: white forces of share r have the density (r F)² times this.
+CORRELATION = 0.1
+# No coordinate's usual force is taken to be smaller than this share of the largest.
+LEAST_FORCE = 0.02
+# Steps of the collocation, s: on the way, and then ever finer until that changes no parameter by more than REFINED
+# standard deviations; the error of the last one is a sixteenth of that change, as its order is four.
+ROUGH_STEP = 0.01
+STEPS = (0.005, 0.0025, 0.00125)
+REFINED = 1.0
+# A step of the search that moves no parameter by more standard deviations than this ends it: the next one would be
+# smaller by far, as the convergence is quadratic near the end.
+SETTLED = 0.5
+MAX_STEPS = 8
+# Derivatives by displacements are told that often and interpolated, s; they only steer the search.
+DERIVATIVES_INTERVAL = 0.04
+# Mean square of the whitened innovations that noise alone may leave: a span of some seconds scatters by a hundredth,
+# the noise behind it is estimated to a tenth.
+LARGEST_MEAN_SQUARE = 1.2
+# Directions of β that the rows tell less of than this share of the best told, in units of the columns' sizes, are left
+# as they are: derivatives are good to 1e-8.
+RANK_TOLERANCE = 1e-8
+# Mass matrices are looked at that often along the motion, s.
+MASS_INTERVAL = 0.1
+
+
+class DivergedError(ArithmeticError):
+    """The search found no parameters and states that agree with the samples."""
+
+
+@dataclass(frozen=True)
+class SpanFit:
+    """What a span says: rows Y β = b with independent unit errors as a factor (n + 1, n + 1), linearised at its end.
+
+    beta (n,): estimate from this span and what was known before it. rows: how many innovations. mean_square: of the
+    whitened innovations. level: of the white forces that are left, 0 where the equations hold. step: of the
+    collocation, s. iterations: Gauss-Newton steps in all. trajectory: the smoothed motion.
+    """
+
+    factor: Array
+    beta: Array
+    rows: int
+    mean_square: float
+    level: float
+    step: float
+    iterations: int
+    trajectory: Trajectory
+
+
+class SpanSmoother:
+    """Fits spans of one session.
+
+    readings: of the samples. sigma (C,): their noise, 1σ a sample. torque (joints,): σ² T_s of n τ, (N m)² s.
+    """
+
+    def __init__(self, model: Model, base: BaseParameters, readings: Readings, sigma: Array, torque: Array) -> None:
+        self._model = model
+        self._base = base
+        self._readings = readings
+        self._sigma = sigma
+        # Unit noise of each motor's mean torque to forces, (n_v, joints), N m √s.
+        self._motors = model.generalized_force(np.eye(torque.size)).T * np.sqrt(torque)
+        self._physical = PhysicalSet(model, base)
+
+    def fit(self, span: Span, beta: Array, known: Array, last_step: float | None) -> SpanFit:
+        """Fit a span from β (n,), with what is known before it as a factor or rows (·, n + 1).
+
+        last_step: of the collocation of an earlier span, s; None in the first one. Raises DivergedError.
+        """
+        try:
+            with np.errstate(over="raise", divide="raise", invalid="raise"):
+                search = _Search(self, span, beta, known)
+                for level in LEVELS if last_step is None else LATER_LEVELS:
+                    search.advance(level)
+                return search.tightened(STEPS if last_step is None else (last_step,))
+        except (np.linalg.LinAlgError, FloatingPointError) as error:
+            raise DivergedError(str(error)) from None
+
+    def dynamics(self, beta: Array) -> Dynamics:
+        """The equations of motion for β (n,)."""
+        return self._model.dynamics(self._base.physical_values(beta))
+
+
+class _Search:
+    """The state of a search: β and the motion, and what the last step was made of."""
+
+    def __init__(self, smoother: SpanSmoother, span: Span, beta: Array, known: Array) -> None:
+        self._smoother, self._span, self._known = smoother, span, known
+        self._model, self._base = smoother._model, smoother._base
+        self.iterations = 0
+        self.beta = beta
+        dynamics = smoother.dynamics(beta)
+        t = span.nodes(ROUGH_STEP)
+        x, v = span.guess(t)
+        self.trajectory = Trajectory(t, x, (dynamics.mass_matrix(x) @ v[..., None])[..., 0])
+        usual = np.sqrt(np.mean(forces(dynamics, x, v) ** 2, axis=0))
+        self._usual = np.maximum(usual, LEAST_FORCE * usual.max())
+        if not self._has_mass(beta):
+            raise DivergedError("the first fit's mass matrix is not positive definite")
+        self._use_nodes()
+
+    def _use_nodes(self) -> None:
+        t = self.trajectory.t
+        self._innovations = Innovations(self._span, t, self._smoother._readings, self._smoother._sigma)
+        impulse = self._span.impulse
+        of_motors = self._model.generalized_force
+        middle = 0.5 * (t[1:] + t[:-1])
+        self._impulse, self._impulse_m = of_motors(impulse(t)), of_motors(impulse(middle))
+
+    def refine(self, step: float) -> None:
+        """Put the motion on nodes at no more than `step`, s."""
+        t = self._span.nodes(step)
+        old = self.trajectory
+        if t.size == old.t.size:
+            return
+        smooth = np.concatenate((old.x, old.p - self._impulse), axis=1)
+        x, p = np.split(interpolated(old.t, smooth, t), [old.x.shape[1]], axis=1)
+        self.trajectory = Trajectory(t, x, p)
+        self._use_nodes()
+        self.trajectory = Trajectory(t, x, p + self._impulse)
+
+    def tightened(self, steps: tuple[float, ...]) -> SpanFit:
+        """The fit with equations that hold, or that hold as well as the samples allow."""
+        for k, step in enumerate(steps):
+            self.refine(step)
+            before = self.beta
+            self.settle(0.0)
+            if k and np.all(np.abs(self.beta - before) <= REFINED * self.std):
+                break
+        level = 0.0
+        for level in (0.0, *reversed(LEVELS)):
+            if level:
+                self.settle(level)
+            if self.mean_square <= LARGEST_MEAN_SQUARE:
+                return SpanFit(
+                    self.factor, self.beta, self.rows, self.mean_square, level, step, self.iterations, self.trajectory
+                )
+        raise DivergedError(f"innovations are {np.sqrt(self.mean_square):.3g} times as large as predicted")
+
+    def settle(self, level: float) -> None:
+        """Search until β stands; DivergedError where it does not."""
+        for _ in range(MAX_STEPS):
+            before = self.beta
+            self.advance(level)
+            if np.all(np.abs(self.beta - before) <= SETTLED * self.std):
+                return
+        raise DivergedError(f"no end of the search after {self.iterations} steps")
+
+    def advance(self, level: float) -> None:
+        """One step of Gauss-Newton with white forces of a level."""
+        trajectory, base = self.trajectory, self._base
+        dynamics = self._smoother.dynamics(self.beta)
+        v = speeds(dynamics, trajectory.x, trajectory.p)
+        differences = self._innovations(trajectory.x, v)
+        lacking = defects(dynamics, trajectory, v, self._impulse, self._impulse_m)
+        kalman = FixedIntervalSmoother(dynamics.mass_matrix(trajectory.x[:1])[0], base.n)
+        every = max(1, round(DERIVATIVES_INTERVAL / trajectory.step))
+        nodes = every * max(1, 512 // every)
+        drive, joints = self._drive(level), self._smoother._motors.shape[1]
+        rows = []
+        for start in range(0, len(v), nodes):
+            piece = slice(start, start + nodes)  # and one more, which ends the last step
+            wide = slice(start, start + nodes + 1)
+            linear = linearise(dynamics, base, self._smoother._readings, trajectory.x[wide], v[wide], every)
+            weights = self._innovations.weights[piece, :, None]
+            steps = transitions(linear, trajectory.step, drive, joints, lacking[piece])
+            count = len(weights)
+            rows.append(kalman.push(differences[piece], weights * linear.C[:count], weights * linear.D[:count], steps))
+        innovations = np.concatenate(rows)
+        Y = -innovations[:, 1:]
+        self.rows = len(Y)
+        self.factor = triangular_factor(np.column_stack((Y, innovations[:, 0] + Y @ self.beta)))
+        delta, solution = self._step()
+        beta = self._admissible(self.beta + delta, solution, level > 0.0)
+        delta = beta - self.beta
+        self.mean_square = float(np.mean((innovations[:, 0] - Y @ delta) ** 2))
+        self.std = np.sqrt(np.diag(solution.covariance()))
+        self.trajectory = trajectory.moved(kalman.smooth(delta))
+        self.beta = beta
+        self.iterations += 1
+
+    def _drive(self, level: float) -> Array:
+        """What unit noise adds to the state in a step, (2 n_v, noises)."""
+        noise = self._smoother._motors
+        if level:
+            noise = np.concatenate((noise, np.diag(level * np.sqrt(CORRELATION) * self._usual)), axis=1)
+        return np.concatenate((np.zeros_like(noise), np.sqrt(self.trajectory.step) * noise))
+
+    def _step(self) -> tuple[Array, Solution]:
+        """δβ (n,) of least squares, and the solution behind it."""
+        problem = triangular_factor(self._known, self.factor)
+        n = self._base.n
+        problem[:, n] -= problem[:, :n] @ self.beta
+        size = np.linalg.norm(problem[:, :n], axis=0)
+        size[size == 0.0] = 1.0
+        return np.linalg.lstsq(problem[:, :n] / size, problem[:, n], rcond=RANK_TOLERANCE)[0] / size, solve(problem)
+
+    def _admissible(self, beta: Array, solution: Solution, always: bool) -> Array:
+        """β, or the nearest of real bodies: `always`, or where its mass matrix is not positive definite."""
+        if always or not self._has_mass(beta):
+            try:
+                beta = self._smoother._physical.project(beta, solution.covariance()).beta
+            except ArithmeticError as error:
+                raise DivergedError(str(error)) from None
+            if not self._has_mass(beta):
+                raise DivergedError("a mass matrix is not positive definite")
+        return beta
+
+    def _has_mass(self, beta: Array) -> bool:
+        x = self.trajectory.x[:: max(1, round(MASS_INTERVAL / self.trajectory.step))]
+        return bool(np.linalg.eigvalsh(self._smoother.dynamics(beta).mass_matrix(x)).min() > 0.0)
