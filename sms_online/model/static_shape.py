@@ -36,15 +36,7 @@ class SensedShape:
         for _ in range(NEWTON_STEPS):
             J = self._kinematics.marker_jacobian(q_f)[:, self._measured]
             told = readings - self._kinematics.markers(q_f)[:, self._measured]
-            q_f = (self._inverse(J) @ (told[..., None] + J @ q_f[..., None]))[..., 0]
+            bent = self._compliance @ J.swapaxes(1, 2)
+            ahead = told[..., None] + J @ q_f[..., None]
+            q_f = (bent @ np.linalg.solve(J @ bent, ahead))[..., 0]
         return q_f
-
-    def jacobian(self, q_f: Array) -> Array:
-        """Derivatives (B, n_f, measured) of `coordinates` by the readings, at q_f (B, n_f)."""
-        J = self._kinematics.marker_jacobian(q_f)
-        return np.asarray(np.linalg.inv(J)) if self.complete else self._inverse(J[:, self._measured])
-
-    def _inverse(self, J: Array) -> Array:
-        """The right inverse of J (B, measured, n_f) of least strain energy."""
-        bent = self._compliance @ J.swapaxes(1, 2)
-        return np.asarray(bent @ np.linalg.inv(J @ bent))

@@ -3,8 +3,8 @@
 The momentum balance gives the estimate as soon as its weights are known. Until then, and where a system asks for
 nothing else, it comes from the energy balance. The two are never added up: both are functions of the same samples, so
 their errors are not independent, and the momentum rows hold what the energy rows hold (power is force times speed).
-Where a link has fewer sensors than coordinates both see a static shape, and are the first fit of a smoother that knows
-the dynamics; it gives the estimate as soon as its first span is through.
+Where a link has fewer sensors than coordinates the energy balance sees a static shape, and is the first fit of a
+smoother that knows the dynamics; it gives the estimate as soon as its first span is through.
 """
 
 from __future__ import annotations
@@ -96,7 +96,9 @@ class Estimator:
         # Positions choose the filter's width; torques pass the same filter for the sake of the lag.
         self._rates = RatesStage(system.sample_rate, range(layout.n_x), self.sensing.noise)
         self._energy = EnergyBalance(model, base, system.sample_rate)
-        self.momentum = None if system.balance == "energy" else Momentum(model, base, self.sensing)
+        # A balance of forces does not hold in a shape that is not the link's; energies bear it best.
+        by_energy = system.balance == "energy" or self.sensing.missing
+        self.momentum = None if by_energy else Momentum(model, base, self.sensing)
         self.energy_tracker: Tracker = RecursiveLeastSquares(base.n)
         self._begin_joints()
         self._segment = -1

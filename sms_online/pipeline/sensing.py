@@ -105,38 +105,38 @@ class Sensing:
 
     @property
     def position_columns(self) -> list[int]:
-        """Channels of the position sensors: base, joints, motors, then each link's markers."""
+        """Channels of the position sensors, in the order of the coordinates that they stand for, where none is missing.
+
+        There are n_x then, and `displacements` and `coordinate_noise` hold.
+        """
         markers = (column for _, columns in self._links.values() for column in columns)
         return [*self._base, *self._q, *self._theta_m, *markers]
 
-    def _by_sensor(self, x: Array) -> Array:
-        """Derivatives (K, n_x, sensors) of the coordinates by the readings of the position sensors, at x (K, n_x)."""
-        layout = self.model.layout
-        rigid = len(self._base) + len(self._q) + len(self._theta_m)
-        out = np.zeros((x.shape[0], layout.n_x, len(self.position_columns)))
-        out[:, range(rigid), range(rigid)] = 1.0
-        offset, first = layout.n_base_positions - layout.n_base_speeds, rigid
-        for i, (shape, columns) in self._links.items():
-            own = slice(layout.q_f[i].start + offset, layout.q_f[i].stop + offset)
-            out[:, own, first : first + len(columns)] = shape.jacobian(self.model.chain.elastic(x, i))
-            first += len(columns)
-        return out
-
     def displacements(self, x: Array) -> Array:
-        """Displacements (K, n_v, sensors) along the speeds, at x (K, n_x), for one more unit of each sensor's reading.
-
-        Sensors are those of positions, in the order of `position_columns`.
-        """
+        """Displacements (K, n_v, n_x) along the speeds, at x (K, n_x), for one more unit of each sensor's reading."""
         layout = self.model.layout
-        by_sensor = self._by_sensor(x)
-        K, n_x, sensors = by_sensor.shape
-        moved = layout.speeds(np.repeat(x, sensors, axis=0), by_sensor.swapaxes(1, 2).reshape(-1, n_x))
-        return np.asarray(moved.reshape(K, sensors, layout.n_v).swapaxes(1, 2))
+        K, n_x = x.shape
+        by_sensor = np.broadcast_to(np.eye(n_x), (K, n_x, n_x)).copy()
+        offset = layout.n_base_positions - layout.n_base_speeds
+        for i, (kinematics, q_f) in enumerate(zip(self.model.chain.flexible, layout.q_f, strict=True)):
+            if kinematics is not None:
+                own = slice(q_f.start + offset, q_f.stop + offset)
+                by_sensor[:, own, own] = np.linalg.inv(kinematics.marker_jacobian(self.model.chain.elastic(x, i)))
+        every = np.repeat(x, n_x, axis=0)
+        moved = layout.speeds(every, by_sensor.swapaxes(1, 2).reshape(-1, n_x))
+        return np.asarray(moved.reshape(K, n_x, -1).swapaxes(1, 2))
 
     def coordinate_noise(self, sensors: Array) -> Array:
-        """1σ of the coordinates (n_x,) for that of the position sensors (sensors,), about the straight arm."""
-        straight = np.zeros((1, self.model.layout.n_x))
-        return np.asarray(np.sqrt(self._by_sensor(straight)[0] ** 2 @ sensors**2))
+        """1σ of the coordinates (n_x,) for that of the position sensors (n_x,), about the straight arm."""
+        layout = self.model.layout
+        out = sensors.copy()
+        offset = layout.n_base_positions - layout.n_base_speeds
+        for kinematics, q_f in zip(self.model.chain.flexible, layout.q_f, strict=True):
+            if kinematics is not None:
+                own = slice(q_f.start + offset, q_f.stop + offset)
+                inverse = np.linalg.inv(kinematics.marker_jacobian(np.zeros((1, kinematics.n_f)))[0])
+                out[own] = np.sqrt(inverse**2 @ sensors[own] ** 2)
+        return out
 
     def coordinates(self, values: Array) -> Array:
         """Positions x (B, n_x) of samples (B, channels)."""

@@ -65,16 +65,15 @@ class Sensitivities:
     def __init__(self, model: Model, readings: Callable[[Array], Array], half_hop: float) -> None:
         self.model = model
         self._readings = readings
-        self._sensors = readings(np.empty((0, model.layout.n_x))).shape[2]
         # Central differences, one-sided at the ends, for a matrix that changes in time, per half hop.
         self._slope: Array = np.asarray(np.gradient(np.eye(INSTANTS + 1), axis=0)) / half_hop
         self.forget(0)
 
     def forget(self, next_instant: int) -> None:
         """Begin anew: `next_instant` is the number of the first one to be told."""
-        n_v = self.model.layout.n_v
+        n_v, n_x = self.model.layout.n_v, self.model.layout.n_x
         self._first = next_instant
-        self._dense = np.empty((0, n_v, n_v + self._sensors))  # H and readings at each instant
+        self._dense = np.empty((0, n_v, n_v + n_x))  # H and readings at each instant
         self._numbers = np.empty(0, dtype=np.int64)  # instants of the derivatives
         self._derivatives = np.empty((0, n_v, 3 * n_v))
 

@@ -26,21 +26,16 @@ STATES_PER_CALL = 512
 
 @dataclass(frozen=True)
 class Trajectory:
-    """States at evenly spaced nodes: t (K + 1,) s, x (K + 1, n_x), p (K + 1, n_v) the momenta ∂K/∂v."""
+    """A motion at evenly spaced nodes: t (K + 1,) s, x (K + 1, n_x), v (K + 1, n_v); ẋ = v."""
 
     t: Array
     x: Array
-    p: Array
+    v: Array
 
     @property
     def step(self) -> float:
         """Time from one node to the next, s."""
         return float((self.t[-1] - self.t[0]) / (self.t.size - 1))
-
-    def moved(self, s: Array) -> Trajectory:
-        """With deviations s (K + 1, 2 n_v) added; positions are a vector, so speeds are their rates."""
-        n = self.x.shape[1]
-        return Trajectory(self.t, self.x + s[:, :n], self.p + s[:, n:])
 
 
 @dataclass(frozen=True)
@@ -56,28 +51,25 @@ class Transitions:
     d: Array
 
 
-def speeds(dynamics: Dynamics, x: Array, p: Array) -> Array:
-    """v (B, n_v) of momenta p (B, n_v). LinAlgError where the mass matrix is singular."""
-    return np.asarray(np.linalg.solve(dynamics.mass_matrix(x), p[..., None])[..., 0])
-
-
-def forces(dynamics: Dynamics, x: Array, v: Array) -> Array:
-    """G π (B, n_v): rates of the momenta but for the motors'."""
+def momenta_and_forces(dynamics: Dynamics, x: Array, v: Array) -> tuple[Array, Array]:
+    """P π and G π (B, n_v): momenta, and their rates but for the motors'."""
     pieces = [slice(k, k + STATES_PER_CALL) for k in range(0, len(x), STATES_PER_CALL)]
-    return np.concatenate([dynamics.momentum_and_force(x[piece], v[piece])[1] for piece in pieces])
+    parts = [dynamics.momentum_and_force(x[piece], v[piece]) for piece in pieces]
+    return np.concatenate([p for p, _ in parts]), np.concatenate([g for _, g in parts])
 
 
-def defects(dynamics: Dynamics, trajectory: Trajectory, v: Array, impulse: Array, impulse_m: Array) -> Array:
+def defects(dynamics: Dynamics, trajectory: Trajectory, impulse: Array, impulse_m: Array) -> Array:
     """What the steps of a motion lack, (K, 2 n_v): h/6 (f_k + 4 f_m + f_{k+1}) - (s_{k+1} - s_k).
 
-    v (K + 1, n_v): its speeds. impulse (K + 1, n_v), impulse_m (K, n_v): of the motors at the nodes and midpoints.
+    impulse (K + 1, n_v), impulse_m (K, n_v): of the motors, at the nodes and at the midpoints.
     """
-    h, x, p = trajectory.step, trajectory.x, trajectory.p - impulse
-    g = forces(dynamics, x, v)
+    h, x, v = trajectory.step, trajectory.x, trajectory.v
+    p, g = momenta_and_forces(dynamics, x, v)
+    p = p - impulse
     x_m = 0.5 * (x[1:] + x[:-1]) + h / 8.0 * (v[:-1] - v[1:])
     p_m = 0.5 * (p[1:] + p[:-1]) + h / 8.0 * (g[:-1] - g[1:]) + impulse_m
-    v_m = speeds(dynamics, x_m, p_m)
-    g_m = forces(dynamics, x_m, v_m)
+    v_m: Array = np.asarray(np.linalg.solve(dynamics.mass_matrix(x_m), p_m[..., None])[..., 0], dtype=np.float64)
+    _, g_m = momenta_and_forces(dynamics, x_m, v_m)
     of_x = h / 6.0 * (v[:-1] + 4.0 * v_m + v[1:]) - np.diff(x, axis=0)
     of_p = h / 6.0 * (g[:-1] + 4.0 * g_m + g[1:]) - np.diff(p, axis=0)
     return np.concatenate((of_x, of_p), axis=1)

@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import numpy as np
 
-from sms_online.bound import FREE_POSITION, FREE_SPEED
 from sms_online.smoother.collocation import Transitions
 from sms_online.stream import Array
 from sms_online.trackers.factor import raw_triangle
@@ -20,13 +19,12 @@ from sms_online.trackers.factor import raw_triangle
 class FixedIntervalSmoother:
     """Filter forwards through `push`, piece by piece, then `smooth` back.
 
-    H (n_v, n_v): mass matrix at the first node; the state there is free. n: number of parameters.
+    root (m, m): the first state has the covariance rootᵀ root. n: number of parameters.
     """
 
-    def __init__(self, H: Array, n: int) -> None:
-        n_v = len(H)
-        self._L = np.diag(np.repeat([FREE_POSITION, FREE_SPEED], n_v))  # LᵀL is the covariance
-        self._L[n_v:, n_v:] @= H
+    def __init__(self, root: Array, n: int) -> None:
+        self._L = root
+        n_v = len(root) // 2
         self._M = np.zeros((2 * n_v, 1 + n))
         self._upper = np.triu(np.ones((2 * n_v, 2 * n_v)))
         self._past: list[tuple[Array, ...]] = []

@@ -19,7 +19,7 @@ from sms_online.model.base_parameters import BaseParameters
 from sms_online.model.model import Dynamics, Model
 from sms_online.physical import PhysicalSet
 from sms_online.sensor_set import Readings
-from sms_online.smoother.collocation import Trajectory, defects, forces, speeds, transitions
+from sms_online.smoother.collocation import Trajectory, defects, momenta_and_forces, transitions
 from sms_online.smoother.filter import FixedIntervalSmoother
 from sms_online.smoother.span import Innovations, Span, interpolated
 from sms_online.stream import Array
@@ -29,11 +29,14 @@ from sms_online.trackers.factor import Solution, solve, triangular_factor
 # moves by a fraction of what the first fit is off.
 LEVELS = (0.3, 0.1, 0.03, 0.01, 0.003, 0.001)
 # Those that a span begins with whose parameters are known from the spans before it.
-LATER_LEVELS = (0.01, 0.001)
+LATER_LEVELS = (0.01, 0.001, 0.0)
 # Time within which forces of a level change, s: white forces of share r have the density (r F)² times this.
 CORRELATION = 0.1
-# No coordinate's usual force is taken to be smaller than this share of the largest.
-LEAST_FORCE = 0.02
+# No coordinate's usual force or speed is taken to be smaller than this share of the largest.
+LEAST_USUAL = 0.02
+# Free to move are positions of the first state by this, rad, m or 1/m, and its speeds by the usual ones. Not further:
+# stiff modes, which no sample sees, decay slowly in the collocation, and are not to ring.
+FREE_POSITION = 10.0
 # Steps of the collocation, s: on the way, and then ever finer until that changes no parameter by more than REFINED
 # standard deviations; the error of the last one is a sixteenth of that change, as its order is four.
 ROUGH_STEP = 0.01
@@ -120,12 +123,10 @@ class _Search:
         self._model, self._base = smoother._model, smoother._base
         self.iterations = 0
         self.beta = beta
-        dynamics = smoother.dynamics(beta)
         t = span.nodes(ROUGH_STEP)
-        x, v = span.guess(t)
-        self.trajectory = Trajectory(t, x, (dynamics.mass_matrix(x) @ v[..., None])[..., 0])
-        usual = np.sqrt(np.mean(forces(dynamics, x, v) ** 2, axis=0))
-        self._usual = np.maximum(usual, LEAST_FORCE * usual.max())
+        self.trajectory = Trajectory(t, *span.guess(t))
+        _, force = momenta_and_forces(smoother.dynamics(beta), self.trajectory.x, self.trajectory.v)
+        self._usual_force, self._usual_speed = _usual(force), _usual(self.trajectory.v)
         if not self._has_mass(beta):
             raise DivergedError("the first fit's mass matrix is not positive definite")
         self._use_nodes()
@@ -144,11 +145,8 @@ class _Search:
         old = self.trajectory
         if t.size == old.t.size:
             return
-        smooth = np.concatenate((old.x, old.p - self._impulse), axis=1)
-        x, p = np.split(interpolated(old.t, smooth, t), [old.x.shape[1]], axis=1)
-        self.trajectory = Trajectory(t, x, p)
+        self.trajectory = Trajectory(t, interpolated(old.t, old.x, t), interpolated(old.t, old.v, t))
         self._use_nodes()
-        self.trajectory = Trajectory(t, x, p + self._impulse)
 
     def tightened(self, steps: tuple[float, ...]) -> SpanFit:
         """The fit with equations that hold, or that hold as well as the samples allow."""
@@ -181,21 +179,22 @@ class _Search:
         """One step of Gauss-Newton with white forces of a level."""
         trajectory, base = self.trajectory, self._base
         dynamics = self._smoother.dynamics(self.beta)
-        v = speeds(dynamics, trajectory.x, trajectory.p)
-        differences = self._innovations(trajectory.x, v)
-        lacking = defects(dynamics, trajectory, v, self._impulse, self._impulse_m)
-        kalman = FixedIntervalSmoother(dynamics.mass_matrix(trajectory.x[:1])[0], base.n)
+        differences = self._innovations(trajectory.x, trajectory.v)
+        lacking = defects(dynamics, trajectory, self._impulse, self._impulse_m)
+        kalman = FixedIntervalSmoother(self._first_state(dynamics), base.n)
         every = max(1, round(DERIVATIVES_INTERVAL / trajectory.step))
         nodes = every * max(1, 512 // every)
         drive, joints = self._drive(level), self._smoother._motors.shape[1]
-        rows = []
-        for start in range(0, len(v), nodes):
+        n_v = self._model.layout.n_v
+        rows, speeds = [], []
+        for start in range(0, len(trajectory.t), nodes):
             piece = slice(start, start + nodes)  # and one more, which ends the last step
             wide = slice(start, start + nodes + 1)
-            linear = linearise(dynamics, base, self._smoother._readings, trajectory.x[wide], v[wide], every)
+            linear = linearise(dynamics, base, self._smoother._readings, trajectory.x[wide], trajectory.v[wide], every)
             weights = self._innovations.weights[piece, :, None]
             steps = transitions(linear, trajectory.step, drive, joints, lacking[piece])
             count = len(weights)
+            speeds.append((linear.A[:count, :n_v], linear.E[:count, :n_v, joints:]))
             rows.append(kalman.push(differences[piece], weights * linear.C[:count], weights * linear.D[:count], steps))
         innovations = np.concatenate(rows)
         Y = -innovations[:, 1:]
@@ -206,15 +205,29 @@ class _Search:
         delta = beta - self.beta
         self.mean_square = float(np.mean((innovations[:, 0] - Y @ delta) ** 2))
         self.std = np.sqrt(np.diag(solution.covariance()))
-        self.trajectory = trajectory.moved(kalman.smooth(delta))
+        s = kalman.smooth(delta)
+        # The motion is moved by its speeds, not by its momenta: of light coordinates momenta tell the speeds badly.
+        moved = [
+            by_s @ s[k : k + len(by_s), :, None] + by_beta @ delta[:, None]
+            for k, (by_s, by_beta) in zip(range(0, len(s), nodes), speeds, strict=True)
+        ]
+        v = trajectory.v + np.concatenate(moved)[..., 0]
+        self.trajectory = Trajectory(trajectory.t, trajectory.x + s[:, :n_v], v)
         self.beta = beta
         self.iterations += 1
+
+    def _first_state(self, dynamics: Dynamics) -> Array:
+        """Root of the covariance that leaves the first state free to move, (2 n_v, 2 n_v)."""
+        n_v = self._model.layout.n_v
+        root = np.diag(np.concatenate((np.full(n_v, FREE_POSITION), self._usual_speed)))
+        root[n_v:, n_v:] @= dynamics.mass_matrix(self.trajectory.x[:1])[0]
+        return root
 
     def _drive(self, level: float) -> Array:
         """What unit noise adds to the state in a step, (2 n_v, noises)."""
         noise = self._smoother._motors
         if level:
-            noise = np.concatenate((noise, np.diag(level * np.sqrt(CORRELATION) * self._usual)), axis=1)
+            noise = np.concatenate((noise, np.diag(level * np.sqrt(CORRELATION) * self._usual_force)), axis=1)
         return np.concatenate((np.zeros_like(noise), np.sqrt(self.trajectory.step) * noise))
 
     def _step(self) -> tuple[Array, Solution]:
@@ -240,3 +253,9 @@ class _Search:
     def _has_mass(self, beta: Array) -> bool:
         x = self.trajectory.x[:: max(1, round(MASS_INTERVAL / self.trajectory.step))]
         return bool(np.linalg.eigvalsh(self._smoother.dynamics(beta).mass_matrix(x)).min() > 0.0)
+
+
+def _usual(samples: Array) -> Array:
+    """rms of each column of samples (B, n_v), and no less than a share of the largest."""
+    rms = np.sqrt(np.mean(samples**2, axis=0))
+    return np.asarray(np.maximum(rms, LEAST_USUAL * rms.max()))
