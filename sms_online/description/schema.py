@@ -294,7 +294,7 @@ class System(Record):
     """A whole testbed. No spacecraft means a fixed base. joints, motors, links are in order from the base outwards.
 
     balance: which rows are fitted; `both` is the momentum balance, and the energy balance until its weights are known.
-    `smoother` is the smoother that knows the dynamics, which is also used where a link has too few sensors.
+    `smoother` is the smoother that knows the dynamics, which links with too few sensors get unless it says `energy`.
     """
 
     name: str

@@ -85,7 +85,7 @@ class Estimator:
         self._newest_energy_row = -np.inf
         self.on_motion: MotionSink | None = None
         self.smoother: Smoother | None = None
-        if self.sensing.missing or system.balance == "smoother":
+        if system.balance == "smoother" or (self.sensing.missing and system.balance != "energy"):
             self.smoother = Smoother(model, base, self.sensing, channels)
         self.channels = tuple(dict.fromkeys((*self.sensing.channels, *self._smoothed_channels)))
         self._columns = [channels.index(name) for name in self.channels]

@@ -195,14 +195,28 @@ class Smoother:
             dof=max(float(self._rows - solution.rank), 0.0),
         )
 
+    def told(self) -> dict[str, Any]:
+        """What the spans so far have told; nothing in it changes when the session goes on."""
+        return {
+            "failures": np.array(self.failures, dtype=np.str_), "spans": self.spans, "level": self.level,
+            "mean_square": self.mean_square, "factor": self._factor, "beta": self._beta, "rows": self._rows,
+            "rss": self._rss, "last_step": self._last_step, "end": self._end,
+        }  # fmt: skip
+
+    def learn(self, told: Mapping[str, Any]) -> None:
+        """Take over what another smoother of the same session told."""
+        self.failures, self.spans = [str(text) for text in told["failures"]], int(told["spans"])
+        self.mean_square, self.level = float(told["mean_square"]), float(told["level"])
+        self._factor, self._beta = np.array(told["factor"]), np.array(told["beta"])
+        self._rows, self._rss = int(told["rows"]), float(told["rss"])
+        self._last_step, self._end = float(told["last_step"]), float(told["end"])
+
     def state(self) -> dict[str, dict[str, Any]]:
         """Everything that `restore` needs to continue to the same bits."""
         return {
             "smoother": {
-                "failures": np.array(self.failures, dtype=np.str_), "spans": self.spans, "level": self.level,
-                "mean_square": self.mean_square, "factor": self._factor, "beta": self._beta, "rows": self._rows,
-                "rss": self._rss, "last_step": self._last_step, "end": self._end, "t": self._t, "values": self._values,
-                "index": self._index, "torque": self._torque, "moved": self._moved, "motion": self._motion,
+                **self.told(), "t": self._t, "values": self._values, "index": self._index, "torque": self._torque,
+                "moved": self._moved, "motion": self._motion,
             },
             "smoother_torques": dict(self._synchroniser.state()),
         }  # fmt: skip
@@ -210,11 +224,7 @@ class Smoother:
     def restore(self, saved: Mapping[str, Mapping[str, NDArray[Any]]]) -> None:
         """Continue from a saved state."""
         state = saved["smoother"]
-        self.failures, self.spans = [str(text) for text in state["failures"]], int(state["spans"])
-        self.mean_square, self.level = float(state["mean_square"]), float(state["level"])
-        self._factor, self._beta = np.array(state["factor"]), np.array(state["beta"])
-        self._rows, self._rss = int(state["rows"]), float(state["rss"])
-        self._last_step, self._end = float(state["last_step"]), float(state["end"])
+        self.learn(state)
         self._t, self._values = np.array(state["t"]), np.array(state["values"])
         self._index, self._torque = np.array(state["index"]), np.array(state["torque"])
         self._moved, self._motion = np.array(state["moved"]), np.array(state["motion"])
