@@ -45,7 +45,7 @@ stiffness = [60.0]
 damping = [15.0]
 
 [trajectory]
-duration = 4.0
+duration = 3.0
 joint_1 = [{ frequency = 3.1, sine = 0.6 }, { frequency = 9.0, sine = 0.15 }]
 """
 

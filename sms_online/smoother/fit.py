@@ -241,13 +241,17 @@ class _Search:
 
     def _admissible(self, beta: Array, solution: Solution, always: bool) -> Array:
         """β, or the nearest of real bodies: `always`, or where its mass matrix is not positive definite."""
-        if always or not self._has_mass(beta):
-            try:
-                beta = self._smoother._physical.project(beta, solution.covariance()).beta
-            except ArithmeticError as error:
-                raise DivergedError(str(error)) from None
-            if not self._has_mass(beta):
-                raise DivergedError("a mass matrix is not positive definite")
+        has_mass = self._has_mass(beta)
+        if has_mass and not always:
+            return beta
+        try:
+            nearest = self._smoother._physical.project(beta, solution.covariance()).beta
+        except ArithmeticError:
+            nearest = beta
+        if self._has_mass(nearest):
+            return nearest
+        if not has_mass:
+            raise DivergedError("a mass matrix is not positive definite")
         return beta
 
     def _has_mass(self, beta: Array) -> bool:
