@@ -10,6 +10,7 @@ equations; Bell, SIAM J. Optimization 4 (1994) 626, for the iterated smoother as
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import dataclass
 
 import numpy as np
@@ -54,6 +55,8 @@ LARGEST_MEAN_SQUARE = 1.2
 # Directions of β that the rows tell less of than this share of the best told, in units of the columns' sizes, are left
 # as they are: derivatives are good to 1e-8.
 RANK_TOLERANCE = 1e-8
+# A step of the search is halved so often, where β is no mechanism's after it.
+MOST_HALVINGS = 6
 # Mass matrices are looked at that often along the motion, s.
 MASS_INTERVAL = 0.1
 
@@ -239,20 +242,19 @@ class _Search:
         size[size == 0.0] = 1.0
         return np.linalg.lstsq(problem[:, :n] / size, problem[:, n], rcond=RANK_TOLERANCE)[0] / size, solve(problem)
 
-    def _admissible(self, beta: Array, solution: Solution, always: bool) -> Array:
-        """β, or the nearest of real bodies: `always`, or where its mass matrix is not positive definite."""
-        has_mass = self._has_mass(beta)
-        if has_mass and not always:
-            return beta
-        try:
-            nearest = self._smoother._physical.project(beta, solution.covariance()).beta
-        except ArithmeticError:
-            nearest = beta
-        if self._has_mass(nearest):
-            return nearest
-        if not has_mass:
-            raise DivergedError("a mass matrix is not positive definite")
-        return beta
+    def _admissible(self, beta: Array, solution: Solution, loose: bool) -> Array:
+        """β, or of real bodies the nearest while equations are loose, or as much of the step as leaves a mechanism.
+
+        Mass matrices are linear in β, so those that are positive definite make a convex set, which the search is in.
+        """
+        if loose:
+            with suppress(ArithmeticError):  # the projection is a help, no more
+                beta = self._smoother._physical.project(beta, solution.covariance()).beta
+        for _ in range(MOST_HALVINGS):
+            if self._has_mass(beta):
+                return beta
+            beta = 0.5 * (self.beta + beta)
+        raise DivergedError("a mass matrix is not positive definite")
 
     def _has_mass(self, beta: Array) -> bool:
         x = self.trajectory.x[:: max(1, round(MASS_INTERVAL / self.trajectory.step))]
