@@ -31,8 +31,12 @@ from sms_online.trackers.factor import Solution, solve, triangular_factor
 LEVELS = (0.3, 0.1, 0.03, 0.01, 0.003, 0.001)
 # Those that a span begins with whose parameters are known from the spans before it.
 LATER_LEVELS = (0.01, 0.001, 0.0)
-# Time within which forces of a level change, s: white forces of share r have the density (r F)² times this.
+# A level is tried again while the innovations are larger than noise makes them, so often at most.
+MOST_TRIES = 3
+# Time within which forces of a level change, s: white forces of share r have the density (r F)² times this. None is to
+# change a speed within it by more than this multiple of r times the usual speed: light coordinates would run away.
 CORRELATION = 0.1
+MOST_SPEED = 3.0
 # No coordinate's usual force or speed is taken to be smaller than this share of the largest.
 LEAST_USUAL = 0.02
 # Free to move are positions of the first state by this, rad, m or 1/m, and its speeds by the usual ones. Not further:
@@ -108,7 +112,7 @@ class SpanSmoother:
             with np.errstate(over="raise", divide="raise", invalid="raise"):
                 search = _Search(self, span, beta, known)
                 for level in LEVELS if last_step is None else LATER_LEVELS:
-                    search.advance(level)
+                    search.loosen(level)
                 return search.tightened(STEPS if last_step is None else (last_step,))
         except (np.linalg.LinAlgError, FloatingPointError) as error:
             raise DivergedError(str(error)) from None
@@ -169,6 +173,13 @@ class _Search:
                 )
         raise DivergedError(f"innovations are {np.sqrt(self.mean_square):.3g} times as large as predicted")
 
+    def loosen(self, level: float) -> None:
+        """Follow the samples with white forces of a level."""
+        for _ in range(MOST_TRIES):
+            self.advance(level)
+            if self.mean_square <= LARGEST_MEAN_SQUARE:
+                return
+
     def settle(self, level: float) -> None:
         """Search until β stands; DivergedError where it does not."""
         for _ in range(MAX_STEPS):
@@ -187,7 +198,7 @@ class _Search:
         kalman = FixedIntervalSmoother(self._first_state(dynamics), base.n)
         every = max(1, round(DERIVATIVES_INTERVAL / trajectory.step))
         nodes = every * max(1, 512 // every)
-        drive, joints = self._drive(level), self._smoother._motors.shape[1]
+        drive, joints = self._drive(dynamics, level), self._smoother._motors.shape[1]
         n_v = self._model.layout.n_v
         rows, speeds = [], []
         for start in range(0, len(trajectory.t), nodes):
@@ -226,11 +237,16 @@ class _Search:
         root[n_v:, n_v:] @= dynamics.mass_matrix(self.trajectory.x[:1])[0]
         return root
 
-    def _drive(self, level: float) -> Array:
+    def _drive(self, dynamics: Dynamics, level: float) -> Array:
         """What unit noise adds to the state in a step, (2 n_v, noises)."""
         noise = self._smoother._motors
         if level:
-            noise = np.concatenate((noise, np.diag(level * np.sqrt(CORRELATION) * self._usual_force)), axis=1)
+            H = dynamics.mass_matrix(self._sparse_motion()).mean(axis=0)
+            # Inverse variances of the two limits add up; as roots, since light coordinates make H ill conditioned.
+            of_forces = np.diag(1.0 / self._usual_force)
+            of_speeds = CORRELATION / MOST_SPEED * np.linalg.inv(H) / self._usual_speed[:, None]
+            root = np.linalg.inv(np.linalg.qr(np.concatenate((of_forces, of_speeds)), mode="r"))
+            noise = np.concatenate((noise, level * np.sqrt(CORRELATION) * root), axis=1)
         return np.concatenate((np.zeros_like(noise), np.sqrt(self.trajectory.step) * noise))
 
     def _step(self) -> tuple[Array, Solution]:
@@ -257,8 +273,12 @@ class _Search:
         raise DivergedError("a mass matrix is not positive definite")
 
     def _has_mass(self, beta: Array) -> bool:
-        x = self.trajectory.x[:: max(1, round(MASS_INTERVAL / self.trajectory.step))]
-        return bool(np.linalg.eigvalsh(self._smoother.dynamics(beta).mass_matrix(x)).min() > 0.0)
+        masses = self._smoother.dynamics(beta).mass_matrix(self._sparse_motion())
+        return bool(np.linalg.eigvalsh(masses).min() > 0.0)
+
+    def _sparse_motion(self) -> Array:
+        """Positions (B, n_x) every now and then."""
+        return self.trajectory.x[:: max(1, round(MASS_INTERVAL / self.trajectory.step))]
 
 
 def _usual(samples: Array) -> Array:
