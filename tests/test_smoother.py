@@ -158,7 +158,8 @@ def test_friction_that_the_model_lacks_widens_the_error_bars() -> None:
     )
     std, wider = standard_deviation(holding)[:-1], standard_deviation(lacking)
     assert np.all(wider > 2.0 * std)
-    assert np.all(np.abs(normalised(lacking)) < 4.0)
+    # Friction is no white force: damping, which is nearest to it, bends to replace it.
+    assert np.all(np.abs(lacking.estimate().pi / truth_of(lacking) - 1.0) < 0.05)
     assert np.all(np.abs(normalised(holding)) < 4.0)
 
 

@@ -31,6 +31,8 @@ from sms_online.trackers.factor import Solution, solve, triangular_factor
 LEVELS = (0.3, 0.1, 0.03, 0.01, 0.003, 0.001)
 # Those that a span begins with whose parameters are known from the spans before it.
 LATER_LEVELS = (0.01, 0.001, 0.0)
+# Those that are allowed for where the samples refute exact equations; more than that is another system.
+ALLOWED = (0.001, 0.003, 0.01, 0.03)
 # A level is tried again while the innovations are larger than noise makes them, so often at most.
 MOST_TRIES = 3
 # Time within which forces of a level change, s: white forces of share r have the density (r F)² times this. None is to
@@ -67,6 +69,10 @@ MASS_INTERVAL = 0.1
 
 class DivergedError(ArithmeticError):
     """The search found no parameters and states that agree with the samples."""
+
+
+# What a search that runs away ends in.
+NO_NUMBERS = (np.linalg.LinAlgError, ArithmeticError)
 
 
 @dataclass(frozen=True)
@@ -114,7 +120,7 @@ class SpanSmoother:
                 for level in LEVELS if last_step is None else LATER_LEVELS:
                     search.loosen(level)
                 return search.tightened(STEPS if last_step is None else (last_step,))
-        except (np.linalg.LinAlgError, FloatingPointError) as error:
+        except NO_NUMBERS as error:
             raise DivergedError(str(error)) from None
 
     def dynamics(self, beta: Array) -> Dynamics:
@@ -130,6 +136,8 @@ class _Search:
         self._model, self._base = smoother._model, smoother._base
         self.iterations = 0
         self.beta = beta
+        self.std = np.full(beta.size, np.inf)
+        self.mean_square = np.inf
         t = span.nodes(ROUGH_STEP)
         self.trajectory = Trajectory(t, *span.guess(t))
         _, force = momenta_and_forces(smoother.dynamics(beta), self.trajectory.x, self.trajectory.v)
@@ -159,19 +167,21 @@ class _Search:
         """The fit with equations that hold, or that hold as well as the samples allow."""
         for k, step in enumerate(steps):
             self.refine(step)
-            before = self.beta
-            self.settle(0.0)
-            if k and np.all(np.abs(self.beta - before) <= REFINED * self.std):
+            before = self.beta, self.trajectory
+            if not self.settled(0.0):
                 break
-        level = 0.0
-        for level in (0.0, *reversed(LEVELS)):
+            if k and np.all(np.abs(self.beta - before[0]) <= REFINED * self.std):
+                break
+        for level in (0.0, *ALLOWED):
             if level:
-                self.settle(level)
+                self.beta, self.trajectory = before
+                if not self.settled(level):
+                    continue
             if self.mean_square <= LARGEST_MEAN_SQUARE:
                 return SpanFit(
                     self.factor, self.beta, self.rows, self.mean_square, level, step, self.iterations, self.trajectory
                 )
-        raise DivergedError(f"innovations are {np.sqrt(self.mean_square):.3g} times as large as predicted")
+        raise DivergedError(f"no motion and no parameters explain the samples, after {self.iterations} steps")
 
     def loosen(self, level: float) -> None:
         """Follow the samples with white forces of a level."""
@@ -180,17 +190,21 @@ class _Search:
             if self.mean_square <= LARGEST_MEAN_SQUARE:
                 return
 
-    def settle(self, level: float) -> None:
-        """Search until β stands; DivergedError where it does not."""
-        for _ in range(MAX_STEPS):
-            before = self.beta
-            self.advance(level)
-            if np.all(np.abs(self.beta - before) <= SETTLED * self.std):
-                return
-        raise DivergedError(f"no end of the search after {self.iterations} steps")
+    def settled(self, level: float) -> bool:
+        """Search until β stands; whether it does."""
+        try:
+            for _ in range(MAX_STEPS):
+                before = self.beta
+                self.advance(level, tame=False)
+                if np.all(np.abs(self.beta - before) <= SETTLED * self.std):
+                    return True
+        except NO_NUMBERS:
+            pass
+        self.mean_square = np.inf
+        return False
 
-    def advance(self, level: float) -> None:
-        """One step of Gauss-Newton with white forces of a level."""
+    def advance(self, level: float, tame: bool = True) -> None:
+        """One step of Gauss-Newton with white forces of a level, which `tame` ones bound by what they do to speeds."""
         trajectory, base = self.trajectory, self._base
         dynamics = self._smoother.dynamics(self.beta)
         differences = self._innovations(trajectory.x, trajectory.v)
@@ -198,7 +212,7 @@ class _Search:
         kalman = FixedIntervalSmoother(self._first_state(dynamics), base.n)
         every = max(1, round(DERIVATIVES_INTERVAL / trajectory.step))
         nodes = every * max(1, 512 // every)
-        drive, joints = self._drive(dynamics, level), self._smoother._motors.shape[1]
+        drive, joints = self._drive(dynamics, level, tame), self._smoother._motors.shape[1]
         n_v = self._model.layout.n_v
         rows, speeds = [], []
         for start in range(0, len(trajectory.t), nodes):
@@ -237,17 +251,21 @@ class _Search:
         root[n_v:, n_v:] @= dynamics.mass_matrix(self.trajectory.x[:1])[0]
         return root
 
-    def _drive(self, dynamics: Dynamics, level: float) -> Array:
+    def _drive(self, dynamics: Dynamics, level: float, tame: bool) -> Array:
         """What unit noise adds to the state in a step, (2 n_v, noises)."""
         noise = self._smoother._motors
         if level:
-            H = dynamics.mass_matrix(self._sparse_motion()).mean(axis=0)
-            # Inverse variances of the two limits add up; as roots, since light coordinates make H ill conditioned.
-            of_forces = np.diag(1.0 / self._usual_force)
-            of_speeds = CORRELATION / MOST_SPEED * np.linalg.inv(H) / self._usual_speed[:, None]
-            root = np.linalg.inv(np.linalg.qr(np.concatenate((of_forces, of_speeds)), mode="r"))
-            noise = np.concatenate((noise, level * np.sqrt(CORRELATION) * root), axis=1)
+            forces = self._tame_forces(dynamics) if tame else np.diag(self._usual_force)
+            noise = np.concatenate((noise, level * np.sqrt(CORRELATION) * forces), axis=1)
         return np.concatenate((np.zeros_like(noise), np.sqrt(self.trajectory.step) * noise))
+
+    def _tame_forces(self, dynamics: Dynamics) -> Array:
+        """Root (n_v, n_v) of the covariance of forces that are as usual and change speeds by no more than is usual."""
+        H = dynamics.mass_matrix(self._sparse_motion()).mean(axis=0)
+        # Inverse variances of the two limits add up; as roots, since light coordinates make H ill conditioned.
+        of_forces = np.diag(1.0 / self._usual_force)
+        of_speeds = CORRELATION / MOST_SPEED * np.linalg.inv(H) / self._usual_speed[:, None]
+        return np.asarray(np.linalg.inv(np.linalg.qr(np.concatenate((of_forces, of_speeds)), mode="r")))
 
     def _step(self) -> tuple[Array, Solution]:
         """δβ (n,) of least squares, and the solution behind it."""
