@@ -21,6 +21,7 @@ from sms_online.pipeline.estimator import Estimator
 from sms_online.results import results_document, standard_deviation
 from sms_online.sensor_set import sensor_set
 from sms_online.stream import Array, Block
+from sms_sim.plant import Plant
 from sms_sim.sensors import Sensors
 from sms_sim.simulate import Simulation, exact_states, sampled_blocks, simulate
 from sms_tools.cli import main
@@ -187,7 +188,7 @@ def test_exact_links_and_one_marker_alone_are_enough() -> None:
 def test_all_coordinates_measured_are_smoothed_only_where_that_is_asked_for(simulation: Simulation) -> None:
     sensors = (*simulation.plant.system.sensors, Sensor(channels=("link_1.marker_*.theta_z",), noise=1e-4))
     system = simulation.plant.system.model_copy(update={"sensors": sensors})
-    block = recorded(Simulation(type(simulation.plant)(system), simulation.solution), 5)
+    block = recorded(Simulation(Plant(system), simulation.solution), 5)
     assert session(system, block).smoother is None
     assert session(system.model_copy(update={"balance": "energy"}), block).smoother is None
     smoothed = session(system.model_copy(update={"balance": "smoother"}), block)

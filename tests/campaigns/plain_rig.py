@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import math
 import sys
 from pathlib import Path
 from time import process_time
@@ -20,54 +19,25 @@ from typing import Any
 
 import numpy as np
 
-from sms_adapters.system_file import load_system
-from sms_online.bound import STEP, Motion, cramer_rao_bound
-from sms_online.description.schema import Sensor, System
+from sms_online.description.schema import System
 from sms_online.model.base_parameters import find_base_parameters
 from sms_online.model.model import Model
 from sms_online.pipeline.estimator import Estimator
 from sms_online.results import NORMAL_95, standard_deviation
-from sms_online.sensor_set import readable_channels, sensor_set
-from sms_online.stream import Array, Block
+from sms_online.stream import Block
 from sms_sim.sensors import Sensors
-from sms_sim.simulate import exact_states, simulate
+from sms_sim.simulate import simulate
 from tests.campaigns.accuracy import Record, read
 from tests.campaigns.sessions import disguised, exact_session, true_parameters
+from tests.plain_rig import bound_of, plain_rig
 
-SYSTEM = "paper-planar"
-TRACKER_RATE = 240.0  # Hz
-SENSORS = (
-    Sensor(channels=("tau_*",), noise=0.01),  # 0.5 N m after the gear
-    Sensor(channels=("theta_m_*", "q_*"), resolution=2.0 * math.pi / 2**17),
-    Sensor(channels=("r_S_*", "theta_0"), rate=TRACKER_RATE, noise=1e-4),
-    Sensor(channels=("gyro_0_z",), noise=1e-4),
-    Sensor(channels=("link_*.marker_*.u_y",), rate=TRACKER_RATE, noise=1e-4),
-)
 # Asked of each parameter: an error within so many times the bound.
 ASKED = 10.0
-
-
-def plain_rig(name: str = SYSTEM) -> System:
-    """A shipped planar system with the sensors of a plain rig."""
-    return load_system(name).model_copy(update={"sensors": SENSORS})
 
 
 def noisy(system: System, exact: Block, seed: int) -> Block:
     """What the described sensors make of exact samples."""
     return Block(exact.t, exact.channels, Sensors(system, exact.channels, None, seed).read(0, exact.values))
-
-
-def bound(system: System) -> Array:
-    """Cramér-Rao bound (n,) of the system's own trajectory and sensors."""
-    simulation = simulate(system)
-    plant = simulation.plant
-    exact = exact_states(simulation, np.linspace(0.0, simulation.duration, round(simulation.duration / STEP) + 1))
-    readable = (*plant.channels[: len(system.joints)], *readable_channels(plant.model))
-    sensors = Sensors(system, readable, None, seed=0)
-    sigma = np.hypot(sensors.noise, sensors.resolution / math.sqrt(12.0))
-    chosen = sensor_set(plant.model, sensors.channels, sigma, sensors.rate)
-    motion = Motion(exact.t, exact.x, exact.v)
-    return cramer_rao_bound(plant.dynamics, find_base_parameters(plant.model), [motion], chosen)
 
 
 def one_session(system: System, block: Block) -> Record:
@@ -94,7 +64,7 @@ def run(results: Path, runs: int) -> None:
     exact = exact_session(system, results.with_suffix(".exact.npz"))
     limit = results.with_suffix(".bound.json")
     if not limit.exists():
-        limit.write_text(json.dumps(bound(system).tolist()), encoding="utf-8")
+        limit.write_text(json.dumps(bound_of(simulate(system)).tolist()), encoding="utf-8")
     done = {record["seed"] for record in read(results)} if results.exists() else set()
     for seed in range(runs):
         if seed not in done:
