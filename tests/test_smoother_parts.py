@@ -68,6 +68,8 @@ def test_a_link_without_any_marker_and_a_spatial_base_with_too_few_are_refused(m
     every = channels(spatial.system)
     with pytest.raises(InputError, match=r"'link_1\.marker_1\.theta_z'"):
         Sensing(spatial, [name for name in every if name != "link_1.marker_1.theta_z"], "capture")
+    with pytest.raises(InputError, match=r"balance: 'smoother'.*planar motion or a fixed base"):
+        parse_system('balance = "smoother"\n' + shipped_text("spatial-two-link"), "spatial-two-link")
 
 
 @pytest.fixture(scope="module")

@@ -21,7 +21,7 @@ from sms_online.description.schema import System
 from sms_online.errors import InputError
 
 # Top-level keys of a file and the field of `System` that each fills; numbered tables come beside them.
-PLAIN = ("name", "title", "reference", "motion", "gravity", "sample_rate", "spacecraft", "payload", "known")
+PLAIN = ("name", "title", "reference", "motion", "gravity", "sample_rate", "balance", "spacecraft", "payload", "known")
 RENAMED = {"sensor": "sensors", "source": "sources", "effect": "effects", "prior": "priors"}
 WITHOUT_NUMBERS = (*PLAIN, *RENAMED, "controller", "trajectory", "windows")
 NUMBERED = re.compile(r"(joint|motor|link)_([1-9]\d*)")

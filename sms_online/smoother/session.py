@@ -93,7 +93,7 @@ class Smoother:
             end = int(self._index[count - 1, 0])
             if not last and not (self._moved.size and self._moved[-1] >= end):
                 return
-            if count > LEAST_SPAN * self._rate:
+            if count > max(LEAST_SPAN * self._rate, FEWEST_SAMPLES):
                 self._fit(count, first_fit)
             self._forget(count)
 
