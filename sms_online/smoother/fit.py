@@ -81,7 +81,7 @@ class SpanFit:
 
     beta (n,): estimate from this span and what was known before it. rows: how many innovations. mean_square: of the
     whitened innovations. level: of the white forces that are left, 0 where the equations hold. step: of the
-    collocation, s. iterations: Gauss-Newton steps in all. trajectory: the smoothed motion.
+    collocation, s.
     """
 
     factor: Array
@@ -90,8 +90,6 @@ class SpanFit:
     mean_square: float
     level: float
     step: float
-    iterations: int
-    trajectory: Trajectory
 
 
 class SpanSmoother:
@@ -178,9 +176,7 @@ class _Search:
                 if not self.settled(level):
                     continue
             if self.mean_square <= LARGEST_MEAN_SQUARE:
-                return SpanFit(
-                    self.factor, self.beta, self.rows, self.mean_square, level, step, self.iterations, self.trajectory
-                )
+                return SpanFit(self.factor, self.beta, self.rows, self.mean_square, level, step)
         raise DivergedError(f"no motion and no parameters explain the samples, after {self.iterations} steps")
 
     def loosen(self, level: float) -> None:
