@@ -97,9 +97,9 @@ def session_bound(estimator: Estimator, record: MotionRecord) -> Array | None:
     None where there is none: no noise known or no noise at all, no motion, parameters not determined, or estimates that
     are no mechanism, with a mass matrix that is not positive definite.
     """
-    if estimator.by_smoother:
+    if estimator.smoother is not None and estimator.by_smoother:
         # The smoother's rows hold the information of all samples, linearised at its own estimate.
-        return None if estimator.system.priors else estimator.estimate().std
+        return None if estimator.smoother.prior is not None else estimator.estimate().std
     noise = None if estimator.momentum is None else estimator.momentum.sensor_noise
     estimate, motions = estimator.estimate(), record.motions
     if noise is None or noise.exact or not motions or not estimate.determined.all():

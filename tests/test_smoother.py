@@ -21,6 +21,7 @@ from sms_online.pipeline.estimator import Estimator
 from sms_online.results import results_document, standard_deviation
 from sms_online.sensor_set import sensor_set
 from sms_online.stream import Array, Block
+from sms_online.trackers.interface import Prior
 from sms_sim.plant import Plant
 from sms_sim.sensors import Sensors
 from sms_sim.simulate import Simulation, exact_states, sampled_blocks, simulate
@@ -92,6 +93,22 @@ def test_results_say_what_gave_the_numbers(first: Estimator) -> None:
     replica = Estimator(first.system, first.channels, "replica")
     snapshot.apply(snapshot.take(first), replica)
     assert results_document(replica, 1.0, [])["parameters"] == document["parameters"]
+
+
+def test_a_weighed_part_sharpens_what_hangs_on_it(simulation: Simulation, first: Estimator) -> None:
+    # All parameters of a bolted-down arm share the scale of its torques: who knows one of them knows it.
+    k = [p.name for p in first.base.parameters].index("link_1.mass_per_length")
+    value, std = np.full((2, first.base.n), np.nan)
+    value[k], std[k] = 3.0, 3e-4
+    block = recorded(simulation, 0)
+    weighed = Estimator(one_link("linear"), block.channels, "simulation")
+    weighed.set_prior(Prior(value, std))
+    weighed.push(block)
+    weighed.finish()
+    assert weighed.by_smoother
+    assert np.all(standard_deviation(weighed)[1:] < 0.5 * standard_deviation(first)[1:])
+    assert np.all(np.abs(normalised(weighed)) < 4.0)
+    assert session_bound(weighed, MotionRecord(500.0)) is None
 
 
 def test_nominal_values_play_no_part(simulation: Simulation, first: Estimator) -> None:

@@ -35,7 +35,8 @@ class Smoother:
 
     It works span by span: a span's rows of independent unit errors join those of the spans before it. channels: of the
     readings that it uses, see `sensor_set.Readings`. failures: spans that were left out and why, a sentence each.
-    spans, mean_square, level: how many it took, and of the last one what `SpanFit` says.
+    spans: how many it took. mean_square: of the last one, see `SpanFit`; level: the largest of all. prior: what it was
+    told beforehand, or None.
     """
 
     def __init__(self, model: Model, base: BaseParameters, sensing: Sensing, available: Sequence[str]) -> None:
@@ -45,7 +46,7 @@ class Smoother:
         self.failures: list[str] = []
         self.spans = 0
         self.mean_square = self.level = np.nan
-        self._prior: Prior | None = None
+        self.prior: Prior | None = None
         self._synchroniser = Synchroniser([f"n_tau_{i}" for i in range(1, joints + 1)], self._rate)
         # Of the spans so far.
         self._factor = np.zeros((base.n + 1, base.n + 1))
@@ -59,7 +60,7 @@ class Smoother:
 
     def set_prior(self, prior: Prior) -> None:
         """Weigh the samples against what is known of the base parameters beforehand; before the first sample."""
-        self._prior = prior
+        self.prior = prior
 
     @property
     def end(self) -> float:
@@ -138,7 +139,7 @@ class Smoother:
             if not moved.any():
                 raise DivergedError("the sensors tell no motion to begin with")
             beta = self._beta if self.spans else self._realisable(first_fit())
-            known = triangular_factor(prior_factor(self._prior, self._base.n), self._factor)
+            known = triangular_factor(prior_factor(self.prior, self._base.n), self._factor)
             fit = smoother.fit(span, beta, known, self._last_step if self.spans else None)
         except DivergedError as error:
             self.failures.append(f"{begin:.6g} … {end:.6g} s: {error}")
@@ -150,7 +151,7 @@ class Smoother:
         self._beta, self._last_step, self._end = fit.beta, fit.step, end
         self._rows += fit.rows
         self._rss += fit.rows * fit.mean_square
-        self.mean_square, self.level = fit.mean_square, fit.level
+        self.mean_square, self.level = fit.mean_square, float(np.fmax(self.level, fit.level))
         self.spans += 1
 
     def _realisable(self, estimate: Estimate) -> Array:
@@ -181,7 +182,7 @@ class Smoother:
     def estimate(self) -> Estimate:
         """The base parameters as the spans so far tell them, with the prior; only after the first span."""
         n = self._base.n
-        problem = triangular_factor(prior_factor(self._prior, n), self._factor)
+        problem = triangular_factor(prior_factor(self.prior, n), self._factor)
         problem[:, n] -= problem[:, :n] @ self._beta
         solution = solve(problem)
         return Estimate(
