@@ -1,12 +1,8 @@
 """Cramér–Rao bound of π: the least standard deviation that an unbiased estimator can reach with given sensors.
 
 Sensors have white noise. The measured torque is the input of the equations of motion, so its noise drives the state;
-controller and initial state are unknown. With the momentum p = ∂K/∂v as half of the state, s = [δx, δp] (attitude as a
-small inertial rotation), the balance d/dt(P π) - G π = Q, (33)-(38), is linearised about the true motion as it stands:
-
-    δv = H⁻¹ (δp - ∂Pπ/∂x δx - P δβ),    d/dt δp = ∂Gπ/∂x δx + ∂Gπ/∂v δv + G δβ + δQ,
-
-without accelerations, which a jolt makes large and a capture does not hold. In discrete time
+controller and initial state are unknown. Linearised about the true motion (`linearised`) the system is, in discrete
+time,
 
     s_{k+1} = Φ_k s_k + Γ_k δ(n τ)_k + B_k δβ,    δy_k = C_k s_k + D_k δβ + noise,
 
@@ -19,19 +15,22 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from sms_online.errors import InputError
+from sms_online.linearised import linearise
 from sms_online.model.base_parameters import BaseParameters
 from sms_online.model.dynamics import Dynamics
 from sms_online.model.model import Model
-from sms_online.model.so3 import skew
-from sms_online.pipeline.estimator import Estimator
-from sms_online.pipeline.sensitivity import derivatives
 from sms_online.sensor_set import Readings, SensorSet, session_sensors
 from sms_online.stream import Array
+from sms_online.trackers.factor import raw_triangle
+
+if TYPE_CHECKING:
+    from sms_online.pipeline.estimator import Estimator
 
 # Step of a bound, s. Planar example, grade B, 20 s: all bounds within 2 % of those at 1 ms (the second stator's inertia
 # within 10 %), at a tenth of the cost.
@@ -41,8 +40,6 @@ STEP = 0.01
 DERIVATIVES_INTERVAL = 0.08
 # Instants worked off together: enough to hide the cost of a call, little memory.
 INSTANTS_PER_CALL = 512
-# Step of the central differences of readings, rad, m, rad/s, m/s: truncation and rounding both near 1e-10 relative.
-DIFFERENCE = 1e-5
 # Initial standard deviations, rad or m, and of the momenta as of speeds in rad/s or m/s, that leave the initial state
 # free: ten thousand times what sensors of the coarsest grade resolve.
 FREE_POSITION = 10.0
@@ -103,6 +100,9 @@ def session_bound(estimator: Estimator, record: MotionRecord) -> Array | None:
     are no mechanism, with a mass matrix that is not positive definite; nor where an effect needs more than a motion
     holds.
     """
+    if estimator.smoother is not None and estimator.by_smoother:
+        # The smoother's rows hold the information of all samples, linearised at its own estimate.
+        return None if estimator.smoother.prior is not None else estimator.estimate().std
     noise = None if estimator.momentum is None else estimator.momentum.sensor_noise
     estimate, motions = estimator.estimate(), record.motions
     if noise is None or noise.exact or not motions or not estimate.determined.all() or _followed(estimator.model):
@@ -114,21 +114,6 @@ def session_bound(estimator: Estimator, record: MotionRecord) -> Array | None:
     except np.linalg.LinAlgError:
         return None
     return cramer_rao_bound(dynamics, estimator.base, motions, session_sensors(estimator.model, noise))
-
-
-@dataclass(frozen=True)
-class LinearSystem:
-    """The linearised system at B instants, m = 2 n_v states.
-
-    A (B, m, m): of ṡ = A s. E (B, m, joints + n): columns by which joint torques n τ and parameters β drive ṡ.
-    C (B, channels, m), D (B, channels, n): readings by s and by β. H (B, n_v, n_v): mass matrix.
-    """
-
-    A: Array
-    E: Array
-    C: Array
-    D: Array
-    H: Array
 
 
 def cramer_rao_bound(dynamics: Dynamics, base: BaseParameters, motions: Sequence[Motion], sensors: SensorSet) -> Array:
@@ -172,57 +157,6 @@ def _followed(model: Model) -> list[str]:
 
 def _middle(samples: Array) -> Array:
     return np.asarray(0.5 * (samples[1:] + samples[:-1]))
-
-
-def linearise(
-    dynamics: Dynamics, base: BaseParameters, readings: Readings, x: Array, v: Array, every: int = 1
-) -> LinearSystem:
-    """The balance and the readings, linearised at x (B, n_x), v (B, n_v).
-
-    every: derivatives by displacements and of readings are told at one instant in so many, and interpolated between.
-    """
-    model, layout = dynamics.model, dynamics.model.layout
-    (B, n_v), joints = v.shape, len(layout.q)
-    nodes = np.unique(np.append(np.arange(0, B, every), B - 1))
-    weights = np.stack([np.interp(np.arange(B), nodes, unit) for unit in np.eye(nodes.size)], axis=1)
-
-    def interpolated(told: Array) -> Array:
-        return np.asarray(np.tensordot(weights, told, 1))
-
-    P_x, G_v, G_x = np.split(interpolated(derivatives(dynamics, x[nodes], v[nodes])), 3, axis=2)
-    C_x, C_v = (interpolated(part) for part in reading_derivatives(readings, model, x[nodes], v[nodes]))
-    H = dynamics.mass_matrix(x)
-    P, G = (base.columns(part) for part in model.momentum_columns(x, v))
-    # δv by δx, δp and δβ.
-    v_p = np.linalg.inv(H)
-    v_x, v_beta = -v_p @ P_x, -v_p @ P
-    A = np.concatenate(
-        (np.concatenate((v_x, v_p), axis=2), np.concatenate((G_x + G_v @ v_x, G_v @ v_p), axis=2)), axis=1
-    )
-    if layout.free and not layout.planar:
-        # A small inertial rotation φ of the attitude obeys φ̇ = δω + ω × φ.
-        A[:, 3:6, 3:6] += skew(v[:, 3:6])
-    E = np.zeros((B, 2 * n_v, joints + base.n))
-    E[:, n_v:, :joints] = model.generalized_force(np.eye(joints)).T
-    E[:, :n_v, joints:], E[:, n_v:, joints:] = v_beta, G + G_v @ v_beta
-    return LinearSystem(A, E, np.concatenate((C_x + C_v @ v_x, C_v @ v_p), axis=2), C_v @ v_beta, H)
-
-
-def reading_derivatives(readings: Readings, model: Model, x: Array, v: Array) -> tuple[Array, Array]:
-    """Derivatives (B, channels, n_v) of readings by displacements in the order of the speeds, and by speeds."""
-    B, n_v = v.shape
-    # Every instant n_v times, moved along one coordinate or rate each.
-    x_n, v_n = np.repeat(x, n_v, axis=0), np.repeat(v, n_v, axis=0)
-    dv = DIFFERENCE * np.tile(np.eye(n_v), (B, 1))
-    dx = model.position_rate(x_n, dv)
-
-    def difference(plus: Array, minus: Array) -> Array:
-        return np.asarray(((plus - minus) / (2.0 * DIFFERENCE)).reshape(B, n_v, -1).transpose(0, 2, 1))
-
-    by_x = difference(readings(x_n + dx, v_n), readings(x_n - dx, v_n))
-    if not readings.reads_rates:
-        return by_x, np.zeros_like(by_x)
-    return by_x, difference(readings(x_n, v_n + dv), readings(x_n, v_n - dv))
 
 
 def discretise(A: Array, E: Array, step: float) -> tuple[Array, Array]:
@@ -279,13 +213,13 @@ class Information:
         rows = [self._root]
         for C_k, D_k, Phi_k, Gamma_k, B_k in zip(C, D, Phi, Gamma, B, strict=True):
             prior[n_y:, :n_y], prior[n_y:, n_y:] = self._L @ C_k.T, self._L
-            posterior = _triangle(prior)  # [[R_e^½, R_e^-½ C P], [·, root of P after the sample]]
+            posterior = raw_triangle(prior)  # [[R_e^½, R_e^-½ C P], [·, root of P after the sample]]
             S = np.linalg.solve(np.triu(posterior[:n_y, :n_y]).T, C_k @ self._M + D_k)
             rows.append(S)
             self._M = Phi_k @ (self._M - posterior[:n_y, n_y:].T @ S) + B_k
             L = posterior[n_y:, n_y:] * upper
-            self._L = _triangle(np.concatenate((L @ Phi_k.T, Gamma_k.T)))[:m] * upper
-        self._root = np.triu(_triangle(np.concatenate(rows))[: self._n])
+            self._L = raw_triangle(np.concatenate((L @ Phi_k.T, Gamma_k.T)))[:m] * upper
+        self._root = np.triu(raw_triangle(np.concatenate(rows))[: self._n])
 
     def standard_deviations(self) -> Array:
         """Root of the diagonal of the information's inverse (n,); inf where it is singular."""
@@ -300,8 +234,3 @@ class Information:
         lost = (np.abs(V[~determined]) > UNDETERMINED_SHARE).any(axis=0)
         out[seen] = np.where(lost, np.inf, np.sqrt(variance) / norms[seen])
         return out
-
-
-def _triangle(rows: Array) -> Array:
-    """R with Rᵀ R = rowsᵀ rows in its upper triangle; below it there is what LAPACK leaves there."""
-    return np.asarray(np.linalg.qr(rows, mode="raw")[0].T, dtype=np.float64)

@@ -33,6 +33,7 @@ def standard_deviation(estimator: Estimator, estimate: Estimate | None = None) -
     """1σ of each parameter (n,) as known now, inf where the data determine nothing.
 
     estimate: the estimator's own of now, where it is at hand: to make it costs milliseconds.
+    The smoother's covariance follows from the noise of sensors and torques, and of forces where it had to allow some.
     Rows of the momentum balance have a predicted variance. While the residual agrees with it, the estimate's covariance
     follows from it; where rows leave more, the model lacks something and the residual decides, as it does for rows of
     the energy balance.
@@ -47,7 +48,7 @@ def standard_deviation(estimator: Estimator, estimate: Estimate | None = None) -
     if estimate.dof <= 0.0:
         return std
     known = estimate.determined
-    if estimate.scale is not None:
+    if estimate.scale is not None or estimator.by_smoother:
         std[known] = estimate.std[known]
         return std
     row_variance = estimate.rss / estimate.dof
@@ -95,7 +96,8 @@ def residuals(estimator: Estimator, beta: Array) -> dict[str, dict[str, float | 
     layout, momentum = estimator.model.layout, estimator.momentum
 
     def whitened(rows: list[int]) -> float | None:
-        return momentum.whitened(rows, beta) if momentum is not None and rows else None
+        # Where the smoother knows better, rows of the balance see shapes that are not the links'.
+        return momentum.whitened(rows, beta) if momentum is not None and rows and not estimator.by_smoother else None
 
     out: dict[str, dict[str, float | None]] = {"energy": {"relative": None, "whitened": None}}
     for i, joint in enumerate(estimator.joint_residuals, start=1):
@@ -127,6 +129,31 @@ def _pull_warning(estimator: Estimator) -> list[str]:
     if not names:
         return []
     return [f"sensor noise in the columns pulls {', '.join(names)} by more than the error bar"]
+
+
+def method(estimator: Estimator) -> str:
+    """What the estimate comes from: `smoother`, or the `momentum` or `energy` balance."""
+    if estimator.by_smoother:
+        return "smoother"
+    return "momentum" if estimator.by_momentum else "energy"
+
+
+def _smoother_warnings(estimator: Estimator) -> list[str]:
+    """What the smoother replaced, and where it failed."""
+    smoother = estimator.smoother
+    if smoother is None:
+        return []
+    out = [f"the smoother left out {failure}" for failure in smoother.failures]
+    missing = ", ".join(estimator.sensing.missing)
+    if estimator.by_smoother:
+        if missing:
+            out.append(f"not measured, and told by the equations of motion: {missing}")
+        if smoother.level > 0.0:
+            share = f"{100.0 * smoother.level:.2g} % of the usual ones"
+            out.append(f"samples do not agree with the equations of motion: unknown forces of {share} are allowed for")
+    elif missing:
+        out.append(f"links are taken as bent statically, for {missing} are not measured: estimates are off by percents")
+    return out
 
 
 def projected(estimator: Estimator, estimate: Estimate, std: Array) -> Projection | None:
@@ -211,6 +238,7 @@ def results_document(
         "system": describe(estimator.system),
         "samples": estimator.samples,
         "duration_s": estimator.duration,
+        "method": method(estimator),
         "parameters": parameters,
         "events": [event_document(event) for event in estimator.events],
         "residual": residual,
@@ -225,5 +253,6 @@ def results_document(
             *doubts(parameters, residual),
             *_pull_warning(estimator),
             *_projection_warning(projection),
+            *_smoother_warnings(estimator),
         ],
     }

@@ -63,8 +63,8 @@ def test_replay_prints_a_table_and_writes_the_document(bench: Path, capsys: pyte
     found = document(bench / "done")
     assert sorted(path.name for path in (bench / "done").iterdir()) == ["report.html", "results.json"]
     assert list(found) == [
-        "schema", "system", "samples", "duration_s", "parameters", "events", "residual", "physical", "condition_number",
-        "throughput_samples_per_s", "lost_samples", "warnings",
+        "schema", "system", "samples", "duration_s", "method", "parameters", "events", "residual", "physical",
+        "condition_number", "throughput_samples_per_s", "lost_samples", "warnings",
     ]  # fmt: skip
     assert found["schema"] == "sms-online/results/1"
     assert found["samples"] == 1200

@@ -50,4 +50,4 @@ def load_checkpoint(path: Path, estimator: Estimator) -> None:
 
 
 def _identity(estimator: Estimator) -> str:
-    return json.dumps({"system": describe(estimator.system), "channels": estimator.sensing.channels}, sort_keys=True)
+    return json.dumps({"system": describe(estimator.system), "channels": estimator.channels}, sort_keys=True)

@@ -6,10 +6,11 @@ from functools import cached_property
 
 import numpy as np
 
-from sms_online.description.channels import drive_channel
+from sms_online.description.channels import drive_channel, sensed_channels
 from sms_online.description.schema import System
 from sms_online.effects.base import Inputs
 from sms_online.model.model import Model
+from sms_online.sensor_set import Readings, readable_channels
 from sms_online.stream import Array
 from sms_sim.controller import JointPD
 from sms_sim.references import FourierReference
@@ -90,6 +91,23 @@ class Plant:
             for name in kinematics.marker_names
         ]
         return (*(drive_channel(self.system, i) for i in joints), *model.layout.position_names[:rigid], *markers)
+
+    @cached_property
+    def rate_channels(self) -> tuple[str, ...]:
+        """Rates of the base that some described sensor reads: v_S, ω_0 and a gyro's."""
+        system = self.system
+        described = {channel for sensor in system.sensors for channel in sensed_channels(system, sensor)}
+        rates = readable_channels(self.model)[self.model.layout.n_x :]
+        return tuple(channel for channel in rates if channel in described)
+
+    @property
+    def recordable(self) -> tuple[str, ...]:
+        """Channels that a recording may hold: those of the exact motion, and the described rates."""
+        return (*self.channels, *self.rate_channels)
+
+    def rate_values(self, x: Array, v: Array) -> Array:
+        """Exact values (B, rate_channels) at positions x (B, n_x) and speeds v (B, n_v)."""
+        return Readings(self.model, self.rate_channels)(x, v)
 
     def channel_values(self, torque: Array, x: Array) -> Array:
         """Exact values (B, channels) at torques after the gear n τ (B, joints) and positions x (B, n_x)."""

@@ -160,15 +160,15 @@ def exact_states(simulation: Simulation, t: Array) -> ExactStates:
 
 
 def sampled_blocks(simulation: Simulation, grade: str | None = None, seed: int = 0) -> Iterator[Block]:
-    """What the sensors record at the system's rate, in blocks: drives and position channels, no rates.
+    """What the sensors record at the system's rate, in blocks: drives, position channels, and rates that are described.
 
     grade: a noise grade (`sensors.GRADES`) in place of the described sensors. seed: of the noise. Raises InputError on
     an unknown grade.
     """
     plant, duration = simulation.plant, simulation.duration
-    sensors = Sensors(plant.system, plant.channels, grade, seed)
+    sensors = Sensors(plant.system, plant.recordable, grade, seed)
     rate = plant.system.sample_rate
-    columns = [plant.channels.index(channel) for channel in sensors.channels]
+    columns = [plant.recordable.index(channel) for channel in sensors.channels]
     # Half a sample of slack: duration times rate may fall short of a whole number by rounding.
     samples = int(duration * rate + 0.5) + 1
 
@@ -180,7 +180,8 @@ def sampled_blocks(simulation: Simulation, grade: str | None = None, seed: int =
         inside = np.clip(t, 0.0, duration)
         y = simulation.solution(inside)
         torque = np.where(t[:, None] < 0.0, 0.0, plant.torque(inside, y))
-        return plant.channel_values(torque, plant.split(y)[0])[:, columns]
+        x, v = plant.split(y)
+        return np.concatenate((plant.channel_values(torque, x), plant.rate_values(x, v)), axis=1)[:, columns]
 
     for first in range(0, samples, BLOCK_SAMPLES):
         end = min(first + BLOCK_SAMPLES, samples)

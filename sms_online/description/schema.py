@@ -294,6 +294,7 @@ class System(Record):
     """A whole testbed. No spacecraft means a fixed base. joints, motors, links are in order from the base outwards.
 
     balance: which rows are fitted; `both` is the momentum balance, and the energy balance until its weights are known.
+    `smoother` is the smoother that knows the dynamics, which links with too few sensors get unless it says `energy`.
     """
 
     name: str
@@ -315,4 +316,4 @@ class System(Record):
     controller: Controller | None = None
     trajectory: Trajectory | None = None
     windows: Windows = Windows()
-    balance: Literal["both", "energy", "momentum"] = "both"
+    balance: Literal["both", "energy", "momentum", "smoother"] = "both"

@@ -29,8 +29,8 @@ from sms_online.trackers.interface import Prior
 
 # Share of a session that coefficients are fitted to where no other capture is held out; the rest checks them.
 FITTED = 2.0 / 3.0
-# A verdict names effects that take away all but this share of what is beyond noise: a wrong one, 10° from the right one,
-# leaves sin² 10°.
+# A verdict names effects that take away all but this share of what is beyond noise: a wrong one that is 10° from the
+# right one leaves sin² 10°.
 LARGEST_SHARE_LEFT = 0.03
 # Times that the constants of channels' effects are improved, each with samples corrected by those found before.
 CORRECTIONS = 3

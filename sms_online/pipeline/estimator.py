@@ -3,6 +3,8 @@
 The momentum balance gives the estimate as soon as its weights are known. Until then, and where a system asks for
 nothing else, it comes from the energy balance. The two are never added up: both are functions of the same samples, so
 their errors are not independent, and the momentum rows hold what the energy rows hold (power is force times speed).
+Where a link has fewer sensors than coordinates the energy balance sees a static shape, and is the first fit of a
+smoother that knows the dynamics; it gives the estimate as soon as its first span is through.
 """
 
 from __future__ import annotations
@@ -28,6 +30,7 @@ from sms_online.pipeline.momentum import Momentum
 from sms_online.pipeline.rates import RateSamples, RatesStage
 from sms_online.pipeline.sensing import AttitudeContinuity, Sensing
 from sms_online.pipeline.synchronise import GridSamples, SyncCounters, Synchroniser
+from sms_online.smoother.session import Smoother
 from sms_online.stream import Array, Block
 from sms_online.trackers.interface import Estimate, Prior, Rows, Tracker
 from sms_online.trackers.square_root import RecursiveLeastSquares
@@ -93,7 +96,12 @@ class Estimator:
         self._newest_energy_row = -np.inf
         self.on_motion: MotionSink | None = None
         self.on_samples: SampleSink | None = None
-        self._columns = [channels.index(name) for name in self.sensing.channels]
+        self.smoother: Smoother | None = None
+        if system.balance == "smoother" or (self.sensing.missing and system.balance != "energy"):
+            self.smoother = Smoother(model, base, self.sensing, channels)
+        self.channels = tuple(dict.fromkeys((*self.sensing.channels, *self._smoothed_channels)))
+        self._columns = [channels.index(name) for name in self.channels]
+        self._smoothed_columns = [self.channels.index(name) for name in self._smoothed_channels]
         self._attitude = AttitudeContinuity()
         self._synchroniser = Synchroniser(self.sensing.channels, system.sample_rate)
         self._conditioning = Conditioning(system, self.sensing.channels)
@@ -102,7 +110,9 @@ class Estimator:
         self._rates = RatesStage(system.sample_rate, range(layout.n_x), self.sensing.noise)
         self._followed = FollowedStates(model, system.sample_rate, len(self.sensing.channels))
         self._energy = EnergyBalance(model, base, system.sample_rate)
-        self.momentum = None if system.balance == "energy" else Momentum(model, base, self.sensing)
+        # A balance of forces does not hold in a shape that is not the link's; energies bear it best.
+        by_energy = system.balance == "energy" or self.sensing.missing
+        self.momentum = None if by_energy else Momentum(model, base, self.sensing)
         self.energy_tracker: Tracker = RecursiveLeastSquares(base.n)
         self._begin_joints()
         self._block = ENERGY_BLOCK if self.momentum is None else BLOCK
@@ -116,6 +126,17 @@ class Estimator:
         self.energy_tracker = RecursiveLeastSquares(self.base.n, prior=prior, scaled_by_residual=True)
         if self.momentum is not None:
             self.momentum.set_prior(prior)
+        if self.smoother is not None:
+            self.smoother.set_prior(prior)
+
+    @property
+    def _smoothed_channels(self) -> tuple[str, ...]:
+        return () if self.smoother is None else self.smoother.channels
+
+    @property
+    def unused(self) -> tuple[str, ...]:
+        """Channels of the source that play no part."""
+        return tuple(name for name in self.sensing.unused if name not in self.channels)
 
     @property
     def model(self) -> Model:
@@ -141,14 +162,23 @@ class Estimator:
     @property
     def newest_row(self) -> float:
         """Time of the newest sample behind the estimate, s; -inf where there is none."""
+        if self.smoother is not None and self.by_smoother:
+            return self.smoother.end
         if self.momentum is not None and self.by_momentum:
             return self.momentum.newest_row
         return self._newest_energy_row
 
     @property
+    def by_smoother(self) -> bool:
+        """Whether the estimate comes from the smoother, which holds as long as nothing changes."""
+        return self.smoother is not None and self.smoother.spans > 0 and not self.events
+
+    @property
     def by_momentum(self) -> bool:
         """Whether the estimate comes from the momentum balance."""
-        return self.momentum is not None and (self.momentum.started or self.system.balance == "momentum")
+        if self.momentum is None or self.by_smoother:
+            return False
+        return self.momentum.started or self.system.balance == "momentum"
 
     @property
     def misfit(self) -> bool:
@@ -206,13 +236,21 @@ class Estimator:
             self.momentum.finish(self.periods)
             if len(self.events) > events:
                 self._begin_joints()
+        if self.smoother is not None:
+            self.smoother.work(self._balanced, last=True)
 
     def _synchronise(self, t: Array, values: Array) -> None:
-        block = self._attitude.restore(Block(t, self.sensing.channels, values))
+        if self.smoother is not None:
+            torque = self.sensing.joint_torque(values[:, : len(self.sensing.channels)])
+            self.smoother.push(t, torque, values[:, self._smoothed_columns])
+        block = Block(t, self.sensing.channels, values[:, : len(self.sensing.channels)])
+        block = self._attitude.restore(block)
         if self.momentum is not None:
             self.momentum.observe(block.t, block.values)
         for piece in self._synchroniser.push(block):
             self._condition(piece)
+        if self.smoother is not None:
+            self.smoother.work(self._balanced)
 
     def _condition(self, piece: GridSamples) -> None:
         if self.on_samples is not None:
@@ -243,6 +281,8 @@ class Estimator:
         n_x = self.model.layout.n_x
         x, torque = rates.values[:, :n_x], rates.values[:, n_x:]
         v = self.model.layout.speeds(x, rates.rates[:, :n_x])
+        if self.smoother is not None:
+            self.smoother.move(rates.index, x, v)
         if self.on_motion is not None:
             self.on_motion(rates.index, rates.segment, x, v)
         signals = np.concatenate((torque, self._followed.push(rates, x, v)), axis=1)
@@ -264,6 +304,12 @@ class Estimator:
 
     def estimate(self) -> Estimate:
         """The base parameters as they are known now."""
+        if self.smoother is not None and self.by_smoother:
+            return self.smoother.estimate()
+        return self._balanced()
+
+    def _balanced(self) -> Estimate:
+        """What the balances tell of the base parameters."""
         if self.momentum is not None and self.by_momentum:
             return self.momentum.estimate()
         return self.energy_tracker.estimate()
@@ -292,6 +338,7 @@ class Estimator:
             "joints": dict(self._joints.state()),
             "tracker": dict(self.energy_tracker.state()),
             **({} if self.momentum is None else self.momentum.state()),
+            **({} if self.smoother is None else self.smoother.state()),
         }
 
     def restore(self, state: SessionState) -> None:
@@ -300,6 +347,8 @@ class Estimator:
         if self.momentum is not None:
             self.momentum.restore(state)
             self._begin_joints()
+        if self.smoother is not None:
+            self.smoother.restore(state)
         self.samples, self.duration = int(session["samples"]), float(session["duration"])
         self._first_time, self._segment = float(session["first_time"]), int(session["segment"])
         self._attitude.last = np.array(session["attitude"])

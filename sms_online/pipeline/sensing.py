@@ -7,19 +7,34 @@ from collections.abc import Sequence
 import numpy as np
 
 from sms_online.description.channels import sensed_channels
+from sms_online.description.schema import System
 from sms_online.errors import InputError
 from sms_online.model.beam import LinearLink
 from sms_online.model.model import Model
+from sms_online.model.static_shape import SensedShape
 from sms_online.stream import Array, Block
 
 EULER_PARAMETERS = ("eps_x", "eps_y", "eps_z", "eta")
+
+
+def stated_noise(system: System, channels: Sequence[str]) -> Array:
+    """White noise that a description states of channels, 1σ per sample in their own unit (channels,); else NaN."""
+    stated = np.full(len(channels), np.nan)
+    for sensor in system.sensors:
+        for name in sensed_channels(system, sensor):
+            if name in channels and sensor.noise > 0.0:
+                # Rounding to a resolution r adds r²/12.
+                stated[channels.index(name)] = np.hypot(sensor.noise, sensor.resolution / np.sqrt(12.0))
+    return stated
 
 
 class Sensing:
     """Which of a source's channels give each coordinate and torque of a model.
 
     channels: those it takes, in an order of its own. torque_columns: the torques' among them, joint by joint. unused:
-    the source's others. Raises InputError, naming the source, when a channel that the model needs is not there.
+    the source's others. A flexible link needs one marker at least; where it has fewer readings than coordinates its
+    shape is the static one, and `missing` names what is not read. Not so on a spatial free base, where every marker is
+    needed. Raises InputError, naming the source, when a channel that the model needs is not there.
     """
 
     def __init__(self, model: Model, available: Sequence[str], source: str) -> None:
@@ -43,12 +58,20 @@ class Sensing:
             for i in joints
         ]
         self._theta_m = [need(f"theta_m_{i}") for i in joints if layout.q[i - 1] != layout.theta_m[i - 1]]
-        self._markers = [
-            [need(f"link_{i}.{name}") for name in kinematics.marker_names]
-            for i, kinematics in enumerate(model.chain.flexible, start=1)
-            if kinematics is not None
-        ]
-        self._flexible = [kinematics for kinematics in model.chain.flexible if kinematics is not None]
+        # Markers that are not there leave some of a link's coordinates to the smoother, which needs a vector of them.
+        partial = layout.planar or not layout.free
+        self._links: dict[int, tuple[SensedShape, list[int]]] = {}
+        missing = []
+        for i, kinematics in enumerate(model.chain.flexible, start=1):
+            if kinematics is None:
+                continue
+            names = [f"link_{i}.{name}" for name in kinematics.marker_names]
+            read = [k for k, name in enumerate(names) if name in available]
+            if not partial or not read:
+                read = list(range(len(names)))
+            self._links[i - 1] = SensedShape(kinematics, read), [need(names[k]) for k in read]
+            missing += [name for k, name in enumerate(names) if k not in read]
+        self.missing = tuple(missing)
         self.torque_columns = [need(f"tau_{i}", f"force_{i}") for i in joints]
         # tau_i is measured at the motor shaft, before the gear; force_i acts on the joint.
         self._ratio = np.array(
@@ -63,32 +86,32 @@ class Sensing:
     @property
     def stated_noise(self) -> Array:
         """Stated white noise of each channel (channels,), 1σ per sample in its own unit; NaN where none is stated."""
-        stated = np.full(len(self.channels), np.nan)
-        for sensor in self.model.system.sensors:
-            for name in sensed_channels(self.model.system, sensor):
-                if name in self.channels and sensor.noise > 0.0:
-                    # Rounding to a resolution r adds r²/12.
-                    stated[self.channels.index(name)] = np.hypot(sensor.noise, sensor.resolution / np.sqrt(12.0))
-        return stated
+        return stated_noise(self.model.system, self.channels)
 
     @property
     def noise(self) -> Array:
         """Stated white noise, 1σ per sample, of positions and joint torques (n_x + joints,); NaN where none is stated.
 
-        Strain coefficients of exact links mix several markers, so nothing is stated of them.
+        Strain coefficients of exact links mix several markers, and so do static shapes: nothing is stated of them.
         """
         stated = self.stated_noise
-        markers = [
-            stated[columns] if isinstance(kinematics, LinearLink) else np.full(kinematics.n_f, np.nan)
-            for kinematics, columns in zip(self._flexible, self._markers, strict=True)
-        ]
+        markers = []
+        for i, (shape, columns) in self._links.items():
+            kinematics = self.model.chain.flexible[i]
+            assert kinematics is not None
+            own = isinstance(kinematics, LinearLink) and shape.complete
+            markers.append(stated[columns] if own else np.full(kinematics.n_f, np.nan))
         joints = stated[self.torque_columns] * self._ratio
         return np.concatenate((stated[self._base], stated[self._q], stated[self._theta_m], *markers, joints))
 
     @property
     def position_columns(self) -> list[int]:
-        """Channels of the position sensors (n_x,), in the order of the coordinates that they stand for."""
-        return [*self._base, *self._q, *self._theta_m, *(column for columns in self._markers for column in columns)]
+        """Channels of the position sensors, in the order of the coordinates that they stand for, where none is missing.
+
+        There are n_x then, and `displacements` and `coordinate_noise` hold.
+        """
+        markers = (column for _, columns in self._links.values() for column in columns)
+        return [*self._base, *self._q, *self._theta_m, *markers]
 
     def displacements(self, x: Array) -> Array:
         """Displacements (K, n_v, n_x) along the speeds, at x (K, n_x), for one more unit of each sensor's reading."""
@@ -119,8 +142,8 @@ class Sensing:
     def coordinates(self, values: Array) -> Array:
         """Positions x (B, n_x) of samples (B, channels)."""
         parts = [values[:, self._base], values[:, self._q], values[:, self._theta_m]]
-        for kinematics, columns in zip(self._flexible, self._markers, strict=True):
-            parts.append(kinematics.coordinates(values[:, columns]))
+        for shape, columns in self._links.values():
+            parts.append(shape.coordinates(values[:, columns]))
         return np.concatenate(parts, axis=1)
 
     def motion(self, values: Array) -> Array:

@@ -36,6 +36,11 @@ def triangular_factor(*stacked: Array) -> Array:
     return np.asarray(np.linalg.qr(rows, mode="r"))
 
 
+def raw_triangle(rows: Array) -> Array:
+    """R with Rᵀ R = rowsᵀ rows in its upper triangle; below it there is what LAPACK leaves there."""
+    return np.asarray(np.linalg.qr(rows, mode="raw")[0].T, dtype=np.float64)
+
+
 def prior_factor(prior: Prior | None, n: int) -> Array:
     """The known priors as information rows (k, n + 1): π_j / std_j = value_j / std_j."""
     if prior is None:

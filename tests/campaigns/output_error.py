@@ -13,7 +13,8 @@ from functools import cached_property
 import numpy as np
 from scipy.optimize import least_squares
 
-from sms_online.bound import discretise, linearise
+from sms_online.bound import discretise
+from sms_online.linearised import linearise
 from sms_online.model.base_parameters import BaseParameters
 from sms_online.model.model import Model
 from sms_online.sensor_set import Readings

@@ -19,6 +19,11 @@ LEAST_DIGITS, MOST_DIGITS = 2, 7
 # Powers of ten below this one are written as such.
 SMALLEST_PLAIN = -4
 NOT_DETERMINED = "not determined"
+METHODS = {
+    "energy": "energy balance",
+    "momentum": "momentum balance",
+    "smoother": "smoother that knows the dynamics",
+}
 
 Document = dict[str, Any]
 
@@ -97,6 +102,7 @@ def trust_lines(document: Document) -> list[str]:
             lines.append(f"residual {rows}: {residual['relative']:.3g} of the measured torque or force")
         if residual["whitened"] is not None:
             lines.append(f"residual {rows}: {residual['whitened']:.3g} of its predicted deviation")
+    lines.append(f"method: {METHODS[document['method']]}")
     condition = document["condition_number"]
     full_rank = condition is not None and math.isfinite(condition)
     lines.append(f"condition number: {condition:.3g}" if full_rank else "condition number: infinite")

@@ -123,8 +123,8 @@ def document_of(
     if counters.interpolated_cells:
         noticed.append(f"{counters.interpolated_cells} cells interpolated")
     noticed += unstated_latency(estimator)
-    if estimator.sensing.unused:
-        noticed.append(f"channels not used: {', '.join(estimator.sensing.unused)}")
+    if estimator.unused:
+        noticed.append(f"channels not used: {', '.join(estimator.unused)}")
     names = [parameter.name for parameter in estimator.base.physical]
     if truth is not None and not truth.keys() >= set(names):
         missing = next(name for name in names if name not in truth)

@@ -26,7 +26,7 @@ def run(args: argparse.Namespace) -> int:
     for text in args.effect:
         system = system.model_copy(update={"effects": (*system.effects, parse_effect(text, system))})
     capture: Path = args.capture
-    channels = Sensors(system, Plant(system).channels, args.grade, args.seed).channels
+    channels = Sensors(system, Plant(system).recordable, args.grade, args.seed).channels
     # The writer comes first: a name that cannot be written is known before a long simulation.
     with CaptureWriter(capture, channels) as writer:
         try:

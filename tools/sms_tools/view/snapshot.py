@@ -48,6 +48,7 @@ class Snapshot:
     shared_errors: dict[str, Any]
     joint_residuals: list[SquaredResidual]
     momentum: MomentumSnapshot | None
+    smoother: dict[str, Any] | None
 
 
 def take(estimator: Estimator) -> Snapshot:
@@ -61,6 +62,7 @@ def take(estimator: Estimator) -> Snapshot:
         shared_errors=estimator.shared_errors.state(),
         joint_residuals=[SquaredResidual(r.gram.copy(), r.signal) for r in estimator.joint_residuals],
         momentum=None if estimator.momentum is None else _take_momentum(estimator.momentum),
+        smoother=None if estimator.smoother is None else estimator.smoother.told(),
     )
 
 
@@ -88,6 +90,8 @@ def apply(snapshot: Snapshot, replica: Estimator) -> None:
     replica.energy_tracker.restore(snapshot.energy_tracker)
     replica.shared_errors.restore(snapshot.shared_errors)
     replica.joint_residuals = snapshot.joint_residuals
+    if snapshot.smoother is not None and replica.smoother is not None:
+        replica.smoother.learn(snapshot.smoother)
     known, momentum = snapshot.momentum, replica.momentum
     if known is not None and momentum is not None:
         momentum.follow(known.events, known.added)

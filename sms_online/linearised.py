@@ -1,0 +1,92 @@
+"""Equations of motion and readings of the sensors, linearised along a motion.
+
+With the momentum p = ∂K/∂v as half of the state, s = [δx, δp] (attitude as a small inertial rotation), the balance
+d/dt(P π) - G π = Q, (33)-(38), is linearised about a motion as it stands:
+
+    δv = H⁻¹ (δp - ∂Pπ/∂x δx - P δβ),    d/dt δp = ∂Gπ/∂x δx + ∂Gπ/∂v δv + G δβ + δQ,
+
+without accelerations, which a jolt makes large and a capture does not hold.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from sms_online.model.base_parameters import BaseParameters
+from sms_online.model.dynamics import Dynamics
+from sms_online.model.model import Model
+from sms_online.model.so3 import skew
+from sms_online.pipeline.sensitivity import derivatives
+from sms_online.sensor_set import Readings
+from sms_online.stream import Array
+
+# Step of the central differences of readings, rad, m, rad/s, m/s: truncation and rounding both near 1e-10 relative.
+DIFFERENCE = 1e-5
+
+
+@dataclass(frozen=True)
+class LinearSystem:
+    """The linearised system at B instants, m = 2 n_v states.
+
+    A (B, m, m): of ṡ = A s. E (B, m, joints + n): columns by which joint torques n τ and parameters β drive ṡ.
+    C (B, channels, m), D (B, channels, n): readings by s and by β. H (B, n_v, n_v): mass matrix.
+    """
+
+    A: Array
+    E: Array
+    C: Array
+    D: Array
+    H: Array
+
+
+def linearise(
+    dynamics: Dynamics, base: BaseParameters, readings: Readings, x: Array, v: Array, every: int = 1
+) -> LinearSystem:
+    """The balance and the readings, linearised at x (B, n_x), v (B, n_v).
+
+    every: derivatives by displacements and of readings are told at one instant in so many, and interpolated between.
+    """
+    model, layout = dynamics.model, dynamics.model.layout
+    (B, n_v), joints = v.shape, len(layout.q)
+    nodes = np.unique(np.append(np.arange(0, B, every), B - 1))
+    weights = np.stack([np.interp(np.arange(B), nodes, unit) for unit in np.eye(nodes.size)], axis=1)
+
+    def interpolated(told: Array) -> Array:
+        return np.asarray(np.tensordot(weights, told, 1))
+
+    P_x, G_v, G_x = np.split(interpolated(derivatives(dynamics, x[nodes], v[nodes])), 3, axis=2)
+    C_x, C_v = (interpolated(part) for part in reading_derivatives(readings, model, x[nodes], v[nodes]))
+    H = dynamics.mass_matrix(x)
+    P, G = (base.columns(part) for part in model.momentum_columns(x, v))
+    # δv by δx, δp and δβ.
+    v_p = np.linalg.inv(H)
+    v_x, v_beta = -v_p @ P_x, -v_p @ P
+    A = np.concatenate(
+        (np.concatenate((v_x, v_p), axis=2), np.concatenate((G_x + G_v @ v_x, G_v @ v_p), axis=2)), axis=1
+    )
+    if layout.free and not layout.planar:
+        # A small inertial rotation φ of the attitude obeys φ̇ = δω + ω × φ.
+        A[:, 3:6, 3:6] += skew(v[:, 3:6])
+    E = np.zeros((B, 2 * n_v, joints + base.n))
+    E[:, n_v:, :joints] = model.generalized_force(np.eye(joints)).T
+    E[:, :n_v, joints:], E[:, n_v:, joints:] = v_beta, G + G_v @ v_beta
+    return LinearSystem(A, E, np.concatenate((C_x + C_v @ v_x, C_v @ v_p), axis=2), C_v @ v_beta, H)
+
+
+def reading_derivatives(readings: Readings, model: Model, x: Array, v: Array) -> tuple[Array, Array]:
+    """Derivatives (B, channels, n_v) of readings by displacements in the order of the speeds, and by speeds."""
+    B, n_v = v.shape
+    # Every instant n_v times, moved along one coordinate or rate each.
+    x_n, v_n = np.repeat(x, n_v, axis=0), np.repeat(v, n_v, axis=0)
+    dv = DIFFERENCE * np.tile(np.eye(n_v), (B, 1))
+    dx = model.position_rate(x_n, dv)
+
+    def difference(plus: Array, minus: Array) -> Array:
+        return np.asarray(((plus - minus) / (2.0 * DIFFERENCE)).reshape(B, n_v, -1).transpose(0, 2, 1))
+
+    by_x = difference(readings(x_n + dx, v_n), readings(x_n - dx, v_n))
+    if not readings.reads_rates:
+        return by_x, np.zeros_like(by_x)
+    return by_x, difference(readings(x_n, v_n + dv), readings(x_n, v_n - dv))

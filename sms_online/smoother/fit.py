@@ -1,0 +1,302 @@
+"""Parameters and states of a span together: Gauss-Newton on all samples at once, with the equations as constraints.
+
+Only the torques are uncertain in the end. The way there leads over equations that hold roughly: white forces of a level
+that falls step by step act on every coordinate, so that at first the motion follows the samples and the parameters
+follow the motion, as in a fit of the balance; a start that is tens of percent off then suffices. Where the samples
+refute exact equations, the least level stays that they agree with.
+Source: Ramsay, Hooker, Campbell, Cao, J. Royal Statistical Society B 69 (2007) 741, for the path from loose to tight
+equations; Bell, SIAM J. Optimization 4 (1994) 626, for the iterated smoother as Gauss-Newton.
+"""
+
+from __future__ import annotations
+
+from contextlib import suppress
+from dataclasses import dataclass
+
+import numpy as np
+
+from sms_online.linearised import linearise
+from sms_online.model.base_parameters import BaseParameters
+from sms_online.model.dynamics import Dynamics
+from sms_online.model.model import Model
+from sms_online.physical import PhysicalSet
+from sms_online.sensor_set import Readings
+from sms_online.smoother.collocation import Trajectory, defects, momenta_and_forces, transitions
+from sms_online.smoother.filter import FixedIntervalSmoother
+from sms_online.smoother.span import Innovations, Span, interpolated
+from sms_online.stream import Array
+from sms_online.trackers.factor import Solution, solve, triangular_factor
+
+# Levels of the white forces on the way, as shares of each coordinate's usual force. From one to the next the answer
+# moves by a fraction of what the first fit is off.
+LEVELS = (0.3, 0.1, 0.03, 0.01, 0.003, 0.001)
+# Those that a span begins with whose parameters are known from the spans before it.
+LATER_LEVELS = (0.01, 0.001, 0.0)
+# Those that are allowed for where the samples refute exact equations; more than that is another system.
+ALLOWED = (0.001, 0.003, 0.01, 0.03)
+# A level is tried again while the innovations are larger than noise makes them, so often at most.
+MOST_TRIES = 3
+# Time within which forces of a level change, s: white forces of share r have the density (r F)² times this. None is to
+# change a speed within it by more than this multiple of r times the usual speed: light coordinates would run away.
+CORRELATION = 0.1
+MOST_SPEED = 3.0
+# No coordinate's usual force or speed is taken to be smaller than this share of the largest.
+LEAST_USUAL = 0.02
+# Free to move are positions of the first state by this, rad, m or 1/m, and its speeds by the usual ones. Not further:
+# stiff modes, which no sample sees, decay slowly in the collocation, and are not to ring.
+FREE_POSITION = 10.0
+# Steps of the collocation, s: on the way, and then ever finer until that changes no parameter by more than REFINED
+# standard deviations; the error of the last one is a sixteenth of that change, as its order is four.
+ROUGH_STEP = 0.01
+STEPS = (0.005, 0.0025, 0.00125)
+REFINED = 1.0
+# A step of the search that moves no parameter by more standard deviations than this ends it: the next one would be
+# smaller by far, as the convergence is quadratic near the end.
+SETTLED = 0.5
+MAX_STEPS = 8
+# Derivatives by displacements are told that often and interpolated, s; they only steer the search.
+DERIVATIVES_INTERVAL = 0.04
+# Mean square of the whitened innovations that noise alone may leave: a span of some seconds scatters by a hundredth,
+# the noise behind it is estimated to a tenth.
+LARGEST_MEAN_SQUARE = 1.2
+# Directions of β that the rows tell less of than this share of the best told, in units of the columns' sizes, are left
+# as they are: derivatives are good to 1e-8.
+RANK_TOLERANCE = 1e-8
+# A step of the search is halved so often, where β is no mechanism's after it.
+MOST_HALVINGS = 6
+# Mass matrices are looked at that often along the motion, s.
+MASS_INTERVAL = 0.1
+
+
+class DivergedError(ArithmeticError):
+    """The search found no parameters and states that agree with the samples."""
+
+
+# What a search that runs away ends in.
+NO_NUMBERS = (np.linalg.LinAlgError, ArithmeticError)
+
+
+@dataclass(frozen=True)
+class SpanFit:
+    """What a span says: rows Y β = b with independent unit errors as a factor (n + 1, n + 1), linearised at its end.
+
+    beta (n,): estimate from this span and what was known before it. rows: how many innovations. mean_square: of the
+    whitened innovations. level: of the white forces that are left, 0 where the equations hold. step: of the
+    collocation, s.
+    """
+
+    factor: Array
+    beta: Array
+    rows: int
+    mean_square: float
+    level: float
+    step: float
+
+
+class SpanSmoother:
+    """Fits spans of one session.
+
+    readings: of the samples. sigma (C,): their noise, 1σ a sample. torque (joints,): σ² T_s of n τ, (N m)² s.
+    """
+
+    def __init__(self, model: Model, base: BaseParameters, readings: Readings, sigma: Array, torque: Array) -> None:
+        self._model = model
+        self._base = base
+        self._readings = readings
+        self._sigma = sigma
+        # Unit noise of each motor's mean torque to forces, (n_v, joints), N m √s.
+        self._motors = model.generalized_force(np.eye(torque.size)).T * np.sqrt(torque)
+        self._physical = PhysicalSet(model, base)
+
+    def fit(self, span: Span, beta: Array, known: Array, last_step: float | None) -> SpanFit:
+        """Fit a span from β (n,), with what is known before it as a factor or rows (·, n + 1).
+
+        last_step: of the collocation of an earlier span, s; None in the first one. Raises DivergedError.
+        """
+        try:
+            with np.errstate(over="raise", divide="raise", invalid="raise"):
+                search = _Search(self, span, beta, known)
+                for level in LEVELS if last_step is None else LATER_LEVELS:
+                    search.loosen(level)
+                return search.tightened(STEPS if last_step is None else (last_step,))
+        except NO_NUMBERS as error:
+            raise DivergedError(str(error)) from None
+
+    def dynamics(self, beta: Array) -> Dynamics:
+        """The equations of motion for β (n,)."""
+        return self._model.dynamics(self._base.physical_values(beta))
+
+
+class _Search:
+    """The state of a search: β and the motion, and what the last step was made of."""
+
+    def __init__(self, smoother: SpanSmoother, span: Span, beta: Array, known: Array) -> None:
+        self._smoother, self._span, self._known = smoother, span, known
+        self._model, self._base = smoother._model, smoother._base
+        self.iterations = 0
+        self.beta = beta
+        self.std = np.full(beta.size, np.inf)
+        self.mean_square = np.inf
+        t = span.nodes(ROUGH_STEP)
+        self.trajectory = Trajectory(t, *span.guess(t))
+        _, force = momenta_and_forces(smoother.dynamics(beta), self.trajectory.x, self.trajectory.v)
+        self._usual_force, self._usual_speed = _usual(force), _usual(self.trajectory.v)
+        if not self._has_mass(beta):
+            raise DivergedError("the first fit's mass matrix is not positive definite")
+        self._use_nodes()
+
+    def _use_nodes(self) -> None:
+        t = self.trajectory.t
+        self._innovations = Innovations(self._span, t, self._smoother._readings, self._smoother._sigma)
+        impulse = self._span.impulse
+        of_motors = self._model.generalized_force
+        middle = 0.5 * (t[1:] + t[:-1])
+        self._impulse, self._impulse_m = of_motors(impulse(t)), of_motors(impulse(middle))
+
+    def refine(self, step: float) -> None:
+        """Put the motion on nodes at no more than `step`, s."""
+        t = self._span.nodes(step)
+        old = self.trajectory
+        if t.size == old.t.size:
+            return
+        self.trajectory = Trajectory(t, interpolated(old.t, old.x, t), interpolated(old.t, old.v, t))
+        self._use_nodes()
+
+    def tightened(self, steps: tuple[float, ...]) -> SpanFit:
+        """The fit with equations that hold, or that hold as well as the samples allow."""
+        for k, step in enumerate(steps):
+            self.refine(step)
+            before = self.beta, self.trajectory
+            if not self.settled(0.0):
+                break
+            if k and np.all(np.abs(self.beta - before[0]) <= REFINED * self.std):
+                break
+        for level in (0.0, *ALLOWED):
+            if level:
+                self.beta, self.trajectory = before
+                if not self.settled(level):
+                    continue
+            if self.mean_square <= LARGEST_MEAN_SQUARE:
+                return SpanFit(self.factor, self.beta, self.rows, self.mean_square, level, step)
+        raise DivergedError(f"no motion and no parameters explain the samples, after {self.iterations} steps")
+
+    def loosen(self, level: float) -> None:
+        """Follow the samples with white forces of a level."""
+        for _ in range(MOST_TRIES):
+            self.advance(level)
+            if self.mean_square <= LARGEST_MEAN_SQUARE:
+                return
+
+    def settled(self, level: float) -> bool:
+        """Search until β stands; whether it does."""
+        try:
+            for _ in range(MAX_STEPS):
+                before = self.beta
+                self.advance(level, tame=False)
+                if np.all(np.abs(self.beta - before) <= SETTLED * self.std):
+                    return True
+        except NO_NUMBERS:
+            pass
+        self.mean_square = np.inf
+        return False
+
+    def advance(self, level: float, tame: bool = True) -> None:
+        """One step of Gauss-Newton with white forces of a level, which `tame` ones bound by what they do to speeds."""
+        trajectory, base = self.trajectory, self._base
+        dynamics = self._smoother.dynamics(self.beta)
+        differences = self._innovations(trajectory.x, trajectory.v)
+        lacking = defects(dynamics, trajectory, self._impulse, self._impulse_m)
+        kalman = FixedIntervalSmoother(self._first_state(dynamics), base.n)
+        every = max(1, round(DERIVATIVES_INTERVAL / trajectory.step))
+        nodes = every * max(1, 512 // every)
+        drive, joints = self._drive(dynamics, level, tame), self._smoother._motors.shape[1]
+        n_v = self._model.layout.n_v
+        rows, speeds = [], []
+        for start in range(0, len(trajectory.t), nodes):
+            piece = slice(start, start + nodes)  # and one more, which ends the last step
+            wide = slice(start, start + nodes + 1)
+            linear = linearise(dynamics, base, self._smoother._readings, trajectory.x[wide], trajectory.v[wide], every)
+            weights = self._innovations.weights[piece, :, None]
+            steps = transitions(linear, trajectory.step, drive, joints, lacking[piece])
+            count = len(weights)
+            speeds.append((linear.A[:count, :n_v], linear.E[:count, :n_v, joints:]))
+            rows.append(kalman.push(differences[piece], weights * linear.C[:count], weights * linear.D[:count], steps))
+        innovations = np.concatenate(rows)
+        Y = -innovations[:, 1:]
+        self.rows = len(Y)
+        self.factor = triangular_factor(np.column_stack((Y, innovations[:, 0] + Y @ self.beta)))
+        delta, solution = self._step()
+        beta = self._admissible(self.beta + delta, solution, level > 0.0)
+        delta = beta - self.beta
+        self.mean_square = float(np.mean((innovations[:, 0] - Y @ delta) ** 2))
+        self.std = np.sqrt(np.diag(solution.covariance()))
+        s = kalman.smooth(delta)
+        # The motion is moved by its speeds, not by its momenta: of light coordinates momenta tell the speeds badly.
+        moved = [
+            by_s @ s[k : k + len(by_s), :, None] + by_beta @ delta[:, None]
+            for k, (by_s, by_beta) in zip(range(0, len(s), nodes), speeds, strict=True)
+        ]
+        v = trajectory.v + np.concatenate(moved)[..., 0]
+        self.trajectory = Trajectory(trajectory.t, trajectory.x + s[:, :n_v], v)
+        self.beta = beta
+        self.iterations += 1
+
+    def _first_state(self, dynamics: Dynamics) -> Array:
+        """Root of the covariance that leaves the first state free to move, (2 n_v, 2 n_v)."""
+        n_v = self._model.layout.n_v
+        root = np.diag(np.concatenate((np.full(n_v, FREE_POSITION), self._usual_speed)))
+        root[n_v:, n_v:] @= dynamics.mass_matrix(self.trajectory.x[:1])[0]
+        return root
+
+    def _drive(self, dynamics: Dynamics, level: float, tame: bool) -> Array:
+        """What unit noise adds to the state in a step, (2 n_v, noises)."""
+        noise = self._smoother._motors
+        if level:
+            forces = self._tame_forces(dynamics) if tame else np.diag(self._usual_force)
+            noise = np.concatenate((noise, level * np.sqrt(CORRELATION) * forces), axis=1)
+        return np.concatenate((np.zeros_like(noise), np.sqrt(self.trajectory.step) * noise))
+
+    def _tame_forces(self, dynamics: Dynamics) -> Array:
+        """Root (n_v, n_v) of the covariance of forces that are as usual and change speeds by no more than is usual."""
+        H = dynamics.mass_matrix(self._sparse_motion()).mean(axis=0)
+        # Inverse variances of the two limits add up; as roots, since light coordinates make H ill conditioned.
+        of_forces = np.diag(1.0 / self._usual_force)
+        of_speeds = CORRELATION / MOST_SPEED * np.linalg.inv(H) / self._usual_speed[:, None]
+        return np.asarray(np.linalg.inv(np.linalg.qr(np.concatenate((of_forces, of_speeds)), mode="r")))
+
+    def _step(self) -> tuple[Array, Solution]:
+        """δβ (n,) of least squares, and the solution behind it."""
+        problem = triangular_factor(self._known, self.factor)
+        n = self._base.n
+        problem[:, n] -= problem[:, :n] @ self.beta
+        size = np.linalg.norm(problem[:, :n], axis=0)
+        size[size == 0.0] = 1.0
+        return np.linalg.lstsq(problem[:, :n] / size, problem[:, n], rcond=RANK_TOLERANCE)[0] / size, solve(problem)
+
+    def _admissible(self, beta: Array, solution: Solution, loose: bool) -> Array:
+        """β, or of real bodies the nearest while equations are loose, or as much of the step as leaves a mechanism.
+
+        Mass matrices are linear in β, so those that are positive definite make a convex set, which the search is in.
+        """
+        if loose:
+            with suppress(ArithmeticError):  # the projection is a help, no more
+                beta = self._smoother._physical.project(beta, solution.covariance()).beta
+        for _ in range(MOST_HALVINGS):
+            if self._has_mass(beta):
+                return beta
+            beta = 0.5 * (self.beta + beta)
+        raise DivergedError("a mass matrix is not positive definite")
+
+    def _has_mass(self, beta: Array) -> bool:
+        masses = self._smoother.dynamics(beta).mass_matrix(self._sparse_motion())
+        return bool(np.linalg.eigvalsh(masses).min() > 0.0)
+
+    def _sparse_motion(self) -> Array:
+        """Positions (B, n_x) every now and then."""
+        return self.trajectory.x[:: max(1, round(MASS_INTERVAL / self.trajectory.step))]
+
+
+def _usual(samples: Array) -> Array:
+    """rms of each column of samples (B, n_v), and no less than a share of the largest."""
+    rms = np.sqrt(np.mean(samples**2, axis=0))
+    return np.asarray(np.maximum(rms, LEAST_USUAL * rms.max()))
