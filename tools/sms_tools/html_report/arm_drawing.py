@@ -76,11 +76,15 @@ def marked_arm(scene: Scene, x: Array, row: int, marks: Mapping[str, str]) -> st
             parts.append(f'<g opacity="0.35">{_line(line, MARK, 12.0)}</g>')
             at = line[len(line) // 2]
         elif kind == "base":
-            parts.append(f'<polygon points="{_outline(paper(corners[row]))}" fill="none" stroke="{MARK}" stroke-width="3"/>')
+            parts.append(
+                f'<polygon points="{_outline(paper(corners[row]))}" fill="none" stroke="{MARK}" stroke-width="3"/>'
+            )
             at = paper(corners[row]).mean(axis=0)
         else:
             at = paper(drawing.tip[row] if kind == "tip" else drawing.joints[row, int(number) - 1])
-            parts.append(f'<circle cx="{at[0]:.1f}" cy="{at[1]:.1f}" r="9" fill="none" stroke="{MARK}" stroke-width="3"/>')
+            parts.append(
+                f'<circle cx="{at[0]:.1f}" cy="{at[1]:.1f}" r="9" fill="none" stroke="{MARK}" stroke-width="3"/>'
+            )
         badges.append(_badge(at, text, paper))
     return svg(MARKED_WIDTH, MARKED_HEIGHT, "".join([*parts, *badges, _scale_bar(paper)]))
 

@@ -17,8 +17,9 @@ from sms_online.errors import InputError
 from sms_online.pipeline.estimator import Estimator
 from sms_online.stream import Block
 from sms_online.trackers.interface import Prior
-from sms_tools.adopted_system import adopted_text, write_adopted
+from sms_tools.adopted_system import added_lines, adopted_text, write_adopted
 from sms_tools.exit_codes import NOTHING_DETERMINED, OK
+from sms_tools.html_report.diagnosis_page import write_diagnosis
 from sms_tools.priors import base_prior
 from sms_tools.report import Document, parameter_table, report_console, show
 from sms_tools.results_file import results_directory, to_json, write_document
@@ -65,10 +66,13 @@ def run(args: argparse.Namespace) -> int:
     lines += [_residuals(document), "", parameter_table(document["after"], console.width, title="after"), ""]
     lines += [f"warning: {warning}" for warning in document["warnings"]]
     path = write_document(directory / NAME, document)
+    added: list[str] = []
     if diagnosis.after.system != system:
         text = adopted_text(args.system, system, diagnosis.after.system)
+        added = added_lines(args.system, text)
         lines.append(f"system file with what was found: {write_adopted(directory, text)}")
-    show(console, *lines, f"diagnosis: {path}")
+    page = write_diagnosis(directory, document, diagnosis, args.capture.name, added)
+    show(console, *lines, f"diagnosis: {path}", f"page: {page}")
     if args.json:
         print(to_json(document))
     return OK if any(p["identifiable"] for p in document["after"]["parameters"]) else NOTHING_DETERMINED

@@ -1,0 +1,109 @@
+"""Charts of a diagnosis: residual before and after over time, and what it was against the law that explains it."""
+
+from __future__ import annotations
+
+from html import escape
+
+import numpy as np
+
+from sms_online.diagnosis.diagnose import Diagnosis, State
+from sms_online.diagnosis.force_curves import AddedVariable, ForceCurve, added_variables, force_curves
+from sms_online.diagnosis.residuals import row_types
+from sms_online.diagnosis.weak_windows import Windows
+from sms_online.stream import Array
+from sms_tools.html_report.svg import Series, chart
+
+BEFORE, AFTER, NOISE, LAW = "#d55e00", "#0072b2", "#7a8794", "#1c2733"
+BOUNDS = 2.0  # standard deviations
+# Half range of a residual drawn to see noise, in standard deviations.
+CLOSE_UP = 5.0
+# What is held out of another capture is drawn so far behind what was fitted, as a share of the latter.
+PAUSE = 0.02
+
+
+def residual_charts(diagnosis: Diagnosis) -> list[str]:
+    """Of each row type the coordinate that was furthest off, before and after; noise close up where it was far off."""
+    before, after = diagnosis.before, diagnosis.after
+    layout = diagnosis.described.rows.model.layout
+    changed = after.system != before.system
+    windows = diagnosis.described.rows.weak.windows, diagnosis.attempt.rows.weak.windows
+    (t_before, held), (t_after, _) = (_time(*each) for each in zip((before, after), windows, strict=True))
+    out = []
+    names = after.residual.shape == before.residual.shape and diagnosis.attempt.rows.model.layout.speed_names
+    for row, speeds in row_types(layout).items():
+        worst = max(speeds, key=lambda k: float(np.sum(before.residual[:, k] ** 2)))
+        name = layout.speed_names[worst]
+        lines = [_noise(t_before), _residual("before", before, windows[0], t_before, worst, BEFORE)]
+        if changed and names and names[worst] == name:
+            lines.append(_residual("after", after, windows[1], t_after, worst, AFTER))
+        title = f"{row} ({name}): residual over its deviation"
+        out.append(chart(title, t_before, lines, "time, s; shaded: held out", shaded=held))
+        if len(lines) > 2 and before.test[row].beyond:
+            close = [lines[0], lines[2]]
+            half = max(CLOSE_UP, float(np.quantile(np.abs(after.residual[:, worst]), 0.99)))
+            title = f"{row} ({name}), close up: what is left after"
+            out.append(chart(title, t_before, close, "time, s; shaded: held out", (-half, half), shaded=held))
+    return out
+
+
+def _time(state: State, windows: Windows) -> tuple[Array, list[tuple[float, float]]]:
+    """Times (W,) of windows and spans that are held out; what another capture holds is drawn behind the first."""
+    t, held = state.time.copy(), ~state.fitted
+    first = t[state.fitted]
+    if held.any() and first.size and t[held].min() < first.max():
+        t[held] += first.max() * (1.0 + PAUSE) - t[held].min()
+    return t, [(float(t[held].min()), float(t[held].max()))] if held.any() else []
+
+
+def _noise(t: Array) -> Series:
+    ends = np.array((t.min(), t.max()))
+    bound = np.full(2, BOUNDS)
+    return Series("± 2σ of the noise", np.zeros(2), -bound, bound, True, ends, NOISE)
+
+
+def _residual(label: str, state: State, windows: Windows, t: Array, speed: int, color: str) -> Series:
+    """A line that is interrupted between stretches of the session."""
+    starts = np.flatnonzero(np.diff(windows.segment)) + 1
+    y = np.insert(state.residual[:, speed], starts, np.nan)
+    return Series(label, y, x=np.insert(t, starts, t[starts]), color=color)
+
+
+def law_charts(diagnosis: Diagnosis) -> list[str]:
+    """Of each effect found the force that the data show over what it depends on, or its rows, beside the law."""
+    charts = [_curve_chart(curve) for curve in force_curves(diagnosis)]
+    charts += [_added_chart(added) for added in added_variables(diagnosis)]
+    found = diagnosis.unexplained
+    if found is not None:
+        title = f"{found.speed}: force that stands in for what is not known"
+        charts.append(chart(title, found.at, [Series("spline", found.force, color=BEFORE)], found.variable))
+    return charts
+
+
+def _curve_chart(curve: ForceCurve) -> str:
+    bound = BOUNDS * curve.std
+    names = " + ".join(effect.name for effect in curve.effects)
+    series = [
+        Series("from the data ± 2σ", curve.force, curve.force - bound, curve.force + bound, color=BEFORE),
+        Series(f"law: {names}", curve.law, dashed=True, color=LAW),
+    ]
+    title = f"{curve.where}: force that the model lacks, {curve.force_unit}"
+    return chart(title, curve.at, series, f"{curve.variable}, {curve.unit}")
+
+
+def _added_chart(added: AddedVariable) -> str:
+    bound = BOUNDS * added.std
+    series = [
+        Series("left without it ± 2σ", added.left, added.left - bound, added.left + bound, color=BEFORE),
+        Series("as it says", added.expected, dashed=True, color=LAW),
+    ]
+    title = f"{added.effect.name} at {added.effect.where}: rows over their deviation"
+    return chart(title, added.expected, series, "what the effect adds to a row, over its deviation")
+
+
+def explained() -> str:
+    """How these charts are to be read."""
+    return escape(
+        "Where an effect is a force over one variable, the force is also fitted as a free curve of that variable, with "
+        "everything else as found: where the curve leaves the law, the law is not the whole truth. Of other effects the "
+        "rows are shown, free of all that the rest of the model holds and grouped by what the effect adds to them."
+    )
