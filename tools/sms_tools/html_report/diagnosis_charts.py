@@ -33,16 +33,16 @@ def residual_charts(diagnosis: Diagnosis) -> list[str]:
     for row, speeds in row_types(layout).items():
         worst = max(speeds, key=lambda k: float(np.sum(before.residual[:, k] ** 2)))
         name = layout.speed_names[worst]
-        lines = [_noise(t_before), _residual("before", before, windows[0], t_before, worst, BEFORE)]
+        lines = [_noise(t_before), _residual(before, windows[0], t_before, worst, BEFORE)]
         if changed and names and names[worst] == name:
-            lines.append(_residual("after", after, windows[1], t_after, worst, AFTER))
+            lines.append(_residual(after, windows[1], t_after, worst, AFTER))
         title = f"{row} ({name}): residual over its deviation"
-        out.append(chart(title, t_before, lines, "time, s; shaded: held out", shaded=held))
+        out.append(chart(title, t_before, lines, "time, s", shaded=held))
         if len(lines) > 2 and before.test[row].beyond:
             close = [lines[0], lines[2]]
             half = max(CLOSE_UP, float(np.quantile(np.abs(after.residual[:, worst]), 0.99)))
             title = f"{row} ({name}), close up: what is left after"
-            out.append(chart(title, t_before, close, "time, s; shaded: held out", (-half, half), shaded=held))
+            out.append(chart(title, t_before, close, "time, s", (-half, half), shaded=held))
     return out
 
 
@@ -58,14 +58,14 @@ def _time(state: State, windows: Windows) -> tuple[Array, list[tuple[float, floa
 def _noise(t: Array) -> Series:
     ends = np.array((t.min(), t.max()))
     bound = np.full(2, BOUNDS)
-    return Series("± 2σ of the noise", np.zeros(2), -bound, bound, True, ends, NOISE)
+    return Series("", np.zeros(2), -bound, bound, True, ends, NOISE)
 
 
-def _residual(label: str, state: State, windows: Windows, t: Array, speed: int, color: str) -> Series:
+def _residual(state: State, windows: Windows, t: Array, speed: int, color: str) -> Series:
     """A line that is interrupted between stretches of the session."""
     starts = np.flatnonzero(np.diff(windows.segment)) + 1
     y = np.insert(state.residual[:, speed], starts, np.nan)
-    return Series(label, y, x=np.insert(t, starts, t[starts]), color=color)
+    return Series("", y, x=np.insert(t, starts, t[starts]), color=color)
 
 
 def law_charts(diagnosis: Diagnosis) -> list[str]:
