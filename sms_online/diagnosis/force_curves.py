@@ -8,6 +8,7 @@ Regression, 1982, section 2.3.2.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 
@@ -138,7 +139,7 @@ def _knots(values: Array) -> tuple[Array, Array]:
     low, high = float(values.min()), float(values.max())
     ends = [low, 0.0, high] if low < 0.0 < high else [low, high]
     knots, points = [], []
-    for start, end in zip(ends[:-1], ends[1:], strict=True):
+    for start, end in pairwise(ends):
         inside = values[(values > start) & (values < end)]
         inner = np.quantile(inside, np.arange(1, INTERVALS) / INTERVALS)
         knots += [np.full(DEGREE + 1, start), inner]

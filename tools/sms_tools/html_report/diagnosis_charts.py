@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from html import escape
-
 import numpy as np
 
 from sms_online.diagnosis.diagnose import Diagnosis, State
@@ -19,6 +17,8 @@ BOUNDS = 2.0  # standard deviations
 CLOSE_UP = 5.0
 # What is held out of another capture is drawn so far behind what was fitted, as a share of the latter.
 PAUSE = 0.02
+# Room above lines for two lines of legend, as a share of their range.
+LEGEND_ROOM = 0.3
 
 
 def residual_charts(diagnosis: Diagnosis) -> list[str]:
@@ -87,7 +87,15 @@ def _curve_chart(curve: ForceCurve) -> str:
         Series(f"law: {names}", curve.law, dashed=True, color=LAW),
     ]
     title = f"{curve.where}: force that the model lacks, {curve.force_unit}"
-    return chart(title, curve.at, series, f"{curve.variable}, {curve.unit}")
+    return chart(title, curve.at, series, f"{curve.variable}, {curve.unit}", _with_room(curve.force, curve.law))
+
+
+def _with_room(*lines: Array) -> tuple[float, float]:
+    """A range of all lines with room above them for a legend."""
+    values = np.concatenate(lines)
+    low, high = float(np.nanmin(values)), float(np.nanmax(values))
+    size = high - low or abs(high) or 1.0
+    return low - 0.1 * size, high + LEGEND_ROOM * size
 
 
 def _added_chart(added: AddedVariable) -> str:
@@ -97,13 +105,10 @@ def _added_chart(added: AddedVariable) -> str:
         Series("as it says", added.expected, dashed=True, color=LAW),
     ]
     title = f"{added.effect.name} at {added.effect.where}: rows over their deviation"
-    return chart(title, added.expected, series, "what the effect adds to a row, over its deviation")
-
-
-def explained() -> str:
-    """How these charts are to be read."""
-    return escape(
-        "Where an effect is a force over one variable, the force is also fitted as a free curve of that variable, with "
-        "everything else as found: where the curve leaves the law, the law is not the whole truth. Of other effects the "
-        "rows are shown, free of all that the rest of the model holds and grouped by what the effect adds to them."
+    return chart(
+        title,
+        added.expected,
+        series,
+        "what the effect adds to a row, over its deviation",
+        _with_room(added.left, added.expected),
     )

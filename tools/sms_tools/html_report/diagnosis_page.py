@@ -12,11 +12,11 @@ import numpy as np
 from sms_online.description.schema import System
 from sms_online.diagnosis.diagnose import Diagnosis
 from sms_tools.html_report.arm_drawing import marked_arm
-from sms_tools.html_report.diagnosis_charts import AFTER, BEFORE, BOUNDS, explained, law_charts, residual_charts
+from sms_tools.html_report.diagnosis_charts import AFTER, BEFORE, BOUNDS, law_charts, residual_charts
 from sms_tools.html_report.error_bars import Bar, bar_range, error_bars
 from sms_tools.html_report.page import write_page
 from sms_tools.html_report.svg import svg
-from sms_tools.report import NOT_DETERMINED, Document
+from sms_tools.report import NOT_DETERMINED, Document, formatter
 from sms_tools.view.scene import Scene
 
 NAME = "diagnosis.html"
@@ -31,6 +31,12 @@ WAY_POINTS = 300
 JOINT_CHANNEL = re.compile(r"(?:q|theta_m|tau|force)_(\d+)")
 LINK_CHANNEL = re.compile(r"(link_\d+)\.")
 
+HOW_LAWS = (
+    "Where an effect is a force over one variable, that force is also fitted as a free curve, with everything else as "
+    "found: where the curve leaves the law by more than its band, the law is not the whole truth. Of other effects the "
+    "rows are shown, free of all that the rest of the model holds, in groups by what the effect adds to them."
+)
+
 
 def write_diagnosis(
     directory: Path, document: Document, diagnosis: Diagnosis, source: str, added: Sequence[str]
@@ -42,8 +48,7 @@ def write_diagnosis(
     system = diagnosis.described.system
     heading = escape(system.title or system.name)
     sections = [
-        f"<h1>{heading}: {escape(document['verdict'])}</h1>",
-        f"<p>Diagnosis of {escape(source)}, {_conditions(diagnosis)}.</p>",
+        f"<h1>{heading}</h1><p>Diagnosis of {escape(source)}: {_conditions(diagnosis)}.</p>",
         f'<p class="verdict {document["verdict"]}">{escape(document["summary"])}</p>',
         *(f'<p class="warning">{escape(warning)}</p>' for warning in document["warnings"]),
     ]
@@ -54,8 +59,8 @@ def write_diagnosis(
         ]
     laws = law_charts(diagnosis)
     if laws:
-        sections += ["<h2>The effect in the data</h2>", f"<p>{explained()}</p>", *laws]
-    sections += ["<h2>Residual over time</h2>", *residual_charts(diagnosis)]
+        sections += ["<h2>The effect in the data</h2>", f"<p>{HOW_LAWS}</p>", *laws]
+    sections += ["<h2>Residual over time</h2>", f"<p>{_how_residuals()}</p>", *residual_charts(diagnosis)]
     sections += ["<h2>Residual before and after</h2>", _residuals(document)]
     sections += ["<h2>Candidates</h2>", _candidates(document)]
     sections += ["<h2>Parameters before and after</h2>", _parameters(document)]
@@ -100,9 +105,7 @@ def _where(document: Document, diagnosis: Diagnosis) -> str:
 
 def _effects(document: Document) -> str:
     """Effects with their coefficients, then what cannot be told apart and what would."""
-    rows = [
-        "<table><tr><th></th><th>effect</th><th>at</th><th>coefficient</th><th>estimate</th><th>± std</th><th>unit</th></tr>"
-    ]
+    rows = ["<table>" + _heading(("", "effect", "at", "coefficient"), ("estimate", "± std", "unit"))]
     doubts = []
     for number, effect in enumerate(document["effects"], start=1):
         name, where = escape(effect["name"]), escape(effect["where"])
@@ -120,25 +123,30 @@ def _effects(document: Document) -> str:
             others = effect["ambiguous_with"]
             more = f" and {len(others) - LOOK_ALIKES} more" if len(others) > LOOK_ALIKES else ""
             doubts.append(
-                f"<p>{number}. This session cannot tell {name} at {where} from {escape(', '.join(others[:LOOK_ALIKES]))}"
-                f"{more}. What would: {escape(effect['separated_by'])}.</p>"
+                f"<p>{number}. This session cannot tell {name} at {where} from "
+                f"{escape(', '.join(others[:LOOK_ALIKES]))}{more}. What would: {escape(effect['separated_by'])}.</p>"
             )
     unexplained = document["unexplained"]
     if unexplained is not None:
+        variable, speed = escape(unexplained["variable"]), escape(unexplained["speed"])
         share = f"{100.0 * unexplained['share']:.0f} %"
-        doubts.append(
-            f"<p>?. A free curve over {escape(unexplained['variable'])} in {escape(unexplained['speed'])} takes {share} of "
-            "what is left.</p>"
-        )
+        doubts.append(f"<p>?. A free curve over {variable} in {speed} takes {share} of what is left.</p>")
     table = "\n".join([*rows, "</table>"]) if document["effects"] else ""
     return f"<div>{table}{''.join(doubts)}</div>"
+
+
+def _how_residuals() -> str:
+    return (
+        "Of each kind of row the coordinate that was furthest off, each window's residual over the deviation that the "
+        f"sensors' noise predicts: {_legend()}. Grey band: ± 2σ of noise alone. Shaded: held out, not fitted to."
+    )
 
 
 def _residuals(document: Document) -> str:
     """By row type, fitted and held out, and what noise alone would leave."""
     rows = [
-        '<table><tr><th></th><th colspan="5">over the predicted deviation, 1 is noise</th>'
-        '<th colspan="4">share of the measured torque or force</th></tr><tr><th>rows</th>'
+        '<table><tr><th></th><th colspan="5" class="over">over the predicted deviation, 1 is noise</th>'
+        '<th colspan="4" class="over">share of the measured torque or force</th></tr><tr><th>rows</th>'
         "<th>fitted: before</th><th>after</th><th>held out: before</th><th>after</th><th>limit of noise</th>"
         "<th>fitted: before</th><th>after</th><th>held out: before</th><th>after</th></tr>"
     ]
@@ -165,16 +173,14 @@ def _candidates(document: Document) -> str:
     for number, effect in enumerate(document["effects"], start=1):
         for key in effect["ambiguous_with"]:
             like.setdefault(key, []).append(str(number))
-    rows = [
-        "<table><tr><th></th><th>effect</th><th>at</th><th>share of what is beyond noise, taken alone</th><th>%</th><th></th></tr>"
-    ]
+    rows = ["<table>" + _heading(("", "effect", "at", "share taken alone"), ("%", ""))]
     for rank, candidate in enumerate(document["candidates"], start=1):
         name, where, share = candidate["name"], candidate["where"], candidate["share"]
-        number, likes = numbers.get((name, where)), like.get(f"{name}@{where}")
-        if rank > LISTED and number is None:
+        found, likes = numbers.get((name, where)), like.get(f"{name}@{where}")
+        if rank > LISTED and found is None:
             continue
-        color = FOUND if number else LIKE if likes else OTHER
-        remark = f"found: {number}" if number else f"cannot be told from {', '.join(likes)}" if likes else ""
+        color = FOUND if found else LIKE if likes else OTHER
+        remark = f"found: {found}" if found else f"cannot be told from {', '.join(likes)}" if likes else ""
         bar = f'<rect x="0" y="2" width="{SHARE_WIDTH * share:.1f}" height="{SHARE_HEIGHT - 4}" fill="{color}"/>'
         rows.append(
             f'<tr><td>{rank}</td><td class="left">{escape(name)}</td><td class="left">{escape(where)}</td>'
@@ -183,8 +189,8 @@ def _candidates(document: Document) -> str:
         )
     table = "\n".join([*rows, "</table>"])
     why = (
-        "Each of them alone, against the model as described: shares overlap, and what one found leaves goes to the next. "
-        f"{len(document['candidates'])} were tried."
+        "What each of them alone would take of the residual beyond noise, against the model as described; shares "
+        f"overlap, and what one found leaves goes to the next. {len(document['candidates'])} were tried."
     )
     return f"<p>{why}</p>{table}"
 
@@ -197,37 +203,56 @@ def _parameters(document: Document) -> str:
     is_true = any(p["true"] is not None for p in after)
     deviations = np.full((len(after), 2, 2), np.nan)  # before and after; estimate from reference, 2σ, %
     for k, p in enumerate(after):
-        reference = p["true"] if p["true"] is not None else p["estimate"] if p["identifiable"] else None
+        reference = p["true"] if is_true else p["estimate"] if p["identifiable"] else None
         for j, each in enumerate((before.get(p["name"]), p)):
             if each is not None and each["identifiable"] and reference:
                 size = abs(reference) / 100.0
                 deviations[k, j] = (each["estimate"] - reference) / size, BOUNDS * each["std"] / size
     limit = bar_range(np.abs(deviations).sum(axis=2).ravel())
-    about = "true value" if is_true else "value after"
-    rows = [
-        "<table><tr><th>parameter</th><th>unit</th><th>before</th><th>± std</th><th>after</th><th>± std</th>"
-        f"{'<th>true</th>' if is_true else ''}<th>deviation before, %</th><th>after, %</th>"
-        f"<th>± 2σ about the {about}, axis ± {limit:g} %</th></tr>"
-    ]
-    for p, (first, second) in zip(after, deviations, strict=True):
-        earlier = before.get(p["name"])
-        cells = [*_estimate(earlier), *(_estimate(p) if changed else ("", ""))]
+    columns = ["before", *(["after"] if changed else [])]
+    headings = [heading for column in columns for heading in (column, "± std")]
+    if is_true:
+        headings += ["true", *(f"{column}, % off" for column in columns)]
+    elif changed:
+        headings.append("before, % off")
+    headings.append(f"± 2σ, axis ± {limit:g} %")
+    cells = "".join(f"<th>{heading}</th>" for heading in headings)
+    rows = [f'<table><tr><th>parameter</th><th class="left">unit</th>{cells}</tr>']
+    for p, own in zip(after, deviations, strict=True):
+        shown = [before.get(p["name"]), *([p] if changed else [])]
+        numbers = [cell for each in shown for cell in _estimate(each)]
         if is_true:
-            cells.append("" if p["true"] is None else f"{p['true']:.6g}")
-        cells += ["" if np.isnan(each[0]) else f"{each[0]:+.2g}" for each in (first, second)]
-        bars = [Bar(*first.tolist(), BEFORE), Bar(*second.tolist(), AFTER)]
-        cells.append(error_bars(bars if changed else bars[:1], limit))
+            numbers.append("" if p["true"] is None else f"{p['true']:.6g}")
+        off = own[: len(columns), 0] if is_true else own[: len(columns) - 1, 0]
+        numbers += ["" if np.isnan(each) else f"{each:+.2g}" for each in off]
+        bars = [
+            Bar(float(deviation), float(bound), color)
+            for (deviation, bound), color in zip(own[: len(columns)], (BEFORE, AFTER), strict=False)
+        ]
+        numbers.append(error_bars(bars, limit))
         kind = "" if p["identifiable"] else ' class="unknown"'
         start = f'<td>{escape(p["name"])}</td><td class="left">{escape(p["unit"])}</td>'
-        rows.append(f"<tr{kind}>{start}{''.join(f'<td>{cell}</td>' for cell in cells)}</tr>")
-    legend = f'<p><b style="color: {BEFORE}">before</b>, <b style="color: {AFTER}">after</b></p>' if changed else ""
+        rows.append(f"<tr{kind}>{start}{''.join(f'<td>{number}</td>' for number in numbers)}</tr>")
+    about = "the true value" if is_true else "the value after"
+    legend = f"<p>Bars stand about {about}: {_legend()}.</p>" if changed else ""
     return "\n".join([legend, *rows, "</table>"])
+
+
+def _legend() -> str:
+    return f'<b style="color: {BEFORE}">before</b>, <b style="color: {AFTER}">after</b>'
 
 
 def _estimate(p: Document | None) -> tuple[str, str]:
     if p is None:
         return "", ""
-    return (f"{p['estimate']:.5g}", f"{p['std']:.2g}") if p["identifiable"] else (NOT_DETERMINED, "")
+    if not p["identifiable"]:
+        return NOT_DETERMINED, ""
+    return formatter(p["estimate"], p["std"])(p["estimate"]), f"{p['std']:.2g}"
+
+
+def _heading(left: Sequence[str], right: Sequence[str]) -> str:
+    cells = [*(f'<th class="left">{text}</th>' for text in left), *(f"<th>{text}</th>" for text in right)]
+    return f"<tr>{''.join(cells)}</tr>"
 
 
 def _number(value: float | None, form: str) -> str:

@@ -24,6 +24,7 @@ from sms_tools.priors import base_prior
 from sms_tools.report import Document, parameter_table, report_console, show
 from sms_tools.results_file import results_directory, to_json, write_document
 from sms_tools.session import described_system
+from sms_tools.true_values import true_values
 
 NAME = "diagnosis.json"
 # Ambiguous and ranked candidates that people are shown.
@@ -59,7 +60,8 @@ def run(args: argparse.Namespace) -> int:
         console.print(f"{message} …", markup=False, style="dim")
 
     diagnosis = diagnose(system, blocks, str(args.capture), prior, holdout, progress)
-    document = diagnosis_document(diagnosis, warnings, None if truth is None else truth["parameters"])
+    true = None if truth is None else true_values(truth, system, diagnosis.after.system)
+    document = diagnosis_document(diagnosis, warnings, true)
     lines: list[Table | str] = ["", document["summary"], ""]
     if document["effects"]:
         lines += [_effects(document), ""]
