@@ -33,8 +33,9 @@ VARIABLES = {
 }
 # Of those, the ones between motor and link side; the others act on the motor's side alone.
 PAIRS = ("cubic_stiffness", "backlash", "kinematic_error")
-# Intervals of a spline to each side of zero, where friction jumps; all hold the same time of motion.
-INTERVALS = 4
+# Inner knots of a spline to each side of zero, where friction jumps and axes stick: shares of the time of motion between
+# zero and them.
+KNOTS = (0.05, 0.25, 0.5, 0.75)
 # Points of a curve to each side of zero.
 POINTS = 60
 # Groups of rows in an added-variable plot; rows with less than this share of the largest expectation say nothing.
@@ -141,8 +142,8 @@ def _knots(values: Array) -> tuple[Array, Array]:
     knots, points = [], []
     for start, end in pairwise(ends):
         inside = values[(values > start) & (values < end)]
-        inner = np.quantile(inside, np.arange(1, INTERVALS) / INTERVALS)
-        knots += [np.full(DEGREE + 1, start), inner]
+        shares = np.array(KNOTS) if start >= 0.0 else 1.0 - np.array(KNOTS[::-1])
+        knots += [np.full(DEGREE + 1, start), np.quantile(inside, shares)]
         points.append(np.linspace(start, end, POINTS))
     return np.concatenate([*knots, np.full(DEGREE + 1, high)]), np.unique(np.concatenate(points))
 

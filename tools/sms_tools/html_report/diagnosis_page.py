@@ -210,17 +210,17 @@ def _parameters(document: Document) -> str:
                 deviations[k, j] = (each["estimate"] - reference) / size, BOUNDS * each["std"] / size
     limit = bar_range(np.abs(deviations).sum(axis=2).ravel())
     columns = ["before", *(["after"] if changed else [])]
-    headings = [heading for column in columns for heading in (column, "± std")]
+    headings = [f"{column} ± std" for column in columns]
     if is_true:
-        headings += ["true", *(f"{column}, % off" for column in columns)]
+        headings += ["true", *(f"% off {column}" for column in columns)]
     elif changed:
-        headings.append("before, % off")
+        headings.append("% off before")
     headings.append(f"± 2σ, axis ± {limit:g} %")
     cells = "".join(f"<th>{heading}</th>" for heading in headings)
-    rows = [f'<table><tr><th>parameter</th><th class="left">unit</th>{cells}</tr>']
+    rows = [f'<table class="dense"><tr><th>parameter</th><th class="left">unit</th>{cells}</tr>']
     for p, own in zip(after, deviations, strict=True):
         shown = [before.get(p["name"]), *([p] if changed else [])]
-        numbers = [cell for each in shown for cell in _estimate(each)]
+        numbers = [_estimate(each) for each in shown]
         if is_true:
             numbers.append("" if p["true"] is None else f"{p['true']:.6g}")
         off = own[: len(columns), 0] if is_true else own[: len(columns) - 1, 0]
@@ -242,12 +242,10 @@ def _legend() -> str:
     return f'<b style="color: {BEFORE}">before</b>, <b style="color: {AFTER}">after</b>'
 
 
-def _estimate(p: Document | None) -> tuple[str, str]:
-    if p is None:
-        return "", ""
-    if not p["identifiable"]:
-        return NOT_DETERMINED, ""
-    return formatter(p["estimate"], p["std"])(p["estimate"]), f"{p['std']:.2g}"
+def _estimate(p: Document | None) -> str:
+    if p is None or not p["identifiable"]:
+        return "" if p is None else NOT_DETERMINED
+    return f"{formatter(p['estimate'], p['std'])(p['estimate'])} ± {p['std']:.2g}"
 
 
 def _heading(left: Sequence[str], right: Sequence[str]) -> str:
