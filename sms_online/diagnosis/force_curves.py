@@ -33,8 +33,8 @@ VARIABLES = {
 }
 # Of those, the ones between motor and link side; the others act on the motor's side alone.
 PAIRS = ("cubic_stiffness", "backlash", "kinematic_error")
-# Inner knots of a spline to each side of zero, where friction jumps and axes stick: shares of the time of motion between
-# zero and them.
+# Inner knots of a spline to each side of zero, where friction jumps and axes stick: shares of the time that the motion
+# spends between zero and them.
 KNOTS = (0.05, 0.25, 0.5, 0.75)
 # Points of a curve to each side of zero.
 POINTS = 60
@@ -101,15 +101,15 @@ def _curve(diagnosis: Diagnosis, where: str, name: str, own: list[int]) -> Force
     for k in own:
         left = left + candidates[k].columns @ _coefficients(diagnosis, k)
     values = np.concatenate([variable(motion) for motion, _ in rows.weak.motions()])
-    knots, at = _knots(values)
+    knots, at = _knots(values, jumps=name == SPEED)
     white = rows.white(spline_columns(rows, variable, knots, direction))
     found = gain(np.empty((len(white), 0)), rows.white(left[..., None])[:, 0], white)
     B = design(at, knots)
     std = np.sqrt(np.einsum("pi,ij,pj->p", B, found.covariance, B))
     force, law = B @ found.coefficients, _law(diagnosis, own, variable, at)
-    jump = at == 0.0
-    for part in (force, std, law):
-        part[jump] = np.nan
+    if name == SPEED:
+        for part in (force, std, law):
+            part[at == 0.0] = np.nan
     prismatic = rows.model.system.joints[i].kind == "prismatic"
     angle, force_unit = ("m", "N") if prismatic else ("rad", "N m")
     unit = {SPEED: f"{angle}/s", DEFLECTION: angle, PHASE: "rad", TORQUE: force_unit}[name]
@@ -135,15 +135,16 @@ def _variable(attempt: Attempt, i: int, name: str, order: float) -> Variable:
     return values
 
 
-def _knots(values: Array) -> tuple[Array, Array]:
-    """Knots of a spline that may jump at zero, and points (P,) to draw it at."""
+def _knots(values: Array, jumps: bool) -> tuple[Array, Array]:
+    """Knots of a spline over values, which may jump at zero, and points (P,) to draw it at."""
     low, high = float(values.min()), float(values.max())
     ends = [low, 0.0, high] if low < 0.0 < high else [low, high]
-    knots, points = [], []
+    knots, points = [np.full(DEGREE, low)], []
     for start, end in pairwise(ends):
-        inside = values[(values > start) & (values < end)]
+        inside = values[(values >= start) & (values <= end)]
         shares = np.array(KNOTS) if start >= 0.0 else 1.0 - np.array(KNOTS[::-1])
-        knots += [np.full(DEGREE + 1, start), np.quantile(inside, shares)]
+        starts = np.full(DEGREE + 1 if jumps and start == 0.0 else 1, start)
+        knots += [starts, np.quantile(inside, shares)]
         points.append(np.linspace(start, end, POINTS))
     return np.concatenate([*knots, np.full(DEGREE + 1, high)]), np.unique(np.concatenate(points))
 

@@ -37,8 +37,10 @@ svg .title { font-size: 13px; fill: #1c2733 } svg .legend { text-anchor: end; pa
 stroke-width: 3px } .grid { stroke: #e8edf2 } .span { fill: #f1f4f7 } .mark { stroke: #d04040; stroke-dasharray: 3 3 }
 .warning { background: #fff4e0; border-left: 4px solid #e0a030; padding: 0.3em 0.8em; margin: 0.4em 0 }
 .verdict { font-size: 1.1em; border-left: 6px solid #b4005a; background: #f8f1f5; padding: 0.5em 0.9em }
-.verdict.clean { border-color: #009e73; background: #eff8f5 } .pair { display: flex; gap: 1.5em; align-items: center }
-svg .badge { fill: #fff; text-anchor: middle; font-weight: bold } th.over { text-align: center } .dense { font-size: 13px }
+.verdict.clean { border-color: #009e73; background: #eff8f5 }
+.pair { display: flex; gap: 1.5em; align-items: center }
+svg .badge { fill: #fff; text-anchor: middle; font-weight: bold }
+th.over { text-align: center } .dense { font-size: 13px }
 td.beyond { color: #c04000; font-weight: bold }
 pre { background: #f1f4f7; padding: 0.6em 0.9em; font-size: 13px; overflow-x: auto }
 """
