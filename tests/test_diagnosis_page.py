@@ -13,6 +13,7 @@ from axis import AXIS, DAMPING, INERTIA
 
 from sms_adapters.capture import CaptureWriter
 from sms_adapters.system_file import load_system
+from sms_online.description.channels import channels
 from sms_online.description.parse import parse_system
 from sms_online.description.schema import Effect
 from sms_online.diagnosis.diagnose import Diagnosis, diagnose
@@ -23,7 +24,7 @@ from sms_online.stream import Block
 from sms_tools.adopted_system import added_lines, adopted_text
 from sms_tools.cli import main
 from sms_tools.html_report.arm_drawing import MARK, marked_arm
-from sms_tools.html_report.diagnosis_page import place_of, write_diagnosis
+from sms_tools.html_report.diagnosis_page import places_of, write_diagnosis
 from sms_tools.report import Document
 from sms_tools.true_values import true_values
 from sms_tools.view.scene import Scene
@@ -119,14 +120,14 @@ def test_every_place_of_an_effect_is_marked() -> None:
 
 
 @pytest.mark.parametrize(
-    ("where", "place"),
+    ("where", "places"),
     [
-        ("tip", "tip"), ("joint_2", "joint_2"), ("q_1", "joint_1"), ("theta_m_2", "joint_2"), ("tau_1", "joint_1"),
-        ("link_2.*", "link_2"), ("link_1.marker_1.u_y", "link_1"), ("r_S_*", "base"), ("theta_0", "base"),
+        ("tip", ["tip"]), ("joint_2", ["joint_2"]), ("q_1", ["joint_1"]), ("theta_m_*", ["joint_1", "joint_2"]),
+        ("link_2.*", ["link_2"]), ("link_*.marker_*.u_*", ["link_1", "link_2"]), ("r_S_*", ["base"]),
     ],
 )  # fmt: skip
-def test_a_channel_is_marked_where_its_sensor_sits(where: str, place: str) -> None:
-    assert place_of(where, load_system("paper-planar")) == place
+def test_an_effect_on_channels_is_marked_where_their_sensors_sit(where: str, places: list[str]) -> None:
+    assert places_of(where, channels(load_system("paper-planar"))) == places
 
 
 def test_what_a_system_file_gains_is_told_alone() -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from sms_online.diagnosis.diagnose import Diagnosis, State
@@ -15,6 +17,8 @@ BEFORE, AFTER, NOISE, LAW = "#d55e00", "#0072b2", "#7a8794", "#1c2733"
 BOUNDS = 2.0  # standard deviations
 # Half range of a residual drawn to see noise, in standard deviations.
 CLOSE_UP = 5.0
+# Of the residuals drawn close up so many stay inside where noise is left far behind.
+SHOWN = 0.99
 # What is held out of another capture is drawn so far behind what was fitted, as a share of the latter.
 PAUSE = 0.02
 # Room above lines for two lines of legend, as a share of their range.
@@ -24,29 +28,32 @@ LEGEND_ROOM = 0.3
 def residual_charts(diagnosis: Diagnosis) -> list[str]:
     """Of each row type the coordinate that was furthest off, before and after; noise close up where it was far off."""
     before, after = diagnosis.before, diagnosis.after
-    layout = diagnosis.described.rows.model.layout
-    changed = after.system != before.system
-    windows = diagnosis.described.rows.weak.windows, diagnosis.attempt.rows.weak.windows
-    (t_before, held), (t_after, _) = (_time(*each) for each in zip((before, after), windows, strict=True))
+    rows, rows_after = diagnosis.described.rows, diagnosis.attempt.rows
+    names, names_after = (each.model.layout.speed_names for each in (rows, rows_after))
+    types_after = row_types(rows_after.model.layout)
+    (t, held), (t_after, _) = _time(before), _time(after)
     out = []
-    names = after.residual.shape == before.residual.shape and diagnosis.attempt.rows.model.layout.speed_names
-    for row, speeds in row_types(layout).items():
-        worst = max(speeds, key=lambda k: float(np.sum(before.residual[:, k] ** 2)))
-        name = layout.speed_names[worst]
-        lines = [_noise(t_before), _residual(before, windows[0], t_before, worst, BEFORE)]
-        if changed and names and names[worst] == name:
-            lines.append(_residual(after, windows[1], t_after, worst, AFTER))
-        title = f"{row} ({name}): residual over its deviation"
-        out.append(chart(title, t_before, lines, "time, s", shaded=held))
+    for row, speeds in row_types(rows.model.layout).items():
+        worst = _worst(before, speeds)
+        name = names[worst]
+        lines = [_noise(t), _residual(before, rows.weak.windows, t, worst, BEFORE)]
+        if after.system != before.system:
+            # Exact links have coordinates of their own.
+            same = names_after.index(name) if name in names_after else _worst(after, types_after[row])
+            lines.append(_residual(after, rows_after.weak.windows, t_after, same, AFTER))
+        out.append(chart(f"{row} ({name}): residual over its deviation", t, lines, "time, s", shaded=held))
         if len(lines) > 2 and before.test[row].beyond:
-            close = [lines[0], lines[2]]
-            half = max(CLOSE_UP, float(np.quantile(np.abs(after.residual[:, worst]), 0.99)))
-            title = f"{row} ({name}), close up: what is left after"
-            out.append(chart(title, t_before, close, "time, s", (-half, half), shaded=held))
+            half = max(CLOSE_UP, float(np.quantile(np.abs(lines[2].y[np.isfinite(lines[2].y)]), SHOWN)))
+            title = f"{row} ({names_after[same]}), close up: what is left after"
+            out.append(chart(title, t, [lines[0], lines[2]], "time, s", (-half, half), shaded=held))
     return out
 
 
-def _time(state: State, windows: Windows) -> tuple[Array, list[tuple[float, float]]]:
+def _worst(state: State, speeds: Sequence[int]) -> int:
+    return max(speeds, key=lambda k: float(np.sum(state.residual[:, k] ** 2)))
+
+
+def _time(state: State) -> tuple[Array, list[tuple[float, float]]]:
     """Times (W,) of windows and spans that are held out; what another capture holds is drawn behind the first."""
     t, held = state.time.copy(), ~state.fitted
     first = t[state.fitted]

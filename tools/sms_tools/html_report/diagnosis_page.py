@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
+from fnmatch import fnmatchcase
 from html import escape
 from pathlib import Path
 
 import numpy as np
 
-from sms_online.description.schema import System
 from sms_online.diagnosis.diagnose import Diagnosis
 from sms_tools.html_report.arm_drawing import marked_arm
 from sms_tools.html_report.diagnosis_charts import AFTER, BEFORE, BOUNDS, law_charts, residual_charts
@@ -77,14 +77,18 @@ def _conditions(diagnosis: Diagnosis) -> str:
     return f"{seconds:.4g} s of samples in {rows.count} windows, {held} of them held out"
 
 
-def place_of(where: str, system: System) -> str:
-    """Where on the arm an effect is drawn: `joint_i`, `link_i`, `base` or `tip`."""
+def places_of(where: str, channels: Sequence[str]) -> list[str]:
+    """Where on the arm an effect is drawn, `joint_i`, `link_i`, `base` or `tip`: of channels where their sensors sit."""
     if where in ("base", "tip") or re.fullmatch(r"(joint|link)_\d+", where):
-        return where
-    if joint := JOINT_CHANNEL.match(where):
+        return [where]
+    return list(dict.fromkeys(_sensor(channel) for channel in channels if fnmatchcase(channel, where)))
+
+
+def _sensor(channel: str) -> str:
+    if joint := JOINT_CHANNEL.match(channel):
         return f"joint_{joint[1]}"
-    link = LINK_CHANNEL.match(where)
-    return link[1] if link else "base" if system.spacecraft is not None else "joint_1"
+    link = LINK_CHANNEL.match(channel)
+    return link[1] if link else "base"
 
 
 def _where(document: Document, diagnosis: Diagnosis) -> str:
@@ -92,9 +96,11 @@ def _where(document: Document, diagnosis: Diagnosis) -> str:
     rows = diagnosis.attempt.rows
     x = rows.weak.motions()[0][0].x
     x = x[:: max(1, len(x) // WAY_POINTS)]
+    channels = diagnosis.estimator_before.sensing.channels
     marks: dict[str, list[str]] = {}
     for number, effect in enumerate(document["effects"], start=1):
-        marks.setdefault(place_of(effect["where"], diagnosis.after.system), []).append(str(number))
+        for place in places_of(effect["where"], channels):
+            marks.setdefault(place, []).append(str(number))
     if document["unexplained"] is not None:
         marks.setdefault(document["unexplained"]["row"], []).append("?")
     scene = Scene(rows.model)
