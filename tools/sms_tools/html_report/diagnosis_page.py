@@ -78,7 +78,7 @@ def _conditions(diagnosis: Diagnosis) -> str:
 
 
 def places_of(where: str, channels: Sequence[str]) -> list[str]:
-    """Where on the arm an effect is drawn, `joint_i`, `link_i`, `base` or `tip`: of channels where their sensors sit."""
+    """Where an effect is drawn on the arm, `joint_i`, `link_i`, `base` or `tip`: at the sensors of its channels."""
     if where in ("base", "tip") or re.fullmatch(r"(joint|link)_\d+", where):
         return [where]
     return list(dict.fromkeys(_sensor(channel) for channel in channels if fnmatchcase(channel, where)))
