@@ -126,7 +126,7 @@ class Smoother:
         begin, end = torque_t[0], torque_t[-1]
         inside = (self._t >= begin) & (self._t <= end)
         moved = (self._moved >= self._index[0, 0]) & (self._moved <= self._index[count - 1, 0])
-        values, sigma, torque_density = self._weighed(self._values[inside], self._torque[:count])
+        values, sigma, torque_density = self._weighed(self._t[inside], self._values[inside], self._torque[:count])
         sensed = np.flatnonzero(np.isfinite(sigma))
         readings = Readings(self._model, [self.channels[k] for k in sensed])
         guess_x, guess_v = np.split(self._motion[moved], [self._model.layout.n_x], axis=1)
@@ -163,13 +163,13 @@ class Smoother:
         except ArithmeticError as error:
             raise DivergedError(str(error)) from None
 
-    def _weighed(self, values: Array, torque: Array) -> tuple[Array, Array, Array]:
-        """Samples, their noise (C,), NaN where nothing is known of it, and the density of the torques' (joints,)."""
+    def _weighed(self, t: Array, values: Array, torque: Array) -> tuple[Array, Array, Array]:
+        """Samples at t, their noise (C,), NaN where nothing is known of it, and the density of the torques' (joints,)."""
         sigma = stated_noise(self._model.system, self.channels)
         for k in np.flatnonzero(np.isnan(sigma)):
-            own = values[np.isfinite(values[:, k]), k]
+            own = np.flatnonzero(np.isfinite(values[:, k]))[-SAMPLES:]
             if own.size >= FEWEST_SAMPLES:
-                sigma[k] = noise_std(own[-SAMPLES:, None])[0]
+                sigma[k] = noise_std(values[own, k][:, None], t[own])[0]
         largest = np.max(np.abs(values), axis=0, initial=0.0, where=np.isfinite(values))
         sigma = np.maximum(sigma, FINEST * largest + np.finfo(np.float64).tiny)
         drives = self._sensing.noise[self._model.layout.n_x :]

@@ -1,0 +1,144 @@
+"""From a session to a verdict: what the planar example lacks is named, with its place, size and doubt.
+
+Sessions of 6 s at 1 kHz, noise of grade B (seeds are given), nominal values that are not the true ones.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from functools import cache
+from unittest.mock import patch
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+
+from sms_adapters.system_file import load_system
+from sms_online.description.parse import describe, parse_system
+from sms_online.description.schema import Effect, System
+from sms_online.diagnosis.candidates import CandidateColumns
+from sms_online.diagnosis.diagnose import Diagnosis, diagnose
+from sms_online.diagnosis.document import coefficients, diagnosis_document
+from sms_online.effects.catalogue import parse_effect
+from sms_online.stream import Block
+from sms_sim.simulate import sampled_blocks, simulate
+from sms_tools.adopted_system import adopted_text
+
+DURATION = 6.0
+# Far below the noise.
+TOLERANCE = 1e-8
+
+
+def unlike(system: System) -> System:
+    """The system with other joints and links than the true ones, so that nothing found can have been read."""
+    joints = tuple(joint.model_copy(update={"stiffness": 300.0, "damping": 20.0}) for joint in system.joints)
+    links = tuple(link.model_copy(update={"mass_per_length": 10.0}) for link in system.links)
+    return system.model_copy(update={"joints": joints, "links": links})
+
+
+@cache
+def block_of(*texts: str) -> Block:
+    """A session with injected effects."""
+    system = load_system("paper-planar")
+    effects = tuple(parse_effect(text, system) for text in texts)
+    simulation = simulate(system.model_copy(update={"effects": effects}), DURATION, position_tolerance=TOLERANCE)
+    blocks = list(sampled_blocks(simulation, "B", seed=4))
+    t, values = (np.concatenate([getattr(block, part) for block in blocks]) for part in ("t", "values"))
+    return Block(t, blocks[0].channels, values)
+
+
+@cache
+def diagnosed(*texts: str) -> Diagnosis:
+    return diagnose(unlike(load_system("paper-planar")), [block_of(*texts)], "test", lambda estimator: None)
+
+
+def keys(diagnosis: Diagnosis) -> list[str]:
+    return [finding.candidate.key for finding in diagnosis.findings]
+
+
+def told(diagnosis: Diagnosis) -> dict[str, float]:
+    return {name: value for name, (value, _) in coefficients(diagnosis, diagnosis.findings[0]).items()}
+
+
+def test_a_session_that_the_model_explains_is_clean() -> None:
+    diagnosis = diagnosed()
+    assert (diagnosis.verdict, keys(diagnosis)) == ("clean", [])
+    assert not any(row.beyond for row in diagnosis.before.test.values())
+    assert diagnosis.after.system == diagnosis.before.system
+
+
+@pytest.mark.parametrize(
+    ("text", "accuracy"),
+    [
+        # The sign of a noisy rate at standstill takes some of the friction away.
+        ("coulomb_friction@joint_2:torque=1", 0.05),
+        ("cubic_stiffness@joint_1:stiffness=300", 0.01),
+        ("torsional_hysteresis@joint_1:torque=5,width=0.02", 0.02),
+        ("tip_payload@tip:mass=0.5", 0.02),
+        ("sensor_lag@q_1:corner=40", 0.01),
+        ("encoder_offset@theta_m_2:offset=0.01", 0.02),
+        ("table_tilt@base:gravity_x=0.003,gravity_y=-0.002", 0.01),
+    ],
+)
+def test_the_missing_effect_is_named_with_its_place_and_size(text: str, accuracy: float) -> None:
+    """And nothing else is; what is left is noise."""
+    effect = parse_effect(text, load_system("paper-planar"))
+    diagnosis = diagnosed(text)
+    assert diagnosis.verdict == "named"
+    assert keys(diagnosis) == [f"{effect.name}@{effect.where}"]
+    assert told(diagnosis) == pytest.approx(effect.coefficients, rel=accuracy)
+    assert any(row.beyond for row in diagnosis.before.test.values())
+    assert not any(row.beyond for row in diagnosis.after.test.values())
+
+
+def test_two_effects_are_found_in_turn() -> None:
+    texts = "viscous_friction@joint_1:damping=2", "cubic_stiffness@joint_2:stiffness=300"
+    diagnosis = diagnosed(*texts)
+    assert diagnosis.verdict == "named"
+    assert set(keys(diagnosis)) == {text.partition(":")[0] for text in texts}
+
+
+def test_an_effect_that_nobody_knows_is_unexplained_where_it_acts() -> None:
+    """Cubic stiffness, struck from the catalogue with what resembles it: it depends on the deflection of its joint."""
+    alike = ("cubic_stiffness", "backlash", "encoder_eccentricity", "torsional_hysteresis", "encoder_offset")
+    inner = CandidateColumns.effects
+
+    def known(self: CandidateColumns) -> Iterator[Effect]:
+        return (effect for effect in inner(self) if effect.name not in alike)
+
+    block = block_of("cubic_stiffness@joint_1:stiffness=300")
+    with patch.object(CandidateColumns, "effects", known):
+        diagnosis = diagnose(unlike(load_system("paper-planar")), [block], "test", lambda estimator: None)
+    assert diagnosis.verdict == "unexplained"
+    assert diagnosis.unexplained is not None
+    assert diagnosis.unexplained.row in ("joint_1", "link_1")
+    assert diagnosis.unexplained.variable == "deflection of joint_1"
+
+
+def test_the_adopted_system_file_holds_what_was_found() -> None:
+    diagnosis = diagnosed("table_tilt@base:gravity_x=0.003,gravity_y=-0.002")
+    system = load_system("paper-planar")
+    found = diagnosis.after.system
+    text = adopted_text("paper-planar", system, system.model_copy(update={"gravity": found.gravity}))
+    assert_allclose(parse_system(text, "adopted").gravity, found.gravity, rtol=1e-8)
+    diagnosis = diagnosed("torsional_hysteresis@joint_1:torque=5,width=0.02")
+    adopted = system.model_copy(update={"effects": diagnosis.after.system.effects})
+    (effect,) = parse_system(adopted_text("paper-planar", system, adopted), "adopted").effects
+    assert (effect.name, effect.where) == ("torsional_hysteresis", "joint_1")
+    assert effect.coefficients["width"] == pytest.approx(0.02, rel=0.02)
+
+
+def test_the_document_holds_residuals_and_parameters_before_and_after() -> None:
+    diagnosis = diagnosed("cubic_stiffness@joint_1:stiffness=300")
+    document = diagnosis_document(diagnosis, [], None)
+    assert document["verdict"] == "named"
+    (effect,) = document["effects"]
+    assert effect["evidence"]["gain"] > effect["evidence"]["limit"]
+    for part in ("fit", "holdout"):
+        before, after = (document[side][part]["joint_1"] for side in ("before", "after"))
+        assert after["whitened"] < 0.2 * before["whitened"]
+        assert after["relative"] < before["relative"]
+    stiffness = {p["name"]: p["estimate"] for p in document["after"]["parameters"]}["joint_1.stiffness"]
+    assert stiffness == pytest.approx(1000.0, rel=1e-3)
+    assert document["candidates"][0]["name"] == "cubic_stiffness"
+    assert describe(diagnosis.before.system)["effects"] == []

@@ -1,0 +1,146 @@
+"""Rows of a whole session for its diagnosis, and the arithmetic of evidence."""
+
+from __future__ import annotations
+
+from functools import cache
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+
+from sms_adapters.system_file import load_system
+from sms_online.description.schema import Effect
+from sms_online.diagnosis.candidates import CandidateColumns
+from sms_online.diagnosis.constants import corrected, deviations, improved
+from sms_online.diagnosis.evidence import angle, basis, free_of, gain, threshold
+from sms_online.diagnosis.plausible import plausible
+from sms_online.diagnosis.record import SampleRecord, Segment, excerpts
+from sms_online.diagnosis.rows import SessionRows
+from sms_online.effects.base import Inputs
+from sms_online.pipeline.estimator import Estimator
+from sms_online.results import standard_deviation
+from sms_online.stream import Array
+from sms_online.trackers.factor import solve
+from sms_sim.simulate import sampled_blocks, simulate
+
+
+@cache
+def session() -> tuple[Estimator, SessionRows]:
+    """Four seconds of the planar example at grade B (seed 2)."""
+    system = load_system("paper-planar")
+    blocks = list(sampled_blocks(simulate(system, 4.0, position_tolerance=1e-8), "B", seed=2))
+    estimator = Estimator(system, blocks[0].channels, "test")
+    record = SampleRecord(system.sample_rate)
+    estimator.on_samples = record.add
+    for block in blocks:
+        estimator.push(block)
+    estimator.finish()
+    assert estimator.momentum is not None
+    assert estimator.momentum.sensor_noise is not None
+    noise, beta = estimator.momentum.sensor_noise, estimator.estimate().pi
+    return estimator, SessionRows(estimator.model, estimator.base, estimator.sensing, noise, record.segments(), beta)
+
+
+def test_columns_are_evaluated_as_the_balance_evaluates_them() -> None:
+    """The parameters' own columns, through the windows of the diagnosis: to the rounding of sums."""
+    _, rows = session()
+
+    def model(motion: object) -> tuple[Array, Array]:
+        inputs = Inputs(motion.torque, np.zeros((len(motion.x), 0)))  # type: ignore[attr-defined]
+        return rows.model.momentum_columns(motion.x, motion.v, inputs=inputs)  # type: ignore[attr-defined]
+
+    Y = rows.base.columns(rows.weak.columns(model))
+    assert_allclose(Y, rows.Y, atol=1e-9 * np.abs(rows.Y).max())
+
+
+def test_whitened_rows_give_the_estimate_of_the_stream() -> None:
+    """Their weights are those of the last estimate, the stream's those of its time: a third of a deviation apart."""
+    estimator, rows = session()
+    found = solve(rows.white(np.concatenate((rows.Y, rows.b[..., None]), axis=2)))
+    difference = (found.pi - estimator.estimate().pi) / standard_deviation(estimator)
+    assert np.abs(difference).max() < 1.0
+    assert np.sqrt(np.mean(difference**2)) < 1.0 / 3.0
+    assert found.rss / (rows.b.size - rows.base.n) == pytest.approx(1.0, abs=0.15)
+
+
+@pytest.mark.parametrize(
+    ("effect", "linear"),
+    [
+        (Effect(name="encoder_offset", where="q_1", coefficients={"offset": 1e-3}), 1e-3),
+        (Effect(name="sensor_lag", where="theta_m_2", coefficients={"corner": 150.0}), np.sqrt(2.0) / (300.0 * np.pi)),
+    ],
+)
+def test_a_channels_column_is_the_change_of_the_rows_when_it_is_corrected(effect: Effect, linear: float) -> None:
+    """Residuals of rows from corrected samples against those of the session: first order, so to 3 %."""
+    estimator, rows = session()
+    system = rows.model.system.model_copy(update={"effects": (effect,)})
+    parts = [corrected(system, rows.sensing.channels, segment) for segment in rows.segments]
+    moved = SessionRows(rows.model, rows.base, rows.sensing, rows.noise, parts, rows.beta)
+    inner = slice(5, -5)  # corrections begin at the record's ends
+    change = ((moved.Y - rows.Y) @ rows.beta)[inner]
+    same = (moved.weak.windows.half_width == rows.weak.windows.half_width)[inner]
+    column = CandidateColumns(rows, rows.model.system).of(effect.model_copy(update={"coefficients": {}})).columns
+    expected = column[inner, :, 0] * linear
+    scale = np.sqrt(np.mean(expected**2))
+    assert np.sqrt(np.mean((change[same] - expected[same]) ** 2)) < 0.03 * scale
+
+
+def test_a_gain_is_what_least_squares_takes_off_the_residual() -> None:
+    rng = np.random.default_rng(5)
+    Y, Z = rng.normal(size=(200, 4)), rng.normal(size=(200, 2))
+    b = Y @ rng.normal(size=4) + Z @ [0.3, -0.2] + rng.normal(size=200)
+    Q = basis(Y)
+    found = gain(Q, free_of(Q, b[:, None])[:, 0], Z)
+    without, with_both = (np.linalg.lstsq(A, b)[1][0] for A in (Y, np.column_stack((Y, Z))))
+    assert found.gain == pytest.approx(without - with_both)
+    both = np.column_stack((Y, Z))
+    assert_allclose(found.coefficients, np.linalg.lstsq(both, b)[0][4:])
+    assert_allclose(found.covariance, np.linalg.inv(both.T @ both)[4:, 4:])
+
+
+def test_a_column_that_the_model_has_gains_nothing() -> None:
+    rng = np.random.default_rng(6)
+    Y = rng.normal(size=(50, 3))
+    Q = basis(Y)
+    found = gain(Q, free_of(Q, rng.normal(size=(50, 1)))[:, 0], Y @ [[1.0], [2.0], [0.0]])
+    assert (found.gain, found.seen) == (0.0, False)
+
+
+def test_angles_are_those_beside_the_model() -> None:
+    Q = np.eye(4)[:, :1]
+    first, second = np.array([[5.0, 1.0, 0.0, 0.0]]).T, np.array([[-3.0, 1.0, 1.0, 0.0]]).T
+    assert angle(Q, first, second) == pytest.approx(np.pi / 4)
+
+
+def test_the_best_of_many_absent_candidates_passes_the_threshold_as_rarely_as_stated() -> None:
+    """4000 draws of 20 candidates at 5 % (seed 7): 3.9 to 6.1 % pass, four standard deviations of the count."""
+    rng = np.random.default_rng(7)
+    best = (rng.normal(size=(4000, 20)) ** 2).max(axis=1)
+    assert np.mean(best > threshold(0.05, 20, 1)) == pytest.approx(0.05, abs=0.014)
+
+
+def test_excerpts_are_spread_evenly_and_keep_what_fits() -> None:
+    segment = Segment(np.arange(1000), np.zeros((1000, 1)))
+    assert excerpts([segment], 100, 1000) == [segment]
+    parts = excerpts([segment], 100, 300)
+    assert [part.index[0] for part in parts] == [0, 450, 900]
+    assert all(part.index.size == 100 for part in parts)
+
+
+def test_constants_are_improved_by_what_is_left_of_them() -> None:
+    lag = improved(Effect(name="sensor_lag", where="q_1"), np.array([0.01]))
+    assert improved(lag, np.array([0.002])).coefficients["corner"] == pytest.approx(np.sqrt(2.0) / (2 * np.pi * 0.012))
+    disc = improved(Effect(name="encoder_eccentricity", where="q_1"), np.array([3e-3, 0.0]))
+    disc = improved(disc, np.array([0.0, 4e-3]))
+    assert disc.coefficients["amplitude"] == pytest.approx(5e-3)
+    assert np.sin(disc.coefficients["phase"]) == pytest.approx(0.8)
+    # σ of the two parts is σ of the radius, and of the angle over it.
+    stds = deviations(disc, np.diag([1e-8, 1e-8]))
+    assert stds == {"amplitude": pytest.approx(1e-4), "phase": pytest.approx(0.02)}
+
+
+def test_only_plausible_coefficients_are_taken() -> None:
+    assert plausible("coulomb_friction", np.array([0.1]))
+    assert not plausible("coulomb_friction", np.array([-0.1]))
+    assert not plausible("torque_gain", np.array([-1.0]))
+    assert plausible("cubic_stiffness", np.array([-100.0]))
