@@ -72,7 +72,7 @@ def test_whitened_rows_give_the_estimate_of_the_stream() -> None:
 )
 def test_a_channels_column_is_the_change_of_the_rows_when_it_is_corrected(effect: Effect, linear: float) -> None:
     """Residuals of rows from corrected samples against those of the session: first order, so to 3 %."""
-    estimator, rows = session()
+    _, rows = session()
     system = rows.model.system.model_copy(update={"effects": (effect,)})
     parts = [corrected(system, rows.sensing.channels, segment) for segment in rows.segments]
     moved = SessionRows(rows.model, rows.base, rows.sensing, rows.noise, parts, rows.beta)

@@ -16,8 +16,8 @@ from sms_online.effects.catalogue import ENTRIES, channel_effects
 from sms_online.effects.spacecraft import TableTilt
 from sms_online.stream import Array
 
-# Delay of a lag at least, s: one that the data make negative is none.
-SHORTEST_DELAY = 1e-5
+# Delay of a lag at least and at most, s: one that the data make negative is none.
+SHORTEST_DELAY, LONGEST_DELAY = 1e-5, 0.2
 
 
 def is_constant(effect: Effect) -> bool:
@@ -37,7 +37,7 @@ def improved(effect: Effect, increments: Array) -> Effect:
             changed = {"amplitude": float(np.hypot(sine, cosine)), "phase": float(np.arctan2(cosine, sine))}
         case "sensor_lag":
             delay = (delay_of(c["corner"]) if "corner" in c else 0.0) + float(increments[0])
-            changed = {"corner": delay_of(max(SHORTEST_DELAY, delay))}
+            changed = {"corner": delay_of(min(LONGEST_DELAY, max(SHORTEST_DELAY, delay)))}
         case "table_tilt":
             names = ("gravity_x", "gravity_y")
             changed = {name: c.get(name, 0.0) + float(g) for name, g in zip(names, increments, strict=True)}

@@ -134,7 +134,7 @@ class Attempt:
         described = applied(system, constants)
         same = described == session.system
         estimator = session if same else Estimator(described, session.sensing.channels, case.source)
-        known = case.prior(estimator)
+        self.prior = known = case.prior(estimator)
         if beta is None:
             beta = session.estimate().pi
             if known is not None and not session.by_momentum:

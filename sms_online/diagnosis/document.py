@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
 from sms_online.diagnosis.constants import deviations
-from sms_online.diagnosis.diagnose import Diagnosis, Part
+from sms_online.diagnosis.diagnose import Attempt, Diagnosis, Part
 from sms_online.diagnosis.trace import Finding
 from sms_online.effects.base import report
 from sms_online.effects.catalogue import ENTRIES, declarable
-from sms_online.results import results_document, standard_deviation
+from sms_online.model.parameters import Parameter
+from sms_online.results import LARGEST_RELATIVE_STD, NORMAL_95, results_document, standard_deviation
 from sms_online.stream import Array
 
 SCHEMA = "sms-online/diagnosis/1"
@@ -39,9 +41,12 @@ def diagnosis_document(diagnosis: Diagnosis, warnings: list[str], truth: dict[st
                 "fit": _part(state.fit),
                 "holdout": _part(state.holdout),
                 "limit": {row: test.limit for row, test in state.test.items()},
-                "parameters": results[name]["parameters"],
+                "parameters": results[name]["parameters"] if attempt.prior is None else _posterior(attempt, chosen),
             }
-            for name, state in (("before", before), ("after", after))
+            for name, state, attempt, chosen in (
+                ("before", before, diagnosis.described, []),
+                ("after", after, diagnosis.attempt, diagnosis.chosen),
+            )
         },
         "unexplained": None
         if unexplained is None
@@ -163,8 +168,44 @@ def coefficients(diagnosis: Diagnosis, finding: Finding) -> Coefficients:
     }
 
 
+def _posterior(attempt: Attempt, chosen: Sequence[int]) -> list[dict[str, Any]]:
+    """Parameters as in results.json, from the rows of the diagnosis: these bear a prior where the model lacks much.
+
+    A session weighs rows by the sensors' noise alone until it knows better, and against that no prior counts.
+    """
+    parameters, values, covariance = _batch(attempt, chosen)
+    stds = np.sqrt(np.diag(covariance))
+    return [
+        {
+            "name": p.name,
+            "symbol": p.symbol,
+            "unit": p.unit,
+            "estimate": float(value),
+            "std": float(std) if np.isfinite(std) else None,
+            "lower95": float(value - NORMAL_95 * std) if np.isfinite(std) else None,
+            "upper95": float(value + NORMAL_95 * std) if np.isfinite(std) else None,
+            "true": None,
+            "identifiable": bool(std <= LARGEST_RELATIVE_STD * abs(value)),
+        }
+        for p, value, std in zip(parameters, values, stds, strict=True)
+    ]
+
+
+def _batch(attempt: Attempt, chosen: Sequence[int]) -> tuple[list[Parameter], Array, Array]:
+    """Parameters of the model and of the effects chosen, with values and covariance from all rows."""
+    columns = [*attempt.fixed, *(attempt.tracing.candidates[k] for k in chosen)]
+    parameters = [*attempt.rows.base.parameters, *(p for candidate in columns for p in candidate.parameters)]
+    constants = {p.name for candidate in attempt.fixed for p in candidate.parameters}
+    kept = [k for k, p in enumerate(parameters) if p.name not in constants]
+    covariance = attempt.tracing.covariance(chosen)[np.ix_(kept, kept)]
+    return [parameters[k] for k in kept], attempt.solution(chosen)[kept], covariance
+
+
 def _estimate(diagnosis: Diagnosis) -> tuple[list[str], Array, Array]:
     """Names, values and covariance of the parameters after, its deviations those of the results."""
+    if diagnosis.attempt.prior is not None:
+        parameters, values, covariance = _batch(diagnosis.attempt, diagnosis.chosen)
+        return [p.name for p in parameters], values, np.where(np.isfinite(covariance), covariance, 0.0)
     session = diagnosis.estimator_after
     estimate, std = session.estimate(), standard_deviation(session)
     stated = np.sqrt(np.diag(estimate.covariance))

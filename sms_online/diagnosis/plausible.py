@@ -14,15 +14,13 @@ POSITIVE = frozenset(
         "torsional_hysteresis", "viscous_friction",
     )
 )  # fmt: skip
-# Ratios whose size is below this: with -1 a measured torque explains itself and the arm weighs nothing.
-RATIOS = frozenset(("torque_gain", "torque_ripple"))
-LARGEST_RATIO = 0.5
+# Largest coefficients. With a gain of -1 a measured torque explains itself and the arm weighs nothing; a channel that is
+# later than half a window of the planar example, s, is no channel of this session.
+LARGEST = {"torque_gain": 0.5, "torque_ripple": 0.5, "sensor_lag": 0.2, "torque_delay": 0.2}
 
 
 def plausible(name: str, coefficients: Array) -> bool:
     """Whether an effect can have these linear coefficients (c,)."""
-    if name in POSITIVE:
-        return bool(np.all(coefficients >= 0.0))
-    if name in RATIOS:
-        return bool(np.linalg.norm(coefficients) <= LARGEST_RATIO)
-    return True
+    if name in POSITIVE and np.any(coefficients < 0.0):
+        return False
+    return bool(np.linalg.norm(coefficients) <= LARGEST.get(name, np.inf))

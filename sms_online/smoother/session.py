@@ -164,7 +164,7 @@ class Smoother:
             raise DivergedError(str(error)) from None
 
     def _weighed(self, t: Array, values: Array, torque: Array) -> tuple[Array, Array, Array]:
-        """Samples at t, their noise (C,), NaN where nothing is known of it, and the density of the torques' (joints,)."""
+        """Samples at t, their noise (C,), NaN where nothing is known of it, and the torques' density (joints,)."""
         sigma = stated_noise(self._model.system, self.channels)
         for k in np.flatnonzero(np.isnan(sigma)):
             own = np.flatnonzero(np.isfinite(values[:, k]))[-SAMPLES:]
