@@ -272,12 +272,13 @@ class Tracing:
         """Every effect in its best form, by what it alone takes from the residual."""
         gains = self.gains([])
         r = free_of(basis(self._Y), self._b[:, None])[:, 0]
-        excess = max(float(r @ r) - r.size, float(np.finfo(np.float64).tiny))
+        # Where rows were given an error of their own, nothing may be beyond it: then shares are those of the best.
+        excess = max(float(r @ r) - r.size, *(g.gain for g in gains), float(np.finfo(np.float64).tiny))
         best: dict[str, int] = {}
         for k, candidate in enumerate(self.candidates):
             if candidate.key not in best or gains[k].gain > gains[best[candidate.key]].gain:
                 best[candidate.key] = k
-        ranked = [Ranked(self.candidates[k], gains[k].gain, min(1.0, gains[k].gain / excess)) for k in best.values()]
+        ranked = [Ranked(self.candidates[k], gains[k].gain, gains[k].gain / excess) for k in best.values()]
         return sorted(ranked, key=lambda entry: -entry.gain)
 
     def columns(self, chosen: Sequence[int]) -> Array:
