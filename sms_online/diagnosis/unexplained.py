@@ -2,25 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.interpolate import BSpline
 
 from sms_online.diagnosis.evidence import basis, free_of, gain
 from sms_online.diagnosis.residuals import row_types
 from sms_online.diagnosis.rows import SessionRows
-from sms_online.diagnosis.weak_windows import Motion
+from sms_online.diagnosis.splines import DEGREE, Variable, design, spline_columns
 from sms_online.stream import Array
 
 # Cubic splines on so many intervals of a variable's range.
 INTERVALS = 8
-DEGREE = 3
 # Points at which a spline is reported.
 POINTS = 25
-
-Variable = Callable[[Motion], Array]
 
 
 @dataclass(frozen=True)
@@ -54,7 +49,7 @@ def describe_residual(rows: SessionRows, columns: Array, residual: Array) -> Une
         knots = _knots(rows, variable)
         if knots is None:
             continue
-        spline = _columns(rows, variable, knots, speed) / rows.std[..., None]
+        spline = spline_columns(rows, variable, knots, np.eye(layout.n_v)[speed]) / rows.std[..., None]
         found = gain(Q, r, spline.reshape(-1, spline.shape[2]))
         if best is None or found.gain > best[0].gain:
             best = found, name, knots
@@ -62,7 +57,7 @@ def describe_residual(rows: SessionRows, columns: Array, residual: Array) -> Une
     found, name, knots = best
     at = np.linspace(knots[DEGREE], knots[-1 - DEGREE], POINTS)
     share = min(1.0, found.gain / max(float(excess.sum()), float(np.finfo(np.float64).tiny)))
-    return Unexplained(row, layout.speed_names[speed], name, share, at, _design(at, knots) @ found.coefficients)
+    return Unexplained(row, layout.speed_names[speed], name, share, at, design(at, knots) @ found.coefficients)
 
 
 def _variables(rows: SessionRows) -> dict[str, Variable]:
@@ -92,18 +87,3 @@ def _knots(rows: SessionRows, variable: Variable) -> Array | None:
         return None
     inner = np.linspace(low, high, INTERVALS + 1)
     return np.concatenate((np.full(DEGREE, low), inner, np.full(DEGREE, high)))
-
-
-def _design(values: Array, knots: Array) -> Array:
-    inside = np.clip(values, knots[0], knots[-1])
-    return np.asarray(BSpline.design_matrix(inside, knots, DEGREE).toarray())
-
-
-def _columns(rows: SessionRows, variable: Variable, knots: Array, speed: int) -> Array:
-    def weak(motion: Motion) -> tuple[None, Array]:
-        design = _design(variable(motion), knots)
-        G = np.zeros((len(design), rows.model.layout.n_v, design.shape[1]))
-        G[:, speed] = design
-        return None, G
-
-    return rows.weak.columns(weak)
