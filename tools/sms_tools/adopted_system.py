@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from difflib import ndiff
 from pathlib import Path
 
 from sms_online.description.parse import shipped_systems, shipped_text
@@ -14,8 +15,7 @@ NAME = "system.toml"
 
 def adopted_text(described: str, before: System, after: System) -> str:
     """TOML of the system `after`: the text of `described`, file or name of the system `before`, and what is new."""
-    text = shipped_text(described) if described in shipped_systems() else Path(described).read_text(encoding="utf-8")
-    lines = text.rstrip().splitlines()
+    lines = _text(described).rstrip().splitlines()
     if after.gravity != before.gravity:
         stated = [k for k, line in enumerate(lines) if re.match(r"\s*gravity\s*=", line)]
         gravity = (
@@ -33,6 +33,16 @@ def adopted_text(described: str, before: System, after: System) -> str:
                 inside = ", ".join(f"{name} = {value:.9g}" for name, value in effect.coefficients.items())
                 lines.append(f"coefficients = {{ {inside} }}")
     return "\n".join(lines) + "\n"
+
+
+def added_lines(described: str, adopted: str) -> list[str]:
+    """Lines of the TOML `adopted` that the text of `described`, file or name of a system, does not hold."""
+    pairs = ndiff(_text(described).rstrip().splitlines(), adopted.splitlines())
+    return [line[2:] for line in pairs if line.startswith("+ ")]
+
+
+def _text(described: str) -> str:
+    return shipped_text(described) if described in shipped_systems() else Path(described).read_text(encoding="utf-8")
 
 
 def write_adopted(directory: Path, text: str) -> Path:

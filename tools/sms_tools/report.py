@@ -51,7 +51,7 @@ def parameter_table(document: Document, width: int, title: str | None = None) ->
     for p in parameters:
         cells = [p["name"], p["unit"], NOT_DETERMINED, _in_doubt(p)] + [""] * wide
         if p["identifiable"]:
-            shown = _formatter(p["estimate"], p["std"])
+            shown = formatter(p["estimate"], p["std"])
             cells[2:4] = shown(p["estimate"]), f"{p['std']:.2g}"
             if wide:
                 cells[4] = f"{shown(p['lower95'])} … {shown(p['upper95'])}"
@@ -62,7 +62,7 @@ def parameter_table(document: Document, width: int, title: str | None = None) ->
     return table
 
 
-def _formatter(estimate: float, std: float) -> Callable[[float], str]:
+def formatter(estimate: float, std: float) -> Callable[[float], str]:
     """Formats an estimate and its interval down to the second digit of the standard deviation."""
     magnitude = math.floor(math.log10(abs(estimate))) if estimate else 0
     second = math.floor(math.log10(std)) - 1 if std else -math.inf

@@ -12,8 +12,9 @@ from sms_online.errors import InputError
 from sms_online.pipeline.estimator import Estimator
 from sms_online.stream import Array
 from sms_tools.html_report.arm_drawing import arm_drawings
+from sms_tools.html_report.error_bars import Bar, bar_range, error_bars
 from sms_tools.html_report.history import History
-from sms_tools.html_report.svg import Series, chart, svg
+from sms_tools.html_report.svg import Series, chart
 from sms_tools.report import NOT_DETERMINED, Document, trust_lines
 from sms_tools.view.frames import Reference
 from sms_tools.view.parameter_groups import Group, parameter_groups, shortened
@@ -23,22 +24,25 @@ NAME = "report.html"
 # Pictures of the arm: at the start, at the end, and evenly between.
 PICTURES = 5
 BOUNDS = 2.0  # standard deviations
-# Error bars: size, px, and the range of deviations, %, tried in this order until three quarters of them fit.
-BAR_WIDTH, BAR_HEIGHT = 190, 16
-BAR_RANGES = (0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0, 20.0, 50.0, 100.0)
-FITTING = 0.75
 
 STYLE = """
 body { font: 15px/1.45 system-ui, sans-serif; color: #1c2733; max-width: 1160px; margin: 2em auto; padding: 0 1em }
 h1 { font-size: 1.5em; margin-bottom: 0.1em } h2 { font-size: 1.15em; margin-top: 1.8em }
 table { border-collapse: collapse }
 td, th { padding: 0.15em 0.6em; text-align: right; white-space: nowrap; border-bottom: 1px solid #e4e9ee }
-td:first-child, th:first-child, td.left { text-align: left } tr.unknown { color: #8895a3 }
+td:first-child, th:first-child, .left { text-align: left } tr.unknown { color: #8895a3 }
 figure { display: inline-block; margin: 0.3em; text-align: center } figcaption { font-size: 0.85em; color: #5a6875 }
 svg { background: #fff } svg text { font: 11px system-ui, sans-serif; fill: #5a6875 }
 svg .title { font-size: 13px; fill: #1c2733 } svg .legend { text-anchor: end; paint-order: stroke; stroke: #fff;
-stroke-width: 3px } .grid { stroke: #e8edf2 } .mark { stroke: #d04040; stroke-dasharray: 3 3 }
+stroke-width: 3px } .grid { stroke: #e8edf2 } .span { fill: #f1f4f7 } .mark { stroke: #d04040; stroke-dasharray: 3 3 }
 .warning { background: #fff4e0; border-left: 4px solid #e0a030; padding: 0.3em 0.8em; margin: 0.4em 0 }
+.verdict { font-size: 1.1em; border-left: 6px solid #b4005a; background: #f8f1f5; padding: 0.5em 0.9em }
+.verdict.clean { border-color: #009e73; background: #eff8f5 }
+.pair { display: flex; gap: 1.5em; align-items: center }
+svg .badge { fill: #fff; text-anchor: middle; font-weight: bold }
+th.over { text-align: center } .dense { font-size: 13px }
+td.beyond { color: #c04000; font-weight: bold }
+pre { background: #f1f4f7; padding: 0.6em 0.9em; font-size: 13px; overflow-x: auto }
 """
 
 
@@ -98,10 +102,7 @@ def _parameters(document: Document, references: Sequence[Reference | None]) -> s
         if p["identifiable"] and reference is not None and reference.value:
             size = abs(reference.value) / 100.0
             deviations[k] = (p["estimate"] - reference.value) / size, BOUNDS * p["std"] / size
-    reach = np.abs(deviations).sum(axis=1)
-    reach = reach[np.isfinite(reach)]
-    fits = [limit for limit in BAR_RANGES if reach.size and np.mean(reach <= limit) >= FITTING]
-    limit = fits[0] if fits else BAR_RANGES[-1]
+    limit = bar_range(np.abs(deviations).sum(axis=1))
     is_true = any(reference is not None and reference.is_true for reference in references)
     compared = "true" if is_true else "nominal"
     rows = [
@@ -125,22 +126,7 @@ def _parameters(document: Document, references: Sequence[Reference | None]) -> s
 
 def _bar(deviation: float, bound: float, limit: float) -> str:
     """Estimate and ± 2σ on a scale of ± limit %, the reference in the middle; red where it lies outside the bounds."""
-    if not np.isfinite(deviation):
-        return ""
-    center, y = BAR_WIDTH / 2, BAR_HEIGHT / 2
-    left, middle, right = (
-        center + float(np.clip(value / limit, -1.0, 1.0)) * (center - 4)
-        for value in (deviation - bound, deviation, deviation + bound)
-    )
-    color = "#0072b2" if abs(deviation) <= bound else "#d04040"
-    return svg(
-        BAR_WIDTH,
-        BAR_HEIGHT,
-        f'<line class="grid" x1="4" x2="{BAR_WIDTH - 4}" y1="{y}" y2="{y}"/>'
-        f'<line x1="{center}" x2="{center}" y1="1" y2="{BAR_HEIGHT - 1}" stroke="#8895a3"/>'
-        f'<line x1="{left:.1f}" x2="{right:.1f}" y1="{y}" y2="{y}" stroke="{color}" stroke-width="3"/>'
-        f'<circle cx="{middle:.1f}" cy="{y}" r="3.5" fill="{color}"/>',
-    )
+    return error_bars([Bar(deviation, bound, "#0072b2" if abs(deviation) <= bound else "#d04040")], limit)
 
 
 def _convergence(estimator: Estimator, history: History, references: Sequence[Reference | None]) -> list[str]:

@@ -27,13 +27,18 @@ COLORS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#b8860b", "#56b4e9", "#44
 
 @dataclass(frozen=True)
 class Series:
-    """A line y (B,) over the chart's x, NaN where it has a gap, with bounds (B,) where there are some."""
+    """A line y (B,) over the chart's x, NaN where it has a gap, with bounds (B,) where there are some.
+
+    x (B,): of its own where it has them. color: the next of COLORS unless given.
+    """
 
     label: str
     y: Array
     lower: Array | None = None
     upper: Array | None = None
     dashed: bool = False
+    x: Array | None = None
+    color: str | None = None
 
 
 @dataclass(frozen=True)
@@ -69,12 +74,17 @@ def chart(
     x_label: str,
     y_range: tuple[float, float] | None = None,
     marks: Sequence[float] = (),
+    shaded: Sequence[tuple[float, float]] = (),
 ) -> str:
-    """A chart of lines over x (B,); without a range the y axis holds all lines, not their bounds. marks: at these x."""
+    """A chart of lines over x (B,); without a range the y axis holds all lines, not their bounds.
+
+    marks: at these x. shaded: from x to x.
+    """
     span = (float(x[0]), float(x[-1])) if x.size > 1 else (0.0, 1.0)
     horizontal = Axis(*span, LEFT, WIDTH - RIGHT)
     vertical = Axis(*(y_range or _range(series)), HEIGHT - BOTTOM, TOP)
     parts = [f'<text class="title" x="{LEFT}" y="18">{escape(title)}</text>', _grid(horizontal, vertical, x_label)]
+    parts[1:1] = [_span(horizontal, vertical, *span) for span in shaded]
     parts += [_line_at(horizontal, vertical, mark) for mark in marks]
     # Names must differ between the charts of a page and be the same each time it is made.
     name = f"clip{crc32(repr((title, span, [line.label for line in series])).encode())}"
@@ -82,13 +92,17 @@ def chart(
         f'<clipPath id="{name}"><rect x="{LEFT}" y="{TOP}" width="{WIDTH - LEFT - RIGHT}" '
         f'height="{HEIGHT - TOP - BOTTOM}"/></clipPath><g clip-path="url(#{name})">'
     )
-    pixels = horizontal.pixel(x)
     for k, line in enumerate(series):
-        color = COLORS[k % len(COLORS)]
+        color = _color(series, k)
+        pixels = horizontal.pixel(x if line.x is None else line.x)
         if line.lower is not None and line.upper is not None:
             parts.append(_band(pixels, vertical.pixel(line.lower), vertical.pixel(line.upper), color))
         parts.append(path(pixels, vertical.pixel(line.y), color, dashed=line.dashed))
     return svg(WIDTH, HEIGHT, "".join([*parts, "</g>", _legend(series)]))
+
+
+def _color(series: Sequence[Series], k: int) -> str:
+    return series[k].color or COLORS[k % len(COLORS)]
 
 
 def svg(width: float, height: float, content: str) -> str:
@@ -151,12 +165,18 @@ def _line_at(horizontal: Axis, vertical: Axis, mark: float) -> str:
     return f'<line class="mark" x1="{x:.1f}" x2="{x:.1f}" y1="{vertical.end}" y2="{vertical.start}"/>'
 
 
+def _span(horizontal: Axis, vertical: Axis, start: float, end: float) -> str:
+    left, right = horizontal.at(start), horizontal.at(end)
+    size = f'width="{right - left:.1f}" height="{vertical.start - vertical.end:g}"'
+    return f'<rect class="span" x="{left:.1f}" y="{vertical.end:g}" {size}/>'
+
+
 def _legend(series: Sequence[Series]) -> str:
     """Labels in the upper right corner, each in the colour of its line."""
     x = WIDTH - RIGHT - 6
     parts = []
     for k, line in enumerate(series):
-        color = COLORS[k % len(COLORS)]
+        color = _color(series, k)
         place = f'x="{x}" y="{TOP + 14 + 14 * k}"'
         parts.append(f'<text class="legend" {place} style="fill: {color}">{escape(line.label)}</text>')
     return "".join(parts)

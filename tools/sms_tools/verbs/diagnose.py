@@ -17,12 +17,14 @@ from sms_online.errors import InputError
 from sms_online.pipeline.estimator import Estimator
 from sms_online.stream import Block
 from sms_online.trackers.interface import Prior
-from sms_tools.adopted_system import adopted_text, write_adopted
+from sms_tools.adopted_system import added_lines, adopted_text, write_adopted
 from sms_tools.exit_codes import NOTHING_DETERMINED, OK
+from sms_tools.html_report.diagnosis_page import write_diagnosis
 from sms_tools.priors import base_prior
 from sms_tools.report import Document, parameter_table, report_console, show
 from sms_tools.results_file import results_directory, to_json, write_document
 from sms_tools.session import described_system
+from sms_tools.true_values import true_values
 
 NAME = "diagnosis.json"
 # Ambiguous and ranked candidates that people are shown.
@@ -58,17 +60,21 @@ def run(args: argparse.Namespace) -> int:
         console.print(f"{message} …", markup=False, style="dim")
 
     diagnosis = diagnose(system, blocks, str(args.capture), prior, holdout, progress)
-    document = diagnosis_document(diagnosis, warnings, None if truth is None else truth["parameters"])
+    true = None if truth is None else true_values(truth, system, diagnosis.after.system)
+    document = diagnosis_document(diagnosis, warnings, true)
     lines: list[Table | str] = ["", document["summary"], ""]
     if document["effects"]:
         lines += [_effects(document), ""]
     lines += [_residuals(document), "", parameter_table(document["after"], console.width, title="after"), ""]
     lines += [f"warning: {warning}" for warning in document["warnings"]]
     path = write_document(directory / NAME, document)
+    added: list[str] = []
     if diagnosis.after.system != system:
         text = adopted_text(args.system, system, diagnosis.after.system)
+        added = added_lines(args.system, text)
         lines.append(f"system file with what was found: {write_adopted(directory, text)}")
-    show(console, *lines, f"diagnosis: {path}")
+    page = write_diagnosis(directory, document, diagnosis, args.capture.name, added)
+    show(console, *lines, f"diagnosis: {path}", f"page: {page}")
     if args.json:
         print(to_json(document))
     return OK if any(p["identifiable"] for p in document["after"]["parameters"]) else NOTHING_DETERMINED

@@ -1,0 +1,149 @@
+"""diagnosis.html: self-contained, well-formed, and showing the law that the data follow where the effect sits."""
+
+from __future__ import annotations
+
+import json
+import re
+from pathlib import Path
+from xml.etree import ElementTree
+
+import numpy as np
+import pytest
+from axis import AXIS, DAMPING, INERTIA
+
+from sms_adapters.capture import CaptureWriter
+from sms_adapters.system_file import load_system
+from sms_online.description.channels import channels
+from sms_online.description.parse import parse_system
+from sms_online.description.schema import Effect
+from sms_online.diagnosis.diagnose import Diagnosis, diagnose
+from sms_online.diagnosis.document import diagnosis_document
+from sms_online.diagnosis.force_curves import added_variables, force_curves
+from sms_online.model.model import Model
+from sms_online.stream import Block
+from sms_tools.adopted_system import added_lines, adopted_text
+from sms_tools.cli import main
+from sms_tools.html_report.arm_drawing import MARK, marked_arm
+from sms_tools.html_report.diagnosis_page import places_of, write_diagnosis
+from sms_tools.report import Document
+from sms_tools.true_values import true_values
+from sms_tools.view.scene import Scene
+
+COULOMB = 0.2  # N m
+# rad/s; where the axis turns, its filter's half width of 14 samples blurs the speed by up to 11 rad/s² times 0.07 s.
+TURNING = 0.8
+
+
+def axis_block(coulomb: float) -> Block:
+    """The axis along two sines, with friction that its description lacks, sensors' noise of seed 3."""
+    t = np.arange(2400) / 200.0
+    q = np.sin(2 * t) + 0.3 * np.sin(5 * t)
+    rate, acceleration = 2 * np.cos(2 * t) + 1.5 * np.cos(5 * t), -4 * np.sin(2 * t) - 7.5 * np.sin(5 * t)
+    torque = INERTIA * acceleration + DAMPING * rate + coulomb * np.sign(rate)
+    noise = np.random.default_rng(3).standard_normal((2, t.size)) * ((0.01,), (1e-4,))
+    return Block(t, ("force_1", "q_1"), np.stack((torque, q), axis=1) + noise.T)
+
+
+def diagnosed(coulomb: float) -> Diagnosis:
+    return diagnose(parse_system(AXIS, "axis"), [axis_block(coulomb)], "test", lambda estimator: None)
+
+
+@pytest.fixture(scope="module")
+def diagnosis() -> Diagnosis:
+    """Of the axis with Coulomb friction."""
+    return diagnosed(COULOMB)
+
+
+def page_of(diagnosis: Diagnosis, directory: Path, added: list[str]) -> tuple[Document, str]:
+    document = diagnosis_document(diagnosis, ["a warning with <angle brackets>"], None)
+    return document, write_diagnosis(directory, document, diagnosis, "run.csv", added).read_text()
+
+
+def test_the_curve_from_the_data_is_the_friction_that_was_there(diagnosis: Diagnosis) -> None:
+    (curve,) = force_curves(diagnosis)
+    assert [effect.name for effect in curve.effects] == ["coulomb_friction"]
+    moving = np.abs(curve.at) > TURNING
+    for force in (curve.force, curve.law):
+        np.testing.assert_allclose(force[moving], -COULOMB * np.sign(curve.at[moving]), rtol=0.03)
+    assert added_variables(diagnosis) == []
+
+
+def test_the_page_is_whole_and_well_formed(diagnosis: Diagnosis, tmp_path: Path) -> None:
+    document, page = page_of(diagnosis, tmp_path, ['name = "coulomb_friction" # & more'])
+    assert not re.search(r"(src|href)=|https?://|@import|<script", page)
+    drawings = re.findall(r"<svg.*?</svg>", page, re.DOTALL)
+    for drawing in drawings:
+        ElementTree.fromstring(drawing)
+    names = re.findall(r'clipPath id="(\w+)"', page)
+    assert len(names) == len(set(names)) >= 3
+    assert document["summary"] in page
+    assert "a warning with &lt;angle brackets&gt;" in page
+    assert "# &amp; more" in page
+    assert "found: 1" in page
+    for p in document["after"]["parameters"]:
+        assert p["name"] in page
+
+
+def test_the_same_session_gives_the_same_page(diagnosis: Diagnosis, tmp_path: Path) -> None:
+    assert page_of(diagnosis, tmp_path, [])[1] == page_of(diagnosed(COULOMB), tmp_path, [])[1]
+
+
+def test_a_clean_session_has_a_page_without_effects(tmp_path: Path) -> None:
+    document, page = page_of(diagnosed(0.0), tmp_path, [])
+    assert document["verdict"] == "clean"
+    assert "What and where" not in page
+    assert ">after" not in page.split("Parameters before and after")[1]
+
+
+def test_diagnose_writes_the_page_beside_its_document(tmp_path: Path) -> None:
+    system, capture, block = tmp_path / "axis.toml", tmp_path / "run.csv", axis_block(COULOMB)
+    system.write_text(AXIS)
+    with CaptureWriter(capture, block.channels) as writer:
+        writer.write(block)
+    out = tmp_path / "out"
+    assert main(["diagnose", str(capture), "--system", str(system), "--out", str(out)]) == 0
+    page = (out / "diagnosis.html").read_text()
+    assert json.loads((out / "diagnosis.json").read_text())["summary"] in page
+    assert "[[effect]]\nname = &quot;coulomb_friction&quot;\nwhere = &quot;joint_1&quot;" in page
+
+
+def test_every_place_of_an_effect_is_marked() -> None:
+    system = load_system("paper-planar")
+    scene = Scene(Model(system))
+    x = np.zeros((3, scene.model.layout.n_x))
+    places = {"base": "1", "joint_1": "2", "joint_2": "3, 4", "link_1": "5", "link_2": "6", "tip": "?"}
+    root = ElementTree.fromstring(marked_arm(scene, x, 1, places))
+    badges = [text.text for text in root.iter("text") if text.get("class") == "badge"]
+    assert badges == list(places.values())
+    rings = [ring for ring in root.iter("circle") if ring.get("stroke") == MARK]
+    assert len(rings) == 3
+
+
+@pytest.mark.parametrize(
+    ("where", "places"),
+    [
+        ("tip", ["tip"]), ("joint_2", ["joint_2"]), ("q_1", ["joint_1"]), ("theta_m_*", ["joint_1", "joint_2"]),
+        ("link_2.*", ["link_2"]), ("link_*.marker_*.u_*", ["link_1", "link_2"]), ("r_S_*", ["base"]),
+    ],
+)  # fmt: skip
+def test_an_effect_on_channels_is_marked_where_their_sensors_sit(where: str, places: list[str]) -> None:
+    assert places_of(where, channels(load_system("paper-planar"))) == places
+
+
+def test_what_a_system_file_gains_is_told_alone() -> None:
+    system = load_system("paper-planar")
+    found = Effect(name="cubic_stiffness", where="joint_1")
+    after = system.model_copy(update={"effects": (*system.effects, found)})
+    added = added_lines("paper-planar", adopted_text("paper-planar", system, after))
+    assert [line for line in added if line] == ["[[effect]]", 'name = "cubic_stiffness"', 'where = "joint_1"']
+
+
+def test_effects_that_were_not_injected_are_truly_zero() -> None:
+    system = load_system("paper-planar")
+    named = [Effect(name="coulomb_friction", where=f"joint_{i}") for i in (1, 2)]
+    adopted = system.model_copy(update={"effects": (*system.effects, *named)})
+    injected = {"name": "coulomb_friction", "where": "joint_2", "coefficients": {"torque": 1.5}}
+    true = true_values({"parameters": {"link_1.mass": 2.0}, "effects": [injected]}, system, adopted)
+    assert true["coulomb_friction@joint_1.torque"] == 0.0
+    assert true["coulomb_friction@joint_2.torque"] == 1.5
+    assert true["link_1.mass"] == 2.0
