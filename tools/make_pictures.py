@@ -11,6 +11,8 @@ from __future__ import annotations
 import argparse
 import io
 import os
+import shutil
+import subprocess
 import sys
 import tempfile
 from collections.abc import Sequence
@@ -36,13 +38,20 @@ SESSIONS = {
     "planar": ("paper-planar", "20", "B"),
     "seven-joint": ("seven-joint", "20", "A"),
 }
+# Effects behind the picture of a diagnosis, one of each kind that has a picture of its own; size of its page, px.
+EFFECTS = (
+    "coulomb_friction@joint_2:torque=1",
+    "cubic_stiffness@joint_1:stiffness=5000",
+    "sensor_lag@link_1.*:corner=100",
+)
+PAGE_WIDTH, PAGE_HEIGHT = 1200, 2025
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Simulate, replay with a recording, and photograph it."""
     parser = argparse.ArgumentParser(description="Make the pictures in docs/pictures.")
     parser.add_argument("--quanser", metavar="FILE.mat", type=Path, help="the published measurement, for its picture")
-    parser.add_argument("--only", metavar="NAME", help="planar, seven-joint or quanser")
+    parser.add_argument("--only", metavar="NAME", help="planar, seven-joint, quanser or diagnosis")
     options = parser.parse_args(arguments)
     PICTURES.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory() as folder:
@@ -56,6 +65,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
             capture = Path(folder) / "quanser.csv"
             _run("import", "quanser", options.quanser, "--capture", capture)
             recordings["quanser"] = _recording(capture, "quanser-2dsfl", "--prior", "--exaggerate", "3")
+        if options.only in (None, "diagnosis"):
+            _diagnosis(Path(folder) / "diagnosis.csv")
         for name, recording in recordings.items():
             _photograph(recording, name, animated=name == "planar")
 
@@ -69,6 +80,26 @@ def _recording(capture: Path, system: str, *options: str) -> Path:
     directory = capture.with_suffix("")
     _run("replay", capture, "--system", system, "--out", directory, "--rerun", "save", *options)
     return directory / "session.rrd"
+
+
+def _diagnosis(capture: Path) -> None:
+    """The top of the page of a diagnosis, as a browser draws it."""
+    system, seconds, grade = SESSIONS["planar"]
+    effects = [part for effect in EFFECTS for part in ("--effect", effect)]
+    _run("simulate", "--system", system, "--capture", capture, "--duration", seconds, "--grade", grade, *effects)
+    directory = capture.with_suffix("")
+    _run("diagnose", capture, "--system", system, "--out", directory)
+    browser = shutil.which("chromium") or shutil.which("chromium-browser")
+    if browser is None:
+        sys.exit("no Chromium; tools/install_browser.sh installs it")
+    options = [
+        "--headless",
+        "--no-sandbox",  # containers run as root
+        "--hide-scrollbars",
+        f"--window-size={PAGE_WIDTH},{PAGE_HEIGHT}",
+        f"--screenshot={PICTURES / 'diagnosis.png'}",
+    ]
+    subprocess.run([browser, *options, (directory / "diagnosis.html").as_uri()], check=True, stderr=subprocess.DEVNULL)
 
 
 def _photograph(recording: Path, name: str, animated: bool) -> None:
