@@ -14,8 +14,8 @@ POSITIVE = frozenset(
         "torsional_hysteresis", "viscous_friction",
     )
 )  # fmt: skip
-# Largest coefficients. With a gain of -1 a measured torque explains itself and the arm weighs nothing; a channel that is
-# later than half a window of the planar example, s, is no channel of this session.
+# Largest coefficients. With a gain of -1 a measured torque explains itself and the arm weighs nothing; a channel that
+# is later than half a window of the planar example, s, is no channel of this session.
 LARGEST = {"torque_gain": 0.5, "torque_ripple": 0.5, "sensor_lag": 0.2, "torque_delay": 0.2}
 
 

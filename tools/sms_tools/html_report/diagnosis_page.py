@@ -34,7 +34,8 @@ LINK_CHANNEL = re.compile(r"(link_\d+)\.")
 HOW_LAWS = (
     "Where an effect is a force over one variable, that force is also fitted as a free curve, with everything else as "
     "found: where the curve leaves the law by more than its band, the law is not the whole truth. Of other effects the "
-    "rows are shown, free of all that the rest of the model holds, in groups by what the effect adds to them."
+    "rows are shown, free of all that the rest of the model holds, in groups by what the effect adds to them. Close to "
+    "standstill, where an axis sticks and smoothing blurs its speed, curves of friction are rounded."
 )
 
 
@@ -94,8 +95,10 @@ def _sensor(channel: str) -> str:
 def _where(document: Document, diagnosis: Diagnosis) -> str:
     """The arm in the middle of the session, with the effects' numbers at their places."""
     rows = diagnosis.attempt.rows
-    x = rows.weak.motions()[0][0].x
-    x = x[:: max(1, len(x) // WAY_POINTS)]
+    # Windows of each filter's width tell another part of the motion.
+    first = [motion for motion, _ in rows.weak.motions() if motion.segment == 0]
+    order = np.argsort(np.concatenate([motion.samples for motion in first]), kind="stable")
+    x = np.concatenate([motion.x for motion in first])[order][:: max(1, order.size // WAY_POINTS)]
     channels = diagnosis.estimator_before.sensing.channels
     marks: dict[str, list[str]] = {}
     for number, effect in enumerate(document["effects"], start=1):
