@@ -20,6 +20,7 @@ from sms_online.diagnosis.candidates import CandidateColumns
 from sms_online.diagnosis.diagnose import Diagnosis, diagnose
 from sms_online.diagnosis.document import coefficients, diagnosis_document
 from sms_online.effects.catalogue import parse_effect
+from sms_online.errors import InputError
 from sms_online.stream import Block
 from sms_sim.simulate import sampled_blocks, simulate
 from sms_tools.adopted_system import adopted_text
@@ -142,3 +143,37 @@ def test_the_document_holds_residuals_and_parameters_before_and_after() -> None:
     assert stiffness == pytest.approx(1000.0, rel=1e-3)
     assert document["candidates"][0]["name"] == "cubic_stiffness"
     assert describe(diagnosis.before.system)["effects"] == []
+
+
+@pytest.mark.parametrize(("samples", "words"), [(500, "too few"), (700, "too few windows")])
+def test_a_capture_that_is_too_short_is_refused(samples: int, words: str) -> None:
+    block = block_of()
+    short = Block(block.t[:samples], block.channels, block.values[:samples])
+    with pytest.raises(InputError, match=words):
+        diagnose(unlike(load_system("paper-planar")), [short], "short.csv", lambda estimator: None)
+
+
+def test_a_session_without_momentum_rows_is_refused() -> None:
+    system = unlike(load_system("paper-planar")).model_copy(update={"balance": "energy"})
+    with pytest.raises(InputError, match="no momentum balance"):
+        diagnose(system, [block_of()], "test", lambda estimator: None)
+
+
+def test_gaps_and_short_stretches_between_them_do_no_harm() -> None:
+    """Two gaps of half a second with 40 samples between them: still clean."""
+    block = block_of()
+    kept = ~((block.t > 2.0) & (block.t < 2.5)) & ~((block.t > 2.54) & (block.t < 3.0))
+    parts = Block(block.t[kept], block.channels, block.values[kept])
+    diagnosis = diagnose(unlike(load_system("paper-planar")), [parts], "test", lambda estimator: None)
+    assert diagnosis.verdict == "clean"
+
+
+def test_joints_at_rest_end_the_search_and_are_no_error() -> None:
+    """Encoders of joint 2 that stand still: whatever is said of such a session, it is said."""
+    block = block_of()
+    values = block.values.copy()
+    for channel in ("q_2", "theta_m_2"):
+        values[:, block.channels.index(channel)] = 0.1
+    stuck = Block(block.t[:3000], block.channels, values[:3000])
+    diagnosis = diagnose(unlike(load_system("paper-planar")), [stuck], "test", lambda estimator: None)
+    assert diagnosis.verdict == "unexplained"

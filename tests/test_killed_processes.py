@@ -120,7 +120,7 @@ def test_an_arm_that_is_killed_is_named_and_picked_up_when_it_moves_again(
     until(lambda: samples(session) > before + ENOUGH, lambda: session.said)
     document = session.end()
     assert any(w.startswith("encoder: lost 1 times and opened again") for w in document["warnings"])
-    assert "drive: silent for more than 1 s, 1 times" in document["warnings"]
+    assert any(w.startswith("drive: silent for more than 1 s, ") for w in document["warnings"])
     assert document["samples"] > 3 * ENOUGH  # rows of the drive and of the encoder
     assert_right(document)
     assert main(["replay", str(session.out), "--system", str(file), "--out", str(tmp_path / "again")]) == 0

@@ -72,6 +72,8 @@ class CandidateColumns:
                 shapes = dict(zip(grids, values, strict=True))
                 if "order" in shapes and not self._turns(effect.where, shapes["order"]):
                     continue
+                if any(value <= 0.0 < entry.shapes[s].default for s, value in shapes.items()):
+                    continue  # a joint at rest has no range to take a share of
                 yield effect.model_copy(update={"coefficients": effect.coefficients | shapes})
 
     def _turns(self, where: str, order: float) -> bool:

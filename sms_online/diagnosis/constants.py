@@ -80,8 +80,8 @@ def corrected(system: System, channels: Sequence[str], segment: Segment) -> Segm
     """Samples of the channels without the effects on them that the system declares, the last of which was the first."""
     values = segment.values.copy()
     # A sensor's lag acts on what its disc or its zero has already distorted.
-    effects = sorted(channel_effects(system), key=lambda effect: effect.name != "sensor_lag")
-    for effect in effects:
+    last_first = channel_effects(system)[::-1]
+    for effect in sorted(last_first, key=lambda effect: effect.name != "sensor_lag"):
         for k, channel in enumerate(channels):
             if effect.acts_on(channel):
                 values[:, k] = effect.correct(values[:, k], system.sample_rate)

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from sms_online.description.schema import Effect, System
 from sms_online.diagnosis.candidates import CandidateColumns
 from sms_online.diagnosis.constants import applied, corrected, improved, is_constant
+from sms_online.diagnosis.followed import HALF_WIDTH
 from sms_online.diagnosis.record import LONGEST, SampleRecord, Segment, excerpts
 from sms_online.diagnosis.relative import RelativeResiduals
 from sms_online.diagnosis.residuals import ResidualTest, RowResidual, whitened
@@ -97,6 +98,16 @@ class Diagnosis:
     estimator_after: Estimator
     unexplained: Unexplained | None
 
+    @property
+    def left(self) -> float:
+        """Share of what was beyond noise that is left with what was found."""
+        return _left(self.before, self.after)
+
+
+def _left(before: State, after: State) -> float:
+    """Share of what is beyond noise that is left."""
+    return max(0.0, after.excess) / max(before.excess, 1.0)
+
 
 # Gives what is known beforehand of the parameters of an estimator's model.
 PriorOf = Callable[[Estimator], Prior | None]
@@ -137,7 +148,7 @@ class Attempt:
         self.prior = known = case.prior(estimator)
         if beta is None:
             beta = session.estimate().pi
-            if known is not None and not session.by_momentum:
+            if known is not None and not weighed(session):
                 # A fit that leaves half of the torques bends everything; what was known before is nearer.
                 beta = np.where(known.known, known.value, beta)
         positions = case.noise.grid[: len(estimator.sensing.position_columns)]
@@ -145,18 +156,24 @@ class Attempt:
         span = system.windows.momentum
         most = min(most, MOST_WINDOWS * span / HOPS)
         length, longest = (round(seconds * system.sample_rate) for seconds in (STRETCH * span, most))
-        fitting, held = (excerpts(each, length, longest) for each in (case.segments, case.held))
+        # Windows of the widest filter, a tenth of a window more than none.
+        least = round(1.5 * span * system.sample_rate) + 2 * HALF_WIDTH
+        fitting, held = (
+            [part for part in excerpts(each, length, longest) if part.index.size > least]
+            for each in (case.segments, case.held)
+        )
         channels = session.sensing.channels
         values = [corrected(described, channels, segment) for segment in (*fitting, *held)]
         self.rows = SessionRows(estimator.model, estimator.base, estimator.sensing, noise, values, beta)
-        if self.rows.count == 0:
-            expected = f"{span:g} s and more of samples without a gap"
-            raise InputError(case.source, "", "no stretch as long as a window", expected)
         self.make = CandidateColumns(self.rows, described)
         self._fitting = len(fitting)
-        first, last = self.rows.time[0], self.rows.time[-1]
+        first, last = self.rows.time[:1].sum(), self.rows.time[-1:].sum()
         self._split = np.inf if held else first + FITTED * (last - first)
         fitted = self._fitted(self.rows.time, self.rows.weak.windows.segment)
+        enough = min(int(fitted.sum()) * self.rows.model.layout.n_v // (2 * self.rows.base.n), int((~fitted).sum()))
+        if enough == 0:
+            expected = "stretches without a gap of several windows, to fit and to check"
+            raise InputError(case.source, "", f"too few windows of {span:g} s: {self.rows.count}", expected)
         made = self.make.all() if candidates is None else [self._made(candidate) for candidate in candidates]
         self.fixed = [self.make.of(effect) for effect in self.constants]
         self.tracing = Tracing(self.rows, made, fitted, known, self.fixed)
@@ -227,6 +244,11 @@ class Attempt:
         )
 
 
+def weighed(session: Estimator) -> bool:
+    """Whether a session's estimate comes from rows that are weighed by noise."""
+    return session.by_momentum or session.by_smoother
+
+
 def _exact(system: System) -> System | None:
     """The system with all its links exact, by effects that say so; None where there is no linear one."""
     links = places(system, ENTRIES["geometric_stiffening"].at)
@@ -251,15 +273,24 @@ def diagnose(
     """
     progress("fitting the model as described")
     before, record = _session(system, blocks, source, prior)
-    if before.momentum is None or before.momentum.sensor_noise is None:
+    if before.momentum is None:
+        lacking = f"no {before.sensing.missing[0]}" if before.sensing.missing else 'balance = "energy"'
+        raise InputError(
+            source, "", f"{lacking}, so no momentum balance", "a system whose coordinates are all measured"
+        )
+    if before.momentum.sensor_noise is None:
         raise InputError(source, "", "too few samples to tell the sensors' noise", "a longer capture")
+    if before.events:
+        event = before.events[0]
+        expected = "a part without it: -ss or -to"
+        raise InputError(source, f"{event.time:.2f} s", f"an event ({event.kind}) within the capture", expected)
     held = _session(system, holdout, source, prior)[1].segments() if holdout else []
     case = Case(source, before, before.momentum.sensor_noise, record.segments(), held, prior)
     progress("tracing what it leaves")
     attempt = described = Attempt(case, system)
     n = described.rows.base.n
     chosen = attempt.search()
-    for _ in range(0 if before.by_momentum else REWEIGHED):
+    for _ in range(0 if weighed(before) else REWEIGHED):
         # Nothing was known of the rows' noise that was worth the name, for nothing explained the torques.
         beta = attempt.solution(chosen)[:n]
         attempt = described = Attempt(case, system, (), beta, attempt.tracing.candidates)
@@ -295,9 +326,10 @@ def diagnose(
     progress("fitting the model with what was found")
     named = after.system != system
     estimator_after = _session(after.system, blocks, source, prior)[0] if named else before
-    left = max(0.0, after.excess) / max(bare.excess, 1.0)
+    left = _left(bare, after)
     beyond = any(row.beyond for row in after.test.values())
-    verdict = "unexplained" if beyond and left > LARGEST_SHARE_LEFT else "named" if named else "clean"
+    unknown = beyond and (not named or left > LARGEST_SHARE_LEFT)
+    verdict = "unexplained" if unknown else "named" if named else "clean"
     unexplained = None
     if verdict == "unexplained":
         unexplained = describe_residual(attempt.rows, attempt.tracing.columns(chosen), after.residual)

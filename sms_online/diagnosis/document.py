@@ -84,8 +84,9 @@ def summary(diagnosis: Diagnosis) -> str:
         return f"The model lacks {', '.join(keys)}: with it {falls}."
     unexplained = diagnosis.unexplained
     assert unexplained is not None
-    left = max(0.0, after.excess) / max(before.excess, 1.0)
-    tried = f" The nearest known effects ({', '.join(keys)}) leave {100.0 * left:.0f} % of it." if keys else ""
+    tried = (
+        f" The nearest known effects ({', '.join(keys)}) leave {100.0 * diagnosis.left:.0f} % of it." if keys else ""
+    )
     return (
         f"The model lacks something that no known effect explains: most of it acts on {unexplained.row} "
         f"({unexplained.speed}) and depends on {unexplained.variable}.{tried}"
@@ -104,6 +105,7 @@ def _part(part: Part) -> dict[str, dict[str, float | None]]:
 def _effect(diagnosis: Diagnosis, finding: Finding) -> dict[str, Any]:
     effect = finding.candidate.effect
     units = declarable(ENTRIES[effect.name], diagnosis.after.system)
+    units |= {p.quantity: p.unit for p in finding.candidate.parameters if p.quantity in units}
     return {
         "name": effect.name,
         "where": effect.where,
@@ -124,7 +126,6 @@ def _effect(diagnosis: Diagnosis, finding: Finding) -> dict[str, Any]:
 def _kinematics(diagnosis: Diagnosis) -> list[dict[str, Any]]:
     """Effects that changed the kinematics of links: they have no coefficients and replace the rows."""
     described, adopted = diagnosis.described.system, diagnosis.attempt.system
-    left = max(0.0, diagnosis.after.excess) / max(diagnosis.before.excess, 1.0)
     return [
         {
             "name": effect.name,
@@ -132,7 +133,11 @@ def _kinematics(diagnosis: Diagnosis) -> list[dict[str, Any]]:
             "coefficients": {},
             "ambiguous_with": [],
             "separated_by": None,
-            "evidence": {"gain": diagnosis.before.excess * (1.0 - left), "limit": 0.0, "held_out_improvement": None},
+            "evidence": {
+                "gain": diagnosis.before.excess * (1.0 - diagnosis.left),
+                "limit": 0.0,
+                "held_out_improvement": None,
+            },
         }
         for effect in adopted.effects
         if effect not in described.effects
@@ -142,11 +147,9 @@ def _kinematics(diagnosis: Diagnosis) -> list[dict[str, Any]]:
 def coefficients(diagnosis: Diagnosis, finding: Finding) -> Coefficients:
     """What a person reads of an effect, from the session after where it is an unknown of π."""
     effect, attempt = finding.candidate.effect, diagnosis.attempt
-    for constant, candidate in zip(attempt.constants, attempt.fixed, strict=True):
+    for k, (constant, candidate) in enumerate(zip(attempt.constants, attempt.fixed, strict=True)):
         if (constant.name, constant.where) == (effect.name, effect.where):
-            at = attempt.rows.base.n
-            for other in attempt.fixed[: attempt.fixed.index(candidate)]:
-                at += len(other.parameters)
+            at = attempt.rows.base.n + sum(len(other.parameters) for other in attempt.fixed[:k])
             own = slice(at, at + len(candidate.parameters))
             covariance = attempt.tracing.covariance(diagnosis.chosen)[own, own]
             stds = deviations(constant, covariance)

@@ -7,11 +7,9 @@ the likelihood ratio, a χ² with as many degrees of freedom as Z⊥ has columns
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.stats import chi2
 
 from sms_online.stream import Array
@@ -24,6 +22,8 @@ RANK_TOLERANCE = 1e-10
 
 def basis(columns: Array) -> Array:
     """Orthonormal basis (M, rank) of columns (M, n)."""
+    if columns.shape[1] == 0:
+        return columns
     norm = np.linalg.norm(columns, axis=0)
     U, s, _ = np.linalg.svd(columns / np.where(norm > 0.0, norm, 1.0), full_matrices=False)
     return np.asarray(U[:, s > RANK_TOLERANCE * s[0]])
@@ -78,45 +78,3 @@ def angle(Q: Array, first: Array, second: Array) -> float:
 def threshold(level: float, trials: int, freedom: int) -> float:
     """Gain that the best of so many absent candidates of `freedom` columns exceeds with probability `level` at most."""
     return float(chi2.isf(level / trials, freedom))
-
-
-@dataclass(frozen=True)
-class MeanSquare:
-    """Mean square of rows over their predicted variance, and what it would be with noise alone.
-
-    limit: exceeded by noise alone with the probability asked for. rows: how many.
-    """
-
-    value: float
-    limit: float
-    rows: int
-
-    @property
-    def beyond(self) -> bool:
-        """Whether it is more than noise."""
-        return self.value > self.limit
-
-
-def mean_square(residual: Array, freedom: float, level: float, knowledge: float) -> MeanSquare:
-    """Of whitened residuals (·,) with so many degrees of freedom; knowledge: relative error of the predicted variance.
-
-    Correlated rows have fewer degrees of freedom than there are rows (Satterthwaite, Biometrics Bulletin 2 (1946) 110).
-    """
-    limit = float(chi2.isf(level, freedom)) / freedom * (1.0 + knowledge)
-    return MeanSquare(float(np.mean(residual**2)), limit, residual.size)
-
-
-def effective_freedom(correlations: Sequence[Array], windows: NDArray[np.int64]) -> float:
-    """Degrees of freedom of a mean square over correlated rows, W² / Σ ρ².
-
-    correlations: of each window with those before it, oldest first, its own (1) last. windows: numbers of those meant.
-    """
-    meant = set(windows.tolist())
-    total = 0.0
-    for k in windows.tolist():
-        own = correlations[k]
-        for lag in range(1, own.size):
-            if k - lag in meant:
-                total += 2.0 * own[-1 - lag] ** 2
-        total += 1.0
-    return len(meant) ** 2 / total

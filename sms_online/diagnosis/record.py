@@ -30,12 +30,10 @@ class SampleRecord:
         self.sample_rate = sample_rate
         self._pieces: list[GridSamples] = []
         self._left = round(LONGEST * sample_rate)
-        self.complete = True
 
     def add(self, piece: GridSamples) -> None:
         """Take consecutive samples."""
         kept = min(self._left, piece.index.size)
-        self.complete = self.complete and kept == piece.index.size
         if kept:
             self._pieces.append(GridSamples(piece.index[:kept], piece.values[:kept], piece.segment))
             self._left -= kept

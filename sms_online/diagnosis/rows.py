@@ -74,7 +74,9 @@ class SessionRows:
         self.Y, self.b = stacked[..., :-1], stacked[..., -1]
         self.std = np.sqrt([np.diag(covariances[-1]) for covariances in self._covariances]).reshape(-1, n_v)
         # Responses (W, n_v, sensors) of the rows to so much added to each position sensor's reading.
-        self.responses = dict(zip(DISPLACEMENTS, np.moveaxis(np.array(self._responses), 1, 0), strict=True))
+        sensors = len(sensing.position_columns)
+        responses = np.array(self._responses).reshape(len(windows), len(DISPLACEMENTS), n_v, sensors)
+        self.responses = dict(zip(DISPLACEMENTS, np.moveaxis(responses, 1, 0), strict=True))
         half = balance.width / 2 + balance.margin
         self.time = np.array([window.end - half for _, window in windows]) / rate
         where = Windows(

@@ -44,7 +44,7 @@ EXTENDS = {"direction_friction": "viscous_friction"}
 MOST_EFFECTS = 8
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Candidate:
     """An effect that may be missing.
 
@@ -141,8 +141,8 @@ class Tracing:
             free[known] = False
             b = b - self._plain_model[..., known] @ prior.value[known]
         plain = [self._plain_model[..., free], *self._plain]
-        stacked = np.concatenate(plain, axis=2).reshape(-1, sum(part.shape[2] for part in plain))
-        left = free_of(basis(stacked), b.reshape(-1, 1)).reshape(b.shape)
+        stacked = np.concatenate(plain, axis=2)
+        left = free_of(basis(stacked.reshape(b.size, stacked.shape[2])), b.reshape(-1, 1)).reshape(b.shape)
         ratio = np.mean(left**2, axis=0)
         return np.where(ratio > LARGEST_RATIO, ratio - 1.0, 0.0)
 
@@ -202,6 +202,7 @@ class Tracing:
         """
         chosen: list[int] = []
         refused: set[str] = set()
+        seen: set[frozenset[int]] = {frozenset()}
         while len(chosen) < MOST_EFFECTS:
             best = self._preferred(self.gains(chosen), self._eligible(chosen, refused))
             if best is None:
@@ -211,6 +212,9 @@ class Tracing:
                 continue
             refine([*chosen, best], best)
             chosen = self._revised([*chosen, best])
+            if frozenset(chosen) in seen:
+                break  # effects that replace each other in turn
+            seen.add(frozenset(chosen))
             if self.candidates[best].constant:
                 # What it leaves while it is only approximately taken off must not be given to others.
                 break

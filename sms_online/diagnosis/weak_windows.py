@@ -65,34 +65,32 @@ class WeakWindows:
         """Number of windows W."""
         return self.windows.start.size
 
-    def motions(self, values: Sequence[Array] | None = None) -> list[tuple[Motion, NDArray[np.int64]]]:
-        """Motion of each segment and filter width, and the numbers of the windows that see it.
+    def motions(self) -> list[tuple[Motion, NDArray[np.int64]]]:
+        """Motion of each segment and filter width, and the numbers of the windows that see it."""
+        if self._motions is None:
+            self._motions = [
+                self._motion(number, M)
+                for number in range(len(self.segments))
+                for M in np.unique(self.windows.half_width[self.windows.segment == number]).tolist()
+            ]
+        return self._motions
 
-        values (N, channels): of each segment's samples in place of the session's own, such as corrected ones.
-        """
-        if values is None:
-            if self._motions is None:
-                self._motions = self.motions([segment.values for segment in self.segments])
-            return self._motions
-        w, n_x = self.windows, self._layout.n_x
-        out = []
-        for number, samples in enumerate(values):
-            signals = np.concatenate((self._sensing.coordinates(samples), self._sensing.joint_torque(samples)), axis=1)
-            for M in np.unique(w.half_width[w.segment == number]).tolist():
-                which = np.flatnonzero((w.segment == number) & (w.half_width == M))
-                inside = np.arange(0, w.width + 1, w.stride(M))
-                seen = np.unique((w.start[which, None] + inside).ravel())
-                smoothed, rates = smooth(signals, seen, M, self._rate)
-                x = smoothed[:, :n_x]
-                v = self._layout.speeds(x, rates[:, :n_x])
-                out.append((Motion(number, seen, x, v, smoothed[:, n_x:]), which))
-        return out
+    def _motion(self, number: int, M: int) -> tuple[Motion, NDArray[np.int64]]:
+        w, n_x, samples = self.windows, self._layout.n_x, self.segments[number].values
+        signals = np.concatenate((self._sensing.coordinates(samples), self._sensing.joint_torque(samples)), axis=1)
+        which = np.flatnonzero((w.segment == number) & (w.half_width == M))
+        inside = np.arange(0, w.width + 1, w.stride(M))
+        seen = np.unique((w.start[which, None] + inside).ravel())
+        smoothed, rates = smooth(signals, seen, M, self._rate)
+        x = smoothed[:, :n_x]
+        v = self._layout.speeds(x, rates[:, :n_x])
+        return Motion(number, seen, x, v, smoothed[:, n_x:]), which
 
-    def columns(self, weak: WeakColumns, values: Sequence[Array] | None = None) -> Array:
-        """Rows (W, n_v, c); values: see `motions`."""
+    def columns(self, weak: WeakColumns) -> Array:
+        """Rows (W, n_v, c)."""
         w = self.windows
         out: Array | None = None
-        for motion, which in self.motions(values):
+        for motion, which in self.motions():
             P, G = weak(motion)
             if out is None:
                 out = np.zeros((self.count, *G.shape[1:]))
