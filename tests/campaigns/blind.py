@@ -1,13 +1,14 @@
 """Blind cases of the diagnosis: sessions of the planar example with an effect that its description lacks.
 
     python -m tests.campaigns.blind run RESULTS.jsonl --seeds 4
+    python -m tests.campaigns.blind struck RESULTS.jsonl --seeds 4
     python -m tests.campaigns.blind clean RESULTS.jsonl --seeds 100
     python -m tests.campaigns.blind summary RESULTS.jsonl
 
 Place, size and shape constants of each effect are drawn by the seed: it is worth 2 to 20 % of the rms of the rows that
-it acts on. The diagnosis sees a capture with noise of grade B and a description with other nominal values; what was
-drawn is compared afterwards. The first seed's cases are diagnosed again with the true effect, and those whose columns
-are within 10° of it, struck out of the catalogue. Every case is a line of RESULTS.jsonl; a stopped campaign goes on
+it acts on, or of their peaks. The diagnosis sees a capture with noise of grade B and a description with other nominal values; what was
+drawn is compared afterwards. `struck` diagnoses the cases with the true effect, and those whose columns are within 10° of
+it, struck out of the catalogue. Every case is a line of RESULTS.jsonl; a stopped campaign goes on
 where it was.
 """
 
@@ -74,6 +75,8 @@ class Draw:
         torque = np.sqrt(np.mean(self.rows.b**2, axis=0))
         terms = np.sqrt(np.mean(np.sum((self.rows.Y * beta) ** 2, axis=2), axis=0))
         self._size = np.where(torque > 0.0, torque, terms)
+        peaks = np.abs(self.rows.b).max(axis=0)
+        self._peak = np.where(peaks > 0.0, peaks, np.abs(self.rows.Y * beta).sum(axis=2).max(axis=0))
 
     def effect(self, name: str, seed: int) -> Effect:
         """An effect of a name at a place and of a size that the seed chooses, coefficients as `simulate` takes them."""
@@ -95,8 +98,10 @@ class Draw:
         direction = rng.uniform(0.5, 1.0, candidate.columns.shape[2])
         if candidate.columns.shape[2] > 1 and name != "direction_friction":
             direction = rng.standard_normal(candidate.columns.shape[2])
-        added = np.sqrt(np.mean((candidate.columns @ direction) ** 2, axis=0))
-        worth = float(np.max(added / self._size))
+        added = candidate.columns @ direction
+        # By the rms, and by the peaks: an effect of a few moments must not hold the arm.
+        shares = np.sqrt(np.mean(added**2, axis=0)) / self._size, np.abs(added).max(axis=0) / self._peak
+        worth = float(np.max(shares))
         linear = direction * wanted / worth
         return plain.model_copy(update={"coefficients": self._stated(name, drawn.where, linear, shapes)})
 
@@ -133,22 +138,21 @@ class Draw:
         return dict(zip(names, linear.tolist(), strict=False)) | shapes
 
 
-def run(results: Path, cache: Path, seeds: int, names: list[str]) -> None:
+def run(results: Path, cache: Path, seeds: int, names: list[str], struck: bool) -> None:
     """Append the cases that `results` lacks, seed by seed."""
     system = load_system(SYSTEM)
+    kind = "struck" if struck else "single"
     draw = Draw(system, cache)
     done = {(r["kind"], r["name"], r["seed"]) for r in read(results)} if results.exists() else set()
     for seed in range(seeds):
         for name in names:
-            if ("single", name, seed) in done:
+            if (kind, name, seed) in done or (struck and ENTRIES[name].kind == "kinematics"):
                 continue
             effect = draw.effect(name, seed)
             exact = simulate(system.model_copy(update={"effects": (effect,)}), position_tolerance=TOLERANCE)
             block = _joined(sampled_blocks(exact, GRADE, seed))
-            record = _case(system, block, effect)
-            _append(results, {"kind": "single", "seed": seed, **record})
-            if seed == 0 and ENTRIES[name].kind != "kinematics":
-                _append(results, {"kind": "struck", "seed": seed, **_struck(system, block, effect, draw)})
+            case = _struck(system, block, effect, draw) if struck else _case(system, block, effect)
+            _append(results, {"kind": kind, "seed": seed, **case})
 
 
 def clean(results: Path, cache: Path, seeds: int) -> None:
@@ -284,14 +288,14 @@ def summary(records: list[Record]) -> str:
 def main() -> None:
     """Command line of the campaign."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("what", choices=("run", "clean", "summary"))
+    parser.add_argument("what", choices=("run", "struck", "clean", "summary"))
     parser.add_argument("results", type=Path)
     parser.add_argument("--seeds", type=int, default=4)
     parser.add_argument("--cache", type=Path, default=Path("runs/blind-clean.npz"))
     parser.add_argument("--names", nargs="*", default=list(ENTRIES))
     args = parser.parse_args()
-    if args.what == "run":
-        run(args.results, args.cache, args.seeds, args.names)
+    if args.what in ("run", "struck"):
+        run(args.results, args.cache, args.seeds, args.names, args.what == "struck")
     elif args.what == "clean":
         clean(args.results, args.cache, args.seeds)
     else:
