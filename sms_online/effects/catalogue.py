@@ -123,10 +123,15 @@ def with_shapes(effect: Effect, system: System) -> Effect:
 
 
 def with_kinematics(system: System) -> System:
-    """The system with `exact` kinematics of links that declare geometric_stiffening; InputError as `check_effect`."""
+    """The system with `exact` kinematics of the links that declare geometric_stiffening; InputError as `check_effect`.
+
+    What is exact already stays, so that the system that comes out may go in again.
+    """
     links = list(system.links)
+    flexible = [(f"link_{i}", link) for i, link in enumerate(links, start=1) if isinstance(link, FlexibleLink)]
+    exact = {name for name, link in flexible if link.kinematics == "exact"}
     for k, effect in enumerate(system.effects, start=1):
-        if effect.name == GEOMETRIC_STIFFENING.name:
+        if effect.name == GEOMETRIC_STIFFENING.name and effect.where not in exact:
             check_effect(system, effect, f"effect {k}", system.name)
             i = int(effect.where.removeprefix("link_")) - 1
             links[i] = links[i].model_copy(update={"kinematics": "exact"})

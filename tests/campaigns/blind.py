@@ -6,10 +6,10 @@
     python -m tests.campaigns.blind summary RESULTS.jsonl
 
 Place, size and shape constants of each effect are drawn by the seed: it is worth 2 to 20 % of the rms of the rows that
-it acts on, or of their peaks. The diagnosis sees a capture with noise of grade B and a description with other nominal values; what was
-drawn is compared afterwards. `struck` diagnoses the cases with the true effect, and those whose columns are within 10° of
-it, struck out of the catalogue. Every case is a line of RESULTS.jsonl; a stopped campaign goes on
-where it was.
+it acts on, or of their peaks. The diagnosis sees a capture with noise of grade B and a description with other nominal
+values; what was drawn is compared afterwards. `struck` diagnoses the cases with the true effect, and those whose
+columns are within 10° of it, struck out of the catalogue. Every case is a line of RESULTS.jsonl; a stopped campaign
+goes on where it was.
 """
 
 from __future__ import annotations
