@@ -81,7 +81,7 @@ def summary(diagnosis: Diagnosis) -> str:
     fall = f"from {before.test[row].whitened:.3g} to {after.test[row].whitened:.3g} times noise"
     falls = f"the residual of {row} falls {fall}"
     if diagnosis.verdict == "named":
-        return f"The model lacks {', '.join(keys)}: with it {falls}."
+        return f"The model lacks {', '.join(keys)}: with {'them' if len(keys) > 1 else 'it'} {falls}."
     unexplained = diagnosis.unexplained
     assert unexplained is not None
     tried = (
