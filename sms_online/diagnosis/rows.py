@@ -19,7 +19,7 @@ from sms_online.model.model import Model
 from sms_online.pipeline.joint_balance import EXPONENT as JOINT_EXPONENT
 from sms_online.pipeline.joint_balance import JointBalance
 from sms_online.pipeline.momentum_balance import COPIES, EXPONENT, INSTANTS, Instants, MomentumBalance, Window
-from sms_online.pipeline.row_noise import OWN_SHARE, STEPS, RowNoise
+from sms_online.pipeline.row_noise import STEPS, RowNoise, factored
 from sms_online.pipeline.sensing import Sensing
 from sms_online.pipeline.sensitivity import Sensitivities
 from sms_online.pipeline.sensor_noise import FINEST, SensorNoise
@@ -174,18 +174,8 @@ class SessionRows:
         self._operators: list[tuple[Array, Array]] = []
         L = np.empty((0, 0))
         for covariances in self._covariances:
-            own = covariances[-1].copy()
-            own[np.diag_indices(n_v)] *= 1.0 + OWN_SHARE + floor
-            size = n_v * (len(covariances) - 1)
-            L = L[len(L) - size :, len(L) - size :]
-            cross = np.concatenate([np.empty((n_v, 0)), *covariances[:-1]], axis=1).T
-            X = scipy.linalg.solve_triangular(L, cross, lower=True, check_finite=False) if size else cross
-            diagonal = np.linalg.cholesky(own - X.T @ X)
-            self._operators.append((X.T, diagonal))
-            grown = np.zeros((size + n_v, size + n_v))
-            grown[:size, :size] = L
-            grown[size:, :size], grown[size:, size:] = X.T, diagonal
-            L = grown
+            L = factored(L, covariances, floor)
+            self._operators.append((L[-n_v:, :-n_v].copy(), L[-n_v:, -n_v:].copy()))
 
     def white(self, columns: Array) -> Array:
         """Columns (W, n_v, c) in the whitened rows, (W n_v, c)."""

@@ -249,10 +249,7 @@ class Tracing:
         return 1.0 - after / before if before > 0.0 else 0.0
 
     def _held_out(self, chosen: Sequence[int], acting: int) -> float:
-        beta = self.solution(chosen, self.fitted)
-        held = ~self.fitted
-        plain = np.concatenate([self._plain_model, *(self._plain[k] for k in chosen)], axis=2)
-        left = (self.rows.b / self.rows.std)[held] - plain[held] @ beta
+        left = self.residual(chosen, self.solution(chosen, self.fitted))[~self.fitted]
         squares = np.sum(self._plain[acting] ** 2, axis=(0, 2))
         acts = squares > ACTS * squares.max()
         return float(np.sqrt(np.mean(left[:, acts] ** 2)))

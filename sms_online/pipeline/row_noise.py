@@ -112,6 +112,25 @@ def _interpolation(at: Array, nodes: Array) -> Array:
     return np.stack([np.interp(at, nodes, unit) for unit in np.eye(nodes.size)], axis=1)
 
 
+def factored(L: Array, covariances: list[Array], floor: Array | float = 0.0) -> Array:
+    """Cholesky factor of the windows that the last one overlaps, and of itself, its rows below the others'.
+
+    L: the same as of the window before. covariances: see `RowNoise.covariance`. floor (n_v,): share of a row's variance
+    that is an error of its own. Raises numpy.linalg.LinAlgError where the covariance is not positive definite.
+    """
+    own = covariances[-1].copy()
+    n_v = len(own)
+    own[np.diag_indices(n_v)] *= 1.0 + OWN_SHARE + floor
+    size = n_v * (len(covariances) - 1)
+    L = L[len(L) - size :, len(L) - size :]
+    cross = np.concatenate([np.empty((n_v, 0)), *covariances[:-1]], axis=1).T  # (size, n_v)
+    X = scipy.linalg.solve_triangular(L, cross, lower=True, check_finite=False) if size else cross
+    grown = np.zeros((size + n_v, size + n_v))
+    grown[:size, :size] = L
+    grown[size:, :size], grown[size:, size:] = X.T, np.linalg.cholesky(own - X.T @ X)
+    return grown
+
+
 class Whitener:
     """Rows of overlapping windows, one window after the other, turned into rows with independent unit errors."""
 
@@ -130,21 +149,12 @@ class Whitener:
         Raises numpy.linalg.LinAlgError where the covariance is not positive definite.
         """
         n_v = self._n_v
-        own = covariances[-1].copy()
-        own[np.diag_indices(n_v)] *= 1.0 + OWN_SHARE
-        size = n_v * (len(covariances) - 1)
-        forget = len(self._L) - size
-        L, white = self._L[forget:, forget:], self._white[forget:]
-        cross = np.concatenate([np.empty((n_v, 0)), *covariances[:-1]], axis=1).T  # (size, n_v)
-        X = scipy.linalg.solve_triangular(L, cross, lower=True, check_finite=False) if size else cross
-        own -= X.T @ X
-        rows = rows - X.T @ white
-        diagonal = np.linalg.cholesky(own)
-        out = np.asarray(scipy.linalg.solve_triangular(diagonal, rows, lower=True, check_finite=False))
-        grown = np.zeros((size + n_v, size + n_v))
-        grown[:size, :size] = L
-        grown[size:, :size], grown[size:, size:] = X.T, diagonal
-        self._L, self._white = grown, np.concatenate((white, out))
+        self._L = factored(self._L, covariances)
+        white = self._white[len(self._white) + n_v - len(self._L) :]
+        below = self._L[-n_v:]
+        rows = rows - below[:, :-n_v] @ white
+        out = np.asarray(scipy.linalg.solve_triangular(below[:, -n_v:], rows, lower=True, check_finite=False))
+        self._white = np.concatenate((white, out))
         return out
 
     def state(self) -> dict[str, Array]:

@@ -33,6 +33,12 @@ def described_system(args: argparse.Namespace) -> tuple[System, Path | None]:
     return system, path.parent if path.suffix == ".toml" else None
 
 
+def check_part(args: argparse.Namespace) -> None:
+    """InputError where -to is not after -ss."""
+    if args.stop is not None and args.start is not None and args.stop <= args.start:
+        raise InputError("-to", "", f"{args.stop:g} s", f"a time after -ss {args.start:g} s")
+
+
 def new_estimator(system: System, channels: tuple[str, ...], source: str, nominal_prior: bool = False) -> Estimator:
     """The estimator of a session, with the system file's priors; nominal_prior: see `base_prior`."""
     estimator = Estimator(system, channels, source)

@@ -23,7 +23,7 @@ from sms_tools.html_report.diagnosis_page import write_diagnosis
 from sms_tools.priors import base_prior
 from sms_tools.report import Document, parameter_table, report_console, show
 from sms_tools.results_file import results_directory, to_json, write_document
-from sms_tools.session import described_system
+from sms_tools.session import check_part, described_system
 from sms_tools.true_values import true_values
 
 NAME = "diagnosis.json"
@@ -33,8 +33,7 @@ SHOWN = 8
 
 def run(args: argparse.Namespace) -> int:
     """Diagnose a capture; 0, or 3 where nothing is determined."""
-    if args.stop is not None and args.start is not None and args.stop <= args.start:
-        raise InputError("-to", "", f"{args.stop:g} s", f"a time after -ss {args.start:g} s")
+    check_part(args)
     system, folder = described_system(args)
     directory = results_directory(args.out)
     console = report_console(args.json)

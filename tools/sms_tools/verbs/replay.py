@@ -17,11 +17,10 @@ from sms_adapters.session_log import SESSION
 from sms_adapters.sources import open_source
 from sms_adapters.truth import read_truth
 from sms_online.bound import MotionRecord, session_bound
-from sms_online.errors import InputError
 from sms_online.stream import Block
 from sms_tools.interruption import Interruption
 from sms_tools.results_file import results_directory
-from sms_tools.session import conclude, described_system, document_of, new_estimator, stream
+from sms_tools.session import check_part, conclude, described_system, document_of, new_estimator, stream
 from sms_tools.showing import showing
 
 # A progress bar appears from this size on, bytes: a second of work.
@@ -34,8 +33,7 @@ PACE = 0.05
 
 def run(args: argparse.Namespace) -> int:
     """Replay a capture; 0, 3 where nothing is determined, 130 where interrupted."""
-    if args.stop is not None and args.start is not None and args.stop <= args.start:
-        raise InputError("-to", "", f"{args.stop:g} s", f"a time after -ss {args.start:g} s")
+    check_part(args)
     system, folder = described_system(args)
     directory = results_directory(args.out)
     capture: Path = args.capture
