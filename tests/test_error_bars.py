@@ -12,7 +12,7 @@ from sms_online.results import standard_deviation
 from sms_online.stream import Array, Block
 
 SEEDS = 40
-SECONDS, RATE = 20.0, 200.0
+SECONDS, RATE = 10.0, 200.0
 
 
 def normalised_errors(torque_noise: float, position_noise: float) -> Array:

@@ -2,7 +2,9 @@
 
 Weights follow from the sensors' noise and the parameters, never from residuals: those collapse where noise is high. The
 parameters come from the fit itself: the first windows that move are held back, fitted without weights and then with
-them; from then on the estimate so far is taken now and then. A start that is 70 % off gives the same answer.
+them; from then on the estimate so far is taken now and then. A start that is 70 % off gives the same answer. Where such
+a fit leaves more than noise, for it had to tell too many parameters apart without weights, the described values are
+tried as its start, and stay in the weights until the rows determine better ones.
 
 Where rows leave clearly more than the sensors' noise, the model lacks something, and neighbouring rows that share noise
 almost fully must not be subtracted from each other as if that were all: what is left over counts as an error of each
@@ -36,6 +38,10 @@ LEAST_MOTION = 0.4
 HELD_BACK = 16.0
 # Weighted fits of the windows held back before their rows are handed on.
 PASSES = 2
+# The same from described values. A second one would follow what noise in the columns does to few windows.
+PASSES_DESCRIBED = 1
+# A fit of few windows determines a parameter that is so many standard deviations from zero.
+DETERMINED = 3.0
 # A window moves when a coordinate spans this many σ in it; noise alone spans 6.
 MOTION = 20.0
 # Mean square of a coordinate's residual over its predicted variance beyond which the model lacks something there: a
@@ -166,15 +172,15 @@ class MomentumFit:
         """
         self._moving = 0
         self._sensor_noise = noise
-        self.weights = _least_squares(np.concatenate([self._dense(window)[0] for window in self._held]))
-        for _ in range(PASSES):
-            if not self._explains_torques():
-                self.weights = None
-                return []
-            self._retell()
-            white = [self._white(window).Y for window in self._held]
-            self.weights = _least_squares(np.concatenate(white))
-            self._judge()
+        unweighted, _ = _least_squares(np.concatenate([self._dense(window)[0] for window in self._held]))
+        if not (self._explains_torques(unweighted) and self._settle(unweighted, PASSES, partly=False)):
+            self.weights = None
+            return []
+        if self.misfit.any():
+            weights, misfit = self.weights, self.misfit
+            described = self.base.values(self.model.nominal)
+            if not self._settle(described, PASSES_DESCRIBED, partly=True) or self.misfit.sum() >= misfit.sum():
+                self.weights, self.misfit = weights, misfit
         self._retell()
         out = [self._white(window) for window in self._held]
         self._recent = self._held[1 - HOPS :]
@@ -182,11 +188,26 @@ class MomentumFit:
         self._held = []
         return out
 
-    def _explains_torques(self) -> bool:
-        """Whether the fit so far explains every joint's torque over the windows held back, by and large."""
+    def _settle(self, start: Array, passes: int, partly: bool) -> bool:
+        """Fit the windows held back with the weights of β = start (n,), then of the fit before; False where one fails.
+
+        partly: weights take what the rows determine, and keep the rest.
+        """
+        self.weights, self.misfit = start, np.zeros(self.model.layout.n_v)
+        for _ in range(passes):
+            self._retell()
+            fitted, determined = _least_squares(np.concatenate([self._white(window).Y for window in self._held]))
+            if not self._explains_torques(fitted):
+                return False
+            self._judge(fitted)
+            self.weights = np.where(determined, fitted, self.weights) if partly else fitted
+        return True
+
+    def _explains_torques(self, beta: Array) -> bool:
+        """Whether β (n,) explains every joint's torque over the windows held back, by and large."""
         joints = list(self.model.layout.theta_m)
         rows = np.stack([self._dense(window)[0, joints] for window in self._held])
-        left = rows[..., -1] - rows[..., :-1] @ self._known_weights
+        left = rows[..., -1] - rows[..., :-1] @ beta
         return bool(np.all(np.linalg.norm(left, axis=0) <= LARGEST_UNEXPLAINED * np.linalg.norm(rows[..., -1], axis=0)))
 
     @property
@@ -222,7 +243,7 @@ class MomentumFit:
         beta = self._solve()
         self.weights = np.where(np.isnan(beta), self._known_weights, beta)
         self._sensor_noise = noise
-        self._judge()
+        self._judge(self.weights)
         self._since = 0
         self._renewal = min(2 * self._renewal, self._count(LATEST_RENEWAL))
         counted = self.plain_gram.copy(), self.plain_windows, dict(self._bends), dict(self._bent)
@@ -233,11 +254,11 @@ class MomentumFit:
             self._white(window)
         self.plain_gram, self.plain_windows, self._bends, self._bent = counted
 
-    def _judge(self) -> None:
-        """What rows leave beyond their predicted variance so far, where that is no accident."""
+    def _judge(self, beta: Array) -> None:
+        """What rows leave of β (n,) beyond their predicted variance so far, where that is no accident."""
         if self.plain_windows == 0:
             return
-        w = np.append(self._known_weights, -1.0)
+        w = np.append(beta, -1.0)
         ratio = np.einsum("i,vij,j->v", w, self.plain_gram, w) / self.plain_windows
         self.misfit = np.where(ratio > LARGEST_RATIO, ratio - 1.0, 0.0)
 
@@ -358,9 +379,15 @@ def _unpacked(name: str, state: Mapping[str, NDArray[Any]]) -> list[Window]:
     ]
 
 
-def _least_squares(rows: Array) -> Array:
-    """Least-squares solution (n,) of rows [Y b] (M, n + 1), of minimum norm in units of the columns' sizes."""
+def _least_squares(rows: Array) -> tuple[Array, NDArray[np.bool_]]:
+    """Least-squares solution (n,) of rows [Y b] (M, n + 1) of unit variance, and where they determine it.
+
+    Of minimum norm in units of the columns' sizes.
+    """
     size = np.linalg.norm(rows, axis=0)
     scale = np.where(size[:-1] > 0.0, size[:-1], 1.0)
-    solution = np.linalg.lstsq(rows[:, :-1] / scale, rows[:, -1], rcond=RANK_TOLERANCE)[0]
-    return np.asarray(solution / scale)
+    U, S, Vt = np.linalg.svd(rows[:, :-1] / scale, full_matrices=False)
+    known = RANK_TOLERANCE * S[0] < S
+    solution = Vt[known].T @ ((U[:, known].T @ rows[:, -1]) / S[known])
+    spread = np.linalg.norm(Vt.T / np.maximum(S, RANK_TOLERANCE * S[0]), axis=1)
+    return solution / scale, np.abs(solution) > DETERMINED * spread
