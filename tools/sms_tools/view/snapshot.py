@@ -7,7 +7,7 @@ and holds much more.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 from sms_online.pipeline.estimator import Estimator, SquaredResidual
@@ -58,7 +58,7 @@ def take(estimator: Estimator) -> Snapshot:
         samples=estimator.samples,
         duration=estimator.duration,
         dropped_rows=estimator.dropped_rows,
-        counters=replace(estimator.counters),
+        counters=SyncCounters(**vars(estimator.counters)),
         energy_tracker=estimator.energy_tracker.state(),
         shared_errors=estimator.shared_errors.state(),
         joint_residuals=[SquaredResidual(r.gram, r.signal) for r in estimator.joint_residuals],
