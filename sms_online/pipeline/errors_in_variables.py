@@ -34,8 +34,8 @@ class NoiseBias:
 
     def __init__(self, n: int) -> None:
         self._gram = np.zeros((n + 1, n + 1))
-        # What additional noise changes, by clusters of windows: whole ones, and one that windows still join. Written once
-        # and shared with saved states: those of a large arm are 9 MB, too much to be copied often.
+        # What additional noise changes, by clusters of windows: whole ones, and one that windows still join. Written
+        # once and shared with saved states: those of a large arm are 9 MB, too much to be copied often.
         self._whole = np.zeros((MOST_CLUSTERS, n + 1, n + 1))
         self._count = 0
         self._last = np.zeros((n + 1, n + 1))

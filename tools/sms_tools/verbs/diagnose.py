@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import argparse
+import math
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -11,8 +13,8 @@ from rich.table import Table
 from sms_adapters.sources import open_source
 from sms_adapters.truth import read_truth
 from sms_online.description.schema import System
-from sms_online.diagnosis.diagnose import diagnose
-from sms_online.diagnosis.document import diagnosis_document
+from sms_online.diagnosis.diagnose import Diagnosis, PriorOf, diagnose
+from sms_online.diagnosis.document import diagnosis_document, summary
 from sms_online.errors import InputError
 from sms_online.pipeline.estimator import Estimator
 from sms_online.stream import Block
@@ -20,11 +22,13 @@ from sms_online.trackers.interface import Prior
 from sms_tools.adopted_system import added_lines, adopted_text, write_adopted
 from sms_tools.exit_codes import NOTHING_DETERMINED, OK
 from sms_tools.html_report.diagnosis_page import write_diagnosis
+from sms_tools.interruption import Interruption
 from sms_tools.priors import base_prior
 from sms_tools.report import Document, parameter_table, report_console, show
 from sms_tools.results_file import results_directory, to_json, write_document
-from sms_tools.session import check_part, described_system
+from sms_tools.session import check_part, described_system, stream
 from sms_tools.true_values import true_values
+from sms_tools.view.session import View, open_view
 
 NAME = "diagnosis.json"
 # Ambiguous and ranked candidates that people are shown.
@@ -60,7 +64,8 @@ def run(args: argparse.Namespace) -> int:
 
     diagnosis = diagnose(system, blocks, str(args.capture), prior, holdout, progress)
     true = None if truth is None else true_values(truth, system, diagnosis.after.system)
-    document = diagnosis_document(diagnosis, warnings, true)
+    view = None if args.rerun == "off" else _watched(args, diagnosis, blocks, directory, prior, true)
+    document = diagnosis_document(diagnosis, warnings + ([] if view is None else view.warnings), true)
     lines: list[Table | str] = ["", document["summary"], ""]
     if document["effects"]:
         lines += [_effects(document), ""]
@@ -76,7 +81,39 @@ def run(args: argparse.Namespace) -> int:
     show(console, *lines, f"diagnosis: {path}", f"page: {page}")
     if args.json:
         print(to_json(document))
+    if view is not None:
+        with Interruption() as interruption:
+            view.linger(interruption)
     return OK if any(p["identifiable"] for p in document["after"]["parameters"]) else NOTHING_DETERMINED
+
+
+def _watched(
+    args: argparse.Namespace,
+    diagnosis: Diagnosis,
+    blocks: list[Block],
+    directory: Path,
+    prior: PriorOf,
+    true: Mapping[str, float] | None,
+) -> View:
+    """The session once more in view, with what was found; with it the first candidates' evidence, and the verdict."""
+    channels = blocks[0].channels
+    estimator = Estimator(diagnosis.after.system, channels, str(args.capture))
+    known = prior(estimator)
+    if known is not None:
+        estimator.set_prior(known)
+    exaggeration = args.exaggerate
+    with (
+        Interruption() as interruption,
+        open_view(args.rerun, estimator, channels, directory, true, patient=True, exaggeration=exaggeration) as view,
+    ):
+        stream(estimator, view.watch(blocks), interruption)
+        first = diagnosis.ranking[:SHOWN]
+        gains = {f"{r.candidate.effect.name}@{r.candidate.effect.where}": r.gain for r in first}
+        # Judged by all of the capture, so it holds from beginning to end.
+        for t in (blocks[0].t[0], blocks[-1].t[-1]):
+            view.evidence(float(t), {name: math.log10(max(1.0, gain)) for name, gain in gains.items()})
+        view.event(float(blocks[-1].t[-1]), summary(diagnosis))
+    return view
 
 
 def _samples(

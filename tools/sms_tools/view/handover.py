@@ -24,6 +24,7 @@ class Handover:
 
     def __init__(self, pipe: IO[bytes], capacity: int = CAPACITY) -> None:
         self.dropped = 0
+        self.taken = 0  # items that are in the pipe
         self.broken = False
         self._pipe = pipe
         self._capacity = capacity
@@ -55,6 +56,7 @@ class Handover:
         try:
             while True:
                 _send_item(self._waiting.get(), self._pipe)
+                self.taken += 1
         except (OSError, ValueError):  # the other end is gone
             self.broken = True
 

@@ -35,8 +35,10 @@ SAMPLES_A_STATE = 5
 PIPE_SIZE = 1 << 20
 # A view that has taken nothing for so long, s, is given up.
 STALL = 10.0
-# What is left at the end of a session gets so long to be written, s.
+# At the end of a session what is left gets so long to be written, s, each time some of it was taken.
 CLOSING = 10.0
+# The end is waited for in steps of, s.
+STEP = 0.1
 # A viewer in the same laboratory answers within this time, s.
 PROBE_TIMEOUT = 1.0
 
@@ -131,12 +133,20 @@ class View:
             return
         if kind is None:
             self._put(End(self._t, take(self._estimator)))
-            if not self._done.wait(CLOSING):
-                self._trouble("the view did not finish in time")
+            self._close(self._handover)
         if self._handover.dropped:
             self.warnings.append(f"{self._handover.dropped} pictures of the view dropped: it does not keep up")
         if not (self._serving and kind is None and not self.status):
             self._kill()
+
+    def _close(self, handover: Handover) -> None:
+        """Wait until the view has finished, or takes nothing any more."""
+        taken, since = handover.taken, perf_counter()
+        while not self._done.wait(STEP):
+            if handover.taken > taken:
+                taken, since = handover.taken, perf_counter()
+            elif perf_counter() - since > CLOSING:
+                self._trouble("it did not finish in time")
 
     def _show(self, blocks: tuple[Block, ...], with_state: bool) -> None:
         assert self._handover is not None
