@@ -14,7 +14,7 @@ from sms_adapters.sources import open_source
 from sms_adapters.truth import read_truth
 from sms_online.description.schema import System
 from sms_online.diagnosis.diagnose import Diagnosis, PriorOf, diagnose
-from sms_online.diagnosis.document import diagnosis_document, summary
+from sms_online.diagnosis.document import diagnosis_document
 from sms_online.errors import InputError
 from sms_online.pipeline.estimator import Estimator
 from sms_online.stream import Block
@@ -64,8 +64,9 @@ def run(args: argparse.Namespace) -> int:
 
     diagnosis = diagnose(system, blocks, str(args.capture), prior, holdout, progress)
     true = None if truth is None else true_values(truth, system, diagnosis.after.system)
-    view = None if args.rerun == "off" else _watched(args, diagnosis, blocks, directory, prior, true)
-    document = diagnosis_document(diagnosis, warnings + ([] if view is None else view.warnings), true)
+    document = diagnosis_document(diagnosis, warnings, true)
+    view = None if args.rerun == "off" else _watched(args, diagnosis, document, blocks, directory, prior, true)
+    document["warnings"] += [] if view is None else view.warnings
     lines: list[Table | str] = ["", document["summary"], ""]
     if document["effects"]:
         lines += [_effects(document), ""]
@@ -90,6 +91,7 @@ def run(args: argparse.Namespace) -> int:
 def _watched(
     args: argparse.Namespace,
     diagnosis: Diagnosis,
+    document: Document,
     blocks: list[Block],
     directory: Path,
     prior: PriorOf,
@@ -107,12 +109,16 @@ def _watched(
         open_view(args.rerun, estimator, channels, directory, true, patient=True, exaggeration=exaggeration) as view,
     ):
         stream(estimator, view.watch(blocks), interruption)
-        first = diagnosis.ranking[:SHOWN]
-        gains = {f"{r.candidate.effect.name}@{r.candidate.effect.where}": r.gain for r in first}
+        first = document["candidates"][:SHOWN]
+        scores = {f"{c['name']}@{c['where']}": math.log10(max(1.0, c["gain"])) for c in first}
         # Judged by all of the capture, so it holds from beginning to end.
-        for t in (blocks[0].t[0], blocks[-1].t[-1]):
-            view.evidence(float(t), {name: math.log10(max(1.0, gain)) for name, gain in gains.items()})
-        view.event(float(blocks[-1].t[-1]), summary(diagnosis))
+        begin, end = float(blocks[0].t[0]), float(blocks[-1].t[-1])
+        for t in (begin, end):
+            view.evidence(t, scores)
+        view.event(end, document["summary"])
+        for effect in document["effects"]:
+            values = (f"{name} {' '.join(_told(value))}" for name, value in effect["coefficients"].items())
+            view.event(end, ", ".join((f"{effect['name']}@{effect['where']}", *values)))
     return view
 
 
@@ -138,6 +144,12 @@ def _effects(document: Document) -> Table:
             table.add_row(f"{effect['name']}@{effect['where']}" if first else "", name, *cells, others if first else "")
             first = False
     return table
+
+
+def _told(value: dict[str, Any]) -> list[str]:
+    """A coefficient's value, its deviation where it has one, and unit, for a line of text."""
+    estimate, std, unit = _cells(value)
+    return [estimate, *([f"± {std}"] if std else []), *([unit] if unit else [])]
 
 
 def _cells(value: dict[str, Any]) -> list[str]:
