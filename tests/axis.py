@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from sms_online.stream import Block
+
 INERTIA, DAMPING = 0.3, 0.1  # kg m², N m s/rad
 AXIS = f"""
 name = "axis"
@@ -37,3 +39,13 @@ def capture_lines(seconds: float = 6.0) -> list[str]:
     rate, acceleration = 2 * np.cos(2 * t) + 1.5 * np.cos(5 * t), -4 * np.sin(2 * t) - 7.5 * np.sin(5 * t)
     torque = INERTIA * acceleration + DAMPING * rate
     return ["t,force_1,q_1", *(f"{a},{b},{c}" for a, b, c in zip(t.tolist(), torque.tolist(), q.tolist(), strict=True))]
+
+
+def axis_block(coulomb: float) -> Block:
+    """The axis along two sines, with friction that its description lacks, sensors' noise of seed 3."""
+    t = np.arange(2400) / 200.0
+    q = np.sin(2 * t) + 0.3 * np.sin(5 * t)
+    rate, acceleration = 2 * np.cos(2 * t) + 1.5 * np.cos(5 * t), -4 * np.sin(2 * t) - 7.5 * np.sin(5 * t)
+    torque = INERTIA * acceleration + DAMPING * rate + coulomb * np.sign(rate)
+    noise = np.random.default_rng(3).standard_normal((2, t.size)) * ((0.01,), (1e-4,))
+    return Block(t, ("force_1", "q_1"), np.stack((torque, q), axis=1) + noise.T)

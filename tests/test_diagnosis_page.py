@@ -9,7 +9,7 @@ from xml.etree import ElementTree
 
 import numpy as np
 import pytest
-from axis import AXIS, DAMPING, INERTIA
+from axis import AXIS, axis_block
 
 from sms_adapters.capture import CaptureWriter
 from sms_adapters.system_file import load_system
@@ -20,7 +20,6 @@ from sms_online.diagnosis.diagnose import Diagnosis, diagnose
 from sms_online.diagnosis.document import diagnosis_document
 from sms_online.diagnosis.force_curves import added_variables, force_curves
 from sms_online.model.model import Model
-from sms_online.stream import Block
 from sms_tools.adopted_system import added_lines, adopted_text
 from sms_tools.cli import main
 from sms_tools.html_report.arm_drawing import MARK, marked_arm
@@ -32,16 +31,6 @@ from sms_tools.view.scene import Scene
 COULOMB = 0.2  # N m
 # rad/s; where the axis turns, its filter's half width of 14 samples blurs the speed by up to 11 rad/s² times 0.07 s.
 TURNING = 0.8
-
-
-def axis_block(coulomb: float) -> Block:
-    """The axis along two sines, with friction that its description lacks, sensors' noise of seed 3."""
-    t = np.arange(2400) / 200.0
-    q = np.sin(2 * t) + 0.3 * np.sin(5 * t)
-    rate, acceleration = 2 * np.cos(2 * t) + 1.5 * np.cos(5 * t), -4 * np.sin(2 * t) - 7.5 * np.sin(5 * t)
-    torque = INERTIA * acceleration + DAMPING * rate + coulomb * np.sign(rate)
-    noise = np.random.default_rng(3).standard_normal((2, t.size)) * ((0.01,), (1e-4,))
-    return Block(t, ("force_1", "q_1"), np.stack((torque, q), axis=1) + noise.T)
 
 
 def diagnosed(coulomb: float) -> Diagnosis:

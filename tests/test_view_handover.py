@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import io
 import os
-import pickle
 from threading import Event as Flag
 from time import sleep
 from typing import Any
@@ -12,7 +11,7 @@ from typing import Any
 import pytest
 
 from sms_tools.view.choice import Choice, parse_choice
-from sms_tools.view.handover import Handover
+from sms_tools.view.handover import Handover, receive
 
 
 class Gate(io.RawIOBase):
@@ -36,7 +35,7 @@ class Gate(io.RawIOBase):
         found = []
         while True:
             try:
-                found.append(pickle.load(stream))
+                found.append(receive(stream))
             except EOFError:
                 return found
 

@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
+import rerun as rr
+from recordings import columns
 
 from sms_adapters.system_file import load_system
 from sms_online.model.base_parameters import find_base_parameters
@@ -12,6 +16,7 @@ from sms_online.model.parameters import Parameter
 from sms_online.pipeline.estimator import SquaredResidual
 from sms_online.pipeline.events import Event
 from sms_tools.view.frames import Reference
+from sms_tools.view.number_log import NumberLog
 from sms_tools.view.parameter_groups import MOST_LINES, parameter_groups, shortened
 from sms_tools.view.residuals import RecentResidual
 from sms_tools.view.style import BAD, GOOD, residual_colors
@@ -58,6 +63,19 @@ def test_a_table_tells_no_number_of_what_is_not_determined() -> None:
     lines = markdown_table(parameters, known, estimate, std, np.array([True, False])).splitlines()
     assert lines[2] == "| k_1 | N m/rad | 1010 | 5 | 1000 | +1 % |"
     assert lines[3] == "| k_1 | N m/rad | – | – | – | – |"
+
+
+def test_a_plot_may_gain_a_line_between_two_sendings(tmp_path: Path) -> None:
+    stream = rr.RecordingStream("sms_online_test", make_default=False)
+    stream.save(tmp_path / "plot.rrd")
+    numbers = NumberLog(stream)
+    for t, count in enumerate((2, 2, 3)):
+        numbers.add("plot", float(t), np.full(count, float(t)))
+    numbers.send()
+    stream.flush()
+    stream.disconnect()
+    drawn = [row["Scalars:scalars"] for row in columns(tmp_path / "plot.rrd", "/plot")]
+    assert drawn == [[0.0, 0.0], [1.0, 1.0], [2.0, 2.0, 2.0]]
 
 
 def test_colours_go_from_good_to_bad() -> None:

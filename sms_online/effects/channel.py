@@ -10,7 +10,6 @@ from fnmatch import fnmatchcase
 from typing import Protocol
 
 import numpy as np
-import scipy.signal
 from scipy.ndimage import correlate1d
 
 from sms_online.effects.base import Entry, Ranges, Shape
@@ -138,16 +137,20 @@ class SensorLag(_Channel):
 
     def filter(self, sample_rate: float) -> tuple[Array, Array]:
         """Numerator and denominator of the low-pass for samples that are joined by straight lines."""
+        from scipy.signal import cont2discrete  # here, for it takes half a second that only a lag needs
+
         omega = self.omega
         low_pass = (np.array([omega**2]), np.array([1.0, np.sqrt(2.0) * omega, omega**2]))
-        b, a, _ = scipy.signal.cont2discrete(low_pass, 1.0 / sample_rate, method="foh")
+        b, a, _ = cont2discrete(low_pass, 1.0 / sample_rate, method="foh")
         return np.asarray(b[0]), np.asarray(a)
 
     def distort(self, samples: Array, sample_rate: float) -> Array:
         """The low-pass, from rest at the first sample, of samples joined by straight lines."""
+        from scipy.signal import lfilter, lfilter_zi  # here, see `filter`
+
         b, a = self.filter(sample_rate)
-        start = scipy.signal.lfilter_zi(b, a) * samples[0]
-        return np.asarray(scipy.signal.lfilter(b, a, samples, zi=start)[0])
+        start = lfilter_zi(b, a) * samples[0]
+        return np.asarray(lfilter(b, a, samples, zi=start)[0])
 
     def kernel(self, sample_rate: float) -> Array:
         """Weights (2M + 1,) of the samples about an instant in what was before the lag there, y + √2 ẏ / ω + ÿ / ω².

@@ -34,7 +34,11 @@ class NoiseBias:
 
     def __init__(self, n: int) -> None:
         self._gram = np.zeros((n + 1, n + 1))
-        self._clusters = np.zeros((0, n + 1, n + 1))  # what additional noise changes, by clusters of windows
+        # What additional noise changes, by clusters of windows: whole ones, and one that windows still join. Written
+        # once and shared with saved states: those of a large arm are 9 MB, too much to be copied often.
+        self._whole = np.zeros((MOST_CLUSTERS, n + 1, n + 1))
+        self._count = 0
+        self._last = np.zeros((n + 1, n + 1))
         self._length = CLUSTER
         self._open = 0  # windows in the last cluster
 
@@ -42,13 +46,24 @@ class NoiseBias:
         """Rows [Y b] (M, n + 1) of a window, and the same with noise added and subtracted (2, M, n + 1)."""
         gram = rows.T @ rows
         self._gram = self._gram + gram
-        if self._open == 0:
-            if len(self._clusters) == MOST_CLUSTERS:
-                self._clusters = self._clusters[::2] + self._clusters[1::2]
-                self._length *= 2
-            self._clusters = np.concatenate((self._clusters, np.zeros((1, *gram.shape))))
-        self._clusters[-1] += 0.5 * (noisy[0].T @ noisy[0] + noisy[1].T @ noisy[1]) - gram
+        if self._open == 0 and self._count == MOST_CLUSTERS:
+            self._count //= 2
+            merged = self._whole[::2] + self._whole[1::2]
+            self._whole = np.zeros_like(self._whole)
+            self._whole[: self._count] = merged
+            self._length *= 2
+        self._last = self._last + (0.5 * (noisy[0].T @ noisy[0] + noisy[1].T @ noisy[1]) - gram)
         self._open = (self._open + 1) % self._length
+        if self._open == 0:
+            self._whole[self._count] = self._last
+            self._count += 1
+            self._last = np.zeros_like(self._last)
+
+    @property
+    def _clusters(self) -> Array:
+        """All of them (C, n + 1, n + 1), in order of time."""
+        whole = self._whole[: self._count]
+        return whole if self._open == 0 else np.concatenate((whole, self._last[None]))
 
     def correction(self, determined: NDArray[np.bool_]) -> tuple[Array, Array]:
         """What to add to the least-squares estimate (n,) to free it of this bias, and to its covariance (n, n).
@@ -63,7 +78,8 @@ class NoiseBias:
         Zero where nothing is determined, and for columns that are noise.
         """
         shift, covariance = np.zeros(determined.size), np.zeros((determined.size, determined.size))
-        changed = np.diag(self._clusters.sum(axis=0))[:-1]
+        clusters = self._clusters
+        changed = np.diag(clusters.sum(axis=0))[:-1]
         kept = np.flatnonzero(determined & (changed < LARGEST_SHARE * np.diag(self._gram)[:-1]))
         rows = np.append(kept, determined.size)
         size = np.sqrt(np.diag(self._gram)[rows])
@@ -71,7 +87,7 @@ class NoiseBias:
             return shift, covariance
         scale = np.outer(size, size)
         gram = self._gram[np.ix_(rows, rows)] / scale
-        clusters = self._clusters[:, rows[:, None], rows] / scale
+        clusters = clusters[:, rows[:, None], rows] / scale
         corrected = gram - clusters.sum(axis=0)
         biased = np.linalg.solve(gram[:-1, :-1], gram[:-1, -1])
         whole = np.linalg.solve(corrected[:-1, :-1], corrected[:-1, -1]) - biased
@@ -97,16 +113,20 @@ class NoiseBias:
         """Go on with so many parameters more, in which the rows so far have no part."""
         at = [self._gram.shape[0] - 1] * more
         self._gram = np.insert(np.insert(self._gram, at, 0.0, 0), at, 0.0, 1)
-        self._clusters = np.insert(np.insert(self._clusters, at, 0.0, 1), at, 0.0, 2)
+        self._whole = np.insert(np.insert(self._whole, at, 0.0, 1), at, 0.0, 2)
+        self._last = np.insert(np.insert(self._last, at, 0.0, 0), at, 0.0, 1)
 
     def state(self) -> dict[str, Any]:
-        """What `restore` needs to continue."""
+        """What `restore` needs to continue; it does not change when the session goes on."""
         return {
-            "bias_gram": self._gram, "bias_clusters": self._clusters.copy(), "bias_length": self._length,
-            "bias_open": self._open,
+            "bias_gram": self._gram, "bias_clusters": self._whole[: self._count], "bias_last": self._last,
+            "bias_length": self._length, "bias_open": self._open,
         }  # fmt: skip
 
     def restore(self, state: Mapping[str, NDArray[Any]]) -> None:
         """Continue from a saved state."""
-        self._gram, self._clusters = np.array(state["bias_gram"]), np.array(state["bias_clusters"])
+        self._gram, self._last = np.array(state["bias_gram"]), np.array(state["bias_last"])
+        self._count = len(state["bias_clusters"])
+        self._whole = np.zeros((MOST_CLUSTERS, *self._last.shape))
+        self._whole[: self._count] = state["bias_clusters"]
         self._length, self._open = int(state["bias_length"]), int(state["bias_open"])

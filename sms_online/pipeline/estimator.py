@@ -55,7 +55,8 @@ SampleSink = Callable[[GridSamples], None]
 class SquaredResidual:
     """Sums that give the rms of Y β - b for any β: the Gram matrix of [Y b], (n + 1, n + 1), and the measured signal's.
 
-    A Gram matrix tells a residual down to 1e-8 of b, which is enough for a share of the signal.
+    A Gram matrix tells a residual down to 1e-8 of b, which is enough for a share of the signal. It is replaced, never
+    written, so whoever keeps one has the sum of then.
     """
 
     gram: Array
@@ -64,7 +65,7 @@ class SquaredResidual:
     def add(self, Y: Array, b: Array, signal: float) -> None:
         """Add rows Y (M, n), b (M,), and the measured torque or force behind b, before what is known was subtracted."""
         stacked = np.concatenate((Y, b[:, None]), axis=1)
-        self.gram += stacked.T @ stacked
+        self.gram = self.gram + stacked.T @ stacked
         self.signal += float(signal) ** 2
 
     def relative(self, beta: Array) -> float | None:

@@ -112,7 +112,8 @@ class MomentumFit:
         self._bends = {half_width: np.zeros(model.layout.n_v) for half_width in HALF_WIDTHS}
         self._bent = dict.fromkeys(HALF_WIDTHS, 0)
         self._largest = np.zeros(model.layout.n_v)  # largest sum of a row's terms
-        # Gram matrices of rows [Y b] over their own standard deviations, by generalized speed, and how many windows.
+        # Gram matrices of rows [Y b] over their own standard deviations, by generalized speed, and how many windows. No
+        # array is written twice, so whoever keeps one has the sum of then: of a large arm they are 3 MB.
         self.plain_gram = np.zeros((model.layout.n_v, base.n + 1, base.n + 1))
         self.plain_windows = 0
         self.misfit = np.zeros(model.layout.n_v)  # excess over one of the mean square of such rows' residual
@@ -246,7 +247,7 @@ class MomentumFit:
         self._judge(self.weights)
         self._since = 0
         self._renewal = min(2 * self._renewal, self._count(LATEST_RENEWAL))
-        counted = self.plain_gram.copy(), self.plain_windows, dict(self._bends), dict(self._bent)
+        counted = self.plain_gram, self.plain_windows, dict(self._bends), dict(self._bent)
         self._sensitivities.forget(self._first)
         self._forget_rows()
         self._tell()
@@ -264,7 +265,7 @@ class MomentumFit:
 
     def _retell(self) -> None:
         """Work off the windows held back from the first one on."""
-        self.plain_gram[:] = 0.0
+        self.plain_gram = np.zeros_like(self.plain_gram)
         self.plain_windows = 0
         self._bent = dict.fromkeys(HALF_WIDTHS, 0)
         self._sensitivities.forget(self._first)
@@ -305,7 +306,9 @@ class MomentumFit:
         covariances[-1][np.diag_indices(n_v)] += bent + rounding
         variance = np.diag(covariances[-1]).copy()
         plain = rows[0] / np.sqrt(variance)[:, None]
-        self.plain_gram += plain[:, :, None] * plain[:, None, :]
+        gram = plain[:, :, None] * plain[:, None, :]
+        gram += self.plain_gram
+        self.plain_gram = gram
         self.plain_windows += 1
         covariances[-1][np.diag_indices(n_v)] += self.misfit * variance
         side_by_side = rows.swapaxes(0, 1).reshape(n_v, -1)
@@ -339,7 +342,7 @@ class MomentumFit:
             "weights": np.empty(0) if self.weights is None else self.weights, "since": self._since,
             "moving": self._moving, "first": self._first, "x": self._x, "v": self._v, "signals": self._signals,
             "bends": np.array([*self._bends.values()]), "bent": np.array([*self._bent.values()]),
-            "largest": self._largest, "misfit": self.misfit, "plain_gram": self.plain_gram.copy(),
+            "largest": self._largest, "misfit": self.misfit, "plain_gram": self.plain_gram,
             "plain_windows": self.plain_windows, "renewal": self._renewal, **self._noise.state(),
             **self._whitener.state(), **self._sensitivities.state(), **_packed("held", self._held),
             **_packed("recent", self._recent), **noise_state("steady", self._sensor_noise),

@@ -67,7 +67,8 @@ class FullMemory:
 
     def state(self) -> State:
         """See Memory."""
-        return {"factor": self._factor.copy(), "rows": float(self._rows), **self._clusters.state()}
+        # The factor is replaced, never written.
+        return {"factor": self._factor, "rows": float(self._rows), **self._clusters.state()}
 
     def restore(self, state: Mapping[str, Array | float]) -> None:
         """See Memory."""

@@ -201,6 +201,7 @@ def _add_diagnose(verbs: Verbs) -> None:
         "Without it the last third of the capture is held out"
     )
     parser.add_argument("--holdout", metavar="CAPTURE", type=Path, help=text)
+    _add_view(parser)
 
 
 def _add_import(verbs: Verbs) -> None:

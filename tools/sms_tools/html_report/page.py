@@ -106,8 +106,8 @@ def _parameters(document: Document, references: Sequence[Reference | None]) -> s
     is_true = any(reference is not None and reference.is_true for reference in references)
     compared = "true" if is_true else "nominal"
     rows = [
-        "<table><tr><th>parameter</th><th></th><th>unit</th><th>estimate</th><th>± std</th><th>95 % interval</th>"
-        f"<th>{compared}</th><th>deviation %</th><th>± 2σ, axis ± {limit:g} %</th></tr>"
+        '<table class="dense"><tr><th>parameter</th><th></th><th>unit</th><th>estimate</th><th>± std</th>'
+        f"<th>95 % interval</th><th>{compared}</th><th>deviation %</th><th>± 2σ, axis ± {limit:g} %</th></tr>"
     ]
     for p, reference, (deviation, bound) in zip(parameters, references, deviations, strict=True):
         known = "" if reference is None else f"{reference.value:.6g}"
@@ -140,18 +140,23 @@ def _convergence(estimator: Estimator, history: History, references: Sequence[Re
         known = np.flatnonzero(instant.determined)
         estimate[k, known], std[k, known] = instant.estimate[known], instant.std[known]
     marks = [event.time for event in estimator.events]
-    groups = parameter_groups(estimator.base.parameters, references)
-    return [_group_chart(group, t, estimate, std, marks) for group in groups]
+    curves = []
+    for group in parameter_groups(estimator.base.parameters, references):
+        drawn = (estimate[:, group.indices] - group.zero) / group.scale
+        curves.append((group, drawn, BOUNDS * std[:, group.indices] / group.scale))
+    # One axis for all deviations, which holds what was known at half time and at the end: between them they settle.
+    half = len(instants) // 2
+    reach = [np.abs(drawn) + width for group, drawn, width in curves if group.half_range is not None]
+    limit = max(bar_range(np.concatenate([r[k] for r in reach])) for k in (half, -1)) if reach else np.nan
+    return [_group_chart(group, t, drawn, width, limit, marks) for group, drawn, width in curves]
 
 
-def _group_chart(group: Group, t: Array, estimate: Array, std: Array, marks: Sequence[float]) -> str:
-    drawn = (estimate[:, group.indices] - group.zero) / group.scale
-    width = BOUNDS * std[:, group.indices] / group.scale
+def _group_chart(group: Group, t: Array, drawn: Array, width: Array, limit: float, marks: Sequence[float]) -> str:
     series = [
         Series(label, drawn[:, k], drawn[:, k] - width[:, k], drawn[:, k] + width[:, k])
         for k, label in enumerate(group.labels)
     ]
-    y_range = None if group.half_range is None else (-group.half_range, group.half_range)
+    y_range = None if group.half_range is None else (-limit, limit)
     return chart(group.title, t, series, "time, s", y_range, marks)
 
 
@@ -159,6 +164,7 @@ def _residual(document: Document, history: History) -> list[str]:
     rows = "".join(
         f"<tr><td>{escape(name)}</td><td>{_number(residual['relative'])}</td><td>{_number(residual['whitened'])}</td></tr>"
         for name, residual in document["residual"].items()
+        if any(value is not None for value in residual.values())
     )
     heading = "<tr><th>rows</th><th>share of torque or force</th><th>whitened, 1 is noise</th></tr>"
     parts = [f"<table>{heading}{rows}</table>"]

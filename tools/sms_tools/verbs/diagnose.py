@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import argparse
+import math
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +13,7 @@ from rich.table import Table
 from sms_adapters.sources import open_source
 from sms_adapters.truth import read_truth
 from sms_online.description.schema import System
-from sms_online.diagnosis.diagnose import diagnose
+from sms_online.diagnosis.diagnose import Diagnosis, PriorOf, diagnose
 from sms_online.diagnosis.document import diagnosis_document
 from sms_online.errors import InputError
 from sms_online.pipeline.estimator import Estimator
@@ -20,11 +22,13 @@ from sms_online.trackers.interface import Prior
 from sms_tools.adopted_system import added_lines, adopted_text, write_adopted
 from sms_tools.exit_codes import NOTHING_DETERMINED, OK
 from sms_tools.html_report.diagnosis_page import write_diagnosis
+from sms_tools.interruption import Interruption
 from sms_tools.priors import base_prior
 from sms_tools.report import Document, parameter_table, report_console, show
 from sms_tools.results_file import results_directory, to_json, write_document
-from sms_tools.session import check_part, described_system
+from sms_tools.session import check_part, described_system, stream
 from sms_tools.true_values import true_values
+from sms_tools.view.session import View, open_view
 
 NAME = "diagnosis.json"
 # Ambiguous and ranked candidates that people are shown.
@@ -61,6 +65,8 @@ def run(args: argparse.Namespace) -> int:
     diagnosis = diagnose(system, blocks, str(args.capture), prior, holdout, progress)
     true = None if truth is None else true_values(truth, system, diagnosis.after.system)
     document = diagnosis_document(diagnosis, warnings, true)
+    view = None if args.rerun == "off" else _watched(args, diagnosis, document, blocks, directory, prior, true)
+    document["warnings"] += [] if view is None else view.warnings
     lines: list[Table | str] = ["", document["summary"], ""]
     if document["effects"]:
         lines += [_effects(document), ""]
@@ -76,7 +82,44 @@ def run(args: argparse.Namespace) -> int:
     show(console, *lines, f"diagnosis: {path}", f"page: {page}")
     if args.json:
         print(to_json(document))
+    if view is not None:
+        with Interruption() as interruption:
+            view.linger(interruption)
     return OK if any(p["identifiable"] for p in document["after"]["parameters"]) else NOTHING_DETERMINED
+
+
+def _watched(
+    args: argparse.Namespace,
+    diagnosis: Diagnosis,
+    document: Document,
+    blocks: list[Block],
+    directory: Path,
+    prior: PriorOf,
+    true: Mapping[str, float] | None,
+) -> View:
+    """The session once more in view, with what was found; with it the first candidates' evidence, and the verdict."""
+    channels = blocks[0].channels
+    estimator = Estimator(diagnosis.after.system, channels, str(args.capture))
+    known = prior(estimator)
+    if known is not None:
+        estimator.set_prior(known)
+    exaggeration = args.exaggerate
+    with (
+        Interruption() as interruption,
+        open_view(args.rerun, estimator, channels, directory, true, patient=True, exaggeration=exaggeration) as view,
+    ):
+        stream(estimator, view.watch(blocks), interruption)
+        first = document["candidates"][:SHOWN]
+        scores = {f"{c['name']}@{c['where']}": math.log10(max(1.0, c["gain"])) for c in first}
+        # Judged by all of the capture, so it holds from beginning to end.
+        begin, end = float(blocks[0].t[0]), float(blocks[-1].t[-1])
+        for t in (begin, end):
+            view.evidence(t, scores)
+        view.event(end, document["summary"])
+        for effect in document["effects"]:
+            values = (f"{name} {' '.join(_told(value))}" for name, value in effect["coefficients"].items())
+            view.event(end, ", ".join((f"{effect['name']}@{effect['where']}", *values)))
+    return view
 
 
 def _samples(
@@ -101,6 +144,12 @@ def _effects(document: Document) -> Table:
             table.add_row(f"{effect['name']}@{effect['where']}" if first else "", name, *cells, others if first else "")
             first = False
     return table
+
+
+def _told(value: dict[str, Any]) -> list[str]:
+    """A coefficient's value, its deviation where it has one, and unit, for a line of text."""
+    estimate, std, unit = _cells(value)
+    return [estimate, *([f"± {std}"] if std else []), *([unit] if unit else [])]
 
 
 def _cells(value: dict[str, Any]) -> list[str]:

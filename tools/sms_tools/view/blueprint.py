@@ -25,8 +25,9 @@ EYE_DISTANCE = 2.2
 ROOM = 1.3
 # Direction from the arm to the eye of a spatial system, from above one side.
 OBLIQUE = np.array((0.35, -0.8, 0.5))
-# A relative residual of 1 says that the model explains nothing; whitened, 1 is noise.
-RELATIVE_RANGE, WHITENED_RANGE = (0.0, 1.2), (0.0, 5.0)
+# A relative residual of 1 says that the model explains nothing. Whitened ones are drawn in decades: noise is 0, and a
+# model that lacks an effect leaves hundreds of times as much.
+RELATIVE_RANGE, WHITENED_RANGE = (0.0, 1.2), (-0.5, 3.5)
 
 
 def layout(scene: Scene, groups: Sequence[Group], first: Drawing) -> rrb.Blueprint:
@@ -90,7 +91,7 @@ def _plot(
         contents=list(contents),
         name=name,
         axis_y=rrb.ScalarAxis(range=y) if y is not None else None,
-        plot_legend=rrb.PlotLegend(corner=rrb.Corner2D.LeftTop, visible=legend),
+        plot_legend=rrb.PlotLegend(corner=rrb.Corner2D.RightTop, visible=legend),
         axis_x=rrb.TimeAxis(view_range=_range(WINDOW)),
         time_ranges=rrb.VisibleTimeRanges([rr.VisibleTimeRange(TIMELINE, _range(WINDOW))]),
     )
@@ -106,22 +107,29 @@ def _parameters(groups: Sequence[Group]) -> rrb.Container:
     together = [plot for kind in plots.values() for plot in kind]
     if len(together) <= MOST_PLOTS:
         return rrb.Grid(*together, grid_columns=2)
-    return rrb.Tabs(*(rrb.Grid(*members, grid_columns=2, name=kind) for kind, members in plots.items()))
+    tabs: list[tuple[list[str], list[rrb.TimeSeriesView]]] = []
+    for kind, members in plots.items():
+        if tabs and len(tabs[-1][1]) + len(members) <= MOST_PLOTS:
+            tabs[-1][0].append(kind)
+            tabs[-1][1].extend(members)
+        else:
+            tabs.append(([kind], members))
+    return rrb.Tabs(*(rrb.Grid(*shown, grid_columns=2, name=", ".join(kinds)) for kinds, shown in tabs))
 
 
 def _residual() -> rrb.Container:
     relative = _plot("Unexplained torque or force, share", [f"{number_log.RESIDUAL}/relative"], RELATIVE_RANGE)
     whitened = _plot(
-        "Whitened residual, 1 is noise",
+        "Residual over its noise, log10",
         [f"{number_log.RESIDUAL}/whitened/**", f"{number_log.RESIDUAL}/noise"],
         WHITENED_RANGE,
     )
-    energy = _plot("Energy residual, rms, J", [f"{number_log.RESIDUAL}/energy"])
+    energy = _plot("Energy residual, rms, J", [f"{number_log.RESIDUAL}/energy"], legend=False)
     return rrb.Horizontal(relative, whitened, energy, name="Residual")
 
 
 def _evidence() -> rrb.TimeSeriesView:
-    return _plot("Evidence for missing effects", [f"{number_log.EVIDENCE}/**"])
+    return _plot("Evidence for missing effects, log10 of the gain", [f"{number_log.EVIDENCE}/**"])
 
 
 def _health() -> rrb.Container:

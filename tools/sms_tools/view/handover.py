@@ -8,8 +8,9 @@ from threading import Thread
 from time import perf_counter, sleep
 from typing import IO, Any
 
-# Frames that wait for the other end: three seconds of a live session, which is more than the view's process needs to
-# start. Every fifth holds what the estimator knows, 16 MB of a large arm.
+# Frames that wait for the other end: three seconds, live or of a replay five times as fast, which is more than the
+# view's process needs to start. One that holds what the estimator knows shares most of it with the others; its own are
+# 4 MB of a large arm.
 CAPACITY = 64
 # A source that can be kept waiting looks so often whether there is room again, s.
 LOOK_AGAIN = 0.001
@@ -23,6 +24,7 @@ class Handover:
 
     def __init__(self, pipe: IO[bytes], capacity: int = CAPACITY) -> None:
         self.dropped = 0
+        self.taken = 0  # items that are in the pipe
         self.broken = False
         self._pipe = pipe
         self._capacity = capacity
@@ -53,7 +55,30 @@ class Handover:
     def _send(self) -> None:
         try:
             while True:
-                pickle.dump(self._waiting.get(), self._pipe, protocol=pickle.HIGHEST_PROTOCOL)
-                self._pipe.flush()
+                _send_item(self._waiting.get(), self._pipe)
+                self.taken += 1
         except (OSError, ValueError):  # the other end is gone
             self.broken = True
+
+
+def _send_item(item: Any, pipe: IO[bytes]) -> None:
+    """Arrays go from where they stand: a copy of some MB would hold the interpreter's lock."""
+    buffers: list[pickle.PickleBuffer] = []
+    body = pickle.dumps(item, protocol=5, buffer_callback=buffers.append)
+    arrays = [buffer.raw() for buffer in buffers]
+    pickle.dump((body, [array.nbytes for array in arrays]), pipe)
+    for array in arrays:
+        pipe.write(array)
+    pipe.flush()
+
+
+def receive(pipe: IO[bytes]) -> Any:
+    """The next item at the pipe's other end, its arrays read-only.
+
+    EOFError or pickle.UnpicklingError where the pipe ends, which may be in the middle of one.
+    """
+    body, sizes = pickle.load(pipe)
+    arrays = [pipe.read(size) for size in sizes]
+    if [len(array) for array in arrays] != sizes:
+        raise EOFError
+    return pickle.loads(body, buffers=arrays)

@@ -54,8 +54,11 @@ class NumberLog:
         self._stream.log(path, lines, static=True)
 
     def add(self, path: str, t: float, values: Array) -> None:
-        """One row at an instant; NaN leaves a gap."""
+        """One row at an instant; NaN leaves a gap. Later rows may have more numbers."""
         columns = self._waiting.setdefault(path, Columns())
+        if columns.rows and columns.rows[0].size != values.size:
+            self._send(path, columns)
+            columns = self._waiting[path] = Columns()
         columns.t.append(t)
         columns.rows.append(values)
 
@@ -71,10 +74,13 @@ class NumberLog:
     def send(self) -> None:
         """Send what waits."""
         for path, columns in self._waiting.items():
-            values = np.array(columns.rows)
-            scalars = rr.Scalars.columns(scalars=values.ravel()).partition(np.full(len(values), values.shape[1]))
-            self._stream.send_columns(path, times(np.array(columns.t)), scalars)
+            self._send(path, columns)
         self._waiting.clear()
+
+    def _send(self, path: str, columns: Columns) -> None:
+        values = np.array(columns.rows)
+        scalars = rr.Scalars.columns(scalars=values.ravel()).partition(np.full(len(values), values.shape[1]))
+        self._stream.send_columns(path, times(np.array(columns.t)), scalars)
 
     def table(self, t: float, text: str) -> None:
         """The table of all parameters as it is now."""

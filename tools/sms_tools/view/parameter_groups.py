@@ -19,7 +19,7 @@ LONGEST_LABEL = 18
 KINDS = {"spacecraft": "spacecraft", "joint": "joints", "motor": "motors", "link": "links", "payload": "payload"}
 EFFECTS = "effects"
 # Half width of a plot of deviations, %: around true values estimates come close, around nominal ones who knows.
-TRUE_RANGE, NOMINAL_RANGE = 1.0, 100.0
+TRUE_RANGE, NOMINAL_RANGE = 0.2, 100.0
 
 
 @dataclass(frozen=True)

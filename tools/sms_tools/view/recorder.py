@@ -168,13 +168,12 @@ class Recorder:
         self._events = len(events)
 
     def _whole_residuals(self, t: float, estimate: Array) -> None:
-        """Residuals of all rows so far: over their predicted deviation, and of the energy balance."""
+        """Residuals of all rows so far: over their predicted deviation, in decades, and of the energy balance."""
         whole = residuals(self._estimator, estimate)
-        whitened = {rows: r["whitened"] for rows, r in whole.items()}
-        known = {rows: value for rows, value in whitened.items() if value is not None}
+        known = {rows: np.log10(value) for rows, r in whole.items() if (value := r["whitened"])}
         if known:
             self._numbers.add_named(f"{RESIDUAL}/whitened", t, known)
-            self._numbers.add(f"{RESIDUAL}/noise", t, np.ones(1))
+            self._numbers.add(f"{RESIDUAL}/noise", t, np.zeros(1))
         energy = self._estimator.energy_tracker.estimate()
         rms = np.sqrt(energy.rss / energy.dof) if energy.dof > 0.0 else np.nan
         self._numbers.add(f"{RESIDUAL}/energy", t, np.array([rms]))

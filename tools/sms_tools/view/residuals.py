@@ -27,7 +27,7 @@ class RecentResidual:
             # The sums begin anew, with what the event has added.
             self._events = len(estimator.events)
             self._past.clear()
-        self._past.append((t, [SquaredResidual(r.gram.copy(), r.signal) for r in now]))
+        self._past.append((t, [SquaredResidual(r.gram, r.signal) for r in now]))
         while len(self._past) > 1 and self._past[1][0] <= t - SPAN:
             self._past.popleft()
         then = self._past[0][1] if len(self._past) > 1 else [SquaredResidual(0.0 * r.gram, 0.0) for r in now]

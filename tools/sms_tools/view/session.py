@@ -23,7 +23,7 @@ from sms_online.stream import Block
 from sms_tools.interruption import Interruption
 from sms_tools.view.choice import EXPECTED, Choice, parse_choice
 from sms_tools.view.frames import End, Event, Evidence, Frame, Picture, Reference, Start
-from sms_tools.view.handover import CAPACITY, Handover
+from sms_tools.view.handover import Handover
 from sms_tools.view.snapshot import take
 
 RECORDING = "session.rrd"
@@ -31,12 +31,14 @@ RECORDING = "session.rrd"
 # changes by internal blocks of a quarter second.
 SAMPLES_RATE = 20.0
 SAMPLES_A_STATE = 5
-# Frames that wait where the source can be kept waiting; each holds what the estimator knows, 16 MB of a large arm.
-FEW = 8
+# Bytes in the pipe to the view's process, as many as Linux lets anybody have: fewer turns of who writes and who reads.
+PIPE_SIZE = 1 << 20
 # A view that has taken nothing for so long, s, is given up.
 STALL = 10.0
-# What is left at the end of a session gets so long to be written, s.
+# At the end of a session what is left gets so long to be written, s, each time some of it was taken.
 CLOSING = 10.0
+# The end is waited for in steps of, s.
+STEP = 0.1
 # A viewer in the same laboratory answers within this time, s.
 PROBE_TIMEOUT = 1.0
 
@@ -72,10 +74,11 @@ class View:
                 stdout=subprocess.PIPE,
                 stderr=subprocess.DEVNULL,
                 start_new_session=True,
+                pipesize=PIPE_SIZE,
             )
             assert self._process.stdin is not None
             assert self._process.stdout is not None
-            self._handover = Handover(self._process.stdin, FEW if patient else CAPACITY)
+            self._handover = Handover(self._process.stdin)
             Thread(target=self._listen, args=(self._process.stdout,), name="view messages", daemon=True).start()
             self._handover.put(start)
 
@@ -130,12 +133,20 @@ class View:
             return
         if kind is None:
             self._put(End(self._t, take(self._estimator)))
-            if not self._done.wait(CLOSING):
-                self._trouble("the view did not finish in time")
+            self._close(self._handover)
         if self._handover.dropped:
             self.warnings.append(f"{self._handover.dropped} pictures of the view dropped: it does not keep up")
         if not (self._serving and kind is None and not self.status):
             self._kill()
+
+    def _close(self, handover: Handover) -> None:
+        """Wait until the view has finished, or takes nothing any more."""
+        taken, since = handover.taken, perf_counter()
+        while not self._done.wait(STEP):
+            if handover.taken > taken:
+                taken, since = handover.taken, perf_counter()
+            elif perf_counter() - since > CLOSING:
+                self._trouble("it did not finish in time")
 
     def _show(self, blocks: tuple[Block, ...], with_state: bool) -> None:
         assert self._handover is not None

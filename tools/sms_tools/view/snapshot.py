@@ -1,12 +1,13 @@
-"""What an estimator knows at an instant, copied fast enough for its own thread, and put into a replica of it.
+"""What an estimator knows at an instant, taken fast enough for its own thread, and put into a replica of it.
 
-A replica answers whatever the estimator itself would: estimate, error bars, the whole results document. It cannot
-continue the session; `Estimator.state` is for that, and holds much more.
+What is large is not copied: the estimator writes such arrays once. A replica answers whatever the estimator itself
+would: estimate, error bars, the whole results document. It cannot continue the session; `Estimator.state` is for that,
+and holds much more.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 from sms_online.pipeline.estimator import Estimator, SquaredResidual
@@ -57,10 +58,10 @@ def take(estimator: Estimator) -> Snapshot:
         samples=estimator.samples,
         duration=estimator.duration,
         dropped_rows=estimator.dropped_rows,
-        counters=replace(estimator.counters),
+        counters=SyncCounters(**vars(estimator.counters)),
         energy_tracker=estimator.energy_tracker.state(),
         shared_errors=estimator.shared_errors.state(),
-        joint_residuals=[SquaredResidual(r.gram.copy(), r.signal) for r in estimator.joint_residuals],
+        joint_residuals=[SquaredResidual(r.gram, r.signal) for r in estimator.joint_residuals],
         momentum=None if estimator.momentum is None else _take_momentum(estimator.momentum),
         smoother=None if estimator.smoother is None else estimator.smoother.told(),
     )
@@ -77,7 +78,7 @@ def _take_momentum(momentum: Momentum) -> MomentumSnapshot:
         bias=momentum.bias.state(),
         weights=fit.weights,
         misfit=fit.misfit,
-        plain_gram=fit.plain_gram.copy(),
+        plain_gram=fit.plain_gram,
         plain_windows=fit.plain_windows,
     )
 

@@ -1,0 +1,63 @@
+"""A diagnosis in view: the session with what was found, the evidence of the candidates and the verdict."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+from axis import AXIS, axis_block
+from recordings import columns, scalars
+
+from sms_adapters.capture import CaptureWriter
+from sms_tools.cli import main
+
+COULOMB = 0.2  # N m
+
+
+@pytest.fixture(scope="module")
+def diagnosed(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The directory of the diagnosis of an axis with Coulomb friction, with a recording."""
+    folder = tmp_path_factory.mktemp("diagnosed")
+    (folder / "axis.toml").write_text(AXIS)
+    block = axis_block(COULOMB)
+    with CaptureWriter(folder / "run.csv", block.channels) as writer:
+        writer.write(block)
+    arguments = ["diagnose", str(folder / "run.csv"), "--system", str(folder / "axis.toml"), "--out", str(folder)]
+    assert main([*arguments, "--rerun", "save"]) == 0
+    return folder
+
+
+@pytest.fixture(scope="module")
+def document(diagnosed: Path) -> dict[str, Any]:
+    found: dict[str, Any] = json.loads((diagnosed / "diagnosis.json").read_text())
+    return found
+
+
+def test_the_recording_ends_with_the_parameters_after(diagnosed: Path, document: dict[str, Any]) -> None:
+    found = {p["symbol"]: p["estimate"] for p in document["after"]["parameters"]}
+    shown = {}
+    for group in ("links", "effects", "effects_N_m"):  # what was found has no nominal value, so a plot of its own
+        entity = f"/parameters/{group}/estimate"
+        names = columns(diagnosed / "session.rrd", entity)[0]["SeriesLines:names"]
+        shown |= dict(zip(names, scalars(diagnosed / "session.rrd", entity)[1][-1], strict=True))
+    assert shown == found
+
+
+def test_evidence_is_drawn_over_the_whole_session_and_the_effect_has_the_most(
+    diagnosed: Path, document: dict[str, Any]
+) -> None:
+    (effect,) = document["effects"]
+    assert effect["name"] == "coulomb_friction"
+    evidence = {}
+    for candidate in document["candidates"][:3]:
+        entity = f"/evidence/{candidate['name']}\\@{candidate['where']}"
+        t, evidence[candidate["name"]] = scalars(diagnosed / "session.rrd", entity)
+        assert t.tolist() == [0.0, pytest.approx(2399 / 200.0)]
+    assert max(evidence, key=lambda name: float(evidence[name][0, 0])) == "coulomb_friction"
+
+
+def test_the_verdict_is_in_the_log(diagnosed: Path, document: dict[str, Any]) -> None:
+    told = [row["TextLog:text"][0] for row in columns(diagnosed / "session.rrd", "/log") if row.get("TextLog:text")]
+    assert document["summary"] in told
