@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -28,19 +29,20 @@ from sms_online.pipeline.internal_states import FollowedStates
 from sms_online.pipeline.joint_balance import JointBalance
 from sms_online.pipeline.momentum import Momentum
 from sms_online.pipeline.rates import RateSamples, RatesStage
-from sms_online.pipeline.sensing import AttitudeContinuity, Sensing
-from sms_online.pipeline.synchronise import GridSamples, SyncCounters, Synchroniser
+from sms_online.pipeline.sensing import AttitudeContinuity, Sensing, stated_period
+from sms_online.pipeline.synchronise import SIDE, GridSamples, SyncCounters, Synchroniser
 from sms_online.smoother.session import Smoother
 from sms_online.stream import Array, Block
 from sms_online.trackers.interface import Estimate, Prior, Rows, Tracker
 from sms_online.trackers.square_root import RecursiveLeastSquares
 
-# Samples that pass through the pipeline together. Everything behind sees the same blocks however the samples arrive, so
-# the result is the same to the last bit. The cost of NumPy's calls is shared by a block, so the energy balance alone is
-# twice as fast with the longer one. Windows of the momentum balance share theirs, and an event waits for its block: two
-# hops of the usual window at 1 kHz cost it 80 ms at most, where 0.2 s are gone before two windows in a row tell of it.
-BLOCK = 80
+# Samples that pass through the pipeline together are those of some time. Everything behind sees the same blocks however
+# the samples arrive, so the result is the same to the last bit. The cost of NumPy's calls is shared by a block, so the
+# energy balance alone has long ones, in periods of the grid. With momentum rows a block is a hop of their windows, and
+# ends when the next window can be completed: no window waits for its block.
 ENERGY_BLOCK = 256
+# Of a period of the grid: blocks end between its instants, or rounding would decide to which one a sample belongs.
+BETWEEN = 0.5
 
 # What a session saves: arrays and numbers, by stage.
 SessionState = dict[str, dict[str, Any]]
@@ -115,11 +117,20 @@ class Estimator:
         self.momentum = None if by_energy else Momentum(model, base, self.sensing)
         self.energy_tracker: Tracker = RecursiveLeastSquares(base.n)
         self._begin_joints()
-        self._block = ENERGY_BLOCK if self.momentum is None else BLOCK
+        self._block, self._first_block = self._blocks()
         self._segment = -1
         self._first_time = np.nan
         self._pending_t = np.empty(0)
         self._pending = np.empty((0, len(self._columns)))
+
+    def _blocks(self) -> tuple[float, float]:
+        """Duration of a block, s, and of the first one, but for whole blocks."""
+        if self.momentum is None:
+            return ENERGY_BLOCK / self.system.sample_rate, BETWEEN / self.system.sample_rate
+        hop, margin = self.momentum.hop, self.momentum.margin
+        # The last sample behind a window, and those that interpolate the slowest channel there.
+        reach = SIDE * stated_period(self.system, self.sensing.channels)
+        return hop / self.system.sample_rate, (margin % hop + BETWEEN) / self.system.sample_rate + reach
 
     def set_prior(self, prior: Prior) -> None:
         """Weigh the rows against what is known of the base parameters beforehand; before the first sample."""
@@ -215,11 +226,12 @@ class Estimator:
         self.duration = float(block.t[-1]) - self._first_time
         self._pending_t = np.concatenate((self._pending_t, block.t))
         self._pending = np.concatenate((self._pending, block.values[:, self._columns]))
-        whole = self._pending_t.size - self._pending_t.size % self._block
-        for start in range(0, whole, self._block):
-            part = slice(start, start + self._block)
-            self._synchronise(self._pending_t[part], self._pending[part])
-        self._pending_t, self._pending = self._pending_t[whole:], self._pending[whole:]
+        number = np.floor((self._pending_t - self._first_time - self._first_block) / self._block)
+        ends = np.flatnonzero(np.diff(number)) + 1
+        for start, stop in pairwise([0, *ends.tolist()]):
+            self._synchronise(self._pending_t[start:stop], self._pending[start:stop])
+        if ends.size:
+            self._pending_t, self._pending = self._pending_t[ends[-1] :], self._pending[ends[-1] :]
 
     def finish(self) -> None:
         """End of the session: process what is still pending."""

@@ -85,6 +85,16 @@ class Momentum:
             self._build()
 
     @property
+    def hop(self) -> int:
+        """Samples from one window to the next."""
+        return self._balance.hop
+
+    @property
+    def margin(self) -> int:
+        """Samples that a window waits for beyond its end."""
+        return self._balance.margin
+
+    @property
     def started(self) -> bool:
         """Whether weights are known and rows come."""
         return self.fit.weights is not None
@@ -119,7 +129,7 @@ class Momentum:
         self._start_time = start_time
         self._waiting.append(piece)
         due = self._noise_told + round(NOISE_RENEWED * self._sample_rate)
-        if self._estimate.ready and (self.sensor_noise is None or piece.index[-1] >= due):
+        if (self.sensor_noise is None or piece.index[-1] >= due) and self._estimate.ready:
             self.sensor_noise = self._estimate.noise(periods)
             self._noise_told = int(piece.index[-1])
         if self.sensor_noise is None:
