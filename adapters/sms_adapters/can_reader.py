@@ -27,8 +27,8 @@ from sms_adapters.raw import (
 from sms_online.description.schema import CanBus
 from sms_online.stream import Array
 
-# Where the host stamps frames they wait in the driver until so long before the session's next tick, s, while nobody else
-# computes: at every frame the interpreter may be taken by another thread for a millisecond. Reading takes half of it.
+# Where the host stamps frames they wait in the driver until so long before the session's next tick, s. Nobody else
+# computes then, and at every frame another thread may take the interpreter for a millisecond. Reading takes half of it.
 BEFORE_TICK = 4e-3
 # Where nothing but the reading tells when a frame arrived, it must not wait so long, s.
 PROMPT_INTERVAL = 1e-3

@@ -58,10 +58,10 @@ class SerialReader:
         if os.name == "posix" and type(port) is serial.Serial:
             # At every system call another thread may take the interpreter for a millisecond: two will do, pyserial
             # makes five.
-            if not select.select([port.fd], [], [], timeout)[0]:
+            if not select.select([port.fileno()], [], [], timeout)[0]:
                 return b""
             try:
-                data = os.read(port.fd, MOST_BYTES_READ)
+                data = os.read(port.fileno(), MOST_BYTES_READ)
             except BlockingIOError:
                 return b""
             if not data:

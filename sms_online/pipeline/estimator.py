@@ -11,7 +11,8 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from itertools import pairwise
+from itertools import groupby, pairwise
+from operator import attrgetter
 from typing import Any
 
 import numpy as np
@@ -31,6 +32,7 @@ from sms_online.pipeline.momentum import Momentum
 from sms_online.pipeline.rates import RateSamples, RatesStage
 from sms_online.pipeline.sensing import AttitudeContinuity, Sensing, stated_period
 from sms_online.pipeline.synchronise import SIDE, GridSamples, SyncCounters, Synchroniser
+from sms_online.pipeline.waiting import waiting_from_state, waiting_state
 from sms_online.smoother.session import Smoother
 from sms_online.stream import Array, Block
 from sms_online.trackers.interface import Estimate, Prior, Rows, Tracker
@@ -110,6 +112,7 @@ class Estimator:
         layout = model.layout
         # Positions choose the filter's width; torques pass the same filter for the sake of the lag.
         self._rates = RatesStage(system.sample_rate, range(layout.n_x), self.sensing.noise)
+        self._unbalanced: list[GridSamples] = []  # coordinates and torques that wait for the energy balance
         self._followed = FollowedStates(model, system.sample_rate, len(self.sensing.channels))
         self._energy = EnergyBalance(model, base, system.sample_rate)
         # A balance of forces does not hold in a shape that is not the link's; energies bear it best.
@@ -240,6 +243,7 @@ class Estimator:
         self._pending_t, self._pending = self._pending_t[:0], self._pending[:0]
         for piece in self._synchroniser.flush():
             self._condition(piece)
+        self._balance_waiting()
         for rates in self._rates.flush():
             self._balance(rates)
         self._fit()
@@ -272,9 +276,20 @@ class Estimator:
 
     def _differentiate(self, piece: GridSamples) -> None:
         self._followed.wait(piece)
-        for rates in self._rates.push(GridSamples(piece.index, self.sensing.motion(piece.values), piece.segment)):
-            self._balance(rates)
+        self._unbalanced.append(GridSamples(piece.index, self.sensing.motion(piece.values), piece.segment))
+        waiting = sum(each.index.size for each in self._unbalanced)
+        # Beside momentum rows nobody waits for those of the energy, but for the internal states that come with them.
+        if self.momentum is None or self._model.n_states or waiting >= ENERGY_BLOCK:
+            self._balance_waiting()
         self._fit()
+
+    def _balance_waiting(self) -> None:
+        waiting, self._unbalanced = self._unbalanced, []
+        for segment, run in groupby(waiting, key=attrgetter("segment")):
+            pieces = list(run)
+            index, values = (np.concatenate([getattr(each, part) for each in pieces]) for part in ("index", "values"))
+            for rates in self._rates.push(GridSamples(index, values, segment)):
+                self._balance(rates)
 
     def _fit(self) -> None:
         """Hand on to the momentum balance the samples whose internal states are known."""
@@ -340,6 +355,7 @@ class Estimator:
                 "joint_gram": np.stack([residual.gram for residual in self.joint_residuals]),
                 "joint_signal": np.array([residual.signal for residual in self.joint_residuals]),
                 "dropped_rows": self.dropped_rows,
+                **waiting_state("unbalanced", self._unbalanced, self._rates.sigma.size),
             },
             "synchroniser": dict(self._synchroniser.state()),
             "conditioning": dict(self._conditioning.state()),
@@ -366,6 +382,7 @@ class Estimator:
         self._attitude.last = np.array(session["attitude"])
         self._pending_t, self._pending = np.array(session["pending_t"]), np.array(session["pending"])
         self.dropped_rows = int(session["dropped_rows"])
+        self._unbalanced = waiting_from_state("unbalanced", session)
         grams, signals = np.array(session["joint_gram"]), np.array(session["joint_signal"])
         self.joint_residuals = [SquaredResidual(gram, float(s)) for gram, s in zip(grams, signals, strict=True)]
         self._synchroniser.restore(state["synchroniser"])
