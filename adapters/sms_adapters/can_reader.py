@@ -104,11 +104,13 @@ class CanReader:
             if message is None:
                 break
             messages.append(message)
-            arrivals.append(self._clock())
+            if not self._host_stamped:
+                arrivals.append(self._clock())
         self._last_read = time.monotonic()
         if messages:
-            frames = frames_of(messages, np.array(arrivals))
-            return [self._as_stamped(frames) if self._host_stamped else frames]
+            if self._host_stamped:
+                return [self._as_stamped(frames_of(messages, np.full(len(messages), self._clock())))]
+            return [frames_of(messages, np.array(arrivals))]
         if self._lost is not None:
             raise self._lost
         return []

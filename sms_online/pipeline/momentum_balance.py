@@ -6,7 +6,7 @@ of it (windows side by side cost fifteen times the error).
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import groupby
 from operator import itemgetter
@@ -186,16 +186,20 @@ class MomentumBalance:
         if numbers.size == 0:
             return []
         widths = np.minimum(half_width, self.margin + (last - numbers) * self.half_hop)
-        states = [self._states(numbers[widths == M] * self.half_hop, M) for M in np.unique(widths)[::-1].tolist()]
-        x, v, signals = (np.concatenate([part[0] for part in parts]) for parts in zip(*states, strict=True))
+        apart = [(numbers[widths == M] * self.half_hop, M) for M in np.unique(widths)[::-1].tolist()]
+        x, v, signals = self._states(apart)
         self._told = last + 1
-        return [Instants(int(numbers[0]), x, v, signals)]
+        return [Instants(int(numbers[0]), x[0], v[0], signals[0])]
 
-    def _states(self, samples: NDArray[np.int64], half_width: int) -> tuple[Array, Array, Array]:
-        """x (copies, K, n_x), v (copies, K, n_v) and signals (copies, K, joints + n_states) at K samples."""
-        layout = self.model.layout
-        values, rates = smooth(self._samples, samples - self._first + self.lead, half_width, self.sample_rate)
-        apart = len(samples), COPIES, values.shape[1] // COPIES
+    def _states(self, samples: Sequence[tuple[NDArray[np.int64], int]]) -> tuple[Array, Array, Array]:
+        """x (copies, K, n_x), v (copies, K, n_v) and signals (copies, K, joints + n_states) at K samples.
+
+        samples: their numbers, K in all, and half width M of their filter.
+        """
+        layout, before = self.model.layout, self.lead - self._first
+        smoothed = [smooth(self._samples, numbers + before, M, self.sample_rate) for numbers, M in samples]
+        values, rates = (np.concatenate(parts) for parts in zip(*smoothed, strict=True))
+        apart = len(values), COPIES, values.shape[1] // COPIES
         values, rates = (part.reshape(apart).swapaxes(0, 1) for part in (values, rates))
         x, x_dot = values[..., : layout.n_x], rates[..., : layout.n_x]
         v = layout.speeds(x.reshape(-1, layout.n_x), x_dot.reshape(-1, layout.n_x))
@@ -214,9 +218,8 @@ class MomentumBalance:
         skip = max(0, (windows[0] - smoothed.first) // s)
         smoothed.columns = smoothed.columns[skip:]
         smoothed.first += skip * s
-        states = [self._states(fresh, half_width)]
-        states += [self._states(ends - d, self.margin + d) for d in tail.tolist()]
-        columns = self._columns(*(np.concatenate(parts, axis=1) for parts in zip(*states, strict=True)))
+        states = self._states([(fresh, half_width), *((ends - d, self.margin + d) for d in tail.tolist())])
+        columns = self._columns(*states)
         smoothed.columns = np.concatenate((smoothed.columns, columns[: fresh.size]))
         tails = columns[fresh.size :].reshape(tail.size, len(windows), columns.shape[1])
         phi, phi_dot = self._phi[s]

@@ -72,10 +72,14 @@ class NoiseEstimate:
         self._samples = [np.empty((2, 0)) for _ in range(count)]  # instants and values
         self._largest = np.zeros(count)
         self._fresh: list[tuple[Array, Array]] = []  # instants and values that no channel has yet
+        self._unsorted = 0  # how many
 
     def push(self, t: Array, values: Array) -> None:
         """Take samples (B, channels) at instants t (B,), NaN where a channel has none."""
         self._fresh.append((t, values))
+        self._unsorted += t.size
+        if self._unsorted >= SAMPLES:
+            self._sort()
 
     def _sort(self) -> None:
         """Give each channel the samples that came since the noise was asked for last."""
@@ -83,7 +87,7 @@ class NoiseEstimate:
             return
         t = np.concatenate([t for t, _ in self._fresh])
         values = np.concatenate([values for _, values in self._fresh])
-        self._fresh = []
+        self._fresh, self._unsorted = [], 0
         for k, column in enumerate(values.T):
             fresh = np.stack((t, column))[:, np.isfinite(column)]
             last = self._samples[k][0, -1:] if self._samples[k].size else -np.inf
