@@ -101,8 +101,8 @@ class Feed:
             try:
                 self._reader.open()
                 self.lost = None
-                self.tried.set()
                 self._fetched = time.monotonic()
+                self.tried.set()
                 while not self._stopping.is_set():
                     items = self._reader.read(READ_TIMEOUT)
                     if items:
