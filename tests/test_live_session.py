@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import sys
+import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
@@ -222,6 +223,47 @@ def test_arrivals_never_go_back_behind_a_tick_that_was_worked_off(system: System
     feed._take([chunk])
     assert feed.drain(1.0) == []
     assert feed.drain(1.02) == [SerialChunk(1.0, b"a")]
+
+
+def test_a_loop_that_is_behind_waits_until_its_readers_have_fetched_what_came(monkeypatch: pytest.MonkeyPatch) -> None:
+    """It goes on when a read has come back, and at once where the device is not there."""
+
+    class Counted(Played):
+        reads = 0
+
+        def read(self, timeout: float) -> list[Raw]:
+            time.sleep(0.01)
+            self.reads += 1
+            return []
+
+    monkeypatch.setattr(feed_module, "FETCHING", 60.0)
+    reader = Counted("drive", [], FastClock())
+    feed = Feed(reader, None)
+    feed.await_fetched(0.0)
+    feed.start()
+    feed.tried.wait()
+    before = reader.reads
+    feed.await_fetched(0.0)
+    assert reader.reads > before
+    feed.stop()
+    feed.await_fetched(0.0)
+
+
+def test_a_reader_that_never_comes_back_is_not_waited_for_for_ever(monkeypatch: pytest.MonkeyPatch) -> None:
+    released = threading.Event()
+
+    class Stuck(Played):
+        def read(self, timeout: float) -> list[Raw]:
+            released.wait()
+            return []
+
+    monkeypatch.setattr(feed_module, "FETCHING", 0.01)
+    feed = Feed(Stuck("drive", [], FastClock()), None)
+    feed.start()
+    feed.tried.wait()
+    feed.await_fetched(0.0)
+    released.set()
+    feed.stop()
 
 
 def test_a_driver_that_raises_anything_is_a_lost_device() -> None:

@@ -46,7 +46,7 @@ def windows_of(balance: MomentumBalance, x: Array, torque: Array, sigma: float) 
 
 def first_sample(balance: MomentumBalance, window: Window) -> int:
     """Sample at which a window of a segment that begins with sample 0 begins."""
-    return balance.margin + window.start * balance.half_hop
+    return balance.lead + window.start * balance.half_hop
 
 
 def dense(balance: MomentumBalance, window: Window) -> Array:
@@ -61,7 +61,7 @@ def test_rows_are_the_equations_of_motion_on_any_motion(system: System) -> None:
     """Y β = ∫ φ Q dt for the forces that H v̇ + C = Q asks for; the balance is told those of the motors."""
     model = Model(system)
     balance = MomentumBalance(model, find_base_parameters(model), system.sample_rate, SPAN)
-    motion = prescribed(model, balance.width + 2 * balance.margin + 2 * balance.hop + 1, seed=1)
+    motion = prescribed(model, balance.width + balance.lead + balance.margin + 2 * balance.hop + 1, seed=1)
     torque = motion.Q[:, list(model.layout.theta_m)]
     other = motion.Q - model.generalized_force(torque)
     beta = balance.base.values(model.nominal)
@@ -93,7 +93,7 @@ def test_rows_of_the_simulated_example_close_with_its_torque_alone(planar_sessio
 def test_what_is_stored_of_a_row_is_all_that_is_not_zero(system: System) -> None:
     model = Model(system)
     balance = MomentumBalance(model, find_base_parameters(model), system.sample_rate, SPAN)
-    motion = prescribed(model, balance.width + 2 * balance.margin + 1, seed=2)
+    motion = prescribed(model, balance.width + balance.lead + balance.margin + 1, seed=2)
     (window,) = windows_of(balance, motion.x, motion.Q[:, list(model.layout.theta_m)], sigma=0.0)
     phi, phi_dot, _ = weak_test_function(balance.width, balance.span, EXPONENT)
     first = first_sample(balance, window)
@@ -128,17 +128,20 @@ def test_windows_follow_one_another_without_a_gap_and_stay_in_their_segment() ->
     balance = MomentumBalance(model, find_base_parameters(model), system.sample_rate, SPAN)
     motion = prescribed(model, 3 * balance.width, seed=3)
     torque = motion.Q[:, list(model.layout.theta_m)]
-    # What a segment of so many samples holds: windows a hop apart, with the widest filter's reach on either side.
-    expected = (len(motion.t) - 2 * balance.margin - balance.width - 1) // balance.hop + 1
-    for begin in (0, 5000):
+    # What a segment of so many samples holds: windows a hop apart, with the filter's reach on either side.
+    for begin in (0, 5017):
         balance.begin_segment()
+        # Windows end at multiples of a hop.
+        first = begin + balance.lead + balance.width
+        first += -first % balance.hop
+        expected = (begin + len(motion.t) - balance.margin - 1 - first) // balance.hop + 1
         windows = []
         for block in np.array_split(np.arange(len(motion.t)), 7):
             samples = np.concatenate((motion.x[block], torque[block]), axis=1)
             windows += balance.push(begin + block, [samples] * COPIES, np.zeros(model.layout.n_x))[0]
         assert len(windows) == expected
         ends = np.array([window.end for window in windows])
-        np.testing.assert_array_equal(ends, begin + balance.margin + balance.width + balance.hop * np.arange(expected))
+        np.testing.assert_array_equal(ends, first + balance.hop * np.arange(expected))
 
 
 def axis_session(t: Array, noise: float = 0.0) -> Block:
@@ -168,8 +171,11 @@ def test_no_window_spans_a_gap_and_none_beside_it_is_lost() -> None:
     # The sums over a window's samples that the filter for exact data leaves at 200 Hz: 4e-6 at the worst.
     np.testing.assert_allclose(estimator.estimate().pi, [INERTIA, DAMPING], rtol=1e-5)
     balance = MomentumBalance(estimator.model, estimator.base, 200.0, SPAN)
-    around = balance.width + 2 * balance.margin
-    assert momentum.windows == sum((n - around - 1) // balance.hop + 1 for n in (1500, 800, 1400))
+    expected = 0
+    for begin, end in ((0, 1500), (1700, 2500), (2600, 4000)):
+        first = begin + balance.lead + balance.width
+        expected += (end - balance.margin - 1) // balance.hop - -(-first // balance.hop) + 1
+    assert momentum.windows == expected
     assert momentum.dropped_windows == 0
 
 

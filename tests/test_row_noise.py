@@ -68,7 +68,7 @@ def scatter(system: System, draws: int, seed: int) -> Scatter:
     sensing = Sensing(model, plant.channels, "test")
     order = [plant.channels.index(name) for name in sensing.channels]
     probe = MomentumBalance(model, base, system.sample_rate, SPAN)
-    motion = prescribed(model, probe.width + 2 * probe.margin + HOPS_FOLLOWED * probe.hop + 1, seed=1)
+    motion = prescribed(model, probe.width + probe.lead + probe.margin + HOPS_FOLLOWED * probe.hop + 1, seed=1)
     torque = motion.Q[:, list(model.layout.theta_m)]
     exact = plant.channel_values(torque, motion.x)[:, order]
     sigma = np.zeros(len(order))

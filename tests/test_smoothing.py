@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.polynomial import Polynomial
 
-from sms_online.pipeline.smoothing import DEGREE, HALF_WIDTHS, KERNELS, WidthChoice, smooth, stride
+from sms_online.pipeline.smoothing import DEGREE, HALF_WIDTHS, WidthChoice, kernel, smooth, stride
 from sms_online.stream import Array
 
 RATE = 1000.0
@@ -31,13 +31,13 @@ def test_values_and_rates_of_polynomials_up_to_degree_eight_are_exact(half_width
 
 def test_the_narrowest_kernel_is_the_eighth_order_central_difference() -> None:
     side = np.array([4.0 / 5.0, -1.0 / 5.0, 4.0 / 105.0, -1.0 / 280.0])
-    np.testing.assert_allclose(KERNELS[4][:, 1], np.concatenate((-side[::-1], [0.0], side)), rtol=0.0, atol=1e-14)
-    np.testing.assert_allclose(KERNELS[4][:, 0], np.eye(9)[4], rtol=0.0, atol=1e-14)
+    np.testing.assert_allclose(kernel(4)[:, 1], np.concatenate((-side[::-1], [0.0], side)), rtol=0.0, atol=1e-14)
+    np.testing.assert_allclose(kernel(4)[:, 0], np.eye(9)[4], rtol=0.0, atol=1e-14)
 
 
 @half_widths
 def test_kernels_have_no_phase(half_width: int) -> None:
-    value, slope = KERNELS[half_width].T
+    value, slope = kernel(half_width).T
     np.testing.assert_array_equal(value, value[::-1])
     np.testing.assert_array_equal(slope, -slope[::-1])
 
@@ -45,8 +45,8 @@ def test_kernels_have_no_phase(half_width: int) -> None:
 def response(half_width: int, frequency: Array) -> Array:
     """Gains (F, 2) of value and slope, each over its largest, at frequencies (F,) in cycles a sample."""
     k = np.arange(-half_width, half_width + 1)
-    gain = np.abs(np.exp(-2j * np.pi * frequency[:, None] * k) @ KERNELS[half_width])
-    passed = np.abs(np.exp(-2j * np.pi * np.linspace(0.0, 0.5, 1001)[:, None] * k) @ KERNELS[half_width])
+    gain = np.abs(np.exp(-2j * np.pi * frequency[:, None] * k) @ kernel(half_width))
+    passed = np.abs(np.exp(-2j * np.pi * np.linspace(0.0, 0.5, 1001)[:, None] * k) @ kernel(half_width))
     return np.asarray(gain / passed.max(axis=0))
 
 
@@ -95,7 +95,7 @@ def test_what_the_chosen_width_loses_of_a_motion_is_less_than_the_noise_of_the_n
     _, rates = smooth(signal[:, None], centres, half_width, RATE)
     lost = rates[:, 0] - 2.0 * np.pi * frequency * np.cos(2.0 * np.pi * frequency * t[centres])
     narrower = HALF_WIDTHS[max(0, HALF_WIDTHS.index(half_width) - 1)]
-    assert np.sqrt(np.mean(lost**2)) < sigma * np.linalg.norm(KERNELS[narrower][:, 1]) * RATE
+    assert np.sqrt(np.mean(lost**2)) < sigma * np.linalg.norm(kernel(narrower)[:, 1]) * RATE
 
 
 def test_a_calm_motion_gets_the_widest_filter_and_a_jolt_a_narrow_one() -> None:

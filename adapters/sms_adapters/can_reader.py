@@ -11,6 +11,7 @@ from dataclasses import replace
 import can
 import numpy as np
 
+from sms_adapters.clock_merge import TICK
 from sms_adapters.raw import (
     ERROR_FRAME,
     EXTENDED,
@@ -26,9 +27,9 @@ from sms_adapters.raw import (
 from sms_online.description.schema import CanBus
 from sms_online.stream import Array
 
-# Shortest time between two reads, s: frames that come meanwhile wait in the driver, so that a busy bus costs some
-# hundred wake-ups a second and not one a frame. It is a fifth of a tick of the session, which waits anyway.
-READ_INTERVAL = 4e-3
+# Where the host stamps frames they wait in the driver until so long before the session's next tick, s. Nobody else
+# computes then, and at every frame another thread may take the interpreter for a millisecond. Reading takes half of it.
+BEFORE_TICK = 4e-3
 # Where nothing but the reading tells when a frame arrived, it must not wait so long, s.
 PROMPT_INTERVAL = 1e-3
 # Bytes that UDP multicast may hold back; the usual 212 kB overflow within a tenth of a second of a busy bus.
@@ -62,12 +63,15 @@ class CanReader:
 
     What an interface received but could not make a frame of is delivered as an error frame, so that it is recorded and
     counted. Bus-off is a lost device: opening it again starts the controller again.
+
+    period: s; frames that the host stamps are fetched so often, shortly before its multiples on the clock.
     """
 
-    def __init__(self, source: CanBus, clock: Clock) -> None:
+    def __init__(self, source: CanBus, clock: Clock, period: float = TICK) -> None:
         self.name = source.name
         self._source = source
         self._clock = clock
+        self._period = period
         self._bus: can.BusABC | None = None
         self._garbled = 0
         self._host_stamped = source.interface in HOST_STAMPED
@@ -89,10 +93,10 @@ class CanReader:
         """All frames that have come, at most MOST_FRAMES, waiting at most `timeout` s for the first."""
         if self._bus is None:
             raise LostDevice(self.name, "it is not open")
-        interval = READ_INTERVAL if self._host_stamped else PROMPT_INTERVAL
-        wait = interval - (time.monotonic() - self._last_read)
-        if wait > 0:
-            time.sleep(wait)
+        if self._host_stamped:
+            time.sleep(-(self._clock() + BEFORE_TICK) % self._period)
+        else:
+            time.sleep(max(0.0, PROMPT_INTERVAL - (time.monotonic() - self._last_read)))
         messages: list[can.Message] = []
         arrivals: list[float] = []
         while self._lost is None and len(messages) < MOST_FRAMES:
@@ -100,11 +104,13 @@ class CanReader:
             if message is None:
                 break
             messages.append(message)
-            arrivals.append(self._clock())
+            if not self._host_stamped:
+                arrivals.append(self._clock())
         self._last_read = time.monotonic()
         if messages:
-            frames = frames_of(messages, np.array(arrivals))
-            return [self._as_stamped(frames) if self._host_stamped else frames]
+            if self._host_stamped:
+                return [self._as_stamped(frames_of(messages, np.full(len(messages), self._clock())))]
+            return [frames_of(messages, np.array(arrivals))]
         if self._lost is not None:
             raise self._lost
         return []

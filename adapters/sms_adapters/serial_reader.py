@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import os
+import select
+
 import serial
 
 from sms_adapters.raw import Clock, LostDevice, Raw, SerialChunk, one_line
@@ -37,12 +40,7 @@ class SerialReader:
         if self._port is None:
             raise LostDevice(self.name, "it is not open")
         try:
-            if timeout != self._port.timeout:  # setting it is a system call
-                self._port.timeout = timeout
-            data = self._port.read(1)
-            # The rest in one call; what came with the first byte is there by now.
-            if data and (waiting := self._port.in_waiting):
-                data += self._port.read(min(waiting, MOST_BYTES_READ))
+            data = self._bytes(self._port, timeout)
         # Unplugged, pyserial raises SerialException from read, but a bare OSError from in_waiting and, where the
         # descriptor is gone already, a TypeError.
         except (OSError, TypeError) as error:
@@ -53,6 +51,29 @@ class SerialReader:
         chunks: list[Raw] = [SerialChunk(arrival, b""), SerialChunk(arrival, data)]
         opened, self._opened = self._opened, False
         return chunks if opened else chunks[1:]
+
+    @staticmethod
+    def _bytes(port: serial.Serial, timeout: float) -> bytes:
+        """What has come, waiting at most `timeout` s for its first byte."""
+        if os.name == "posix" and type(port) is serial.Serial:
+            # At every system call another thread may take the interpreter for a millisecond: two will do, pyserial
+            # makes five.
+            if not select.select([port.fileno()], [], [], timeout)[0]:
+                return b""
+            try:
+                data = os.read(port.fileno(), MOST_BYTES_READ)
+            except BlockingIOError:
+                return b""
+            if not data:
+                raise serial.SerialException("ready to be read, but nothing comes: gone, or somebody else reads it")
+            return data
+        if timeout != port.timeout:  # setting it is a system call
+            port.timeout = timeout
+        first: bytes = port.read(1)
+        # The rest in one call; what came with the first byte is there by now.
+        if first and (waiting := port.in_waiting):
+            return first + bytes(port.read(min(waiting, MOST_BYTES_READ)))
+        return first
 
     def close(self) -> None:
         """Release the port."""

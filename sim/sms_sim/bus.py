@@ -48,6 +48,8 @@ FIRST_LEAD = 0.5
 SLOWED = 2.0
 # Longest wait between two looks at what is due, s.
 PATIENCE = 0.05
+# Torque commands are fetched so often, s.
+COMMANDED = 4e-3
 # Shorter waits are not worth a system call, s.
 SHORT = 1e-4
 
@@ -102,7 +104,7 @@ class CommandListener:
         # A command is the torque at the motor shaft, before the gear.
         gears = [joint.gear_ratio for joint in system.joints]
         self._gears = np.where([drive.startswith("tau_") for drive in drives], gears, 1.0)
-        self._reader = CanReader(source, time.monotonic)
+        self._reader = CanReader(source, time.monotonic, COMMANDED)
         self._reader.open()
         self._held = held
         threading.Thread(target=self._run, daemon=True).start()

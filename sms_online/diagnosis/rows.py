@@ -58,7 +58,7 @@ class SessionRows:
         self.model, self.base, self.sensing, self.noise, self.beta = model, base, sensing, noise, beta
         self.segments = list(segments)
         self._rate = rate = model.system.sample_rate
-        balance = MomentumBalance(model, base, rate, model.system.windows.momentum)
+        balance = MomentumBalance(model, base, rate, model.system.windows.momentum, prompt=False)
         self._random = np.random.default_rng(SEED)
         self._covariances: list[list[Array]] = []
         self._responses: list[Array] = []

@@ -11,6 +11,8 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from itertools import groupby, pairwise
+from operator import attrgetter
 from typing import Any
 
 import numpy as np
@@ -28,19 +30,23 @@ from sms_online.pipeline.internal_states import FollowedStates
 from sms_online.pipeline.joint_balance import JointBalance
 from sms_online.pipeline.momentum import Momentum
 from sms_online.pipeline.rates import RateSamples, RatesStage
-from sms_online.pipeline.sensing import AttitudeContinuity, Sensing
-from sms_online.pipeline.synchronise import GridSamples, SyncCounters, Synchroniser
+from sms_online.pipeline.sensing import AttitudeContinuity, Sensing, stated_period
+from sms_online.pipeline.synchronise import SIDE, GridSamples, SyncCounters, Synchroniser
+from sms_online.pipeline.waiting import waiting_from_state, waiting_state
 from sms_online.smoother.session import Smoother
 from sms_online.stream import Array, Block
 from sms_online.trackers.interface import Estimate, Prior, Rows, Tracker
 from sms_online.trackers.square_root import RecursiveLeastSquares
 
-# Samples that pass through the pipeline together. Everything behind sees the same blocks however the samples arrive, so
-# the result is the same to the last bit. The cost of NumPy's calls is shared by a block, so the energy balance alone is
-# twice as fast with the longer one. Windows of the momentum balance share theirs, and an event waits for its block: two
-# hops of the usual window at 1 kHz cost it 80 ms at most, where 0.2 s are gone before two windows in a row tell of it.
-BLOCK = 80
+# Samples that pass through the pipeline together are those of some time. Everything behind sees the same blocks however
+# the samples arrive, so the result is the same to the last bit. The cost of NumPy's calls is shared by a block, so the
+# energy balance alone has long ones, in periods of the grid. With momentum rows a block ends when a window can be
+# completed. On a testbed, which has sources, none waits for its block; elsewhere two windows share one, in which an
+# event waits for 80 ms at most at the usual width: 0.2 s are gone before two windows in a row tell of it.
 ENERGY_BLOCK = 256
+TESTBED_HOPS, OTHER_HOPS = 1, 2
+# Of a period of the grid: blocks end between its instants, or rounding would decide to which one a sample belongs.
+BETWEEN = 0.5
 
 # What a session saves: arrays and numbers, by stage.
 SessionState = dict[str, dict[str, Any]]
@@ -109,6 +115,7 @@ class Estimator:
         layout = model.layout
         # Positions choose the filter's width; torques pass the same filter for the sake of the lag.
         self._rates = RatesStage(system.sample_rate, range(layout.n_x), self.sensing.noise)
+        self._unbalanced: list[GridSamples] = []  # coordinates and torques that wait for the energy balance
         self._followed = FollowedStates(model, system.sample_rate, len(self.sensing.channels))
         self._energy = EnergyBalance(model, base, system.sample_rate)
         # A balance of forces does not hold in a shape that is not the link's; energies bear it best.
@@ -116,11 +123,21 @@ class Estimator:
         self.momentum = None if by_energy else Momentum(model, base, self.sensing)
         self.energy_tracker: Tracker = RecursiveLeastSquares(base.n)
         self._begin_joints()
-        self._block = ENERGY_BLOCK if self.momentum is None else BLOCK
+        self._block, self._first_block = self._blocks()
         self._segment = -1
         self._first_time = np.nan
         self._pending_t = np.empty(0)
         self._pending = np.empty((0, len(self._columns)))
+
+    def _blocks(self) -> tuple[float, float]:
+        """Duration of a block, s, and of the first one, but for whole blocks."""
+        if self.momentum is None:
+            return ENERGY_BLOCK / self.system.sample_rate, BETWEEN / self.system.sample_rate
+        hop, margin = self.momentum.hop, self.momentum.margin
+        hops = TESTBED_HOPS if self.system.sources else OTHER_HOPS
+        # The last sample behind a window, and those that interpolate the slowest channel there.
+        reach = SIDE * stated_period(self.system, self.sensing.channels)
+        return hops * hop / self.system.sample_rate, (margin % hop + BETWEEN) / self.system.sample_rate + reach
 
     def set_prior(self, prior: Prior) -> None:
         """Weigh the rows against what is known of the base parameters beforehand; before the first sample."""
@@ -216,11 +233,12 @@ class Estimator:
         self.duration = float(block.t[-1]) - self._first_time
         self._pending_t = np.concatenate((self._pending_t, block.t))
         self._pending = np.concatenate((self._pending, block.values[:, self._columns]))
-        whole = self._pending_t.size - self._pending_t.size % self._block
-        for start in range(0, whole, self._block):
-            part = slice(start, start + self._block)
-            self._synchronise(self._pending_t[part], self._pending[part])
-        self._pending_t, self._pending = self._pending_t[whole:], self._pending[whole:]
+        number = np.floor((self._pending_t - self._first_time - self._first_block) / self._block)
+        ends = np.flatnonzero(np.diff(number)) + 1
+        for start, stop in pairwise([0, *ends.tolist()]):
+            self._synchronise(self._pending_t[start:stop], self._pending[start:stop])
+        if ends.size:
+            self._pending_t, self._pending = self._pending_t[ends[-1] :], self._pending[ends[-1] :]
 
     def finish(self) -> None:
         """End of the session: process what is still pending."""
@@ -229,6 +247,7 @@ class Estimator:
         self._pending_t, self._pending = self._pending_t[:0], self._pending[:0]
         for piece in self._synchroniser.flush():
             self._condition(piece)
+        self._balance_waiting()
         for rates in self._rates.flush():
             self._balance(rates)
         self._fit()
@@ -261,9 +280,20 @@ class Estimator:
 
     def _differentiate(self, piece: GridSamples) -> None:
         self._followed.wait(piece)
-        for rates in self._rates.push(GridSamples(piece.index, self.sensing.motion(piece.values), piece.segment)):
-            self._balance(rates)
+        self._unbalanced.append(GridSamples(piece.index, self.sensing.motion(piece.values), piece.segment))
+        waiting = sum(each.index.size for each in self._unbalanced)
+        # Beside momentum rows nobody waits for those of the energy, but for the internal states that come with them.
+        if self.momentum is None or self._model.n_states or waiting >= ENERGY_BLOCK:
+            self._balance_waiting()
         self._fit()
+
+    def _balance_waiting(self) -> None:
+        waiting, self._unbalanced = self._unbalanced, []
+        for segment, run in groupby(waiting, key=attrgetter("segment")):
+            pieces = list(run)
+            index, values = (np.concatenate([getattr(each, part) for each in pieces]) for part in ("index", "values"))
+            for rates in self._rates.push(GridSamples(index, values, segment)):
+                self._balance(rates)
 
     def _fit(self) -> None:
         """Hand on to the momentum balance the samples whose internal states are known."""
@@ -329,6 +359,7 @@ class Estimator:
                 "joint_gram": np.stack([residual.gram for residual in self.joint_residuals]),
                 "joint_signal": np.array([residual.signal for residual in self.joint_residuals]),
                 "dropped_rows": self.dropped_rows,
+                **waiting_state("unbalanced", self._unbalanced, self._rates.sigma.size),
             },
             "synchroniser": dict(self._synchroniser.state()),
             "conditioning": dict(self._conditioning.state()),
@@ -355,6 +386,7 @@ class Estimator:
         self._attitude.last = np.array(session["attitude"])
         self._pending_t, self._pending = np.array(session["pending_t"]), np.array(session["pending"])
         self.dropped_rows = int(session["dropped_rows"])
+        self._unbalanced = waiting_from_state("unbalanced", session)
         grams, signals = np.array(session["joint_gram"]), np.array(session["joint_signal"])
         self.joint_residuals = [SquaredResidual(gram, float(s)) for gram, s in zip(grams, signals, strict=True)]
         self._synchroniser.restore(state["synchroniser"])

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from sms_online.model.model import Model
 from sms_online.pipeline.rates import RateSamples
 from sms_online.pipeline.synchronise import GridSamples
+from sms_online.pipeline.waiting import waiting_from_state, waiting_state
 from sms_online.stream import Array
 
 
@@ -112,18 +113,11 @@ class FollowedStates:
 
     def state(self) -> dict[str, Any]:
         """What `restore` needs to continue, between pushes."""
-        waiting = self._waiting
-        return {
-            "segment": self._segment,
-            "index": np.concatenate([np.empty(0, dtype=np.int64), *(piece.index for piece in waiting)]),
-            "values": np.concatenate([np.empty((0, self._channels)), *(piece.values for piece in waiting)]),
-            "segments": np.repeat([piece.segment for piece in waiting], [piece.index.size for piece in waiting]),
-            **self._states.state(),
-        }
+        waiting = waiting_state("waiting", self._waiting, self._channels)
+        return {"segment": self._segment, **waiting, **self._states.state()}
 
     def restore(self, state: Mapping[str, NDArray[Any]]) -> None:
         """Continue from a saved state."""
         self._segment = int(state["segment"])
-        segments, index, values = (np.array(state[name]) for name in ("segments", "index", "values"))
-        self._waiting = [GridSamples(index[segments == k], values[segments == k], int(k)) for k in np.unique(segments)]
+        self._waiting = waiting_from_state("waiting", state)
         self._states.restore(state)

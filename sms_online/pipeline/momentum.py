@@ -20,6 +20,7 @@ from sms_online.pipeline.momentum_fit import MomentumFit, WhiteRows
 from sms_online.pipeline.sensing import Sensing
 from sms_online.pipeline.sensor_noise import NoiseEstimate, SensorNoise, noise_from_state, noise_state
 from sms_online.pipeline.synchronise import GridSamples
+from sms_online.pipeline.waiting import waiting_from_state, waiting_state
 from sms_online.stream import Array
 from sms_online.trackers.interface import Estimate, Prior, Rows, Tracker
 from sms_online.trackers.square_root import RecursiveLeastSquares
@@ -85,6 +86,16 @@ class Momentum:
             self._build()
 
     @property
+    def hop(self) -> int:
+        """Samples from one window to the next."""
+        return self._balance.hop
+
+    @property
+    def margin(self) -> int:
+        """Samples that a window waits for beyond its end."""
+        return self._balance.margin
+
+    @property
     def started(self) -> bool:
         """Whether weights are known and rows come."""
         return self.fit.weights is not None
@@ -119,7 +130,7 @@ class Momentum:
         self._start_time = start_time
         self._waiting.append(piece)
         due = self._noise_told + round(NOISE_RENEWED * self._sample_rate)
-        if self._estimate.ready and (self.sensor_noise is None or piece.index[-1] >= due):
+        if (self.sensor_noise is None or piece.index[-1] >= due) and self._estimate.ready:
             self.sensor_noise = self._estimate.noise(periods)
             self._noise_told = int(piece.index[-1])
         if self.sensor_noise is None:
@@ -203,7 +214,6 @@ class Momentum:
 
     def state(self) -> dict[str, dict[str, Any]]:
         """Everything that `restore` needs to continue to the same bits."""
-        waiting = self._waiting
         columns = len(self.sensing.channels) + self.changes.model.n_states
         random = self._random.bit_generator.state["state"]
         return {
@@ -214,9 +224,7 @@ class Momentum:
                 "start_time": self._start_time,
                 "noise_told": self._noise_told,
                 "random": np.array([str(random["state"]), str(random["inc"])]),
-                "waiting_index": np.concatenate([np.empty(0, dtype=np.int64), *(p.index for p in waiting)]),
-                "waiting_values": np.concatenate([np.empty((0, columns)), *(p.values for p in waiting)]),
-                "waiting_segment": np.repeat([p.segment for p in waiting], [p.index.size for p in waiting]),
+                **waiting_state("waiting", self._waiting, columns),
                 **noise_state("noise", self.sensor_noise),
                 **self.bias.state(),
                 **self.latencies.state(),
@@ -241,9 +249,7 @@ class Momentum:
         generator["state"] = {"state": position, "inc": increment}
         self._random.bit_generator.state = generator
         self.sensor_noise = noise_from_state("noise", state)
-        segments = np.array(state["waiting_segment"])
-        index, values = np.array(state["waiting_index"]), np.array(state["waiting_values"])
-        self._waiting = [GridSamples(index[segments == k], values[segments == k], int(k)) for k in np.unique(segments)]
+        self._waiting = waiting_from_state("waiting", state)
         self.bias.restore(state)
         self.latencies.restore(state)
         self._estimate.restore(saved["momentum_noise"])

@@ -28,6 +28,12 @@ def stated_noise(system: System, channels: Sequence[str]) -> Array:
     return stated
 
 
+def stated_period(system: System, channels: Sequence[str]) -> float:
+    """Period of the slowest sensor that fills any of the channels, s, as described."""
+    read = [sensor for sensor in system.sensors if set(sensed_channels(system, sensor)) & set(channels)]
+    return max([1.0 / system.sample_rate, *(1.0 / sensor.rate for sensor in read if sensor.rate is not None)])
+
+
 class Sensing:
     """Which of a source's channels give each coordinate and torque of a model.
 

@@ -71,9 +71,23 @@ class NoiseEstimate:
         count = len(sensing.channels)
         self._samples = [np.empty((2, 0)) for _ in range(count)]  # instants and values
         self._largest = np.zeros(count)
+        self._fresh: list[tuple[Array, Array]] = []  # instants and values that no channel has yet
+        self._unsorted = 0  # how many
 
     def push(self, t: Array, values: Array) -> None:
         """Take samples (B, channels) at instants t (B,), NaN where a channel has none."""
+        self._fresh.append((t, values))
+        self._unsorted += t.size
+        if self._unsorted >= SAMPLES:
+            self._sort()
+
+    def _sort(self) -> None:
+        """Give each channel the samples that came since the noise was asked for last."""
+        if not self._fresh:
+            return
+        t = np.concatenate([t for t, _ in self._fresh])
+        values = np.concatenate([values for _, values in self._fresh])
+        self._fresh, self._unsorted = [], 0
         for k, column in enumerate(values.T):
             fresh = np.stack((t, column))[:, np.isfinite(column)]
             last = self._samples[k][0, -1:] if self._samples[k].size else -np.inf
@@ -84,10 +98,12 @@ class NoiseEstimate:
     @property
     def ready(self) -> bool:
         """Whether every channel has samples enough."""
+        self._sort()
         return all(kept.shape[1] >= FEWEST_SAMPLES for kept in self._samples)
 
     def noise(self, periods: Array) -> SensorNoise:
         """Noise from what is stated and, where nothing is, from the samples so far; periods (channels,): s, or NaN."""
+        self._sort()
         sigma = self._sensing.stated_noise
         silent = np.flatnonzero(np.isnan(sigma))
         for k in silent:
@@ -107,6 +123,7 @@ class NoiseEstimate:
 
     def state(self) -> dict[str, Any]:
         """What `restore` needs to continue."""
+        self._sort()
         sizes = np.array([kept.shape[1] for kept in self._samples])
         return {"samples": np.concatenate(self._samples, axis=1), "sizes": sizes, "largest": self._largest}
 

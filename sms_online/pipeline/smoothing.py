@@ -12,6 +12,8 @@ Source of the filter: Cleveland, J. American Statistical Association 74 (1979) 8
 
 from __future__ import annotations
 
+from functools import cache
+
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
@@ -32,6 +34,7 @@ SAMPLES_A_STEP = 7
 AGREEMENT = 1.5
 
 
+@cache
 def kernel(half_width: int) -> Array:
     """Weights (2M + 1, 2) of value and of slope per sample, to be correlated with the samples."""
     z = np.arange(-half_width, half_width + 1) / (half_width + 1.0)
@@ -43,9 +46,6 @@ def kernel(half_width: int) -> Array:
     return np.stack((value, slope), axis=1)
 
 
-KERNELS = {half_width: kernel(half_width) for half_width in HALF_WIDTHS}
-
-
 def stride(half_width: int, hop: int) -> int:
     """Samples from one smoothed sample to the next: the largest divisor of `hop` that M allows."""
     return max(s for s in range(1, max(1, half_width // SAMPLES_A_STEP) + 1) if hop % s == 0)
@@ -54,7 +54,7 @@ def stride(half_width: int, hop: int) -> int:
 def smooth(samples: Array, centres: NDArray[np.int64], half_width: int, sample_rate: float) -> tuple[Array, Array]:
     """Values and rates (n, C) at `centres` (n,), row numbers of samples (B, C), from M samples on either side."""
     windows = sliding_window_view(samples, 2 * half_width + 1, axis=0)[centres - half_width]
-    both = windows @ KERNELS[half_width]
+    both = windows @ kernel(half_width)
     return both[..., 0], both[..., 1] * sample_rate
 
 
@@ -64,7 +64,7 @@ class WidthChoice:
     def __init__(self, half_widths: tuple[int, ...]) -> None:
         self._half_widths = half_widths
         widest = half_widths[-1]
-        padded = np.stack([np.pad(KERNELS[M][:, 1], widest - M) for M in half_widths], axis=1)
+        padded = np.stack([np.pad(kernel(M)[:, 1], widest - M) for M in half_widths], axis=1)
         self._differences = np.diff(padded, axis=1)  # (2 M_max + 1, steps)
         # Variance that unit white noise leaves in each difference.
         self._gain = np.sum(self._differences**2, axis=0)

@@ -209,10 +209,16 @@ class Synchroniser:
         self.counters.samples += time.size
         self.counters.missing_cells += int(np.count_nonzero(missing))
         before = self._time[-1] if self._time.size else -np.inf
-        close = bool(np.any(np.diff(time, prepend=before) <= self._tolerance))
-        if close or bool(np.any(np.isnan(self._period))):
+        apart = np.diff(time, prepend=before) > self._tolerance
+        # Only among rows at one instant, the last ones before this block included, can a channel have two samples.
+        starts = np.flatnonzero(apart)
+        twice = (~missing[: starts[0] if starts.size else None]).any(axis=0)
+        if 0 < starts.size < time.size:
+            twice |= np.add.reduceat(~missing, starts, axis=0, dtype=np.int64).max(axis=0) > 1
+        judged = np.flatnonzero(twice | np.isnan(self._period))
+        if judged.size:
             values = values.copy()
-            for channel in range(len(self.channels)):
+            for channel in judged.tolist():
                 rows = np.flatnonzero(~missing[:, channel])
                 interval = np.diff(time[rows], prepend=self._last_time[channel])
                 duplicate = interval <= self._tolerance
@@ -334,17 +340,17 @@ class Synchroniser:
             if group.columns.size == values.shape[1]:
                 np.take(self._values, group.rows[last], axis=0, out=values)
             else:
-                values[:, group.columns] = self._values[np.ix_(group.rows[last], group.columns)]
+                values[:, group.columns] = self._values[group.rows[last][:, None], group.columns]
             between = np.flatnonzero(~hit)
             if between.size:
                 nodes = last[between, None] + np.arange(1 - SIDE, 1 + SIDE)
                 x = group.ts[nodes] - (k[between] / self.sample_rate)[:, None]
                 weight = _lagrange_weights_at_zero(x)
+                samples = weight.T[:, :, None] * self._values[group.rows[nodes.T][:, :, None], group.columns]
                 total = np.zeros((between.size, group.columns.size))
-                for node in range(2 * SIDE):  # one after the other: a matrix product's bits depend on its shape
-                    samples = self._values[np.ix_(group.rows[nodes[:, node]], group.columns)]
-                    total += weight[:, node, None] * samples
-                values[np.ix_(between, group.columns)] = total
+                for node in samples:  # one after the other: a matrix product's bits depend on its shape
+                    total += node
+                values[between[:, None], group.columns] = total
                 self.counters.interpolated_cells += total.size
         return values
 

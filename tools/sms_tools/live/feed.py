@@ -6,6 +6,7 @@ import threading
 import time
 from collections.abc import Sequence
 from dataclasses import replace
+from math import inf
 
 from sms_adapters.raw import CanFrames, LostDevice, Raw, Reader
 from sms_adapters.recorder import Recorder
@@ -17,6 +18,8 @@ from sms_online.description.schema import SerialPort, Source
 READ_TIMEOUT = 0.1
 # Waits before a lost device is tried again, s: each twice the one before, from the first to the longest.
 FIRST_RETRY, LONGEST_RETRY = 0.1, 1.0
+# Where the loop is behind, a reader has so long to fetch what came before a tick, s, and is looked at so often.
+FETCHING, LOOK = 0.05, 5e-4
 # Items that may wait for the estimator: a dozen seconds of a busy bus, for the first fit of the momentum balance takes
 # one or two. What comes when it is full is dropped: the samples that wait are then without a gap, which many small ones
 # would be worth nothing.
@@ -55,6 +58,7 @@ class Feed:
         self.dropped = 0
         self.received = 0
         self.tried = threading.Event()  # to open the device, at least once
+        self._fetched = inf  # machine's time when the last read came back, s; infinite while nothing can be read
         self._reader = reader
         self._recorder = recorder
         self._queued = queued
@@ -82,23 +86,35 @@ class Feed:
             self._waiting -= number_of_items(early)
         return early
 
+    def await_fetched(self, age: float) -> None:
+        """Wait until all that came more than `age` s ago has been fetched, for FETCHING s at most.
+
+        A loop that works off a backlog keeps the interpreter from the readers, and must not overtake them.
+        """
+        began = time.monotonic()
+        while self._fetched < began - age and time.monotonic() < began + FETCHING:
+            time.sleep(LOOK)
+
     def _run(self) -> None:
         retry = FIRST_RETRY
         while not self._stopping.is_set():
             try:
                 self._reader.open()
                 self.lost = None
+                self._fetched = time.monotonic()
                 self.tried.set()
                 while not self._stopping.is_set():
                     items = self._reader.read(READ_TIMEOUT)
                     if items:
                         retry = FIRST_RETRY
                         self._take(items)
+                    self._fetched = time.monotonic()
             except LostDevice as error:
                 self._lose(error.why)
             # A driver may raise anything; a thread that ended silently would look like a device that says nothing.
             except Exception as error:
                 self._lose(f"{type(error).__name__}: {error}")
+            self._fetched = inf
             self._reader.close()
             self.tried.set()
             self._stopping.wait(retry)

@@ -16,7 +16,7 @@ from sms_online.pipeline.estimator import Estimator
 from sms_online.results import standard_deviation
 from sms_online.stream import Block
 from sms_tools.interruption import Interruption
-from sms_tools.live.feed import Feed, SessionClock
+from sms_tools.live.feed import READ_TIMEOUT, Feed, SessionClock
 from sms_tools.live.latency import Latencies
 from sms_tools.live.status import Leading, News, StatusWriter
 from sms_tools.session import unstated_latency
@@ -107,6 +107,10 @@ class LiveSession:
         """One tick."""
         self._tick += 1
         tick = tick_time(self._tick)
+        behind = self._clock() - tick
+        if behind > READ_TIMEOUT:  # in which a read comes back even where nothing is there
+            for feed in self._feeds:
+                feed.await_fetched(behind)
         items = [feed.drain(tick) for feed in self._feeds]
         started = time.perf_counter()
         block = self._merger.advance(tick, items)
