@@ -94,8 +94,8 @@ def test_a_payload_is_noticed_in_time_wherever_it_falls_in_a_block(planar_sessio
     """The same 5 kg, in sessions that begin at 3 s and up to a block later."""
     loaded = PLANAR.model_copy(update={"payload": RigidBody(mass=5.0)})
     block = noisy(PLANAR, changed_session(planar_session, loaded, CHANGE, CHANGE + DETECTED), "B", 1)
-    block = OTHER_HOPS * round(PLANAR.windows.momentum * PLANAR.sample_rate / HOPS)
-    for phase in range(0, block, block // 5):
+    longest = OTHER_HOPS * round(PLANAR.windows.momentum * PLANAR.sample_rate / HOPS)
+    for phase in range(0, longest, longest // 5):
         late = slice(round(3.0 * PLANAR.sample_rate) + phase, None)
         _, noticed = run(Block(block.t[late], block.channels, block.values[late]), size=1)
         assert CHANGE < noticed <= CHANGE + DETECTED
