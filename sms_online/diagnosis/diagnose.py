@@ -13,6 +13,7 @@ from sms_online.description.schema import Effect, System
 from sms_online.diagnosis.candidates import CandidateColumns
 from sms_online.diagnosis.constants import applied, corrected, improved, is_constant
 from sms_online.diagnosis.followed import HALF_WIDTH
+from sms_online.diagnosis.late_sensors import LateSensor, find_late
 from sms_online.diagnosis.record import LONGEST, SampleRecord, Segment, excerpts
 from sms_online.diagnosis.relative import RelativeResiduals
 from sms_online.diagnosis.residuals import ResidualTest, RowResidual, whitened
@@ -82,12 +83,14 @@ class Diagnosis:
     """What was found.
 
     verdict: "clean", "named" or "unexplained". findings: constants first, then the effects that are unknowns of π.
+    late: sensors far behind the others, whose lag the description of the last attempt states.
     described, attempt: first and last description against the samples; chosen: of the last one's candidates.
     estimator_before, estimator_after: sessions of the two systems over the whole capture.
     """
 
     verdict: str
     findings: list[Finding]
+    late: list[LateSensor]
     ranking: list[Ranked]
     described: Attempt
     attempt: Attempt
@@ -289,20 +292,27 @@ def diagnose(
     progress("tracing what it leaves")
     attempt = described = Attempt(case, system)
     n = described.rows.base.n
+    late: list[LateSensor] = []
+    while not weighed(before) and (found := find_late(attempt.rows, attempt.make, attempt.tracing.fitted)) is not None:
+        progress("taking off a sensor's lag")
+        late.append(found)
+        lagging = attempt.system.model_copy(update={"effects": (*attempt.system.effects, found.effect)})
+        attempt = Attempt(case, lagging)
     chosen = attempt.search()
     for _ in range(0 if weighed(before) else REWEIGHED):
         # Nothing was known of the rows' noise that was worth the name, for nothing explained the torques.
         beta = attempt.solution(chosen)[:n]
-        attempt = described = Attempt(case, system, (), beta, attempt.tracing.candidates)
+        attempt = Attempt(case, attempt.system, (), beta, attempt.tracing.candidates)
+        described = Attempt(case, system, (), beta, ()) if late else attempt
         chosen = attempt.search()
     ranking = attempt.tracing.ranking()
     bare = described.state([])
-    exact = _exact(system)
+    exact = _exact(attempt.system)
     if exact is not None and any(row.beyond for row in attempt.state(chosen).test.values()):
         progress("comparing exact links")
         beta = described.solution([])[:n]
         first = [attempt.tracing.candidates[k].effect for k in chosen[:1]]
-        linear = Attempt(case, system, (), beta, first, SOME).excess(range(len(first)))
+        linear = Attempt(case, attempt.system, (), beta, first, SOME).excess(range(len(first)))
         if Attempt(case, exact, (), beta, (), SOME).excess(()) < linear:
             attempt = Attempt(case, exact, (), beta)
             chosen = attempt.search()
@@ -334,7 +344,7 @@ def diagnose(
     if verdict == "unexplained":
         unexplained = describe_residual(attempt.rows, attempt.tracing.columns(chosen), after.residual)
     return Diagnosis(
-        verdict, findings, ranking, described, attempt, chosen, bare, after, before, estimator_after, unexplained
+        verdict, findings, late, ranking, described, attempt, chosen, bare, after, before, estimator_after, unexplained
     )
 
 
