@@ -18,8 +18,8 @@ from sms_online.stream import Array
 class Readings:
     """Exact readings of channels along a motion.
 
-    Known are the poses, markers and strains of `Sensing`, rates of the base, and a gyro on it. Raises InputError, naming the
-    system, where a channel is not one of them.
+    Known are the poses, markers and strains of `Sensing`, rates of the base, and a gyro on it. Raises InputError,
+    naming the system, where a channel is not one of them.
     """
 
     def __init__(self, model: Model, channels: Sequence[str]) -> None:
@@ -57,7 +57,7 @@ class Readings:
 
 
 def readable_channels(model: Model) -> tuple[str, ...]:
-    """Channels that `Readings` knows: poses of base and joints, markers in their link's frame, rates, the gyro, strain."""
+    """Channels that `Readings` knows: poses of base and joints, markers in link frames, rates, the gyro, strain."""
     layout = model.layout
     rigid = layout.n_x - sum(q_f.stop - q_f.start for q_f in layout.q_f)
     markers = [

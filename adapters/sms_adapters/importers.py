@@ -44,8 +44,9 @@ def import_quanser(source: Path, capture: Path) -> int:
     tau_i = Ktg_i I_i / Kg_i, N m at the motor shaft, from the measured current data_Im_i (grid 0.61 mA) and the maker's
     torque constant at the output and gear ratio; theta_m_i = the hub encoder data_th_i1 (grid 15.3 and 30.7 µrad) and
     link_i.strain_angle = the tip deflection as an angle from the root's strain, data_th_i2, rad. All are the third
-    columns, angles in degrees. In radians they equal stage1_X1_meas and stage2_X2_sim to 1e-16 at the same instants: in spite of its name the latter holds the
-    measured stage 2, and stage2_X2_meas its reference. The strain, alone among the signals, shows no grid.
+    columns, angles in degrees. In radians they equal stage1_X1_meas and stage2_X2_sim to 1e-16 at the same instants: in
+    spite of its name the latter holds the measured stage 2, and stage2_X2_meas its reference. The strain, alone among
+    the signals, shows no grid.
     Raises InputError where a variable is missing, of another size, or not on the instants of the first current.
     """
     data = _load(source)

@@ -160,7 +160,7 @@ def exact_states(simulation: Simulation, t: Array) -> ExactStates:
 
 
 def sampled_blocks(simulation: Simulation, grade: str | None = None, seed: int = 0) -> Iterator[Block]:
-    """What the sensors record at the system's rate, in blocks: drives, position channels, and rates or strain that are described.
+    """What the sensors record at the system's rate, in blocks: drives, positions, and rates or strain described.
 
     grade: a noise grade (`sensors.GRADES`) in place of the described sensors. seed: of the noise. Raises InputError on
     an unknown grade.

@@ -36,6 +36,9 @@ def diagnosis_document(diagnosis: Diagnosis, warnings: list[str], truth: dict[st
         "verdict": diagnosis.verdict,
         "summary": summary(diagnosis),
         "effects": [_effect(diagnosis, finding) for finding in diagnosis.findings] + _by_comparison(diagnosis),
+        "steps": [
+            {"taken": step.taken, "effects": list(step.effects), "holdout": step.relative} for step in diagnosis.steps
+        ],
         **{
             name: {
                 "fit": _part(state.fit),
@@ -129,7 +132,9 @@ def _by_comparison(diagnosis: Diagnosis) -> list[dict[str, Any]]:
         {
             "name": found.effect.name,
             "where": found.effect.where,
-            "coefficients": {"corner": {"estimate": found.effect.coefficients["corner"], "std": found.std, "unit": "Hz"}},
+            "coefficients": {
+                "corner": {"estimate": found.effect.coefficients["corner"], "std": found.std, "unit": "Hz"}
+            },
             "ambiguous_with": list(found.ambiguous),
             "separated_by": ENTRIES[found.effect.name].separated_by if found.ambiguous else None,
             "evidence": {"gain": found.gain, "limit": found.limit, "held_out_improvement": found.improvement},

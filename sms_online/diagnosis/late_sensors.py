@@ -64,6 +64,11 @@ class LateSensor:
     ambiguous: tuple[str, ...]
 
     @property
+    def corner(self) -> float:
+        """Of the lag, Hz."""
+        return self.effect.coefficients["corner"]
+
+    @property
     def improvement(self) -> float:
         """Share of what no masses could follow that is gone."""
         return 1.0 - self.after / self.before
