@@ -142,7 +142,7 @@ def _by_comparison(diagnosis: Diagnosis) -> list[dict[str, Any]]:
         for found in diagnosis.late
     ]
     known = [*diagnosis.described.system.effects, *(found.effect for found in diagnosis.late)]
-    kinematics = [
+    kinematics: list[dict[str, Any]] = [
         {
             "name": effect.name,
             "where": effect.where,

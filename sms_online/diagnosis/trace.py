@@ -272,10 +272,15 @@ class Tracing:
         improvement = self.improvement(others, k)
         own = gains[k]
         taken = {self.candidates[other].key for other in chosen}
+        found = self.candidates[k]
         ambiguous = dict.fromkeys(
             candidate.key
             for j, candidate in enumerate(self.candidates)
-            if candidate.key not in taken and gains[j].seen and self._near(gains[j].gain, own.gain)
+            # A law and what refines it are no rivals.
+            if candidate.key not in taken | {found.extends}
+            and candidate.extends != found.key
+            and gains[j].seen
+            and self._near(gains[j].gain, own.gain)
         )
         limit = threshold(FALSE_ALARM, self.trials, self._Z[k].shape[1])
         return Finding(self.candidates[k], own, limit, improvement, tuple(ambiguous))

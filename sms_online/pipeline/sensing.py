@@ -107,8 +107,8 @@ class Sensing:
             markers.append(stated[columns] if own else np.full(kinematics.n_f, np.nan))
         joints = stated[self.torque_columns] * self._ratio
         q = stated[self._q]
-        for own, motor in self._beyond:
-            q[own] = np.hypot(q[own], stated[self._theta_m[motor]])
+        for joint, motor in self._beyond:
+            q[joint] = np.hypot(q[joint], stated[self._theta_m[motor]])
         return np.concatenate((stated[self._base], q, stated[self._theta_m], *markers, joints))
 
     @property
@@ -125,8 +125,8 @@ class Sensing:
         layout = self.model.layout
         K, n_x = x.shape
         by_sensor = np.broadcast_to(np.eye(n_x), (K, n_x, n_x)).copy()
-        for own, motor in self._beyond_coordinates:
-            by_sensor[:, own, motor] = 1.0
+        for angle, motor in self._beyond_coordinates:
+            by_sensor[:, angle, motor] = 1.0
         offset = layout.n_base_positions - layout.n_base_speeds
         for i, (kinematics, q_f) in enumerate(zip(self.model.chain.flexible, layout.q_f, strict=True)):
             if kinematics is not None:
@@ -140,8 +140,8 @@ class Sensing:
         """1σ of the coordinates (n_x,) for that of the position sensors (n_x,), about the straight arm."""
         layout = self.model.layout
         out = sensors.copy()
-        for own, motor in self._beyond_coordinates:
-            out[own] = np.hypot(out[own], sensors[motor])
+        for angle, motor in self._beyond_coordinates:
+            out[angle] = np.hypot(out[angle], sensors[motor])
         offset = layout.n_base_positions - layout.n_base_speeds
         for kinematics, q_f in zip(self.model.chain.flexible, layout.q_f, strict=True):
             if kinematics is not None:
@@ -154,13 +154,13 @@ class Sensing:
     def _beyond_coordinates(self) -> list[tuple[int, int]]:
         """Numbers of the coordinates q_i that are read as an angle beyond θ_m_i, with those of θ_m_i."""
         first = len(self._base)
-        return [(first + own, first + len(self._q) + motor) for own, motor in self._beyond]
+        return [(first + joint, first + len(self._q) + motor) for joint, motor in self._beyond]
 
     def coordinates(self, values: Array) -> Array:
         """Positions x (B, n_x) of samples (B, channels)."""
         q = values[:, self._q]
-        for own, motor in self._beyond:
-            q[:, own] += values[:, self._theta_m[motor]]
+        for joint, motor in self._beyond:
+            q[:, joint] += values[:, self._theta_m[motor]]
         parts = [values[:, self._base], q, values[:, self._theta_m]]
         for shape, columns in self._links.values():
             parts.append(shape.coordinates(values[:, columns]))
