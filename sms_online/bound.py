@@ -113,7 +113,7 @@ def session_bound(estimator: Estimator, record: MotionRecord) -> Array | None:
             np.linalg.cholesky(dynamics.mass_matrix(motion.x))
     except np.linalg.LinAlgError:
         return None
-    return cramer_rao_bound(dynamics, estimator.base, motions, session_sensors(estimator.model, noise))
+    return cramer_rao_bound(dynamics, estimator.base, motions, session_sensors(estimator.sensing, noise))
 
 
 def cramer_rao_bound(dynamics: Dynamics, base: BaseParameters, motions: Sequence[Motion], sensors: SensorSet) -> Array:

@@ -7,9 +7,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sms_online.description.channels import AXES, drive_channel
+from sms_online.description.channels import AXES, drive_channel, strain_channel
 from sms_online.errors import InputError
 from sms_online.model.model import Model
+from sms_online.pipeline.sensing import Sensing
 from sms_online.pipeline.sensor_noise import SensorNoise
 from sms_online.stream import Array
 
@@ -17,8 +18,8 @@ from sms_online.stream import Array
 class Readings:
     """Exact readings of channels along a motion.
 
-    Known are the poses and markers of `Sensing`, rates of the base, and a gyro on it. Raises InputError, naming the
-    system, where a channel is not one of them.
+    Known are the poses, markers and strains of `Sensing`, rates of the base, and a gyro on it. Raises InputError,
+    naming the system, where a channel is not one of them.
     """
 
     def __init__(self, model: Model, channels: Sequence[str]) -> None:
@@ -31,8 +32,10 @@ class Readings:
         self._columns = [names.index(name) for name in channels]
         layout = model.layout
         self._rigid = layout.n_x - sum(q_f.stop - q_f.start for q_f in layout.q_f)
-        # Rates come last, those of the base and then the gyro's.
-        self.reads_rates = any(column >= len(names) - 2 * layout.n_base_speeds for column in self._columns)
+        self._strips = _strips(model)
+        # After the positions come rates, those of the base and then the gyro's.
+        rates = range(layout.n_x, layout.n_x + layout.n_base_speeds + len(layout.base_angular))
+        self.reads_rates = any(column in rates for column in self._columns)
 
     def __call__(self, x: Array, v: Array) -> Array:
         """Readings (B, channels) at x (B, n_x), v (B, n_v)."""
@@ -48,11 +51,13 @@ class Readings:
             linear = len(layout.base_linear)
             omega[:, list(layout.base_angular)] = v[:, linear : layout.n_base_speeds]
             parts.append((omega[:, None] @ T_0)[:, 0, list(layout.base_angular)])
+        offset = layout.n_base_positions - layout.n_base_speeds
+        parts += [x[:, [layout.q[i] + offset]] - x[:, [layout.theta_m[i] + offset]] for i in self._strips]
         return np.concatenate(parts, axis=1)[:, self._columns]
 
 
 def readable_channels(model: Model) -> tuple[str, ...]:
-    """Channels that `Readings` knows: poses of base and joints, markers in their link's frame, rates, the gyro."""
+    """Channels that `Readings` knows: poses of base and joints, markers in link frames, rates, the gyro, strain."""
     layout = model.layout
     rigid = layout.n_x - sum(q_f.stop - q_f.start for q_f in layout.q_f)
     markers = [
@@ -62,7 +67,13 @@ def readable_channels(model: Model) -> tuple[str, ...]:
         for name in kinematics.marker_names
     ]
     gyro = [f"gyro_0_{AXES[axis]}" for axis in layout.base_angular]
-    return (*layout.position_names[:rigid], *markers, *layout.speed_names[: layout.n_base_speeds], *gyro)
+    strain = [f"link_{i + 1}.strain_angle" for i in _strips(model)]
+    return (*layout.position_names[:rigid], *markers, *layout.speed_names[: layout.n_base_speeds], *gyro, *strain)
+
+
+def _strips(model: Model) -> list[int]:
+    """Links, from 0, whose strain is the deflection of their joint."""
+    return [i for i in range(len(model.system.joints)) if strain_channel(model.system, i + 1) is not None]
 
 
 @dataclass(frozen=True)
@@ -103,7 +114,7 @@ def sensor_set(model: Model, channels: Sequence[str], sigma: Array, rate: Array)
     return SensorSet(tuple(channels[k] for k in others), density[others], torque)
 
 
-def session_sensors(model: Model, noise: SensorNoise) -> SensorSet:
+def session_sensors(sensing: Sensing, noise: SensorNoise) -> SensorSet:
     """The position sensors and torques that a session has used, with the noise that it has used of them."""
-    # Markers stand in the place of elastic coordinates, so positions and their sensors are as many.
-    return SensorSet(readable_channels(model)[: model.layout.n_x], noise.sensors, noise.torque)
+    channels = tuple(sensing.channels[column] for column in sensing.position_columns)
+    return SensorSet(channels, noise.sensors, noise.torque)

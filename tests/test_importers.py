@@ -50,18 +50,18 @@ def test_emps_is_force_and_measured_position(tmp_path: Path) -> None:
     assert np.array_equal(channels["q_1"], data["qm"])
 
 
-def test_quanser_is_motor_torque_hub_and_link_angle(tmp_path: Path) -> None:
+def test_quanser_is_motor_torque_hub_and_strain(tmp_path: Path) -> None:
     data = quanser()
     savemat(tmp_path / "in.mat", data)
     assert import_quanser(tmp_path / "in.mat", tmp_path / "out.csv") == 40
     t, channels = read(tmp_path / "out.csv")
     assert t.tolist() == [round(0.002 * k, 9) for k in range(40)]
-    assert list(channels) == ["tau_1", "theta_m_1", "q_1", "tau_2", "theta_m_2", "q_2"]
+    assert list(channels) == ["tau_1", "theta_m_1", "link_1.strain_angle", "tau_2", "theta_m_2", "link_2.strain_angle"]
     for i, (torque_constant, gear) in enumerate(((9.0, 100.0), (0.9, 50.0)), start=1):
         hub, deflection = np.deg2rad(data[f"data_th{i}1"][:, 2]), np.deg2rad(data[f"data_th{i}2"][:, 2])
         np.testing.assert_allclose(gear * channels[f"tau_{i}"], torque_constant * data[f"data_Im{i}"][:, 2], rtol=1e-14)
         np.testing.assert_allclose(channels[f"theta_m_{i}"], hub, rtol=1e-14)
-        np.testing.assert_allclose(channels[f"q_{i}"], hub + deflection, rtol=1e-13)
+        np.testing.assert_allclose(channels[f"link_{i}.strain_angle"], deflection, rtol=1e-13)
 
 
 @pytest.mark.parametrize("name", ["t", "qm", "vir", "gtau"])
@@ -120,4 +120,4 @@ def test_the_measured_quanser_agrees_with_its_log_in_radians(tmp_path: Path) -> 
     for i, name in ((1, "stage1_X1_meas"), (2, "stage2_X2_sim")):  # the second label is swapped in the file
         logged = data[name].signals.values[-10_000:]
         assert np.abs(channels[f"theta_m_{i}"] - logged[:, 0]).max() < 1e-15
-        assert np.abs(channels[f"q_{i}"] - logged[:, :2].sum(axis=1)).max() < 1e-15
+        assert np.abs(channels[f"link_{i}.strain_angle"] - logged[:, 1]).max() < 1e-15

@@ -24,7 +24,9 @@ def diagnosis(out: Path, *arguments: str) -> dict[str, Any]:
 
 
 def test_the_friction_of_emps_is_found_from_its_mass_alone(tmp_path: Path) -> None:
-    """Published: 95.11 kg, 20.39 N and 203.5 N s/m, which leave 4.08 % of the force, with friction by no direction."""
+    """Published: 95.11 kg, 20.39 N, 203.5 N s/m and an offset, which leave 4.08 % of the force; friction by direction
+    of travel leaves 3.11 %, with 166.7 and 240.4 N s/m.
+    """
     if not EMPS.exists():
         pytest.skip(f"measured data {EMPS.name} is not beside the checkout")
     import_emps(EMPS, tmp_path / "emps.csv")
@@ -33,33 +35,50 @@ def test_the_friction_of_emps_is_found_from_its_mass_alone(tmp_path: Path) -> No
     (tmp_path / "mass.toml").write_text(bare)
     document = diagnosis(tmp_path / "out", str(tmp_path / "emps.csv"), "--system", str(tmp_path / "mass.toml"))
     found = {effect["name"]: effect["coefficients"] for effect in document["effects"]}
-    assert {"coulomb_friction", "direction_friction"} <= set(found)
+    # The simple laws first, then the one that refines them; a lag of less than a sample is none of the encoder's.
+    taken = [step["taken"].partition("@")[0] for step in document["steps"]]
+    assert taken == ["coulomb_friction", "viscous_friction", "torque_offset", "direction_friction"]
+    assert {"coulomb_friction", "direction_friction"} <= set(found) <= set(taken)
     assert found["coulomb_friction"]["torque"]["estimate"] == pytest.approx(20.3935, rel=0.03)
     viscous = [found["direction_friction"][side]["estimate"] for side in ("plus", "minus")]
-    assert sum(viscous) / 2.0 == pytest.approx(203.5034, rel=0.03)
+    assert viscous == pytest.approx([166.71, 240.42], rel=0.03)
     mass = document["after"]["parameters"][0]
     assert mass["estimate"] == pytest.approx(95.1089, rel=0.005)
     assert document["before"]["holdout"]["joint_1"]["relative"] > 0.5
-    assert document["after"]["holdout"]["joint_1"]["relative"] < 0.033
+    # Of the part that was fitted; the other has slower motion, and friction that depends on the place.
+    assert document["after"]["fit"]["joint_1"]["relative"] < 0.031
+    assert document["after"]["holdout"]["joint_1"]["relative"] < 0.035
     # The file with what was found is a system of its own.
     adopted = parse_system((tmp_path / "out" / "system.toml").read_text(), "system.toml")
     assert {effect.name for effect in adopted.effects} == set(found)
 
 
-def test_the_friction_that_was_left_out_of_the_quanser_rig_is_found(tmp_path: Path) -> None:
-    """Fitted to the first half, checked on the second: hub 1 falls from nearly all of the torque to below a quarter."""
+def test_the_lag_and_the_friction_of_the_quanser_rig_are_found(tmp_path: Path) -> None:
+    """Fitted to the first half, checked on the second: hubs fall from nearly all of the torque to below a quarter.
+
+    What the strain gauges tell comes through a low-pass at 1.7 Hz; without it no masses fit what they show.
+    """
     if not QUANSER.exists():
         pytest.skip(f"measured data {QUANSER.name} is not beside the checkout")
     capture = str(tmp_path / "quanser.csv")
     import_quanser(QUANSER, Path(capture))
     arguments = (capture, "--system", "quanser-2dsfl", "--prior", "-to", "10", "--holdout", capture)
     document = diagnosis(tmp_path / "out", *arguments)
-    joints = {effect["where"] for effect in document["effects"] if effect["name"].endswith("_friction")}
-    assert joints == {"joint_1", "joint_2"}
+    found = {(effect["name"], effect["where"]): effect for effect in document["effects"]}
+    assert {where for name, where in found if name.endswith("_friction")} == {"joint_1", "joint_2"}
+    lag = found["sensor_lag", "link_*.strain_angle"]
+    assert lag["ambiguous_with"] == []
+    assert lag["coefficients"]["corner"]["estimate"] == pytest.approx(1.7, rel=0.05)
     before, after = (document[side]["holdout"] for side in ("before", "after"))
     assert before["joint_1"]["relative"] > 0.9
     assert after["joint_1"]["relative"] < 0.25
-    assert after["joint_2"]["relative"] < 0.5 * before["joint_2"]["relative"]
+    assert before["joint_2"]["relative"] > 0.9
+    assert after["joint_2"]["relative"] < 0.25
+    # Signs that real bodies and springs have, and a first strip near the maker's older test, 27 N m/rad.
+    parameters = {p["name"]: p["estimate"] for p in document["after"]["parameters"]}
+    physical = [name for name in parameters if name.endswith(("inertia", "stiffness", "damping"))]
+    assert min(parameters[name] for name in physical) > 0.0
+    assert 20.0 < parameters["joint_1.stiffness"] < 30.0
 
 
 def test_a_holdout_that_is_the_capture_itself_needs_an_end(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

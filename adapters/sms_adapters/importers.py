@@ -43,10 +43,10 @@ def import_quanser(source: Path, capture: Path) -> int:
     The 2-DOF Serial Flexible Link of CTU Prague (aa4cc), 500 Hz, the last 20 s, time from 0. With stage i:
     tau_i = Ktg_i I_i / Kg_i, N m at the motor shaft, from the measured current data_Im_i (grid 0.61 mA) and the maker's
     torque constant at the output and gear ratio; theta_m_i = the hub encoder data_th_i1 (grid 15.3 and 30.7 µrad) and
-    q_i = hub + tip deflection, data_th_i1 + data_th_i2, rad. All are the third columns, angles in degrees. In radians
-    they equal stage1_X1_meas and stage2_X2_sim to 1e-16 at the same instants: in spite of its name the latter holds the
-    measured stage 2, and stage2_X2_meas its reference. The deflections come from strain gauges and, alone among the
-    signals, show no grid: something filtered them before they were recorded.
+    link_i.strain_angle = the tip deflection as an angle from the root's strain, data_th_i2, rad. All are the third
+    columns, angles in degrees. In radians they equal stage1_X1_meas and stage2_X2_sim to 1e-16 at the same instants: in
+    spite of its name the latter holds the measured stage 2, and stage2_X2_meas its reference. The strain, alone among
+    the signals, shows no grid.
     Raises InputError where a variable is missing, of another size, or not on the instants of the first current.
     """
     data = _load(source)
@@ -59,8 +59,8 @@ def import_quanser(source: Path, capture: Path) -> int:
         )
         torque_constant = _numbers(source, data, f"Ktg{stage}", ())
         gear = _numbers(source, data, f"Kg{stage}", ())
-        channels += [f"tau_{stage}", f"theta_m_{stage}", f"q_{stage}"]
-        columns += [torque_constant * current / gear, np.deg2rad(hub), np.deg2rad(hub + deflection)]
+        channels += [f"tau_{stage}", f"theta_m_{stage}", f"link_{stage}.strain_angle"]
+        columns += [torque_constant * current / gear, np.deg2rad(hub), np.deg2rad(deflection)]
     return _write(source, capture, np.round(t - t[0], _TIME_DECIMALS), tuple(channels), np.column_stack(columns))
 
 

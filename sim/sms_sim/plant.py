@@ -93,21 +93,21 @@ class Plant:
         return (*(drive_channel(self.system, i) for i in joints), *model.layout.position_names[:rigid], *markers)
 
     @cached_property
-    def rate_channels(self) -> tuple[str, ...]:
-        """Rates of the base that some described sensor reads: v_S, ω_0 and a gyro's."""
+    def further_channels(self) -> tuple[str, ...]:
+        """What some described sensor reads beside positions: v_S, ω_0 and a gyro's rates, strain."""
         system = self.system
         described = {channel for sensor in system.sensors for channel in sensed_channels(system, sensor)}
-        rates = readable_channels(self.model)[self.model.layout.n_x :]
-        return tuple(channel for channel in rates if channel in described)
+        further = readable_channels(self.model)[self.model.layout.n_x :]
+        return tuple(channel for channel in further if channel in described)
 
     @property
     def recordable(self) -> tuple[str, ...]:
-        """Channels that a recording may hold: those of the exact motion, and the described rates."""
-        return (*self.channels, *self.rate_channels)
+        """Channels that a recording may hold: those of the exact motion, and what is described beside."""
+        return (*self.channels, *self.further_channels)
 
-    def rate_values(self, x: Array, v: Array) -> Array:
-        """Exact values (B, rate_channels) at positions x (B, n_x) and speeds v (B, n_v)."""
-        return Readings(self.model, self.rate_channels)(x, v)
+    def further_values(self, x: Array, v: Array) -> Array:
+        """Exact values (B, further_channels) at positions x (B, n_x) and speeds v (B, n_v)."""
+        return Readings(self.model, self.further_channels)(x, v)
 
     def channel_values(self, torque: Array, x: Array) -> Array:
         """Exact values (B, channels) at torques after the gear n τ (B, joints) and positions x (B, n_x)."""

@@ -160,7 +160,7 @@ def exact_states(simulation: Simulation, t: Array) -> ExactStates:
 
 
 def sampled_blocks(simulation: Simulation, grade: str | None = None, seed: int = 0) -> Iterator[Block]:
-    """What the sensors record at the system's rate, in blocks: drives, position channels, and rates that are described.
+    """What the sensors record at the system's rate, in blocks: drives, positions, and rates or strain described.
 
     grade: a noise grade (`sensors.GRADES`) in place of the described sensors. seed: of the noise. Raises InputError on
     an unknown grade.
@@ -181,7 +181,7 @@ def sampled_blocks(simulation: Simulation, grade: str | None = None, seed: int =
         y = simulation.solution(inside)
         torque = np.where(t[:, None] < 0.0, 0.0, plant.torque(inside, y))
         x, v = plant.split(y)
-        return np.concatenate((plant.channel_values(torque, x), plant.rate_values(x, v)), axis=1)[:, columns]
+        return np.concatenate((plant.channel_values(torque, x), plant.further_values(x, v)), axis=1)[:, columns]
 
     for first in range(0, samples, BLOCK_SAMPLES):
         end = min(first + BLOCK_SAMPLES, samples)

@@ -28,6 +28,17 @@ def drive_channel(system: System, i: int) -> str:
     return f"force_{i}" if is_directly_driven(system.joints[i - 1]) else f"tau_{i}"
 
 
+def strain_channel(system: System, i: int) -> str | None:
+    """Channel of the strain at the root of link i (from 1), as an angle, where that stands for the spring of joint i.
+
+    A strip of which only one mode is described is a rigid link behind a flexible joint: the angle is q_i - θ_m_i. None
+    where the joint is no such spring.
+    """
+    joint = system.joints[i - 1]
+    bends = joint.transmission == "flexible" and joint.kind == "revolute"
+    return f"link_{i}.strain_angle" if bends and not isinstance(system.links[i - 1], FlexibleLink) else None
+
+
 def channels(system: System) -> tuple[str, ...]:
     """Every channel that a capture of this system may hold: drives, joints, base, then the markers of each link."""
     joints = range(1, len(system.joints) + 1)
@@ -39,6 +50,8 @@ def channels(system: System) -> tuple[str, ...]:
     for i, link in enumerate(system.links, start=1):
         if isinstance(link, FlexibleLink):
             names += _link_channels(i, link, planar=system.motion == "planar")
+        elif (strain := strain_channel(system, i)) is not None:
+            names.append(strain)
     return tuple(names)
 
 

@@ -13,6 +13,7 @@ from sms_online.description.schema import Effect, System
 from sms_online.diagnosis.candidates import CandidateColumns
 from sms_online.diagnosis.constants import applied, corrected, improved, is_constant
 from sms_online.diagnosis.followed import HALF_WIDTH
+from sms_online.diagnosis.late_sensors import LateSensor, find_late
 from sms_online.diagnosis.record import LONGEST, SampleRecord, Segment, excerpts
 from sms_online.diagnosis.relative import RelativeResiduals
 from sms_online.diagnosis.residuals import ResidualTest, RowResidual, whitened
@@ -82,15 +83,19 @@ class Diagnosis:
     """What was found.
 
     verdict: "clean", "named" or "unexplained". findings: constants first, then the effects that are unknowns of π.
+    late: sensors far behind the others, whose lag the description of the last attempt states. steps: of the last
+    search, its effects one after the other.
     described, attempt: first and last description against the samples; chosen: of the last one's candidates.
     estimator_before, estimator_after: sessions of the two systems over the whole capture.
     """
 
     verdict: str
     findings: list[Finding]
+    late: list[LateSensor]
     ranking: list[Ranked]
     described: Attempt
     attempt: Attempt
+    steps: list[Step]
     chosen: list[int]
     before: State
     after: State
@@ -107,6 +112,19 @@ class Diagnosis:
 def _left(before: State, after: State) -> float:
     """Share of what is beyond noise that is left."""
     return max(0.0, after.excess) / max(before.excess, 1.0)
+
+
+@dataclass(frozen=True)
+class Step:
+    """What a search had found when it took one more effect.
+
+    taken: its key, name@where; effects: all keys by then, what it replaced left out. relative: residual of held-out
+    rows by joint, over the measured torque or force, fitted to the others.
+    """
+
+    taken: str
+    effects: tuple[str, ...]
+    relative: dict[str, float]
 
 
 # Gives what is known beforehand of the parameters of an estimator's model.
@@ -243,6 +261,18 @@ class Attempt:
             test=ResidualTest(rows).of(residual),
         )
 
+    def steps(self) -> list[Step]:
+        """The way of the last search."""
+        joints = RelativeResiduals(self.rows, self.make)
+        held = ~self._fitted(joints.times, joints.segment)
+        out = []
+        for taken, chosen in self.tracing.path:
+            effects = [self.tracing.candidates[k] for k in chosen]
+            joints.declare([*self.constants, *(candidate.effect for candidate in effects)])
+            relative = joints.of(self.tracing.solution(chosen, self.tracing.fitted), held)
+            out.append(Step(self.tracing.candidates[taken].key, tuple(c.key for c in effects), relative))
+        return out
+
 
 def weighed(session: Estimator) -> bool:
     """Whether a session's estimate comes from rows that are weighed by noise."""
@@ -280,8 +310,10 @@ def diagnose(
         )
     if before.momentum.sensor_noise is None:
         raise InputError(source, "", "too few samples to tell the sensors' noise", "a longer capture")
-    if before.events:
-        event = before.events[0]
+    # Windows that nothing explained are a diagnosis's own affair; a change of parameters is not.
+    changes = [event for event in before.events if event.parameters]
+    if changes:
+        event = changes[0]
         expected = "a part without it: -ss or -to"
         raise InputError(source, f"{event.time:.2f} s", f"an event ({event.kind}) within the capture", expected)
     held = _session(system, holdout, source, prior)[1].segments() if holdout else []
@@ -289,20 +321,27 @@ def diagnose(
     progress("tracing what it leaves")
     attempt = described = Attempt(case, system)
     n = described.rows.base.n
+    late: list[LateSensor] = []
+    while not weighed(before) and (found := find_late(attempt.rows, attempt.make, attempt.tracing.fitted)):
+        progress("taking off a sensor's lag")
+        late.append(found)
+        lagging = attempt.system.model_copy(update={"effects": (*attempt.system.effects, found.effect)})
+        attempt = Attempt(case, lagging)
     chosen = attempt.search()
     for _ in range(0 if weighed(before) else REWEIGHED):
         # Nothing was known of the rows' noise that was worth the name, for nothing explained the torques.
         beta = attempt.solution(chosen)[:n]
-        attempt = described = Attempt(case, system, (), beta, attempt.tracing.candidates)
+        attempt = Attempt(case, attempt.system, (), beta, attempt.tracing.candidates)
+        described = Attempt(case, system, (), beta, ()) if late else attempt
         chosen = attempt.search()
     ranking = attempt.tracing.ranking()
     bare = described.state([])
-    exact = _exact(system)
+    exact = _exact(attempt.system)
     if exact is not None and any(row.beyond for row in attempt.state(chosen).test.values()):
         progress("comparing exact links")
         beta = described.solution([])[:n]
         first = [attempt.tracing.candidates[k].effect for k in chosen[:1]]
-        linear = Attempt(case, system, (), beta, first, SOME).excess(range(len(first)))
+        linear = Attempt(case, attempt.system, (), beta, first, SOME).excess(range(len(first)))
         if Attempt(case, exact, (), beta, (), SOME).excess(()) < linear:
             attempt = Attempt(case, exact, (), beta)
             chosen = attempt.search()
@@ -334,7 +373,19 @@ def diagnose(
     if verdict == "unexplained":
         unexplained = describe_residual(attempt.rows, attempt.tracing.columns(chosen), after.residual)
     return Diagnosis(
-        verdict, findings, ranking, described, attempt, chosen, bare, after, before, estimator_after, unexplained
+        verdict=verdict,
+        findings=findings,
+        late=late,
+        ranking=ranking,
+        described=described,
+        attempt=attempt,
+        steps=attempt.steps(),
+        chosen=chosen,
+        before=bare,
+        after=after,
+        estimator_before=before,
+        estimator_after=estimator_after,
+        unexplained=unexplained,
     )
 
 

@@ -35,7 +35,10 @@ def diagnosis_document(diagnosis: Diagnosis, warnings: list[str], truth: dict[st
         "schema": SCHEMA,
         "verdict": diagnosis.verdict,
         "summary": summary(diagnosis),
-        "effects": [_effect(diagnosis, finding) for finding in diagnosis.findings] + _kinematics(diagnosis),
+        "effects": [_effect(diagnosis, finding) for finding in diagnosis.findings] + _by_comparison(diagnosis),
+        "steps": [
+            {"taken": step.taken, "effects": list(step.effects), "holdout": step.relative} for step in diagnosis.steps
+        ],
         **{
             name: {
                 "fit": _part(state.fit),
@@ -95,7 +98,7 @@ def summary(diagnosis: Diagnosis) -> str:
 
 def _named(diagnosis: Diagnosis) -> list[dict[str, str]]:
     found = [{"name": f.candidate.effect.name, "where": f.candidate.effect.where} for f in diagnosis.findings]
-    return [{"name": each["name"], "where": each["where"]} for each in _kinematics(diagnosis)] + found
+    return [{"name": each["name"], "where": each["where"]} for each in _by_comparison(diagnosis)] + found
 
 
 def _part(part: Part) -> dict[str, dict[str, float | None]]:
@@ -123,10 +126,23 @@ def _effect(diagnosis: Diagnosis, finding: Finding) -> dict[str, Any]:
     }
 
 
-def _kinematics(diagnosis: Diagnosis) -> list[dict[str, Any]]:
-    """Effects that changed the kinematics of links: they have no coefficients and replace the rows."""
-    described, adopted = diagnosis.described.system, diagnosis.attempt.system
-    return [
+def _by_comparison(diagnosis: Diagnosis) -> list[dict[str, Any]]:
+    """Effects that replace all rows, found by comparing whole descriptions: late sensors, kinematics of links."""
+    late = [
+        {
+            "name": found.effect.name,
+            "where": found.effect.where,
+            "coefficients": {
+                "corner": {"estimate": found.effect.coefficients["corner"], "std": found.std, "unit": "Hz"}
+            },
+            "ambiguous_with": list(found.ambiguous),
+            "separated_by": ENTRIES[found.effect.name].separated_by if found.ambiguous else None,
+            "evidence": {"gain": found.gain, "limit": found.limit, "held_out_improvement": found.improvement},
+        }
+        for found in diagnosis.late
+    ]
+    known = [*diagnosis.described.system.effects, *(found.effect for found in diagnosis.late)]
+    kinematics: list[dict[str, Any]] = [
         {
             "name": effect.name,
             "where": effect.where,
@@ -139,9 +155,10 @@ def _kinematics(diagnosis: Diagnosis) -> list[dict[str, Any]]:
                 "held_out_improvement": None,
             },
         }
-        for effect in adopted.effects
-        if effect not in described.effects
+        for effect in diagnosis.attempt.system.effects
+        if effect not in known
     ]
+    return [*late, *kinematics]
 
 
 def coefficients(diagnosis: Diagnosis, finding: Finding) -> Coefficients:

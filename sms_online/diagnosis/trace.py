@@ -38,7 +38,9 @@ ACTS = 0.01
 # Rows whose mean square exceeds their variance by more than this although everything that is known of has been
 # subtracted have an error of their own: friction is never quite its model.
 LARGEST_RATIO = 1.5
-# Effects that contain a simpler one, which is to be tried first: fewest coefficients win.
+# A drive that holds its command over a sample acts half a sample late: a lag up to that, in samples, is no sensor's.
+HELD = 0.5
+# Effects that contain a simpler one, which is to be tried first, as is everything else: they refine a law.
 EXTENDS = {"direction_friction": "viscous_friction"}
 # At most so many effects are looked for in turn.
 MOST_EFFECTS = 8
@@ -127,6 +129,8 @@ class Tracing:
         self._b = np.concatenate((rows.white(rows.b[..., None])[:, 0], known[:, -1]))
         self._Z = [self._whitened(candidate) for candidate in self.candidates]
         self.trials = len(self.candidates)
+        # Which candidate each step of the search took, and all that were chosen then.
+        self.path: list[tuple[int, list[int]]] = []
 
     def _floor(self, prior: Prior | None) -> Array:
         """Excess of each speed's rows over their variance, (n_v,), that all candidates together leave.
@@ -155,10 +159,11 @@ class Tracing:
         r = free_of(Q, self._b[:, None])[:, 0]
         return [self._plausible(c, gain(Q, r, Z)) for c, Z in zip(self.candidates, self._Z, strict=True)]
 
-    @staticmethod
-    def _plausible(candidate: Candidate, found: Gain) -> Gain:
+    def _plausible(self, candidate: Candidate, found: Gain) -> Gain:
         """The gain, none where the effect cannot have the coefficients."""
-        return found if plausible(candidate.effect.name, found.coefficients) else replace(found, gain=0.0)
+        name = candidate.effect.name
+        held = name == "sensor_lag" and found.coefficients[0] <= HELD / self.rows.model.system.sample_rate
+        return replace(found, gain=0.0) if held or not plausible(name, found.coefficients) else found
 
     def gain_of(self, candidate: Candidate, chosen: Sequence[int]) -> Gain:
         """What any candidate would take beside those chosen."""
@@ -201,10 +206,13 @@ class Tracing:
         refine: improves the shape constants of one of those chosen, before what it leaves is given to others.
         """
         chosen: list[int] = []
+        self.path = []
         refused: set[str] = set()
         seen: set[frozenset[int]] = {frozenset()}
         while len(chosen) < MOST_EFFECTS:
-            best = self._preferred(self.gains(chosen), self._eligible(chosen, refused))
+            gains, eligible = self.gains(chosen), self._eligible(chosen, refused)
+            best = self._preferred(gains, [k for k in eligible if self.candidates[k].extends is None])
+            best = self._preferred(gains, eligible) if best is None else best
             if best is None:
                 break
             if self.improvement(chosen, best) < LEAST_IMPROVEMENT:
@@ -215,6 +223,7 @@ class Tracing:
             if frozenset(chosen) in seen:
                 break  # effects that replace each other in turn
             seen.add(frozenset(chosen))
+            self.path.append((best, list(chosen)))
             if self.candidates[best].constant:
                 # What it leaves while it is only approximately taken off must not be given to others.
                 break
@@ -235,7 +244,9 @@ class Tracing:
         for k in list(chosen):
             others = [other for other in chosen if other != k]
             gains = self.gains(others)
-            best = self._preferred(gains, self._eligible(others, set()))
+            # What refines a law is a step of its own, and in place of no other effect.
+            simple = [j for j in self._eligible(others, set()) if j == k or self.candidates[j].extends is None]
+            best = self._preferred(gains, [*simple, k] if k not in simple else simple)
             if best is None or self._excess(k, gains[k]) <= 0.0:
                 chosen = others
             elif best != k and not self._near(gains[k].gain, gains[best].gain):
@@ -261,10 +272,15 @@ class Tracing:
         improvement = self.improvement(others, k)
         own = gains[k]
         taken = {self.candidates[other].key for other in chosen}
+        found = self.candidates[k]
         ambiguous = dict.fromkeys(
             candidate.key
             for j, candidate in enumerate(self.candidates)
-            if candidate.key not in taken and gains[j].seen and self._near(gains[j].gain, own.gain)
+            # A law and what refines it are no rivals.
+            if candidate.key not in taken | {found.extends}
+            and candidate.extends != found.key
+            and gains[j].seen
+            and self._near(gains[j].gain, own.gain)
         )
         limit = threshold(FALSE_ALARM, self.trials, self._Z[k].shape[1])
         return Finding(self.candidates[k], own, limit, improvement, tuple(ambiguous))

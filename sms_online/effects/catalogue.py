@@ -10,7 +10,7 @@ import re
 from collections.abc import Callable, Iterable, Mapping
 from fnmatch import fnmatchcase
 
-from sms_online.description.channels import channels, drive_channel
+from sms_online.description.channels import channels, drive_channel, strain_channel
 from sms_online.description.explain import hint, nearest
 from sms_online.description.schema import Effect, FlexibleLink, System
 from sms_online.effects.base import Entry, ForceEffect, Place, Site
@@ -199,7 +199,7 @@ def candidates(system: System) -> list[Effect]:
     """Every effect that may be declared, at every place that makes sense, shape constants at their defaults.
 
     A lag is that of a whole group of channels, as the sensors' tables form them; an offset and an eccentricity are
-    those of one encoder. What the system declares already is left out.
+    those of one encoder, an offset also that of a strain gauge. What the system declares already is left out.
     """
     declared = {(effect.name, effect.where) for effect in system.effects}
     out = []
@@ -216,11 +216,15 @@ DEVICES = ("r_S_*", "eps_*")
 
 def _groups(system: System, entry: Entry) -> Iterable[str]:
     """Channels, or patterns of channels, that one cause is likely to act on together."""
+    strips = [strain_channel(system, i) for i in range(1, len(system.joints) + 1)]
+    gauges = [strip for strip in strips if strip is not None]
+    if entry.name == EncoderOffset.entry.name:
+        return (*places(system, "angle"), *gauges)
     if entry.name != SensorLag.entry.name:
         return places(system, "angle")
     positions = places(system, "position")
     # What one device delivers: an encoder its angle, a tracker the base's position, a camera a link's markers.
     devices = [next((p for p in DEVICES if fnmatchcase(c, p)), c) for c in positions]
-    links = [f"{c.split('.')[0]}.*" if "." in c else c for c in devices]
+    links = [f"{c.split('.')[0]}.*" if "." in c and c not in gauges else c for c in devices]
     patterns = [pattern for sensor in system.sensors for pattern in sensor.channels]
     return dict.fromkeys([*links, *(p for p in patterns if any(fnmatchcase(c, p) for c in positions))])

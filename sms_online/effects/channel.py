@@ -19,8 +19,11 @@ from sms_online.stream import Array
 # grows so far that squares of it bias a fit (links' rows of the planar example leave five times their deviation).
 # NOISE_WEIGHT is that of the sum of squared weights against squared relative errors.
 PASSBAND, HIGHEST, NOISE_WEIGHT = 1.0, 0.4, 1e-6
-# Frequencies that are compared for each sample of the half width.
-FREQUENCIES = 20
+# A slow lag is taken back up to this at least, Hz: rows of windows of 0.4 s hear no more, and less would leave a
+# channel without the motion that the others show.
+LEAST_BAND = 8.0
+# Frequencies that are compared: a kernel of the slowest corner resolves 15.
+FREQUENCIES = 400
 # Fixed-point steps from a reading back to the angle; the error falls by the amplitude (rad) each.
 INVERSIONS = 20
 
@@ -119,7 +122,7 @@ class SensorLag(_Channel):
     """A reading behind a second-order Butterworth low-pass, ÿ = ω² (x - y) - √2 ω ẏ, ω = 2π f, f `corner` in Hz.
 
     Below the corner that is a delay of √2 / ω.
-    Limitations: what lies above the corner is lost in noise.
+    Limitations: what lies above the corner, and above LEAST_BAND, is lost in noise.
     """
 
     entry = Entry(
@@ -161,7 +164,7 @@ class SensorLag(_Channel):
         corner, omega = self.coefficients["corner"], self.omega
         M = max(4, round(sample_rate / corner))
         k = np.arange(-M, M + 1)
-        f = np.linspace(0.0, min(PASSBAND * corner, HIGHEST * sample_rate), FREQUENCIES * M)
+        f = np.linspace(0.0, min(max(PASSBAND * corner, LEAST_BAND), HIGHEST * sample_rate), FREQUENCIES)
         s = 1j * f / corner
         inverse = 1.0 + np.sqrt(2.0) * s + s**2
         response = np.exp(2j * np.pi * np.outer(f, k) / sample_rate) / np.abs(inverse)[:, None]

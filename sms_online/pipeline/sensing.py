@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from sms_online.description.channels import sensed_channels
+from sms_online.description.channels import sensed_channels, strain_channel
 from sms_online.description.schema import System
 from sms_online.errors import InputError
 from sms_online.model.beam import LinearLink
@@ -38,7 +38,8 @@ class Sensing:
     """Which of a source's channels give each coordinate and torque of a model.
 
     channels: those it takes, in an order of its own. torque_columns: the torques' among them, joint by joint. unused:
-    the source's others. A flexible link needs one marker at least; where it has fewer readings than coordinates its
+    the source's others. In place of q_i a flexible joint may have the strain of the strip that it stands for, an angle
+    beyond θ_m_i. A flexible link needs one marker at least; where it has fewer readings than coordinates its
     shape is the static one, and `missing` names what is not read. Not so on a spatial free base, where every marker is
     needed. Raises InputError, naming the source, when a channel that the model needs is not there.
     """
@@ -59,11 +60,14 @@ class Sensing:
         base = layout.position_names[: layout.n_base_positions]
         self._base = [need(name) for name in base]
         joints = range(1, len(model.system.joints) + 1)
-        self._q = [
-            need(f"q_{i}") if layout.q[i - 1] != layout.theta_m[i - 1] else need(f"q_{i}", f"theta_m_{i}")
-            for i in joints
+        flexible = [i for i in joints if layout.q[i - 1] != layout.theta_m[i - 1]]
+        instead = {i: strain_channel(model.system, i) if i in flexible else f"theta_m_{i}" for i in joints}
+        self._q = [need(*filter(None, (f"q_{i}", instead[i]))) for i in joints]
+        self._theta_m = [need(f"theta_m_{i}") for i in flexible]
+        # Which q are an angle beyond which θ_m, both as numbers in their own lists.
+        self._beyond = [
+            (i - 1, k) for k, i in enumerate(flexible) if channels[self._q[i - 1]] == strain_channel(model.system, i)
         ]
-        self._theta_m = [need(f"theta_m_{i}") for i in joints if layout.q[i - 1] != layout.theta_m[i - 1]]
         # Markers that are not there leave some of a link's coordinates to the smoother, which needs a vector of them.
         partial = layout.planar or not layout.free
         self._links: dict[int, tuple[SensedShape, list[int]]] = {}
@@ -108,7 +112,10 @@ class Sensing:
             own = isinstance(kinematics, LinearLink) and shape.complete
             markers.append(stated[columns] if own else np.full(kinematics.n_f, np.nan))
         joints = stated[self.torque_columns] * self._ratio
-        return np.concatenate((stated[self._base], stated[self._q], stated[self._theta_m], *markers, joints))
+        q = stated[self._q]
+        for joint, motor in self._beyond:
+            q[joint] = np.hypot(q[joint], stated[self._theta_m[motor]])
+        return np.concatenate((stated[self._base], q, stated[self._theta_m], *markers, joints))
 
     @property
     def position_columns(self) -> list[int]:
@@ -124,6 +131,8 @@ class Sensing:
         layout = self.model.layout
         K, n_x = x.shape
         by_sensor = np.broadcast_to(np.eye(n_x), (K, n_x, n_x)).copy()
+        for angle, motor in self._beyond_coordinates:
+            by_sensor[:, angle, motor] = 1.0
         offset = layout.n_base_positions - layout.n_base_speeds
         for i, (kinematics, q_f) in enumerate(zip(self.model.chain.flexible, layout.q_f, strict=True)):
             if kinematics is not None:
@@ -137,6 +146,8 @@ class Sensing:
         """1σ of the coordinates (n_x,) for that of the position sensors (n_x,), about the straight arm."""
         layout = self.model.layout
         out = sensors.copy()
+        for angle, motor in self._beyond_coordinates:
+            out[angle] = np.hypot(out[angle], sensors[motor])
         offset = layout.n_base_positions - layout.n_base_speeds
         for kinematics, q_f in zip(self.model.chain.flexible, layout.q_f, strict=True):
             if kinematics is not None:
@@ -145,9 +156,18 @@ class Sensing:
                 out[own] = np.sqrt(inverse**2 @ sensors[own] ** 2)
         return out
 
+    @property
+    def _beyond_coordinates(self) -> list[tuple[int, int]]:
+        """Numbers of the coordinates q_i that are read as an angle beyond θ_m_i, with those of θ_m_i."""
+        first = len(self._base)
+        return [(first + joint, first + len(self._q) + motor) for joint, motor in self._beyond]
+
     def coordinates(self, values: Array) -> Array:
         """Positions x (B, n_x) of samples (B, channels)."""
-        parts = [values[:, self._base], values[:, self._q], values[:, self._theta_m]]
+        q = values[:, self._q]
+        for joint, motor in self._beyond:
+            q[:, joint] += values[:, self._theta_m[motor]]
+        parts = [values[:, self._base], q, values[:, self._theta_m]]
         for shape, columns in self._links.values():
             parts.append(shape.coordinates(values[:, columns]))
         return np.concatenate(parts, axis=1)
