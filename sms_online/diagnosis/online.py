@@ -192,14 +192,14 @@ class OnlineDiagnosis:
         self._onset, self._pending = None, None
 
     def _notice(self, momentum: Momentum) -> None:
-        if self._onset is not None:
+        if self._onset is not None or self._quiet:
             return
         detector, test = momentum.changes.detector, momentum.test
         width = momentum.changes.window_samples
         if detector.alarm is not None:
             last, first = detector.onset - MARGIN, detector.alarm
             row = max(test.evidence, key=lambda name: test.evidence[name])
-        elif test.alarm is not None and not self._quiet:
+        elif test.alarm is not None:
             last, first, row = test.alarm.since - width, test.alarm.end - width, test.alarm.row
         else:
             return
@@ -210,7 +210,7 @@ class OnlineDiagnosis:
         else:
             self._onset = _Onset(last, first, seen.factor, seen.windows)
         began = None if self._onset.last is None else self._time(0.5 * (last + first))
-        self._due, self._quiet = 0, False
+        self._due = 0
         self.episodes.append(Episode(self._now, row, began))
         self.on_verdict(self._now, line(self.episodes[-1]))
 

@@ -61,14 +61,15 @@ class WhiteRows:
     """Rows of one window, n_v of them: Y (n_v, n + 1) with b as its last column, independent, errors of unit variance.
 
     noisy (2, n_v, n + 1): the same with synthetic noise added and subtracted. raw (n_v, n + 1): the rows as they were,
-    with their own covariance (n_v, n_v). end: grid index of the window's last sample. late (n_v, G): columns of the
-    sources' latencies, independent like Y.
+    with their own covariance (n_v, n_v), of which noise is the part that the sensors make. end: grid index of the
+    window's last sample. late (n_v, G): columns of the sources' latencies, independent like Y.
     """
 
     Y: Array
     noisy: Array
     raw: Array
     covariance: Array
+    noise: Array
     end: int
     late: Array
 
@@ -286,6 +287,7 @@ class MomentumFit:
         plain = rows[0] / np.sqrt(variance)[:, None]
         self.plain_gram += plain[:, :, None] * plain[:, None, :]
         self.plain_windows += 1
+        of_noise = covariances[-1] + np.diag(UNSTEADY * bend**2)
         covariances[-1][np.diag_indices(n_v)] += self.misfit * variance
         side_by_side = rows.swapaxes(0, 1).reshape(n_v, -1)
         if len(self._late):
@@ -294,7 +296,7 @@ class MomentumFit:
         late = whitened[:, COPIES * rows.shape[2] :]
         white = whitened[:, : COPIES * rows.shape[2]].reshape(n_v, COPIES, -1).swapaxes(0, 1)
         own = covariances[-1] + np.diag(UNSTEADY * bend**2)
-        return WhiteRows(white[0], white[1:], rows[0], own, window.end, late)
+        return WhiteRows(white[0], white[1:], rows[0], own, of_noise, window.end, late)
 
     def _late_columns(self, start: int, noise: SensorNoise) -> Array:
         """Columns (n_v, G) of the latencies in the window's rows."""

@@ -1,7 +1,8 @@
 """Do the rows leave more than noise? A sequential test of every coordinate and row type of the momentum balance.
 
 The rows of a window are compared with the estimate from windows that ended before it began, so that the two share no
-sample: of e = b - Y β̂ the covariance is C + Y P Yᵀ, C that of the rows and P that of β̂. Where nothing but noise is
+sample: of e = b - Y β̂ the covariance is C + Y P Yᵀ, C what the sensors' noise makes of
+the rows and P that of β̂. Where nothing but noise is
 left e² over its variance is χ². A variance v₁ of e against a variance v₀, both in units of that, has the log likelihood
 ratio ½ χ² (1/v₀ - 1/v₁) - ½ ν log(v₁/v₀) for ν coordinates, and its cumulative sum, never below zero, alarms beyond h.
 
@@ -106,7 +107,7 @@ class SequentialTest:
         Y, n_v = rows.raw[:, :-1], self._layout.n_v
         e = rows.raw[:, -1] - Y @ self._beta
         spread = Y @ self._root
-        S = rows.covariance + spread @ spread.T
+        S = rows.noise + spread @ spread.T
         scaled = Y / self._scale
         tested = np.linalg.norm(scaled @ self._null, axis=1) <= KNOWN * np.linalg.norm(scaled, axis=1)
         out = np.zeros(n_v + len(self._types))
