@@ -15,8 +15,8 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from sms_online.description.schema import System
-from sms_online.diagnosis.constants import is_constant
+from sms_online.description.schema import Effect, System
+from sms_online.diagnosis.constants import applied, is_constant
 from sms_online.diagnosis.online_search import Named, Outcome, Request, least_samples, search
 from sms_online.diagnosis.record import Segment
 from sms_online.effects.catalogue import ENTRIES
@@ -82,9 +82,9 @@ class Episode:
     """More than noise, and what came of it.
 
     noticed: s, samples up to then were there. row: type of the rows that leave most; began: s, None where it may have
-    been there from the start. verdict: "noticed", "named", "unexplained", or "change" where a jump of parameters, an
-    event, explains it. named_at: s, when a search first named what was found in the end. adopted: s, when that was
-    taken up; refused: why it was not.
+    been there from the start. verdict: "noticed", "named", "unexplained", or "change" where a jump of parameters, the
+    event, explains it. named_at: s, when a search first named what was found in the end, or when the event was decided.
+    adopted: s, when what was named was taken up; refused: why it was not.
     """
 
     noticed: float
@@ -95,8 +95,8 @@ class Episode:
     named_at: float | None = None
     adopted: float | None = None
     refused: str | None = None
+    event: Event | None = None
     evidence: list[Evidence] = field(default_factory=list)
-    open: bool = True
 
 
 @dataclass(frozen=True)
@@ -137,14 +137,27 @@ class OnlineDiagnosis:
 
     @property
     def system(self) -> System:
-        """The described system with what has been named, taken up or not."""
-        effects = [named.effect for episode in self.episodes for named in episode.named]
-        return self._estimator.system.model_copy(update={"effects": (*self._estimator.system.effects, *effects)})
+        """The described system with the effects that were named, taken up or not, and those that events have added."""
+        system = self._estimator.system
+        found = [named.effect for episode in self.episodes for named in episode.named]
+        changed = [name for episode in self.episodes if episode.event for name in episode.event.parameters]
+        for key in dict.fromkeys(name.rsplit(".", 1)[0] for name in changed if "@" in name):
+            effect, _, where = key.partition("@")
+            found.append(Effect(name=effect, where=where))
+        held = {(effect.name, effect.where) for effect in system.effects}
+        fresh = {(effect.name, effect.where): effect for effect in found if (effect.name, effect.where) not in held}
+        forces = [effect for effect in fresh.values() if not is_constant(effect)]
+        declared = system.model_copy(update={"effects": (*system.effects, *forces)})
+        return applied(declared, [effect for effect in fresh.values() if is_constant(effect)])
 
     @property
     def notices(self) -> list[str]:
         """What there is to say, a line for each episode."""
-        return [line(episode) for episode in self.episodes if episode.verdict != "change"]
+        return [line(episode) for episode in self.episodes]
+
+    def document(self) -> list[dict[str, Any]]:
+        """The episodes as results.json holds them."""
+        return [episode_document(episode) for episode in self.episodes]
 
     def _keep(self, piece: GridSamples) -> None:
         self._record.append(piece)
@@ -156,17 +169,22 @@ class OnlineDiagnosis:
         """An internal block is through."""
         self._blocks += 1
         done = self._searcher.outcome(self._blocks)
-        momentum = self._estimator.momentum
-        if momentum is None or not self._record:
+        if self._estimator.momentum is None or not self._record:
             return
         self._follow_events()
         if done is not None and self._pending is not None and done[0] == self._pending[0]:
             time, self._pending = self._pending[1], None
             if done[1] is not None and self._onset is not None:
-                self._hear(Evidence(time, self._now, done[1]), momentum)
-        if momentum.started:
-            self._notice(momentum)
-            self._search(momentum)
+                self._hear(Evidence(time, self._now, done[1]))
+        if self._momentum.started:
+            self._notice()
+            self._search()
+
+    @property
+    def _momentum(self) -> Momentum:
+        momentum = self._estimator.momentum
+        assert momentum is not None  # else nothing is done
+        return momentum
 
     @property
     def _now(self) -> float:
@@ -181,21 +199,24 @@ class OnlineDiagnosis:
             self._events += 1
             if event.kind in ("unexplained", "undecided"):
                 continue
-            if self._onset is not None:
-                self.episodes[-1].verdict = "change"
-                self._close()
+            if self._onset is None:
+                evidence = self._momentum.test.evidence
+                self.episodes.append(Episode(self._now, max(evidence, key=lambda row: evidence[row]), event.time))
+            episode = self.episodes[-1]
+            episode.verdict, episode.named, episode.event, episode.named_at = "change", (), event, self._now
+            self._close()
+            self.on_verdict(self._now, line(episode))
             index = round((event.time - self._estimator.start_time) * self._estimator.system.sample_rate)
             self._valid, self._quiet = index + self._unit // 2, False
 
     def _close(self) -> None:
-        self.episodes[-1].open = False
         self._onset, self._pending = None, None
 
-    def _notice(self, momentum: Momentum) -> None:
+    def _notice(self) -> None:
         if self._onset is not None or self._quiet:
             return
-        detector, test = momentum.changes.detector, momentum.test
-        width = momentum.changes.window_samples
+        detector, test = self._momentum.changes.detector, self._momentum.test
+        width = self._momentum.changes.window_samples
         if detector.alarm is not None:
             last, first = detector.onset - MARGIN, detector.alarm
             row = max(test.evidence, key=lambda name: test.evidence[name])
@@ -214,7 +235,7 @@ class OnlineDiagnosis:
         self.episodes.append(Episode(self._now, row, began))
         self.on_verdict(self._now, line(self.episodes[-1]))
 
-    def _search(self, momentum: Momentum) -> None:
+    def _search(self) -> None:
         """Begin the search that is due."""
         onset = self._onset
         if onset is None:
@@ -226,7 +247,7 @@ class OnlineDiagnosis:
         if due > self._due:
             self._due = due
             self._begun += 1
-            request = self._request(momentum, onset)
+            request = self._request(onset)
             if self._pending is None and request is not None and self._searcher.submit(self._begun, request):
                 self._pending = self._begun, self._now
         elif self._due == len(schedule) and self._pending is None:
@@ -235,12 +256,12 @@ class OnlineDiagnosis:
     def _give_up(self) -> None:
         """Nothing was named twice by all that is remembered."""
         episode = self.episodes[-1]
-        episode.verdict = "unexplained"
+        episode.verdict, episode.named, episode.named_at = "unexplained", (), None
         self._quiet = True
         self._close()
         self.on_verdict(self._now, line(episode))
 
-    def _request(self, momentum: Momentum, onset: _Onset) -> Request | None:
+    def _request(self, onset: _Onset) -> Request | None:
         """The record, cut where the effect began."""
         estimator = self._estimator
         before: list[Segment] = []
@@ -249,6 +270,7 @@ class OnlineDiagnosis:
             before = self._segments(earliest, onset.last)
         after = self._segments(onset.first, None)
         beta = solve(onset.factor).pi if before else estimator.estimate().pi
+        momentum = self._momentum
         assert momentum.sensor_noise is not None
         if not after:
             return None
@@ -274,12 +296,12 @@ class OnlineDiagnosis:
                 out.append(Segment(index[inside], values[inside]))
         return out
 
-    def _hear(self, evidence: Evidence, momentum: Momentum) -> None:
+    def _hear(self, evidence: Evidence) -> None:
         """What a search said."""
         episode, outcome = self.episodes[-1], evidence.outcome
         before = episode.evidence[-1].outcome if episode.evidence else None
         episode.evidence.append(evidence)
-        self.on_evidence(evidence.time, outcome.scores)
+        self.on_evidence(evidence.known, outcome.scores)
         if outcome.verdict != "named":
             episode.verdict, episode.named, episode.named_at = "noticed", (), None
             return
@@ -288,13 +310,13 @@ class OnlineDiagnosis:
             episode.named_at = evidence.known
         episode.verdict, episode.named = "named", outcome.named
         if again and self._adopt:
-            self._take_up(episode, outcome, momentum)
+            self._take_up(episode, outcome)
         self.on_verdict(evidence.known, line(episode))
         if again:
             self._quiet = episode.adopted is None
             self._close()
 
-    def _take_up(self, episode: Episode, outcome: Outcome, momentum: Momentum) -> None:
+    def _take_up(self, episode: Episode, outcome: Outcome) -> None:
         """Go on with what was named."""
         onset, estimator = self._onset, self._estimator
         assert onset is not None
@@ -322,7 +344,7 @@ class OnlineDiagnosis:
         )
         weights = np.concatenate((outcome.beta, *(named.values for named in outcome.named)))
         effects = [named.effect for named in outcome.named]
-        estimator.adopt(momentum.changes.adopt(effects, event, known, weights, samples))
+        estimator.adopt(self._momentum.changes.adopt(effects, event, known, weights, samples))
         self._events = len(estimator.events)
         self._valid = int(samples.index[0])
         episode.adopted = self._now
@@ -355,9 +377,10 @@ def line(episode: Episode) -> str:
         return f"{where}: the model lacks {told}{taken}"
     if episode.verdict == "unexplained":
         return f"{where}, which no known effect explains"
-    if episode.verdict == "change":
-        return f"{where}: a change of parameters"
-    return where if episode.evidence or not episode.open else f"{where}, searching"
+    if episode.event is not None:
+        jumps = zip(episode.event.parameters, episode.event.sizes, episode.event.units, strict=True)
+        return f"{where}: {', '.join(f'{name} {size:+.4g} {unit}' for name, size, unit in jumps)}"
+    return f"{where}, not named yet"
 
 
 def _told(named: Named) -> str:
@@ -372,6 +395,7 @@ def _told(named: Named) -> str:
 def episode_document(episode: Episode) -> dict[str, Any]:
     """An episode as results.json holds it."""
     return {
+        "summary": line(episode),
         "noticed": episode.noticed,
         "row": episode.row,
         "began": episode.began,

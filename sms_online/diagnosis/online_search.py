@@ -25,6 +25,7 @@ from sms_online.diagnosis.shape import refine
 from sms_online.diagnosis.trace import Candidate, Tracing
 from sms_online.effects.base import report
 from sms_online.effects.catalogue import ENTRIES, declarable
+from sms_online.effects.spacecraft import TableTilt
 from sms_online.model.base_parameters import BaseParameters
 from sms_online.model.model import Model
 from sms_online.pipeline.sensing import Sensing
@@ -182,7 +183,7 @@ def _trace(request: Request, rows: SessionRows, everything: Sequence[Candidate],
     solution, covariance = _solution(final, used), final.covariance(used)
     named = [
         Named(
-            effect=effect,
+            effect=improved(effect, solution[own]) if effect.name == TableTilt.entry.name else effect,
             parameters=tuple(p.name for p in finding.candidate.parameters) if effect is not constant else (),
             units=tuple(p.unit for p in finding.candidate.parameters) if effect is not constant else (),
             values=solution[own] if effect is not constant else np.empty(0),

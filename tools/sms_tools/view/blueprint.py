@@ -121,7 +121,7 @@ def _residual() -> rrb.Container:
 
 
 def _evidence() -> rrb.TimeSeriesView:
-    return _plot("Evidence for missing effects", [f"{number_log.EVIDENCE}/**"])
+    return _plot("Evidence for missing effects, log10 of the gain", [f"{number_log.EVIDENCE}/**"])
 
 
 def _health() -> rrb.Container:
