@@ -40,6 +40,9 @@ LEAST_BEFORE = 5.0
 DUE = (3.0, 5.0, 8.0, 12.0, 18.0, 30.0)
 DUE_FROM_THE_START = (10.0, 15.0, 20.0, 30.0, 40.0)
 
+# Episodes whose effects are taken up at most: what is left of a real rig then is for a person.
+MOST_ADOPTED = 8
+
 
 class Searcher(Protocol):
     """Makes searches, one at a time."""
@@ -313,7 +316,8 @@ class OnlineDiagnosis:
             self._take_up(episode, outcome)
         self.on_verdict(evidence.known, line(episode))
         if again:
-            self._quiet = episode.adopted is None
+            adopted = sum(each.adopted is not None for each in self.episodes)
+            self._quiet = episode.adopted is None or adopted == MOST_ADOPTED
             self._close()
 
     def _take_up(self, episode: Episode, outcome: Outcome) -> None:

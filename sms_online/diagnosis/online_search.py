@@ -35,6 +35,9 @@ from sms_online.trackers.interface import Prior
 
 # Windows that the effect acts in, of which a third checks what the others say.
 LEAST_WINDOWS = 12
+# What takes less than this share of what the best effect takes is rather an error of that one's model, for real
+# friction has no corner; else it is found once the others have been taken up.
+LEAST_SHARE = 1e-3
 # Candidates whose evidence is told, the best ones.
 TOLD = 8
 
@@ -170,6 +173,8 @@ def _trace(request: Request, rows: SessionRows, everything: Sequence[Candidate],
     tracing = Tracing(rows, [c for c in limited if np.any(c.columns)], fitted, request.prior)
     chosen = tracing.run(lambda found, k: refine(tracing, make, found, k))
     ranking = tracing.ranking()[:TOLD]
+    gains = {k: tracing.finding(chosen, k).gain.gain for k in chosen}
+    chosen = [k for k in chosen if gains[k] >= LEAST_SHARE * max(gains.values())]
     findings = [tracing.finding(chosen, k) for k in chosen]
     before = _excess(tracing, [])
     final, used, constant = tracing, list(chosen), None
