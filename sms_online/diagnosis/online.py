@@ -9,7 +9,7 @@ later block, which has to be the same one in the repetition (`Searcher`).
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any, Protocol
 
 import numpy as np
@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from sms_online.description.schema import Effect, System
 from sms_online.diagnosis.constants import applied, is_constant
+from sms_online.diagnosis.episodes import Episode, Evidence, episode_document, line
 from sms_online.diagnosis.online_search import Named, Outcome, Request, least_samples, search
 from sms_online.diagnosis.record import Segment
 from sms_online.effects.catalogue import ENTRIES
@@ -69,37 +70,6 @@ class Immediate:
         """See `Searcher`."""
         done, self._done = self._done, None
         return done
-
-
-@dataclass(frozen=True)
-class Evidence:
-    """What a search said: of samples up to `time`, s, known when samples up to `known`, s, were there."""
-
-    time: float
-    known: float
-    outcome: Outcome
-
-
-@dataclass
-class Episode:
-    """More than noise, and what came of it.
-
-    noticed: s, samples up to then were there. row: type of the rows that leave most; began: s, None where it may have
-    been there from the start. verdict: "noticed", "named", "unexplained", or "change" where a jump of parameters, the
-    event, explains it. named_at: s, when a search first named what was found in the end, or when the event was decided.
-    adopted: s, when what was named was taken up; refused: why it was not.
-    """
-
-    noticed: float
-    row: str
-    began: float | None
-    verdict: str = "noticed"
-    named: tuple[Named, ...] = ()
-    named_at: float | None = None
-    adopted: float | None = None
-    refused: str | None = None
-    event: Event | None = None
-    evidence: list[Evidence] = field(default_factory=list)
 
 
 @dataclass(frozen=True)
@@ -179,9 +149,8 @@ class OnlineDiagnosis:
             time, self._pending = self._pending[1], None
             if done[1] is not None and self._onset is not None:
                 self._hear(Evidence(time, self._now, done[1]))
-        if self._momentum.started:
-            self._notice()
-            self._search()
+        self._notice()
+        self._search()
 
     @property
     def _momentum(self) -> Momentum:
@@ -225,9 +194,12 @@ class OnlineDiagnosis:
             row = max(test.evidence, key=lambda name: test.evidence[name])
         elif test.alarm is not None:
             last, first, row = test.alarm.since - width, test.alarm.end - width, test.alarm.row
+        elif (joint := self._momentum.fit.unexplained) is not None:
+            # Rows are not even weighed.
+            last, first, row = -1, 0, f"joint_{joint + 1}"
         else:
             return
-        seen = detector.before(last)
+        seen = detector.before(last) if last >= 0 else None
         if seen is None or last - self._valid < LEAST_BEFORE * self._unit:
             n = self._estimator.base.n
             self._onset = _Onset(None, self._valid, np.zeros((n + 1, n + 1)), 0)
@@ -285,6 +257,7 @@ class OnlineDiagnosis:
             segments=(*before, *after),
             late=len(before),
             beta=beta,
+            weighed=momentum.started,
             prior=None if momentum.prior is None else momentum.changes.prior(momentum.prior),
         )
 
@@ -366,69 +339,3 @@ def refusal(model: Model, named: tuple[Named, ...]) -> str | None:
         if with_it.n_states:
             return f"{each.key} has an internal state, which begins at rest"
     return None
-
-
-def line(episode: Episode) -> str:
-    """What there is to say of an episode."""
-    where = f"more than noise in the rows of {episode.row} since {episode.noticed:.2f} s"
-    if episode.verdict == "named":
-        told = ", ".join(_told(named) for named in episode.named)
-        taken = ""
-        if episode.adopted is not None:
-            taken = f"; taken up at {episode.adopted:.2f} s"
-        elif episode.refused is not None:
-            taken = f"; not taken up: {episode.refused}"
-        return f"{where}: the model lacks {told}{taken}"
-    if episode.verdict == "unexplained":
-        return f"{where}, which no known effect explains"
-    if episode.event is not None:
-        jumps = zip(episode.event.parameters, episode.event.sizes, episode.event.units, strict=True)
-        return f"{where}: {', '.join(f'{name} {size:+.4g} {unit}' for name, size, unit in jumps)}"
-    return f"{where}, not named yet"
-
-
-def _told(named: Named) -> str:
-    values = ", ".join(
-        f"{name} {value:.4g}" + ("" if std is None else f" ± {std:.2g}") + f" {unit}".rstrip()
-        for name, (value, std, unit) in named.coefficients.items()
-    )
-    others = f", or {', '.join(named.ambiguous)}" if named.ambiguous else ""
-    return f"{named.key}{others} ({values})"
-
-
-def episode_document(episode: Episode) -> dict[str, Any]:
-    """An episode as results.json holds it."""
-    return {
-        "summary": line(episode),
-        "noticed": episode.noticed,
-        "row": episode.row,
-        "began": episode.began,
-        "verdict": episode.verdict,
-        "named": episode.named_at,
-        "adopted": episode.adopted,
-        "refused": episode.refused,
-        "effects": [
-            {
-                "name": named.effect.name,
-                "where": named.effect.where,
-                "coefficients": {
-                    name: {"estimate": value, "std": std, "unit": unit}
-                    for name, (value, std, unit) in named.coefficients.items()
-                },
-                "ambiguous_with": list(named.ambiguous),
-                "evidence": {"gain": named.gain, "limit": named.limit},
-            }
-            for named in episode.named
-        ],
-        "evidence": [
-            {
-                "time": evidence.time,
-                "known": evidence.known,
-                "verdict": evidence.outcome.verdict,
-                "named": list(evidence.outcome.keys),
-                "left": evidence.outcome.left,
-                "candidates": evidence.outcome.scores,
-            }
-            for evidence in episode.evidence
-        ],
-    }

@@ -16,9 +16,16 @@ from numpy.typing import NDArray
 from sms_online.description.schema import Effect, System
 from sms_online.diagnosis.candidates import LINEAR, CandidateColumns
 from sms_online.diagnosis.constants import applied, corrected, deviations, improved
-from sms_online.diagnosis.diagnose import CORRECTIONS, FITTED, LARGEST_SHARE_LEFT
+from sms_online.diagnosis.diagnose import (
+    CORRECTIONS,
+    FITTED,
+    LARGEST_SHARE_LEFT,
+    MOST_WINDOWS,
+    REWEIGHED,
+    STRETCH,
+)
 from sms_online.diagnosis.followed import HALF_WIDTH
-from sms_online.diagnosis.record import Segment
+from sms_online.diagnosis.record import Segment, excerpts
 from sms_online.diagnosis.residuals import ResidualTest
 from sms_online.diagnosis.rows import SessionRows
 from sms_online.diagnosis.shape import refine
@@ -28,6 +35,7 @@ from sms_online.effects.catalogue import ENTRIES, declarable
 from sms_online.effects.spacecraft import TableTilt
 from sms_online.model.base_parameters import BaseParameters
 from sms_online.model.model import Model
+from sms_online.pipeline.momentum_balance import HOPS
 from sms_online.pipeline.sensing import Sensing
 from sms_online.pipeline.sensor_noise import SensorNoise
 from sms_online.stream import Array
@@ -48,7 +56,7 @@ class Request:
 
     model, base: those of the session, of `model.system`. segments: gap-free samples of the session's channels as they
     came. late: number of the first segment that holds the effect, if it began at all. beta (n,): parameters behind the
-    rows' noise. prior: what is known of them beforehand.
+    rows' noise; weighed: they come from rows that were weighed by it. prior: what is known of them beforehand.
     """
 
     model: Model
@@ -58,6 +66,7 @@ class Request:
     segments: tuple[Segment, ...]
     late: int
     beta: Array
+    weighed: bool
     prior: Prior | None
 
 
@@ -132,6 +141,7 @@ class LateColumns(CandidateColumns):
 
 def search(request: Request) -> Outcome | None:
     """Trace what the record holds beyond the model; None where it is too short to tell."""
+    request = _bounded(request)
     system = request.model.system
     rows = _rows(request, request.beta)
     late = rows.weak.windows.segment >= request.late
@@ -139,10 +149,22 @@ def search(request: Request) -> Outcome | None:
         return None
     everything = CandidateColumns(rows, system).all()
     outcome = _trace(request, rows, everything, request.late)
+    for _ in range(0 if request.weighed else REWEIGHED):
+        # Nothing was known of the rows' noise that was worth the name, for nothing explained the torques.
+        outcome = _trace(request, _rows(request, outcome.beta), everything, request.late)
     if outcome.verdict != "unexplained" or request.late == 0:
         return outcome
     always = _trace(request, rows, everything, 0)
     return always if always.verdict == "named" or always.left < outcome.left else outcome
+
+
+def _bounded(request: Request) -> Request:
+    """Stretches of the record, where its windows are so short that it holds too many of them."""
+    windows, rate = request.model.system.windows, request.model.system.sample_rate
+    length, most = round(STRETCH * windows.momentum * rate), round(MOST_WINDOWS * windows.momentum / HOPS * rate)
+    before = excerpts(request.segments[: request.late], length, most // 3)
+    after = excerpts(request.segments[request.late :], length, most - most // 3)
+    return replace(request, segments=(*before, *after), late=len(before))
 
 
 def _rows(request: Request, beta: Array, late: int = 0, constants: Sequence[Effect] = ()) -> SessionRows:

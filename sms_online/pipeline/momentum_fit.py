@@ -99,6 +99,7 @@ class MomentumFit:
         self._late = LatencyColumns(sources)
         self._whitener = Whitener(model.layout.n_v, COPIES * (base.n + 1) + len(sources))
         self.weights: Array | None = None  # β (n,) behind the weights
+        self.unexplained: int | None = None  # joint whose torque is least explained, where that forbids weights
         self._since = 0  # windows since they were renewed
         self._moving = 0
         self._renewal = 0  # windows from one renewal to the next
@@ -188,7 +189,10 @@ class MomentumFit:
         joints = list(self.model.layout.theta_m)
         rows = np.stack([self._dense(window)[0, joints] for window in self._held])
         left = rows[..., -1] - rows[..., :-1] @ self._known_weights
-        return bool(np.all(np.linalg.norm(left, axis=0) <= LARGEST_UNEXPLAINED * np.linalg.norm(rows[..., -1], axis=0)))
+        left_norm, torque = np.linalg.norm(left, axis=0), np.linalg.norm(rows[..., -1], axis=0)
+        explained = bool(np.all(left_norm <= LARGEST_UNEXPLAINED * torque))
+        self.unexplained = None if explained else int(np.argmax(left_norm / np.maximum(torque, np.finfo(float).tiny)))
+        return explained
 
     @property
     def _known_weights(self) -> Array:

@@ -42,7 +42,7 @@ CASES = (
     "air_drag@base:damping=60",
     "thruster_leak@base:force_x=1,force_y=0.5",
     "cubic_stiffness@joint_1:stiffness=300",
-    "torsional_hysteresis@joint_2:torque=5,width=0.02",
+    "load_friction@joint_2:ratio=0.05",
     "link_damping@link_1:time=0.001",
     "sensor_lag@q_1:corner=40",
     "encoder_offset@theta_m_2:offset=0.01",
