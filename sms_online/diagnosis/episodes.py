@@ -52,7 +52,10 @@ def line(episode: Episode) -> str:
             taken = f"; not taken up: {episode.refused}"
         return f"{where}: the model lacks {told}{taken}"
     if episode.verdict == "unexplained":
-        return f"{where}, which no known effect explains"
+        nearest = ""
+        if episode.evidence and (last := episode.evidence[-1].outcome).keys:
+            nearest = f"; the nearest ({', '.join(last.keys)}) leave {100.0 * last.left:.0f} % of it"
+        return f"{where}, which no known effect explains{nearest}"
     if episode.event is not None:
         jumps = zip(episode.event.parameters, episode.event.sizes, episode.event.units, strict=True)
         return f"{where}: {', '.join(f'{name} {size:+.4g} {unit}' for name, size, unit in jumps)}"
