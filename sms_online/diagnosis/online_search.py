@@ -140,8 +140,14 @@ class LateColumns(CandidateColumns):
 
 
 def search(request: Request) -> Outcome | None:
-    """Trace what the record holds beyond the model; None where it is too short to tell."""
-    request = _bounded(request)
+    """Trace what the record holds beyond the model; None where it is too short to tell, or its rows are degenerate."""
+    try:
+        return _search(_bounded(request))
+    except np.linalg.LinAlgError:
+        return None
+
+
+def _search(request: Request) -> Outcome | None:
     system = request.model.system
     rows = _rows(request, request.beta)
     late = rows.weak.windows.segment >= request.late
@@ -197,10 +203,14 @@ def _trace(request: Request, rows: SessionRows, everything: Sequence[Candidate],
     ranking = tracing.ranking()[:TOLD]
     gains = {k: tracing.finding(chosen, k).gain.gain for k in chosen}
     chosen = [k for k in chosen if gains[k] >= LEAST_SHARE * max(gains.values())]
+    if channels := [k for k in chosen if ENTRIES[tracing.candidates[k].effect.name].kind == "channel"]:
+        # One at a time, for its column is a first approximation: what others take is told once it has been taken off.
+        best = max(channels, key=lambda k: gains[k])
+        chosen = [*(k for k in chosen if k not in channels), best]
     findings = [tracing.finding(chosen, k) for k in chosen]
     before = _excess(tracing, [])
     final, used, constant = tracing, list(chosen), None
-    if chosen and ENTRIES[tracing.candidates[chosen[-1]].effect.name].kind == "channel":
+    if channels:
         final, used, constant = _corrected(request, tracing, chosen, late)
     after = _excess(final, used)
     left = max(0.0, after) / max(before, 1.0)
