@@ -23,9 +23,9 @@ class Episode:
     """More than noise, and what came of it.
 
     noticed: s, samples up to then were there. row: type of the rows that leave most; began: s, None where it may have
-    been there from the start. verdict: "noticed", "named", "unexplained", or "change" where a jump of parameters, the
-    event, explains it. named_at: s, when a search first named what was found in the end, or when the event was decided.
-    adopted: s, when what was named was taken up; refused: why it was not.
+    been there from the start. verdict: "noticed", "named", "unexplained", "passed" where the last samples show nothing of
+    it, or "change" where a jump of parameters, the event, explains it. named_at: s, when a search first named what was
+    found in the end, or when the event was decided. adopted: s, when what was named was taken up; refused: why not.
     """
 
     noticed: float
@@ -56,6 +56,8 @@ def line(episode: Episode) -> str:
         if episode.evidence and (last := episode.evidence[-1].outcome).keys:
             nearest = f"; the nearest ({', '.join(last.keys)}) leave {100.0 * last.left:.0f} % of it"
         return f"{where}, which no known effect explains{nearest}"
+    if episode.verdict == "passed":
+        return f"{where}, of which the last samples show nothing"
     if episode.event is not None:
         jumps = zip(episode.event.parameters, episode.event.sizes, episode.event.units, strict=True)
         return f"{where}: {', '.join(f'{name} {size:+.4g} {unit}' for name, size, unit in jumps)}"

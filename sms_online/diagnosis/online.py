@@ -231,7 +231,8 @@ class OnlineDiagnosis:
     def _give_up(self) -> None:
         """Nothing was named twice by all that is remembered."""
         episode = self.episodes[-1]
-        episode.verdict, episode.named, episode.named_at = "unexplained", (), None
+        passed = bool(episode.evidence) and episode.evidence[-1].outcome.verdict == "clean"
+        episode.verdict, episode.named, episode.named_at = "passed" if passed else "unexplained", (), None
         self._quiet = True
         self._close()
         self.on_verdict(self._now, line(episode))

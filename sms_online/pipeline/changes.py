@@ -226,7 +226,7 @@ class Changes:
         self._follow_adopted((*self.adopted, *effects))
         factor = widened(factor, len(event.parameters))
         self.events.append(event)
-        self._clear = int(samples.index[0])
+        self._clear, self._wanted = int(samples.index[0]), DECISION
         self.detector = self._new_detector()
         self.detector.begin(factor, windows)
         return Adoption(self.model, self.base, factor, windows, weights, samples)

@@ -56,7 +56,11 @@ class SearchProcess:
             return None
         done = self._done.get()
         self._busy = False
-        self._log.write(json.dumps({"search": done[0], "block": block}) + "\n")
+        try:
+            self._log.write(json.dumps({"search": done[0], "block": block}) + "\n")
+        except OSError as error:
+            # No disk is worth the session.
+            self.problem = f"a search was not noted, so that a replay will differ: {error.strerror or error}"
         return done
 
     def close(self) -> None:
