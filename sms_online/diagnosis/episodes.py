@@ -23,9 +23,9 @@ class Episode:
     """More than noise, and what came of it.
 
     noticed: s, samples up to then were there. row: type of the rows that leave most; began: s, None where it may have
-    been there from the start. verdict: "noticed", "named", "unexplained", "passed" where the last samples show nothing of
-    it, or "change" where a jump of parameters, the event, explains it. named_at: s, when a search first named what was
-    found in the end, or when the event was decided. adopted: s, when what was named was taken up; refused: why not.
+    been there from the start. verdict: "noticed", "named", "unexplained", "passed" where the last samples show nothing
+    of it, or "change" where a jump of parameters, the event, explains it. named_at: s, when a search first named what
+    was found in the end, or when the event was decided. adopted: s, when what was named was taken up; refused: why not.
     """
 
     noticed: float
