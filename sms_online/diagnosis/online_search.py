@@ -45,7 +45,7 @@ from sms_online.trackers.interface import Prior
 LEAST_WINDOWS = 12
 # What takes less than this share of what the best effect takes is rather an error of that one's model, for real
 # friction has no corner; else it is found once the others have been taken up.
-LEAST_SHARE = 1e-3
+LEAST_SHARE = 0.01
 # Candidates whose evidence is told, the best ones.
 TOLD = 8
 
@@ -201,13 +201,15 @@ def _trace(request: Request, rows: SessionRows, everything: Sequence[Candidate],
     tracing = Tracing(rows, [c for c in limited if np.any(c.columns)], fitted, request.prior)
     chosen = tracing.run(lambda found, k: refine(tracing, make, found, k))
     ranking = tracing.ranking()[:TOLD]
-    gains = {k: tracing.finding(chosen, k).gain.gain for k in chosen}
-    chosen = [k for k in chosen if gains[k] >= LEAST_SHARE * max(gains.values())]
-    if channels := [k for k in chosen if ENTRIES[tracing.candidates[k].effect.name].kind == "channel"]:
+    findings = [tracing.finding(chosen, k) for k in chosen]
+    gains = {k: finding.gain.gain for k, finding in zip(chosen, findings, strict=True)}
+    kept = [k for k in chosen if gains[k] >= LEAST_SHARE * max(gains.values())]
+    if channels := [k for k in kept if ENTRIES[tracing.candidates[k].effect.name].kind == "channel"]:
         # One at a time, for its column is a first approximation: what others take is told once it has been taken off.
         best = max(channels, key=lambda k: gains[k])
-        chosen = [*(k for k in chosen if k not in channels), best]
-    findings = [tracing.finding(chosen, k) for k in chosen]
+        kept = [*(k for k in kept if k not in channels), best]
+    if kept != chosen:
+        chosen, findings = kept, [tracing.finding(kept, k) for k in kept]
     before = _excess(tracing, [])
     final, used, constant = tracing, list(chosen), None
     if channels:
