@@ -10,25 +10,13 @@ from numpy.typing import NDArray
 from scipy.stats import chi2
 
 from sms_online.diagnosis.rows import SessionRows
-from sms_online.model.layout import Layout
+from sms_online.model.layout import row_types
 from sms_online.stream import Array
 
 # Sensors' noise, and with it the predicted variance of rows, is known to a tenth where it is estimated from samples.
 NOISE_KNOWN = 0.1
 # Probability that noise alone takes any row type beyond its limit.
 FALSE_ALARM = 0.01
-
-
-def row_types(layout: Layout) -> dict[str, list[int]]:
-    """Generalized speeds by row type: `joint_i` holds the motor's torque, `link_i` what moves with link i, `base`."""
-    out = {f"joint_{i}": [theta_m] for i, theta_m in enumerate(layout.theta_m, start=1)}
-    for i, (q, theta_m, q_f) in enumerate(zip(layout.q, layout.theta_m, layout.q_f, strict=True), start=1):
-        rows = [*range(q_f.start, q_f.stop), *([q] if q != theta_m else [])]
-        if rows:
-            out[f"link_{i}"] = rows
-    if layout.n_base_speeds:
-        out["base"] = list(range(layout.n_base_speeds))
-    return out
 
 
 @dataclass(frozen=True)

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from sms_online.diagnosis.evidence import basis, free_of, gain
-from sms_online.diagnosis.residuals import row_types
 from sms_online.diagnosis.rows import SessionRows
 from sms_online.diagnosis.splines import DEGREE, Variable, design, spline_columns
+from sms_online.model.layout import row_types
 from sms_online.stream import Array
 
 # Cubic splines on so many intervals of a variable's range.

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from sms_online.description.schema import Effect
 from sms_online.model.base_parameters import BaseParameters
 from sms_online.model.model import Model
 from sms_online.pipeline.event_hypotheses import (
@@ -63,7 +64,7 @@ class Adoption:
 class Changes:
     """Events of one session.
 
-    model, base: current ones, with what events have added to the system's own.
+    model, base: current ones, with what events have added to the system's own. adopted: effects among that.
     """
 
     def __init__(self, model: Model, base: BaseParameters, sensing: Sensing) -> None:
@@ -72,6 +73,7 @@ class Changes:
         self._system, self._described = model.system, base
         self._sensing = sensing
         self._added: list[str] = []
+        self.adopted: tuple[Effect, ...] = ()
         rate, span = self._system.sample_rate, self._system.windows.momentum
         self._half_hop = max(1, round(span * rate / INSTANTS))
         self.detector = self._new_detector()
@@ -85,7 +87,8 @@ class Changes:
         return ChangeDetector(self.base.n, self.model.layout.n_v, 2 * self._half_hop / self._system.sample_rate)
 
     @property
-    def _width(self) -> int:
+    def window_samples(self) -> int:
+        """Samples of a window."""
         return INSTANTS * self._half_hop
 
     def keep(self, piece: GridSamples) -> None:
@@ -93,7 +96,7 @@ class Changes:
         if piece.segment != self._segment:
             self._segment, self._clear = piece.segment, int(piece.index[0])
             self._index, self._values = self._index[:0], self._values[:0]
-        kept = 2 * REMEMBERED * self._half_hop + self._width + 2 * MARGIN
+        kept = 2 * REMEMBERED * self._half_hop + self.window_samples + 2 * MARGIN
         self._index = np.concatenate((self._index, piece.index))[-kept:]
         self._values = np.concatenate((self._values, piece.values))[-kept:]
 
@@ -102,7 +105,7 @@ class Changes:
         """Number of windows that samples from after the event give."""
         if self.detector.alarm is None or self._index.size == 0:
             return 0
-        samples = int(self._index[-1]) - max(self.detector.alarm, self._clear) - self._width - 2 * MARGIN
+        samples = int(self._index[-1]) - max(self.detector.alarm, self._clear) - self.window_samples - 2 * MARGIN
         return max(0, samples // (2 * self._half_hop))
 
     def decide(self, noise: SensorNoise, start_time: float, last: bool) -> Adoption | None:
@@ -170,7 +173,7 @@ class Changes:
             by = np.zeros(whole.n_pi)
             by[[base.independent[k] for k in jump.columns]] = explanation.sizes
             x, signals = self._sensing.coordinates(self._values), self._sensing.signals(self._values)
-            between = (onset - self._width // 2, alarm)
+            between = (onset - self.window_samples // 2, alarm)
             instant = event_instant(
                 whole, by, explanation.beta, self.detector.history, self._index, x, signals, between, self._half_hop,
                 self._system.sample_rate,
@@ -190,6 +193,7 @@ class Changes:
         weights[:n] = explanation.beta if jumped else solve(before.factor).pi
         weights[jumped] += explanation.sizes[: len(jumped)]
         factor = widened(before.factor, len(fresh))
+        reach = last + self.window_samples
         # What no hypothesis explains leaves nothing of what was known.
         factor = np.zeros_like(factor) if jump is None else opened(factor, jumped)
         event = Event(
@@ -199,7 +203,7 @@ class Changes:
             units=tuple(self.base.parameters[k].unit for k in jumped),
             sizes=tuple(float(size) for size in explanation.sizes[: len(jumped)]),
             stds=tuple(float(std) for std in explanation.stds[: len(jumped)]),
-            dropped_windows=sum(first - MARGIN < seen.end <= last + self._width for seen in self.detector.history),
+            dropped_windows=sum(first - MARGIN < seen.end <= reach for seen in self.detector.history),
         )
         self.events.append(event)
         after = self._index >= max(last, self._clear)
@@ -207,6 +211,31 @@ class Changes:
         self.detector = self._new_detector()
         self.detector.begin(factor, before.windows if jump is not None else 0)
         return Adoption(self.model, self.base, factor, self.detector.windows, weights, samples)
+
+    def adopt(
+        self, effects: Sequence[Effect], event: Event, known: tuple[Array, int], weights: Array, samples: GridSamples
+    ) -> Adoption:
+        """Go on with effects that the model lacked: forces without internal states, or a payload.
+
+        event: what is to be told of it; its parameters are the effects' own. known: factor (n + 1, n + 1) of the rows
+        that they had no part in, and the number of windows behind it. weights (n + c,): of the parameters, then the
+        effects'. samples: those of the session's last segment that hold the effects.
+        """
+        factor, windows = known
+        self._added += event.parameters
+        self._follow_adopted((*self.adopted, *effects))
+        factor = widened(factor, len(event.parameters))
+        self.events.append(event)
+        self._clear, self._wanted = int(samples.index[0]), DECISION
+        self.detector = self._new_detector()
+        self.detector.begin(factor, windows)
+        return Adoption(self.model, self.base, factor, windows, weights, samples)
+
+    def _follow_adopted(self, adopted: tuple[Effect, ...]) -> None:
+        fresh = adopted[len(self.adopted) :]
+        self._system = self._system.model_copy(update={"effects": (*self._system.effects, *fresh)})
+        self.adopted = adopted
+        self._extend()
 
     def prior(self, described: Prior) -> Prior:
         """What is known beforehand of the current parameters: nothing of those that have jumped."""
@@ -228,6 +257,7 @@ class Changes:
         return {
             "events": np.array(json.dumps([asdict(event) for event in self.events])),
             "added": np.array(json.dumps(self._added)),
+            "adopted": np.array(json.dumps([effect.model_dump() for effect in self.adopted])),
             "place": np.array([self._segment, self._clear, self._wanted]),
             "index": self._index,
             "values": self._values,
@@ -239,15 +269,16 @@ class Changes:
         """Names of the parameters that events have added, in their order."""
         return tuple(self._added)
 
-    def follow(self, events: Iterable[Event], added: Iterable[str]) -> None:
-        """Know of these events, which have added these parameters."""
+    def follow(self, events: Iterable[Event], added: Iterable[str], adopted: Iterable[Effect] = ()) -> None:
+        """Know of these events, which have added these parameters, and these effects."""
         self.events, self._added = list(events), list(added)
-        self._extend()
+        self._follow_adopted(tuple(adopted))
 
     def restore(self, state: Mapping[str, NDArray[Any]]) -> None:
         """Continue from a saved state."""
         events = [Event.from_saved(entry) for entry in json.loads(str(state["events"]))]
-        self.follow(events, json.loads(str(state["added"])))
+        adopted = [Effect.model_validate(entry) for entry in json.loads(str(state["adopted"]))]
+        self.follow(events, json.loads(str(state["added"])), adopted)
         self._segment, self._clear, self._wanted = (int(number) for number in state["place"])
         self._index, self._values = np.array(state["index"]), np.array(state["values"])
         self.detector = self._new_detector()

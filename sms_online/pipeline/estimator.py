@@ -23,6 +23,7 @@ from sms_online.effects.spacecraft import TableTilt
 from sms_online.errors import InputError
 from sms_online.model.base_parameters import BaseParameters, find_base_parameters
 from sms_online.model.model import Model
+from sms_online.pipeline.changes import Adoption
 from sms_online.pipeline.conditioning import Conditioning
 from sms_online.pipeline.energy_balance import BalanceRows, EnergyBalance, SharedErrors
 from sms_online.pipeline.events import Event
@@ -103,6 +104,7 @@ class Estimator:
         self._newest_energy_row = -np.inf
         self.on_motion: MotionSink | None = None
         self.on_samples: SampleSink | None = None
+        self.on_block: Callable[[], None] | None = None  # when an internal block is through
         self.smoother: Smoother | None = None
         if system.balance == "smoother" or (self.sensing.missing and system.balance != "energy"):
             self.smoother = Smoother(model, base, self.sensing, channels)
@@ -219,6 +221,11 @@ class Estimator:
         return self._synchroniser.periods
 
     @property
+    def start_time(self) -> float:
+        """Time of the grid's index 0, s."""
+        return self._synchroniser.start_time
+
+    @property
     def counters(self) -> SyncCounters:
         """Counts of the synchroniser: missing and interpolated cells, gaps, lost samples."""
         return self._synchroniser.counters
@@ -271,6 +278,14 @@ class Estimator:
             self._condition(piece)
         if self.smoother is not None:
             self.smoother.work(self._balanced)
+        if self.on_block is not None:
+            self.on_block()
+
+    def adopt(self, adoption: Adoption) -> None:
+        """Go on with effects that the model lacked, see `Changes.adopt`; from within `on_block` alone."""
+        assert self.momentum is not None
+        self.momentum.adopt(adoption)
+        self._begin_joints()
 
     def _condition(self, piece: GridSamples) -> None:
         if self.on_samples is not None:

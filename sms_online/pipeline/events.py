@@ -49,8 +49,9 @@ class Event:
 
     time: s. kind: `payload`, `stiffness`, `damping`, `friction`, `offset` or `inertia`; `unexplained` where no jump
     explains what followed, so that the estimate began anew; `undecided` where the session ended too early to tell, so
-    that the estimate is that of before. parameters: the names of what jumped, with unit, size and std (1σ) of each jump
-    in that unit. dropped_windows: windows of rows that reach across the event and were left out.
+    that the estimate is that of before; `effect` where one that the model lacked was taken up. parameters: the names of
+    what jumped, with unit, size and std (1σ) of each jump in that unit. dropped_windows: windows of rows that reach
+    across the event and were left out.
     """
 
     time: float

@@ -9,14 +9,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from sms_online.description.schema import Effect
 from sms_online.model.base_parameters import BaseParameters
 from sms_online.model.model import Model
 from sms_online.pipeline.changes import Adoption, Changes
 from sms_online.pipeline.errors_in_variables import NoiseBias
 from sms_online.pipeline.events import Event
 from sms_online.pipeline.latency import Latencies, source_groups
-from sms_online.pipeline.momentum_balance import COPIES, MomentumBalance
+from sms_online.pipeline.momentum_balance import COPIES, HOPS, MomentumBalance
 from sms_online.pipeline.momentum_fit import MomentumFit, WhiteRows
+from sms_online.pipeline.residual_test import SequentialTest
 from sms_online.pipeline.sensing import Sensing
 from sms_online.pipeline.sensor_noise import NoiseEstimate, SensorNoise, noise_from_state, noise_state
 from sms_online.pipeline.synchronise import GridSamples
@@ -35,9 +37,9 @@ class Momentum:
     """Balance, weights and tracker of one session.
 
     tracker: square-root RLS, fed with rows of unit variance. bias: what noise in the columns does to the estimate. fit:
-    what makes rows independent, and its sums. windows: how many it took
-    since the last event. latencies: of the sources, since then too. changes: events, and the model and parameters that
-    the session goes on with after them.
+    what makes rows independent, and its sums. windows: how many it took since the last event. latencies: of the
+    sources, since then too. test: whether rows leave more than noise, likewise. changes: events, and the model and
+    parameters that the session goes on with after them. prior: what is known of the described ones beforehand.
     """
 
     def __init__(self, model: Model, base: BaseParameters, sensing: Sensing) -> None:
@@ -50,7 +52,7 @@ class Momentum:
         self._sample_rate = system.sample_rate
         self._estimate = NoiseEstimate(sensing, system.sample_rate)
         self._span = system.windows.momentum
-        self._prior: Prior | None = None
+        self.prior: Prior | None = None
         self._sources = source_groups(sensing)
         self._build()
         self._random = np.random.default_rng(SEED)
@@ -68,20 +70,22 @@ class Momentum:
         self.latencies = Latencies(self._sources, base.n)
         self.fit = MomentumFit(model, base, self._balance, self.sensing.displacements, self._solved, self._sources)
         self.tracker: Tracker = self._new_tracker()
+        self.test = SequentialTest(model.layout, self._balance.span / HOPS)
 
     def _new_tracker(self) -> RecursiveLeastSquares:
-        prior = None if self._prior is None else self.changes.prior(self._prior)
+        prior = None if self.prior is None else self.changes.prior(self.prior)
         return RecursiveLeastSquares(self.changes.base.n, prior=prior, scaled_by_residual=prior is not None)
 
     def set_prior(self, prior: Prior) -> None:
         """Weigh the rows against what is known of the base parameters beforehand; before the first sample."""
-        self._prior = prior
+        self.prior = prior
         self.tracker = self._new_tracker()
 
-    def follow(self, events: Sequence[Event], added: Sequence[str]) -> None:
-        """Have the parameters of a session of the same system with these events, knowing nothing of them yet."""
+    def follow(self, events: Sequence[Event], added: Sequence[str], adopted: Sequence[Effect] = ()) -> None:
+        """Have the parameters of a session of the same system with these events and effects, knowing nothing of them
+        yet."""
         new = tuple(added) != self.changes.added
-        self.changes.follow(events, added)
+        self.changes.follow(events, added, adopted)
         if new:
             self._build()
 
@@ -160,6 +164,11 @@ class Momentum:
         if adoption is not None:
             self._adopt(adoption, noise)
 
+    def adopt(self, adoption: Adoption) -> None:
+        """Go on with effects that the model lacked, see `Changes.adopt`; rows are there already."""
+        assert self.sensor_noise is not None
+        self._adopt(adoption, self.sensor_noise)
+
     def _adopt(self, adoption: Adoption, noise: SensorNoise) -> None:
         """Go on after an event with what is known from before it."""
         bias = self.bias
@@ -198,7 +207,10 @@ class Momentum:
             if not np.isfinite(rows.Y).all():
                 self.dropped_windows += 1
                 continue
-            if not self.changes.detector.push(rows, self.misfit):
+            detector = self.changes.detector
+            if self.sensor_noise is not None and not self.sensor_noise.exact:
+                self.test.push(rows, detector.factor)
+            if not detector.push(rows, self.misfit):
                 continue
             t = self._start_time + rows.end / self._sample_rate
             M = rows.Y.shape[0]
@@ -234,6 +246,7 @@ class Momentum:
             "momentum_fit": self.fit.state(),
             "momentum_changes": self.changes.state(),
             "momentum_tracker": dict(self.tracker.state()),
+            "momentum_test": self.test.state(),
         }
 
     def restore(self, saved: Mapping[str, Mapping[str, NDArray[Any]]]) -> None:
@@ -256,3 +269,4 @@ class Momentum:
         self._balance.restore(saved["momentum_balance"])
         self.fit.restore(saved["momentum_fit"])
         self.tracker.restore(saved["momentum_tracker"])
+        self.test.restore(saved["momentum_test"])

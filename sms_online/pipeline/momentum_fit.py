@@ -67,14 +67,15 @@ class WhiteRows:
     """Rows of one window, n_v of them: Y (n_v, n + 1) with b as its last column, independent, errors of unit variance.
 
     noisy (2, n_v, n + 1): the same with synthetic noise added and subtracted. raw (n_v, n + 1): the rows as they were,
-    with their own covariance (n_v, n_v). end: grid index of the window's last sample. late (n_v, G): columns of the
-    sources' latencies, independent like Y.
+    with their own covariance (n_v, n_v), of which noise is the part that the sensors make. end: grid index of the
+    window's last sample. late (n_v, G): columns of the sources' latencies, independent like Y.
     """
 
     Y: Array
     noisy: Array
     raw: Array
     covariance: Array
+    noise: Array
     end: int
     late: Array
 
@@ -104,6 +105,7 @@ class MomentumFit:
         self._late = LatencyColumns(sources)
         self._whitener = Whitener(model.layout.n_v, COPIES * (base.n + 1) + len(sources))
         self.weights: Array | None = None  # β (n,) behind the weights
+        self.unexplained: int | None = None  # joint whose torque is least explained, where that forbids weights
         self._since = 0  # windows since they were renewed
         self._moving = 0
         self._renewal = 0  # windows from one renewal to the next
@@ -181,7 +183,7 @@ class MomentumFit:
             weights, misfit = self.weights, self.misfit
             described = self.base.values(self.model.nominal)
             if not self._settle(described, PASSES_DESCRIBED, partly=True) or self.misfit.sum() >= misfit.sum():
-                self.weights, self.misfit = weights, misfit
+                self.weights, self.misfit, self.unexplained = weights, misfit, None
         self._retell()
         out = [self._white(window) for window in self._held]
         self._recent = self._held[1 - HOPS :]
@@ -209,7 +211,10 @@ class MomentumFit:
         joints = list(self.model.layout.theta_m)
         rows = np.stack([self._dense(window)[0, joints] for window in self._held])
         left = rows[..., -1] - rows[..., :-1] @ beta
-        return bool(np.all(np.linalg.norm(left, axis=0) <= LARGEST_UNEXPLAINED * np.linalg.norm(rows[..., -1], axis=0)))
+        left_norm, torque = np.linalg.norm(left, axis=0), np.linalg.norm(rows[..., -1], axis=0)
+        explained = bool(np.all(left_norm <= LARGEST_UNEXPLAINED * torque))
+        self.unexplained = None if explained else int(np.argmax(left_norm / np.maximum(torque, np.finfo(float).tiny)))
+        return explained
 
     @property
     def _known_weights(self) -> Array:
@@ -310,6 +315,7 @@ class MomentumFit:
         gram += self.plain_gram
         self.plain_gram = gram
         self.plain_windows += 1
+        of_noise = covariances[-1] + np.diag(UNSTEADY * bend**2)
         covariances[-1][np.diag_indices(n_v)] += self.misfit * variance
         side_by_side = rows.swapaxes(0, 1).reshape(n_v, -1)
         if len(self._late):
@@ -318,7 +324,7 @@ class MomentumFit:
         late = whitened[:, COPIES * rows.shape[2] :]
         white = whitened[:, : COPIES * rows.shape[2]].reshape(n_v, COPIES, -1).swapaxes(0, 1)
         own = covariances[-1] + np.diag(UNSTEADY * bend**2)
-        return WhiteRows(white[0], white[1:], rows[0], own, window.end, late)
+        return WhiteRows(white[0], white[1:], rows[0], own, of_noise, window.end, late)
 
     def _late_columns(self, start: int, noise: SensorNoise) -> Array:
         """Columns (n_v, G) of the latencies in the window's rows."""

@@ -11,6 +11,8 @@ from sms_online.description.schema import System
 from sms_online.errors import InputError
 
 NAME = "system.toml"
+# Beside a recording, which holds the described system under that name.
+ONLINE_NAME = "adopted.toml"
 
 
 def adopted_text(described: str, before: System, after: System) -> str:
@@ -45,9 +47,9 @@ def _text(described: str) -> str:
     return shipped_text(described) if described in shipped_systems() else Path(described).read_text(encoding="utf-8")
 
 
-def write_adopted(directory: Path, text: str) -> Path:
-    """Write DIR/system.toml; InputError where that fails."""
-    path = directory / NAME
+def write_adopted(directory: Path, text: str, name: str = NAME) -> Path:
+    """Write DIR/system.toml, or another name; InputError where that fails."""
+    path = directory / name
     try:
         directory.mkdir(parents=True, exist_ok=True)
         path.write_text(text, encoding="utf-8")

@@ -109,6 +109,11 @@ def _add_view(parser: Parser) -> None:
     parser.add_argument("--exaggerate", metavar="FACTOR", type=_factor, default=1.0, help=text)
 
 
+def _add_adopt(parser: Parser) -> None:
+    text = "take up effects that the model lacks as soon as they are named, and write adopted.toml with them"
+    parser.add_argument("--adopt", action="store_true", help=text)
+
+
 def _add_noise(parser: Parser) -> None:
     text = "noise of all sensors in place of the described one: 0 none, A, B, C ever more"
     parser.add_argument("--grade", choices=("0", "A", "B", "C"), help=text)
@@ -131,6 +136,7 @@ def _add_live(verbs: Verbs) -> None:
     parser = _add_verb(verbs, "live", "live", "Estimate while the testbed moves, and record what its devices send.")
     _add_system(parser)
     _add_out(parser)
+    _add_adopt(parser)
     text = "go on from the last checkpoint of an earlier session"
     parser.add_argument("--resume", metavar="DIR", type=Path, help=text)
     _add_session_length(parser)
@@ -175,6 +181,7 @@ def _add_replay(verbs: Verbs) -> None:
     parser.add_argument("--bound", action="store_true", help=text)
     text = "as fast as it goes, or in step with the recorded time"
     parser.add_argument("--speed", choices=("max", "1"), default="max", help=text)
+    _add_adopt(parser)
     _add_view(parser)
 
 

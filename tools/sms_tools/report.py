@@ -97,6 +97,7 @@ def event_line(event: Document) -> str:
 def trust_lines(document: Document) -> list[str]:
     """Events, residual, condition number, amount of data, throughput and warnings, a line each."""
     lines = [event_line(event) for event in document["events"]]
+    lines += [f"diagnosis: {episode['summary']}" for episode in document.get("diagnosis", [])]
     for rows, residual in document["residual"].items():
         if residual["relative"] is not None:
             lines.append(f"residual {rows}: {residual['relative']:.3g} of the measured torque or force")

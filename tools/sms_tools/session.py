@@ -12,10 +12,12 @@ from rich.table import Table
 
 from sms_adapters.system_file import load_system
 from sms_online.description.schema import System
+from sms_online.diagnosis.online import OnlineDiagnosis
 from sms_online.errors import InputError
 from sms_online.pipeline.estimator import Estimator
 from sms_online.results import results_document
 from sms_online.stream import Array, Block
+from sms_tools.adopted_system import ONLINE_NAME, adopted_text, write_adopted
 from sms_tools.exit_codes import INTERRUPTED, NOTHING_DETERMINED, OK
 from sms_tools.interruption import Interruption
 from sms_tools.priors import base_prior
@@ -88,6 +90,15 @@ def conclude(args: argparse.Namespace, document: Document, directory: Path, inte
     if interrupted:
         return INTERRUPTED
     return OK if any(p["identifiable"] for p in document["parameters"]) else NOTHING_DETERMINED
+
+
+def write_named(args: argparse.Namespace, online: OnlineDiagnosis, directory: Path) -> None:
+    """With --adopt, the system file with what was named, if anything was."""
+    system = online.system
+    described = load_system(args.system)
+    if args.adopt and system != described:
+        path = write_adopted(directory, adopted_text(args.system, described, system), ONLINE_NAME)
+        show(report_console(args.json), f"system file with what was found: {path}")
 
 
 def unstated_latency(estimator: Estimator) -> list[str]:

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import argparse
+import math
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 
+from sms_online.diagnosis.online import OnlineDiagnosis
 from sms_online.pipeline.estimator import Estimator
 from sms_online.stream import Block
 from sms_tools.html_report.history import History
@@ -43,6 +45,14 @@ class Showing:
     def watch(self, blocks: Iterable[Block]) -> Iterator[Block]:
         """The same blocks, looked at on their way."""
         return iter(self._history.watch(self._view.watch(blocks)))
+
+    def follow(self, online: OnlineDiagnosis) -> None:
+        """Show what a diagnosis finds meanwhile: evidence as a plot, verdicts in the log."""
+
+        def evidence(t: float, scores: Mapping[str, float]) -> None:
+            self._view.evidence(t, {name: math.log10(max(1.0, gain)) for name, gain in scores.items()})
+
+        online.on_evidence, online.on_verdict = evidence, self._view.event
 
     def report(self, document: Document, interruption: Interruption) -> None:
         """Write the page of a finished session, say where it is, and keep serving the view while that is asked for."""

@@ -8,8 +8,8 @@ import numpy as np
 
 from sms_online.diagnosis.diagnose import Diagnosis, State
 from sms_online.diagnosis.force_curves import AddedVariable, ForceCurve, added_variables, force_curves
-from sms_online.diagnosis.residuals import row_types
 from sms_online.diagnosis.weak_windows import Windows
+from sms_online.model.layout import row_types
 from sms_online.stream import Array
 from sms_tools.html_report.svg import Series, chart
 

@@ -24,6 +24,8 @@ NAME = "report.html"
 # Pictures of the arm: at the start, at the end, and evenly between.
 PICTURES = 5
 BOUNDS = 2.0  # standard deviations
+# Candidates in a chart: more lines than that nobody tells apart.
+MOST_CANDIDATES = 6
 
 STYLE = """
 body { font: 15px/1.45 system-ui, sans-serif; color: #1c2733; max-width: 1160px; margin: 2em auto; padding: 0 1em }
@@ -69,6 +71,7 @@ def write_report(
         *_convergence(estimator, history, references),
         "<h2>Residual</h2>",
         *_residual(document, history),
+        *_diagnosis(document),
         "<h2>The arm</h2>",
         *_arm(Scene(estimator.model, exaggeration), history),
         "<h2>Conditions</h2><ul>",
@@ -173,6 +176,24 @@ def _residual(document: Document, history: History) -> list[str]:
         relative = np.array([instant.residual for instant in history.instants])
         series = [Series(f"joint {i + 1}", relative[:, i]) for i in range(relative.shape[1])]
         parts.append(chart("Unexplained torque or force, share", t, series, "time, s", (0.0, 1.0)))
+    return parts
+
+
+def _diagnosis(document: Document) -> list[str]:
+    """What was noticed and named on the way, with the evidence as it grew."""
+    episodes = document.get("diagnosis", [])
+    parts = ["<h2>Diagnosis</h2>"] if episodes else []
+    for episode in episodes:
+        parts.append(f'<p class="verdict">{escape(episode["summary"])}</p>')
+        searches = episode["evidence"]
+        if len(searches) > 1:
+            t = np.array([each["time"] for each in searches])
+            names = list(dict.fromkeys(name for each in searches for name in each["candidates"]))[:MOST_CANDIDATES]
+            gains = np.array([[each["candidates"].get(name, np.nan) for name in names] for each in searches])
+            series = [
+                Series(name, column) for name, column in zip(names, np.log10(np.maximum(gains, 1.0)).T, strict=True)
+            ]
+            parts.append(chart("Evidence for candidates, log10 of the gain", t, series, "time of the newest sample, s"))
     return parts
 
 

@@ -50,6 +50,7 @@ class LiveSession:
         status: StatusWriter | None = None,
     ) -> None:
         self.latencies = Latencies()
+        self.notices: Callable[[], Sequence[str]] = tuple  # further lines of the status
         self.busy = 0.0  # s spent on samples
         self._clock = clock
         self._feeds = feeds
@@ -167,7 +168,13 @@ class LiveSession:
             leading=[
                 Leading(parameters[k].name, parameters[k].unit, float(estimate.pi[k]), float(std[k])) for k in best
             ],
-            troubles=[*troubles, *self._merger.warnings, *self.warnings, *unstated_latency(self._estimator)],
+            troubles=[
+                *self.notices(),
+                *troubles,
+                *self._merger.warnings,
+                *self.warnings,
+                *unstated_latency(self._estimator),
+            ],
         )
         self._said, self._said_samples = now, self._estimator.samples
         self._status.publish(news)

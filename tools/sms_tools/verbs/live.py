@@ -5,15 +5,18 @@ from __future__ import annotations
 import argparse
 import math
 import sys
+from contextlib import closing
 
+from sms_online.diagnosis.online import OnlineDiagnosis
 from sms_tools.exit_codes import INTERRUPTED
 from sms_tools.interruption import Interruption
+from sms_tools.live.searches import SearchProcess
 from sms_tools.live.signals import termination_interrupts
 from sms_tools.live.status import StatusWriter
 from sms_tools.live.testbed import open_testbed
 from sms_tools.report import report_console, show
 from sms_tools.results_file import results_directory
-from sms_tools.session import conclude, described_system, document_of
+from sms_tools.session import conclude, described_system, document_of, write_named
 from sms_tools.showing import showing
 
 # Threads give way to each other after so long, s; by default it is 5 ms, in which a bus sends a dozen frames.
@@ -28,7 +31,13 @@ def run(args: argparse.Namespace) -> int:
     session, estimator, merger = open_testbed(args.system, system, folder, directory, args.resume, status)
     sys.setswitchinterval(SWITCH_INTERVAL)
     with Interruption() as interruption, termination_interrupts():
-        with showing(args, estimator, merger.channels, directory, None) as shown:
+        with (
+            showing(args, estimator, merger.channels, directory, None) as shown,
+            closing(SearchProcess(directory, args.adopt)) as searches,
+        ):
+            online = OnlineDiagnosis(estimator, searches, args.adopt)
+            session.notices = lambda: online.notices
+            shown.follow(online)
             blocks = session.blocks(interruption, math.inf if args.duration is None else args.duration)
             for block in shown.watch(blocks):
                 estimator.push(block)
@@ -37,7 +46,10 @@ def run(args: argparse.Namespace) -> int:
         status.close()
         throughput = estimator.samples / session.busy if session.busy else 0.0
         warnings = [*merger.warnings, *session.warnings, *shown.warnings]
+        warnings += [] if searches.problem is None else [searches.problem]
         document = document_of(estimator, throughput, warnings, None)
+        document["diagnosis"] = online.document()
+        write_named(args, online, directory)
         code = conclude(args, document, directory, interrupted=False)
         shown.report(document, interruption)
     half, nearly_all = session.latencies.quantile(0.5), session.latencies.quantile(0.99)

@@ -17,10 +17,20 @@ from sms_adapters.session_log import SESSION
 from sms_adapters.sources import open_source
 from sms_adapters.truth import read_truth
 from sms_online.bound import MotionRecord, session_bound
+from sms_online.diagnosis.online import Immediate, OnlineDiagnosis
 from sms_online.stream import Block
 from sms_tools.interruption import Interruption
+from sms_tools.live.searches import searcher_of
 from sms_tools.results_file import results_directory
-from sms_tools.session import check_part, conclude, described_system, document_of, new_estimator, stream
+from sms_tools.session import (
+    check_part,
+    conclude,
+    described_system,
+    document_of,
+    new_estimator,
+    stream,
+    write_named,
+)
 from sms_tools.showing import showing
 
 # A progress bar appears from this size on, bytes: a second of work.
@@ -63,11 +73,16 @@ def run(args: argparse.Namespace) -> int:
                 blocks = _pieces(source, PIECE)
             patient = args.speed == "max"
             with showing(args, estimator, source.channels, directory, parameters, patient) as shown:
+                searcher = searcher_of(capture, args.adopt) if args.start is args.stop is None else Immediate()
+                online = OnlineDiagnosis(estimator, searcher, args.adopt)
+                shown.follow(online)
                 stream(estimator, shown.watch(blocks), interruption)
                 wall = perf_counter() - opened
         bound = None if record is None else session_bound(estimator, record)
         warnings = [*source.warnings, *shown.warnings]
         document = document_of(estimator, estimator.samples / wall, warnings, parameters, bound)
+        document["diagnosis"] = online.document()
+        write_named(args, online, directory)
         code = conclude(args, document, directory, interruption.requested)
         shown.report(document, interruption)
     return code

@@ -10,6 +10,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
+from sms_online.description.schema import Effect
 from sms_online.pipeline.estimator import Estimator, SquaredResidual
 from sms_online.pipeline.events import Event
 from sms_online.pipeline.momentum import Momentum
@@ -22,11 +23,12 @@ from sms_online.trackers.interface import State
 class MomentumSnapshot:
     """Of the momentum balance: its tracker, the bias of noisy columns, and the sums behind whitened residuals.
 
-    added: names of the parameters that events have added.
+    added: names of the parameters that events have added. adopted: effects that were taken up.
     """
 
     events: tuple[Event, ...]
     added: tuple[str, ...]
+    adopted: tuple[Effect, ...]
     windows: int
     dropped_windows: int
     tracker: State
@@ -72,6 +74,7 @@ def _take_momentum(momentum: Momentum) -> MomentumSnapshot:
     return MomentumSnapshot(
         events=tuple(momentum.changes.events),
         added=momentum.changes.added,
+        adopted=momentum.changes.adopted,
         windows=momentum.windows,
         dropped_windows=momentum.dropped_windows,
         tracker=momentum.tracker.state(),
@@ -95,7 +98,7 @@ def apply(snapshot: Snapshot, replica: Estimator) -> None:
         replica.smoother.learn(snapshot.smoother)
     known, momentum = snapshot.momentum, replica.momentum
     if known is not None and momentum is not None:
-        momentum.follow(known.events, known.added)
+        momentum.follow(known.events, known.added, known.adopted)
         momentum.windows, momentum.dropped_windows = known.windows, known.dropped_windows
         momentum.tracker.restore(known.tracker)
         momentum.bias.restore(known.bias)

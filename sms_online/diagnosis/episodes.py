@@ -1,0 +1,111 @@
+"""What a running session has noticed, and what came of it, as people and results.json have it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+from sms_online.diagnosis.online_search import Named, Outcome
+from sms_online.pipeline.events import Event
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """What a search said: of samples up to `time`, s, known when samples up to `known`, s, were there."""
+
+    time: float
+    known: float
+    outcome: Outcome
+
+
+@dataclass
+class Episode:
+    """More than noise, and what came of it.
+
+    noticed: s, samples up to then were there. row: type of the rows that leave most; began: s, None where it may have
+    been there from the start. verdict: "noticed", "named", "unexplained", "passed" where the last samples show nothing
+    of it, or "change" where a jump of parameters, the event, explains it. named_at: s, when a search first named what
+    was found in the end, or when the event was decided. adopted: s, when what was named was taken up; refused: why not.
+    """
+
+    noticed: float
+    row: str
+    began: float | None
+    verdict: str = "noticed"
+    named: tuple[Named, ...] = ()
+    named_at: float | None = None
+    adopted: float | None = None
+    refused: str | None = None
+    event: Event | None = None
+    evidence: list[Evidence] = field(default_factory=list)
+
+
+def line(episode: Episode) -> str:
+    """What there is to say of an episode."""
+    where = f"more than noise in the rows of {episode.row} since {episode.noticed:.2f} s"
+    if episode.verdict == "named":
+        told = ", ".join(_told(named) for named in episode.named)
+        taken = ""
+        if episode.adopted is not None:
+            taken = f"; taken up at {episode.adopted:.2f} s"
+        elif episode.refused is not None:
+            taken = f"; not taken up: {episode.refused}"
+        return f"{where}: the model lacks {told}{taken}"
+    if episode.verdict == "unexplained":
+        nearest = ""
+        if episode.evidence and (last := episode.evidence[-1].outcome).keys:
+            nearest = f"; the nearest ({', '.join(last.keys)}) leave {100.0 * last.left:.0f} % of it"
+        return f"{where}, which no known effect explains{nearest}"
+    if episode.verdict == "passed":
+        return f"{where}, of which the last samples show nothing"
+    if episode.event is not None:
+        jumps = zip(episode.event.parameters, episode.event.sizes, episode.event.units, strict=True)
+        return f"{where}: {', '.join(f'{name} {size:+.4g} {unit}' for name, size, unit in jumps)}"
+    return f"{where}, not named yet"
+
+
+def _told(named: Named) -> str:
+    values = ", ".join(
+        f"{name} {value:.4g}" + ("" if std is None else f" ± {std:.2g}") + f" {unit}".rstrip()
+        for name, (value, std, unit) in named.coefficients.items()
+    )
+    others = f", or {', '.join(named.ambiguous)}" if named.ambiguous else ""
+    return f"{named.key}{others} ({values})"
+
+
+def episode_document(episode: Episode) -> dict[str, Any]:
+    """An episode as results.json holds it."""
+    return {
+        "summary": line(episode),
+        "noticed": episode.noticed,
+        "row": episode.row,
+        "began": episode.began,
+        "verdict": episode.verdict,
+        "named": episode.named_at,
+        "adopted": episode.adopted,
+        "refused": episode.refused,
+        "effects": [
+            {
+                "name": named.effect.name,
+                "where": named.effect.where,
+                "coefficients": {
+                    name: {"estimate": value, "std": std, "unit": unit}
+                    for name, (value, std, unit) in named.coefficients.items()
+                },
+                "ambiguous_with": list(named.ambiguous),
+                "evidence": {"gain": named.gain, "limit": named.limit},
+            }
+            for named in episode.named
+        ],
+        "evidence": [
+            {
+                "time": evidence.time,
+                "known": evidence.known,
+                "verdict": evidence.outcome.verdict,
+                "named": list(evidence.outcome.keys),
+                "left": evidence.outcome.left,
+                "candidates": evidence.outcome.scores,
+            }
+            for evidence in episode.evidence
+        ],
+    }

@@ -1,0 +1,342 @@
+"""Diagnosis while a session runs: more than noise is noticed, the effect behind it is named, and taken up if wanted.
+
+Samples are remembered for some seconds. Where the sequential test or the detector of changes alarms, they are searched,
+again as more come, until two searches in a row name the same. Everything is decided between internal blocks and at
+times of the data, so that a session and its repetition decide the same: what a search says may be used at once, or at a
+later block, which has to be the same one in the repetition (`Searcher`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sms_online.description.schema import Effect, System
+from sms_online.diagnosis.constants import applied, is_constant
+from sms_online.diagnosis.episodes import Episode, Evidence, episode_document, line
+from sms_online.diagnosis.online_search import Named, Outcome, Request, least_samples, search
+from sms_online.diagnosis.record import Segment
+from sms_online.effects.catalogue import ENTRIES
+from sms_online.model.model import Model
+from sms_online.pipeline.estimator import Estimator
+from sms_online.pipeline.events import Event
+from sms_online.pipeline.momentum import Momentum
+from sms_online.pipeline.momentum_balance import MARGIN
+from sms_online.pipeline.synchronise import GridSamples
+from sms_online.stream import Array
+from sms_online.trackers.factor import solve
+
+# Times are in units of the windows of the momentum balance, those of 0.4 s at least.
+SHORTEST_UNIT = 0.4
+# Samples that are remembered, and those before an effect that tell the parameters: 16 s and 6 s at the usual width.
+REMEMBERED, BEFORE = 40.0, 15.0
+# Fewer before an effect tell nothing beside it: it may as well have been there from the start.
+LEAST_BEFORE = 5.0
+# A search is made when there are so many after an effect has begun: 1.2, 2, 3.2, 4.8, 7.2 and 12 s; and of one that may
+# have been there all the time, when so many are remembered: 4, 6, 8, 12 and 16 s.
+DUE = (3.0, 5.0, 8.0, 12.0, 18.0, 30.0)
+DUE_FROM_THE_START = (10.0, 15.0, 20.0, 30.0, 40.0)
+
+# Episodes whose effects are taken up at most: what is left of a real rig then is for a person.
+MOST_ADOPTED = 8
+
+
+class Searcher(Protocol):
+    """Makes searches, one at a time."""
+
+    def submit(self, number: int, request: Request) -> bool:
+        """Begin a search; False where this one is left out."""
+
+    def outcome(self, block: int) -> tuple[int, Outcome | None] | None:
+        """Number of the search that was begun, and what it says, once, from the internal block on that may use it."""
+
+
+class Immediate:
+    """Every search, at once."""
+
+    def __init__(self) -> None:
+        self._done: tuple[int, Outcome | None] | None = None
+
+    def submit(self, number: int, request: Request) -> bool:
+        """See `Searcher`."""
+        self._done = number, search(request)
+        return True
+
+    def outcome(self, block: int) -> tuple[int, Outcome | None] | None:
+        """See `Searcher`."""
+        done, self._done = self._done, None
+        return done
+
+
+@dataclass(frozen=True)
+class _Onset:
+    """Grid indices: the effect is absent up to `last`, None where it may always have been there, and present from
+    `first`. factor, windows: what is known from before."""
+
+    last: int | None
+    first: int
+    factor: Array
+    windows: int
+
+
+class OnlineDiagnosis:
+    """Watches one session, from before its first sample; takes the estimator's `on_samples` and `on_block`.
+
+    adopt: take up what is named. on_verdict (t, text), on_evidence (t, gain by candidate): are told what is new.
+    """
+
+    def __init__(self, estimator: Estimator, searcher: Searcher, adopt: bool) -> None:
+        self.episodes: list[Episode] = []
+        self.on_verdict: Callable[[float, str], None] = lambda t, text: None
+        self.on_evidence: Callable[[float, Mapping[str, float]], None] = lambda t, scores: None
+        self._estimator, self._searcher, self._adopt = estimator, searcher, adopt
+        system = estimator.system
+        self._unit = round(max(SHORTEST_UNIT, system.windows.momentum) * system.sample_rate)
+        self._record: list[GridSamples] = []
+        self._valid = 0  # grid index from which on the current model, or what it lacks, has been there
+        self._blocks = 0
+        self._events = len(estimator.events)
+        self._quiet = False  # what is lacking has been said, and not taken up
+        self._onset: _Onset | None = None  # of the open episode
+        self._due = 0  # searches of the open episode that were due so far
+        self._begun = 0  # searches that were begun or left out
+        self._pending: tuple[int, float] | None = None  # number of a search that runs, and time of its last sample, s
+        estimator.on_samples = self._keep
+        estimator.on_block = self._step
+
+    @property
+    def system(self) -> System:
+        """The described system with the effects that were named, taken up or not, and those that events have added."""
+        system = self._estimator.system
+        found = [named.effect for episode in self.episodes for named in episode.named]
+        changed = [name for episode in self.episodes if episode.event for name in episode.event.parameters]
+        for key in dict.fromkeys(name.rsplit(".", 1)[0] for name in changed if "@" in name):
+            effect, _, where = key.partition("@")
+            found.append(Effect(name=effect, where=where))
+        held = {(effect.name, effect.where) for effect in system.effects}
+        fresh = {(effect.name, effect.where): effect for effect in found if (effect.name, effect.where) not in held}
+        forces = [effect for effect in fresh.values() if not is_constant(effect)]
+        declared = system.model_copy(update={"effects": (*system.effects, *forces)})
+        return applied(declared, [effect for effect in fresh.values() if is_constant(effect)])
+
+    @property
+    def notices(self) -> list[str]:
+        """What there is to say, a line for each episode."""
+        return [line(episode) for episode in self.episodes]
+
+    def document(self) -> list[dict[str, Any]]:
+        """The episodes as results.json holds them."""
+        return [episode_document(episode) for episode in self.episodes]
+
+    def _keep(self, piece: GridSamples) -> None:
+        self._record.append(piece)
+        oldest = int(piece.index[-1]) - round(REMEMBERED * self._unit)
+        while self._record[0].index[-1] < oldest:
+            self._record.pop(0)
+
+    def _step(self) -> None:
+        """An internal block is through."""
+        self._blocks += 1
+        done = self._searcher.outcome(self._blocks)
+        if self._estimator.momentum is None or not self._record:
+            return
+        self._follow_events()
+        if done is not None and self._pending is not None and done[0] == self._pending[0]:
+            time, self._pending = self._pending[1], None
+            if done[1] is not None and self._onset is not None:
+                self._hear(Evidence(time, self._now, done[1]))
+        self._notice()
+        self._search()
+
+    @property
+    def _momentum(self) -> Momentum:
+        momentum = self._estimator.momentum
+        assert momentum is not None  # else nothing is done
+        return momentum
+
+    @property
+    def _now(self) -> float:
+        return self._time(int(self._record[-1].index[-1]))
+
+    def _time(self, index: float) -> float:
+        return float(self._estimator.start_time + index / self._estimator.system.sample_rate)
+
+    def _follow_events(self) -> None:
+        """A jump of parameters explains what was noticed; what no jump explains goes on being searched."""
+        for event in self._estimator.events[self._events :]:
+            self._events += 1
+            if event.kind in ("unexplained", "undecided"):
+                continue
+            if self._onset is None:
+                evidence = self._momentum.test.evidence
+                self.episodes.append(Episode(self._now, max(evidence, key=lambda row: evidence[row]), event.time))
+            episode = self.episodes[-1]
+            episode.verdict, episode.named, episode.event, episode.named_at = "change", (), event, self._now
+            self._close()
+            self.on_verdict(self._now, line(episode))
+            index = round((event.time - self._estimator.start_time) * self._estimator.system.sample_rate)
+            self._valid, self._quiet = index + self._unit // 2, False
+
+    def _close(self) -> None:
+        self._onset, self._pending = None, None
+
+    def _notice(self) -> None:
+        if self._onset is not None or self._quiet:
+            return
+        detector, test = self._momentum.changes.detector, self._momentum.test
+        width = self._momentum.changes.window_samples
+        if detector.alarm is not None:
+            last, first = detector.onset - MARGIN, detector.alarm
+            row = max(test.evidence, key=lambda name: test.evidence[name])
+        elif test.alarm is not None:
+            last, first, row = test.alarm.since - width, test.alarm.end - width, test.alarm.row
+        elif (joint := self._momentum.fit.unexplained) is not None:
+            # Rows are not even weighed.
+            last, first, row = -1, 0, f"joint_{joint + 1}"
+        else:
+            return
+        seen = detector.before(last) if last >= 0 else None
+        if seen is None or last - self._valid < LEAST_BEFORE * self._unit:
+            n = self._estimator.base.n
+            self._onset = _Onset(None, self._valid, np.zeros((n + 1, n + 1)), 0)
+        else:
+            self._onset = _Onset(last, first, seen.factor, seen.windows)
+        began = None if self._onset.last is None else self._time(0.5 * (last + first))
+        self._due = 0
+        self.episodes.append(Episode(self._now, row, began))
+        self.on_verdict(self._now, line(self.episodes[-1]))
+
+    def _search(self) -> None:
+        """Begin the search that is due."""
+        onset = self._onset
+        if onset is None:
+            return
+        newest = int(self._record[-1].index[-1])
+        schedule = DUE_FROM_THE_START if onset.last is None else DUE
+        first = max(onset.first, int(self._record[0].index[0]))
+        due = int(np.count_nonzero((newest - first) / self._unit >= np.array(schedule)))
+        if due > self._due:
+            self._due = due
+            self._begun += 1
+            request = self._request(onset)
+            if self._pending is None and request is not None and self._searcher.submit(self._begun, request):
+                self._pending = self._begun, self._now
+        elif self._due == len(schedule) and self._pending is None:
+            self._give_up()
+
+    def _give_up(self) -> None:
+        """Nothing was named twice by all that is remembered."""
+        episode = self.episodes[-1]
+        passed = bool(episode.evidence) and episode.evidence[-1].outcome.verdict == "clean"
+        episode.verdict, episode.named, episode.named_at = "passed" if passed else "unexplained", (), None
+        self._quiet = True
+        self._close()
+        self.on_verdict(self._now, line(episode))
+
+    def _request(self, onset: _Onset) -> Request | None:
+        """The record, cut where the effect began."""
+        estimator = self._estimator
+        before: list[Segment] = []
+        if onset.last is not None:
+            earliest = max(self._valid, onset.last - round(BEFORE * self._unit))
+            before = self._segments(earliest, onset.last)
+        after = self._segments(onset.first, None)
+        beta = solve(onset.factor).pi if before else estimator.estimate().pi
+        momentum = self._momentum
+        assert momentum.sensor_noise is not None
+        if not after:
+            return None
+        return Request(
+            model=estimator.model,
+            base=estimator.base,
+            sensing=estimator.sensing,
+            noise=momentum.sensor_noise,
+            segments=(*before, *after),
+            late=len(before),
+            beta=beta,
+            weighed=momentum.started,
+            prior=None if momentum.prior is None else momentum.changes.prior(momentum.prior),
+        )
+
+    def _segments(self, first: int, last: int | None) -> list[Segment]:
+        """Remembered samples from one grid index to another, cut at gaps; those too short for a window left out."""
+        out = []
+        for number in dict.fromkeys(piece.segment for piece in self._record):
+            own = [piece for piece in self._record if piece.segment == number]
+            index, values = (np.concatenate([getattr(piece, part) for piece in own]) for part in ("index", "values"))
+            inside: NDArray[np.bool_] = (index >= first) & (True if last is None else index <= last)
+            if int(inside.sum()) > least_samples(self._estimator.system):
+                out.append(Segment(index[inside], values[inside]))
+        return out
+
+    def _hear(self, evidence: Evidence) -> None:
+        """What a search said."""
+        episode, outcome = self.episodes[-1], evidence.outcome
+        before = episode.evidence[-1].outcome if episode.evidence else None
+        episode.evidence.append(evidence)
+        self.on_evidence(evidence.known, outcome.scores)
+        if outcome.verdict != "named":
+            episode.verdict, episode.named, episode.named_at = "noticed", (), None
+            return
+        again = before is not None and before.verdict == "named" and before.keys == outcome.keys
+        if not again:
+            episode.named_at = evidence.known
+        episode.verdict, episode.named = "named", outcome.named
+        if again and self._adopt:
+            self._take_up(episode, outcome)
+        self.on_verdict(evidence.known, line(episode))
+        if again:
+            adopted = sum(each.adopted is not None for each in self.episodes)
+            self._quiet = episode.adopted is None or adopted == MOST_ADOPTED
+            self._close()
+
+    def _take_up(self, episode: Episode, outcome: Outcome) -> None:
+        """Go on with what was named."""
+        onset, estimator = self._onset, self._estimator
+        assert onset is not None
+        episode.refused = refusal(estimator.model, outcome.named)
+        n = estimator.base.n
+        first, known = onset.first, (onset.factor, onset.windows)
+        if not outcome.began or onset.last is None:
+            first, known = self._valid, (np.zeros((n + 1, n + 1)), 0)
+        last = self._record[-1].segment
+        pieces = [piece for piece in self._record if piece.segment == last]
+        index, values = (np.concatenate([getattr(piece, part) for piece in pieces]) for part in ("index", "values"))
+        late = index >= first
+        if episode.refused is not None:
+            return
+        samples = GridSamples(index[late], values[late], last)
+        time = self._time(int(samples.index[0])) if episode.began is None or not outcome.began else episode.began
+        event = Event(
+            time=time,
+            kind="effect",
+            parameters=tuple(name for named in outcome.named for name in named.parameters),
+            units=tuple(unit for named in outcome.named for unit in named.units),
+            sizes=tuple(float(value) for named in outcome.named for value in named.values),
+            stds=tuple(float(std) for named in outcome.named for std in named.stds),
+            dropped_windows=0,
+        )
+        weights = np.concatenate((outcome.beta, *(named.values for named in outcome.named)))
+        effects = [named.effect for named in outcome.named]
+        estimator.adopt(self._momentum.changes.adopt(effects, event, known, weights, samples))
+        self._events = len(estimator.events)
+        self._valid = int(samples.index[0])
+        episode.adopted = self._now
+
+
+def refusal(model: Model, named: tuple[Named, ...]) -> str | None:
+    """Why effects cannot be taken up while a session runs, None where they can: stages before the balance stay."""
+    channels = [effect for effect in model.system.effects if ENTRIES[effect.name].kind == "channel"]
+    if channels or model.n_states:
+        return "the samples are corrected, or internal states followed, for what the system file declares"
+    for each in named:
+        if is_constant(each.effect):
+            return f"{each.key} is a constant of the description"
+        with_it = model.of(model.system.model_copy(update={"effects": (*model.system.effects, each.effect)}))
+        if with_it.n_states:
+            return f"{each.key} has an internal state, which begins at rest"
+    return None

@@ -1,0 +1,319 @@
+"""Which effect the last seconds of a running session hold: the search of a diagnosis over a bounded record.
+
+An effect that began while the session ran has no trace before: its columns are zero in the windows of the samples
+before, which tell the parameters. Where nothing is named so, it may have been there all the time: the same columns once
+more, in all windows. A search is a function of its request alone, so that it may be made in another process, or again.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sms_online.description.schema import Effect, System
+from sms_online.diagnosis.candidates import LINEAR, CandidateColumns
+from sms_online.diagnosis.constants import applied, corrected, deviations, improved
+from sms_online.diagnosis.diagnose import (
+    CORRECTIONS,
+    FITTED,
+    LARGEST_SHARE_LEFT,
+    MOST_WINDOWS,
+    REWEIGHED,
+    STRETCH,
+)
+from sms_online.diagnosis.followed import HALF_WIDTH
+from sms_online.diagnosis.record import Segment, excerpts
+from sms_online.diagnosis.residuals import ResidualTest
+from sms_online.diagnosis.rows import SessionRows
+from sms_online.diagnosis.shape import refine
+from sms_online.diagnosis.trace import Candidate, Tracing
+from sms_online.effects.base import report
+from sms_online.effects.catalogue import ENTRIES, declarable
+from sms_online.effects.spacecraft import TableTilt
+from sms_online.model.base_parameters import BaseParameters
+from sms_online.model.model import Model
+from sms_online.pipeline.momentum_balance import HOPS
+from sms_online.pipeline.sensing import Sensing
+from sms_online.pipeline.sensor_noise import SensorNoise
+from sms_online.stream import Array
+from sms_online.trackers.interface import Prior
+
+# Windows that the effect acts in, of which a third checks what the others say.
+LEAST_WINDOWS = 12
+# What takes less than this share of what the best effect takes is rather an error of that one's model, for real
+# friction has no corner; else it is found once the others have been taken up.
+LEAST_SHARE = 0.01
+# Candidates whose evidence is told, the best ones.
+TOLD = 8
+
+
+@dataclass(frozen=True)
+class Request:
+    """Samples of a session that show more than noise.
+
+    model, base: those of the session, of `model.system`. segments: gap-free samples of the session's channels as they
+    came. late: number of the first segment that holds the effect, if it began at all. beta (n,): parameters behind the
+    rows' noise; weighed: they come from rows that were weighed by it. prior: what is known of them beforehand.
+    """
+
+    model: Model
+    base: BaseParameters
+    sensing: Sensing
+    noise: SensorNoise
+    segments: tuple[Segment, ...]
+    late: int
+    beta: Array
+    weighed: bool
+    prior: Prior | None
+
+
+@dataclass(frozen=True)
+class Named:
+    """An effect that the record shows.
+
+    effect: as a system file declares it. parameters, values (c,): its unknowns of π, none where it is a constant.
+    coefficients: as people read them, name to value, 1σ (None where there is none) and unit. gain: evidence, twice the
+    log likelihood ratio; limit: what the best of all absent candidates reaches by accident. ambiguous: keys of others
+    that explain as much.
+    """
+
+    effect: Effect
+    parameters: tuple[str, ...]
+    units: tuple[str, ...]
+    values: Array
+    stds: Array
+    coefficients: dict[str, tuple[float, float | None, str]]
+    gain: float
+    limit: float
+    ambiguous: tuple[str, ...]
+
+    @property
+    def key(self) -> str:
+        """name@where."""
+        return f"{self.effect.name}@{self.effect.where}"
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What a search says: verdict "clean", "named" or "unexplained".
+
+    named: the effects found, also where they leave more than noise. scores: gain of the best candidates alone, by key.
+    left: share of what was beyond noise that is left. began: whether the effects are absent from the segments before
+    the late ones. beta (n,): parameters with the effects.
+    """
+
+    verdict: str
+    named: tuple[Named, ...]
+    scores: dict[str, float]
+    left: float
+    began: bool
+    beta: Array
+
+    @property
+    def keys(self) -> tuple[str, ...]:
+        """What was found, in an order that does not depend on that of the search."""
+        return tuple(sorted(named.key for named in self.named))
+
+
+def least_samples(system: System) -> int:
+    """Samples of a segment that give any window."""
+    return round(1.5 * system.windows.momentum * system.sample_rate) + 2 * HALF_WIDTH
+
+
+class LateColumns(CandidateColumns):
+    """Candidates that act from a segment on."""
+
+    def __init__(self, rows: SessionRows, system: System, late: int) -> None:
+        super().__init__(rows, system)
+        self._before = rows.weak.windows.segment < late
+
+    def of(self, effect: Effect) -> Candidate:
+        """The candidate of one declaration."""
+        return self.limited(super().of(effect))
+
+    def limited(self, candidate: Candidate) -> Candidate:
+        """The same without the windows before."""
+        return replace(candidate, columns=np.where(self._before[:, None, None], 0.0, candidate.columns))
+
+
+def search(request: Request) -> Outcome | None:
+    """Trace what the record holds beyond the model; None where it is too short to tell, or its rows are degenerate."""
+    try:
+        return _search(_bounded(request))
+    except np.linalg.LinAlgError:
+        return None
+
+
+def _search(request: Request) -> Outcome | None:
+    system = request.model.system
+    rows = _rows(request, request.beta)
+    late = rows.weak.windows.segment >= request.late
+    if int(late.sum()) < LEAST_WINDOWS or rows.count * rows.model.layout.n_v < 2 * rows.base.n:
+        return None
+    everything = CandidateColumns(rows, system).all()
+    outcome = _trace(request, rows, everything, request.late)
+    for _ in range(0 if request.weighed else REWEIGHED):
+        # Nothing was known of the rows' noise that was worth the name, for nothing explained the torques.
+        outcome = _trace(request, _rows(request, outcome.beta), everything, request.late)
+    if outcome.verdict != "unexplained" or request.late == 0:
+        return outcome
+    always = _trace(request, rows, everything, 0)
+    return always if always.verdict == "named" or always.left < outcome.left else outcome
+
+
+def _bounded(request: Request) -> Request:
+    """Stretches of the record, where its windows are so short that it holds too many of them."""
+    windows, rate = request.model.system.windows, request.model.system.sample_rate
+    length, most = round(STRETCH * windows.momentum * rate), round(MOST_WINDOWS * windows.momentum / HOPS * rate)
+    before = excerpts(request.segments[: request.late], length, most // 3)
+    after = excerpts(request.segments[request.late :], length, most - most // 3)
+    return replace(request, segments=(*before, *after), late=len(before))
+
+
+def _rows(request: Request, beta: Array, late: int = 0, constants: Sequence[Effect] = ()) -> SessionRows:
+    """Rows of the record, the late segments free of what these constants do to channels."""
+    system, channels = request.model.system, request.sensing.channels
+    described = applied(system, constants)
+    segments = [
+        corrected(described if number >= late else system, channels, segment)
+        for number, segment in enumerate(request.segments)
+    ]
+    return SessionRows(request.model, request.base, request.sensing, request.noise, segments, beta)
+
+
+def _fitted(rows: SessionRows, late: int) -> NDArray[np.bool_]:
+    """All windows before, and so many of those that the effect acts in."""
+    acting = np.flatnonzero(rows.weak.windows.segment >= late)
+    fitted = np.ones(rows.count, dtype=bool)
+    fitted[acting[round(FITTED * acting.size) :]] = False
+    return fitted
+
+
+def _trace(request: Request, rows: SessionRows, everything: Sequence[Candidate], late: int) -> Outcome:
+    """One search, for effects that act from a segment on."""
+    system = request.model.system
+    make = LateColumns(rows, system, late)
+    limited = [make.limited(candidate) for candidate in everything]
+    fitted = _fitted(rows, late)
+    tracing = Tracing(rows, [c for c in limited if np.any(c.columns)], fitted, request.prior)
+    chosen = tracing.run(lambda found, k: refine(tracing, make, found, k))
+    ranking = tracing.ranking()[:TOLD]
+    findings = [tracing.finding(chosen, k) for k in chosen]
+    gains = {k: finding.gain.gain for k, finding in zip(chosen, findings, strict=True)}
+    kept = [k for k in chosen if gains[k] >= LEAST_SHARE * max(gains.values())]
+    if channels := [k for k in kept if ENTRIES[tracing.candidates[k].effect.name].kind == "channel"]:
+        # One at a time, for its column is a first approximation: what others take is told once it has been taken off.
+        best = max(channels, key=lambda k: gains[k])
+        kept = [*(k for k in kept if k not in channels), best]
+    if kept != chosen:
+        chosen, findings = kept, [tracing.finding(kept, k) for k in kept]
+    before = _excess(tracing, [])
+    final, used, constant = tracing, list(chosen), None
+    if channels:
+        final, used, constant = _corrected(request, tracing, chosen, late)
+    after = _excess(final, used)
+    left = max(0.0, after) / max(before, 1.0)
+    beyond = any(row.beyond for row in ResidualTest(final.rows).of(_residual(final, used)).values())
+    unknown = beyond and (not chosen or left > LARGEST_SHARE_LEFT)
+    verdict = "unexplained" if unknown else "named" if chosen else "clean"
+    solution, covariance = _solution(final, used), final.covariance(used)
+    named = [
+        Named(
+            effect=improved(effect, solution[own]) if effect.name == TableTilt.entry.name else effect,
+            parameters=tuple(p.name for p in finding.candidate.parameters) if effect is not constant else (),
+            units=tuple(p.unit for p in finding.candidate.parameters) if effect is not constant else (),
+            values=solution[own] if effect is not constant else np.empty(0),
+            stds=np.sqrt(np.diag(covariance))[own] if effect is not constant else np.empty(0),
+            coefficients=_coefficients(request, final, used, effect, own, effect is constant),
+            gain=finding.gain.gain,
+            limit=finding.limit,
+            ambiguous=finding.ambiguous,
+        )
+        for finding, (effect, own) in zip(findings, _places(final, used, constant), strict=True)
+    ]
+    scores = {ranked.candidate.key: ranked.gain for ranked in ranking}
+    return Outcome(verdict, tuple(named), scores, left, late > 0, solution[: rows.base.n])
+
+
+def _solution(tracing: Tracing, used: Sequence[int]) -> Array:
+    return tracing.solution(used, np.ones(tracing.rows.count, dtype=bool))
+
+
+def _residual(tracing: Tracing, used: Sequence[int]) -> Array:
+    return tracing.residual(used, _solution(tracing, used))
+
+
+def _excess(tracing: Tracing, used: Sequence[int]) -> float:
+    """Sum of squares beyond noise."""
+    residual = _residual(tracing, used)
+    return float(np.sum(residual**2) - residual.size)
+
+
+def _places(tracing: Tracing, used: Sequence[int], constant: Effect | None) -> list[tuple[Effect, slice]]:
+    """The effects in the order of the search, and where the solution holds them; a constant, the last, comes first."""
+    candidates = [tracing.candidates[k] for k in used]
+    at = tracing.rows.base.n if constant is None else tracing.rows.base.n + len(LINEAR[constant.name])
+    out = []
+    for candidate in candidates:
+        out.append((candidate.effect, slice(at, at + len(candidate.parameters))))
+        at += len(candidate.parameters)
+    if constant is not None:
+        out.append((constant, slice(tracing.rows.base.n, tracing.rows.base.n + len(LINEAR[constant.name]))))
+    return out
+
+
+def _corrected(
+    request: Request, tracing: Tracing, chosen: Sequence[int], late: int
+) -> tuple[Tracing, list[int], Effect]:
+    """The same effects, with the readings free of the last one, a channel's, and its constants improved."""
+    system, n = request.model.system, request.base.n
+    forces = [tracing.candidates[k].effect for k in chosen[:-1]]
+    solution = _solution(tracing, chosen)
+    last = tracing.candidates[chosen[-1]]
+    constant = improved(last.effect, solution[len(solution) - len(last.parameters) :])
+    used = list(range(len(forces)))
+    for _ in range(CORRECTIONS):
+        rows = _rows(request, solution[:n], late, [constant])
+        make = LateColumns(rows, applied(system, [constant]), late)
+        candidates = [make.of(force) for force in forces]
+        tracing = Tracing(rows, candidates, _fitted(rows, late), request.prior, [make.of(constant)])
+        solution = _solution(tracing, used)
+        constant = improved(constant, solution[n : n + len(last.parameters)])
+    return tracing, used, constant
+
+
+def _coefficients(
+    request: Request, tracing: Tracing, used: Sequence[int], effect: Effect, own: slice, constant: bool
+) -> dict[str, tuple[float, float | None, str]]:
+    """What people read of an effect."""
+    system, base = request.model.system, request.base
+    solution, covariance = _solution(tracing, used), tracing.covariance(used)
+    units = declarable(ENTRIES[effect.name], system)
+    if constant:
+        stds = deviations(effect, covariance[own, own])
+        return {name: (value, stds.get(name), units.get(name, "")) for name, value in effect.coefficients.items()}
+    names = [p.name for p in base.parameters]
+    declared = system.model_copy(update={"effects": (*system.effects, effect)})
+    model = Model(declared, base.physical_values(solution[: base.n]))
+    known = [*range(base.n), *range(own.start, own.stop)]
+    values, spread = solution[known], covariance[np.ix_(known, known)]
+    spread = np.where(np.isfinite(spread), spread, 0.0)
+    for force in model.effects:
+        if (force.name, force.where) == (effect.name, effect.where):
+            names += [p.name for p in force.parameters]
+            # What only a combination of parameters is known of counts as zero in the others' favour.
+            absent = [name for name in force.relative_to if name not in names]
+            told = report(force, [*names, *absent], np.pad(values, (0, len(absent))), np.pad(spread, (0, len(absent))))
+            return {
+                name: (value, None if name in force.shapes else std, units.get(name, ""))
+                for name, (value, std) in told.items()
+            }
+    fresh = [p for p in model.parameters if p.name.startswith(f"{effect.name}@{effect.where}.")]
+    stds_own = np.sqrt(np.diag(spread))[base.n :]
+    return {
+        p.quantity: (float(value), float(std), p.unit)
+        for p, value, std in zip(fresh, values[base.n :], stds_own, strict=True)
+    }

@@ -1,0 +1,165 @@
+"""Do the rows leave more than noise? A sequential test of every coordinate and row type of the momentum balance.
+
+The rows of a window are compared with the estimate from windows that ended before it began, so that the two share no
+sample: of e = b - Y β̂ the covariance is C + Y P Yᵀ, C what the sensors' noise makes of
+the rows and P that of β̂. Where nothing but noise is
+left e² over its variance is χ². A variance v₁ of e against a variance v₀, both in units of that, has the log likelihood
+ratio ½ χ² (1/v₀ - 1/v₁) - ½ ν log(v₁/v₀) for ν coordinates, and its cumulative sum, never below zero, alarms beyond h.
+
+The expectation of its exponential is 1 at the variance v₀ and less below it, so that the mean number of independent
+windows to a false alarm is at least eʰ; a cap on what one window counts only adds to it. Windows overlap, so every sum
+takes one window in HOPS: there are HOPS of them for every test, and their rates add. Hence h for a stated rate.
+Sources: Page, Biometrika 41 (1954) 100; Lorden, Annals of Mathematical Statistics 42 (1971) 1897 (the bound).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sms_online.model.layout import Layout, row_types
+from sms_online.pipeline.momentum_balance import HOPS
+from sms_online.pipeline.momentum_fit import WhiteRows
+from sms_online.stream import Array
+
+# False alarms an hour, at most: one in a hundred hours of motion.
+FALSE_ALARMS = 0.01
+# Variance that noise may have at most, for it is known to a tenth; and the one that the test is best for: twice the
+# deviation.
+NOISE, WANTED = 1.1**2, 2.0**2
+# So many windows that share no sample alarm at least: errors of second order burst for one or two in a row.
+LEAST_WINDOWS = 3
+# Singular values below this share of the largest, of columns scaled to unit length: nothing is known of a direction.
+RANK_TOLERANCE = 1e-10
+# A row that has more than this share of itself in such directions is not tested.
+KNOWN = 1e-6
+
+
+@dataclass(frozen=True)
+class Alarm:
+    """Rows leave more than noise: type of the row and its generalized speed, the one that leaves most.
+
+    end: grid index of the last window behind it. since: grid index of the last window's end that showed nothing.
+    """
+
+    row: str
+    speed: str
+    end: int
+    since: int
+
+
+class SequentialTest:
+    """Tests the windows of a session, in order, until the first alarm.
+
+    hop: time from one window to the next, s. alarm: None while all is noise. limit: h.
+    """
+
+    def __init__(self, layout: Layout, hop: float) -> None:
+        self._layout = layout
+        self._types = {name: speeds for name, speeds in row_types(layout).items() if len(speeds) > 1}
+        tests = layout.n_v + len(self._types)
+        self.limit = float(np.log(tests * 3600.0 / hop / FALSE_ALARMS))
+        self.alarm: Alarm | None = None
+        self._sums = np.zeros((HOPS, tests))  # the coordinates', then the types'
+        self._since = np.full((HOPS, tests), -1, dtype=np.int64)  # window's end at which each sum was zero last
+        self._windows = 0
+        self._waiting: Array | None = None  # factor that the next estimate is made of
+        self._known = np.zeros((0, 0))  # factor behind the estimate
+        self._beta, self._scale = np.zeros(0), np.zeros(0)
+        self._root, self._null = np.zeros((0, 0)), np.zeros((0, 0))
+
+    def push(self, rows: WhiteRows, factor: Array) -> None:
+        """Test a window; factor (n + 1, n + 1): information of the rows before it."""
+        turn = self._windows % HOPS
+        if turn == 0:
+            self._know(factor if self._waiting is None else self._waiting)
+            self._waiting = factor
+        self._windows += 1
+        if self.alarm is not None:
+            return
+        ratios = self._log_likelihood(rows)
+        sums = np.maximum(0.0, self._sums[turn] + np.minimum(ratios, self.limit / LEAST_WINDOWS))
+        self._sums[turn] = sums
+        self._since[turn] = np.where((sums == 0.0) | (self._since[turn] < 0), rows.end, self._since[turn])
+        worst = int(np.argmax(sums))
+        if sums[worst] > self.limit:
+            row, speed = self._place(worst, turn)
+            self.alarm = Alarm(row, speed, rows.end, int(self._since[turn, worst]))
+
+    def _know(self, factor: Array) -> None:
+        """Take β̂ from a factor; null holds the directions of which it knows nothing, columns scaled to unit length."""
+        self._known = factor
+        n = len(factor) - 1
+        norm = np.linalg.norm(factor[:, :n], axis=0)
+        self._scale = scale = np.where(norm > 0.0, norm, 1.0)
+        U, s, Vt = np.linalg.svd(factor[:, :n] / scale, full_matrices=False)
+        rank = int(np.count_nonzero(s > RANK_TOLERANCE * max(float(s[0]), 1.0)))
+        self._root = Vt[:rank].T / s[:rank] / scale[:, None]
+        self._beta = self._root @ (U[:, :rank].T @ factor[:, -1])
+        self._null = Vt[rank:].T
+
+    def _log_likelihood(self, rows: WhiteRows) -> Array:
+        """Of every test (tests,); what nothing is known of says nothing."""
+        Y, n_v = rows.raw[:, :-1], self._layout.n_v
+        e = rows.raw[:, -1] - Y @ self._beta
+        spread = Y @ self._root
+        S = rows.noise + spread @ spread.T
+        scaled = Y / self._scale
+        tested = np.linalg.norm(scaled @ self._null, axis=1) <= KNOWN * np.linalg.norm(scaled, axis=1)
+        out = np.zeros(n_v + len(self._types))
+        out[:n_v] = np.where(tested, _ratio(e**2 / np.diag(S), 1), 0.0)
+        for k, speeds in enumerate(self._types.values(), start=n_v):
+            own = [speed for speed in speeds if tested[speed]]
+            if own:
+                chi2 = float(e[own] @ np.linalg.solve(S[np.ix_(own, own)], e[own]))
+                out[k] = _ratio(chi2, len(own))
+        return out
+
+    def _place(self, test: int, turn: int) -> tuple[str, str]:
+        """Row type of a test, and the speed of it that leaves most."""
+        n_v = self._layout.n_v
+        types = row_types(self._layout)
+        row = next(name for name, speeds in types.items() if test in speeds) if test < n_v else ""
+        name = row or list(self._types)[test - n_v]
+        worst = max(types[name], key=lambda speed: self._sums[turn, speed])
+        return name, self._layout.speed_names[worst]
+
+    @property
+    def evidence(self) -> dict[str, float]:
+        """By row type, the largest sum over its limit: 1 alarms."""
+        n_v, shares = self._layout.n_v, self._sums.max(axis=0) / self.limit
+        out = {name: float(shares[speeds].max()) for name, speeds in row_types(self._layout).items()}
+        for k, name in enumerate(self._types, start=n_v):
+            out[name] = max(out[name], float(shares[k]))
+        return out
+
+    def state(self) -> dict[str, Any]:
+        """What `restore` needs to continue."""
+        waiting = self._known[:0] if self._waiting is None else self._waiting
+        alarm = ("", "", -1, -1) if self.alarm is None else (
+            self.alarm.row, self.alarm.speed, self.alarm.end, self.alarm.since,
+        )  # fmt: skip
+        return {
+            "sums": self._sums.copy(), "since": self._since.copy(), "windows": self._windows, "waiting": waiting,
+            "known": self._known, "place": np.array(alarm[:2]), "alarm": np.array(alarm[2:]),
+        }  # fmt: skip
+
+    def restore(self, state: Mapping[str, NDArray[Any]]) -> None:
+        """Continue from a saved state."""
+        self._sums, self._since = np.array(state["sums"]), np.array(state["since"])
+        self._windows = int(state["windows"])
+        self._waiting = np.array(state["waiting"]) if self._windows else None
+        if self._windows:
+            self._know(np.array(state["known"]))
+        row, speed = (str(text) for text in state["place"])
+        end, since = (int(number) for number in state["alarm"])
+        self.alarm = Alarm(row, speed, end, since) if row else None
+
+
+def _ratio(chi2: Any, freedom: int) -> Any:
+    """Log likelihood ratio of the variance WANTED against NOISE."""
+    return 0.5 * chi2 * (1.0 / NOISE - 1.0 / WANTED) - 0.5 * freedom * np.log(WANTED / NOISE)

@@ -1,0 +1,204 @@
+"""Effects noticed, named and taken up while a session runs; the same however its samples come."""
+
+from __future__ import annotations
+
+import json
+from functools import cache
+
+import numpy as np
+import pytest
+from axis import DAMPING, INERTIA
+from axis_effects import BARE, COGGING, PHASE, SYSTEM, axis_block, cogging, nothing
+from changed_session import changed_session, noisy
+
+from sms_adapters.system_file import load_system
+from sms_online.description.schema import Effect, System
+from sms_online.diagnosis.online import Immediate, OnlineDiagnosis, refusal
+from sms_online.model.base_parameters import find_base_parameters
+from sms_online.model.model import Model
+from sms_online.pipeline.estimator import Estimator
+from sms_online.results import results_document
+from sms_online.stream import Block
+from sms_sim.simulate import Simulation
+from sms_tools.view import snapshot
+
+PLANAR = load_system("paper-planar")
+BEGIN = 8.0  # s
+
+
+def watched(system: System, block: Block, adopt: bool = True, size: int = 64) -> tuple[Estimator, OnlineDiagnosis]:
+    estimator = Estimator(system, block.channels, "test")
+    online = OnlineDiagnosis(estimator, Immediate(), adopt)
+    for k in range(0, block.t.size, size):
+        estimator.push(Block(block.t[k : k + size], block.channels, block.values[k : k + size]))
+    estimator.finish()
+    return estimator, online
+
+
+@cache
+def cogged(adopt: bool) -> tuple[Estimator, OnlineDiagnosis]:
+    return watched(SYSTEM, axis_block(cogging, BEGIN), adopt)
+
+
+def estimated(estimator: Estimator) -> dict[str, tuple[float, float]]:
+    estimate = estimator.estimate()
+    names = [p.name for p in estimator.base.parameters]
+    return dict(zip(names, zip(estimate.pi.tolist(), estimate.std.tolist(), strict=True), strict=True))
+
+
+def document(estimator: Estimator, online: OnlineDiagnosis) -> str:
+    return json.dumps([results_document(estimator, 0.0, []), online.document()])
+
+
+def test_an_effect_of_the_base_that_begins_in_mid_session_is_named_and_disturbs_nothing(
+    planar_session: Simulation,
+) -> None:
+    """A drag of 60 N s/m at grade B, seed 1: noticed within 2 s of data, named within 5 s, then known like the rest."""
+    drag = Effect(name="air_drag", where="base", coefficients={"damping": 60.0})
+    changed = PLANAR.model_copy(update={"effects": (drag,)})
+    block = noisy(PLANAR, changed_session(planar_session, changed, BEGIN, BEGIN + 3.5), "B", 1)
+    estimator, online = watched(PLANAR, block, size=80)
+    (episode,) = online.episodes
+    assert episode.row == "base"
+    assert BEGIN < episode.noticed < BEGIN + 2.0
+    assert episode.named_at is not None
+    assert episode.named_at < BEGIN + 5.0
+    assert [named.key for named in episode.named] == ["air_drag@base"]
+    assert episode.adopted is not None
+    (event,) = estimator.events
+    assert (event.kind, event.parameters) == ("effect", ("air_drag@base.damping",))
+    assert event.time == pytest.approx(BEGIN, abs=0.15)
+    base = find_base_parameters(Model(PLANAR))
+    true = np.append(base.values(Model(PLANAR).nominal), 60.0)
+    estimate = estimator.estimate()
+    assert (np.abs(estimate.pi - true) < 4.0 * estimate.std).all()
+    assert estimate.pi[-1] == pytest.approx(60.0, rel=1e-3)
+
+
+def test_an_effect_that_begins_is_dated_sized_and_taken_up() -> None:
+    estimator, online = cogged(True)
+    (episode,) = online.episodes
+    assert episode.verdict == "named"
+    assert episode.noticed < BEGIN + 2.0
+    assert episode.began == pytest.approx(BEGIN, abs=0.4)
+    (named,) = episode.named
+    assert named.key == "cogging@joint_1"
+    amplitude, phase = (named.coefficients[name] for name in ("amplitude", "phase"))
+    assert amplitude[0] == pytest.approx(COGGING, abs=4.0 * (amplitude[1] or 0.0))
+    assert phase[0] == pytest.approx(PHASE, abs=4.0 * (phase[1] or 0.0))
+    found = estimated(estimator)
+    for name, true in (("link_1.inertia", INERTIA), ("cogging@joint_1.cosine", COGGING * np.cos(PHASE))):
+        assert found[name][0] == pytest.approx(true, abs=4.0 * found[name][1])
+    assert not estimator.misfit
+
+
+def test_without_adopt_it_is_only_told() -> None:
+    estimator, online = cogged(False)
+    (episode,) = online.episodes
+    assert (episode.verdict, episode.adopted) == ("named", None)
+    assert [named.key for named in episode.named] == ["cogging@joint_1"]
+    assert [p.name for p in estimator.base.parameters] == ["link_1.inertia", "viscous_friction@joint_1.damping"]
+    assert "taken up" not in online.notices[0]
+    plain = Estimator(SYSTEM, ("force_1", "q_1"), "plain")
+    plain.push(axis_block(cogging, BEGIN))
+    plain.finish()
+    assert results_document(plain, 0.0, []) == results_document(estimator, 0.0, [])
+
+
+def test_an_effect_that_was_there_from_the_start_is_named_and_leaves_no_bias() -> None:
+    """Friction that the description lacks: noticed as soon as there are weights, named at the first search."""
+    estimator, online = watched(BARE, axis_block(nothing, seconds=9.0))
+    (episode,) = online.episodes
+    assert episode.began is None
+    assert episode.noticed < 4.0
+    assert [named.key for named in episode.named] == ["viscous_friction@joint_1"]
+    found = estimated(estimator)
+    for name, true in (("link_1.inertia", INERTIA), ("viscous_friction@joint_1.damping", DAMPING)):
+        assert found[name][0] == pytest.approx(true, abs=4.0 * found[name][1])
+
+
+def test_the_evidence_grows_with_the_samples() -> None:
+    _, online = cogged(True)
+    told = online.document()[0]
+    first, second = told["evidence"]
+    assert first["time"] < second["time"] <= told["adopted"]
+    assert second["candidates"]["cogging@joint_1"] > first["candidates"]["cogging@joint_1"]
+    assert max(second["candidates"], key=second["candidates"].get) == "cogging@joint_1"
+    assert told["effects"][0]["evidence"]["gain"] > told["effects"][0]["evidence"]["limit"]
+
+
+def test_a_session_without_anything_missing_says_nothing() -> None:
+    estimator, online = watched(SYSTEM, axis_block(nothing, seconds=30.0))
+    assert online.document() == []
+    assert online.system == SYSTEM
+    assert estimator.momentum is not None
+    assert estimator.momentum.test.alarm is None
+
+
+def test_a_change_that_an_event_explains_is_named_by_it() -> None:
+    """Friction twice as high: the event's jump, not a search, says so."""
+    block = axis_block(lambda q, rate: DAMPING * rate, BEGIN)
+    estimator, online = watched(SYSTEM, block)
+    (episode,) = online.episodes
+    assert episode.verdict == "change"
+    assert episode.event == estimator.events[0]
+    assert episode.evidence == []
+    assert "viscous_friction@joint_1.damping" in online.notices[0]
+
+
+def test_what_no_effect_explains_is_said_to_be_unexplained() -> None:
+    """A torque that depends on time alone, from the start."""
+    _, online = watched(SYSTEM, _with_torque(axis_block(nothing, seconds=20.0)))
+    (episode,) = online.episodes
+    assert episode.verdict == "unexplained"
+    assert episode.named == ()
+    assert online.system == SYSTEM
+
+
+def _with_torque(block: Block) -> Block:
+    values = block.values.copy()
+    values[:, 0] += 0.3 * np.sin(9.0 * block.t) + 0.2 * np.sin(3.1 * block.t)
+    return Block(block.t, block.channels, values)
+
+
+def test_nothing_depends_on_how_samples_arrive() -> None:
+    assert document(*watched(SYSTEM, axis_block(cogging, BEGIN), size=1)) == document(*cogged(True))
+
+
+def test_a_session_with_an_adopted_effect_is_saved_and_goes_on_to_the_same_bits() -> None:
+    block = axis_block(cogging, BEGIN)
+    split = 13 * 200
+    first, second = (Block(block.t[part], block.channels, block.values[part]) for part in np.s_[:split, split:])
+    running = Estimator(SYSTEM, block.channels, "running")
+    OnlineDiagnosis(running, Immediate(), adopt=True)
+    running.push(first)
+    assert running.momentum is not None
+    assert [effect.name for effect in running.momentum.changes.adopted] == ["cogging"]
+    continued = Estimator(SYSTEM, block.channels, "continued")
+    continued.restore(running.state())
+    running.on_block = running.on_samples = None
+    for estimator in (running, continued):
+        estimator.push(second)
+        estimator.finish()
+    assert results_document(continued, 0.0, []) == results_document(running, 0.0, [])
+
+
+def test_a_replica_follows_an_adoption() -> None:
+    estimator, _ = cogged(True)
+    replica = Estimator(SYSTEM, ("force_1", "q_1"), "replica")
+    snapshot.apply(snapshot.take(estimator), replica)
+    assert results_document(replica, 0.0, []) == results_document(estimator, 0.0, [])
+
+
+def test_what_acts_before_the_balance_is_not_taken_up_while_running() -> None:
+    """A constant of a channel, and an effect with a state of its own, say why."""
+    (named,) = cogged(True)[1].episodes[0].named
+    model = Model(PLANAR)
+
+    def as_if(name: str, where: str) -> str | None:
+        effect = Effect(name=name, where=where)
+        return refusal(model, (type(named)(effect, (), (), np.empty(0), np.empty(0), {}, 0.0, 0.0, ()),))
+
+    assert "constant" in (as_if("sensor_lag", "q_1") or "")
+    assert "internal state" in (as_if("torsional_hysteresis", "joint_1") or "")
+    assert as_if("air_drag", "base") is None

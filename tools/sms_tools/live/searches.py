@@ -1,0 +1,131 @@
+"""Searches of a session beside its loop: made by a process of their own, and repeated where a recording is replayed."""
+
+from __future__ import annotations
+
+import json
+import pickle
+import subprocess
+import sys
+from pathlib import Path
+from queue import SimpleQueue
+from threading import Thread
+from typing import IO
+
+from sms_online.diagnosis.online import Immediate, Searcher
+from sms_online.diagnosis.online_search import Outcome, Request, search
+from sms_online.errors import InputError
+
+NAME = "searches.jsonl"
+
+
+class SearchProcess:
+    """Searches in a process of low priority, one at a time; those that come meanwhile are left out.
+
+    Which were made, and at which internal block each was used, is written to `directory`, for the replay. problem: why
+    there are no more of them, None while there are.
+    """
+
+    def __init__(self, directory: Path, adopt: bool) -> None:
+        self.problem: str | None = None
+        # A session of its own: Ctrl-C is for the estimator, which then ends the process.
+        self._process = subprocess.Popen(
+            [sys.executable, "-m", "sms_tools.live.search_worker"],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.DEVNULL,
+            start_new_session=True,
+        )
+        self._log = (directory / NAME).open("w", encoding="utf-8", buffering=1)
+        self._log.write(json.dumps({"adopt": adopt}) + "\n")
+        self._requests: SimpleQueue[tuple[int, Request] | None] = SimpleQueue()
+        self._done: SimpleQueue[tuple[int, Outcome | None]] = SimpleQueue()
+        self._busy = False
+        Thread(target=self._run, name="searches", daemon=True).start()
+
+    def submit(self, number: int, request: Request) -> bool:
+        """See `Searcher`."""
+        if self._busy or self.problem is not None:
+            return False
+        self._busy = True
+        self._requests.put((number, request))
+        return True
+
+    def outcome(self, block: int) -> tuple[int, Outcome | None] | None:
+        """See `Searcher`."""
+        if self._done.empty():
+            return None
+        done = self._done.get()
+        self._busy = False
+        try:
+            self._log.write(json.dumps({"search": done[0], "block": block}) + "\n")
+        except OSError as error:
+            # No disk is worth the session.
+            self.problem = f"a search was not noted, so that a replay will differ: {error.strerror or error}"
+        return done
+
+    def close(self) -> None:
+        """End the process, and a search that runs."""
+        self._requests.put(None)
+        self._process.kill()
+        self._process.wait()
+        self._log.close()
+
+    def _run(self) -> None:
+        """Hand requests over and take answers, neither of which may wait in the loop's thread."""
+        to, back = self._process.stdin, self._process.stdout
+        assert to is not None
+        assert back is not None
+        while (task := self._requests.get()) is not None:
+            try:
+                self._done.put((task[0], _asked(task[1], to, back)))
+            except (OSError, EOFError, pickle.UnpicklingError) as error:
+                self.problem = f"no more searches for effects: their process ended ({type(error).__name__})"
+                return
+
+
+def _asked(request: Request, to: IO[bytes], back: IO[bytes]) -> Outcome | None:
+    pickle.dump(request, to)
+    to.flush()
+    outcome: Outcome | None = pickle.load(back)
+    return outcome
+
+
+class Repeated:
+    """The searches that a recorded session made, each used at the block at which that one used it."""
+
+    def __init__(self, blocks: dict[int, int]) -> None:
+        self._blocks = blocks
+        self._done: tuple[int, Outcome | None] | None = None
+
+    def submit(self, number: int, request: Request) -> bool:
+        """See `Searcher`."""
+        if self._done is not None or number not in self._blocks:
+            return False
+        self._done = number, search(request)
+        return True
+
+    def outcome(self, block: int) -> tuple[int, Outcome | None] | None:
+        """See `Searcher`."""
+        if self._done is None or block < self._blocks[self._done[0]]:
+            return None
+        done, self._done = self._done, None
+        return done
+
+
+def searcher_of(capture: Path, adopt: bool) -> Searcher:
+    """For the replay of a capture: at once, or, of a recording that was made with the same `adopt`, as it was then.
+
+    Raises InputError where the recording's searches are no such document.
+    """
+    path = capture / NAME
+    if not path.is_file():
+        return Immediate()
+    try:
+        # A session that was killed may have left half a line.
+        whole = [line for line in path.read_text(encoding="utf-8").splitlines(keepends=True) if line.endswith("\n")]
+        first, *others = (json.loads(line) for line in whole)
+        blocks = {int(entry["search"]): int(entry["block"]) for entry in others}
+        same = bool(first["adopt"]) == adopt
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise InputError(str(path), "", f"{type(error).__name__}: {error}", "searches as `live` writes them") from None
+    return Repeated(blocks) if same else Immediate()
