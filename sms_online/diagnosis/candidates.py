@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import replace
 from fnmatch import fnmatchcase
 from itertools import product
@@ -10,6 +10,7 @@ from itertools import product
 import numpy as np
 
 from sms_online.description.schema import Effect, System
+from sms_online.diagnosis.constants import is_constant
 from sms_online.diagnosis.rows import SessionRows
 from sms_online.diagnosis.trace import Candidate
 from sms_online.diagnosis.weak_windows import Motion, WeakWindows
@@ -31,14 +32,13 @@ LINEAR = {
 class CandidateColumns:
     """Makes candidates for the rows of a session, of effects that the system does not declare.
 
-    pi (n_pi,): parameters that columns of channels are taken at.
+    Columns of those that become constants hold the parameters behind the noise of the rows, and follow them.
     """
 
     def __init__(self, rows: SessionRows, system: System, weak: WeakWindows | None = None) -> None:
         """weak: windows that columns are wanted in, in place of the rows'."""
         self.rows, self.system = rows, system
         self._weak = rows.weak if weak is None else weak
-        self.pi = rows.base.physical_values(rows.beta)
         self._own = {p.name for p in rows.model.parameters}
 
     def within(self, weak: WeakWindows) -> CandidateColumns:
@@ -54,7 +54,18 @@ class CandidateColumns:
 
     def all(self) -> list[Candidate]:
         """Each effect at each place, with each shape constant of its grid; those that leave no trace left out."""
-        made = [self.of(effect) for effect in self.effects()]
+        return self.constants() + self.forces()
+
+    def forces(self) -> list[Candidate]:
+        """Those that become unknowns of π."""
+        return self._seen(effect for effect in self.effects() if not is_constant(effect))
+
+    def constants(self) -> list[Candidate]:
+        """Those that become constants of the description; the rows have to be weighed."""
+        return self._seen(effect for effect in self.effects() if is_constant(effect))
+
+    def _seen(self, effects: Iterable[Effect]) -> list[Candidate]:
+        made = [self.of(effect) for effect in effects]
         return [candidate for candidate in made if np.any(candidate.columns)]
 
     def effects(self) -> Iterator[Effect]:
@@ -101,7 +112,8 @@ class CandidateColumns:
         declared = self.system.model_copy(update={"effects": (*self.system.effects, effect)})
         if ENTRIES[effect.name].kind == "channel":
             return self._channel(effect)
-        model = Model(declared, self.pi)
+        # What becomes a constant is linear only beside parameters that are known.
+        model = Model(declared, self.rows.base.physical_values(self.rows.beta) if is_constant(effect) else None)
         added = [k for k, p in enumerate(model.parameters) if p.name not in self._own]
         parameters = tuple(model.parameters[k] for k in added)
         if ENTRIES[effect.name].kind == "inertia":
@@ -119,7 +131,7 @@ class CandidateColumns:
             P = force.momentum(model.layout, motion.x, motion.v, inputs)
             return P, force.force(model.layout, motion.x, motion.v, inputs)
 
-        return Candidate(effect, parameters, self._weak.columns(columns))
+        return Candidate(effect, parameters, self._weak.columns(columns, dense=True))
 
     def _channel(self, effect: Effect) -> Candidate:
         """What is added to readings, times the rows' response to it; in other windows than the rows' there is none.

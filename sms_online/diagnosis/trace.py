@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from sms_online.description.schema import Effect
 from sms_online.diagnosis.constants import is_constant
-from sms_online.diagnosis.evidence import RANK_TOLERANCE, Gain, basis, free_of, gain, threshold
+from sms_online.diagnosis.evidence import Gain, basis, free_of, gain, least_squares, threshold
 from sms_online.diagnosis.plausible import plausible
 from sms_online.diagnosis.rows import SessionRows
 from sms_online.model.parameters import Parameter
@@ -98,6 +98,22 @@ class Ranked:
     share: float
 
 
+def together(columns: Array, b: Array, prior: Prior | None) -> Array:
+    """Solution (n + c,) for columns (W, n_v, n + c) of a model and of all candidates, and b (W, n_v).
+
+    Parameters that are known beforehand keep their values: where a model lacks much, parameters that shrink to zero
+    would explain rows without a torque.
+    """
+    known = np.zeros(columns.shape[2], dtype=bool)
+    solution = np.zeros(columns.shape[2])
+    if prior is not None:
+        known[: prior.known.size] = prior.known
+        solution[known] = prior.value[prior.known]
+    left = b - columns[..., known] @ solution[known]
+    solution[~known] = least_squares(columns[..., ~known].reshape(b.size, -1), left.ravel())
+    return solution
+
+
 class Tracing:
     """Searches the candidates for what the rows of a session leave.
 
@@ -119,30 +135,25 @@ class Tracing:
         self._plain_model = self._model / rows.std[..., None]
         self._plain = [candidate.columns / rows.std[..., None] for candidate in self.candidates]
         self.floor = self._floor(prior)
-        rows.whiten(self.floor)
+        rows.whiten(np.broadcast_to(self.floor, rows.std.shape))
         # What is known beforehand are rows too, of parameters alone.
         known = prior_factor(prior, rows.base.n)
-        more = self._model.shape[2] - rows.base.n
-        self._Y = np.concatenate((rows.white(self._model), np.pad(known[:, :-1], ((0, 0), (0, more)))))
-        self._b = np.concatenate((rows.white(rows.b[..., None])[:, 0], known[:, -1]))
-        self._Z = [self._whitened(candidate) for candidate in self.candidates]
+        self._known = len(known)
+        n, width = rows.base.n, self._model.shape[2]
+        parts = [self._model, rows.b[..., None], *(candidate.columns for candidate in self.candidates)]
+        white = self._padded(rows.white(np.concatenate(parts, axis=2)))
+        if self._known:
+            white[-self._known :, :n], white[-self._known :, width] = known[:, :-1], known[:, -1]
+        ends = np.cumsum([part.shape[2] for part in parts])
+        self._Y, b, *self._Z = np.split(white, ends[:-1], axis=1)
+        self._b = b[:, 0]
         self.trials = len(self.candidates)
 
     def _floor(self, prior: Prior | None) -> Array:
-        """Excess of each speed's rows over their variance, (n_v,), that all candidates together leave.
-
-        Parameters that are known beforehand keep their values here: where a model lacks much, parameters that shrink to
-        zero would explain rows without a torque.
-        """
-        free = np.ones(self._plain_model.shape[2], dtype=bool)
-        b = self.rows.b / self.rows.std
-        if prior is not None:
-            known = np.flatnonzero(prior.known)
-            free[known] = False
-            b = b - self._plain_model[..., known] @ prior.value[known]
-        plain = [self._plain_model[..., free], *self._plain]
-        stacked = np.concatenate(plain, axis=2)
-        left = free_of(basis(stacked.reshape(b.size, stacked.shape[2])), b.reshape(-1, 1)).reshape(b.shape)
+        """Excess of each speed's rows over their variance, (n_v,), that all candidates together leave."""
+        left = self.rows.b / self.rows.std
+        plain = np.concatenate([self._plain_model, *self._plain], axis=2)
+        left = left - plain @ together(plain, left, prior)
         ratio = np.mean(left**2, axis=0)
         return np.where(ratio > LARGEST_RATIO, ratio - 1.0, 0.0)
 
@@ -172,8 +183,10 @@ class Tracing:
         self._Z[k] = self._whitened(candidate)
 
     def _whitened(self, candidate: Candidate) -> Array:
-        white = self.rows.white(candidate.columns)
-        return np.concatenate((white, np.zeros((len(self._Y) - len(white), white.shape[1]))))
+        return self._padded(self.rows.white(candidate.columns))
+
+    def _padded(self, white: Array) -> Array:
+        return np.concatenate((white, np.zeros((self._known, white.shape[1]))))
 
     def _excess(self, k: int, g: Gain) -> float:
         return g.gain - threshold(FALSE_ALARM, self.trials, self._Z[k].shape[1])
@@ -290,10 +303,7 @@ class Tracing:
         """Parameters and coefficients (n + c,) of the model with those chosen, from some windows (W,)."""
         use = np.ones(len(self._b), dtype=bool)
         use[: windows.size * self._n_v] = np.repeat(windows, self._n_v)
-        columns = self._columns(chosen)[use]
-        size = np.linalg.norm(columns, axis=0)
-        size[size == 0.0] = 1.0
-        return np.asarray(np.linalg.lstsq(columns / size, self._b[use], rcond=RANK_TOLERANCE)[0] / size)
+        return least_squares(self._columns(chosen)[use], self._b[use])
 
     def covariance(self, chosen: Sequence[int]) -> Array:
         """Of the solution (n + c, n + c) from all windows, infinite where they tell nothing."""
