@@ -18,6 +18,7 @@ from sms_online.effects.base import Inputs, Ranges
 from sms_online.effects.catalogue import ENTRIES, candidates
 from sms_online.model.model import Model
 from sms_online.model.parameters import Parameter
+from sms_online.pipeline.momentum_balance import HOPS
 from sms_online.stream import Array
 
 # Linear coefficients of effects on channels: quantity, unit, what a unit of it adds to a reading, with its sign. A lag
@@ -39,6 +40,7 @@ class CandidateColumns:
         """weak: windows that columns are wanted in, in place of the rows'."""
         self.rows, self.system = rows, system
         self._weak = rows.weak if weak is None else weak
+        self._noisy: list[CandidateColumns] | None = None
         self._own = {p.name for p in rows.model.parameters}
 
     def within(self, weak: WeakWindows) -> CandidateColumns:
@@ -132,6 +134,22 @@ class CandidateColumns:
             return P, force.force(model.layout, motion.x, motion.v, inputs)
 
         return Candidate(effect, parameters, self._weak.columns(columns, dense=True))
+
+    def variance(self, candidate: Candidate, coefficients: Array) -> Array:
+        """Variance (W, n_v) of the rows for what the sensors' noise makes of a force with coefficients (c,).
+
+        Two samples of it in every window, averaged over the windows that a window overlaps: the noise of a force that
+        jumps with the sign of a rate is that of its reversals, and no derivative tells it.
+        """
+        if ENTRIES[candidate.effect.name].kind != "force" or is_constant(candidate.effect) or self.rows.noise.exact:
+            return np.zeros_like(self.rows.b)
+        if self._noisy is None:
+            self._noisy = [self.within(weak) for weak in self.rows.noisy()]
+        changes = [(noisy.of(candidate.effect).columns - candidate.columns) @ coefficients for noisy in self._noisy]
+        squares = np.mean(np.square(changes), axis=0)
+        near = np.ones(2 * HOPS - 1)
+        count = np.convolve(np.ones(len(squares)), near, mode="same")
+        return np.stack([np.convolve(column, near, mode="same") / count for column in squares.T], axis=1)
 
     def _channel(self, effect: Effect) -> Candidate:
         """What is added to readings, times the rows' response to it; in other windows than the rows' there is none.

@@ -43,8 +43,8 @@ STRETCH = 5.0
 STARTS = 2
 # Rows for a column at least, for all candidates to be fitted together.
 LEAST_ROWS = 4
-# Times at most that rows are weighed anew by what was found, to search again; weights are the same where the size of the
-# rows' terms changes by less than this share.
+# Times at most that rows are weighed anew by what was found, to search again; weights are the same where the size of
+# the rows' terms changes by less than this share.
 REWEIGHED = 2
 SAME_WEIGHTS = 0.1
 # Part of a session that tells which kinematics of links are nearer, and improves channels' constants, s.
@@ -205,7 +205,8 @@ class Attempt:
         sought = self._sought
         constants = [c for c in self.make.constants() if sought is None or (c.effect.name, c.effect.where) in sought]
         self.fixed = [self.make.of(effect) for effect in self.constants]
-        self.tracing = Tracing(self.rows, [*constants, *forces], self._fitted_windows, self.prior, self.fixed)
+        parts = self._fitted_windows, self.make.variance, self.prior, self.fixed
+        self.tracing = Tracing(self.rows, [*constants, *forces], *parts)
 
     def _fitted(self, time: NDArray[np.floating[Any]], segment: NDArray[np.int64]) -> NDArray[np.bool_]:
         return np.asarray((segment < self._fitting) & (time < self._split))
@@ -268,6 +269,7 @@ class Attempt:
     def state(self, chosen: Sequence[int]) -> State:
         """Residuals of the model with the effects chosen."""
         rows, tracing = self.rows, self.tracing
+        tracing.settle(chosen)
         fitted = tracing.fitted
         solution = tracing.solution(chosen, fitted)
         residual = tracing.residual(chosen, solution)
@@ -327,10 +329,11 @@ def diagnose(
     attempt = described = Attempt(case, system)
     n = described.rows.base.n
     chosen = attempt.search()
-    ranking = attempt.tracing.ranking()
+    beyond = any(row.beyond for row in attempt.state(chosen).test.values())
     bare = described.state([])
+    ranking = attempt.tracing.ranking()
     exact = _exact(system)
-    if exact is not None and any(row.beyond for row in attempt.state(chosen).test.values()):
+    if exact is not None and beyond:
         progress("comparing exact links")
         beta = described.rows.beta
         first = [attempt.tracing.candidates[k].effect for k in chosen[:1]]
@@ -354,8 +357,8 @@ def diagnose(
         others = [effect for effect in tried if (effect.name, effect.where) not in keys]
         attempt = Attempt(case, attempt.system, constants, beta, others)
         chosen = attempt.search()
-    findings += [attempt.tracing.finding(chosen, k) for k in chosen]
     after = attempt.state(chosen)
+    findings += [attempt.tracing.finding(chosen, k) for k in chosen]
     progress("fitting the model with what was found")
     named = after.system != system
     estimator_after = _session(after.system, blocks, source, prior)[0] if named else before

@@ -77,9 +77,9 @@ class SessionRows:
         self.segments = list(segments)
         self._rate = rate = model.system.sample_rate
         self._balance = balance = MomentumBalance(model, base, rate, model.system.windows.momentum)
-        random = np.random.default_rng(SEED)
         self.followed = FollowedMotion(sensing, self.segments, rate)
-        self._told = [self._of_segment(number, segment, random) for number, segment in enumerate(self.segments)]
+        added = self._noise_samples(np.random.default_rng(SEED))
+        self._told = [self._of_segment(k, *part) for k, part in enumerate(zip(self.segments, added, strict=True))]
         windows = [(number, window) for number, told in enumerate(self._told) for window in told.windows]
         n_v = model.layout.n_v
         stacked = np.concatenate([np.empty((0, n_v, base.n + 1)), *(told.copies[:, 0] for told in self._told)])
@@ -97,16 +97,21 @@ class SessionRows:
         )
         self.weak = WeakWindows(where, model.layout, sensing, self.segments, rate)
 
-    def _of_segment(self, number: int, segment: Segment, random: np.random.Generator) -> _Told:
+    def _noise_samples(self, random: np.random.Generator) -> list[Array]:
+        """Noise of position sensors and torques, for each segment's samples (B, channels)."""
+        columns = [*self.sensing.position_columns, *self.sensing.torque_columns]
+        out = [np.zeros_like(segment.values) for segment in self.segments]
+        for added in out:
+            added[:, columns] = random.standard_normal((len(added), len(columns))) * self.noise.grid
+        return out
+
+    def _of_segment(self, number: int, segment: Segment, added: Array) -> _Told:
         noise, n_v, balance = self.noise, self.model.layout.n_v, self._balance
         balance.begin_segment()
         followed = self.followed.states(self.model, number)
         measured = self.sensing.motion(np.concatenate((segment.values, followed), axis=1))
         copies = [measured] * COPIES
         if not noise.exact:
-            added = np.zeros_like(segment.values)
-            columns = [*self.sensing.position_columns, *self.sensing.torque_columns]
-            added[:, columns] = random.standard_normal((len(measured), len(columns))) * noise.grid
             copies[1:] = [
                 self.sensing.motion(np.concatenate((segment.values + sign * added, followed), axis=1))
                 for sign in (1.0, -1.0)
@@ -182,6 +187,19 @@ class SessionRows:
         parts = [np.concatenate([getattr(piece, part) for piece in instants]) for part in ("x", "v", "signals")]
         for start in range(0, len(parts[0]), TOLD):
             out.tell(pi, *(part[start : start + TOLD] for part in parts))
+        return out
+
+    def noisy(self) -> list[WeakWindows]:
+        """The windows over the same session with synthetic noise of the sensors added and subtracted."""
+        added = self._noise_samples(np.random.default_rng(SEED))
+        weak = self.weak
+        out = []
+        for sign in (1.0, -1.0):
+            moved = [
+                Segment(segment.index, segment.values + sign * each)
+                for segment, each in zip(self.segments, added, strict=True)
+            ]
+            out.append(WeakWindows(weak.windows, self.model.layout, self.sensing, moved, self._rate))
         return out
 
     @property

@@ -21,6 +21,7 @@ from sms_online.diagnosis.evidence import Gain, basis, free_of, gain, least_squa
 from sms_online.diagnosis.plausible import plausible
 from sms_online.diagnosis.rows import SessionRows
 from sms_online.model.parameters import Parameter
+from sms_online.pipeline.momentum_balance import HOPS
 from sms_online.stream import Array
 from sms_online.trackers.factor import prior_factor, solve
 from sms_online.trackers.interface import Prior
@@ -38,6 +39,10 @@ ACTS = 0.01
 # Rows whose mean square exceeds their variance by more than this although everything that is known of has been
 # subtracted have an error of their own: friction is never quite its model.
 LARGEST_RATIO = 1.5
+# No law of a force is true to better than 0.3 %, and what it leaves of its own gain is no other effect on its rows.
+INEXACT = 1e-5
+# Share of a row's variance by which that of the effects chosen has to change for rows to be weighed anew.
+SMALL_CHANGE = 0.1
 # Effects that contain a simpler one, which is to be tried first: fewest coefficients win.
 EXTENDS = {"direction_friction": "viscous_friction"}
 # At most so many effects are looked for in turn.
@@ -125,19 +130,45 @@ class Tracing:
         rows: SessionRows,
         candidates: Sequence[Candidate],
         fitted: NDArray[np.bool_],
+        variance: Callable[[Candidate, Array], Array],
         prior: Prior | None = None,
         fixed: Sequence[Candidate] = (),
     ) -> None:
-        """fixed: effects that belong to the model already, whose columns come right after its parameters'."""
+        """variance: gives (W, n_v) of the rows for what noise makes of a candidate with coefficients (c,). fixed:
+        effects that belong to the model already, whose columns come right after its parameters'.
+        """
         self.rows, self.candidates, self.fitted = rows, list(candidates), fitted
+        self._variance, self._prior = variance, prior
         self._n_v = rows.model.layout.n_v
         self._model = np.concatenate([rows.Y, *(candidate.columns for candidate in fixed)], axis=2)
-        self._plain_model = self._model / rows.std[..., None]
-        self._plain = [candidate.columns / rows.std[..., None] for candidate in self.candidates]
-        self.floor = self._floor(prior)
-        rows.whiten(np.broadcast_to(self.floor, rows.std.shape))
+        self.trials = len(self.candidates)
+        self._own = np.zeros_like(rows.std)  # variance of the effects chosen
+        self._taken: dict[int, float] = {}  # gains of the effects chosen
+        self._weigh()
+
+    def settle(self, chosen: Sequence[int]) -> None:
+        """Weigh the rows with what noise makes of the effects chosen too: of a rate's sign near a reversal, say."""
+        own = np.zeros_like(self.rows.std)
+        at, solution = self._model.shape[2], self.solution(chosen, np.ones(self.rows.count, dtype=bool))
+        for k in chosen:
+            c = len(self.candidates[k].parameters)
+            own += self._variance(self.candidates[k], solution[at : at + c])
+            at += c
+        if np.any(np.abs(own - self._own) > SMALL_CHANGE * (self.rows.std**2 + self._own)):
+            self._own = own
+            self._weigh()
+
+    def _weigh(self) -> None:
+        rows = self.rows
+        self.std = np.sqrt(rows.std**2 + self._own)
+        self._plain_model = self._model / self.std[..., None]
+        self._plain = [candidate.columns / self.std[..., None] for candidate in self.candidates]
+        self.floor = self._floor()
+        # Windows that overlap share the noise of the effects chosen: as errors of their own they count it once.
+        weighed = (1.0 + self.floor) * self.std**2 + (HOPS - 1) * self._own
+        rows.whiten(weighed / rows.std**2 - 1.0)
         # What is known beforehand are rows too, of parameters alone.
-        known = prior_factor(prior, rows.base.n)
+        known = prior_factor(self._prior, rows.base.n)
         self._known = len(known)
         n, width = rows.base.n, self._model.shape[2]
         parts = [self._model, rows.b[..., None], *(candidate.columns for candidate in self.candidates)]
@@ -147,13 +178,12 @@ class Tracing:
         ends = np.cumsum([part.shape[2] for part in parts])
         self._Y, b, *self._Z = np.split(white, ends[:-1], axis=1)
         self._b = b[:, 0]
-        self.trials = len(self.candidates)
 
-    def _floor(self, prior: Prior | None) -> Array:
+    def _floor(self) -> Array:
         """Excess of each speed's rows over their variance, (n_v,), that all candidates together leave."""
-        left = self.rows.b / self.rows.std
+        left = self.rows.b / self.std
         plain = np.concatenate([self._plain_model, *self._plain], axis=2)
-        left = left - plain @ together(plain, left, prior)
+        left = left - plain @ together(plain, left, self._prior)
         ratio = np.mean(left**2, axis=0)
         return np.where(ratio > LARGEST_RATIO, ratio - 1.0, 0.0)
 
@@ -179,7 +209,7 @@ class Tracing:
     def put(self, k: int, candidate: Candidate) -> None:
         """Put another form of an effect in the place of a candidate."""
         self.candidates[k] = candidate
-        self._plain[k] = candidate.columns / self.rows.std[..., None]
+        self._plain[k] = candidate.columns / self.std[..., None]
         self._Z[k] = self._whitened(candidate)
 
     def _whitened(self, candidate: Candidate) -> Array:
@@ -189,7 +219,15 @@ class Tracing:
         return np.concatenate((white, np.zeros((self._known, white.shape[1]))))
 
     def _excess(self, k: int, g: Gain) -> float:
-        return g.gain - threshold(FALSE_ALARM, self.trials, self._Z[k].shape[1])
+        """Gain beyond what an absent candidate reaches, and beyond what the laws of those found are uncertain by."""
+        acts = self._acts(k)
+        same = [taken for other, taken in self._taken.items() if other != k and np.any(acts & self._acts(other))]
+        return g.gain - max(threshold(FALSE_ALARM, self.trials, self._Z[k].shape[1]), INEXACT * max(same, default=0.0))
+
+    def _acts(self, k: int) -> NDArray[np.bool_]:
+        """Speeds (n_v,) in whose rows a candidate acts."""
+        squares = np.sum(self._plain[k] ** 2, axis=(0, 2))
+        return np.asarray(squares > ACTS * squares.max())
 
     def _preferred(self, gains: Sequence[Gain], allowed: Sequence[int]) -> int | None:
         """The candidate to take: the best one, or one with fewer constants that takes nearly as much."""
@@ -214,6 +252,7 @@ class Tracing:
         refine: improves the shape constants of one of those chosen, before what it leaves is given to others.
         """
         chosen: list[int] = []
+        self._taken = {}
         refused: set[str] = set()
         seen: set[frozenset[int]] = {frozenset()}
         while len(chosen) < MOST_EFFECTS:
@@ -224,10 +263,13 @@ class Tracing:
                 refused.add(self.candidates[best].key)
                 continue
             refine([*chosen, best], best)
+            self._taken[best] = self.gains(chosen)[best].gain
             chosen = self._revised([*chosen, best])
+            self._taken = {k: gain for k, gain in self._taken.items() if k in chosen}
             if frozenset(chosen) in seen:
                 break  # effects that replace each other in turn
             seen.add(frozenset(chosen))
+            self.settle(chosen)
             if self.candidates[best].constant:
                 # What it leaves while it is only approximately taken off must not be given to others.
                 break
@@ -263,9 +305,7 @@ class Tracing:
 
     def _held_out(self, chosen: Sequence[int], acting: int) -> float:
         left = self.residual(chosen, self.solution(chosen, self.fitted))[~self.fitted]
-        squares = np.sum(self._plain[acting] ** 2, axis=(0, 2))
-        acts = squares > ACTS * squares.max()
-        return float(np.sqrt(np.mean(left[:, acts] ** 2)))
+        return float(np.sqrt(np.mean(left[:, self._acts(acting)] ** 2)))
 
     def finding(self, chosen: Sequence[int], k: int) -> Finding:
         """What is to be said of one of the candidates chosen."""
@@ -311,6 +351,6 @@ class Tracing:
         return solve(np.column_stack((columns, self._b))).covariance()
 
     def residual(self, chosen: Sequence[int], solution: Array) -> Array:
-        """What is left of every row (W, n_v) over its own deviation."""
+        """What is left of every row (W, n_v) over its own deviation, see `settle`."""
         plain = np.concatenate([self._plain_model, *(self._plain[k] for k in chosen)], axis=2)
-        return np.asarray(self.rows.b / self.rows.std - plain @ solution)
+        return np.asarray(self.rows.b / self.std - plain @ solution)
