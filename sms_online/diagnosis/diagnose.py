@@ -212,11 +212,13 @@ class Attempt:
         return np.asarray((segment < self._fitting) & (time < self._split))
 
     def search(self) -> list[int]:
-        """Numbers of the candidates found, with rows weighed by what was found."""
+        """Numbers of the candidates found, with rows weighed by what was found if it explains them."""
         chosen = self._search()
         for _ in range(REWEIGHED):
             beta = self.solution(chosen)[: self.rows.base.n]
-            if self._same_weights(beta):
+            if self.prior is not None:
+                beta = np.where(self.prior.known, self.prior.value, beta)
+            if self._same_weights(beta) or self.excess(chosen) > LARGEST_SHARE_LEFT * self.excess([]):
                 break
             self.rows.weigh(beta)
             self._trace([candidate for candidate in self.tracing.candidates if not candidate.constant])
