@@ -38,9 +38,7 @@ def session() -> tuple[Estimator, SessionRows]:
     assert estimator.momentum is not None
     assert estimator.momentum.sensor_noise is not None
     noise, beta = estimator.momentum.sensor_noise, estimator.estimate().pi
-    rows = SessionRows(estimator.model, estimator.base, estimator.sensing, noise, record.segments())
-    rows.weigh(beta)
-    return estimator, rows
+    return estimator, SessionRows(estimator.model, estimator.base, estimator.sensing, noise, record.segments(), beta)
 
 
 def test_columns_are_evaluated_as_the_balance_evaluates_them() -> None:
@@ -77,7 +75,7 @@ def test_a_channels_column_is_the_change_of_the_rows_when_it_is_corrected(effect
     _, rows = session()
     system = rows.model.system.model_copy(update={"effects": (effect,)})
     parts = [corrected(system, rows.sensing.channels, segment) for segment in rows.segments]
-    moved = SessionRows(rows.model, rows.base, rows.sensing, rows.noise, parts)
+    moved = SessionRows(rows.model, rows.base, rows.sensing, rows.noise, parts, rows.beta)
     inner = slice(5, -5)  # corrections begin at the record's ends
     change = ((moved.Y - rows.Y) @ rows.beta)[inner]
     same = (moved.weak.windows.half_width == rows.weak.windows.half_width)[inner]

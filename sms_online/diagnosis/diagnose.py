@@ -205,7 +205,7 @@ class Attempt:
         sought = self._sought
         constants = [c for c in self.make.constants() if sought is None or (c.effect.name, c.effect.where) in sought]
         self.fixed = [self.make.of(effect) for effect in self.constants]
-        parts = self._fitted_windows, self.make.variance, self.prior, self.fixed
+        parts = self._fitted_windows, self.prior, self.fixed, self.make.variance
         self.tracing = Tracing(self.rows, [*constants, *forces], *parts)
 
     def _fitted(self, time: NDArray[np.floating[Any]], segment: NDArray[np.int64]) -> NDArray[np.bool_]:

@@ -72,7 +72,9 @@ class SessionRows:
         sensing: Sensing,
         noise: SensorNoise,
         segments: Sequence[Segment],
+        beta: Array | None = None,
     ) -> None:
+        """beta (n,): to weigh the rows with at once."""
         self.model, self.base, self.sensing, self.noise = model, base, sensing, noise
         self.segments = list(segments)
         self._rate = rate = model.system.sample_rate
@@ -96,6 +98,8 @@ class SessionRows:
             stride=lambda M: stride(M, balance.hop),
         )
         self.weak = WeakWindows(where, model.layout, sensing, self.segments, rate)
+        if beta is not None:
+            self.weigh(beta)
 
     def _noise_samples(self, random: np.random.Generator) -> list[Array]:
         """Noise of position sensors and torques, for each segment's samples (B, channels)."""

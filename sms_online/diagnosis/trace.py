@@ -130,12 +130,12 @@ class Tracing:
         rows: SessionRows,
         candidates: Sequence[Candidate],
         fitted: NDArray[np.bool_],
-        variance: Callable[[Candidate, Array], Array],
         prior: Prior | None = None,
         fixed: Sequence[Candidate] = (),
+        variance: Callable[[Candidate, Array], Array] | None = None,
     ) -> None:
-        """variance: gives (W, n_v) of the rows for what noise makes of a candidate with coefficients (c,). fixed:
-        effects that belong to the model already, whose columns come right after its parameters'.
+        """fixed: effects that belong to the model already, whose columns come right after its parameters'. variance:
+        gives (W, n_v) of the rows for what noise makes of a candidate with coefficients (c,); none unless given.
         """
         self.rows, self.candidates, self.fitted = rows, list(candidates), fitted
         self._variance, self._prior = variance, prior
@@ -148,6 +148,8 @@ class Tracing:
 
     def settle(self, chosen: Sequence[int]) -> None:
         """Weigh the rows with what noise makes of the effects chosen too: of a rate's sign near a reversal, say."""
+        if self._variance is None:
+            return
         own = np.zeros_like(self.rows.std)
         at, solution = self._model.shape[2], self.solution(chosen, np.ones(self.rows.count, dtype=bool))
         for k in chosen:

@@ -69,8 +69,7 @@ class Draw:
         assert estimator.momentum.sensor_noise is not None
         beta = true_parameters(system)
         parts = (estimator.model, estimator.base, estimator.sensing, estimator.momentum.sensor_noise)
-        self.rows = SessionRows(*parts, record.segments())
-        self.rows.weigh(beta)
+        self.rows = SessionRows(*parts, record.segments(), beta)
         self.make = CandidateColumns(self.rows, system)
         # Size of each speed's rows: of the torque where there is one, else of all its terms together.
         torque = np.sqrt(np.mean(self.rows.b**2, axis=0))
