@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import replace
 from fnmatch import fnmatchcase
 from itertools import product
@@ -10,6 +10,7 @@ from itertools import product
 import numpy as np
 
 from sms_online.description.schema import Effect, System
+from sms_online.diagnosis.constants import is_constant
 from sms_online.diagnosis.rows import SessionRows
 from sms_online.diagnosis.trace import Candidate
 from sms_online.diagnosis.weak_windows import Motion, WeakWindows
@@ -17,6 +18,7 @@ from sms_online.effects.base import Inputs, Ranges
 from sms_online.effects.catalogue import ENTRIES, candidates
 from sms_online.model.model import Model
 from sms_online.model.parameters import Parameter
+from sms_online.pipeline.momentum_balance import HOPS
 from sms_online.stream import Array
 
 # Linear coefficients of effects on channels: quantity, unit, what a unit of it adds to a reading, with its sign. A lag
@@ -31,14 +33,14 @@ LINEAR = {
 class CandidateColumns:
     """Makes candidates for the rows of a session, of effects that the system does not declare.
 
-    pi (n_pi,): parameters that columns of channels are taken at.
+    Columns of those that become constants hold the parameters behind the noise of the rows, and follow them.
     """
 
     def __init__(self, rows: SessionRows, system: System, weak: WeakWindows | None = None) -> None:
         """weak: windows that columns are wanted in, in place of the rows'."""
         self.rows, self.system = rows, system
         self._weak = rows.weak if weak is None else weak
-        self.pi = rows.base.physical_values(rows.beta)
+        self._noisy: list[CandidateColumns] | None = None
         self._own = {p.name for p in rows.model.parameters}
 
     def within(self, weak: WeakWindows) -> CandidateColumns:
@@ -54,7 +56,18 @@ class CandidateColumns:
 
     def all(self) -> list[Candidate]:
         """Each effect at each place, with each shape constant of its grid; those that leave no trace left out."""
-        made = [self.of(effect) for effect in self.effects()]
+        return self.constants() + self.forces()
+
+    def forces(self) -> list[Candidate]:
+        """Those that become unknowns of π."""
+        return self._seen(effect for effect in self.effects() if not is_constant(effect))
+
+    def constants(self) -> list[Candidate]:
+        """Those that become constants of the description; the rows have to be weighed."""
+        return self._seen(effect for effect in self.effects() if is_constant(effect))
+
+    def _seen(self, effects: Iterable[Effect]) -> list[Candidate]:
+        made = [self.of(effect) for effect in effects]
         return [candidate for candidate in made if np.any(candidate.columns)]
 
     def effects(self) -> Iterator[Effect]:
@@ -101,7 +114,8 @@ class CandidateColumns:
         declared = self.system.model_copy(update={"effects": (*self.system.effects, effect)})
         if ENTRIES[effect.name].kind == "channel":
             return self._channel(effect)
-        model = Model(declared, self.pi)
+        # What becomes a constant is linear only beside parameters that are known.
+        model = Model(declared, self.rows.base.physical_values(self.rows.beta) if is_constant(effect) else None)
         added = [k for k, p in enumerate(model.parameters) if p.name not in self._own]
         parameters = tuple(model.parameters[k] for k in added)
         if ENTRIES[effect.name].kind == "inertia":
@@ -119,7 +133,23 @@ class CandidateColumns:
             P = force.momentum(model.layout, motion.x, motion.v, inputs)
             return P, force.force(model.layout, motion.x, motion.v, inputs)
 
-        return Candidate(effect, parameters, self._weak.columns(columns))
+        return Candidate(effect, parameters, self._weak.columns(columns, dense=True))
+
+    def variance(self, candidate: Candidate, coefficients: Array) -> Array:
+        """Variance (W, n_v) of the rows for what the sensors' noise makes of a force with coefficients (c,).
+
+        Two samples of it in every window, averaged over the windows that a window overlaps: the noise of a force that
+        jumps with the sign of a rate is that of its reversals, and no derivative tells it.
+        """
+        if ENTRIES[candidate.effect.name].kind != "force" or is_constant(candidate.effect) or self.rows.noise.exact:
+            return np.zeros_like(self.rows.b)
+        if self._noisy is None:
+            self._noisy = [self.within(weak) for weak in self.rows.noisy()]
+        changes = [(noisy.of(candidate.effect).columns - candidate.columns) @ coefficients for noisy in self._noisy]
+        squares = np.mean(np.square(changes), axis=0)
+        near = np.ones(2 * HOPS - 1)
+        count = np.convolve(np.ones(len(squares)), near, mode="same")
+        return np.stack([np.convolve(column, near, mode="same") / count for column in squares.T], axis=1)
 
     def _channel(self, effect: Effect) -> Candidate:
         """What is added to readings, times the rows' response to it; in other windows than the rows' there is none.

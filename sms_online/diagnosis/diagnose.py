@@ -19,7 +19,7 @@ from sms_online.diagnosis.relative import RelativeResiduals
 from sms_online.diagnosis.residuals import ResidualTest, RowResidual, whitened
 from sms_online.diagnosis.rows import SessionRows
 from sms_online.diagnosis.shape import refine
-from sms_online.diagnosis.trace import Candidate, Finding, Ranked, Tracing
+from sms_online.diagnosis.trace import Candidate, Finding, Ranked, Tracing, together
 from sms_online.diagnosis.unexplained import Unexplained, describe_residual
 from sms_online.effects.catalogue import ENTRIES, places
 from sms_online.errors import InputError
@@ -40,8 +40,14 @@ CORRECTIONS = 3
 MOST_WINDOWS = 2500
 # Stretches of a session that is used in part, in window lengths.
 STRETCH = 5.0
-# Times that rows are weighed anew where the session's own fit could not weigh them.
+# Times that all candidates are fitted together for the first weights of the rows: without weights, then with those.
+STARTS = 2
+# Rows for a column at least, for all candidates to be fitted together.
+LEAST_ROWS = 4
+# Times at most that rows are weighed anew by what was found, to search again; weights are the same where the size of
+# the rows' terms changes by less than this share.
 REWEIGHED = 2
+SAME_WEIGHTS = 0.1
 # Part of a session that tells which kinematics of links are nearer, and improves channels' constants, s.
 SOME = 8.0
 
@@ -152,23 +158,18 @@ class Attempt:
         system: System,
         constants: Sequence[Effect] = (),
         beta: Array | None = None,
-        candidates: Sequence[Candidate] | Sequence[Effect] | None = None,
+        candidates: Sequence[Effect] | None = None,
         most: float = LONGEST,
     ) -> None:
-        """constants: see that module. beta (n,): behind the noise of rows, the session's unless given. candidates: all
-        by default; columns made for the same windows before serve to search. most: s of the session that are used.
+        """constants: see that module. beta (n,): behind the noise of rows, from the rows themselves unless given.
+        candidates: all by default. most: s of the session that are used.
         """
         self.system, self.constants = system, list(constants)
         session = case.session
         described = applied(system, constants)
         same = described == session.system
         estimator = session if same else Estimator(described, session.sensing.channels, case.source)
-        self.prior = known = case.prior(estimator)
-        if beta is None:
-            beta = session.estimate().pi
-            if known is not None and not weighed(session):
-                # A fit that leaves half of the torques bends everything; what was known before is nearer.
-                beta = np.where(known.known, known.value, beta)
+        self.prior = case.prior(estimator)
         positions = case.noise.grid[: len(estimator.sensing.position_columns)]
         noise = replace(case.noise, coordinates=estimator.sensing.coordinate_noise(positions))
         span = system.windows.momentum
@@ -182,7 +183,7 @@ class Attempt:
         )
         channels = session.sensing.channels
         values = [corrected(described, channels, segment) for segment in (*fitting, *held)]
-        self.rows = SessionRows(estimator.model, estimator.base, estimator.sensing, noise, values, beta)
+        self.rows = SessionRows(estimator.model, estimator.base, estimator.sensing, noise, values)
         self.make = CandidateColumns(self.rows, described)
         self._fitting = len(fitting)
         first, last = self.rows.time[:1].sum(), self.rows.time[-1:].sum()
@@ -192,19 +193,63 @@ class Attempt:
         if enough == 0:
             expected = "stretches without a gap of several windows, to fit and to check"
             raise InputError(case.source, "", f"too few windows of {span:g} s: {self.rows.count}", expected)
-        made = self.make.all() if candidates is None else [self._made(candidate) for candidate in candidates]
-        self.fixed = [self.make.of(effect) for effect in self.constants]
-        self.tracing = Tracing(self.rows, made, fitted, known, self.fixed)
+        self._sought = None if candidates is None else {(effect.name, effect.where) for effect in candidates}
+        self._fitted_windows = fitted
+        forces = [effect for effect in candidates or () if not is_constant(effect)]
+        made = self.make.forces() if candidates is None else [self.make.of(effect) for effect in forces]
+        if beta is None:
+            self._start(made)
+        else:
+            self.rows.weigh(beta)
+        self._trace(made)
 
-    def _made(self, candidate: Candidate | Effect) -> Candidate:
-        return candidate if isinstance(candidate, Candidate) else self.make.of(candidate)
+    def _start(self, candidates: Sequence[Candidate]) -> None:
+        """Weigh the rows with what the model and all candidates together make of them.
+
+        Weights of a model that lacks a large force are no start: most rows are homogeneous in π, and where it cannot
+        explain them it shrinks π, with π their noise, and with that their weight grows without end.
+        """
+        rows = self.rows
+        columns = np.concatenate([rows.Y, *(candidate.columns for candidate in candidates)], axis=2)
+        if LEAST_ROWS * columns.shape[2] > rows.b.size:
+            columns = rows.Y
+        std = np.ones_like(rows.b)
+        for _ in range(STARTS):
+            rows.weigh(together(columns / std[..., None], rows.b / std, self.prior)[: rows.base.n])
+            std = rows.std
+
+    def _trace(self, forces: Sequence[Candidate]) -> None:
+        """Begin to trace with the weights that the rows have now."""
+        sought = self._sought
+        constants = [c for c in self.make.constants() if sought is None or (c.effect.name, c.effect.where) in sought]
+        self.fixed = [self.make.of(effect) for effect in self.constants]
+        parts = self._fitted_windows, self.prior, self.fixed, self.make.variance
+        self.tracing = Tracing(self.rows, [*constants, *forces], *parts)
 
     def _fitted(self, time: NDArray[np.floating[Any]], segment: NDArray[np.int64]) -> NDArray[np.bool_]:
         return np.asarray((segment < self._fitting) & (time < self._split))
 
     def search(self) -> list[int]:
-        """Numbers of the candidates found."""
+        """Numbers of the candidates found, with rows weighed by what was found if it explains them."""
+        chosen = self._search()
+        for _ in range(REWEIGHED):
+            beta = self.solution(chosen)[: self.rows.base.n]
+            if self.prior is not None:
+                beta = np.where(self.prior.known, self.prior.value, beta)
+            if self._same_weights(beta) or self.excess(chosen) > LARGEST_SHARE_LEFT * self.excess([]):
+                break
+            self.rows.weigh(beta)
+            self._trace([candidate for candidate in self.tracing.candidates if not candidate.constant])
+            chosen = self._search()
+        return chosen
+
+    def _search(self) -> list[int]:
         return self.tracing.run(lambda chosen, k: refine(self.tracing, self.make, chosen, k))
+
+    def _same_weights(self, beta: Array) -> bool:
+        """Whether rows would be weighed alike with beta (n,): their noise goes with the size of their terms."""
+        sizes = [np.linalg.norm(self.rows.Y * values, axis=(0, 2)) for values in (beta, self.rows.beta)]
+        return bool(np.all(np.abs(sizes[0] - sizes[1]) <= SAME_WEIGHTS * sizes[1]))
 
     def solution(self, chosen: Sequence[int]) -> Array:
         """Parameters and coefficients from all windows."""
@@ -244,6 +289,7 @@ class Attempt:
     def state(self, chosen: Sequence[int]) -> State:
         """Residuals of the model with the effects chosen."""
         rows, tracing = self.rows, self.tracing
+        tracing.settle(chosen)
         fitted = tracing.fitted
         solution = tracing.solution(chosen, fitted)
         residual = tracing.residual(chosen, solution)
@@ -272,11 +318,6 @@ class Attempt:
             relative = joints.of(self.tracing.solution(chosen, self.tracing.fitted), held)
             out.append(Step(self.tracing.candidates[taken].key, tuple(c.key for c in effects), relative))
         return out
-
-
-def weighed(session: Estimator) -> bool:
-    """Whether a session's estimate comes from rows that are weighed by noise."""
-    return session.by_momentum or session.by_smoother
 
 
 def _exact(system: System) -> System | None:
@@ -322,24 +363,24 @@ def diagnose(
     attempt = described = Attempt(case, system)
     n = described.rows.base.n
     late: list[LateSensor] = []
-    while not weighed(before) and (found := find_late(attempt.rows, attempt.make, attempt.tracing.fitted)):
+    while not (before.by_momentum or before.by_smoother) and (
+        found := find_late(attempt.rows, attempt.make, attempt.tracing.fitted)
+    ):
         progress("taking off a sensor's lag")
         late.append(found)
         lagging = attempt.system.model_copy(update={"effects": (*attempt.system.effects, found.effect)})
         attempt = Attempt(case, lagging)
     chosen = attempt.search()
-    for _ in range(0 if weighed(before) else REWEIGHED):
-        # Nothing was known of the rows' noise that was worth the name, for nothing explained the torques.
-        beta = attempt.solution(chosen)[:n]
-        attempt = Attempt(case, attempt.system, (), beta, attempt.tracing.candidates)
-        described = Attempt(case, system, (), beta, ()) if late else attempt
-        chosen = attempt.search()
-    ranking = attempt.tracing.ranking()
+    if late:
+        # Weighed alike, so that before and after are in the same measure.
+        described = Attempt(case, system, (), attempt.rows.beta, ())
+    beyond = any(row.beyond for row in attempt.state(chosen).test.values())
     bare = described.state([])
+    ranking = attempt.tracing.ranking()
     exact = _exact(attempt.system)
-    if exact is not None and any(row.beyond for row in attempt.state(chosen).test.values()):
+    if exact is not None and beyond:
         progress("comparing exact links")
-        beta = described.solution([])[:n]
+        beta = described.rows.beta
         first = [attempt.tracing.candidates[k].effect for k in chosen[:1]]
         linear = Attempt(case, attempt.system, (), beta, first, SOME).excess(range(len(first)))
         if Attempt(case, exact, (), beta, (), SOME).excess(()) < linear:
@@ -357,11 +398,12 @@ def diagnose(
             solution = fewer.solution(range(len(forces)))
             constants, beta = fewer.improved(solution), solution[:n]
         keys = {(effect.name, effect.where) for effect in constants}
-        others = [c for c in attempt.tracing.candidates if (c.effect.name, c.effect.where) not in keys]
+        tried = [candidate.effect for candidate in attempt.tracing.candidates]
+        others = [effect for effect in tried if (effect.name, effect.where) not in keys]
         attempt = Attempt(case, attempt.system, constants, beta, others)
         chosen = attempt.search()
-    findings += [attempt.tracing.finding(chosen, k) for k in chosen]
     after = attempt.state(chosen)
+    findings += [attempt.tracing.finding(chosen, k) for k in chosen]
     progress("fitting the model with what was found")
     named = after.system != system
     estimator_after = _session(after.system, blocks, source, prior)[0] if named else before

@@ -13,7 +13,7 @@ from sms_online.diagnosis.trace import Finding
 from sms_online.effects.base import report
 from sms_online.effects.catalogue import ENTRIES, declarable
 from sms_online.model.parameters import Parameter
-from sms_online.results import LARGEST_RELATIVE_STD, NORMAL_95, results_document, standard_deviation
+from sms_online.results import LARGEST_RELATIVE_STD, NORMAL_95, results_document
 from sms_online.stream import Array
 
 SCHEMA = "sms-online/diagnosis/1"
@@ -162,7 +162,7 @@ def _by_comparison(diagnosis: Diagnosis) -> list[dict[str, Any]]:
 
 
 def coefficients(diagnosis: Diagnosis, finding: Finding) -> Coefficients:
-    """What a person reads of an effect, from the session after where it is an unknown of π."""
+    """What a person reads of an effect."""
     effect, attempt = finding.candidate.effect, diagnosis.attempt
     for k, (constant, candidate) in enumerate(zip(attempt.constants, attempt.fixed, strict=True)):
         if (constant.name, constant.where) == (effect.name, effect.where):
@@ -222,14 +222,9 @@ def _batch(attempt: Attempt, chosen: Sequence[int]) -> tuple[list[Parameter], Ar
 
 
 def _estimate(diagnosis: Diagnosis) -> tuple[list[str], Array, Array]:
-    """Names, values and covariance of the parameters after, its deviations those of the results."""
-    if diagnosis.attempt.prior is not None:
-        parameters, values, covariance = _batch(diagnosis.attempt, diagnosis.chosen)
-        return [p.name for p in parameters], values, np.where(np.isfinite(covariance), covariance, 0.0)
-    session = diagnosis.estimator_after
-    estimate, std = session.estimate(), standard_deviation(session)
-    stated = np.sqrt(np.diag(estimate.covariance))
-    ratio = np.divide(std, stated, out=np.ones_like(std), where=np.isfinite(stated) & (stated > 0.0))
-    known = np.isfinite(stated)
-    covariance = np.where(np.outer(known, known), estimate.covariance, 0.0) * np.outer(ratio, ratio)
-    return [p.name for p in session.base.parameters], estimate.pi, covariance
+    """Names, values and covariance of the parameters after, from the rows of the diagnosis.
+
+    A session thins the motion to what the arm's own columns need; a cogging's phase turns faster than that.
+    """
+    parameters, values, covariance = _batch(diagnosis.attempt, diagnosis.chosen)
+    return [p.name for p in parameters], values, np.where(np.isfinite(covariance), covariance, 0.0)

@@ -35,6 +35,14 @@ def free_of(Q: Array, columns: Array) -> Array:
     return np.asarray(once - Q @ (Q.T @ once))
 
 
+def least_squares(columns: Array, b: Array) -> Array:
+    """Solution (n,) for columns (M, n) and b (M,), of minimum norm in units of the columns' sizes."""
+    size = np.linalg.norm(columns, axis=0)
+    size[size == 0.0] = 1.0
+    R = np.asarray(np.linalg.qr(np.column_stack((columns / size, b)), mode="r"))
+    return np.asarray(np.linalg.lstsq(R[:, :-1], R[:, -1], rcond=RANK_TOLERANCE)[0] / size)
+
+
 @dataclass(frozen=True)
 class Gain:
     """What a candidate would do: gain of the residual sum of squares, coefficients (c,), covariance (c, c).

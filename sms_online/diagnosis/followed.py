@@ -27,6 +27,7 @@ class FollowedMotion:
         self._rate = sample_rate
         layout = sensing.model.layout
         self._motions = []
+        self._last: tuple[Model, dict[int, Array]] | None = None
         self._sizes = [segment.index.size for segment in segments]
         for segment in segments:
             x = sensing.coordinates(segment.values)
@@ -43,5 +44,11 @@ class FollowedMotion:
         if model.n_states == 0:
             return np.zeros((len(at), 0))
         samples, x, v = self._motions[number]
-        z = InternalStates(model, self._rate / STEP).push(x, v)
+        # Windows of one segment ask in turn for the same model's.
+        if self._last is None or self._last[0] is not model:
+            self._last = model, {}
+        known = self._last[1]
+        if number not in known:
+            known[number] = InternalStates(model, self._rate / STEP).push(x, v)
+        z = known[number]
         return np.stack([np.interp(at, samples, column) for column in z.T], axis=1)

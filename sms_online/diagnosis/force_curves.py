@@ -97,7 +97,7 @@ def _curve(diagnosis: Diagnosis, where: str, name: str, own: list[int]) -> Force
         direction[layout.q[i]] = -1.0
     variable = _variable(attempt, i, name, effects[0].coefficients.get("order", 1.0))
     # What is left once everything else has been subtracted.
-    left = after.residual * rows.std
+    left = after.residual * attempt.tracing.std
     for k in own:
         left = left + candidates[k].columns @ _coefficients(diagnosis, k)
     values = np.concatenate([variable(motion) for motion, _ in rows.weak.motions()])

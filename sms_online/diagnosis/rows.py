@@ -7,6 +7,7 @@ them is a column Z: Y β + Z c = b. Columns pass the same test functions and the
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 import scipy.linalg
@@ -18,7 +19,7 @@ from sms_online.model.base_parameters import BaseParameters
 from sms_online.model.model import Model
 from sms_online.pipeline.joint_balance import EXPONENT as JOINT_EXPONENT
 from sms_online.pipeline.joint_balance import JointBalance
-from sms_online.pipeline.momentum_balance import COPIES, EXPONENT, INSTANTS, Instants, MomentumBalance, Window
+from sms_online.pipeline.momentum_balance import COPIES, EXPONENT, HOPS, INSTANTS, Instants, MomentumBalance, Window
 from sms_online.pipeline.row_noise import STEPS, RowNoise, factored
 from sms_online.pipeline.sensing import Sensing
 from sms_online.pipeline.sensitivity import Sensitivities
@@ -39,12 +40,30 @@ def _displacements(readings: Array, rates: Array) -> Array:
     return np.stack((np.ones_like(readings), np.sin(readings), np.cos(readings), rates))
 
 
+@dataclass(frozen=True)
+class _Told:
+    """What the balance makes of one segment: windows, instants, rows [Y b] of all copies (W, copies, n_v, n + 1).
+
+    displacements (W, 4, STEPS + 1, sensors): of the readings, see DISPLACEMENTS, along each window.
+    """
+
+    windows: list[Window]
+    instants: list[Instants]
+    copies: Array
+    displacements: Array
+
+
 class SessionRows:
     """Rows of the windows of a session, n_v a window.
 
-    beta (n,): values behind the noise of the rows. Y (W, n_v, n), b (W, n_v): rows as they are. std (W, n_v): their own
-    predicted deviation. time (W,): the windows' middles, s since grid index 0. weak: evaluates further columns.
+    Y (W, n_v, n), b (W, n_v): rows as they are. time (W,): the windows' middles, s since grid index 0. weak: evaluates
+    further columns. Once they are weighed: beta (n,), values behind their noise; std (W, n_v), their own predicted
+    deviation; responses, name to (W, n_v, sensors): of the rows to so much added to each position sensor's reading.
     """
+
+    beta: Array
+    std: Array
+    responses: dict[str, Array]
 
     def __init__(
         self,
@@ -53,30 +72,20 @@ class SessionRows:
         sensing: Sensing,
         noise: SensorNoise,
         segments: Sequence[Segment],
-        beta: Array,
+        beta: Array | None = None,
     ) -> None:
-        self.model, self.base, self.sensing, self.noise, self.beta = model, base, sensing, noise, beta
+        """beta (n,): to weigh the rows with at once."""
+        self.model, self.base, self.sensing, self.noise = model, base, sensing, noise
         self.segments = list(segments)
         self._rate = rate = model.system.sample_rate
-        balance = MomentumBalance(model, base, rate, model.system.windows.momentum, prompt=False)
-        self._random = np.random.default_rng(SEED)
-        self._covariances: list[list[Array]] = []
-        self._responses: list[Array] = []
-        windows: list[tuple[int, Window]] = []
-        rows: list[Array] = []
+        self._balance = balance = MomentumBalance(model, base, rate, model.system.windows.momentum, prompt=False)
         self.followed = FollowedMotion(sensing, self.segments, rate)
-        for number, segment in enumerate(self.segments):
-            for window, dense in self._of_segment(balance, number, segment):
-                windows.append((number, window))
-                rows.append(dense)
+        added = self._noise_samples(np.random.default_rng(SEED))
+        self._told = [self._of_segment(k, *part) for k, part in enumerate(zip(self.segments, added, strict=True))]
+        windows = [(number, window) for number, told in enumerate(self._told) for window in told.windows]
         n_v = model.layout.n_v
-        stacked = np.array(rows).reshape(-1, n_v, base.n + 1)
+        stacked = np.concatenate([np.empty((0, n_v, base.n + 1)), *(told.copies[:, 0] for told in self._told)])
         self.Y, self.b = stacked[..., :-1], stacked[..., -1]
-        self.std = np.sqrt([np.diag(covariances[-1]) for covariances in self._covariances]).reshape(-1, n_v)
-        # Responses (W, n_v, sensors) of the rows to so much added to each position sensor's reading.
-        sensors = len(sensing.position_columns)
-        responses = np.array(self._responses).reshape(len(windows), len(DISPLACEMENTS), n_v, sensors)
-        self.responses = dict(zip(DISPLACEMENTS, np.moveaxis(responses, 1, 0), strict=True))
         half = balance.width / 2 + balance.margin
         self.time = np.array([window.end - half for _, window in windows]) / rate
         where = Windows(
@@ -89,45 +98,66 @@ class SessionRows:
             stride=lambda M: stride(M, balance.hop),
         )
         self.weak = WeakWindows(where, model.layout, sensing, self.segments, rate)
-        self.whiten(np.zeros(n_v))
+        if beta is not None:
+            self.weigh(beta)
 
-    def _of_segment(self, balance: MomentumBalance, number: int, segment: Segment) -> list[tuple[Window, Array]]:
-        """Windows of one segment with their rows [Y b] (n_v, n + 1); their covariances are appended to the others."""
-        noise, n_v = self.noise, self.model.layout.n_v
+    def _noise_samples(self, random: np.random.Generator) -> list[Array]:
+        """Noise of position sensors and torques, for each segment's samples (B, channels)."""
+        columns = [*self.sensing.position_columns, *self.sensing.torque_columns]
+        out = [np.zeros_like(segment.values) for segment in self.segments]
+        for added in out:
+            added[:, columns] = random.standard_normal((len(added), len(columns))) * self.noise.grid
+        return out
+
+    def _of_segment(self, number: int, segment: Segment, added: Array) -> _Told:
+        noise, n_v, balance = self.noise, self.model.layout.n_v, self._balance
         balance.begin_segment()
         followed = self.followed.states(self.model, number)
         measured = self.sensing.motion(np.concatenate((segment.values, followed), axis=1))
         copies = [measured] * COPIES
         if not noise.exact:
-            added = np.zeros_like(segment.values)
-            columns = [*self.sensing.position_columns, *self.sensing.torque_columns]
-            added[:, columns] = self._random.standard_normal((len(measured), len(columns))) * noise.grid
             copies[1:] = [
                 self.sensing.motion(np.concatenate((segment.values + sign * added, followed), axis=1))
                 for sign in (1.0, -1.0)
             ]
         windows, instants = balance.push(segment.index, copies, noise.coordinates)
-        if not windows:
-            return []
-        sensitivities = self._sensitivities(instants, balance.span)
-        row_noise = RowNoise(self.model.layout.theta_m, balance.span)
-        readings = self._readings(segment, _middle([window.half_width for window in windows]))
-        seconds = np.arange(STEPS + 1) * balance.span / STEPS
         dense = np.zeros((len(windows), COPIES, n_v, self.base.n + 1))
         for rows, window in zip(dense, windows, strict=True):
             rows[:, balance.rows, balance.columns] = window.Y
             rows[:, :, -1] = window.b
-        extra = self._beyond_first_order(dense, [window.half_width for window in windows])
-        for window, variance in zip(windows, extra, strict=True):
-            sensitivity = sensitivities.window(window.start)
-            covariances = row_noise.covariance(sensitivity, noise.sensors, noise.torque)
-            covariances[-1][np.diag_indices(n_v)] += variance
-            self._covariances.append(covariances)
-            begin_s = (window.start * balance.half_hop + balance.margin) / self._rate
-            added = _displacements(*readings(begin_s + seconds))
-            kernel = row_noise.kernel(sensitivity) * (balance.span / STEPS)
-            self._responses.append(np.einsum("sij,dsj->dij", kernel, added))
-        return list(zip(windows, dense[:, 0], strict=True))
+        displacements = np.empty((0, len(DISPLACEMENTS), STEPS + 1, len(self.sensing.position_columns)))
+        if windows:
+            readings = self._readings(segment, _middle([window.half_width for window in windows]))
+            begin = np.array([window.start * balance.half_hop + balance.margin for window in windows]) / self._rate
+            at = begin[:, None] + np.arange(STEPS + 1) * balance.span / STEPS
+            added = _displacements(*readings(at.ravel()))
+            displacements = added.reshape(len(DISPLACEMENTS), len(windows), STEPS + 1, -1).swapaxes(0, 1)
+        return _Told(windows, instants, dense, displacements)
+
+    def weigh(self, beta: Array) -> None:
+        """Tell the noise of the rows for parameters beta (n,), and make them independent of each other."""
+        n_v, noise, span = self.model.layout.n_v, self.noise, self._balance.span
+        self.beta = beta
+        self._covariances: list[list[Array]] = []
+        responses: list[Array] = []
+        for told in self._told:
+            if not told.windows:
+                continue
+            sensitivities = self._sensitivities(told.instants, span)
+            row_noise = RowNoise(self.model.layout.theta_m, span)
+            extra = self._beyond_first_order(told.copies, [window.half_width for window in told.windows])
+            for window, variance, added in zip(told.windows, extra, told.displacements, strict=True):
+                sensitivity = sensitivities.window(window.start)
+                covariances = row_noise.covariance(sensitivity, noise.sensors, noise.torque)
+                covariances[-1][np.diag_indices(n_v)] += variance
+                self._covariances.append(covariances)
+                # Sums over the steps, sensor by sensor.
+                kernel = row_noise.kernel(sensitivity).transpose(2, 1, 0) * (span / STEPS)
+                responses.append((kernel @ added.transpose(2, 1, 0)).transpose(2, 1, 0))
+        self.std = np.sqrt([np.diag(covariances[-1]) for covariances in self._covariances]).reshape(-1, n_v)
+        stacked = np.array(responses).reshape(self.count, len(DISPLACEMENTS), n_v, -1)
+        self.responses = dict(zip(DISPLACEMENTS, np.moveaxis(stacked, 1, 0), strict=True))
+        self.whiten(np.zeros_like(self.std))
 
     def _beyond_first_order(self, dense: Array, half_widths: list[int]) -> Array:
         """Variance (W, n_v) of what noise does beyond first order, by filter width, and of rounding, as in the fit."""
@@ -163,28 +193,41 @@ class SessionRows:
             out.tell(pi, *(part[start : start + TOLD] for part in parts))
         return out
 
+    def noisy(self) -> list[WeakWindows]:
+        """The windows over the same session with synthetic noise of the sensors added and subtracted."""
+        added = self._noise_samples(np.random.default_rng(SEED))
+        weak = self.weak
+        out = []
+        for sign in (1.0, -1.0):
+            moved = [
+                Segment(segment.index, segment.values + sign * each)
+                for segment, each in zip(self.segments, added, strict=True)
+            ]
+            out.append(WeakWindows(weak.windows, self.model.layout, self.sensing, moved, self._rate))
+        return out
+
     @property
     def count(self) -> int:
         """Number of windows W."""
-        return len(self._covariances)
+        return len(self.b)
 
-    def whiten(self, floor: Array) -> None:
-        """Make the windows' rows independent; floor (n_v,): share of a row's variance that is an error of its own."""
+    def whiten(self, own: Array) -> None:
+        """Make the windows' rows independent; own (W, n_v): share of a row's variance that is an error of its own."""
         n_v = self.model.layout.n_v
         self._operators: list[tuple[Array, Array]] = []
         L = np.empty((0, 0))
-        for covariances in self._covariances:
-            L = factored(L, covariances, floor)
-            self._operators.append((L[-n_v:, :-n_v].copy(), L[-n_v:, -n_v:].copy()))
+        for covariances, share in zip(self._covariances, own, strict=True):
+            L = factored(L, covariances, share)
+            inverse = scipy.linalg.solve_triangular(L[-n_v:, -n_v:], np.eye(n_v), lower=True, check_finite=False)
+            self._operators.append((inverse @ L[-n_v:, :-n_v], inverse))
 
     def white(self, columns: Array) -> Array:
         """Columns (W, n_v, c) in the whitened rows, (W n_v, c)."""
         n_v, c = columns.shape[1:]
         out = np.empty((self.count * n_v, c))
-        for k, (X, diagonal) in enumerate(self._operators):
+        for k, (before, own) in enumerate(self._operators):
             begin = k * n_v
-            rows = columns[k] - X @ out[begin - X.shape[1] : begin]
-            out[begin : begin + n_v] = scipy.linalg.solve_triangular(diagonal, rows, lower=True, check_finite=False)
+            out[begin : begin + n_v] = own @ columns[k] - before @ out[begin - before.shape[1] : begin]
         return out
 
     def freedom(self, speeds: Sequence[int]) -> float:
@@ -193,12 +236,13 @@ class SessionRows:
         2 / variance of the mean of squares of correlated normal numbers: (W S)² / Σ ρ².
         """
         total = 0.0
-        deviations = [np.sqrt(np.diag(covariances[-1]))[list(speeds)] for covariances in self._covariances]
-        for k, covariances in enumerate(self._covariances):
-            for lag, block in enumerate(reversed(covariances)):
-                scale = np.outer(deviations[k], deviations[k - lag])
-                part = float(np.sum((block[np.ix_(speeds, speeds)] / scale) ** 2))
-                total += part if lag == 0 else 2.0 * part
+        variance = self.std[:, speeds] ** 2
+        for lag in range(HOPS):
+            later = [k for k, covariances in enumerate(self._covariances) if len(covariances) > lag]
+            if later:
+                blocks = np.array([self._covariances[k][-1 - lag] for k in later])[:, speeds][..., speeds]
+                scale = variance[later, :, None] * variance[np.array(later) - lag, None, :]
+                total += (1.0 if lag == 0 else 2.0) * float(np.sum(blocks**2 / scale))
         return (self.count * len(speeds)) ** 2 / total
 
 

@@ -17,10 +17,11 @@ from numpy.typing import NDArray
 
 from sms_online.description.schema import Effect
 from sms_online.diagnosis.constants import is_constant
-from sms_online.diagnosis.evidence import RANK_TOLERANCE, Gain, basis, free_of, gain, threshold
+from sms_online.diagnosis.evidence import Gain, basis, free_of, gain, least_squares, threshold
 from sms_online.diagnosis.plausible import plausible
 from sms_online.diagnosis.rows import SessionRows
 from sms_online.model.parameters import Parameter
+from sms_online.pipeline.momentum_balance import HOPS
 from sms_online.stream import Array
 from sms_online.trackers.factor import prior_factor, solve
 from sms_online.trackers.interface import Prior
@@ -40,6 +41,10 @@ ACTS = 0.01
 LARGEST_RATIO = 1.5
 # A drive that holds its command over a sample acts half a sample late: a lag up to that, in samples, is no sensor's.
 HELD = 0.5
+# No law of a force is true to better than 0.3 %, and what it leaves of its own gain is no other effect on its rows.
+INEXACT = 1e-5
+# Share of a row's variance by which that of the effects chosen has to change for rows to be weighed anew.
+SMALL_CHANGE = 0.1
 # Effects that contain a simpler one, which is to be tried first, as is everything else: they refine a law.
 EXTENDS = {"direction_friction": "viscous_friction"}
 # At most so many effects are looked for in turn.
@@ -100,6 +105,22 @@ class Ranked:
     share: float
 
 
+def together(columns: Array, b: Array, prior: Prior | None) -> Array:
+    """Solution (n + c,) for columns (W, n_v, n + c) of a model and of all candidates, and b (W, n_v).
+
+    Parameters that are known beforehand keep their values: where a model lacks much, parameters that shrink to zero
+    would explain rows without a torque.
+    """
+    known = np.zeros(columns.shape[2], dtype=bool)
+    solution = np.zeros(columns.shape[2])
+    if prior is not None:
+        known[: prior.known.size] = prior.known
+        solution[known] = prior.value[prior.known]
+    left = b - columns[..., known] @ solution[known]
+    solution[~known] = least_squares(columns[..., ~known].reshape(b.size, -1), left.ravel())
+    return solution
+
+
 class Tracing:
     """Searches the candidates for what the rows of a session leave.
 
@@ -113,40 +134,62 @@ class Tracing:
         fitted: NDArray[np.bool_],
         prior: Prior | None = None,
         fixed: Sequence[Candidate] = (),
+        variance: Callable[[Candidate, Array], Array] | None = None,
     ) -> None:
-        """fixed: effects that belong to the model already, whose columns come right after its parameters'."""
+        """fixed: effects that belong to the model already, whose columns come right after its parameters'. variance:
+        gives (W, n_v) of the rows for what noise makes of a candidate with coefficients (c,); none unless given.
+        """
         self.rows, self.candidates, self.fitted = rows, list(candidates), fitted
+        self._variance, self._prior = variance, prior
         self._n_v = rows.model.layout.n_v
         self._model = np.concatenate([rows.Y, *(candidate.columns for candidate in fixed)], axis=2)
-        self._plain_model = self._model / rows.std[..., None]
-        self._plain = [candidate.columns / rows.std[..., None] for candidate in self.candidates]
-        self.floor = self._floor(prior)
-        rows.whiten(self.floor)
-        # What is known beforehand are rows too, of parameters alone.
-        known = prior_factor(prior, rows.base.n)
-        more = self._model.shape[2] - rows.base.n
-        self._Y = np.concatenate((rows.white(self._model), np.pad(known[:, :-1], ((0, 0), (0, more)))))
-        self._b = np.concatenate((rows.white(rows.b[..., None])[:, 0], known[:, -1]))
-        self._Z = [self._whitened(candidate) for candidate in self.candidates]
         self.trials = len(self.candidates)
         # Which candidate each step of the search took, and all that were chosen then.
         self.path: list[tuple[int, list[int]]] = []
+        self._own = np.zeros_like(rows.std)  # variance of the effects chosen
+        self._taken: dict[int, float] = {}  # gains of the effects chosen
+        self._weigh()
 
-    def _floor(self, prior: Prior | None) -> Array:
-        """Excess of each speed's rows over their variance, (n_v,), that all candidates together leave.
+    def settle(self, chosen: Sequence[int]) -> None:
+        """Weigh the rows with what noise makes of the effects chosen too: of a rate's sign near a reversal, say."""
+        if self._variance is None:
+            return
+        own = np.zeros_like(self.rows.std)
+        at, solution = self._model.shape[2], self.solution(chosen, np.ones(self.rows.count, dtype=bool))
+        for k in chosen:
+            c = len(self.candidates[k].parameters)
+            own += self._variance(self.candidates[k], solution[at : at + c])
+            at += c
+        if np.any(np.abs(own - self._own) > SMALL_CHANGE * (self.rows.std**2 + self._own)):
+            self._own = own
+            self._weigh()
 
-        Parameters that are known beforehand keep their values here: where a model lacks much, parameters that shrink to
-        zero would explain rows without a torque.
-        """
-        free = np.ones(self._plain_model.shape[2], dtype=bool)
-        b = self.rows.b / self.rows.std
-        if prior is not None:
-            known = np.flatnonzero(prior.known)
-            free[known] = False
-            b = b - self._plain_model[..., known] @ prior.value[known]
-        plain = [self._plain_model[..., free], *self._plain]
-        stacked = np.concatenate(plain, axis=2)
-        left = free_of(basis(stacked.reshape(b.size, stacked.shape[2])), b.reshape(-1, 1)).reshape(b.shape)
+    def _weigh(self) -> None:
+        rows = self.rows
+        self.std = np.sqrt(rows.std**2 + self._own)
+        self._plain_model = self._model / self.std[..., None]
+        self._plain = [candidate.columns / self.std[..., None] for candidate in self.candidates]
+        self.floor = self._floor()
+        # Windows that overlap share the noise of the effects chosen: as errors of their own they count it once.
+        weighed = (1.0 + self.floor) * self.std**2 + (HOPS - 1) * self._own
+        rows.whiten(weighed / rows.std**2 - 1.0)
+        # What is known beforehand are rows too, of parameters alone.
+        known = prior_factor(self._prior, rows.base.n)
+        self._known = len(known)
+        n, width = rows.base.n, self._model.shape[2]
+        parts = [self._model, rows.b[..., None], *(candidate.columns for candidate in self.candidates)]
+        white = self._padded(rows.white(np.concatenate(parts, axis=2)))
+        if self._known:
+            white[-self._known :, :n], white[-self._known :, width] = known[:, :-1], known[:, -1]
+        ends = np.cumsum([part.shape[2] for part in parts])
+        self._Y, b, *self._Z = np.split(white, ends[:-1], axis=1)
+        self._b = b[:, 0]
+
+    def _floor(self) -> Array:
+        """Excess of each speed's rows over their variance, (n_v,), that all candidates together leave."""
+        left = self.rows.b / self.std
+        plain = np.concatenate([self._plain_model, *self._plain], axis=2)
+        left = left - plain @ together(plain, left, self._prior)
         ratio = np.mean(left**2, axis=0)
         return np.where(ratio > LARGEST_RATIO, ratio - 1.0, 0.0)
 
@@ -173,15 +216,25 @@ class Tracing:
     def put(self, k: int, candidate: Candidate) -> None:
         """Put another form of an effect in the place of a candidate."""
         self.candidates[k] = candidate
-        self._plain[k] = candidate.columns / self.rows.std[..., None]
+        self._plain[k] = candidate.columns / self.std[..., None]
         self._Z[k] = self._whitened(candidate)
 
     def _whitened(self, candidate: Candidate) -> Array:
-        white = self.rows.white(candidate.columns)
-        return np.concatenate((white, np.zeros((len(self._Y) - len(white), white.shape[1]))))
+        return self._padded(self.rows.white(candidate.columns))
+
+    def _padded(self, white: Array) -> Array:
+        return np.concatenate((white, np.zeros((self._known, white.shape[1]))))
 
     def _excess(self, k: int, g: Gain) -> float:
-        return g.gain - threshold(FALSE_ALARM, self.trials, self._Z[k].shape[1])
+        """Gain beyond what an absent candidate reaches, and beyond what the laws of those found are uncertain by."""
+        acts = self._acts(k)
+        same = [taken for other, taken in self._taken.items() if other != k and np.any(acts & self._acts(other))]
+        return g.gain - max(threshold(FALSE_ALARM, self.trials, self._Z[k].shape[1]), INEXACT * max(same, default=0.0))
+
+    def _acts(self, k: int) -> NDArray[np.bool_]:
+        """Speeds (n_v,) in whose rows a candidate acts."""
+        squares = np.sum(self._plain[k] ** 2, axis=(0, 2))
+        return np.asarray(squares > ACTS * squares.max())
 
     def _preferred(self, gains: Sequence[Gain], allowed: Sequence[int]) -> int | None:
         """The candidate to take: the best one, or one with fewer constants that takes nearly as much."""
@@ -207,6 +260,7 @@ class Tracing:
         """
         chosen: list[int] = []
         self.path = []
+        self._taken = {}
         refused: set[str] = set()
         seen: set[frozenset[int]] = {frozenset()}
         while len(chosen) < MOST_EFFECTS:
@@ -219,11 +273,14 @@ class Tracing:
                 refused.add(self.candidates[best].key)
                 continue
             refine([*chosen, best], best)
+            self._taken[best] = self.gains(chosen)[best].gain
             chosen = self._revised([*chosen, best])
+            self._taken = {k: gain for k, gain in self._taken.items() if k in chosen}
             if frozenset(chosen) in seen:
                 break  # effects that replace each other in turn
             seen.add(frozenset(chosen))
             self.path.append((best, list(chosen)))
+            self.settle(chosen)
             if self.candidates[best].constant:
                 # What it leaves while it is only approximately taken off must not be given to others.
                 break
@@ -261,9 +318,7 @@ class Tracing:
 
     def _held_out(self, chosen: Sequence[int], acting: int) -> float:
         left = self.residual(chosen, self.solution(chosen, self.fitted))[~self.fitted]
-        squares = np.sum(self._plain[acting] ** 2, axis=(0, 2))
-        acts = squares > ACTS * squares.max()
-        return float(np.sqrt(np.mean(left[:, acts] ** 2)))
+        return float(np.sqrt(np.mean(left[:, self._acts(acting)] ** 2)))
 
     def finding(self, chosen: Sequence[int], k: int) -> Finding:
         """What is to be said of one of the candidates chosen."""
@@ -306,10 +361,7 @@ class Tracing:
         """Parameters and coefficients (n + c,) of the model with those chosen, from some windows (W,)."""
         use = np.ones(len(self._b), dtype=bool)
         use[: windows.size * self._n_v] = np.repeat(windows, self._n_v)
-        columns = self._columns(chosen)[use]
-        size = np.linalg.norm(columns, axis=0)
-        size[size == 0.0] = 1.0
-        return np.asarray(np.linalg.lstsq(columns / size, self._b[use], rcond=RANK_TOLERANCE)[0] / size)
+        return least_squares(self._columns(chosen)[use], self._b[use])
 
     def covariance(self, chosen: Sequence[int]) -> Array:
         """Of the solution (n + c, n + c) from all windows, infinite where they tell nothing."""
@@ -317,6 +369,6 @@ class Tracing:
         return solve(np.column_stack((columns, self._b))).covariance()
 
     def residual(self, chosen: Sequence[int], solution: Array) -> Array:
-        """What is left of every row (W, n_v) over its own deviation."""
+        """What is left of every row (W, n_v) over its own deviation, see `settle`."""
         plain = np.concatenate([self._plain_model, *(self._plain[k] for k in chosen)], axis=2)
-        return np.asarray(self.rows.b / self.rows.std - plain @ solution)
+        return np.asarray(self.rows.b / self.std - plain @ solution)

@@ -2,14 +2,15 @@
 
     python -m tests.campaigns.blind run RESULTS.jsonl --seeds 4
     python -m tests.campaigns.blind struck RESULTS.jsonl --seeds 4
+    python -m tests.campaigns.blind pairs RESULTS.jsonl --seeds 20
     python -m tests.campaigns.blind clean RESULTS.jsonl --seeds 100
     python -m tests.campaigns.blind summary RESULTS.jsonl
 
 Place, size and shape constants of each effect are drawn by the seed: it is worth 2 to 20 % of the rms of the rows that
 it acts on, or of their peaks. The diagnosis sees a capture with noise of grade B and a description with other nominal
 values; what was drawn is compared afterwards. `struck` diagnoses the cases with the true effect, and those whose
-columns are within 10° of it, struck out of the catalogue. Every case is a line of RESULTS.jsonl; a stopped campaign
-goes on where it was.
+columns are within 10° of it, struck out of the catalogue; in those of `pairs` two effects act at once. Every case is a
+line of RESULTS.jsonl; a stopped campaign goes on where it was.
 """
 
 from __future__ import annotations
@@ -155,6 +156,31 @@ def run(results: Path, cache: Path, seeds: int, names: list[str], struck: bool) 
             _append(results, {"kind": kind, "seed": seed, **case})
 
 
+def pairs(results: Path, cache: Path, seeds: int, names: list[str]) -> None:
+    """Append sessions with two effects of different names, one pair for each seed."""
+    system = load_system(SYSTEM)
+    draw = Draw(system, cache)
+    done = {r["seed"] for r in read(results) if r["kind"] == "pair"} if results.exists() else set()
+    drawn = [name for name in names if ENTRIES[name].kind != "kinematics"]
+    for seed in range(seeds):
+        if seed in done:
+            continue
+        rng = np.random.default_rng([seed, 2])
+        effects = tuple(draw.effect(str(name), seed) for name in rng.choice(drawn, 2, replace=False))
+        exact = simulate(system.model_copy(update={"effects": effects}), position_tolerance=TOLERANCE)
+        found = diagnose(disguised(system), [_joined(sampled_blocks(exact, GRADE, seed))], "case", lambda _: None)
+        record = {
+            "kind": "pair",
+            "seed": seed,
+            "name": "+".join(effect.name for effect in effects),
+            "true": {f"{effect.name}@{effect.where}": effect.coefficients for effect in effects},
+            "verdict": found.verdict,
+            "found": _keys(found),
+            "holdout": found.after.holdout.whitened,
+        }
+        _append(results, record)
+
+
 def clean(results: Path, cache: Path, seeds: int) -> None:
     """Append clean sessions of all grades."""
     system = load_system(SYSTEM)
@@ -250,7 +276,7 @@ def _struck(system: System, block: Block, effect: Effect, draw: Draw) -> Record:
 
 
 def summary(records: list[Record]) -> str:
-    """Shares of cases named rightly, inside the ambiguity group, unexplained when struck, and clean."""
+    """Shares of cases named rightly, inside the ambiguity group, unexplained when struck, in pairs, and clean."""
     lines = []
     singles = [r for r in records if r["kind"] == "single"]
     right = group = 0
@@ -279,6 +305,11 @@ def summary(records: list[Record]) -> str:
         right_row = sum(r["row"] == r["worst"] for r in unexplained)
         lines.append(f"{len(struck)} struck: unexplained {len(unexplained)}, right row {right_row}")
         lines += [f"   {r['name']}@{r['where']}: {r['verdict']} {r['found']}" for r in struck if r not in unexplained]
+    both = [r for r in records if r["kind"] == "pair"]
+    if both:
+        named = [r for r in both if set(r["true"]) <= set(r["found"])]
+        lines.append(f"{len(both)} pairs: both named {len(named)}")
+        lines += [f"   {list(r['true'])} → {r['found']}" for r in both if r not in named]
     cleans = [r for r in records if r["kind"] == "clean"]
     if cleans:
         lines.append(f"{len(cleans)} clean: {sum(r['verdict'] != 'clean' for r in cleans)} more than noise")
@@ -288,7 +319,7 @@ def summary(records: list[Record]) -> str:
 def main() -> None:
     """Command line of the campaign."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("what", choices=("run", "struck", "clean", "summary"))
+    parser.add_argument("what", choices=("run", "struck", "pairs", "clean", "summary"))
     parser.add_argument("results", type=Path)
     parser.add_argument("--seeds", type=int, default=4)
     parser.add_argument("--cache", type=Path, default=Path("runs/blind-clean.npz"))
@@ -296,6 +327,8 @@ def main() -> None:
     args = parser.parse_args()
     if args.what in ("run", "struck"):
         run(args.results, args.cache, args.seeds, args.names, args.what == "struck")
+    elif args.what == "pairs":
+        pairs(args.results, args.cache, args.seeds, args.names)
     elif args.what == "clean":
         clean(args.results, args.cache, args.seeds)
     else:
