@@ -140,7 +140,10 @@ def test_constants_are_improved_by_what_is_left_of_them() -> None:
 
 
 def test_only_plausible_coefficients_are_taken() -> None:
-    assert plausible("coulomb_friction", np.array([0.1]))
-    assert not plausible("coulomb_friction", np.array([-0.1]))
-    assert not plausible("torque_gain", np.array([-1.0]))
-    assert plausible("cubic_stiffness", np.array([-100.0]))
+    assert plausible("coulomb_friction", np.array([0.1]), 1000.0)
+    assert not plausible("coulomb_friction", np.array([-0.1]), 1000.0)
+    assert not plausible("torque_gain", np.array([-1.0]), 1000.0)
+    assert plausible("cubic_stiffness", np.array([-100.0]), 1000.0)
+    # What a held command does is no sensor's lag.
+    assert not plausible("sensor_lag", np.array([4e-4]), 1000.0)
+    assert plausible("sensor_lag", np.array([4e-4]), 2000.0)

@@ -11,6 +11,7 @@ from collections.abc import Iterable, Sequence
 import numpy as np
 
 from sms_online.description.schema import Effect, System
+from sms_online.diagnosis.plausible import plausible
 from sms_online.diagnosis.record import Segment
 from sms_online.effects.catalogue import ENTRIES, channel_effects
 from sms_online.effects.spacecraft import TableTilt
@@ -44,6 +45,13 @@ def improved(effect: Effect, increments: Array) -> Effect:
         case _:
             raise ValueError(f"{effect.name} has no constants to improve")
     return effect.model_copy(update={"coefficients": changed})
+
+
+def stands(effect: Effect, sample_rate: float) -> bool:
+    """Whether constants that were improved are still of an effect, on samples at so many Hz."""
+    if effect.name != "sensor_lag":
+        return True
+    return plausible(effect.name, np.array([delay_of(effect.coefficients["corner"])]), sample_rate)
 
 
 def deviations(effect: Effect, covariance: Array) -> dict[str, float]:

@@ -3,85 +3,24 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
-from typing import Any
-
-import numpy as np
-from numpy.typing import NDArray
+from dataclasses import dataclass
 
 from sms_online.description.schema import Effect, System
-from sms_online.diagnosis.candidates import CandidateColumns
-from sms_online.diagnosis.constants import applied, corrected, improved, is_constant
-from sms_online.diagnosis.followed import HALF_WIDTH
+from sms_online.diagnosis.attempt import LARGEST_SHARE_LEFT, Attempt, Case, PriorOf, State, Step
+from sms_online.diagnosis.constants import stands
 from sms_online.diagnosis.late_sensors import LateSensor, find_late
-from sms_online.diagnosis.record import LONGEST, SampleRecord, Segment, excerpts
-from sms_online.diagnosis.relative import RelativeResiduals
-from sms_online.diagnosis.residuals import ResidualTest, RowResidual, whitened
-from sms_online.diagnosis.rows import SessionRows
-from sms_online.diagnosis.shape import refine
-from sms_online.diagnosis.trace import Candidate, Finding, Ranked, Tracing, together
+from sms_online.diagnosis.record import SampleRecord
+from sms_online.diagnosis.trace import Finding, Ranked
 from sms_online.diagnosis.unexplained import Unexplained, describe_residual
 from sms_online.effects.catalogue import ENTRIES, places
 from sms_online.errors import InputError
 from sms_online.pipeline.estimator import Estimator
-from sms_online.pipeline.momentum_balance import HOPS
-from sms_online.pipeline.sensor_noise import SensorNoise
-from sms_online.stream import Array, Block
-from sms_online.trackers.interface import Prior
+from sms_online.stream import Block
 
-# Share of a session that coefficients are fitted to where no other capture is held out; the rest checks them.
-FITTED = 2.0 / 3.0
-# A verdict names effects that take away all but this share of what is beyond noise: a wrong one that is 10° from the
-# right one leaves sin² 10°.
-LARGEST_SHARE_LEFT = 0.03
 # Times that the constants of channels' effects are improved, each with samples corrected by those found before.
 CORRECTIONS = 3
-# Windows that a session is judged by at most: of a longer one stretches are taken.
-MOST_WINDOWS = 2500
-# Stretches of a session that is used in part, in window lengths.
-STRETCH = 5.0
-# Times that all candidates are fitted together for the first weights of the rows: without weights, then with those.
-STARTS = 2
-# Rows for a column at least, for all candidates to be fitted together.
-LEAST_ROWS = 4
-# Times at most that rows are weighed anew by what was found, to search again; weights are the same where the size of
-# the rows' terms changes by less than this share.
-REWEIGHED = 2
-SAME_WEIGHTS = 0.1
 # Part of a session that tells which kinematics of links are nearer, and improves channels' constants, s.
 SOME = 8.0
-
-
-@dataclass(frozen=True)
-class Part:
-    """Residuals of a model with what was fitted, by row type; whitened over the predicted deviation, relative to the
-    measured torque or force."""
-
-    whitened: dict[str, float]
-    relative: dict[str, float]
-
-
-@dataclass(frozen=True)
-class State:
-    """What a model, with or without the effects found, makes of the session.
-
-    system: with the effects. solution (n + c,): parameters and coefficients fitted to the fitted windows. residual (W,
-    n_v): of all windows, over each row's own predicted deviation; time (W,): their middles, s since grid index 0.
-    """
-
-    system: System
-    solution: Array
-    residual: Array
-    time: Array
-    fitted: NDArray[np.bool_]
-    fit: Part
-    holdout: Part
-    test: dict[str, RowResidual]
-
-    @property
-    def excess(self) -> float:
-        """Sum of squares beyond noise."""
-        return float(np.sum(self.residual**2) - self.residual.size)
 
 
 @dataclass(frozen=True)
@@ -118,206 +57,6 @@ class Diagnosis:
 def _left(before: State, after: State) -> float:
     """Share of what is beyond noise that is left."""
     return max(0.0, after.excess) / max(before.excess, 1.0)
-
-
-@dataclass(frozen=True)
-class Step:
-    """What a search had found when it took one more effect.
-
-    taken: its key, name@where; effects: all keys by then, what it replaced left out. relative: residual of held-out
-    rows by joint, over the measured torque or force, fitted to the others.
-    """
-
-    taken: str
-    effects: tuple[str, ...]
-    relative: dict[str, float]
-
-
-# Gives what is known beforehand of the parameters of an estimator's model.
-PriorOf = Callable[[Estimator], Prior | None]
-
-
-@dataclass(frozen=True)
-class Case:
-    """A capture to be diagnosed: its session with the system as described, samples, and those held out."""
-
-    source: str
-    session: Estimator
-    noise: SensorNoise
-    segments: Sequence[Segment]
-    held: Sequence[Segment]
-    prior: PriorOf
-
-
-class Attempt:
-    """One description of the system against the samples of a session."""
-
-    def __init__(
-        self,
-        case: Case,
-        system: System,
-        constants: Sequence[Effect] = (),
-        beta: Array | None = None,
-        candidates: Sequence[Effect] | None = None,
-        most: float = LONGEST,
-    ) -> None:
-        """constants: see that module. beta (n,): behind the noise of rows, from the rows themselves unless given.
-        candidates: all by default. most: s of the session that are used.
-        """
-        self.system, self.constants = system, list(constants)
-        session = case.session
-        described = applied(system, constants)
-        same = described == session.system
-        estimator = session if same else Estimator(described, session.sensing.channels, case.source)
-        self.prior = case.prior(estimator)
-        positions = case.noise.grid[: len(estimator.sensing.position_columns)]
-        noise = replace(case.noise, coordinates=estimator.sensing.coordinate_noise(positions))
-        span = system.windows.momentum
-        most = min(most, MOST_WINDOWS * span / HOPS)
-        length, longest = (round(seconds * system.sample_rate) for seconds in (STRETCH * span, most))
-        # Windows of the widest filter, a tenth of a window more than none.
-        least = round(1.5 * span * system.sample_rate) + 2 * HALF_WIDTH
-        fitting, held = (
-            [part for part in excerpts(each, length, longest) if part.index.size > least]
-            for each in (case.segments, case.held)
-        )
-        channels = session.sensing.channels
-        values = [corrected(described, channels, segment) for segment in (*fitting, *held)]
-        self.rows = SessionRows(estimator.model, estimator.base, estimator.sensing, noise, values)
-        self.make = CandidateColumns(self.rows, described)
-        self._fitting = len(fitting)
-        first, last = self.rows.time[:1].sum(), self.rows.time[-1:].sum()
-        self._split = np.inf if held else first + FITTED * (last - first)
-        fitted = self._fitted(self.rows.time, self.rows.weak.windows.segment)
-        enough = min(int(fitted.sum()) * self.rows.model.layout.n_v // (2 * self.rows.base.n), int((~fitted).sum()))
-        if enough == 0:
-            expected = "stretches without a gap of several windows, to fit and to check"
-            raise InputError(case.source, "", f"too few windows of {span:g} s: {self.rows.count}", expected)
-        self._sought = None if candidates is None else {(effect.name, effect.where) for effect in candidates}
-        self._fitted_windows = fitted
-        forces = [effect for effect in candidates or () if not is_constant(effect)]
-        made = self.make.forces() if candidates is None else [self.make.of(effect) for effect in forces]
-        if beta is None:
-            self._start(made)
-        else:
-            self.rows.weigh(beta)
-        self._trace(made)
-
-    def _start(self, candidates: Sequence[Candidate]) -> None:
-        """Weigh the rows with what the model and all candidates together make of them.
-
-        Weights of a model that lacks a large force are no start: most rows are homogeneous in π, and where it cannot
-        explain them it shrinks π, with π their noise, and with that their weight grows without end.
-        """
-        rows = self.rows
-        columns = np.concatenate([rows.Y, *(candidate.columns for candidate in candidates)], axis=2)
-        if LEAST_ROWS * columns.shape[2] > rows.b.size:
-            columns = rows.Y
-        std = np.ones_like(rows.b)
-        for _ in range(STARTS):
-            rows.weigh(together(columns / std[..., None], rows.b / std, self.prior)[: rows.base.n])
-            std = rows.std
-
-    def _trace(self, forces: Sequence[Candidate]) -> None:
-        """Begin to trace with the weights that the rows have now."""
-        sought = self._sought
-        constants = [c for c in self.make.constants() if sought is None or (c.effect.name, c.effect.where) in sought]
-        self.fixed = [self.make.of(effect) for effect in self.constants]
-        parts = self._fitted_windows, self.prior, self.fixed, self.make.variance
-        self.tracing = Tracing(self.rows, [*constants, *forces], *parts)
-
-    def _fitted(self, time: NDArray[np.floating[Any]], segment: NDArray[np.int64]) -> NDArray[np.bool_]:
-        return np.asarray((segment < self._fitting) & (time < self._split))
-
-    def search(self) -> list[int]:
-        """Numbers of the candidates found, with rows weighed by what was found if it explains them."""
-        chosen = self._search()
-        for _ in range(REWEIGHED):
-            beta = self.solution(chosen)[: self.rows.base.n]
-            if self.prior is not None:
-                beta = np.where(self.prior.known, self.prior.value, beta)
-            if self._same_weights(beta) or self.excess(chosen) > LARGEST_SHARE_LEFT * self.excess([]):
-                break
-            self.rows.weigh(beta)
-            self._trace([candidate for candidate in self.tracing.candidates if not candidate.constant])
-            chosen = self._search()
-        return chosen
-
-    def _search(self) -> list[int]:
-        return self.tracing.run(lambda chosen, k: refine(self.tracing, self.make, chosen, k))
-
-    def _same_weights(self, beta: Array) -> bool:
-        """Whether rows would be weighed alike with beta (n,): their noise goes with the size of their terms."""
-        sizes = [np.linalg.norm(self.rows.Y * values, axis=(0, 2)) for values in (beta, self.rows.beta)]
-        return bool(np.all(np.abs(sizes[0] - sizes[1]) <= SAME_WEIGHTS * sizes[1]))
-
-    def solution(self, chosen: Sequence[int]) -> Array:
-        """Parameters and coefficients from all windows."""
-        return self.tracing.solution(chosen, np.ones(self.rows.count, dtype=bool))
-
-    def excess(self, chosen: Sequence[int]) -> float:
-        """Sum of squares that is left beyond noise."""
-        residual = self.tracing.residual(chosen, self.solution(chosen))
-        return float(np.sum(residual**2) - residual.size)
-
-    def improved(self, solution: Array) -> list[Effect]:
-        """The constants improved by a solution."""
-        return self._improved(self.fixed, solution[self.rows.base.n :])
-
-    def found(self, chosen: Sequence[int], solution: Array) -> tuple[list[Effect], list[Effect]]:
-        """Of the effects chosen, those that become constants, with their values, and the others."""
-        size = sum(len(candidate.parameters) for candidate in self.fixed)
-        candidates = [self.tracing.candidates[k] for k in chosen]
-        everything = self._improved(candidates, solution[self.rows.base.n + size :])
-        return [e for e in everything if is_constant(e)], [e for e in everything if not is_constant(e)]
-
-    @staticmethod
-    def _improved(candidates: Sequence[Candidate], values: Array) -> list[Effect]:
-        out, at = [], 0
-        for candidate in candidates:
-            own = values[at : at + len(candidate.parameters)]
-            at += len(candidate.parameters)
-            out.append(improved(candidate.effect, own) if candidate.constant else candidate.effect)
-        return out
-
-    def adopted(self, chosen: Sequence[int]) -> System:
-        """The described system with everything that was found."""
-        described = applied(self.system, self.constants)
-        effects = [self.tracing.candidates[k].effect for k in chosen]
-        return described.model_copy(update={"effects": (*described.effects, *effects)})
-
-    def state(self, chosen: Sequence[int]) -> State:
-        """Residuals of the model with the effects chosen."""
-        rows, tracing = self.rows, self.tracing
-        tracing.settle(chosen)
-        fitted = tracing.fitted
-        solution = tracing.solution(chosen, fitted)
-        residual = tracing.residual(chosen, solution)
-        joints = RelativeResiduals(rows, self.make)
-        joints.declare([*self.constants, *(tracing.candidates[k].effect for k in chosen)])
-        early = self._fitted(joints.times, joints.segment)
-        return State(
-            system=self.adopted(chosen),
-            solution=solution,
-            residual=residual,
-            time=rows.time,
-            fitted=fitted,
-            fit=Part(whitened(rows, residual, fitted), joints.of(solution, early)),
-            holdout=Part(whitened(rows, residual, ~fitted), joints.of(solution, ~early)),
-            test=ResidualTest(rows).of(residual),
-        )
-
-    def steps(self) -> list[Step]:
-        """The way of the last search."""
-        joints = RelativeResiduals(self.rows, self.make)
-        held = ~self._fitted(joints.times, joints.segment)
-        out = []
-        for taken, chosen in self.tracing.path:
-            effects = [self.tracing.candidates[k] for k in chosen]
-            joints.declare([*self.constants, *(candidate.effect for candidate in effects)])
-            relative = joints.of(self.tracing.solution(chosen, self.tracing.fitted), held)
-            out.append(Step(self.tracing.candidates[taken].key, tuple(c.key for c in effects), relative))
-        return out
 
 
 def _exact(system: System) -> System | None:
@@ -398,11 +137,14 @@ def diagnose(
             solution = fewer.solution(range(len(forces)))
             constants, beta = fewer.improved(solution), solution[:n]
         keys = {(effect.name, effect.where) for effect in constants}
+        constants = [effect for effect in constants if stands(effect, system.sample_rate)]
         tried = [candidate.effect for candidate in attempt.tracing.candidates]
         others = [effect for effect in tried if (effect.name, effect.where) not in keys]
         attempt = Attempt(case, attempt.system, constants, beta, others)
         chosen = attempt.search()
     after = attempt.state(chosen)
+    standing = {(effect.name, effect.where) for effect in attempt.constants}
+    findings = [f for f in findings if (f.candidate.effect.name, f.candidate.effect.where) in standing]
     findings += [attempt.tracing.finding(chosen, k) for k in chosen]
     progress("fitting the model with what was found")
     named = after.system != system

@@ -7,8 +7,9 @@ from typing import Any
 
 import numpy as np
 
+from sms_online.diagnosis.attempt import Attempt, Part
 from sms_online.diagnosis.constants import deviations
-from sms_online.diagnosis.diagnose import Attempt, Diagnosis, Part
+from sms_online.diagnosis.diagnose import Diagnosis
 from sms_online.diagnosis.trace import Finding
 from sms_online.effects.base import report
 from sms_online.effects.catalogue import ENTRIES, declarable

@@ -13,7 +13,8 @@ from itertools import pairwise
 import numpy as np
 
 from sms_online.description.schema import Effect
-from sms_online.diagnosis.diagnose import Attempt, Diagnosis
+from sms_online.diagnosis.attempt import Attempt
+from sms_online.diagnosis.diagnose import Diagnosis
 from sms_online.diagnosis.evidence import basis, free_of, gain
 from sms_online.diagnosis.splines import DEGREE, Variable, design, spline_columns
 from sms_online.diagnosis.trace import Candidate

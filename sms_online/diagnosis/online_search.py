@@ -14,16 +14,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sms_online.description.schema import Effect, System
+from sms_online.diagnosis.attempt import FITTED, LARGEST_SHARE_LEFT, MOST_WINDOWS, REWEIGHED, STRETCH
 from sms_online.diagnosis.candidates import LINEAR, CandidateColumns
 from sms_online.diagnosis.constants import applied, corrected, deviations, improved
-from sms_online.diagnosis.diagnose import (
-    CORRECTIONS,
-    FITTED,
-    LARGEST_SHARE_LEFT,
-    MOST_WINDOWS,
-    REWEIGHED,
-    STRETCH,
-)
+from sms_online.diagnosis.diagnose import CORRECTIONS
 from sms_online.diagnosis.followed import HALF_WIDTH
 from sms_online.diagnosis.record import Segment, excerpts
 from sms_online.diagnosis.residuals import ResidualTest

@@ -18,9 +18,14 @@ POSITIVE = frozenset(
 # is later than half a window of the planar example, s, is no channel of this session.
 LARGEST = {"torque_gain": 0.5, "torque_ripple": 0.5, "sensor_lag": 0.2, "torque_delay": 0.2}
 
+# A drive that holds its command over a sample acts half a sample late: a lag up to that, in samples, is no sensor's.
+HELD = 0.5
 
-def plausible(name: str, coefficients: Array) -> bool:
-    """Whether an effect can have these linear coefficients (c,)."""
+
+def plausible(name: str, coefficients: Array, sample_rate: float) -> bool:
+    """Whether an effect can have these linear coefficients (c,) on samples at so many Hz."""
     if name in POSITIVE and np.any(coefficients < 0.0):
+        return False
+    if name == "sensor_lag" and coefficients[0] <= HELD / sample_rate:
         return False
     return bool(np.linalg.norm(coefficients) <= LARGEST.get(name, np.inf))

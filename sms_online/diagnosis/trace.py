@@ -39,8 +39,6 @@ ACTS = 0.01
 # Rows whose mean square exceeds their variance by more than this although everything that is known of has been
 # subtracted have an error of their own: friction is never quite its model.
 LARGEST_RATIO = 1.5
-# A drive that holds its command over a sample acts half a sample late: a lag up to that, in samples, is no sensor's.
-HELD = 0.5
 # No law of a force is true to better than 0.3 %, and what it leaves of its own gain is no other effect on its rows.
 INEXACT = 1e-5
 # Share of a row's variance by which that of the effects chosen has to change for rows to be weighed anew.
@@ -204,9 +202,8 @@ class Tracing:
 
     def _plausible(self, candidate: Candidate, found: Gain) -> Gain:
         """The gain, none where the effect cannot have the coefficients."""
-        name = candidate.effect.name
-        held = name == "sensor_lag" and found.coefficients[0] <= HELD / self.rows.model.system.sample_rate
-        return replace(found, gain=0.0) if held or not plausible(name, found.coefficients) else found
+        possible = plausible(candidate.effect.name, found.coefficients, self.rows.model.system.sample_rate)
+        return found if possible else replace(found, gain=0.0)
 
     def gain_of(self, candidate: Candidate, chosen: Sequence[int]) -> Gain:
         """What any candidate would take beside those chosen."""

@@ -6,7 +6,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from sms_online.diagnosis.diagnose import Diagnosis, State
+from sms_online.diagnosis.attempt import State
+from sms_online.diagnosis.diagnose import Diagnosis
 from sms_online.diagnosis.force_curves import AddedVariable, ForceCurve, added_variables, force_curves
 from sms_online.diagnosis.weak_windows import Windows
 from sms_online.model.layout import row_types

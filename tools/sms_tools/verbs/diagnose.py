@@ -13,7 +13,8 @@ from rich.table import Table
 from sms_adapters.sources import open_source
 from sms_adapters.truth import read_truth
 from sms_online.description.schema import System
-from sms_online.diagnosis.diagnose import Diagnosis, PriorOf, diagnose
+from sms_online.diagnosis.attempt import PriorOf
+from sms_online.diagnosis.diagnose import Diagnosis, diagnose
 from sms_online.diagnosis.document import diagnosis_document
 from sms_online.errors import InputError
 from sms_online.pipeline.estimator import Estimator
