@@ -73,15 +73,15 @@ def test_a_session_that_the_model_explains_is_clean() -> None:
     [
         # The sign of a noisy rate at standstill takes some of the friction away.
         ("coulomb_friction@joint_2:torque=1", 0.05),
-        ("cubic_stiffness@joint_1:stiffness=300", 0.01),
+        pytest.param("cubic_stiffness@joint_1:stiffness=300", 0.01, marks=pytest.mark.slow),
         # Without it the base's rows are best explained by an arm of no mass, whose rows have no noise.
         ("air_drag@base:damping=150", 0.01),
         # Its phase turns by 200 rad a radian: faster than the motion that the arm's own columns are taken from.
         ("cogging@joint_1:amplitude=30,phase=1,order=4", 0.02),
-        ("torsional_hysteresis@joint_1:torque=5,width=0.02", 0.02),
-        ("tip_payload@tip:mass=0.5", 0.02),
+        pytest.param("torsional_hysteresis@joint_1:torque=5,width=0.02", 0.02, marks=pytest.mark.slow),
+        pytest.param("tip_payload@tip:mass=0.5", 0.02, marks=pytest.mark.slow),
         ("sensor_lag@q_1:corner=40", 0.01),
-        ("encoder_offset@theta_m_2:offset=0.01", 0.02),
+        pytest.param("encoder_offset@theta_m_2:offset=0.01", 0.02, marks=pytest.mark.slow),
         ("table_tilt@base:gravity_x=0.003,gravity_y=-0.002", 0.01),
     ],
 )

@@ -14,7 +14,7 @@ from sms_online.description.parse import parse_system
 from sms_online.description.schema import Effect, Inertia, RigidBody, System
 from sms_online.model.base_parameters import find_base_parameters
 from sms_online.model.model import Model
-from sms_online.pipeline.estimator import OTHER_HOPS, Estimator
+from sms_online.pipeline.estimator import Estimator
 from sms_online.pipeline.event_hypotheses import opened
 from sms_online.pipeline.events import Event
 from sms_online.pipeline.momentum_balance import HOPS, MARGIN
@@ -94,7 +94,7 @@ def test_a_payload_is_noticed_in_time_wherever_it_falls_in_a_block(planar_sessio
     """The same 5 kg, in sessions that begin at 3 s and up to a block later."""
     loaded = PLANAR.model_copy(update={"payload": RigidBody(mass=5.0)})
     block = noisy(PLANAR, changed_session(planar_session, loaded, CHANGE, CHANGE + DETECTED), "B", 1)
-    longest = OTHER_HOPS * round(PLANAR.windows.momentum * PLANAR.sample_rate / HOPS)
+    longest = round(PLANAR.windows.momentum * PLANAR.sample_rate / HOPS)
     for phase in range(0, longest, longest // 5):
         late = slice(round(3.0 * PLANAR.sample_rate) + phase, None)
         _, noticed = run(Block(block.t[late], block.channels, block.values[late]), size=1)

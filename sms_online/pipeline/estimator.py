@@ -42,10 +42,8 @@ from sms_online.trackers.square_root import RecursiveLeastSquares
 # Samples that pass through the pipeline together are those of some time. Everything behind sees the same blocks however
 # the samples arrive, so the result is the same to the last bit. The cost of NumPy's calls is shared by a block, so the
 # energy balance alone has long ones, in periods of the grid. With momentum rows a block ends when a window can be
-# completed. On a testbed, which has sources, none waits for its block; elsewhere two windows share one, in which an
-# event waits for 80 ms at most at the usual width: 0.2 s are gone before two windows in a row tell of it.
+# completed, for whoever waits for an estimate or an event waits for the block too.
 ENERGY_BLOCK = 256
-TESTBED_HOPS, OTHER_HOPS = 1, 2
 # Of a period of the grid: blocks end between its instants, or rounding would decide to which one a sample belongs.
 BETWEEN = 0.5
 
@@ -136,10 +134,9 @@ class Estimator:
         if self.momentum is None:
             return ENERGY_BLOCK / self.system.sample_rate, BETWEEN / self.system.sample_rate
         hop, margin = self.momentum.hop, self.momentum.margin
-        hops = TESTBED_HOPS if self.system.sources else OTHER_HOPS
         # The last sample behind a window, and those that interpolate the slowest channel there.
         reach = SIDE * stated_period(self.system, self.sensing.channels)
-        return hops * hop / self.system.sample_rate, (margin % hop + BETWEEN) / self.system.sample_rate + reach
+        return hop / self.system.sample_rate, (margin % hop + BETWEEN) / self.system.sample_rate + reach
 
     def set_prior(self, prior: Prior) -> None:
         """Weigh the rows against what is known of the base parameters beforehand; before the first sample."""

@@ -47,6 +47,8 @@ MOTION = 20.0
 # Mean square of a coordinate's residual over its predicted variance beyond which the model lacks something there: a
 # second of windows scatters by 20 %, the noise behind the prediction by 10 %.
 LARGEST_RATIO = 2.0
+# Rounding of a sum of products, in units of its last place.
+ROUNDED = 16.0
 # Multiple of the square of one sample of what noise does beyond first order in a row that stands for its variance in
 # the row's own covariance.
 UNSTEADY = 4.0
@@ -265,7 +267,10 @@ class MomentumFit:
         if self.plain_windows == 0:
             return
         w = np.append(beta, -1.0)
-        ratio = np.einsum("i,vij,j->v", w, self.plain_gram, w) / self.plain_windows
+        squares = np.einsum("i,vij,j->v", w, self.plain_gram, w)
+        # Where samples are exact nothing but rounding is left of the sum.
+        rounding = np.finfo(np.float64).eps * np.einsum("i,vij,j->v", np.abs(w), np.abs(self.plain_gram), np.abs(w))
+        ratio = (squares - ROUNDED * rounding) / self.plain_windows
         self.misfit = np.where(ratio > LARGEST_RATIO, ratio - 1.0, 0.0)
 
     def _retell(self) -> None:
