@@ -1,7 +1,8 @@
 """The system description: what stands on the testbed, as frozen and validated records.
 
-A description holds nominal values. They make a simulated truth and, where the person asks for it, priors; the estimator
-never reads them otherwise. SI units throughout. The paper's symbols are given beside each field.
+A description holds nominal values. They make a simulated truth and, where the person asks for it, priors. Otherwise the
+estimator reads them only to start the weights of its rows, where a fit without weights leaves more than noise. SI units
+throughout. The paper's symbols are given beside each field.
 """
 
 from __future__ import annotations
