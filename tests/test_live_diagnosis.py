@@ -138,7 +138,7 @@ def test_a_search_in_another_process_says_what_it_says_here_and_is_noted(tmp_pat
     assert (done[1].verdict, done[1].scores, done[1].left) == (here.verdict, here.scores, here.left)
     assert done[1].beta.tobytes() == here.beta.tobytes()
     noted = [json.loads(line) for line in (tmp_path / NAME).read_text().splitlines()]
-    assert noted == [{"adopt": True}, {"search": 3, "block": 17}]
+    assert noted == [{"adopt": True}, {"begun": 3}, {"search": 3, "block": 17}]
 
 
 def test_a_search_process_that_dies_is_named_and_nobody_waits_for_it(tmp_path: Path) -> None:
@@ -151,9 +151,25 @@ def test_a_search_process_that_dies_is_named_and_nobody_waits_for_it(tmp_path: P
         time.sleep(0.01)
     assert searches.problem is not None
     assert searches.problem.startswith("no more searches for effects")
-    assert searches.outcome(5) is None
+    assert searches.outcome(5) == (1, None)
     assert not searches.submit(2, asked())
     searches.close()
+    # The replay does not make it, and goes on when the session did.
+    repeated = searcher_of(tmp_path, adopt=False)
+    assert repeated.submit(1, asked())
+    assert repeated.outcome(4) is None
+    assert repeated.outcome(5) == (1, None)
+    assert not repeated.submit(2, asked())
+
+
+def test_a_search_that_the_sessions_end_overtook_is_no_problem_and_never_answers(tmp_path: Path) -> None:
+    searches = SearchProcess(tmp_path, adopt=False)
+    assert searches.submit(1, asked())
+    searches.close()
+    assert searches.problem is None
+    repeated = searcher_of(tmp_path, adopt=False)
+    assert repeated.submit(1, asked())
+    assert repeated.outcome(1000) is None
 
 
 def test_the_searches_of_a_recording_are_repeated_only_under_the_same_conditions(tmp_path: Path) -> None:

@@ -115,7 +115,9 @@ def diagnose(
         described = Attempt(case, system, (), attempt.rows.beta, ())
     beyond = any(row.beyond for row in attempt.state(chosen).test.values())
     bare = described.state([])
+    attempt.tracing.settle([])
     ranking = attempt.tracing.ranking()
+    attempt.tracing.settle(chosen)
     exact = _exact(attempt.system)
     if exact is not None and beyond:
         progress("comparing exact links")

@@ -111,14 +111,19 @@ class OnlineDiagnosis:
     @property
     def system(self) -> System:
         """The described system with the effects that were named, taken up or not, and those that events have added."""
-        system = self._estimator.system
+        system, momentum = self._estimator.system, self._estimator.momentum
         found = [named.effect for episode in self.episodes for named in episode.named]
-        changed = [name for episode in self.episodes if episode.event for name in episode.event.parameters]
+        # A session that was resumed knows of more than its own episodes.
+        changed = () if momentum is None else momentum.changes.added
+        found += () if momentum is None else momentum.changes.adopted
         for key in dict.fromkeys(name.rsplit(".", 1)[0] for name in changed if "@" in name):
-            effect, _, where = key.partition("@")
-            found.append(Effect(name=effect, where=where))
+            name, _, where = key.partition("@")
+            found.append(Effect(name=name, where=where))
         held = {(effect.name, effect.where) for effect in system.effects}
-        fresh = {(effect.name, effect.where): effect for effect in found if (effect.name, effect.where) not in held}
+        fresh: dict[tuple[str, str], Effect] = {}
+        for effect in found:
+            if (effect.name, effect.where) not in held:
+                fresh.setdefault((effect.name, effect.where), effect)
         forces = [effect for effect in fresh.values() if not is_constant(effect)]
         declared = system.model_copy(update={"effects": (*system.effects, *forces)})
         return applied(declared, [effect for effect in fresh.values() if is_constant(effect)])
@@ -131,6 +136,11 @@ class OnlineDiagnosis:
     def document(self) -> list[dict[str, Any]]:
         """The episodes as results.json holds them."""
         return [episode_document(episode) for episode in self.episodes]
+
+    def finish(self) -> None:
+        """After the session's end, which may have decided on a change."""
+        if self._estimator.momentum is not None and self._record:
+            self._follow_events()
 
     def _keep(self, piece: GridSamples) -> None:
         self._record.append(piece)

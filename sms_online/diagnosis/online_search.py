@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from sms_online.description.schema import Effect, System
 from sms_online.diagnosis.attempt import FITTED, LARGEST_SHARE_LEFT, MOST_WINDOWS, REWEIGHED, STRETCH
 from sms_online.diagnosis.candidates import LINEAR, CandidateColumns
-from sms_online.diagnosis.constants import applied, corrected, deviations, improved
+from sms_online.diagnosis.constants import applied, corrected, deviations, improved, stands
 from sms_online.diagnosis.diagnose import CORRECTIONS
 from sms_online.diagnosis.followed import HALF_WIDTH
 from sms_online.diagnosis.record import Segment, excerpts
@@ -208,6 +208,9 @@ def _trace(request: Request, rows: SessionRows, everything: Sequence[Candidate],
     final, used, constant = tracing, list(chosen), None
     if channels:
         final, used, constant = _corrected(request, tracing, chosen, late)
+        if not stands(constant, system.sample_rate):
+            key = tracing.candidates[chosen[-1]].key
+            return _trace(request, rows, [candidate for candidate in everything if candidate.key != key], late)
     after = _excess(final, used)
     left = max(0.0, after) / max(before, 1.0)
     beyond = any(row.beyond for row in ResidualTest(final.rows).of(_residual(final, used)).values())

@@ -86,7 +86,7 @@ class SessionRows:
         n_v = model.layout.n_v
         stacked = np.concatenate([np.empty((0, n_v, base.n + 1)), *(told.copies[:, 0] for told in self._told)])
         self.Y, self.b = stacked[..., :-1], stacked[..., -1]
-        half = balance.width / 2 + balance.margin
+        half = balance.width / 2
         self.time = np.array([window.end - half for _, window in windows]) / rate
         where = Windows(
             segment=np.array([number for number, _ in windows], dtype=np.int64),

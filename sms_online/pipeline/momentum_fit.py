@@ -180,6 +180,7 @@ class MomentumFit:
         unweighted, _ = _least_squares(np.concatenate([self._dense(window)[0] for window in self._held]))
         if not (self._explains_torques(unweighted) and self._settle(unweighted, PASSES, partly=False)):
             self.weights = None
+            self.misfit[:], self.plain_gram, self.plain_windows = 0.0, np.zeros_like(self.plain_gram), 0
             return []
         if self.misfit.any():
             weights, misfit = self.weights, self.misfit
@@ -353,6 +354,7 @@ class MomentumFit:
             "weights": np.empty(0) if self.weights is None else self.weights, "since": self._since,
             "moving": self._moving, "first": self._first, "x": self._x, "v": self._v, "signals": self._signals,
             "bends": np.array([*self._bends.values()]), "bent": np.array([*self._bent.values()]),
+            "unexplained": -1 if self.unexplained is None else self.unexplained,
             "largest": self._largest, "misfit": self.misfit, "plain_gram": self.plain_gram,
             "plain_windows": self.plain_windows, "renewal": self._renewal, **self._noise.state(),
             **self._whitener.state(), **self._sensitivities.state(), **_packed("held", self._held),
@@ -369,6 +371,7 @@ class MomentumFit:
         self._bends = dict(zip(HALF_WIDTHS, np.array(state["bends"]), strict=True))
         self._bent = dict(zip(HALF_WIDTHS, state["bent"].tolist(), strict=True))
         self.misfit = np.array(state["misfit"])
+        self.unexplained = None if state["unexplained"] < 0 else int(state["unexplained"])
         self.plain_gram, self.plain_windows = np.array(state["plain_gram"]), int(state["plain_windows"])
         self._held, self._recent = _unpacked("held", state), _unpacked("recent", state)
         self._renewal = int(state["renewal"])

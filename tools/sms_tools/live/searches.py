@@ -16,17 +16,20 @@ from sms_online.diagnosis.online_search import Outcome, Request, search
 from sms_online.errors import InputError
 
 NAME = "searches.jsonl"
+# Keys of its lines: a search that was begun, used at a block, or lost by then.
+BEGUN, USED, LOST = "begun", "search", "lost"
 
 
 class SearchProcess:
     """Searches in a process of low priority, one at a time; those that come meanwhile are left out.
 
-    Which were made, and at which internal block each was used, is written to `directory`, for the replay. problem: why
-    there are no more of them, None while there are.
+    Which were begun, and at which internal block each was used or lost, is written to `directory`, for the replay.
+    problem: why there are no more of them, None while there are.
     """
 
     def __init__(self, directory: Path, adopt: bool) -> None:
         self.problem: str | None = None
+        self._closing = False
         # A session of its own: Ctrl-C is for the estimator, which then ends the process.
         self._process = subprocess.Popen(
             [sys.executable, "-m", "sms_tools.live.search_worker"],
@@ -38,7 +41,7 @@ class SearchProcess:
         self._log = (directory / NAME).open("w", encoding="utf-8", buffering=1)
         self._log.write(json.dumps({"adopt": adopt}) + "\n")
         self._requests: SimpleQueue[tuple[int, Request] | None] = SimpleQueue()
-        self._done: SimpleQueue[tuple[int, Outcome | None]] = SimpleQueue()
+        self._done: SimpleQueue[tuple[str, int, Outcome | None]] = SimpleQueue()
         self._busy = False
         Thread(target=self._run, name="searches", daemon=True).start()
 
@@ -47,6 +50,7 @@ class SearchProcess:
         if self._busy or self.problem is not None:
             return False
         self._busy = True
+        self._note({BEGUN: number})
         self._requests.put((number, request))
         return True
 
@@ -54,17 +58,21 @@ class SearchProcess:
         """See `Searcher`."""
         if self._done.empty():
             return None
-        done = self._done.get()
+        kind, number, outcome = self._done.get()
         self._busy = False
+        self._note({kind: number, "block": block})
+        return number, outcome
+
+    def _note(self, entry: dict[str, int]) -> None:
         try:
-            self._log.write(json.dumps({"search": done[0], "block": block}) + "\n")
+            self._log.write(json.dumps(entry) + "\n")
         except OSError as error:
             # No disk is worth the session.
             self.problem = f"a search was not noted, so that a replay will differ: {error.strerror or error}"
-        return done
 
     def close(self) -> None:
         """End the process, and a search that runs."""
+        self._closing = True
         self._requests.put(None)
         self._process.kill()
         self._process.wait()
@@ -77,9 +85,11 @@ class SearchProcess:
         assert back is not None
         while (task := self._requests.get()) is not None:
             try:
-                self._done.put((task[0], _asked(task[1], to, back)))
+                self._done.put((USED, task[0], _asked(task[1], to, back)))
             except (OSError, EOFError, pickle.UnpicklingError) as error:
-                self.problem = f"no more searches for effects: their process ended ({type(error).__name__})"
+                if not self._closing:
+                    self.problem = f"no more searches for effects: their process ended ({type(error).__name__})"
+                self._done.put((LOST, task[0], None))
                 return
 
 
@@ -91,18 +101,24 @@ def _asked(request: Request, to: IO[bytes], back: IO[bytes]) -> Outcome | None:
 
 
 class Repeated:
-    """The searches that a recorded session made, each used at the block at which that one used it."""
+    """The searches that a recorded session made, each used at the block at which that one used it.
 
-    def __init__(self, blocks: dict[int, int]) -> None:
-        self._blocks = blocks
+    used, lost: their blocks, of those that said something and of those that ended without. begun: also those that the
+    session's end overtook.
+    """
+
+    def __init__(self, used: dict[int, int], lost: dict[int, int], begun: set[int]) -> None:
+        self._blocks, self._lost, self._begun = used | lost, lost, begun
         self._done: tuple[int, Outcome | None] | None = None
 
     def submit(self, number: int, request: Request) -> bool:
         """See `Searcher`."""
-        if self._done is not None or number not in self._blocks:
+        if self._done is not None:
             return False
-        self._done = number, search(request)
-        return True
+        if number in self._blocks:
+            self._done = number, None if number in self._lost else search(request)
+            return True
+        return number in self._begun
 
     def outcome(self, block: int) -> tuple[int, Outcome | None] | None:
         """See `Searcher`."""
@@ -124,8 +140,9 @@ def searcher_of(capture: Path, adopt: bool) -> Searcher:
         # A session that was killed may have left half a line.
         whole = [line for line in path.read_text(encoding="utf-8").splitlines(keepends=True) if line.endswith("\n")]
         first, *others = (json.loads(line) for line in whole)
-        blocks = {int(entry["search"]): int(entry["block"]) for entry in others}
+        used, lost = ({int(e[kind]): int(e["block"]) for e in others if kind in e} for kind in (USED, LOST))
+        begun = {int(entry[BEGUN]) for entry in others if BEGUN in entry}
         same = bool(first["adopt"]) == adopt
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise InputError(str(path), "", f"{type(error).__name__}: {error}", "searches as `live` writes them") from None
-    return Repeated(blocks) if same else Immediate()
+    return Repeated(used, lost, begun) if same else Immediate()

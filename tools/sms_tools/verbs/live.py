@@ -42,6 +42,7 @@ def run(args: argparse.Namespace) -> int:
             for block in shown.watch(blocks):
                 estimator.push(block)
             estimator.finish()
+            online.finish()
         session.close()
         status.close()
         throughput = estimator.samples / session.busy if session.busy else 0.0

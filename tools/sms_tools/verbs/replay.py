@@ -77,6 +77,7 @@ def run(args: argparse.Namespace) -> int:
                 online = OnlineDiagnosis(estimator, searcher, args.adopt)
                 shown.follow(online)
                 stream(estimator, shown.watch(blocks), interruption)
+                online.finish()
                 wall = perf_counter() - opened
         bound = None if record is None else session_bound(estimator, record)
         warnings = [*source.warnings, *shown.warnings]
