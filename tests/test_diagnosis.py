@@ -82,7 +82,7 @@ def test_a_session_that_the_model_explains_is_clean() -> None:
         pytest.param("tip_payload@tip:mass=0.5", 0.02, marks=pytest.mark.slow),
         ("sensor_lag@q_1:corner=40", 0.01),
         pytest.param("encoder_offset@theta_m_2:offset=0.01", 0.02, marks=pytest.mark.slow),
-        ("table_tilt@base:gravity_x=0.003,gravity_y=-0.002", 0.01),
+        pytest.param("table_tilt@base:gravity_x=0.003,gravity_y=-0.002", 0.01, marks=pytest.mark.slow),
     ],
 )
 def test_the_missing_effect_is_named_with_its_place_and_size(text: str, accuracy: float) -> None:
@@ -172,6 +172,7 @@ def test_gaps_and_short_stretches_between_them_do_no_harm() -> None:
     assert diagnosis.verdict == "clean"
 
 
+@pytest.mark.slow
 def test_joints_at_rest_end_the_search_and_are_no_error() -> None:
     """Encoders of joint 2 that stand still: whatever is said of such a session, it is said."""
     block = block_of()
