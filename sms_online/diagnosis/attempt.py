@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from sms_online.description.schema import Effect, System
 from sms_online.diagnosis.candidates import CandidateColumns
 from sms_online.diagnosis.constants import applied, corrected, improved, is_constant
-from sms_online.diagnosis.followed import HALF_WIDTH
+from sms_online.diagnosis.followed import least_samples
 from sms_online.diagnosis.record import LONGEST, Segment, excerpts
 from sms_online.diagnosis.relative import RelativeResiduals
 from sms_online.diagnosis.residuals import ResidualTest, RowResidual, whitened
@@ -132,8 +132,7 @@ class Attempt:
         span = system.windows.momentum
         most = min(most, MOST_WINDOWS * span / HOPS)
         length, longest = (round(seconds * system.sample_rate) for seconds in (STRETCH * span, most))
-        # Windows of the widest filter, a tenth of a window more than none.
-        least = round(1.5 * span * system.sample_rate) + 2 * HALF_WIDTH
+        least = least_samples(system)
         fitting, held = (
             [part for part in excerpts(each, length, longest) if part.index.size > least]
             for each in (case.segments, case.held)

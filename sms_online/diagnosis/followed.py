@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from sms_online.description.schema import System
 from sms_online.diagnosis.record import Segment
 from sms_online.model.model import Model
 from sms_online.pipeline.internal_states import InternalStates
@@ -18,6 +19,11 @@ from sms_online.stream import Array
 STEP = 4
 # Half width of the filter of the motion behind them: passes 70 Hz at 1 kHz.
 HALF_WIDTH = 28
+
+
+def least_samples(system: System) -> int:
+    """Samples of a segment that give any window: of the widest filter, a tenth of a window more than none."""
+    return round(1.5 * system.windows.momentum * system.sample_rate) + 2 * HALF_WIDTH
 
 
 class FollowedMotion:

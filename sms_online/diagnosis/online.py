@@ -18,7 +18,8 @@ from numpy.typing import NDArray
 from sms_online.description.schema import Effect, System
 from sms_online.diagnosis.constants import applied, is_constant
 from sms_online.diagnosis.episodes import Episode, Evidence, episode_document, line
-from sms_online.diagnosis.online_search import Named, Outcome, Request, least_samples, search
+from sms_online.diagnosis.followed import least_samples
+from sms_online.diagnosis.online_search import Named, Outcome, Request, search
 from sms_online.diagnosis.record import Segment
 from sms_online.effects.catalogue import ENTRIES
 from sms_online.model.model import Model
@@ -309,6 +310,8 @@ class OnlineDiagnosis:
         onset, estimator = self._onset, self._estimator
         assert onset is not None
         episode.refused = refusal(estimator.model, outcome.named)
+        if episode.refused is not None:
+            return
         n = estimator.base.n
         first, known = onset.first, (onset.factor, onset.windows)
         if not outcome.began or onset.last is None:
@@ -317,8 +320,6 @@ class OnlineDiagnosis:
         pieces = [piece for piece in self._record if piece.segment == last]
         index, values = (np.concatenate([getattr(piece, part) for piece in pieces]) for part in ("index", "values"))
         late = index >= first
-        if episode.refused is not None:
-            return
         samples = GridSamples(index[late], values[late], last)
         time = self._time(int(samples.index[0])) if episode.began is None or not outcome.began else episode.began
         event = Event(

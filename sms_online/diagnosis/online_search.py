@@ -18,7 +18,6 @@ from sms_online.diagnosis.attempt import FITTED, LARGEST_SHARE_LEFT, MOST_WINDOW
 from sms_online.diagnosis.candidates import LINEAR, CandidateColumns
 from sms_online.diagnosis.constants import applied, corrected, deviations, improved, stands
 from sms_online.diagnosis.diagnose import CORRECTIONS
-from sms_online.diagnosis.followed import HALF_WIDTH
 from sms_online.diagnosis.record import Segment, excerpts
 from sms_online.diagnosis.residuals import ResidualTest
 from sms_online.diagnosis.rows import SessionRows
@@ -110,11 +109,6 @@ class Outcome:
     def keys(self) -> tuple[str, ...]:
         """What was found, in an order that does not depend on that of the search."""
         return tuple(sorted(named.key for named in self.named))
-
-
-def least_samples(system: System) -> int:
-    """Samples of a segment that give any window."""
-    return round(1.5 * system.windows.momentum * system.sample_rate) + 2 * HALF_WIDTH
 
 
 class LateColumns(CandidateColumns):

@@ -180,7 +180,8 @@ class MomentumFit:
         unweighted, _ = _least_squares(np.concatenate([self._dense(window)[0] for window in self._held]))
         if not (self._explains_torques(unweighted) and self._settle(unweighted, PASSES, partly=False)):
             self.weights = None
-            self.misfit[:], self.plain_gram, self.plain_windows = 0.0, np.zeros_like(self.plain_gram), 0
+            self.misfit, self.plain_gram = np.zeros_like(self.misfit), np.zeros_like(self.plain_gram)
+            self.plain_windows = 0
             return []
         if self.misfit.any():
             weights, misfit = self.weights, self.misfit
