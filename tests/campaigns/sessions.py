@@ -14,7 +14,7 @@ from sms_online.model.base_parameters import find_base_parameters
 from sms_online.model.model import Model
 from sms_online.stream import Array, Block
 from sms_sim.sensors import Sensors
-from sms_sim.simulate import sampled_blocks, simulate
+from sms_sim.simulate import POSITION_TOLERANCE, sampled_blocks, simulate
 
 # Nominal values that an estimator gets to see are these keys of the description times this: any number would do.
 DISGUISED = (
@@ -24,14 +24,14 @@ DISGUISED = (
 DISGUISE = 2.0
 
 
-def exact_session(system: System, cache: Path) -> Block:
+def exact_session(system: System, cache: Path, position_tolerance: float = POSITION_TOLERANCE) -> Block:
     """Exact samples of the system's own trajectory, read from `cache` or else simulated and written there."""
     description = json.dumps(describe(system))
     if cache.exists():
         with np.load(cache) as saved:
             if str(saved["system"]) == description:
                 return Block(saved["t"], tuple(saved["channels"].tolist()), saved["values"])
-    blocks = list(sampled_blocks(simulate(system), "0"))
+    blocks = list(sampled_blocks(simulate(system, position_tolerance=position_tolerance), "0"))
     t, values = (np.concatenate([getattr(block, name) for block in blocks]) for name in ("t", "values"))
     cache.parent.mkdir(parents=True, exist_ok=True)
     np.savez(cache, system=np.array(description), t=t, channels=np.array(blocks[0].channels), values=values)
