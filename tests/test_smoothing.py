@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.polynomial import Polynomial
 
-from sms_online.pipeline.smoothing import DEGREE, HALF_WIDTHS, WidthChoice, kernel, smooth, stride
+from sms_online.pipeline.smoothing import DEGREE, HALF_WIDTHS, WidthChoice, kernel, smooth, smooth_all, stride
 from sms_online.stream import Array
 
 RATE = 1000.0
@@ -40,6 +40,16 @@ def test_kernels_have_no_phase(half_width: int) -> None:
     value, slope = kernel(half_width).T
     np.testing.assert_array_equal(value, value[::-1])
     np.testing.assert_array_equal(slope, -slope[::-1])
+
+
+@half_widths
+def test_all_centres_at_once_are_the_same_up_to_rounding(half_width: int) -> None:
+    """Noise of unit size, seed 3."""
+    samples = np.random.default_rng(3).standard_normal((5 * half_width, 2))
+    centres = np.arange(half_width, len(samples) - half_width)
+    one_by_one, at_once = smooth(samples, centres, half_width, RATE), smooth_all(samples, half_width, RATE)
+    for each, together in zip(one_by_one, at_once, strict=True):
+        np.testing.assert_allclose(together, each, rtol=0.0, atol=1e-12 * np.abs(each).max())
 
 
 def response(half_width: int, frequency: Array) -> Array:

@@ -24,7 +24,7 @@ from sms_online.pipeline.row_noise import STEPS, RowNoise, factored
 from sms_online.pipeline.sensing import Sensing
 from sms_online.pipeline.sensitivity import Sensitivities
 from sms_online.pipeline.sensor_noise import FINEST, SensorNoise
-from sms_online.pipeline.smoothing import smooth, stride
+from sms_online.pipeline.smoothing import smooth_all, stride
 from sms_online.stream import Array
 
 # Instants that the sensitivity to noise is told at in one call.
@@ -175,7 +175,7 @@ class SessionRows:
         """Smoothed readings (T, sensors) of the position sensors, and their rates, at instants (T,) of a segment, s."""
         values = segment.values[:, self.sensing.position_columns]
         samples = np.arange(half_width, len(values) - half_width, max(1, half_width // 4))
-        smoothed, rates = smooth(values, samples, half_width, self._rate)
+        smoothed, rates = (part[samples - half_width] for part in smooth_all(values, half_width, self._rate))
 
         def at(seconds: Array) -> tuple[Array, Array]:
             place = seconds * self._rate

@@ -270,18 +270,26 @@ class Tracing:
                 refused.add(self.candidates[best].key)
                 continue
             refine([*chosen, best], best)
-            self._taken[best] = self.gains(chosen)[best].gain
+            self._take([*chosen, best])
             chosen = self._revised([*chosen, best])
-            self._taken = {k: gain for k, gain in self._taken.items() if k in chosen}
             if frozenset(chosen) in seen:
                 break  # effects that replace each other in turn
             seen.add(frozenset(chosen))
             self.path.append((best, list(chosen)))
             self.settle(chosen)
+            # What the laws found are uncertain by is told in the rows' new weights.
+            self._take(chosen)
             if self.candidates[best].constant:
                 # What it leaves while it is only approximately taken off must not be given to others.
                 break
         return chosen
+
+    def _take(self, chosen: Sequence[int]) -> None:
+        """Remember what each of the effects chosen takes beside the others."""
+        self._taken = {}
+        for k in chosen:
+            Q = basis(self._columns([other for other in chosen if other != k]))
+            self._taken[k] = gain(Q, free_of(Q, self._b[:, None])[:, 0], self._Z[k]).gain
 
     def _eligible(self, chosen: Sequence[int], refused: set[str]) -> list[int]:
         """Candidates that may come to those chosen; one that extends another comes after it, and then replaces it."""

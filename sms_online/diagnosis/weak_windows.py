@@ -6,13 +6,13 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.lib.stride_tricks import sliding_window_view
+import scipy.sparse
 from numpy.typing import NDArray
 
 from sms_online.diagnosis.record import Segment
 from sms_online.model.layout import Layout
 from sms_online.pipeline.sensing import Sensing
-from sms_online.pipeline.smoothing import smooth
+from sms_online.pipeline.smoothing import smooth, smooth_all
 from sms_online.pipeline.weak_form import test_function
 from sms_online.stream import Array
 
@@ -64,6 +64,7 @@ class WeakWindows:
             for segment in segments
         ]
         self._motions: dict[bool, list[tuple[Motion, NDArray[np.int64]]]] = {}
+        self._operators: dict[bool, list[tuple[scipy.sparse.csr_array, scipy.sparse.csr_array]]] = {}
 
     @property
     def count(self) -> int:
@@ -89,7 +90,10 @@ class WeakWindows:
         which = np.flatnonzero((w.segment == number) & (w.half_width == M))
         inside = np.arange(0, w.width + 1, self._step(M, dense))
         seen = np.unique((w.start[which, None] + inside).ravel())
-        smoothed, rates = smooth(signals, seen, M, self._rate)
+        if dense:
+            smoothed, rates = (part[seen - M] for part in smooth_all(signals, M, self._rate))
+        else:
+            smoothed, rates = smooth(signals, seen, M, self._rate)
         x = smoothed[:, :n_x]
         v = self._layout.speeds(x, rates[:, :n_x])
         return Motion(number, seen, x, v, smoothed[:, n_x:]), which
@@ -100,23 +104,37 @@ class WeakWindows:
         dense: from every sample. What is no smooth function of the motion, or turns fast with it (a cogging's phase),
         holds frequencies that a thinned motion folds back into the rows.
         """
-        w = self.windows
         out: Array | None = None
-        for motion, which in self.motions(dense):
+        for (motion, which), operators in zip(self.motions(dense), self._sums(dense), strict=True):
             P, G = weak(motion)
             if out is None:
                 out = np.zeros((self.count, *G.shape[1:]))
-            step = self._step(int(w.half_width[which[0]]), dense)
-            phi, phi_dot, _ = test_function(w.width // step, w.width / self._rate, w.exponent)
-            firsts = np.searchsorted(motion.samples, w.start[which])
-            for part, weights in ((G, phi), (P, phi_dot)):
+            for part, operator in zip((G, P), operators, strict=True):
                 if part is None:
                     continue
                 flat = part.reshape(len(part), -1)
                 # A force acts on few of the rows.
                 acts = np.flatnonzero(np.any(flat, axis=0))
-                seen = sliding_window_view(flat[:, acts], phi.size, axis=0)
-                weighted = np.stack([seen[first] @ weights for first in firsts])
-                out.reshape(self.count, -1)[np.ix_(which, acts)] -= step / self._rate * weighted
+                out.reshape(self.count, -1)[np.ix_(which, acts)] -= operator @ flat[:, acts]
         assert out is not None
         return out
+
+    def _sums(self, dense: bool) -> list[tuple[scipy.sparse.csr_array, scipy.sparse.csr_array]]:
+        """For each of `motions`, what makes ∫ φ · dt and ∫ φ̇ · dt of its windows (W', K) of values at its samples."""
+        if dense not in self._operators:
+            self._operators[dense] = [self._sum(*seen, dense) for seen in self.motions(dense)]
+        return self._operators[dense]
+
+    def _sum(
+        self, motion: Motion, which: NDArray[np.int64], dense: bool
+    ) -> tuple[scipy.sparse.csr_array, scipy.sparse.csr_array]:
+        w = self.windows
+        step = self._step(int(w.half_width[which[0]]), dense)
+        phi, phi_dot, _ = test_function(w.width // step, w.width / self._rate, w.exponent)
+        firsts = np.searchsorted(motion.samples, w.start[which])
+        columns = (firsts[:, None] + np.arange(phi.size)).ravel()
+        rows = np.arange(0, columns.size + 1, phi.size)
+        shape = which.size, motion.samples.size
+        weights = (np.tile(step / self._rate * values, which.size) for values in (phi, phi_dot))
+        by_force, by_momentum = (scipy.sparse.csr_array((each, columns, rows), shape=shape) for each in weights)
+        return by_force, by_momentum

@@ -17,6 +17,7 @@ from functools import cache
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
+from scipy.signal import oaconvolve
 
 from sms_online.stream import Array
 
@@ -56,6 +57,14 @@ def smooth(samples: Array, centres: NDArray[np.int64], half_width: int, sample_r
     windows = sliding_window_view(samples, 2 * half_width + 1, axis=0)[centres - half_width]
     both = windows @ kernel(half_width)
     return both[..., 0], both[..., 1] * sample_rate
+
+
+def smooth_all(samples: Array, half_width: int, sample_rate: float) -> tuple[Array, Array]:
+    """As `smooth` at every centre of samples (B, C), (B - 2M, C): of many at once, and equal up to rounding."""
+    # Correlation is convolution with the kernel reversed.
+    reversed_kernel = kernel(half_width)[::-1]
+    both = [oaconvolve(samples, column[:, None], mode="valid", axes=0) for column in reversed_kernel.T]
+    return np.asarray(both[0]), np.asarray(both[1]) * sample_rate
 
 
 class WidthChoice:

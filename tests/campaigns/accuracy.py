@@ -124,16 +124,16 @@ def _summary(grade: str, names: list[str], truth: Array, records: list[Record]) 
         covered, bias = 100.0 * float(inside[:, k].mean()), float(normalised[:, k].mean())
         late = grade == "B" and name not in ASKED_WEAK and at_4_s > ASKED_EARLY
         lines.append(
-            f"{name:34}{_flag(median, median > asked, '.5f'):>18}{asked:9g}{error[:, k].max():10.4f}"
-            f"{_flag(at_4_s, late, '.4f'):>10}{np.median(100.0 * std[:, k] / np.abs(truth[k])):12.5f}"
-            f"{_flag(covered, not EACH[0] <= covered <= EACH[1], '.1f'):>11}"
-            f"{_flag(bias, abs(bias) > LARGEST_BIAS, '+.2f'):>10}{np.sqrt(np.mean(normalised[:, k] ** 2)):9.2f}"
+            f"{name:34}{flagged(median, median > asked, '.5f'):>18}{asked:9g}{error[:, k].max():10.4f}"
+            f"{flagged(at_4_s, late, '.4f'):>10}{np.median(100.0 * std[:, k] / np.abs(truth[k])):12.5f}"
+            f"{flagged(covered, not EACH[0] <= covered <= EACH[1], '.1f'):>11}"
+            f"{flagged(bias, abs(bias) > LARGEST_BIAS, '+.2f'):>10}{np.sqrt(np.mean(normalised[:, k] ** 2)):9.2f}"
         )
     pooled = 100.0 * float(inside.mean())
     chi2, seconds = (np.array([record[key] for record in records]) for key in ("chi2", "seconds"))
     events = [record["events"] for record in records if record["events"] is not None]
     lines += [
-        f"95 % intervals cover {_flag(pooled, not POOLED[0] <= pooled <= POOLED[1], '.2f')} % pooled",
+        f"95 % intervals cover {flagged(pooled, not POOLED[0] <= pooled <= POOLED[1], '.2f')} % pooled",
         f"rows' variance over predicted {np.median(chi2):.3f} ({chi2.min():.3f} … {chi2.max():.3f})",
         f"{np.median(seconds):.2f} s of one core a session",
     ]
@@ -142,7 +142,8 @@ def _summary(grade: str, names: list[str], truth: Array, records: list[Record]) 
     return "\n".join(lines)
 
 
-def _flag(value: float, missed: bool, form: str) -> str:
+def flagged(value: float, missed: bool, form: str) -> str:
+    """The value, with an exclamation mark where it is not what is asked."""
     return f"{value:{form}}" + ("!" if missed else "")
 
 
