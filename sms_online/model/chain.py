@@ -10,12 +10,12 @@ Frames, from the base outwards: 0 is {0} with origin in joint 1; mount i is the 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
 
-from sms_online.description.schema import Joint, RigidLink, System
+from sms_online.description.schema import FlexibleLink, Joint, RigidLink, System
 from sms_online.model import so3
 from sms_online.model.beam import LinearLink
 from sms_online.model.flexible import LinkKinematics, Shape, ShapeRate
@@ -30,6 +30,12 @@ class Frame:
 
     origin: Array
     rotation: Array
+
+
+@lru_cache(maxsize=64)
+def link_kinematics(link: FlexibleLink, free_end: bool) -> LinkKinematics:
+    """The constant geometry of a flexible link, once for all the models that a search for effects makes of a system."""
+    return LinearLink(link) if link.kinematics == "linear" else ExactRod(link, free_end=free_end)
 
 
 class Chain:
@@ -47,13 +53,9 @@ class Chain:
         self.links = system.links
         self.flexible: list[LinkKinematics | None] = []
         for i, link in enumerate(system.links):
-            if isinstance(link, RigidLink):
-                self.flexible.append(None)
-            elif link.kinematics == "linear":
-                self.flexible.append(LinearLink(link))
-            else:
-                last = i == len(system.links) - 1
-                self.flexible.append(ExactRod(link, free_end=last and system.payload is None))
+            last = i == len(system.links) - 1
+            free_end = last and system.payload is None
+            self.flexible.append(None if isinstance(link, RigidLink) else link_kinematics(link, free_end))
         tracked = system.spacecraft.tracked_point if system.spacecraft is not None else (0.0, 0.0, 0.0)
         self.joint_1_from_S = -np.array(tracked)
         # Twist of the base in inertial axes out of v, (6, n_v).
