@@ -24,6 +24,7 @@ from sms_online.diagnosis.online import Immediate, OnlineDiagnosis, Searcher
 from sms_online.diagnosis.online_search import Outcome, Request, search
 from sms_online.errors import InputError
 from sms_online.pipeline.estimator import Estimator
+from sms_online.pipeline.momentum_balance import HOPS
 from sms_online.results import results_document
 from sms_online.stream import Array, Block
 from sms_tools.cli import main
@@ -102,6 +103,25 @@ def test_answers_that_came_late_are_used_as_late_in_the_repetition(tmp_path: Pat
         assert online.episodes[0].adopted is not None
         told.append(json.dumps([online.document(), results_document(estimator, 0.0, [])]))
     assert told[0] == told[1] != told[2]
+
+
+def test_what_falls_due_while_a_search_runs_is_searched_right_after_it(tmp_path: Path) -> None:
+    """An answer that takes two seconds skips one search that is due; the next one does not wait for another to be."""
+    block = axis_block(cogging, BEGIN, seconds=14.0)
+    estimator = Estimator(SYSTEM, block.channels, "session")
+    newest: list[float] = []
+
+    class Slow(Late):
+        def submit(self, number: int, request: Request) -> bool:
+            newest.append(float(request.segments[-1].index[-1]) / SYSTEM.sample_rate)
+            return super().submit(number, request)
+
+    blocks_a_second = 1.0 / (SYSTEM.windows.momentum / HOPS)
+    online = OnlineDiagnosis(estimator, Slow(tmp_path, round(2.0 * blocks_a_second)), adopt=False)
+    estimator.push(block)
+    estimator.finish()
+    assert online.episodes[0].verdict == "named"
+    assert newest[1] - newest[0] == pytest.approx(2.0, abs=1.5 / blocks_a_second)
 
 
 @cache

@@ -230,13 +230,15 @@ class OnlineDiagnosis:
         schedule = DUE_FROM_THE_START if onset.last is None else DUE
         first = max(onset.first, int(self._record[0].index[0]))
         due = int(np.count_nonzero((newest - first) / self._unit >= np.array(schedule)))
+        if self._pending is not None:
+            return  # what falls due meanwhile is searched right after it, in all that has come by then
         if due > self._due:
             self._due = due
             self._begun += 1
             request = self._request(onset)
-            if self._pending is None and request is not None and self._searcher.submit(self._begun, request):
+            if request is not None and self._searcher.submit(self._begun, request):
                 self._pending = self._begun, self._now
-        elif self._due == len(schedule) and self._pending is None:
+        elif self._due == len(schedule):
             self._give_up()
 
     def _give_up(self) -> None:
