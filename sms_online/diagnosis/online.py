@@ -20,7 +20,7 @@ from sms_online.diagnosis.constants import applied, is_constant
 from sms_online.diagnosis.episodes import Episode, Evidence, episode_document, line
 from sms_online.diagnosis.followed import least_samples
 from sms_online.diagnosis.online_search import Named, Outcome, Request, search
-from sms_online.diagnosis.record import Segment
+from sms_online.diagnosis.record import Segment, joined
 from sms_online.effects.catalogue import ENTRIES
 from sms_online.model.model import Model
 from sms_online.pipeline.estimator import Estimator
@@ -278,12 +278,10 @@ class OnlineDiagnosis:
     def _segments(self, first: int, last: int | None) -> list[Segment]:
         """Remembered samples from one grid index to another, cut at gaps; those too short for a window left out."""
         out = []
-        for number in dict.fromkeys(piece.segment for piece in self._record):
-            own = [piece for piece in self._record if piece.segment == number]
-            index, values = (np.concatenate([getattr(piece, part) for piece in own]) for part in ("index", "values"))
-            inside: NDArray[np.bool_] = (index >= first) & (True if last is None else index <= last)
+        for each in joined(self._record).values():
+            inside: NDArray[np.bool_] = (each.index >= first) & (True if last is None else each.index <= last)
             if int(inside.sum()) > least_samples(self._estimator.system):
-                out.append(Segment(index[inside], values[inside]))
+                out.append(Segment(each.index[inside], each.values[inside]))
         return out
 
     def _hear(self, evidence: Evidence) -> None:
@@ -319,10 +317,9 @@ class OnlineDiagnosis:
         if not outcome.began or onset.last is None:
             first, known = self._valid, (np.zeros((n + 1, n + 1)), 0)
         last = self._record[-1].segment
-        pieces = [piece for piece in self._record if piece.segment == last]
-        index, values = (np.concatenate([getattr(piece, part) for piece in pieces]) for part in ("index", "values"))
-        late = index >= first
-        samples = GridSamples(index[late], values[late], last)
+        newest = joined(self._record)[last]
+        late = newest.index >= first
+        samples = GridSamples(newest.index[late], newest.values[late], last)
         time = self._time(int(samples.index[0])) if episode.began is None or not outcome.began else episode.began
         event = Event(
             time=time,

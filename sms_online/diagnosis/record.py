@@ -40,12 +40,17 @@ class SampleRecord:
 
     def segments(self) -> list[Segment]:
         """The session so far, cut where its gaps are."""
-        out = []
-        for number in dict.fromkeys(piece.segment for piece in self._pieces):
-            own = [piece for piece in self._pieces if piece.segment == number]
-            index, values = (np.concatenate([getattr(piece, part) for piece in own]) for part in ("index", "values"))
-            out.append(Segment(index, values))
-        return out
+        return list(joined(self._pieces).values())
+
+
+def joined(pieces: Sequence[GridSamples]) -> dict[int, Segment]:
+    """Consecutive samples as their segments, by number."""
+    out = {}
+    for number in dict.fromkeys(piece.segment for piece in pieces):
+        own = [piece for piece in pieces if piece.segment == number]
+        index, values = (np.concatenate([getattr(piece, part) for piece in own]) for part in ("index", "values"))
+        out[number] = Segment(index, values)
+    return out
 
 
 def excerpts(segments: Sequence[Segment], length: int, most: int) -> list[Segment]:
