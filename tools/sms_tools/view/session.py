@@ -134,6 +134,7 @@ class View:
         if kind is None:
             self._put(End(self._t, take(self._estimator)))
             self._close(self._handover)
+        self._handover.close()
         if self._handover.dropped:
             self.warnings.append(f"{self._handover.dropped} pictures of the view dropped: it does not keep up")
         if not (self._serving and kind is None and not self.status):
