@@ -60,4 +60,4 @@ def test_evidence_is_drawn_over_the_whole_session_and_the_effect_has_the_most(
 
 def test_the_verdict_is_in_the_log(diagnosed: Path, document: dict[str, Any]) -> None:
     told = [row["TextLog:text"][0] for row in columns(diagnosed / "session.rrd", "/log") if row.get("TextLog:text")]
-    assert document["summary"] in told
+    assert f"11.99 s: {document['summary']}" in told

@@ -103,7 +103,8 @@ def test_rerun_verifies_the_recording(recorded: Path) -> None:
 
 def test_events_are_told_when_they_happen(recorded: Path) -> None:
     rows = [row for row in columns(recorded / "session.rrd", "/log") if row.get("TextLog:text")]
-    told = {row["TextLog:text"][0].split(" is ")[0] for row in rows if "is determined" in row["TextLog:text"][0]}
+    lines = [row["TextLog:text"][0].split(" s: ")[1] for row in rows]
+    told = {line.split(" is ")[0] for line in lines if "is determined" in line}
     assert told >= {p["name"] for p in results(recorded)["parameters"] if p["identifiable"]}
 
 

@@ -12,6 +12,7 @@ import argparse
 import io
 import os
 import shutil
+import signal
 import subprocess
 import sys
 import tempfile
@@ -26,12 +27,13 @@ from rerun.experimental import ViewerClient
 from sms_tools.cli import main as sms_online
 
 PICTURES = Path(__file__).parent.parent / "docs" / "pictures"
-WIDTH = 1440  # px, of a screenshot
+# px, of a screenshot: large enough for every title, small enough to be read where a page scales it to half.
+WIDTH, HEIGHT = 1600, 900
 # The animated one: px, pictures a second of the session and of the animation, quality of its compression.
 ANIMATED_WIDTH, FRAME_RATE, QUALITY = 960, 5.0, 60
 ANIMATED_SECONDS = 12.0
-# The viewer needs so long to load a recording, and to draw another instant, s.
-LOADING, DRAWING = 6.0, 0.8
+# The viewer needs so long to start, to load a recording, and to draw another instant, s.
+STARTING, LOADING, DRAWING = 5.0, 6.0, 0.8
 PORT = 19876
 # System, seconds of motion, grade of noise.
 SESSIONS = {
@@ -103,9 +105,13 @@ def _diagnosis(capture: Path) -> None:
 
 
 def _photograph(recording: Path, name: str, animated: bool) -> None:
-    # The viewer stands beside the interpreter, whether or not that directory is in PATH.
-    os.environ["PATH"] = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
-    viewer = ViewerClient.spawn(headless=True, port=PORT, detach_process=False)
+    # The viewer stands beside the interpreter, whether or not that directory is in PATH. `ViewerClient.spawn` would start
+    # one of another size.
+    program = [Path(sys.executable).with_name("rerun"), "--headless", "--port", str(PORT)]
+    size = ["--window-size", f"{WIDTH}x{HEIGHT}"]
+    process = subprocess.Popen([*program, *size], stderr=subprocess.DEVNULL, start_new_session=True)
+    sleep(STARTING)
+    viewer = ViewerClient.connect(f"rerun+http://127.0.0.1:{PORT}/proxy")
     try:
         viewer.open([str(recording)])
         sleep(LOADING)
@@ -125,7 +131,9 @@ def _photograph(recording: Path, name: str, animated: bool) -> None:
                 quality=QUALITY,
             )
     finally:
-        viewer.quit()
+        # That program is a script, which starts the viewer itself.
+        os.killpg(process.pid, signal.SIGTERM)
+        process.wait()
 
 
 def _screenshot(viewer: ViewerClient, width: int) -> Image.Image:

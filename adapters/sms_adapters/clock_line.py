@@ -113,6 +113,11 @@ class DeviceClock:
         """How much longer the session's second is counted than the device's, relative."""
         return self._slope - 1.0
 
+    @property
+    def gained(self) -> float:
+        """By how much the session's clock has run ahead of the device's since the first sample, s, to the newest."""
+        return self._offset + (self._slope - 1.0) * self._newest
+
     def push(self, device: Array, arrival: Array) -> Array:
         """Times (K,) of the next K samples in order of arrival, earlier ones held back included; NaN: drop the sample.
 
