@@ -129,6 +129,18 @@ def test_a_replica_knows_what_the_estimator_knew(samples: Block) -> None:
     assert results_document(estimator, 0.0, []) != then
 
 
+def test_health_of_a_live_source_is_recorded(samples: Block, tmp_path: Path) -> None:
+    estimator = Estimator(load_system("paper-planar"), samples.channels, "test")
+    told = {"latency": {"p99": 12.5}, "clocks": {"can": -0.25}}
+    with open_view("save", estimator, samples.channels, tmp_path, patient=True, health=lambda: told) as view:
+        for block in view.watch([samples]):
+            estimator.push(block)
+    for entity, value in (("/health/latency/p99", 12.5), ("/health/clocks/can", -0.25)):
+        t, values = scalars(tmp_path / "session.rrd", entity)
+        assert t[-1] > SECONDS - 1.0
+        assert np.unique(values).tolist() == [value]
+
+
 @pytest.fixture
 def deaf_viewer() -> Iterator[int]:
     """The port of somebody who accepts connections and never reads."""
