@@ -116,7 +116,7 @@ class DeviceClock:
 
     @property
     def gained(self) -> float:
-        """By how much the session's clock has run ahead of the device's, s, from the first line to the newest sample."""
+        """By how much the session's clock has run ahead of the device's since the first line was fitted, s."""
         return self._ahead() - self._ahead_at_first
 
     def push(self, device: Array, arrival: Array) -> Array:
