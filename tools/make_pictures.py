@@ -37,7 +37,7 @@ ANIMATED_SECONDS = 12.0
 # The viewer needs so long to start, to load a recording, and to draw another instant, s.
 STARTING, LOADING, DRAWING = 5.0, 6.0, 0.8
 PORT = 19876
-COLORS = 128
+COLORS = 256
 # System, seconds of motion, grade of noise.
 SESSIONS = {
     "planar": ("paper-planar", "20", "B"),
@@ -120,8 +120,9 @@ def _photograph(recording: Path, name: str, animated: bool) -> None:
     try:
         viewer.open([str(recording)])
         sleep(LOADING)
-        # Few colours do for lines on black, and make it a third as large.
-        _screenshot(viewer, width).quantize(COLORS).save(PICTURES / f"{name}.png", optimize=True)
+        # Few colours do for lines on black and make it a third as large; this method keeps the rare ones.
+        few = _screenshot(viewer, width).quantize(COLORS, Image.Quantize.MAXCOVERAGE)
+        few.save(PICTURES / f"{name}.png", optimize=True)
         if animated:
             frames = []
             for t in np.arange(0.4, ANIMATED_SECONDS, 1.0 / FRAME_RATE):

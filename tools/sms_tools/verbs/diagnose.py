@@ -139,12 +139,13 @@ def _watched(
 def _evidence(document: Document) -> dict[str, float]:
     """log10 of the gain, before anything was taken up, of what was named and of the best others, MOST_LINES in all.
 
-    What was found by comparing whole descriptions is no candidate and has the gain of that comparison.
+    What was found by comparing whole descriptions has the gain of that comparison, for as a candidate it gains nothing.
     """
     named = {f"{effect['name']}@{effect['where']}": effect["evidence"]["gain"] for effect in document["effects"]}
     ranked = {f"{candidate['name']}@{candidate['where']}": candidate["gain"] for candidate in document["candidates"]}
-    # The union keeps the order of what was named, and takes the candidates' numbers.
-    gains = list((named | ranked).items())[: max(MOST_LINES, len(named))]
+    late = {name: gain for name, gain in named.items() if ranked.get(name, 0.0) < 1.0}
+    # A union keeps the order of what was named, and takes the later numbers.
+    gains = list((named | ranked | late).items())[: max(MOST_LINES, len(named))]
     return {name: math.log10(max(1.0, gain)) for name, gain in gains}
 
 
