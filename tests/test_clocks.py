@@ -49,6 +49,8 @@ def test_two_devices_agree_within_30_microseconds_and_1_ppm_after_30_seconds(see
         errors.append(np.sqrt(np.mean((times - t)[after] ** 2)))
     assert np.hypot(*errors) < 30e-6
     assert abs((clocks[1].drift - 50e-6) - clocks[0].drift) < 1e-6
+    # From the first line on, which a second of samples gives, and which is good to a tenth of a millisecond.
+    assert clocks[1].gained - clocks[0].gained == pytest.approx(50e-6 * 59.0, abs=2e-4)
 
 
 def test_no_sample_waits_longer_than_the_first_second() -> None:
@@ -68,6 +70,7 @@ def test_a_jump_of_the_devices_clock_is_found_and_bridged(jump: float) -> None:
     times = corrected(clock, device + np.where(t > 11.0, jump, 0.0), arrival)
     assert clock.counters.jumps == 1
     assert clock.last_jump == pytest.approx(jump, abs=1e-3)
+    assert clock.gained == pytest.approx(50e-6 * 19.0 - jump, abs=1e-3)
     assert clock.counters.corrupt == 0
     np.testing.assert_allclose(times, t, rtol=0, atol=1e-4)
 

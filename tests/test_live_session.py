@@ -189,6 +189,14 @@ def test_a_display_that_never_reads_blocks_nobody(tmp_path: Path, system: System
     os.close(reader)  # which ends the write that waits
 
 
+def test_health_tells_the_latency_and_the_clocks(tmp_path: Path, system: System) -> None:
+    bench = Bench(tmp_path, system)
+    bench.run(21.0)
+    health = bench.session.health
+    assert 0.0 < health["latency"]["median"] <= health["latency"]["p99"]
+    assert health["clocks"].keys() == {"drive", "encoder"}
+
+
 def test_a_checkpoint_is_there_while_the_session_runs_and_goes_on_to_the_same_bits(
     tmp_path: Path, system: System, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -16,16 +16,19 @@ from sms_tools.cli import main
 COULOMB = 0.2  # N m
 
 
-@pytest.fixture(scope="module")
-def diagnosed(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The directory of the diagnosis of an axis with Coulomb friction, with a recording."""
+@pytest.fixture(scope="module", params=[[], ["--prior"]], ids=["", "prior"])
+def diagnosed(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The directory of the diagnosis of an axis with Coulomb friction, with a recording; also with a prior.
+
+    With one the parameters come from the rows of the diagnosis, not from a session.
+    """
     folder = tmp_path_factory.mktemp("diagnosed")
     (folder / "axis.toml").write_text(AXIS)
     block = axis_block(COULOMB)
     with CaptureWriter(folder / "run.csv", block.channels) as writer:
         writer.write(block)
     arguments = ["diagnose", str(folder / "run.csv"), "--system", str(folder / "axis.toml"), "--out", str(folder)]
-    assert main([*arguments, "--rerun", "save"]) == 0
+    assert main([*arguments, "--rerun", "save", *request.param]) == 0
     return folder
 
 
@@ -36,12 +39,13 @@ def document(diagnosed: Path) -> dict[str, Any]:
 
 
 def test_the_recording_ends_with_the_parameters_after(diagnosed: Path, document: dict[str, Any]) -> None:
-    found = {p["symbol"]: p["estimate"] for p in document["after"]["parameters"]}
+    found = {p["symbol"]: (p["estimate"], p["std"]) for p in document["after"]["parameters"]}
     shown = {}
     for group in ("links", "effects", "effects_N_m"):  # what was found has no nominal value, so a plot of its own
-        entity = f"/parameters/{group}/estimate"
-        names = columns(diagnosed / "session.rrd", entity)[0]["SeriesLines:names"]
-        shown |= dict(zip(names, scalars(diagnosed / "session.rrd", entity)[1][-1], strict=True))
+        recording, entity = diagnosed / "session.rrd", f"/parameters/{group}"
+        names = columns(recording, f"{entity}/estimate")[0]["SeriesLines:names"]
+        last = [scalars(recording, f"{entity}/{number}")[1][-1].tolist() for number in ("estimate", "std")]
+        shown |= dict(zip(names, zip(*last, strict=True), strict=True))
     assert shown == found
 
 
@@ -60,4 +64,4 @@ def test_evidence_is_drawn_over_the_whole_session_and_the_effect_has_the_most(
 
 def test_the_verdict_is_in_the_log(diagnosed: Path, document: dict[str, Any]) -> None:
     told = [row["TextLog:text"][0] for row in columns(diagnosed / "session.rrd", "/log") if row.get("TextLog:text")]
-    assert document["summary"] in told
+    assert f"11.99 s: {document['summary']}" in told

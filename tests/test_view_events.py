@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from axis import AXIS, DAMPING, INERTIA
+from recordings import scalars
 from rerun.chunk import RrdReader
 
 from sms_adapters.capture import CaptureWriter
@@ -69,7 +70,15 @@ def test_the_recording_goes_on_with_the_parameter_that_an_event_has_added(shown:
             told += row.get("TextLog:text") or []
     (payload,) = (value for path, value in last.items() if path.startswith("/parameters/payload"))
     assert payload == found["payload.inertia"]
-    assert any(re.match(r"event at 10\.0\d+ s: payload payload.inertia", text) for text in told)
+    assert any(re.search(r"s: event at 10\.0\d+ s: payload payload.inertia", text) for text in told)
+
+
+def test_an_event_is_marked_in_plots_of_parameters_and_residuals(shown: Path) -> None:
+    (event,) = json.loads((shown / "results.json").read_text())["events"]
+    for entity in ("/parameters/links/events", "/residual/relative_events", "/residual/whitened_events"):
+        t, values = scalars(shown / "session.rrd", entity)
+        at = t[np.isfinite(values[:, 0])]
+        assert event["time"] == pytest.approx(at[0], abs=1e-6), entity
 
 
 def test_the_page_draws_all_parameters_of_a_changed_session(shown: Path) -> None:

@@ -63,7 +63,7 @@ def test_the_oldest_are_dropped_and_counted_where_it_does_not() -> None:
     gate = Gate()
     handover = Handover(gate, capacity=4)  # type: ignore[arg-type]
     handover.put("in the pipe")
-    wait_for(lambda: handover._waiting.qsize() == 0)
+    wait_for(lambda: not handover._waiting)
     taken = [handover.put(k) for k in range(10)]
     assert taken == [True] * 4 + [False] * 6
     assert handover.dropped == 6
@@ -79,7 +79,14 @@ def test_a_broken_pipe_is_noticed_and_then_costs_nothing() -> None:
     handover.put("first")
     wait_for(lambda: handover.broken)
     assert not handover.put("second", patience=10.0)
-    assert handover._waiting.qsize() == 0
+    assert not handover._waiting
+
+
+def test_a_closed_hand_over_ends_its_thread() -> None:
+    handover = Handover(Gate())  # type: ignore[arg-type]
+    handover.close()
+    handover._thread.join(10.0)
+    assert not handover._thread.is_alive()
 
 
 @pytest.mark.parametrize(

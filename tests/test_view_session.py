@@ -103,7 +103,8 @@ def test_rerun_verifies_the_recording(recorded: Path) -> None:
 
 def test_events_are_told_when_they_happen(recorded: Path) -> None:
     rows = [row for row in columns(recorded / "session.rrd", "/log") if row.get("TextLog:text")]
-    told = {row["TextLog:text"][0].split(" is ")[0] for row in rows if "is determined" in row["TextLog:text"][0]}
+    lines = [row["TextLog:text"][0].split(" s: ")[1] for row in rows]
+    told = {line.split(" is ")[0] for line in lines if "is determined" in line}
     assert told >= {p["name"] for p in results(recorded)["parameters"] if p["identifiable"]}
 
 
@@ -126,6 +127,18 @@ def test_a_replica_knows_what_the_estimator_knew(samples: Block) -> None:
     snapshot.apply(taken, replica)
     assert results_document(replica, 0.0, []) == then
     assert results_document(estimator, 0.0, []) != then
+
+
+def test_health_of_a_live_source_is_recorded(samples: Block, tmp_path: Path) -> None:
+    estimator = Estimator(load_system("paper-planar"), samples.channels, "test")
+    told = {"latency": {"p99": 12.5}, "clocks": {"can": -0.25}}
+    with open_view("save", estimator, samples.channels, tmp_path, patient=True, health=lambda: told) as view:
+        for block in view.watch([samples]):
+            estimator.push(block)
+    for entity, value in (("/health/latency/p99", 12.5), ("/health/clocks/can", -0.25)):
+        t, values = scalars(tmp_path / "session.rrd", entity)
+        assert t[-1] > SECONDS - 1.0
+        assert np.unique(values).tolist() == [value]
 
 
 @pytest.fixture

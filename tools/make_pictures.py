@@ -12,6 +12,7 @@ import argparse
 import io
 import os
 import shutil
+import signal
 import subprocess
 import sys
 import tempfile
@@ -26,13 +27,17 @@ from rerun.experimental import ViewerClient
 from sms_tools.cli import main as sms_online
 
 PICTURES = Path(__file__).parent.parent / "docs" / "pictures"
-WIDTH = 1440  # px, of a screenshot
+# px, of a screenshot: large enough for every title, small enough to be read where a page scales it to half; larger
+# where there are more parameters.
+WIDTH, HEIGHT = 1600, 900
+LARGER = {"seven-joint": (1920, 1080)}
 # The animated one: px, pictures a second of the session and of the animation, quality of its compression.
 ANIMATED_WIDTH, FRAME_RATE, QUALITY = 960, 5.0, 60
 ANIMATED_SECONDS = 12.0
-# The viewer needs so long to load a recording, and to draw another instant, s.
-LOADING, DRAWING = 6.0, 0.8
+# The viewer needs so long to start, to load a recording, and to draw another instant, s.
+STARTING, LOADING, DRAWING = 5.0, 6.0, 0.8
 PORT = 19876
+COLORS = 256
 # System, seconds of motion, grade of noise.
 SESSIONS = {
     "planar": ("paper-planar", "20", "B"),
@@ -66,7 +71,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
             _run("import", "quanser", options.quanser, "--capture", capture)
             recordings["quanser"] = _recording(capture, "quanser-2dsfl", "--prior", "--exaggerate", "3")
         if options.only in (None, "diagnosis"):
-            _diagnosis(Path(folder) / "diagnosis.csv")
+            recordings["diagnosis-rerun"] = _diagnosis(Path(folder) / "diagnosis.csv")
         for name, recording in recordings.items():
             _photograph(recording, name, animated=name == "planar")
 
@@ -82,13 +87,13 @@ def _recording(capture: Path, system: str, *options: str) -> Path:
     return directory / "session.rrd"
 
 
-def _diagnosis(capture: Path) -> None:
-    """The top of the page of a diagnosis, as a browser draws it."""
+def _diagnosis(capture: Path) -> Path:
+    """The top of the page of a diagnosis, as a browser draws it; returns its recording."""
     system, seconds, grade = SESSIONS["planar"]
     effects = [part for effect in EFFECTS for part in ("--effect", effect)]
     _run("simulate", "--system", system, "--capture", capture, "--duration", seconds, "--grade", grade, *effects)
     directory = capture.with_suffix("")
-    _run("diagnose", capture, "--system", system, "--out", directory)
+    _run("diagnose", capture, "--system", system, "--out", directory, "--rerun", "save")
     browser = shutil.which("chromium") or shutil.which("chromium-browser")
     if browser is None:
         sys.exit("no Chromium; tools/install_browser.sh installs it")
@@ -100,16 +105,24 @@ def _diagnosis(capture: Path) -> None:
         f"--screenshot={PICTURES / 'diagnosis.png'}",
     ]
     subprocess.run([browser, *options, (directory / "diagnosis.html").as_uri()], check=True, stderr=subprocess.DEVNULL)
+    return directory / "session.rrd"
 
 
 def _photograph(recording: Path, name: str, animated: bool) -> None:
-    # The viewer stands beside the interpreter, whether or not that directory is in PATH.
-    os.environ["PATH"] = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
-    viewer = ViewerClient.spawn(headless=True, port=PORT, detach_process=False)
+    # The viewer stands beside the interpreter, whether or not that directory is in PATH. `ViewerClient.spawn` would
+    # start one of another size.
+    program = [Path(sys.executable).with_name("rerun"), "--headless", "--port", str(PORT)]
+    width, height = LARGER.get(name, (WIDTH, HEIGHT))
+    size = ["--window-size", f"{width}x{height}"]
+    process = subprocess.Popen([*program, *size], stderr=subprocess.DEVNULL, start_new_session=True)
+    sleep(STARTING)
+    viewer = ViewerClient.connect(f"rerun+http://127.0.0.1:{PORT}/proxy")
     try:
         viewer.open([str(recording)])
         sleep(LOADING)
-        _screenshot(viewer, WIDTH).save(PICTURES / f"{name}.png", optimize=True)
+        # Few colours do for lines on black and make it a third as large; this method keeps the rare ones.
+        few = _screenshot(viewer, width).quantize(COLORS, Image.Quantize.MAXCOVERAGE)
+        few.save(PICTURES / f"{name}.png", optimize=True)
         if animated:
             frames = []
             for t in np.arange(0.4, ANIMATED_SECONDS, 1.0 / FRAME_RATE):
@@ -125,7 +138,9 @@ def _photograph(recording: Path, name: str, animated: bool) -> None:
                 quality=QUALITY,
             )
     finally:
-        viewer.quit()
+        # That program is a script, which starts the viewer itself.
+        os.killpg(process.pid, signal.SIGTERM)
+        process.wait()
 
 
 def _screenshot(viewer: ViewerClient, width: int) -> Image.Image:

@@ -96,6 +96,7 @@ class DeviceClock:
         self._slope = 1.0
         self._offset = 0.0
         self._settled = False
+        self._ahead_at_first: float = np.nan  # of the two clocks, when the first line was fitted
         self._held = np.empty(0)  # device times that wait for their time
         self._dropped = np.empty(0, dtype=bool)  # of those, which are not to get one
         self._ready = np.empty(0)  # times of samples before a jump, not yet given out
@@ -112,6 +113,11 @@ class DeviceClock:
     def drift(self) -> float:
         """How much longer the session's second is counted than the device's, relative."""
         return self._slope - 1.0
+
+    @property
+    def gained(self) -> float:
+        """By how much the session's clock has run ahead of the device's since the first line was fitted, s."""
+        return self._ahead() - self._ahead_at_first
 
     def push(self, device: Array, arrival: Array) -> Array:
         """Times (K,) of the next K samples in order of arrival, earlier ones held back included; NaN: drop the sample.
@@ -242,6 +248,9 @@ class DeviceClock:
         paused = len(last) == PAUSED_INTERVALS and min(last) > PAUSE and max(last) - min(last) < SAME
         return paused or len(self._off) >= LATE_INTERVALS
 
+    def _ahead(self) -> float:
+        return self._offset + (self._slope - 1.0) * self._newest
+
     def _line(self, d: float) -> float:
         return self._offset + self._slope * d
 
@@ -254,6 +263,8 @@ class DeviceClock:
         else:
             self._offset = float(np.min(y - self._slope * x))
         self._settled = self._bins >= self._settling
+        if self._settled and np.isnan(self._ahead_at_first):
+            self._ahead_at_first = self._ahead()
 
     def _times(self, count: int) -> Array:
         """Times of the first `count` samples held."""

@@ -228,6 +228,19 @@ class Merger:
         filled = ~np.isnan(rows).all(axis=1)
         return Block(t[order][filled] + self._start, self.channels, rows[filled])
 
+    @property
+    def clock_offsets(self) -> dict[str, float]:
+        """How far the session's clock has gained on each device's, ms, by source and, of several, number of the stream.
+
+        Of what can be told now.
+        """
+        offsets = {}
+        for lane in self.lanes:
+            for k, clock in enumerate(lane.clocks, start=1):
+                if clock.settled:
+                    offsets[lane.name if len(lane.clocks) == 1 else f"{lane.name} {k}"] = 1e3 * clock.gained
+        return offsets
+
     def silent(self, now: float) -> list[str]:
         """Names of the sources that are silent at the tick `now`, s."""
         return [lane.name for lane, heard in zip(self.lanes, self._heard, strict=True) if now - heard > SILENCE]

@@ -82,7 +82,7 @@ def summary(diagnosis: Diagnosis) -> str:
     keys = [f"{effect['name']} at {effect['where']}" for effect in _named(diagnosis)]
     before, after = diagnosis.before, diagnosis.after
     row = max(before.test, key=lambda name: before.test[name].whitened)
-    fall = f"from {before.test[row].whitened:.3g} to {after.test[row].whitened:.3g} times noise"
+    fall = f"from {_times(before.test[row].whitened)} to {_times(after.test[row].whitened)} times noise"
     falls = f"the residual of {row} falls {fall}"
     if diagnosis.verdict == "named":
         return f"The model lacks {', '.join(keys)}: with {'them' if len(keys) > 1 else 'it'} {falls}."
@@ -95,6 +95,11 @@ def summary(diagnosis: Diagnosis) -> str:
         f"The model lacks something that no known effect explains: most of it acts on {unexplained.row} "
         f"({unexplained.speed}) and depends on {unexplained.variable}.{tried}"
     )
+
+
+def _times(value: float) -> str:
+    """Three digits, without an exponent."""
+    return f"{value:.3g}" if value < 1000.0 else f"{value:,.0f}"
 
 
 def _named(diagnosis: Diagnosis) -> list[dict[str, str]]:

@@ -6,6 +6,7 @@ pytest tests/bench/test_bench_view.py --override-ini addopts= -s
 from __future__ import annotations
 
 import os
+import resource
 import subprocess
 import sys
 from pathlib import Path
@@ -21,8 +22,10 @@ from sms_online.stream import Block
 from sms_sim.simulate import sampled_blocks, simulate
 from sms_tools.view.session import View, open_view
 
-# Of the long replay: MINUTES in the environment, an hour by default, which takes nine minutes twice.
+# Of the long replay: MINUTES in the environment, an hour by default, which takes a quarter of an hour twice.
 ROWS = round(float(os.environ.get("MINUTES", "60")) * 60_000)
+# Rows over the seconds between two looks at the memory: of an hour every 30 s.
+SAMPLED_ROWS = 120_000.0
 GAP = 0.1  # s between repetitions of a motion, a gap that the synchroniser sees
 # Samples that a live source delivers at a time.
 DELIVERED = 10
@@ -66,7 +69,7 @@ def test_hand_over(tmp_path: Path, name: str, monkeypatch: pytest.MonkeyPatch) -
 
 
 def test_an_hour(tmp_path: Path) -> None:
-    """An hour at 1 kHz with a recording and without: time, memory of both processes, size of the file."""
+    """An hour at 1 kHz without and with a recording: both processes' time and memory as it goes, size of the file."""
     system = load_system("paper-planar")
     blocks = list(sampled_blocks(simulate(system, 20.0), "B", seed=1))
     capture = tmp_path / "hour.csv"
@@ -74,20 +77,58 @@ def test_an_hour(tmp_path: Path) -> None:
         for k in range(-(-ROWS // sum(block.t.size for block in blocks))):
             for block in blocks:
                 writer.write(Block(block.t + k * (20.0 + GAP), block.channels, block.values))
-    wall = {}
+    recording = tmp_path / "session.rrd"
+    wall, cpu = {}, {}
     for choice in ("off", "save"):
         program = (
             "import resource, sys; from sms_tools.cli import main; "
             f"code = main(['replay', {str(capture)!r}, '--system', 'paper-planar', '--out', {str(tmp_path)!r}, "
             f"'--rerun', {choice!r}]); "
-            "peaks = [resource.getrusage(who).ru_maxrss / 1024 for who in (resource.RUSAGE_SELF, "
-            "resource.RUSAGE_CHILDREN)]; print('peaks', *peaks); sys.exit(code)"
+            "used = [resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)]; "
+            "print('cpu', *(u.ru_utime + u.ru_stime for u in used)); sys.exit(code)"
         )
         start = perf_counter()
-        done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
-        wall[choice] = perf_counter() - start
-        own, view = done.stdout.rsplit("peaks", 1)[1].split()
-        print(f"\n--rerun {choice}: {wall[choice]:.1f} s, peak {own} MB, view's process {view} MB", done.stderr)
-    recording = tmp_path / "session.rrd"
-    print(f"ratio {wall['save'] / wall['off']:.2f}, recording {recording.stat().st_size / 1e6:.1f} MB")
+        with (tmp_path / f"{choice}.txt").open("w+") as out:
+            replay = subprocess.Popen([sys.executable, "-c", program], stdout=out, stderr=subprocess.STDOUT)
+            while replay.poll() is None:
+                size = recording.stat().st_size / 1e6 if recording.exists() else 0.0
+                print(
+                    f"{choice} {perf_counter() - start:6.0f} s: memory {_memory(replay.pid)} MB, "
+                    f"recording {size:.1f} MB",
+                    flush=True,
+                )
+                try:
+                    replay.wait(ROWS / SAMPLED_ROWS)
+                except subprocess.TimeoutExpired:
+                    continue
+            wall[choice] = perf_counter() - start
+            out.seek(0)
+            told = out.read()
+        assert replay.returncode == 0, told
+        own, view = map(float, told.rsplit("cpu", 1)[1].split())
+        cpu[choice] = own
+        print(
+            f"--rerun {choice}: {wall[choice]:.1f} s, CPU {own:.1f} s and {view:.1f} s of the view\n{told}", flush=True
+        )
+    print(
+        f"ratio {wall['save'] / wall['off']:.2f} by the clock, {cpu['save'] / cpu['off']:.2f} by the estimator's CPU "
+        f"time; recording {recording.stat().st_size / 1e6:.1f} MB"
+    )
     subprocess.run([str(Path(sys.executable).with_name("rerun")), "rrd", "verify", str(recording)], check=True)
+
+
+def _memory(process: int) -> list[int]:
+    """Resident memory, MB, of a process and its children; an ended one is left out."""
+    found = []
+    for member in (process, *_children(process)):
+        try:
+            pages = int(Path(f"/proc/{member}/statm").read_text().split()[1])
+        except OSError:
+            continue
+        found.append(round(pages * resource.getpagesize() / 1e6))
+    return found
+
+
+def _children(process: int) -> list[int]:
+    done = subprocess.run(["ps", "-o", "pid=", "--ppid", str(process)], capture_output=True, text=True, check=False)
+    return [int(word) for word in done.stdout.split()]

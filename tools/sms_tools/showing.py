@@ -15,7 +15,7 @@ from sms_tools.html_report.history import History
 from sms_tools.html_report.page import write_report
 from sms_tools.interruption import Interruption
 from sms_tools.report import Document, report_console, show
-from sms_tools.view.session import View, open_view, references
+from sms_tools.view.session import Health, View, open_view, references
 
 
 class Showing:
@@ -36,6 +36,11 @@ class Showing:
         self._history = History(estimator, channels)
         self._directory = directory
         self._truth = truth
+
+    @property
+    def notices(self) -> list[str]:
+        """A line on the view where it has been given up."""
+        return [self._view.status] if self._view.status else []
 
     @property
     def warnings(self) -> list[str]:
@@ -71,12 +76,14 @@ def showing(
     directory: Path,
     truth: Mapping[str, float] | None,
     patient: bool = False,
+    health: Health | None = None,
 ) -> Iterator[Showing]:
     """What `--rerun` asks for, while the context lasts; the estimator has to be finished within it.
 
-    patient: the session may wait for the view, as a replay as fast as it goes does.
+    patient: the session may wait for the view, as a replay as fast as it goes does. health: of a live source.
     """
+    exaggeration = args.exaggerate
     with open_view(
-        args.rerun, estimator, channels, directory, truth, patient=patient, exaggeration=args.exaggerate
+        args.rerun, estimator, channels, directory, truth, patient=patient, exaggeration=exaggeration, health=health
     ) as view:
         yield Showing(args, estimator, view, channels, directory, truth)

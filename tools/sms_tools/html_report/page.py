@@ -15,7 +15,7 @@ from sms_tools.html_report.arm_drawing import arm_drawings
 from sms_tools.html_report.error_bars import Bar, bar_range, error_bars
 from sms_tools.html_report.history import History
 from sms_tools.html_report.svg import Series, chart
-from sms_tools.report import NOT_DETERMINED, Document, trust_lines
+from sms_tools.report import NOT_DETERMINED, Document, formatter, trust_lines
 from sms_tools.view.frames import Reference
 from sms_tools.view.parameter_groups import Group, parameter_groups, shortened
 from sms_tools.view.scene import Scene
@@ -116,7 +116,8 @@ def _parameters(document: Document, references: Sequence[Reference | None]) -> s
         known = "" if reference is None else f"{reference.value:.6g}"
         if p["identifiable"]:
             percent = f"{deviation:+.3g}" if np.isfinite(deviation) else ""
-            numbers = [f"{p['estimate']:.5g}", f"{p['std']:.2g}", f"{p['lower95']:.5g} … {p['upper95']:.5g}"]
+            shown = formatter(p["estimate"], p["std"])
+            numbers = [shown(p["estimate"]), f"{p['std']:.2g}", f"{shown(p['lower95'])} … {shown(p['upper95'])}"]
             cells = [*numbers, known, percent, _bar(deviation, bound, limit)]
         else:
             cells = [NOT_DETERMINED, "", "", known, "", ""]

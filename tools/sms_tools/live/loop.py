@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -52,6 +52,7 @@ class LiveSession:
         self.latencies = Latencies()
         self.notices: Callable[[], Sequence[str]] = tuple  # further lines of the status
         self.busy = 0.0  # s spent on samples
+        self.health: Mapping[str, Mapping[str, float]] = {}  # latency and clock offsets, ms, by name; replaced when new
         self._clock = clock
         self._feeds = feeds
         self._merger = merger
@@ -61,6 +62,7 @@ class LiveSession:
         self._recorder = recorder
         self._status = status
         self._tick = 0
+        self._looked = 0.0
         self._said = 0.0
         self._said_samples = 0
         self._saved = 0.0
@@ -125,11 +127,19 @@ class LiveSession:
     def _look_around(self) -> None:
         """What is done now and then."""
         now = self._clock()
-        if self._status is not None and now - self._said >= NEWS_INTERVAL:
-            self._publish()
+        if now - self._looked >= NEWS_INTERVAL:
+            self._looked = now
+            self.health = {"latency": self._latency(), "clocks": self._merger.clock_offsets}
+            if self._status is not None:
+                self._publish()
         if now - self._saved >= CHECKPOINT_INTERVAL:
             self._saved = now
             self.save()
+
+    def _latency(self) -> dict[str, float]:
+        """Quantiles of the latency, ms, as far as they are known."""
+        quantiles = {"median": self.latencies.quantile(0.5), "p99": self.latencies.quantile(0.99)}
+        return {name: 1e3 * value for name, value in quantiles.items() if value is not None}
 
     def save(self) -> None:
         """Write a checkpoint."""

@@ -29,10 +29,12 @@ from sms_tools.report import Document, parameter_table, report_console, show
 from sms_tools.results_file import results_directory, to_json, write_document
 from sms_tools.session import check_part, described_system, stream
 from sms_tools.true_values import true_values
+from sms_tools.view.frames import Diagnosed
+from sms_tools.view.parameter_groups import MOST_LINES
 from sms_tools.view.session import View, open_view
 
 NAME = "diagnosis.json"
-# Ambiguous and ranked candidates that people are shown.
+# Ambiguous candidates that people are shown.
 SHOWN = 8
 
 
@@ -102,16 +104,27 @@ def _watched(
     channels = blocks[0].channels
     estimator = Estimator(diagnosis.after.system, channels, str(args.capture))
     known = prior(estimator)
+    told: dict[str, tuple[float, float]] = {}
     if known is not None:
         estimator.set_prior(known)
-    exaggeration = args.exaggerate
+        # These come from the diagnosis's rows, not from a session; see `diagnosis_document`.
+        after = document["after"]["parameters"]
+        told = {p["name"]: (p["estimate"], math.inf if p["std"] is None else p["std"]) for p in after}
     with (
         Interruption() as interruption,
-        open_view(args.rerun, estimator, channels, directory, true, patient=True, exaggeration=exaggeration) as view,
+        open_view(
+            args.rerun,
+            estimator,
+            channels,
+            directory,
+            true,
+            patient=True,
+            exaggeration=args.exaggerate,
+            diagnosed=Diagnosed(told),
+        ) as view,
     ):
         stream(estimator, view.watch(blocks), interruption)
-        first = document["candidates"][:SHOWN]
-        scores = {f"{c['name']}@{c['where']}": math.log10(max(1.0, c["gain"])) for c in first}
+        scores = _evidence(document)
         # Judged by all of the capture, so it holds from beginning to end.
         begin, end = float(blocks[0].t[0]), float(blocks[-1].t[-1])
         for t in (begin, end):
@@ -121,6 +134,19 @@ def _watched(
             values = (f"{name} {' '.join(_told(value))}" for name, value in effect["coefficients"].items())
             view.event(end, ", ".join((f"{effect['name']}@{effect['where']}", *values)))
     return view
+
+
+def _evidence(document: Document) -> dict[str, float]:
+    """log10 of the gain, before anything was taken up, of what was named and of the best others, MOST_LINES in all.
+
+    What was found by comparing whole descriptions has the gain of that comparison, for as a candidate it gains nothing.
+    """
+    named = {f"{effect['name']}@{effect['where']}": effect["evidence"]["gain"] for effect in document["effects"]}
+    ranked = {f"{candidate['name']}@{candidate['where']}": candidate["gain"] for candidate in document["candidates"]}
+    late = {name: gain for name, gain in named.items() if ranked.get(name, 0.0) < 1.0}
+    # A union keeps the order of what was named, and takes the later numbers.
+    gains = list((named | ranked | late).items())[: max(MOST_LINES, len(named))]
+    return {name: math.log10(max(1.0, gain)) for name, gain in gains}
 
 
 def _samples(

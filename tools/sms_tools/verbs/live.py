@@ -32,11 +32,11 @@ def run(args: argparse.Namespace) -> int:
     sys.setswitchinterval(SWITCH_INTERVAL)
     with Interruption() as interruption, termination_interrupts():
         with (
-            showing(args, estimator, merger.channels, directory, None) as shown,
+            showing(args, estimator, merger.channels, directory, None, health=lambda: session.health) as shown,
             closing(SearchProcess(directory, args.adopt)) as searches,
         ):
             online = OnlineDiagnosis(estimator, searches, args.adopt)
-            session.notices = lambda: online.notices
+            session.notices = lambda: [*online.notices, *shown.notices]
             shown.follow(online)
             blocks = session.blocks(interruption, math.inf if args.duration is None else args.duration)
             for block in shown.watch(blocks):

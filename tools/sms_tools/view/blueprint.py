@@ -13,8 +13,11 @@ from sms_tools.view.arm_log import ARM, TIMELINE, TIP
 from sms_tools.view.parameter_groups import Group
 from sms_tools.view.scene import Drawing, Scene
 
-# Plots show so much of the past, s: the whole of the example's motion, and of longer sessions what a person remembers.
-WINDOW = 20.0
+# Plots show so much of the past, s: the whole of the example's motion, and of longer sessions what a person remembers;
+# and so much beyond now, or the last label of their axis would be cut.
+WINDOW, AHEAD = 20.0, 1.5
+# The same across: room beyond the range of what is drawn.
+MARGIN = 1.1
 # Past of the tip that is drawn, s: a good part of one swing.
 TRAIL = 4.0
 # More plots of parameters than this side by side are too small to read; they go into tabs.
@@ -22,21 +25,27 @@ MOST_PLOTS = 6
 # Distance of the eye over the radius of what is to be seen: the viewer's field of view is 55° high.
 EYE_DISTANCE = 2.2
 # In space the arm is looked at where it begins, with so much room around it.
-ROOM = 1.3
+ROOM = 1.15
 # Direction from the arm to the eye of a spatial system, from above one side.
 OBLIQUE = np.array((0.35, -0.8, 0.5))
-# A relative residual of 1 says that the model explains nothing. Whitened ones are drawn in decades: noise is 0, and a
-# model that lacks an effect leaves hundreds of times as much.
-RELATIVE_RANGE, WHITENED_RANGE = (0.0, 1.2), (-0.5, 3.5)
 
 
-def layout(scene: Scene, groups: Sequence[Group], first: Drawing) -> rrb.Blueprint:
-    """Layout for an arm that is first seen as the first picture of `first` shows it."""
-    shown = rrb.TextLogColumns(text_log_columns=["LogLevel", "Body"])
+def layout(
+    scene: Scene, groups: Sequence[Group], first: Drawing, live: bool = False, diagnosed: bool = False
+) -> rrb.Blueprint:
+    """Layout for an arm that is first seen as the first picture of `first` shows it.
+
+    live: with plots of the source's latency and clocks. diagnosed: verdict and evidence are in front.
+    """
+    shown = rrb.TextLogColumns(
+        timeline_columns=[rrb.encodings.TimelineColumn(TIMELINE, visible=False)],
+        text_log_columns=["LogLevel", "Body"],
+    )
     log = rrb.TextLogView(origin=number_log.LOG, name="Events and verdicts", columns=shown)
     table = rrb.TextDocumentView(origin=number_log.TABLE, name="Parameters")
-    left = rrb.Vertical(_arm(scene, first), rrb.Tabs(table, log, active_tab=0), row_shares=[11, 9])
-    below = rrb.Tabs(_residual(), _evidence(), _health(), active_tab=0)
+    told = rrb.Tabs(table, log, active_tab=int(diagnosed))
+    left = rrb.Vertical(_arm(scene, first), told, row_shares=[11, 9])
+    below = rrb.Tabs(_residual(), _evidence(), _health(live), active_tab=int(diagnosed))
     right = rrb.Vertical(_parameters(groups), below, row_shares=[7, 3])
     return rrb.Blueprint(
         rrb.Horizontal(left, right, column_shares=[2, 3]),
@@ -76,10 +85,11 @@ def _arm(scene: Scene, first: Drawing) -> rrb.Spatial3DView:
     )
 
 
-def _range(seconds: float) -> rr.TimeRange:
-    """The last seconds before the instant that the viewer shows."""
+def _range(seconds: float, ahead: float = 0.0) -> rr.TimeRange:
+    """The last seconds before the instant that the viewer shows, and some beyond it."""
     return rr.TimeRange(
-        start=rr.TimeRangeBoundary.cursor_relative(seconds=-seconds), end=rr.TimeRangeBoundary.cursor_relative()
+        start=rr.TimeRangeBoundary.cursor_relative(seconds=-seconds),
+        end=rr.TimeRangeBoundary.cursor_relative(seconds=ahead),
     )
 
 
@@ -91,8 +101,9 @@ def _plot(
         contents=list(contents),
         name=name,
         axis_y=rrb.ScalarAxis(range=y) if y is not None else None,
-        plot_legend=rrb.PlotLegend(corner=rrb.Corner2D.RightTop, visible=legend),
-        axis_x=rrb.TimeAxis(view_range=_range(WINDOW)),
+        # Over the past, of which the first seconds have no estimate yet.
+        plot_legend=rrb.PlotLegend(corner=rrb.Corner2D.LeftTop, visible=legend),
+        axis_x=rrb.TimeAxis(view_range=_range(WINDOW, AHEAD)),
         time_ranges=rrb.VisibleTimeRanges([rr.VisibleTimeRange(TIMELINE, _range(WINDOW))]),
     )
 
@@ -101,7 +112,7 @@ def _parameters(groups: Sequence[Group]) -> rrb.Container:
     plots: dict[str, list[rrb.TimeSeriesView]] = {}
     for group in groups:
         path = f"{number_log.PARAMETERS}/{group.path}"
-        y = None if group.half_range is None else (-group.half_range, group.half_range)
+        y = None if group.half_range is None else (-MARGIN * group.half_range, MARGIN * group.half_range)
         contents = [f"{path}/deviation", f"{path}/two_sigma", f"{path}/events"]
         plots.setdefault(group.kind, []).append(_plot(group.title[:1].upper() + group.title[1:], contents, y))
     together = [plot for kind in plots.values() for plot in kind]
@@ -118,13 +129,18 @@ def _parameters(groups: Sequence[Group]) -> rrb.Container:
 
 
 def _residual() -> rrb.Container:
-    relative = _plot("Unexplained torque or force, share", [f"{number_log.RESIDUAL}/relative"], RELATIVE_RANGE)
-    whitened = _plot(
-        "Residual over its noise, log10",
-        [f"{number_log.RESIDUAL}/whitened/**", f"{number_log.RESIDUAL}/noise"],
-        WHITENED_RANGE,
+    residual = number_log.RESIDUAL
+    relative = _plot(
+        "Unexplained torque, share",
+        [f"{residual}/relative", f"{residual}/relative_events"],
+        number_log.RELATIVE_RANGE,
     )
-    energy = _plot("Energy residual, rms, J", [f"{number_log.RESIDUAL}/energy"], legend=False)
+    whitened = _plot(
+        "Rows over their noise, log10",
+        [f"{residual}/whitened/**", f"{residual}/noise", f"{residual}/whitened_events"],
+        number_log.WHITENED_RANGE,
+    )
+    energy = _plot("Energy residual, rms, J", [f"{residual}/energy"], legend=False)
     return rrb.Horizontal(relative, whitened, energy, name="Residual")
 
 
@@ -132,11 +148,15 @@ def _evidence() -> rrb.TimeSeriesView:
     return _plot("Evidence for missing effects, log10 of the gain", [f"{number_log.EVIDENCE}/**"])
 
 
-def _health() -> rrb.Container:
+def _health(live: bool) -> rrb.Container:
     health = number_log.HEALTH
-    return rrb.Horizontal(
-        _plot("Samples/s", [f"{health}/rates/**"]),
-        _plot("Lost, dropped and bridged, counts", [f"{health}/counts/**"]),
-        _plot("Of the source: latency, clocks", [f"{health}/source/**"]),
-        name="Health",
-    )
+    plots = [
+        _plot("Rate, samples/s", [f"{health}/rates/**"], legend=False),
+        _plot("Lost, dropped, bridged, counts", [f"{health}/counts/**"]),
+    ]
+    if live:
+        plots += [
+            _plot("Latency, ms", [f"{health}/latency/**"]),
+            _plot("Clock offsets, ms", [f"{health}/clocks/**"]),
+        ]
+    return rrb.Horizontal(*plots, name="Health")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -23,11 +24,23 @@ class Reference:
 
 
 @dataclass(frozen=True)
+class Diagnosed:
+    """That the session has been diagnosed before it is shown: verdict and evidence are in front.
+
+    parameters: estimate and standard deviation by name, to be shown instead of what the session tells; empty where that
+    tells the same.
+    """
+
+    parameters: Mapping[str, tuple[float, float]]
+
+
+@dataclass(frozen=True)
 class Start:
     """The session: its estimator before any sample, the channels of its blocks, a reference for each parameter.
 
     estimator: pickled when the session began, for it goes on working while this waits to be sent. recording: file that
-    `save` writes. exaggeration: factor on every deflection drawn.
+    `save` writes. exaggeration: factor on every deflection drawn. live: the source tells its latency and clocks.
+    diagnosed: of a session that is shown once more.
     """
 
     estimator: bytes
@@ -36,18 +49,20 @@ class Start:
     recording: Path
     references: tuple[Reference | None, ...]
     exaggeration: float
+    live: bool
+    diagnosed: Diagnosed | None
 
 
 @dataclass(frozen=True)
 class Picture:
     """Samples since the last picture; where due also what the estimator knows behind them.
 
-    health: further numbers of the source, name with unit to value. wall: s, of the process's own clock.
+    health: of a live source, see `session.Health`. wall: s, of the process's own clock.
     """
 
     blocks: tuple[Block, ...]
     state: Snapshot | None
-    health: dict[str, float]
+    health: Mapping[str, Mapping[str, float]]
     wall: float
     dropped: int
 

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import pickle
-from queue import Empty, SimpleQueue
-from threading import Thread
+from collections import deque
+from threading import Event, Thread
 from time import perf_counter, sleep
 from typing import IO, Any
 
@@ -12,6 +12,9 @@ from typing import IO, Any
 # view's process needs to start. One that holds what the estimator knows shares most of it with the others; its own are
 # 4 MB of a large arm.
 CAPACITY = 64
+# The sending thread looks so often for frames, s, about as often as there is one. Nobody wakes it: a wake-up costs who
+# puts a system call, and often the core that it runs on.
+TURN = 0.05
 # A source that can be kept waiting looks so often whether there is room again, s.
 LOOK_AGAIN = 0.001
 
@@ -28,8 +31,10 @@ class Handover:
         self.broken = False
         self._pipe = pipe
         self._capacity = capacity
-        self._waiting: SimpleQueue[Any] = SimpleQueue()
-        Thread(target=self._send, name="view hand-over", daemon=True).start()
+        self._waiting: deque[Any] = deque()
+        self._closed = Event()
+        self._thread = Thread(target=self._send, name="view hand-over", daemon=True)
+        self._thread.start()
 
     def put(self, item: Any, patience: float = 0.0) -> bool:
         """Hand an item over; False where after `patience` seconds there was no room and the oldest was dropped.
@@ -38,24 +43,33 @@ class Handover:
         """
         if self.broken:
             return False
-        if self._waiting.qsize() >= self._capacity:
+        if len(self._waiting) >= self._capacity:
             end = perf_counter() + patience
-            while self._waiting.qsize() >= self._capacity and not self.broken and perf_counter() < end:
+            while len(self._waiting) >= self._capacity and not self.broken and perf_counter() < end:
                 sleep(LOOK_AGAIN)
-        room = self._waiting.qsize() < self._capacity
+        room = len(self._waiting) < self._capacity
         if not room:
             try:
-                self._waiting.get_nowait()
+                self._waiting.popleft()
                 self.dropped += 1
-            except Empty:  # taken by the pipe just now
+            except IndexError:  # taken by the pipe just now
                 pass
-        self._waiting.put(item)
+        self._waiting.append(item)
         return room
+
+    def close(self) -> None:
+        """Send nothing more."""
+        self._closed.set()
 
     def _send(self) -> None:
         try:
-            while True:
-                _send_item(self._waiting.get(), self._pipe)
+            while not self._closed.is_set():
+                try:
+                    item = self._waiting.popleft()
+                except IndexError:
+                    self._closed.wait(TURN)
+                    continue
+                _send_item(item, self._pipe)
                 self.taken += 1
         except (OSError, ValueError):  # the other end is gone
             self.broken = True

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -17,6 +17,9 @@ from sms_tools.view.parameter_groups import Group
 PARAMETERS, RESIDUAL, HEALTH, EVIDENCE = "parameters", "residual", "health", "evidence"
 TABLE, LOG = "table", "log"
 BOUNDS = 2.0  # standard deviations
+# Of plots of residuals. A relative one of 1 says that the model explains nothing. Whitened ones are drawn in decades:
+# noise is 0, and a model that lacks an effect leaves hundreds of times as much.
+RELATIVE_RANGE, WHITENED_RANGE = (-0.1, 1.2), (-0.5, 3.5)
 # An event is drawn as a line from bottom to top of a plot: two values this far apart, s.
 MARK_WIDTH = 1e-9
 
@@ -35,7 +38,8 @@ class NumberLog:
     def __init__(self, stream: rr.RecordingStream) -> None:
         self._stream = stream
         self._waiting: dict[str, Columns] = {}
-        self._known: set[str] = set()
+        self._named: set[str] = set()  # entities that came with a name of their own
+        self._counted: dict[str, int] = {}  # of these, by folder
 
     def describe(
         self,
@@ -46,7 +50,6 @@ class NumberLog:
         aggregated: bool = True,
     ) -> None:
         """Names, colours and width of an entity's lines; aggregated: as means where there are more than pixels."""
-        self._known.add(path)
         n = len(names)
         chosen = [style.LINES[k % len(style.LINES)] for k in range(n)] if colors is None else list(colors)
         policy = None if aggregated else rr.components.AggregationPolicy.Off
@@ -62,14 +65,24 @@ class NumberLog:
         columns.t.append(t)
         columns.rows.append(values)
 
-    def add_named(self, folder: str, t: float, values: dict[str, float]) -> None:
+    def add_named(self, folder: str, t: float, values: Mapping[str, float]) -> None:
         """Numbers that come with names of their own, each an entity."""
         for name, value in values.items():
             path = f"{folder}/{rr.escape_entity_path_part(name)}"
-            if path not in self._known:
-                colors = [style.LINES[len(self._known) % len(style.LINES)]]
-                self.describe(path, [name], colors)
+            if path not in self._named:
+                self._named.add(path)
+                number = self._counted[folder] = self._counted.get(folder, 0) + 1
+                self.describe(path, [name], [style.LINES[(number - 1) % len(style.LINES)]])
             self.add(path, t, np.array([value]))
+
+    def describe_events(self, path: str) -> None:
+        """An entity that `mark` draws on."""
+        self.describe(path, ["event"], [style.EVENT], width=1.0, aggregated=False)
+
+    def mark(self, path: str, t: float, low: float, high: float) -> None:
+        """A vertical line at an instant."""
+        for k, value in enumerate((low, high, np.nan)):
+            self.add(path, t + k * MARK_WIDTH, np.array([value]))
 
     def send(self) -> None:
         """Send what waits."""
@@ -88,9 +101,9 @@ class NumberLog:
         self._stream.send_columns(TABLE, times(np.array([t])), document)
 
     def tell(self, t: float, text: str, warning: bool = False) -> None:
-        """A line of the log."""
-        level = "WARN" if warning else "INFO"
-        self._stream.send_columns(LOG, times(np.array([t])), rr.TextLog.columns(text=[text], level=[level]))
+        """A line of the log; it begins with the time, for the viewer's own column of it is too narrow to be read."""
+        line = rr.TextLog.columns(text=[f"{t:.2f} s: {text}"], level=["WARN" if warning else "INFO"])
+        self._stream.send_columns(LOG, times(np.array([t])), line)
 
 
 class ParameterLog:
@@ -99,13 +112,14 @@ class ParameterLog:
     def __init__(self, numbers: NumberLog, groups: Sequence[Group]) -> None:
         self._numbers = numbers
         self.groups = groups
+        self._extent: dict[str, tuple[float, float]] = {}  # of what is drawn now, by group
         for group in groups:
             colors = [style.LINES[k % len(style.LINES)] for k in range(len(group.labels))]
             path = f"{PARAMETERS}/{group.path}"
             numbers.describe(f"{path}/estimate", group.labels, colors)
             numbers.describe(f"{path}/std", group.labels, colors)
             numbers.describe(f"{path}/deviation", group.labels, colors, width=2.5)
-            numbers.describe(f"{path}/events", ["event"], [style.EVENT], width=1.0, aggregated=False)
+            numbers.describe_events(f"{path}/events")
             bounds = [style.translucent(color) for color in colors]
             numbers.describe(f"{path}/two_sigma", ["± 2σ"] * len(bounds * 2), bounds * 2, width=1.0)
 
@@ -120,12 +134,14 @@ class ParameterLog:
             width = BOUNDS * deviation[k] / group.scale
             self._numbers.add(f"{path}/deviation", t, drawn)
             self._numbers.add(f"{path}/two_sigma", t, np.concatenate((drawn + width, drawn - width)))
+            if determined[k].any():
+                self._extent[group.path] = float(np.nanmin(drawn - width)), float(np.nanmax(drawn + width))
 
     def mark(self, t: float) -> None:
-        """A vertical line in every plot of parameters with a fixed axis."""
+        """A vertical line in every plot of parameters: over a fixed axis, or over what is drawn just now."""
         for group in self.groups:
-            if group.half_range is None:
-                continue
-            path = f"{PARAMETERS}/{group.path}/events"
-            for k, value in enumerate((-group.half_range, group.half_range, np.nan)):
-                self._numbers.add(path, t + k * MARK_WIDTH, np.array([value]))
+            extent = self._extent.get(group.path)
+            if group.half_range is not None:
+                extent = -group.half_range, group.half_range
+            if extent is not None:
+                self._numbers.mark(f"{PARAMETERS}/{group.path}/events", t, *extent)

@@ -79,7 +79,7 @@ def _group(
         scale = np.abs(zero) / 100.0
         half_range = TRUE_RANGE if all(reference.is_true for reference in found) else NOMINAL_RANGE
         compared = "true" if half_range == TRUE_RANGE else "nominal"
-        title = f"{kind}{which}: estimate ± 2σ from the {compared} value, %"
+        title = f"{kind}{which}: ± 2σ from the {compared} value, %"
     path = re.sub(r"\W", "_", f"{kind}_{unit}{which}").strip("_")
     return Group(path, kind, title, indices, labels, zero, scale, unit, half_range)
 

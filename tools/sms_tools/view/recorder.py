@@ -7,6 +7,7 @@ from collections import deque
 from collections.abc import Callable
 
 import numpy as np
+import rerun.blueprint as rrb
 from numpy.typing import NDArray
 
 from sms_online.pipeline.estimator import Estimator
@@ -17,7 +18,15 @@ from sms_tools.view import style
 from sms_tools.view.arm_log import ArmLog
 from sms_tools.view.blueprint import layout
 from sms_tools.view.frames import End, Event, Evidence, Picture, Start
-from sms_tools.view.number_log import EVIDENCE, HEALTH, RESIDUAL, NumberLog, ParameterLog
+from sms_tools.view.number_log import (
+    EVIDENCE,
+    HEALTH,
+    RELATIVE_RANGE,
+    RESIDUAL,
+    WHITENED_RANGE,
+    NumberLog,
+    ParameterLog,
+)
 from sms_tools.view.parameter_groups import parameter_groups
 from sms_tools.view.readings import Readings
 from sms_tools.view.residuals import RecentResidual
@@ -28,7 +37,8 @@ from sms_tools.view.table import markdown_table
 
 # The table, and residuals of all rows so far, which move slowly: s of the session.
 SLOW_INTERVAL = 1.0
-
+# Plots of residuals in which events are marked, and how far across.
+RANGES = {"relative": RELATIVE_RANGE, "whitened": WHITENED_RANGE}
 # The rate of samples is stated over so many states: five seconds of a live session.
 RATE_STATES = 20
 
@@ -44,6 +54,7 @@ class Recorder:
         estimator: Estimator = pickle.loads(start.estimator)
         self._estimator = estimator
         self._references = start.references
+        self._live, self._diagnosed = start.live, start.diagnosed
         self._opened: Callable[[str], None] | None = opened
         self._scene = Scene(estimator.model, start.exaggeration)
         self._readings = Readings(estimator.sensing, start.channels)
@@ -64,7 +75,7 @@ class Recorder:
         if self._opened is None:
             return
         self._first = self._scene.draw(x[:1])
-        self._opened(self._sink.open(layout(self._scene, self._groups, self._first)))
+        self._opened(self._sink.open(self._layout()))
         self._opened = None
         stream = self._sink.stream
         self._arm_log = ArmLog(stream, self._scene)
@@ -74,9 +85,14 @@ class Recorder:
         self._numbers.describe(f"{RESIDUAL}/relative", joints)
         self._numbers.describe(f"{RESIDUAL}/energy", ["energy"])
         self._numbers.describe(f"{RESIDUAL}/noise", ["noise"], [style.REFERENCE], width=1.0)
+        for plot in RANGES:
+            self._numbers.describe_events(f"{RESIDUAL}/{plot}_events")
         self._numbers.describe(f"{HEALTH}/rates/samples", ["samples/s"])
         counts = ["samples lost", "rows dropped", "gaps", "cells interpolated", "pictures dropped"]
         self._numbers.describe(f"{HEALTH}/counts/all", counts)
+
+    def _layout(self) -> rrb.Blueprint:
+        return layout(self._scene, self._groups, self._first, self._live, self._diagnosed is not None)
 
     def picture(self, picture: Picture) -> None:
         """Take in the samples and, where one comes with them, the estimator's state."""
@@ -98,12 +114,13 @@ class Recorder:
             counters = self._estimator.counters
             counts = [counters.lost_samples, self._estimator.dropped_rows, counters.gaps, counters.interpolated_cells]
             self._numbers.add(f"{HEALTH}/counts/all", t_state, np.array([*counts, picture.dropped], dtype=np.float64))
-            self._numbers.add_named(f"{HEALTH}/source", t_state, picture.health)
+            for plot, values in picture.health.items():
+                self._numbers.add_named(f"{HEALTH}/{plot}", t_state, values)
 
     def event(self, event: Event) -> None:
         """Mark an event in the plots and tell it in the log."""
         if self._opened is None:
-            self._parameters.mark(event.t)
+            self._mark(event.t)
             self._numbers.tell(event.t, event.text)
 
     def evidence(self, evidence: Evidence) -> None:
@@ -138,8 +155,7 @@ class Recorder:
         estimator = self._estimator
         apply(state, estimator)
         self._follow_events()
-        now = estimator.estimate()
-        estimate, std = now.pi, standard_deviation(estimator, now)
+        estimate, std = self._estimate()
         determined = std <= LARGEST_RELATIVE_STD * np.abs(estimate)
         self._parameters.add(t, estimate, std, determined)
         self._residual = self._recent.push(t, estimator, estimate)
@@ -151,6 +167,23 @@ class Recorder:
             self._whole_residuals(t, estimate)
             self._slow_due = t + SLOW_INTERVAL
 
+    def _estimate(self) -> tuple[Array, Array]:
+        """Estimate (n,) and standard deviation (n,) of the base parameters: the session's, or a diagnosis's."""
+        estimator = self._estimator
+        if self._diagnosed is not None and self._diagnosed.parameters:
+            unknown = np.nan, np.inf
+            known = [self._diagnosed.parameters.get(p.name, unknown) for p in estimator.base.parameters]
+            estimate, std = np.array(known).T
+            return estimate, std
+        now = estimator.estimate()
+        return now.pi, standard_deviation(estimator, now)
+
+    def _mark(self, t: float) -> None:
+        """A vertical line in all plots of parameters and residuals."""
+        self._parameters.mark(t)
+        for plot, extent in RANGES.items():
+            self._numbers.mark(f"{RESIDUAL}/{plot}_events", t, *extent)
+
     def _follow_events(self) -> None:
         """Mark and tell new events; the plots take in the parameters that they have added."""
         base = self._estimator.base
@@ -160,10 +193,10 @@ class Recorder:
             self._determined = np.append(self._determined, np.zeros(more, dtype=bool))
             self._groups = parameter_groups(base.parameters, self._references)
             self._parameters = ParameterLog(self._numbers, self._groups)
-            self._sink.arrange(layout(self._scene, self._groups, self._first))
+            self._sink.arrange(self._layout())
         events = self._estimator.events
         for event in events[self._events :]:
-            self._parameters.mark(event.time)
+            self._mark(event.time)
             self._numbers.tell(event.time, event_line(event_document(event)), warning=True)
         self._events = len(events)
 
@@ -171,9 +204,8 @@ class Recorder:
         """Residuals of all rows so far: over their predicted deviation, in decades, and of the energy balance."""
         whole = residuals(self._estimator, estimate)
         known = {rows: np.log10(value) for rows, r in whole.items() if (value := r["whitened"])}
-        if known:
-            self._numbers.add_named(f"{RESIDUAL}/whitened", t, known)
-            self._numbers.add(f"{RESIDUAL}/noise", t, np.zeros(1))
+        self._numbers.add_named(f"{RESIDUAL}/whitened", t, known)
+        self._numbers.add(f"{RESIDUAL}/noise", t, np.zeros(1))
         energy = self._estimator.energy_tracker.estimate()
         rms = np.sqrt(energy.rss / energy.dof) if energy.dof > 0.0 else np.nan
         self._numbers.add(f"{RESIDUAL}/energy", t, np.array([rms]))
@@ -189,6 +221,6 @@ class Recorder:
         self._determined = determined
         gaps = self._estimator.counters.gaps
         if gaps > self._gaps:
-            self._parameters.mark(t)
+            self._mark(t)
             self._numbers.tell(t, "a gap too long to bridge: a new window of the balance begins", warning=True)
         self._gaps = gaps

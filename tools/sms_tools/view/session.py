@@ -22,7 +22,7 @@ from sms_online.pipeline.estimator import Estimator
 from sms_online.stream import Block
 from sms_tools.interruption import Interruption
 from sms_tools.view.choice import EXPECTED, Choice, parse_choice
-from sms_tools.view.frames import End, Event, Evidence, Frame, Picture, Reference, Start
+from sms_tools.view.frames import Diagnosed, End, Event, Evidence, Frame, Picture, Reference, Start
 from sms_tools.view.handover import Handover
 from sms_tools.view.snapshot import take
 
@@ -42,8 +42,8 @@ STEP = 0.1
 # A viewer in the same laboratory answers within this time, s.
 PROBE_TIMEOUT = 1.0
 
-# Further numbers of a source (latency, clock offsets), name with unit to value, asked for with every state.
-Health = Callable[[], Mapping[str, float]]
+# Further numbers of a live source, asked for with every state: `latency` and offsets of `clocks`, ms, name to value.
+Health = Callable[[], Mapping[str, Mapping[str, float]]]
 
 
 class View:
@@ -134,6 +134,7 @@ class View:
         if kind is None:
             self._put(End(self._t, take(self._estimator)))
             self._close(self._handover)
+        self._handover.close()
         if self._handover.dropped:
             self.warnings.append(f"{self._handover.dropped} pictures of the view dropped: it does not keep up")
         if not (self._serving and kind is None and not self.status):
@@ -150,7 +151,7 @@ class View:
 
     def _show(self, blocks: tuple[Block, ...], with_state: bool) -> None:
         assert self._handover is not None
-        health = dict(self._health()) if with_state and self._health is not None else {}
+        health = self._health() if with_state and self._health is not None else {}
         state = take(self._estimator) if with_state else None
         self._put(Picture(blocks, state, health, perf_counter(), self._handover.dropped))
 
@@ -198,13 +199,14 @@ def open_view(
     patient: bool = False,
     exaggeration: float = 1.0,
     health: Health | None = None,
+    diagnosed: Diagnosed | None = None,
 ) -> View:
     """A view of a session that has not begun, by the value of --rerun.
 
     channels: of the session's blocks. directory: where `save` writes session.rrd. truth: true physical parameters by
     name. patient: wait for the view rather than leave pictures out, for a source that can be kept waiting.
-    exaggeration: factor on drawn deflections. health: see there. Raises InputError on an unknown choice or a directory
-    that cannot be made.
+    exaggeration: factor on drawn deflections. health: see there; what it returns must not change afterwards. diagnosed:
+    see there. Raises InputError on an unknown choice or a directory that cannot be made.
     """
     try:
         parsed = parse_choice(choice)
@@ -218,7 +220,16 @@ def open_view(
             directory.mkdir(parents=True, exist_ok=True)
         except OSError as error:
             raise InputError(str(directory), "", error.strerror or str(error), "a directory that can be made") from None
-    start = Start(pickle.dumps(estimator), channels, parsed, recording, references(estimator, truth), exaggeration)
+    start = Start(
+        estimator=pickle.dumps(estimator),
+        channels=channels,
+        choice=parsed,
+        recording=recording,
+        references=references(estimator, truth),
+        exaggeration=exaggeration,
+        live=health is not None,
+        diagnosed=diagnosed,
+    )
     return View(estimator, start, patient, health)
 
 

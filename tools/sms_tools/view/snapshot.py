@@ -7,20 +7,18 @@ and holds much more.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Any
+from collections.abc import Mapping
+from typing import Any, NamedTuple
 
 from sms_online.description.schema import Effect
 from sms_online.pipeline.estimator import Estimator, SquaredResidual
 from sms_online.pipeline.events import Event
 from sms_online.pipeline.momentum import Momentum
-from sms_online.pipeline.synchronise import SyncCounters
 from sms_online.stream import Array
 from sms_online.trackers.interface import State
 
 
-@dataclass(frozen=True)
-class MomentumSnapshot:
+class MomentumSnapshot(NamedTuple):
     """Of the momentum balance: its tracker, the bias of noisy columns, and the sums behind whitened residuals.
 
     added: names of the parameters that events have added. adopted: effects that were taken up.
@@ -39,50 +37,53 @@ class MomentumSnapshot:
     plain_windows: int
 
 
-@dataclass(frozen=True)
-class Snapshot:
-    """Counts, and the states of what turns rows into numbers."""
+class Snapshot(NamedTuple):
+    """Counts, and the states of what turns rows into numbers.
+
+    counters: the synchroniser's, by name. joint_residuals: Gram matrix and signal of each joint's rows.
+    """
 
     samples: int
     duration: float
     dropped_rows: int
-    counters: SyncCounters
+    counters: Mapping[str, int]
     energy_tracker: State
     shared_errors: dict[str, Any]
-    joint_residuals: list[SquaredResidual]
+    joint_residuals: tuple[tuple[Array, float], ...]
     momentum: MomentumSnapshot | None
     smoother: dict[str, Any] | None
 
 
 def take(estimator: Estimator) -> Snapshot:
     """What the estimator knows now; nothing in it changes when the estimator goes on."""
+    momentum, smoother = estimator.momentum, estimator.smoother
     return Snapshot(
-        samples=estimator.samples,
-        duration=estimator.duration,
-        dropped_rows=estimator.dropped_rows,
-        counters=SyncCounters(**vars(estimator.counters)),
-        energy_tracker=estimator.energy_tracker.state(),
-        shared_errors=estimator.shared_errors.state(),
-        joint_residuals=[SquaredResidual(r.gram, r.signal) for r in estimator.joint_residuals],
-        momentum=None if estimator.momentum is None else _take_momentum(estimator.momentum),
-        smoother=None if estimator.smoother is None else estimator.smoother.told(),
+        estimator.samples,
+        estimator.duration,
+        estimator.dropped_rows,
+        vars(estimator.counters).copy(),
+        estimator.energy_tracker.state(),
+        estimator.shared_errors.state(),
+        tuple([(r.gram, r.signal) for r in estimator.joint_residuals]),
+        None if momentum is None else _take_momentum(momentum),
+        None if smoother is None else smoother.told(),
     )
 
 
 def _take_momentum(momentum: Momentum) -> MomentumSnapshot:
-    fit = momentum.fit
+    fit, changes = momentum.fit, momentum.changes
     return MomentumSnapshot(
-        events=tuple(momentum.changes.events),
-        added=momentum.changes.added,
-        adopted=momentum.changes.adopted,
-        windows=momentum.windows,
-        dropped_windows=momentum.dropped_windows,
-        tracker=momentum.tracker.state(),
-        bias=momentum.bias.state(),
-        weights=fit.weights,
-        misfit=fit.misfit,
-        plain_gram=fit.plain_gram,
-        plain_windows=fit.plain_windows,
+        tuple(changes.events),
+        changes.added,
+        changes.adopted,
+        momentum.windows,
+        momentum.dropped_windows,
+        momentum.tracker.state(),
+        momentum.bias.state(),
+        fit.weights,
+        fit.misfit,
+        fit.plain_gram,
+        fit.plain_windows,
     )
 
 
@@ -90,10 +91,10 @@ def apply(snapshot: Snapshot, replica: Estimator) -> None:
     """Make an estimator of the same system, channels and priors know the same."""
     replica.samples, replica.duration = snapshot.samples, snapshot.duration
     replica.dropped_rows = snapshot.dropped_rows
-    vars(replica.counters).update(vars(snapshot.counters))
+    vars(replica.counters).update(snapshot.counters)
     replica.energy_tracker.restore(snapshot.energy_tracker)
     replica.shared_errors.restore(snapshot.shared_errors)
-    replica.joint_residuals = snapshot.joint_residuals
+    replica.joint_residuals = [SquaredResidual(gram, signal) for gram, signal in snapshot.joint_residuals]
     if snapshot.smoother is not None and replica.smoother is not None:
         replica.smoother.learn(snapshot.smoother)
     known, momentum = snapshot.momentum, replica.momentum

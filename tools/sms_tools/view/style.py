@@ -26,7 +26,6 @@ LINES: tuple[Color, ...] = (
     (213, 94, 0),
     (204, 121, 167),
     (0, 114, 178),
-    (140, 140, 140),
 )
 # Of the arm's view, whatever theme the viewer has.
 BACKGROUND: Color = (14, 17, 22)
