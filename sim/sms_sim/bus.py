@@ -50,8 +50,6 @@ SLOWED = 2.0
 PATIENCE = 0.05
 # Torque commands are fetched so often, s.
 COMMANDED = 4e-3
-# Shorter waits are not worth a system call, s.
-SHORT = 1e-4
 
 
 @dataclass(frozen=True)
@@ -177,6 +175,7 @@ class Bus:
         self._moving = threading.Condition()
         self._ended = False
         self._solved = 0.0  # s of motion that are in the queue, or through it
+        self._ahead = 0.0
         can_devices, serial_devices = devices(system, directory, [clock] * len(system.sources))
         by_name = {source.name: source for source in system.sources}
         try:
@@ -192,12 +191,22 @@ class Bus:
             self.close()
             raise
 
-    def run(self, blocks: Iterable[Block], duration: float, speed: float, ahead: float = AHEAD) -> None:
-        """Send the blocks' samples, `duration` s of them, in step with the clock, times `speed`.
+    def take(self, blocks: Iterable[Block], ahead: float = AHEAD) -> None:
+        """Begin to take the blocks' samples, before they are due.
 
-        ahead: how far blocks are taken before they are due, s; 0 where the arm has to obey in time.
+        ahead: by how much, s; 0 where the arm has to obey in time.
         """
+        self._ahead = ahead
         threading.Thread(target=self._fill, args=(blocks, ahead), daemon=True).start()
+
+    def await_taken(self) -> None:
+        """Wait until samples have been taken as far ahead as they may be."""
+        while not (self._ended or self._solved >= self._ahead):
+            time.sleep(PATIENCE)
+
+    def run(self, duration: float, speed: float) -> None:
+        """Send the samples taken, `duration` s of them, in step with the clock, times `speed`."""
+        ahead = self._ahead
         start: float | None = None
         began = time.monotonic()
         while ahead and not (self._ended or self._far_enough(time.monotonic() - began, duration, speed)):
@@ -212,7 +221,8 @@ class Bus:
             if start is None:
                 start = time.monotonic() - due / speed
             wait = start + due / speed - time.monotonic()
-            if wait > SHORT:
+            # Not a microsecond early: who reads the bus takes the least delayed of its samples for undelayed.
+            if wait > 0.0:
                 time.sleep(min(wait, PATIENCE))
                 continue
             with self._moving:
@@ -332,10 +342,16 @@ def main(arguments: list[str] | None = None) -> int:
         print(f"sms_sim.bus: {error}", file=sys.stderr)
         return 2
     try:
+        if args.capture is not None:
+            # This process reads it, and could not send in time beside that.
+            bus.take(blocks)
+            bus.await_taken()
         if args.wait:
             print("ready", flush=True)
             sys.stdin.readline()
-        bus.run(blocks, duration, args.speed, ahead=0.0 if args.commanded else AHEAD)
+        if args.capture is None:
+            bus.take(blocks, ahead=0.0 if args.commanded else AHEAD)
+        bus.run(duration, args.speed)
     except KeyboardInterrupt:
         return 130
     finally:
