@@ -9,7 +9,8 @@ import numpy as np
 
 from sms_online.effects.base import Inputs
 from sms_online.model.flexible import ShapeRate
-from sms_online.model.inertia import BodyTerm, LinkMotion, Term, convective
+from sms_online.model.inertia import BodyTerm, LinkMotion, LinkTerm, convective
+from sms_online.model.projection import project
 from sms_online.model.springs import Spring
 from sms_online.stream import Array
 
@@ -103,40 +104,17 @@ class Dynamics:
         model = self.model
         configuration = model.chain.configure(x)
         shape_rates = configuration.shape_rates(v)
-        rates, none = v[:, :, None], np.zeros_like(self._eye)
-        velocities = configuration.twists(rates, model._frames)
-        W = configuration.jacobians
-        W_dot = configuration.twist_rates(self._eye, W, v, shape_rates)
-        p = np.zeros_like(v)
-        g = -(model._spring_coordinates(x) @ self.stiffness + v @ self.damping)
-
-        def add(term: Term, momentum: Array, force: Array) -> None:
-            nonlocal p, g
-            J, J_dot = term.local(W, self._eye), term.local(W_dot, none)
-            p = p + (momentum.swapaxes(1, 2) @ J)[:, 0]
-            g = g + (momentum.swapaxes(1, 2) @ J_dot + force.swapaxes(1, 2) @ J)[:, 0]
-
-        for body in self._bodies:
-            nu = body.local(velocities, rates)[..., 0]
-            momentum = body.momentum(nu)
-            force = convective(nu, momentum)
-            if model.gravity.any():
-                force = force + body.momentum(model._fall(configuration, body, model.gravity))
-            add(body, momentum, force)
-        for link in model.links:
-            nu = link.local(velocities, rates)[..., 0]
-            motion, rate = LinkMotion(link, configuration), shape_rates[link.link]
-            assert rate is not None
-            pi = self.pi[list(link.parameters), None]
-            force = motion.convective(nu, rate) @ pi
-            if model.gravity.any():
-                force = force + motion.momentum(model._fall(configuration, link, model.gravity)) @ pi
-            add(link, motion.momentum(nu) @ pi, force)
+        loads = []
+        for term, p, g in model.loads(configuration, v, shape_rates, self._bodies):
+            weigh = self.pi[list(term.parameters), None] if isinstance(term, LinkTerm) else np.ones((1, 1))
+            loads.append((term, 0, p @ weigh, g @ weigh))
+        p, g = project(configuration, v, shape_rates, loads, 1)[..., 0]
+        g -= model._spring_coordinates(x) @ self.stiffness + v @ self.damping
         for effect, columns, own in model.acting(inputs):
-            g = g + effect.force(model.layout, x, v, own) @ self.pi[columns]
+            g += effect.force(model.layout, x, v, own) @ self.pi[columns]
             effect_momentum = effect.momentum(model.layout, x, v, own)
             if effect_momentum is not None:
-                p = p + effect_momentum @ self.pi[columns]
+                p += effect_momentum @ self.pi[columns]
         return p, g
 
     def acceleration(self, x: Array, v: Array, Q: Array, inputs: Inputs | None = None) -> Array:

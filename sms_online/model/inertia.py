@@ -13,7 +13,7 @@ import numpy as np
 
 from sms_online.model.chain import Configuration
 from sms_online.model.flexible import Shape, ShapeRate
-from sms_online.model.so3 import cross, skew
+from sms_online.model.so3 import cross, moment, skew
 from sms_online.stream import Array
 
 
@@ -86,15 +86,14 @@ class LinkMotion:
         self.shape: Shape = shape
         self.size = configuration.size
 
-    def _velocities(self, nu: Array) -> Array:
-        """A ν (B, G, 3) of the quadrature points, m/s, in {i}."""
-        turned = self.shape.points @ skew(nu[:, 3:6]).transpose(0, 2, 1)
-        return turned + nu[:, None, :3] + _columns(self.shape.J, nu[:, 6:])
+    def _velocities(self, nu: Array, elastic: Array) -> Array:
+        """A ν (B, G, 3) of the quadrature points, m/s, in {i}; elastic: J times the rates of the link's own speeds."""
+        return self.shape.points @ skew(nu[:, 3:6]).swapaxes(1, 2) + nu[:, None, :3] + elastic
 
     def _collect(self, f: Array) -> Array:
         """Aᵀ f (B, d) of forces f (B, G, 3) on the points."""
         return np.concatenate(
-            (f.sum(axis=1), cross(self.shape.points, f).sum(axis=1), _columns_transposed(self.shape.J, f)), axis=1
+            (f.sum(axis=1), moment(self.shape.points, f), _columns_transposed(self.shape.J, f)), axis=1
         )
 
     def _spins(self, nu: Array) -> Array:
@@ -110,7 +109,7 @@ class LinkMotion:
 
     def energy(self, nu: Array) -> Array:
         """K (B, n) of each parameter."""
-        u = self._velocities(nu)
+        u = self._velocities(nu, _columns(self.shape.J, nu[:, 6:]))
         out = [0.5 * ((u * u).sum(axis=2) @ self.term.weights)]
         if self.term.polar:
             out.append(0.5 * (self._spins(nu) ** 2 @ self.term.weights))
@@ -119,7 +118,7 @@ class LinkMotion:
     def momentum(self, nu: Array) -> Array:
         """p (B, d, n) of each parameter."""
         weights = self.term.weights[:, None]
-        out = [self._collect(self._velocities(nu) * weights)]
+        out = [self._collect(self._velocities(nu, _columns(self.shape.J, nu[:, 6:])) * weights)]
         if self.term.polar:
             out.append(self._collect_moments(self._spins(nu)[..., None] * self.shape.tangent * weights))
         return np.stack(out, axis=2)
@@ -142,27 +141,28 @@ class LinkMotion:
             M += pi[1] * (S.transpose(0, 2, 1) @ S)
         return np.asarray(M)
 
-    def convective(self, nu: Array, rate: ShapeRate) -> Array:
-        """g (B, d, n) of each parameter: Ȧᵀ u - Aᵀ (ω × u), and for the axial spin y tᵀ [0, 1, spin] likewise."""
+    def momentum_and_convective(self, nu: Array, rate: ShapeRate) -> tuple[Array, Array]:
+        """p and g (B, d, n) of each parameter: g = Ȧᵀ u - Aᵀ (ω × u), and for the axial spin tᵀ [0, 1, spin] likewise."""
         weights = self.term.weights[:, None]
-        u = self._velocities(nu) * weights
-        omega = nu[:, None, 3:6]
+        elastic = _columns(self.shape.J, nu[:, 6:])
+        u = self._velocities(nu, elastic) * weights
         g = -self._collect(_turn(nu, u))
-        g[:, 3:6] += cross(_columns(self.shape.J, nu[:, 6:]), u).sum(axis=1)
+        g[:, 3:6] += moment(elastic, u)
         g[:, 6:] += _columns_transposed(rate.J, u)
-        out = [g]
+        momenta, forces = [self._collect(u)], [g]
         if self.term.polar:
             momentum = self._spins(nu)[..., None] * self.shape.tangent * weights
-            g = -self._collect_moments(cross(np.broadcast_to(omega, momentum.shape), momentum))
+            g = -self._collect_moments(_turn(nu, momentum))
             g[:, 6:] += _columns_transposed(rate.spin, momentum)
-            out.append(g)
-        return np.stack(out, axis=2)
+            momenta.append(self._collect_moments(momentum))
+            forces.append(g)
+        return np.stack(momenta, axis=2), np.stack(forces, axis=2)
 
     def bias_force(self, nu: Array, rate: ShapeRate) -> Array:
         """F (B, d, n) at ν̇ = 0 of each parameter: Aᵀ (Ȧ ν + ω × u), and [0, 1, spin]ᵀ d/dt(y t)."""
         weights = self.term.weights[:, None]
         elastic = _columns(self.shape.J, nu[:, 6:])
-        a = _turn(nu, elastic + self._velocities(nu)) + _columns(rate.J, nu[:, 6:])
+        a = _turn(nu, elastic + self._velocities(nu, elastic)) + _columns(rate.J, nu[:, 6:])
         out = [self._collect(a * weights)]
         if self.term.polar:
             relative = np.broadcast_to(_columns(self.shape.spin, nu[:, 6:]), (self.size, *self.shape.spin.shape[1:3]))

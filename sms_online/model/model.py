@@ -17,9 +17,11 @@ from sms_online.effects.catalogue import build_effects, with_kinematics
 from sms_online.effects.payload import TipPayload
 from sms_online.model.chain import Chain, Configuration
 from sms_online.model.dynamics import Dynamics
+from sms_online.model.flexible import ShapeRate
 from sms_online.model.inertia import BodyTerm, LinkMotion, LinkTerm, Term, convective
 from sms_online.model.layout import Layout, build_layout
 from sms_online.model.parameters import InertialParameter, Parameter, motor, rigid_body, rigidity_parameter
+from sms_online.model.projection import project
 from sms_online.model.springs import QuadraticForms, Spring
 from sms_online.stream import Array
 
@@ -52,6 +54,13 @@ class Model:
             self._add_inertia(parameters, inertia)
         # Frames that something sits in: the last one, the end of the last link, holds the payload alone.
         self._frames = 1 + max(term.frame for term in (*self.bodies, *self.links))
+        # Kinetic terms from the tip to the base, the first of each one's columns then, and the columns' places in π.
+        terms = (*self.bodies, *self.links)
+        self._kinetic: list[int] = []
+        self._kinetic_order: list[tuple[int, int]] = []
+        for k in sorted(range(len(terms)), key=lambda k: -terms[k].frame):
+            self._kinetic_order.append((k, len(self._kinetic)))
+            self._kinetic += terms[k].parameters
         # Of each effect, its columns in π and its internal states in `Inputs.states`.
         self.effect_slices: list[slice] = []
         self.state_slices: list[slice] = []
@@ -256,43 +265,46 @@ class Model:
         rows = range(n_v) if rows is None else rows
         P, G = np.zeros((B, len(rows), self.n_pi)), np.zeros((B, len(rows), self.n_pi))
         configuration = self.chain.configure(x)
-        rates, select, none = v[:, :, None], np.eye(n_v)[None, :, list(rows)], np.zeros((1, n_v, len(rows)))
-        twists = configuration.twists(rates, self._frames)
         self._add_forces(P, G, x, v, rows, inputs)
         if not self.chain.moves(self._frames - 1, slice(0, 0))[list(rows)].any():
             # Motor sides of flexible joints alone: no frame moves with them, their momentum is all there is.
+            rates = v[:, :, None]
+            twists = configuration.twists(rates, self._frames)
             for body in self.bodies:
                 for row in np.flatnonzero(np.isin(rows, range(*body.speeds.indices(n_v)))):
                     P[:, row, body.parameters] = body.momentum(body.local(twists, rates)[..., 0])[:, 6]
             return P, G
         shape_rates = configuration.shape_rates(v)
-        W = configuration.twists(select)
-        W_dot = configuration.twist_rates(select, W, v, shape_rates)
-
-        def add(term: Term, p: Array, g: Array) -> None:
-            J, J_dot = term.local(W, select), term.local(W_dot, none)
-            P[:, :, term.parameters] = J.transpose(0, 2, 1) @ p
-            G[:, :, term.parameters] += J_dot.transpose(0, 2, 1) @ p + J.transpose(0, 2, 1) @ g
-
-        for body in self.bodies:
-            if self.chain.moves(body.frame, body.speeds)[list(rows)].any():
-                nu = body.local(twists, rates)[..., 0]
-                p = body.momentum(nu)
-                g = convective(nu, p)
-                if self.gravity.any():
-                    g += body.momentum(self._fall(configuration, body, self.gravity))
-                add(body, p, g)
-        for link in self.links:
-            if self.chain.moves(link.frame, link.speeds)[list(rows)].any():
-                nu = link.local(twists, rates)[..., 0]
-                motion = LinkMotion(link, configuration)
-                rate = shape_rates[link.link]
-                assert rate is not None
-                g = motion.convective(nu, rate)
-                if self.gravity.any():
-                    g += motion.momentum(self._fall(configuration, link, self.gravity))
-                add(link, motion.momentum(nu), g)
+        loads = list(self.loads(configuration, v, shape_rates, self.bodies))
+        ordered = [(loads[k][0], first, *loads[k][1:]) for k, first in self._kinetic_order]
+        kinetic = project(configuration, v, shape_rates, ordered, len(self._kinetic))
+        if len(rows) < n_v:
+            kinetic = kinetic[:, :, list(rows)]
+        P[:, :, self._kinetic], G[:, :, self._kinetic] = kinetic
         return P, G
+
+    def loads(
+        self, configuration: Configuration, v: Array, shape_rates: list[ShapeRate | None], bodies: Sequence[BodyTerm]
+    ) -> Iterator[tuple[BodyTerm | LinkTerm, Array, Array]]:
+        """Momenta p and convective parts g, gravity's force among them, of bodies and then of all links, (B, d, n)."""
+        rates = v[:, :, None]
+        twists = configuration.twists(rates, self._frames)
+        falls = bool(self.gravity.any())
+        for body in bodies:
+            nu = body.local(twists, rates)[..., 0]
+            p = body.momentum(nu)
+            g = convective(nu, p)
+            if falls:
+                g += body.momentum(self._fall(configuration, body, self.gravity))
+            yield body, p, g
+        for link in self.links:
+            nu, rate = link.local(twists, rates)[..., 0], shape_rates[link.link]
+            assert rate is not None
+            motion = LinkMotion(link, configuration)
+            p, g = motion.momentum_and_convective(nu, rate)
+            if falls:
+                g += motion.momentum(self._fall(configuration, link, self.gravity))
+            yield link, p, g
 
     def _fall(self, configuration: Configuration, term: Term, g: Array) -> Array:
         """Local speeds (B, d) of free fall: a gravity vector g (3,) in the frame's axes."""

@@ -47,6 +47,12 @@ def cross(a: Array, b: Array) -> Array:
     return np.stack((a1 * b2 - a2 * b1, a2 * b0 - a0 * b2, a0 * b1 - a1 * b0), axis=-1)
 
 
+def moment(r: Array, f: Array) -> Array:
+    """Σ r × f (..., 3) over the last axis but one of (..., G, 3)."""
+    products = r.swapaxes(-1, -2) @ f  # all r_j f_k summed, and of those the antisymmetric part
+    return np.asarray(-products.reshape(*products.shape[:-2], 9) @ _SKEW.T)
+
+
 class RotationVector:
     """Rotations exp(θ×) of rotation vectors θ (..., 3), rad, of at most π."""
 
