@@ -299,9 +299,12 @@ class Synchroniser:
         ts, now = self._time[rows], self._time[-1]
         grid = k / self.sample_rate
         last = np.searchsorted(ts, grid + self._tolerance, side="right") - 1
-        padded = np.concatenate([[NOWHERE], row_index])
-        hit = padded[last + 1] == k
-        passes = hit & (_run_length(padded)[last + 1] >= SIDE)
+        if np.all(row_index == NOWHERE):  # as those of any device whose clock is not the grid's
+            hit = passes = np.zeros(k.size, dtype=bool)
+        else:
+            padded = np.concatenate([[NOWHERE], row_index])
+            hit = padded[last + 1] == k
+            passes = hit & (_run_length(padded)[last + 1] >= SIDE)
         group = _Group(columns, rows, ts, last, hit)
         rest = np.flatnonzero(~passes)
         if rest.size == 0:
@@ -347,11 +350,9 @@ class Synchroniser:
                 x = group.ts[nodes] - (k[between] / self.sample_rate)[:, None]
                 weight = _lagrange_weights_at_zero(x)
                 samples = weight.T[:, :, None] * self._values[group.rows[nodes.T][:, :, None], group.columns]
-                total = np.zeros((between.size, group.columns.size))
-                for node in samples:  # one after the other: a matrix product's bits depend on its shape
-                    total += node
-                values[between[:, None], group.columns] = total
-                self.counters.interpolated_cells += total.size
+                # One node after the other: a matrix product's bits depend on its shape.
+                values[between[:, None], group.columns] = np.add.reduce(samples, axis=0)
+                self.counters.interpolated_cells += samples[0].size
         return values
 
     def _forget(self, groups: list[_Group]) -> None:
@@ -390,9 +391,10 @@ def _run_length(row_index: Indices) -> Indices:
 
 def _lagrange_weights_at_zero(x: Array) -> Array:
     """Weights (K, n) of the polynomial through nodes x (K, n), read at 0."""
-    weight = np.ones_like(x)
-    for i in range(x.shape[1]):
-        for j in range(x.shape[1]):
-            if i != j:
-                weight[:, i] *= x[:, j] / (x[:, j] - x[:, i])
-    return weight
+    node = np.arange(x.shape[1])
+    at = x.T[:, :, None]
+    apart = at - x  # (j, K, i)
+    apart[node, :, node] = 1.0
+    factor = at / apart
+    factor[node, :, node] = 1.0
+    return np.asarray(np.multiply.reduce(factor, axis=0))
