@@ -45,6 +45,9 @@ SOCKETCAN_FRAMES = ("socketcan", "udp_multicast", "virtual")
 # the reader, s, until its stamp is not believed: somebody may have set that clock.
 HOST_STAMPED = SOCKETCAN_FRAMES
 LONGEST_WAIT = 1.0
+# Two clocks read within so long, s, are read at once; so often is it tried.
+SAME_INSTANT = 5e-6
+MOST_TRIES = 10
 
 
 def open_bus(source: CanBus) -> can.BusABC:
@@ -117,14 +120,29 @@ class CanReader:
 
     def _as_stamped(self, frames: CanFrames) -> CanFrames:
         """The frames with arrivals by the host's stamps, which no waiting for this thread delays."""
-        now = self._clock()
-        waited = time.time() - frames.stamp
+        now, host = self._both_clocks()
+        waited = host - frames.stamp
         believed = (waited >= 0.0) & (waited <= LONGEST_WAIT)
         arrival = np.where(believed, now - waited, frames.arrival)
         # In order, as they were received.
         arrival = np.maximum.accumulate(np.concatenate(([self._last_arrival], arrival)))[1:]
         self._last_arrival = float(arrival[-1])
         return replace(frames, arrival=arrival)
+
+    def _both_clocks(self) -> tuple[float, float]:
+        """The session's clock and the host's (UTC) at one instant, s.
+
+        Between two readings another thread may take the interpreter for milliseconds. Frames would then be early by as
+        much, which no bus makes them, and whoever looks for the least delayed ones would follow these.
+        """
+        nearest, pair = np.inf, (0.0, 0.0)
+        for _ in range(MOST_TRIES):
+            before, host, after = self._clock(), time.time(), self._clock()
+            if after - before < nearest:
+                nearest, pair = after - before, (before, host)
+            if nearest <= SAME_INSTANT:
+                break
+        return pair
 
     def _receive(self, bus: can.BusABC, timeout: float) -> can.Message | None:
         """The next frame, None where there is none, or where the device turns out to be lost."""
