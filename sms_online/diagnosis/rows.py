@@ -19,6 +19,7 @@ from sms_online.model.base_parameters import BaseParameters
 from sms_online.model.model import Model
 from sms_online.pipeline.joint_balance import EXPONENT as JOINT_EXPONENT
 from sms_online.pipeline.joint_balance import JointBalance
+from sms_online.pipeline.latency import clock_groups
 from sms_online.pipeline.momentum_balance import COPIES, EXPONENT, HOPS, INSTANTS, Instants, MomentumBalance, Window
 from sms_online.pipeline.row_noise import STEPS, RowNoise, factored
 from sms_online.pipeline.sensing import Sensing
@@ -144,11 +145,12 @@ class SessionRows:
             if not told.windows:
                 continue
             sensitivities = self._sensitivities(told.instants, span)
-            row_noise = RowNoise(self.model.layout.theta_m, span)
+            row_noise = RowNoise(self.model.layout.theta_m, span, clock_groups(self.sensing))
             extra = self._beyond_first_order(told.copies, [window.half_width for window in told.windows])
             for window, variance, added in zip(told.windows, extra, told.displacements, strict=True):
                 sensitivity = sensitivities.window(window.start)
-                covariances = row_noise.covariance(sensitivity, noise.sensors, noise.torque)
+                age = window.end / self._rate
+                covariances = row_noise.covariance(sensitivity, noise.sensors, noise.torque, age)
                 covariances[-1][np.diag_indices(n_v)] += variance
                 self._covariances.append(covariances)
                 # Sums over the steps, sensor by sensor.

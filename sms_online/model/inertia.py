@@ -142,7 +142,7 @@ class LinkMotion:
         return np.asarray(M)
 
     def momentum_and_convective(self, nu: Array, rate: ShapeRate) -> tuple[Array, Array]:
-        """p and g (B, d, n) of each parameter: g = Ȧᵀ u - Aᵀ (ω × u), and for the axial spin tᵀ [0, 1, spin] likewise."""
+        """p and g (B, d, n) of each parameter: g = Ȧᵀ u - Aᵀ (ω × u), for the axial spin with tᵀ [0, 1, spin] as A."""
         weights = self.term.weights[:, None]
         elastic = _columns(self.shape.J, nu[:, 6:])
         u = self._velocities(nu, elastic) * weights

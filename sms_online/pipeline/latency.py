@@ -59,20 +59,38 @@ def source_channels(source: Source) -> list[str]:
     return [signal.channel for signal in source.signals.values()]
 
 
+def _group(sensing: Sensing, name: str, channels: Sequence[str]) -> SourceGroup:
+    """Those of the channels that are used."""
+    positions = [sensing.channels[column] for column in sensing.position_columns]
+    mine = [channel for channel in channels if channel in sensing.channels]
+    sensors = tuple(positions.index(channel) for channel in mine if channel in positions)
+    joints = tuple(int(channel.rsplit("_", 1)[1]) for channel in mine if channel.startswith(("tau_", "force_")))
+    return SourceGroup(name, sensors, joints, tuple(mine))
+
+
 def source_groups(sensing: Sensing) -> tuple[SourceGroup, ...]:
     """The sources of a session whose latencies can be told apart; none where not exactly one delivers torques."""
-    groups = []
-    positions = [sensing.channels[column] for column in sensing.position_columns]
-    for source in sensing.model.system.sources:
-        mine = [name for name in source_channels(source) if name in sensing.channels]
-        sensors = tuple(positions.index(name) for name in mine if name in positions)
-        joints = tuple(int(name.rsplit("_", 1)[1]) for name in mine if name.startswith(("tau_", "force_")))
-        if sensors or joints:
-            groups.append(SourceGroup(source.name, sensors, joints, tuple(mine)))
-    whole = sorted(index for group in groups for index in group.sensors) == list(range(len(positions)))
+    every = [_group(sensing, source.name, source_channels(source)) for source in sensing.model.system.sources]
+    groups = [group for group in every if group.sensors or group.joints]
+    positions = len(sensing.position_columns)
+    whole = sorted(index for group in groups for index in group.sensors) == list(range(positions))
     if len(groups) < 2 or not whole or sum(bool(group.joints) for group in groups) != 1:
         return ()
     return tuple(groups)
+
+
+def clock_groups(sensing: Sensing) -> tuple[SourceGroup, ...]:
+    """What has a clock of its own: the senders on a bus, each with messages of its name, and serial devices."""
+    members: dict[tuple[str, str], list[str]] = {}
+    for source in sensing.model.system.sources:
+        if isinstance(source, SerialFrames | SerialLines):
+            members[source.name, ""] = source_channels(source)
+        else:
+            for key, signal in source.signals.items():
+                members.setdefault((source.name, key.partition(".")[0]), []).append(signal.channel)
+    every = [_group(sensing, name, channels) for (name, _), channels in members.items()]
+    groups = tuple(group for group in every if group.sensors or group.joints)
+    return groups if len(groups) > 1 else ()
 
 
 class Latencies:
@@ -135,16 +153,8 @@ class LatencyColumns:
     def __len__(self) -> int:
         return len(self._sensors)
 
-    def of(self, c: Array, readings: Array, v: Array) -> Array:
-        """Columns (n_v, G) of a window's rows.
-
-        c (n_v, K, sensors): what a reading adds to each row, at K instants. readings (K, n_v, sensors): displacement
-        along the speeds that it stands for. v (K, n_v): speeds.
-        """
-        n_v, sensors = readings.shape[1:]
-        # The rates of the readings themselves, of which Euler parameters are one more than speeds.
-        inverse = np.linalg.inv(readings) if n_v == sensors else np.linalg.pinv(readings)
-        by_sensor = np.einsum("vks,ks->vs", c, (inverse @ v[:, :, None])[:, :, 0])
+    def of(self, by_sensor: Array) -> Array:
+        """Columns (n_v, G) of a window's rows, from those of each sensor's own latency (n_v, sensors)."""
         columns = np.stack([by_sensor[:, own].sum(axis=1) for own in self._sensors], axis=1)
         for k in self._torque:
             columns[:, k] = -np.delete(columns, k, axis=1).sum(axis=1)

@@ -15,7 +15,7 @@ from sms_online.model.model import Model
 from sms_online.pipeline.changes import Adoption, Changes
 from sms_online.pipeline.errors_in_variables import NoiseBias
 from sms_online.pipeline.events import Event
-from sms_online.pipeline.latency import Latencies, source_groups
+from sms_online.pipeline.latency import Latencies, clock_groups, source_groups
 from sms_online.pipeline.momentum_balance import COPIES, HOPS, MomentumBalance
 from sms_online.pipeline.momentum_fit import MomentumFit, WhiteRows
 from sms_online.pipeline.residual_test import SequentialTest
@@ -53,7 +53,7 @@ class Momentum:
         self._estimate = NoiseEstimate(sensing, system.sample_rate)
         self._span = system.windows.momentum
         self.prior: Prior | None = None
-        self._sources = source_groups(sensing)
+        self._sources, self._clocks = source_groups(sensing), clock_groups(sensing)
         self._build()
         self._random = np.random.default_rng(SEED)
         self._segment = -1
@@ -68,7 +68,9 @@ class Momentum:
         self.windows = 0
         self._balance = MomentumBalance(model, base, self._sample_rate, self._span)
         self.latencies = Latencies(self._sources, base.n)
-        self.fit = MomentumFit(model, base, self._balance, self.sensing.displacements, self._solved, self._sources)
+        self.fit = MomentumFit(
+            model, base, self._balance, self.sensing.displacements, self._solved, self._sources, self._clocks
+        )
         self.tracker: Tracker = self._new_tracker()
         self.test = SequentialTest(model.layout, self._balance.span / HOPS)
 

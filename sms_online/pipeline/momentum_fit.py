@@ -87,6 +87,7 @@ class MomentumFit:
 
     solve: gives the estimate of β so far (n,), NaN where nothing is known of it. readings: x (K, n_x) to the
     displacements (K, n_v, sensors) that unit noise of each position sensor makes. sources: whose latencies are told.
+    clocks: see `RowNoise`.
     """
 
     def __init__(
@@ -97,13 +98,14 @@ class MomentumFit:
         readings: Callable[[Array], Array],
         solve: Callable[[], Array],
         sources: Sequence[SourceGroup] = (),
+        clocks: Sequence[SourceGroup] = (),
     ) -> None:
         self.model = model
         self.base = base
         self._balance = balance
         self._solve = solve
         self._sensitivities = Sensitivities(model, readings, balance.span / INSTANTS)
-        self._noise = RowNoise(model.layout.theta_m, balance.span)
+        self._noise = RowNoise(model.layout.theta_m, balance.span, clocks)
         self._late = LatencyColumns(sources)
         self._whitener = Whitener(model.layout.n_v, COPIES * (base.n + 1) + len(sources))
         self.weights: Array | None = None  # β (n,) behind the weights
@@ -301,7 +303,8 @@ class MomentumFit:
         n_v = self.model.layout.n_v
         noise, sensitivity = self._sensor_noise, self._sensitivities.window(window.start)
         assert noise is not None
-        covariances = self._noise.covariance(sensitivity, noise.sensors, noise.torque)
+        age = window.end / self._balance.sample_rate
+        covariances = self._noise.covariance(sensitivity, noise.sensors, noise.torque, age)
         rows = self._dense(window)
         residual = rows[..., -1] - rows[..., :-1] @ self._known_weights
         # What noise does beyond first order, which nothing propagates: a sample of it for every row.
@@ -326,18 +329,12 @@ class MomentumFit:
         covariances[-1][np.diag_indices(n_v)] += self.misfit * variance
         side_by_side = rows.swapaxes(0, 1).reshape(n_v, -1)
         if len(self._late):
-            side_by_side = np.concatenate((side_by_side, self._late_columns(window.start, noise)), axis=1)
+            side_by_side = np.concatenate((side_by_side, self._late.of(self._noise.late)), axis=1)
         whitened = self._whitener.push(covariances, side_by_side)
         late = whitened[:, COPIES * rows.shape[2] :]
         white = whitened[:, : COPIES * rows.shape[2]].reshape(n_v, COPIES, -1).swapaxes(0, 1)
         own = covariances[-1] + np.diag(UNSTEADY * bend**2)
         return WhiteRows(white[0], white[1:], rows[0], own, of_noise, window.end, late)
-
-    def _late_columns(self, start: int, noise: SensorNoise) -> Array:
-        """Columns (n_v, G) of the latencies in the window's rows."""
-        inside = slice(start - self._first, start - self._first + INSTANTS + 1)
-        c = self._noise.reading_weights(noise.sensors)
-        return self._late.of(c, self._sensitivities.readings(start), self._v[inside])
 
     def _forget_instants(self) -> None:
         """Drop the states that no window to come asks for."""

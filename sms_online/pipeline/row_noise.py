@@ -5,18 +5,22 @@ c = φ̈ H + φ̇ (Ḣ + ∂Gπ/∂v - ∂Pπ/∂x) + φ (d/dt ∂Gπ/∂v - ∂
 balance; and ∫ φ n_τ dt from the noise of the torque. White noise of 1σ per sample has the density σ² T_s. Rows of
 windows that overlap share noise, so their covariance is block-banded, and so is its Cholesky factor L: L⁻¹ [Y b] are
 rows with independent errors of standard deviation one.
+
+Devices with clocks of their own are all a little early or late against each other, by the same for seconds. Over a
+window that is an error of the row in proportion to the rates of that device's readings.
 """
 
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 import scipy.linalg
 from numpy.typing import NDArray
 
+from sms_online.pipeline.latency import SourceGroup
 from sms_online.pipeline.momentum_balance import EXPONENT, HOPS, INSTANTS
 from sms_online.pipeline.sensitivity import SPARSE, Sensitivity, nodes
 from sms_online.pipeline.weak_form import test_function
@@ -27,16 +31,22 @@ STEPS = 2 * INSTANTS
 STEPS_A_HOP = STEPS // HOPS
 # Share of a row's variance that is added to it alone, for the rounding of the factorisation.
 OWN_SHARE = 1e-7
+# What the clock of a device is off by, 1σ, s, when it has been watched for CLOCK_KNOWN, s. The line behind it is told
+# by the least delayed samples, which reach the loop some 100 µs late, give or take 50; before, it is off by the more
+# the fewer they are.
+CLOCK_ERROR, CLOCK_KNOWN = 5e-5, 10.0
 
 
 class RowNoise:
     """Covariance of each window's rows with those of the windows before it.
 
-    joint_rows: rows that hold each joint's torque.
+    joint_rows: rows that hold each joint's torque. clocks: what comes by each clock; the rest is as late as the grid.
+    late (n_v, sensors): what a second of delay of each sensor adds to the rows of the last window.
     """
 
-    def __init__(self, joint_rows: tuple[int, ...], span: float) -> None:
+    def __init__(self, joint_rows: tuple[int, ...], span: float, clocks: Sequence[SourceGroup] = ()) -> None:
         self._joint_rows = list(joint_rows)
+        self._clocks = [(list(clock.sensors), [joint_rows[i - 1] for i in clock.joints]) for clock in clocks]
         self._step = span / STEPS
         self._phi, self._phi_dot, self._phi_ddot = test_function(STEPS, span, EXPONENT)
         self._weights = [self._told(offset, span) for offset in range(SPARSE)]
@@ -45,6 +55,8 @@ class RowNoise:
         self._overlap = self._step * np.array(shifted)
         self._before: deque[Array] = deque(maxlen=HOPS - 1)
         self._torque_before: deque[Array] = deque(maxlen=HOPS - 1)
+        self._late_before: deque[Array] = deque(maxlen=HOPS - 1)
+        self.late = np.empty((0, 0))
 
     def _told(self, offset: int, span: float) -> Array:
         """Weights (STEPS + 1, ·) that make c out of H, Ḣ, ∂Pπ/∂x, ∂Gπ/∂v and ∂Gπ/∂x where they are told."""
@@ -60,6 +72,7 @@ class RowNoise:
         """The next window shares no samples with those before."""
         self._before.clear()
         self._torque_before.clear()
+        self._late_before.clear()
 
     def kernel(self, window: Sensitivity) -> Array:
         """c (STEPS + 1, n_v, sensors): what a displacement n(t) of each sensor adds to the rows is ∫ c(t) n(t) dt."""
@@ -68,43 +81,66 @@ class RowNoise:
         stacked = np.concatenate(parts).reshape(-1, n_v * sensors)
         return np.asarray((self._weights[window.offset] @ stacked).reshape(STEPS + 1, n_v, sensors))
 
-    def covariance(self, window: Sensitivity, sensor_density: Array, torque_density: Array) -> list[Array]:
+    def covariance(
+        self, window: Sensitivity, sensor_density: Array, torque_density: Array, age: float = np.inf
+    ) -> list[Array]:
         """Covariances (n_v, n_v) with the windows before, oldest first, then the window's own; (N s)² and so on.
 
         sensor_density (sensors,): σ² T_s of each position sensor. torque_density (joints,): of n τ, (N m)² s.
+        age: of the clocks at the window's end, s.
         """
-        c = (self.kernel(window) * np.sqrt(self._step * sensor_density)).transpose(1, 0, 2)
-        c = np.ascontiguousarray(c)  # (n_v, STEPS + 1, sensors)
+        kernel = self.kernel(window)
+        n_v, sensors = kernel.shape[1:]
+        # By time, so that what two windows have in common lies in one piece.
+        c = np.multiply(kernel.swapaxes(1, 2), np.sqrt(self._step * sensor_density)[:, None], order="C")
+        c = c.reshape(-1, n_v)
+        self.late = self._lateness(kernel, window.rates)
+        late = CLOCK_ERROR * max(1.0, CLOCK_KNOWN / age) * self._by_clock(self.late)
         out = []
         for k in range(len(self._before), -1, -1):
-            other = c if k == 0 else self._before[-k]
-            shift = k * STEPS_A_HOP
-            ours, theirs = c[:, : STEPS + 1 - shift], other[:, shift:]
-            block = ours.reshape(len(c), -1) @ theirs.reshape(len(c), -1).T
+            first = k * STEPS_A_HOP * sensors
+            block = c[: len(c) - first].T @ (c if k == 0 else self._before[-k][first:])
             torque = np.sqrt(torque_density * (torque_density if k == 0 else self._torque_before[-k]))
             block[self._joint_rows, self._joint_rows] += self._overlap[k] * torque
+            # What windows share fades out where they no longer overlap, for the covariance to stay banded.
+            if self._clocks:
+                block += (1.0 - k / HOPS) * late @ (late if k == 0 else self._late_before[-k]).T
             out.append(block)
         self._before.append(c)
         self._torque_before.append(torque_density)
+        self._late_before.append(late)
         return out
 
-    def reading_weights(self, sensor_density: Array) -> Array:
-        """c dt (n_v, INSTANTS + 1, sensors) of the last window: what a unit of each reading adds to a row."""
-        steps = self._before[-1] * np.sqrt(self._step / sensor_density)
+    def _lateness(self, kernel: Array, rates: Array) -> Array:
+        """See `late`; rates (INSTANTS + 1, sensors): of the readings."""
         # Every other step stands between two instants and counts half for each.
-        weights = steps[:, ::2].copy()
-        weights[:, :-1] += 0.5 * steps[:, 1::2]
-        weights[:, 1:] += 0.5 * steps[:, 1::2]
-        return np.asarray(weights)
+        weights = kernel[::2].copy()
+        weights[:-1] += 0.5 * kernel[1::2]
+        weights[1:] += 0.5 * kernel[1::2]
+        return np.asarray(self._step * np.einsum("kvs,ks->vs", weights, rates))
+
+    def _by_clock(self, late: Array) -> Array:
+        """The same of each clock (n_v, clocks). All together being late changes nothing: so much do torques do."""
+        columns = np.zeros((len(late), len(self._clocks)))
+        torque = -late.sum(axis=1)
+        for column, (sensors, joint_rows) in zip(columns.T, self._clocks, strict=True):
+            column += late[:, sensors].sum(axis=1)
+            column[joint_rows] += torque[joint_rows]
+        return columns
 
     def state(self) -> dict[str, Array]:
         """What `restore` needs to continue."""
-        return {"before": np.array(self._before), "torque_before": np.array(self._torque_before)}
+        return {
+            "before": np.array(self._before),
+            "torque_before": np.array(self._torque_before),
+            "late_before": np.array(self._late_before),
+        }
 
     def restore(self, state: Mapping[str, NDArray[Any]]) -> None:
         """Continue from a saved state."""
         self._before = deque(np.array(state["before"]), maxlen=HOPS - 1)
         self._torque_before = deque(np.array(state["torque_before"]), maxlen=HOPS - 1)
+        self._late_before = deque(np.array(state["late_before"]), maxlen=HOPS - 1)
 
 
 def _interpolation(at: Array, nodes: Array) -> Array:

@@ -27,7 +27,8 @@ class Sensitivity:
     """Over a window of INSTANTS + 1 instants, for displacements that one unit of each position sensor's noise makes.
 
     H, H_dot (INSTANTS + 1, n_v, sensors): ∂Pπ/∂v and Ḣ. P_x, G_v, G_x (nodes, n_v, sensors): ∂Pπ/∂x, ∂Gπ/∂v, ∂Gπ/∂x at
-    every other instant, the first of which is `offset` instants into the window.
+    every other instant, the first of which is `offset` instants into the window. rates (INSTANTS + 1, sensors): of the
+    readings.
     """
 
     H: Array
@@ -36,6 +37,7 @@ class Sensitivity:
     G_v: Array
     G_x: Array
     offset: int
+    rates: Array
 
 
 def derivatives(dynamics: Dynamics, x: Array, v: Array, signals: Array | None = None) -> Array:
@@ -83,6 +85,7 @@ class Sensitivities:
         n_v, n_x = self.model.layout.n_v, self.model.layout.n_x
         self._first = next_instant
         self._dense = np.empty((0, n_v, n_v + n_x))  # H and readings at each instant
+        self._rates = np.empty((0, n_x))
         self._numbers = np.empty(0, dtype=np.int64)  # instants of the derivatives
         self._derivatives = np.empty((0, n_v, 3 * n_v))
 
@@ -98,9 +101,11 @@ class Sensitivities:
         dynamics = self.model.dynamics(pi)
         numbers = self.next_instant + np.arange(len(x))
         sparse = numbers % SPARSE == 0
-        self._dense = np.concatenate(
-            (self._dense, np.concatenate((dynamics.mass_matrix(x), self._readings(x)), axis=2))
-        )
+        readings = self._readings(x)
+        self._dense = np.concatenate((self._dense, np.concatenate((dynamics.mass_matrix(x), readings), axis=2)))
+        # The rates of the readings themselves, of which Euler parameters are one more than speeds.
+        inverse = np.linalg.inv(readings) if v.shape[1] == readings.shape[2] else np.linalg.pinv(readings)
+        self._rates = np.concatenate((self._rates, (inverse @ v[:, :, None])[:, :, 0]))
         if sparse.any():
             self._numbers = np.concatenate((self._numbers, numbers[sparse]))
             told = derivatives(dynamics, x[sparse], v[sparse], signals[sparse])
@@ -116,16 +121,11 @@ class Sensitivities:
         first = int(np.searchsorted(self._numbers, start))
         told = self._derivatives[first : first + nodes(offset).size]
         P_x, G_v, G_x = (told[:, :, k * n_v : (k + 1) * n_v] @ readings[nodes(offset)] for k in range(3))
-        return Sensitivity(H @ readings, H_dot @ readings, P_x, G_v, G_x, offset)
-
-    def readings(self, start: int) -> Array:
-        """Displacements (INSTANTS + 1, n_v, sensors) that units of the sensors make, at the instants from `start`."""
-        inside = slice(start - self._first, start - self._first + INSTANTS + 1)
-        return self._dense[inside, :, self.model.layout.n_v :]
+        return Sensitivity(H @ readings, H_dot @ readings, P_x, G_v, G_x, offset, self._rates[inside])
 
     def drop(self, before: int) -> None:
         """Forget instants with smaller numbers."""
-        self._dense = self._dense[before - self._first :]
+        self._dense, self._rates = self._dense[before - self._first :], self._rates[before - self._first :]
         self._first = before
         kept = self._numbers >= before
         self._numbers, self._derivatives = self._numbers[kept], self._derivatives[kept]
@@ -133,11 +133,12 @@ class Sensitivities:
     def state(self) -> dict[str, Any]:
         """What `restore` needs to continue."""
         return {
-            "told_first": self._first, "told_dense": self._dense, "told_numbers": self._numbers,
-            "told_derivatives": self._derivatives,
+            "told_first": self._first, "told_dense": self._dense, "told_rates": self._rates,
+            "told_numbers": self._numbers, "told_derivatives": self._derivatives,
         }  # fmt: skip
 
     def restore(self, state: Mapping[str, NDArray[Any]]) -> None:
         """Continue from a saved state."""
         self._first, self._dense = int(state["told_first"]), np.array(state["told_dense"])
+        self._rates = np.array(state["told_rates"])
         self._numbers, self._derivatives = np.array(state["told_numbers"]), np.array(state["told_derivatives"])
