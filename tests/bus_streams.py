@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 from axis import AXIS, DAMPING, INERTIA
 
-from sms_adapters.clock_lanes import lanes
+from sms_adapters.clock_lanes import merger
 from sms_adapters.clock_merge import Merger
 from sms_adapters.raw import MOST_BYTES, CanFrames, Raw, SerialChunk
 from sms_adapters.recording import split, tick_time
@@ -144,7 +144,7 @@ def in_order(arrival: Array) -> Array:
 
 def merged(system: System, folder: Path, drive: CanFrames, encoder: list[SerialChunk]) -> tuple[Merger, list[Block]]:
     """The rows of a session with these raw items."""
-    merger = Merger(lanes(system, folder))
+    ours = merger(system, folder)
     by_tick: dict[int, tuple[list[Raw], list[Raw]]] = {}
     number = 1
     rest: list[Raw] = [drive] if len(drive) else []
@@ -155,8 +155,8 @@ def merged(system: System, folder: Path, drive: CanFrames, encoder: list[SerialC
     for chunk in encoder:
         number = next(k for k in itertools.count(int(chunk.arrival / tick_time(1))) if chunk.arrival < tick_time(k))
         by_tick.setdefault(number, ([], []))[1].append(chunk)
-    blocks = [merger.advance(tick_time(k), by_tick.get(k, ([], []))) for k in range(1, max(by_tick) + 1)]
-    return merger, [block for block in [*blocks, merger.finish()] if block is not None]
+    blocks = [ours.advance(tick_time(k), by_tick.get(k, ([], []))) for k in range(1, max(by_tick) + 1)]
+    return ours, [block for block in [*blocks, ours.finish()] if block is not None]
 
 
 def estimated(system: System, blocks: list[Block], channels: tuple[str, ...]) -> tuple[Array, Array]:

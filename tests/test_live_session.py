@@ -16,8 +16,8 @@ from axis import DAMPING, INERTIA
 from bus_streams import AxisBus, axis_testbed
 
 from sms_adapters.checkpoint import load_checkpoint
-from sms_adapters.clock_lanes import lanes
-from sms_adapters.clock_merge import PATIENCE, Merger
+from sms_adapters.clock_lanes import merger
+from sms_adapters.clock_merge import PATIENCE
 from sms_adapters.raw import LostDevice, Raw, SerialChunk
 from sms_adapters.recorder import Recorder
 from sms_adapters.recording import split
@@ -96,7 +96,7 @@ class Bench:
             Played("encoder", bus.encoder(system), self.clock, repeat),
         ]
         self.feeds = [Feed(reader, self.recorder) for reader in self.readers]
-        self.merger = Merger(lanes(system, folder))
+        self.merger = merger(system, folder)
         self.estimator = Estimator(system, self.merger.channels, "live")
         self.session = LiveSession(
             self.clock, self.feeds, self.merger, self.estimator, 0.0, self.directory, self.recorder, **options

@@ -7,10 +7,11 @@ from pathlib import Path
 
 from sms_adapters.can_signals import WantedMessage, wanted_messages
 from sms_adapters.canopen_signals import pdo_messages
-from sms_adapters.clock_merge import SourceLane, Stream
+from sms_adapters.clock_merge import Merger, SourceLane, Steps, Stream
 from sms_adapters.devices import make_decoder
 from sms_online.description.schema import CanopenSource, CanSource, Source, System
 from sms_online.errors import InputError
+from sms_online.pipeline.blocks import momentum_blocks
 
 
 def lanes(system: System, directory: Path | None) -> list[SourceLane]:
@@ -21,6 +22,17 @@ def lanes(system: System, directory: Path | None) -> list[SourceLane]:
     if not system.sources:
         raise InputError(system.name, "source", "no such table", "a table [[source]] for each device of the testbed")
     return [_lane(system, source, directory) for source in system.sources]
+
+
+def merger(system: System, directory: Path | None, start: float = 0.0) -> Merger:
+    """Merger of the system's sources, in step with the estimator's blocks; raises InputError as `lanes` does."""
+    sources = lanes(system, directory)
+    slowest = max(stream.period for lane in sources for stream in lane.streams)
+    steps = None
+    if system.balance != "energy":
+        first, block = momentum_blocks(system, slowest)
+        steps = Steps(first + 1.0 / system.sample_rate, block)  # the sample behind an end shows that it is one
+    return Merger(sources, start, steps)
 
 
 def period(system: System, channel: str) -> float:

@@ -139,6 +139,8 @@ class DeviceClock:
 
     def finish(self) -> Array:
         """Times of all samples held back, at the end of a session, however little is known of the line."""
+        if self._origin is None:
+            return np.empty(0)
         self._discard(self._held.size)
         if self._best is not None and not self._settled:
             self._complete_interval()

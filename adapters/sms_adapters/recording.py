@@ -8,8 +8,8 @@ from pathlib import Path
 
 import numpy as np
 
-from sms_adapters.clock_lanes import lanes
-from sms_adapters.clock_merge import TICK, TICK_MICROSECONDS, Merger
+from sms_adapters.clock_lanes import merger
+from sms_adapters.clock_merge import TICK, TICK_MICROSECONDS
 from sms_adapters.raw import CanFrames, Raw
 from sms_adapters.session_log import CHECKPOINT, RecordedItems, from_microseconds, read_header
 from sms_online.description.schema import System
@@ -60,7 +60,7 @@ class Recording:
         if set(names) != set(self._header.sources):
             found = ", ".join(self._header.sources) or "none"
             raise InputError(str(directory), "sources", found, f"those of the system: {', '.join(names) or 'none'}")
-        self._merger = Merger(lanes(system, system_directory), self._header.start)
+        self._merger = merger(system, system_directory, self._header.start)
 
     @property
     def channels(self) -> tuple[str, ...]:
@@ -84,7 +84,7 @@ class Recording:
 
     def __iter__(self) -> Iterator[Block]:
         """Yield the blocks from the beginning."""
-        self._merger = merger = Merger(lanes(self._system, self._system_directory), self._header.start)
+        self._merger = ours = merger(self._system, self._system_directory, self._header.start)
         recorded = [
             iter(RecordedItems(self._directory, source.name, self._header.sources[source.name], self._header.epoch))
             for source in self._system.sources
@@ -106,10 +106,10 @@ class Recording:
             for k in range(len(waiting)):
                 early, waiting[k] = split(waiting[k], now)
                 due.append(early)
-            block = self._cut(merger.advance(now, due))
+            block = self._cut(ours.advance(now, due))
             if block is not None:
                 yield block
-        block = self._cut(merger.finish())
+        block = self._cut(ours.finish())
         if block is not None:
             yield block
 

@@ -10,7 +10,6 @@ smoother that knows the dynamics; it gives the estimate as soon as its first spa
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from itertools import groupby, pairwise
 from operator import attrgetter
 from typing import Any
@@ -23,29 +22,22 @@ from sms_online.effects.spacecraft import TableTilt
 from sms_online.errors import InputError
 from sms_online.model.base_parameters import BaseParameters, find_base_parameters
 from sms_online.model.model import Model
+from sms_online.pipeline.blocks import ENERGY_BLOCK, energy_blocks, momentum_blocks
 from sms_online.pipeline.changes import Adoption
 from sms_online.pipeline.conditioning import Conditioning
 from sms_online.pipeline.energy_balance import BalanceRows, EnergyBalance, SharedErrors
 from sms_online.pipeline.events import Event
 from sms_online.pipeline.internal_states import FollowedStates
-from sms_online.pipeline.joint_balance import JointBalance
+from sms_online.pipeline.joint_balance import JointBalance, SquaredResidual
 from sms_online.pipeline.momentum import Momentum
 from sms_online.pipeline.rates import RateSamples, RatesStage
 from sms_online.pipeline.sensing import AttitudeContinuity, Sensing, stated_period
-from sms_online.pipeline.synchronise import SIDE, GridSamples, SyncCounters, Synchroniser
+from sms_online.pipeline.synchronise import GridSamples, SyncCounters, Synchroniser
 from sms_online.pipeline.waiting import waiting_from_state, waiting_state
 from sms_online.smoother.session import Smoother
 from sms_online.stream import Array, Block
 from sms_online.trackers.interface import Estimate, Prior, Rows, Tracker
 from sms_online.trackers.square_root import RecursiveLeastSquares
-
-# Samples that pass through the pipeline together are those of some time. Everything behind sees the same blocks however
-# the samples arrive, so the result is the same to the last bit. The cost of NumPy's calls is shared by a block, so the
-# energy balance alone has long ones, in periods of the grid. With momentum rows a block ends when a window can be
-# completed, for whoever waits for an estimate or an event waits for the block too.
-ENERGY_BLOCK = 256
-# Of a period of the grid: blocks end between its instants, or rounding would decide to which one a sample belongs.
-BETWEEN = 0.5
 
 # What a session saves: arrays and numbers, by stage.
 SessionState = dict[str, dict[str, Any]]
@@ -54,31 +46,6 @@ SessionState = dict[str, dict[str, Any]]
 MotionSink = Callable[[NDArray[np.int64], int, Array, Array], None]
 # Takes the grid samples of the channels that the model reads, as the synchroniser gives them.
 SampleSink = Callable[[GridSamples], None]
-
-
-@dataclass
-class SquaredResidual:
-    """Sums that give the rms of Y β - b for any β: the Gram matrix of [Y b], (n + 1, n + 1), and the measured signal's.
-
-    A Gram matrix tells a residual down to 1e-8 of b, which is enough for a share of the signal. It is replaced, never
-    written, so whoever keeps one has the sum of then.
-    """
-
-    gram: Array
-    signal: float = 0.0
-
-    def add(self, Y: Array, b: Array, signal: float) -> None:
-        """Add rows Y (M, n), b (M,), and the measured torque or force behind b, before what is known was subtracted."""
-        stacked = np.concatenate((Y, b[:, None]), axis=1)
-        self.gram = self.gram + stacked.T @ stacked
-        self.signal += float(signal) ** 2
-
-    def relative(self, beta: Array) -> float | None:
-        """rms of the residual over rms of the measured signal; None where there is none."""
-        if self.signal == 0.0:
-            return None
-        w = np.append(beta, -1.0)
-        return float(np.sqrt(max(0.0, w @ self.gram @ w) / self.signal))
 
 
 class Estimator:
@@ -123,20 +90,17 @@ class Estimator:
         self.momentum = None if by_energy else Momentum(model, base, self.sensing)
         self.energy_tracker: Tracker = RecursiveLeastSquares(base.n)
         self._begin_joints()
-        self._block, self._first_block = self._blocks()
+        self._first_block, self._block = self._blocks()
         self._segment = -1
         self._first_time = np.nan
         self._pending_t = np.empty(0)
         self._pending = np.empty((0, len(self._columns)))
 
     def _blocks(self) -> tuple[float, float]:
-        """Duration of a block, s, and of the first one, but for whole blocks."""
+        """See `blocks`."""
         if self.momentum is None:
-            return ENERGY_BLOCK / self.system.sample_rate, BETWEEN / self.system.sample_rate
-        hop, margin = self.momentum.hop, self.momentum.margin
-        # The last sample behind a window, and those that interpolate the slowest channel there.
-        reach = SIDE * stated_period(self.system, self.sensing.channels)
-        return hop / self.system.sample_rate, (margin % hop + BETWEEN) / self.system.sample_rate + reach
+            return energy_blocks(self.system)
+        return momentum_blocks(self.system, stated_period(self.system, self.sensing.channels))
 
     def set_prior(self, prior: Prior) -> None:
         """Weigh the rows against what is known of the base parameters beforehand; before the first sample."""

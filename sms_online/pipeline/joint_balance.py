@@ -6,6 +6,8 @@ only positions and speeds appear: -∫ (φ̇ P + φ G) dt π = ∫ φ n τ dt.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -20,6 +22,31 @@ EXPONENT = 4
 # A quarter of the data is enough for an rms, so short windows leave three times their width out; but windows follow
 # each other at least this often, s, and overlap by half at most.
 LARGEST_HOP = 0.4
+
+
+@dataclass
+class SquaredResidual:
+    """Sums that give the rms of Y β - b for any β: the Gram matrix of [Y b], (n + 1, n + 1), and the measured signal's.
+
+    A Gram matrix tells a residual down to 1e-8 of b, which is enough for a share of the signal. It is replaced, never
+    written, so whoever keeps one has the sum of then.
+    """
+
+    gram: Array
+    signal: float = 0.0
+
+    def add(self, Y: Array, b: Array, signal: float) -> None:
+        """Add rows Y (M, n), b (M,), and the measured torque or force behind b, before what is known was subtracted."""
+        stacked = np.concatenate((Y, b[:, None]), axis=1)
+        self.gram = self.gram + stacked.T @ stacked
+        self.signal += float(signal) ** 2
+
+    def relative(self, beta: Array) -> float | None:
+        """rms of the residual over rms of the measured signal; None where there is none."""
+        if self.signal == 0.0:
+            return None
+        w = np.append(beta, -1.0)
+        return float(np.sqrt(max(0.0, w @ self.gram @ w) / self.signal))
 
 
 class JointBalance:

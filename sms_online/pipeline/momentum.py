@@ -92,16 +92,6 @@ class Momentum:
             self._build()
 
     @property
-    def hop(self) -> int:
-        """Samples from one window to the next."""
-        return self._balance.hop
-
-    @property
-    def margin(self) -> int:
-        """Samples that a window waits for beyond its end."""
-        return self._balance.margin
-
-    @property
     def started(self) -> bool:
         """Whether weights are known and rows come."""
         return self.fit.weights is not None

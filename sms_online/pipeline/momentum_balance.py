@@ -84,6 +84,21 @@ def momentum_pattern(model: Model) -> NDArray[np.bool_]:
     return np.asarray(size > RANK_TOLERANCE * size.max(axis=0))
 
 
+def half_hop(sample_rate: float, span: float) -> int:
+    """Samples of half a hop between windows of `span` s, whole ones."""
+    return max(1, round(span * sample_rate / INSTANTS))
+
+
+def half_widths(width: int) -> tuple[int, ...]:
+    """The filter's for windows of so many samples: where these are few, the narrowest one is all there is."""
+    return tuple(M for M in HALF_WIDTHS if width >= WIDEST_SHARE * M) or HALF_WIDTHS[:1]
+
+
+def prompt_margin(width: int) -> int:
+    """Samples that a window of so many waits for beyond its end."""
+    return max(HALF_WIDTHS[0], min(half_widths(width)[-1], width // PROMPT_SHARE))
+
+
 @dataclass
 class _Smoothed:
     """Momenta and forces at the thinned samples of one half width, as far as windows have asked for them.
@@ -109,18 +124,16 @@ class MomentumBalance:
         self.model = model
         self.base = base
         self.sample_rate = sample_rate
-        # Half hops are whole samples.
-        self.half_hop = max(1, round(span * sample_rate / INSTANTS))
+        self.half_hop = half_hop(sample_rate, span)
         self.hop = 2 * self.half_hop
         self.width = INSTANTS * self.half_hop
         self.span = self.width / sample_rate
         self.rows, self.columns = np.nonzero(momentum_pattern(model)[:, list(base.independent)])
         self._physical = np.array(base.independent)[self.columns]
-        # Where windows are short, the narrowest filter is all there is.
-        self._widths = tuple(M for M in HALF_WIDTHS if self.width >= WIDEST_SHARE * M) or HALF_WIDTHS[:1]
+        self._widths = half_widths(self.width)
         # Samples before and after a window that its filter needs.
         self.lead = self._widths[-1]
-        self.margin = max(HALF_WIDTHS[0], min(self.lead, self.width // PROMPT_SHARE)) if prompt else self.lead
+        self.margin = prompt_margin(self.width) if prompt else self.lead
         self._prompt = prompt
         self._choice = WidthChoice(self._widths)
         self._phi = {s: self._weights(s) for s in {stride(M, self.hop) for M in self._widths}}

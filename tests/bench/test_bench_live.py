@@ -24,8 +24,8 @@ from axis import AXIS, DAMPING, INERTIA
 
 from sms_adapters.capture import CaptureWriter
 from sms_adapters.checkpoint import save_checkpoint
-from sms_adapters.clock_lanes import lanes
-from sms_adapters.clock_merge import TICK, Merger
+from sms_adapters.clock_lanes import merger
+from sms_adapters.clock_merge import TICK
 from sms_adapters.raw import CanFrames, Raw, SerialChunk, concatenate_frames
 from sms_adapters.recording import tick_time
 from sms_adapters.system_file import load_system
@@ -148,8 +148,8 @@ def test_hours_at_full_speed(tmp_path: Path) -> None:
     columns = [blocks[0].channels.index(channel) for channel in sensors.channels]
     motion = np.concatenate([block.values for block in blocks])[:-1, columns]
     bus = Devices(system, file.parent)
-    merger = Merger(lanes(system, file.parent))
-    estimator = Estimator(system, merger.channels, "bench")
+    ours = merger(system, file.parent)
+    estimator = Estimator(system, ours.channels, "bench")
     # Each motion begins anew, from rest, after a pause of the serial devices, which ends a segment.
     pause = np.repeat(motion[-1:], round(PERIOD * system.sample_rate) - motion.shape[0], axis=0)
     on_can = {channel for group in messages(sensors.channels) for channel in group}
@@ -164,7 +164,7 @@ def test_hours_at_full_speed(tmp_path: Path) -> None:
         sources = bus.items(Block(k * PERIOD + rows / system.sample_rate, sensors.channels, values))
         parts = [by_tick(items, k * ticks, ticks) for items in sources]
         for tick in range(ticks):
-            block = merger.advance(tick_time(k * ticks + tick + 1), [part[tick] for part in parts])
+            block = ours.advance(tick_time(k * ticks + tick + 1), [part[tick] for part in parts])
             if block is not None:
                 estimator.push(block)
         if k % max(1, rounds // 12) == 0 or k == rounds - 1:
@@ -174,7 +174,7 @@ def test_hours_at_full_speed(tmp_path: Path) -> None:
             took = perf_counter() - began
             print(f"\n{hours:6.2f} h in {took:6.0f} s, resident {resident():.1f} MB, {shown}", end="", flush=True)
     print()
-    print("\n".join(merger.warnings))
+    print("\n".join(ours.warnings))
 
 
 # Samples of a period of the axis: its message counts to 65536, so that frames repeat with it, arrivals apart.
@@ -229,9 +229,9 @@ def test_a_day_at_full_speed(tmp_path: Path, balance: str) -> None:
     (tmp_path / "axis.toml").write_text(described + AXIS_SOURCE)
     system = load_system(str(tmp_path / "axis.toml"))
     frames = axis_round(np.random.default_rng(1))
-    merger = Merger(lanes(system, tmp_path))
-    estimator = Estimator(system, merger.channels, "bench")
-    history = History(estimator, merger.channels)
+    ours = merger(system, tmp_path)
+    estimator = Estimator(system, ours.channels, "bench")
+    history = History(estimator, ours.channels)
     rounds = round(float(os.environ.get("HOURS", "24")) * 3600.0 / (ROUND * 1e-3))
 
     def blocks() -> Iterator[Block]:
@@ -242,11 +242,11 @@ def test_a_day_at_full_speed(tmp_path: Path, balance: str) -> None:
             steps = np.arange(tick, int(arrival[-1] / TICK), TICKS)[1:]
             edges = np.searchsorted(arrival, [tick_time(int(step)) for step in steps])
             for step, a, b in zip(steps.tolist(), [0, *edges[:-1].tolist()], edges.tolist(), strict=True):
-                block = merger.advance(tick_time(step), [[now[a:b]] if b > a else []])
+                block = ours.advance(tick_time(step), [[now[a:b]] if b > a else []])
                 if block is not None:
                     yield block
             tick = int(steps[-1])
-            block = merger.advance(tick_time(tick), [[now[int(edges[-1]) :]]])
+            block = ours.advance(tick_time(tick), [[now[int(edges[-1]) :]]])
             if block is not None:
                 yield block
             save_checkpoint(tmp_path / "checkpoint.npz", estimator)
@@ -260,7 +260,7 @@ def test_a_day_at_full_speed(tmp_path: Path, balance: str) -> None:
     for block in history.watch(blocks()):
         estimator.push(block)
     print()
-    print("\n".join(merger.warnings), f"events {len(estimator.events)}, lost {estimator.counters.lost_samples}")
+    print("\n".join(ours.warnings), f"events {len(estimator.events)}, lost {estimator.counters.lost_samples}")
 
 
 def resident() -> float:

@@ -7,7 +7,7 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
 from sms_adapters.checkpoint import load_checkpoint
-from sms_adapters.clock_lanes import lanes
+from sms_adapters.clock_lanes import merger
 from sms_adapters.clock_merge import Merger
 from sms_adapters.devices import make_reader
 from sms_adapters.recorder import Recorder
@@ -60,8 +60,7 @@ def open_testbed(
     last checkpoint this one goes on. Raises InputError for a system without sources, files that do not fit, a directory
     that cannot be written, a checkpoint of another system.
     """
-    opened = lanes(system, folder)
-    channels = tuple(channel for lane in opened for channel in lane.decoder.channels)
+    channels = merger(system, folder).channels
     estimator = new_estimator(system, channels, name)
     clock = SessionClock()
     start = 0.0 if resume is None else resumed_start(resume, estimator, clock.epoch)
@@ -70,8 +69,8 @@ def open_testbed(
     if resume is not None:
         shutil.copyfile(resume / CHECKPOINT, directory / RESUMED_FROM)
     feeds = [Feed(make_reader(source, clock), recorder) for source in system.sources]
-    merger = Merger(opened, start)
-    return LiveSession(clock, feeds, merger, estimator, start, directory, recorder, status), estimator, merger
+    merged = merger(system, folder, start)
+    return LiveSession(clock, feeds, merged, estimator, start, directory, recorder, status), estimator, merged
 
 
 def resumed_start(resume: Path, estimator: Estimator, epoch: int) -> float:

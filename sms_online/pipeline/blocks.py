@@ -1,0 +1,31 @@
+"""How many samples pass through the pipeline together."""
+
+from __future__ import annotations
+
+from sms_online.description.schema import System
+from sms_online.pipeline.momentum_balance import HOPS, half_hop, prompt_margin
+from sms_online.pipeline.synchronise import SIDE
+
+# Samples that pass through the pipeline together are those of some time. Everything behind sees the same blocks however
+# the samples arrive, so the result is the same to the last bit. The cost of NumPy's calls is shared by a block, so the
+# energy balance alone has long ones, in periods of the grid. With momentum rows a block ends when a window can be
+# completed, for whoever waits for an estimate or an event waits for the block too.
+ENERGY_BLOCK = 256
+# Of a period of the grid: blocks end between its instants, or rounding would decide to which one a sample belongs.
+BETWEEN = 0.5
+
+
+def energy_blocks(system: System) -> tuple[float, float]:
+    """Duration of the first block without momentum rows, but for whole blocks, and of the others, s."""
+    return BETWEEN / system.sample_rate, ENERGY_BLOCK / system.sample_rate
+
+
+def momentum_blocks(system: System, slowest: float) -> tuple[float, float]:
+    """Duration of the first block with momentum rows, but for whole blocks, and of the others, s.
+
+    A block ends with the last sample behind a window, and with those that interpolate the slowest channel there, which
+    has the period `slowest`, s.
+    """
+    hop = 2 * half_hop(system.sample_rate, system.windows.momentum)
+    margin = prompt_margin(hop * HOPS)
+    return (margin % hop + BETWEEN) / system.sample_rate + SIDE * slowest, hop / system.sample_rate
