@@ -13,8 +13,8 @@ from sms_adapters.system_file import load_system
 from sms_online.model.base_parameters import find_base_parameters
 from sms_online.model.model import Model
 from sms_online.model.parameters import Parameter
-from sms_online.pipeline.estimator import SquaredResidual
 from sms_online.pipeline.events import Event
+from sms_online.pipeline.joint_balance import SquaredResidual
 from sms_tools.view.frames import Reference
 from sms_tools.view.number_log import NumberLog
 from sms_tools.view.parameter_groups import MOST_LINES, parameter_groups, shortened

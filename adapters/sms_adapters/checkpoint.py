@@ -5,9 +5,12 @@ from __future__ import annotations
 import json
 import os
 import zipfile
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from sms_online.description.parse import describe
 from sms_online.errors import InputError
@@ -21,11 +24,21 @@ SEPARATOR = "/"
 
 def save_checkpoint(path: Path, estimator: Estimator) -> None:
     """Write an estimator's state; the file is complete or not there."""
-    arrays = {IDENTITY: np.array(_identity(estimator))} | {
-        f"{stage}{SEPARATOR}{key}": np.asarray(value)
+    write_checkpoint(path, snapshot(estimator))
+
+
+def snapshot(estimator: Estimator) -> dict[str, NDArray[Any]]:
+    """An estimator's state now, as arrays of their own: the estimator may go on before they are written."""
+    arrays = {
+        f"{stage}{SEPARATOR}{key}": np.array(value)
         for stage, entries in estimator.state().items()
         for key, value in entries.items()
     }
+    return {IDENTITY: np.array(_identity(estimator))} | arrays
+
+
+def write_checkpoint(path: Path, arrays: Mapping[str, NDArray[Any]]) -> None:
+    """Write a `snapshot`; the file is complete or not there."""
     temporary = path.with_name(path.name + ".part")
     with temporary.open("wb") as file:
         np.savez(file, allow_pickle=False, **arrays)

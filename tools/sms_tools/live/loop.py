@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import gc
+import threading
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from sms_adapters.checkpoint import save_checkpoint
+from sms_adapters.checkpoint import save_checkpoint, snapshot, write_checkpoint
 from sms_adapters.clock_merge import Merger
 from sms_adapters.recorder import Recorder
 from sms_adapters.recording import tick_time
@@ -67,6 +70,8 @@ class LiveSession:
         self._said = 0.0
         self._said_samples = 0
         self._saved = 0.0
+        self._saving = threading.Thread()
+        self._unsaved = ""  # why a checkpoint could not be written
 
     def blocks(
         self,
@@ -137,9 +142,19 @@ class LiveSession:
             self.health = {"latency": self._latency(), "clocks": self._merger.clock_offsets}
             if self._status is not None:
                 self._publish()
-        if now - self._saved >= CHECKPOINT_INTERVAL:
+        if now - self._saved >= CHECKPOINT_INTERVAL and not self._saving.is_alive():
             self._saved = now
-            self.save()
+            # Writing takes as long as two blocks may, so it is not the loop's.
+            state = snapshot(self._estimator)
+            self._saving = threading.Thread(target=self._write, args=(state,), name="checkpoint")
+            self._saving.start()
+
+    def _write(self, state: Mapping[str, NDArray[Any]]) -> None:
+        """Write a checkpoint beside the loop, which goes on without."""
+        try:
+            write_checkpoint(self._directory / CHECKPOINT, state)
+        except OSError as error:
+            self._unsaved = error.strerror or str(error)
 
     def _latency(self) -> dict[str, float]:
         """Quantiles of the latency, ms, as far as they are known."""
@@ -147,13 +162,17 @@ class LiveSession:
         return {name: 1e3 * value for name, value in quantiles.items() if value is not None}
 
     def save(self) -> None:
-        """Write a checkpoint."""
+        """Write a checkpoint, now."""
+        if self._saving.ident is not None:
+            self._saving.join()
         save_checkpoint(self._directory / CHECKPOINT, self._estimator)
 
     @property
     def warnings(self) -> list[str]:
         """What no raw item tells of this session."""
         found = [warning for feed in self._feeds for warning in feed.warnings]
+        if self._unsaved:
+            found.append(f"a checkpoint could not be written: {self._unsaved}")
         if self._recorder is not None and self._recorder.unrecorded:
             why = f" ({self._recorder.problem})" if self._recorder.problem else ""
             found.append(f"{self._recorder.unrecorded} items could not be recorded{why}")

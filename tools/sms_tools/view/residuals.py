@@ -6,7 +6,8 @@ from collections import deque
 
 import numpy as np
 
-from sms_online.pipeline.estimator import Estimator, SquaredResidual
+from sms_online.pipeline.estimator import Estimator
+from sms_online.pipeline.joint_balance import SquaredResidual
 from sms_online.stream import Array
 
 # A residual is stated over the last so many seconds: some windows of the balance.

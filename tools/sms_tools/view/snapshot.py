@@ -11,8 +11,9 @@ from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 from sms_online.description.schema import Effect
-from sms_online.pipeline.estimator import Estimator, SquaredResidual
+from sms_online.pipeline.estimator import Estimator
 from sms_online.pipeline.events import Event
+from sms_online.pipeline.joint_balance import SquaredResidual
 from sms_online.pipeline.momentum import Momentum
 from sms_online.stream import Array
 from sms_online.trackers.interface import State
