@@ -87,6 +87,24 @@ def test_a_frame_that_waited_for_its_reader_arrived_when_it_was_stamped(bus: tup
     assert frames.arrival[0] - sent < 0.2
 
 
+def test_a_reader_that_is_interrupted_between_two_clocks_makes_no_frame_early(
+    bus: tuple[CanReader, can.BusABC], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    reader, node = bus
+    sent = time.monotonic()
+    node.send(can.Message(arbitration_id=0x123, is_extended_id=False, data=b"\x01"))
+    utc, stalls = time.time, iter([0.01] * 4)
+
+    def interrupted() -> float:
+        time.sleep(next(stalls, 0.0))
+        return utc()
+
+    monkeypatch.setattr(time, "time", interrupted)
+    frames = received(reader, 1)
+    assert next(stalls, None) is None
+    assert sent - 1e-4 < frames.arrival[0] < sent + 5e-3
+
+
 def test_a_silent_bus_gives_nothing_and_a_flooded_one_bounded_pieces(bus: tuple[CanReader, can.BusABC]) -> None:
     reader, node = bus
     assert reader.read(0.01) == []

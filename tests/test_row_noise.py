@@ -15,8 +15,9 @@ from sms_online.description.parse import parse_system
 from sms_online.description.schema import System
 from sms_online.model.base_parameters import find_base_parameters
 from sms_online.model.model import Model
+from sms_online.pipeline.latency import SourceGroup
 from sms_online.pipeline.momentum_balance import COPIES, HOPS, INSTANTS, MomentumBalance, Window
-from sms_online.pipeline.row_noise import OWN_SHARE, RowNoise, Whitener
+from sms_online.pipeline.row_noise import CLOCK_ERROR, CLOCK_KNOWN, OWN_SHARE, RowNoise, Whitener
 from sms_online.pipeline.sensing import Sensing
 from sms_online.pipeline.sensitivity import Sensitivities
 from sms_online.pipeline.sensor_noise import NoiseEstimate
@@ -133,6 +134,46 @@ def test_rows_of_noisy_readings_scatter_as_predicted(system: System, draws: int)
         assert (np.abs(np.mean(ahead * behind, axis=0) - expected) < 4.5 * error).all()
     # As well as the noise itself is estimated from a thousand samples.
     assert abs(np.mean(found.whitened**2) - 1.0) < 0.05
+
+
+def test_a_clock_that_is_off_moves_rows_by_the_rates_of_its_readings() -> None:
+    """Against rows of samples moved in time; windows that overlap share it, and a clock just found is off by more."""
+    system = paper()
+    model = Model(system)
+    base = find_base_parameters(model)
+    motion = prescribed(model, 800, seed=1)
+    sensors, late = (model.layout.position_names.index("q_1"), model.layout.position_names.index("q_2")), 1e-6  # s
+    balance = MomentumBalance(model, base, system.sample_rate, SPAN)
+    told = Sensitivities(model, lambda x: np.tile(np.eye(model.layout.n_v), (len(x), 1, 1)), balance.span / INSTANTS)
+
+    def windows(delay: float) -> list[Array]:
+        x = motion.x.copy()
+        x[:, sensors] -= delay * motion.v[:, sensors]
+        balance.begin_segment()
+        signals = np.zeros((len(x), len(model.layout.q)))
+        found, instants = balance.push(np.arange(len(x)), [np.concatenate((x, signals), axis=1)] * COPIES, np.ones(15))
+        for piece in instants if delay == 0.0 else []:
+            told.tell(model.nominal, piece.x, piece.v, piece.signals)
+        dense = np.zeros((len(found), model.layout.n_v, base.n))
+        for Y, window in zip(dense, found, strict=True):
+            Y[balance.rows, balance.columns] = window.Y[0]
+        starts.extend(window.start for window in found if delay == 0.0)
+        return list(dense @ base.values(model.nominal))
+
+    starts: list[int] = []
+    still, moved = windows(0.0), windows(late)
+    slopes = [(b - a) / late for a, b in zip(still, moved, strict=True)]
+    clock = SourceGroup("encoders", sensors, (), ())
+    noise = RowNoise(model.layout.theta_m, balance.span, (clock,))
+    nothing = np.zeros(model.layout.n_x), np.zeros(len(model.layout.q))
+    found = [noise.covariance(told.window(start), *nothing) for start in starts]
+    assert len(found) > 2
+    for k in range(2):  # a window with itself and with the one before
+        expected = (1.0 - k / HOPS) * CLOCK_ERROR**2 * np.outer(slopes[-1], slopes[-1 - k])
+        np.testing.assert_allclose(found[-1][-1 - k], expected, atol=0.02 * np.abs(expected).max())
+    young = RowNoise(model.layout.theta_m, balance.span, (clock,))
+    own = young.covariance(told.window(starts[-1]), *nothing, 0.5 * CLOCK_KNOWN)[-1]
+    np.testing.assert_allclose(own, 4.0 * found[-1][-1], rtol=1e-12)
 
 
 def random_banded(n_v: int, windows: int, seed: int) -> list[list[Array]]:
