@@ -13,12 +13,13 @@ import io
 import os
 import shutil
 import signal
+import socket
 import subprocess
 import sys
 import tempfile
 from collections.abc import Sequence
 from pathlib import Path
-from time import sleep
+from time import monotonic, sleep
 
 import numpy as np
 from PIL import Image
@@ -34,9 +35,8 @@ LARGER = {"seven-joint": (1920, 1080)}
 # The animated one: px, pictures a second of the session and of the animation, quality of its compression.
 ANIMATED_WIDTH, FRAME_RATE, QUALITY = 960, 5.0, 60
 ANIMATED_SECONDS = 12.0
-# The viewer needs so long to start, to load a recording, and to draw another instant, s.
-STARTING, LOADING, DRAWING = 5.0, 6.0, 0.8
-PORT = 19876
+# The viewer needs so long to start at most, to load a recording, and to draw another instant, s.
+STARTING, LOADING, DRAWING = 60.0, 6.0, 0.8
 COLORS = 256
 # System, seconds of motion, grade of noise.
 SESSIONS = {
@@ -111,13 +111,13 @@ def _diagnosis(capture: Path) -> Path:
 def _photograph(recording: Path, name: str, animated: bool) -> None:
     # The viewer stands beside the interpreter, whether or not that directory is in PATH. `ViewerClient.spawn` would
     # start one of another size.
-    program = [Path(sys.executable).with_name("rerun"), "--headless", "--port", str(PORT)]
+    port = _free_port()
+    program = [Path(sys.executable).with_name("rerun"), "--headless", "--port", str(port)]
     width, height = LARGER.get(name, (WIDTH, HEIGHT))
     size = ["--window-size", f"{width}x{height}"]
     process = subprocess.Popen([*program, *size], stderr=subprocess.DEVNULL, start_new_session=True)
-    sleep(STARTING)
-    viewer = ViewerClient.connect(f"rerun+http://127.0.0.1:{PORT}/proxy")
     try:
+        viewer = _connected(f"rerun+http://127.0.0.1:{port}/proxy")
         viewer.open([str(recording)])
         sleep(LOADING)
         # Few colours do for lines on black and make it a third as large; this method keeps the rare ones.
@@ -141,6 +141,23 @@ def _photograph(recording: Path, name: str, animated: bool) -> None:
         # That program is a script, which starts the viewer itself.
         os.killpg(process.pid, signal.SIGTERM)
         process.wait()
+
+
+def _free_port() -> int:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])
+
+
+def _connected(url: str) -> ViewerClient:
+    end = monotonic() + STARTING
+    while True:
+        try:
+            return ViewerClient.connect(url)
+        except ConnectionError:
+            if monotonic() > end:
+                raise
+            sleep(0.5)
 
 
 def _screenshot(viewer: ViewerClient, width: int) -> Image.Image:
