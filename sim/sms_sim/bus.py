@@ -175,6 +175,7 @@ class Bus:
         self._moving = threading.Condition()
         self._ended = False
         self._solved = 0.0  # s of motion that are in the queue, or through it
+        self._full = False  # whether it ever held as much as it may
         self._ahead = 0.0
         can_devices, serial_devices = devices(system, directory, [clock] * len(system.sources))
         by_name = {source.name: source for source in system.sources}
@@ -201,7 +202,7 @@ class Bus:
 
     def await_taken(self) -> None:
         """Wait until samples have been taken as far ahead as they may be."""
-        while not (self._ended or self._solved >= self._ahead):
+        while not (self._ended or self._full or self._solved >= self._ahead):
             time.sleep(PATIENCE)
 
     def run(self, duration: float, speed: float) -> None:
@@ -209,7 +210,7 @@ class Bus:
         ahead = self._ahead
         start: float | None = None
         began = time.monotonic()
-        while ahead and not (self._ended or self._far_enough(time.monotonic() - began, duration, speed)):
+        while ahead and not (self._ended or self._full or self._far_enough(time.monotonic() - began, duration, speed)):
             time.sleep(PATIENCE)
         while True:
             with self._moving:
@@ -242,6 +243,7 @@ class Bus:
             for block in blocks:
                 with self._moving:
                     while self._queue and float(block.t[0]) - self._queue[0][0] > ahead:
+                        self._full = True
                         self._moving.wait(PATIENCE)
                 for sender in self._senders:
                     for k, (t, payloads) in enumerate(sender.payloads(block)):

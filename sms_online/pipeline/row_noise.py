@@ -31,10 +31,9 @@ STEPS = 2 * INSTANTS
 STEPS_A_HOP = STEPS // HOPS
 # Share of a row's variance that is added to it alone, for the rounding of the factorisation.
 OWN_SHARE = 1e-7
-# What the clock of a device is off by, 1σ, s, when it has been watched for CLOCK_KNOWN, s. The line behind it is told
-# by the least delayed samples, which reach the loop some 100 µs late, give or take 50; before, it is off by the more
-# the fewer they are.
-CLOCK_ERROR, CLOCK_KNOWN = 5e-5, 10.0
+# What the clock of a device is off by, 1σ, s, when it has been watched for CLOCK_KNOWN, s, and before. The line behind
+# it is told by the least delayed samples, which reach the loop some 100 µs late, give or take 50; few tell less.
+CLOCK_ERROR, YOUNG_CLOCK_ERROR, CLOCK_KNOWN = 5e-5, 1e-4, 10.0
 
 
 class RowNoise:
@@ -95,7 +94,7 @@ class RowNoise:
         c = np.multiply(kernel.swapaxes(1, 2), np.sqrt(self._step * sensor_density)[:, None], order="C")
         c = c.reshape(-1, n_v)
         self.late = self._lateness(kernel, window.rates)
-        late = CLOCK_ERROR * max(1.0, CLOCK_KNOWN / age) * self._by_clock(self.late)
+        late = (CLOCK_ERROR if age >= CLOCK_KNOWN else YOUNG_CLOCK_ERROR) * self._by_clock(self.late)
         out = []
         for k in range(len(self._before), -1, -1):
             first = k * STEPS_A_HOP * sensors

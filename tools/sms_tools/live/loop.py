@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sms_adapters.checkpoint import save_checkpoint, snapshot, write_checkpoint
+from sms_adapters.checkpoint import snapshot, write_checkpoint
 from sms_adapters.clock_merge import Merger
 from sms_adapters.recorder import Recorder
 from sms_adapters.recording import tick_time
@@ -90,18 +90,20 @@ class LiveSession:
             feed.start()
         for feed in self._feeds:
             feed.tried.wait(OPENING)
-        ready()
         # What is there by now stays, and looking through it for garbage would stop the loop for a tenth of a second.
         gc.collect()
         gc.freeze()
-        while not (interruption.requested or ended() or self._clock() >= duration):
-            interruption.sleep(tick_time(self._tick + 1) - self._clock())
-            if self._clock() >= tick_time(self._tick + 1):
-                yield from self._advance()
-            self._look_around()
-        gc.unfreeze()
-        for feed in self._feeds:
-            feed.stop()
+        ready()
+        try:
+            while not (interruption.requested or ended() or self._clock() >= duration):
+                interruption.sleep(tick_time(self._tick + 1) - self._clock())
+                if self._clock() >= tick_time(self._tick + 1):
+                    yield from self._advance()
+                self._look_around()
+        finally:
+            gc.unfreeze()
+            for feed in self._feeds:
+                feed.stop()
         # What arrived until then, also where the loop was behind.
         while tick_time(self._tick) <= self._clock():
             yield from self._advance()
@@ -150,9 +152,10 @@ class LiveSession:
             self._saving.start()
 
     def _write(self, state: Mapping[str, NDArray[Any]]) -> None:
-        """Write a checkpoint beside the loop, which goes on without."""
+        """Write a checkpoint; no disk is worth the session, which goes on and ends without."""
         try:
             write_checkpoint(self._directory / CHECKPOINT, state)
+            self._unsaved = ""
         except OSError as error:
             self._unsaved = error.strerror or str(error)
 
@@ -165,7 +168,7 @@ class LiveSession:
         """Write a checkpoint, now."""
         if self._saving.ident is not None:
             self._saving.join()
-        save_checkpoint(self._directory / CHECKPOINT, self._estimator)
+        self._write(snapshot(self._estimator))
 
     @property
     def warnings(self) -> list[str]:
