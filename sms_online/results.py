@@ -21,6 +21,8 @@ NORMAL_95 = 1.959963984540054
 LARGEST_RELATIVE_STD = 1.0 / 3.0
 # A joint whose unexplained torque reaches this share of the measured one lacks an effect, whatever the error bars say.
 LARGEST_RESIDUAL = 0.5
+# Rows that hold this many times their predicted deviation bend parameters by more than bars from the residual tell.
+LARGEST_WHITENED = 3.0
 # Mean square of rows over their predicted variance that noise alone may leave: the noise itself is estimated to 5 %.
 LARGEST_ROW_VARIANCE = 1.2
 # Noise in the columns matters where it pulls an estimate by more than this many standard deviations.
@@ -83,6 +85,13 @@ def doubts(parameters: list[dict[str, Any]], residual: dict[str, dict[str, float
         if relative is not None and relative > LARGEST_RESIDUAL:
             share = f"{100.0 * relative:.0f} % of the torque or force of {name} is not explained"
             out.append(f"{share}: the model lacks an effect there, and the parameters bend to replace it")
+    noise = {name: rows["whitened"] for name, rows in residual.items() if rows["whitened"] is not None}
+    worst = max(noise, key=lambda name: noise[name], default=None)
+    if worst is not None and noise[worst] > LARGEST_WHITENED:
+        out.append(
+            f"rows of {worst} hold {noise[worst]:.0f} times what the sensors' noise explains: the model or the samples "
+            "are wrong there, by more than error bars can tell"
+        )
     for p in parameters:
         if p["identifiable"] and p["upper95"] < 0.0 and p["name"].endswith(POSITIVE):
             out.append(

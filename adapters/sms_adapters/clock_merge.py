@@ -290,7 +290,8 @@ class Merger:
             if self.silences[k]:
                 found.append(f"{lane.name}: silent for more than {SILENCE:g} s, {self.silences[k]} times")
             if self.late[k]:
-                found.append(f"{lane.name}: {self.late[k]} samples skipped, they came more than {PATIENCE:g} s late")
+                late = f"{self.late[k]} samples skipped, they came more than {PATIENCE:g} s late"
+                found.append(f"{lane.name}: {late}: the machine is too slow, or the source")
             for channel, blanked in zip(lane.decoder.channels, guard.blanked.tolist(), strict=True):
                 if blanked:
                     found.append(f"{channel}: {blanked} samples skipped, the sensor stood still or at its limit")

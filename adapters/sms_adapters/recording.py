@@ -11,7 +11,7 @@ import numpy as np
 from sms_adapters.clock_lanes import merger
 from sms_adapters.clock_merge import TICK, TICK_MICROSECONDS
 from sms_adapters.raw import CanFrames, Raw
-from sms_adapters.session_log import CHECKPOINT, RecordedItems, from_microseconds, read_header
+from sms_adapters.session_log import CHECKPOINT, SYSTEM, RecordedItems, from_microseconds, read_header
 from sms_online.description.schema import System
 from sms_online.errors import InputError
 from sms_online.stream import Block
@@ -59,7 +59,8 @@ class Recording:
         names = [source.name for source in system.sources]
         if set(names) != set(self._header.sources):
             found = ", ".join(self._header.sources) or "none"
-            raise InputError(str(directory), "sources", found, f"those of the system: {', '.join(names) or 'none'}")
+            expected = f"those of the system: {', '.join(names) or 'none'}; --system {directory / SYSTEM} has its own"
+            raise InputError(str(directory), "sources", found, expected)
         self._merger = merger(system, system_directory, self._header.start)
 
     @property
