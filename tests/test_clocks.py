@@ -75,6 +75,17 @@ def test_a_jump_of_the_devices_clock_is_found_and_bridged(jump: float) -> None:
     np.testing.assert_allclose(times, t, rtol=0, atol=1e-4)
 
 
+def test_jumps_that_come_in_one_piece_lose_and_invent_no_sample() -> None:
+    """There and back within samples that are pushed together, as a loop with a backlog does."""
+    clock = DeviceClock(LATENCY)
+    t, device, arrival = pairs(1000.0, 8.0, 0.0, 0.0, seed=3)
+    jumped = device + np.where((t > 5.0) & (t < 5.1), 2.0, 0.0)
+    early = t < 4.5
+    times = [clock.push(jumped[part], arrival[part]) for part in (early, ~early)]
+    assert clock.counters.jumps == 2
+    assert sum(each.size for each in times) + clock.finish().size == t.size
+
+
 @pytest.mark.parametrize("wrong", [1e6, -1e6, 5.0, -5.0, 0.2, -0.2])
 def test_corrupt_stamps_are_dropped_and_move_nothing(wrong: float) -> None:
     t, device, arrival = pairs(200.0, 8.0, 20e-6, 0.1, seed=9)

@@ -154,18 +154,18 @@ class DeviceClock:
 
     def _sift(self, d: Array, a: Array) -> None:
         """Sample by sample, where a jump is in the air."""
-        first = self._held.size - d.size
         for k in range(d.size):
             one = slice(k, k + 1)
+            held = self._held.size - d.size + k  # where it is held: a jump takes those before it away
             if self._suspicious(d[one], a[one])[0]:
                 near = not self._suspects or abs(a[k] - d[k] - self._suspects[-1][1] + self._suspects[-1][0]) < JUMP
                 if not near:
-                    self._discard(first + k)
+                    self._discard(held)
                 self._suspects.append((float(d[k]), float(a[k])))
                 if len(self._suspects) == CONFIRMED:
-                    self._jump(first + k)
+                    self._jump(held)
             else:
-                self._discard(first + k)
+                self._discard(held)
                 self._take(d[one], a[one])
 
     def _discard(self, end: int) -> None:
