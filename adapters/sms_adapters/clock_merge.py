@@ -175,6 +175,7 @@ class Merger:
         self._heard = [np.inf for _ in lanes]  # tick of the last item of each source
         self._start = start
         self._first = np.inf  # arrival of the first item
+        self._silent = [False for _ in lanes]
         self._settled = False
         self._given = -np.inf  # time up to which rows are out
         self._guards = [StuckGuard([stream.columns for stream in lane.streams]) for lane in lanes]
@@ -188,10 +189,12 @@ class Merger:
         """Take what arrived up to the tick `now`, s, of each source, and return the rows that are in order by now."""
         for k, raw in enumerate(items):
             if not raw:
-                # Counted once, when it has just been too long.
-                self.silences[k] += int(now - TICK - self._heard[k] <= SILENCE < now - self._heard[k])
+                # Counted once, when it has been too long.
+                too_long = now - self._heard[k] > SILENCE
+                self.silences[k] += int(too_long and not self._silent[k])
+                self._silent[k] = too_long
             else:
-                self._heard[k] = now
+                self._heard[k], self._silent[k] = now, False
                 self._first = min(self._first, float(np.min([np.min(item.arrival) for item in raw])))
                 self._items[k] += raw
         if now < self._wake:
