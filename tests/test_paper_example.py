@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from keeping_tracker import KeepingTracker
 
-from sms_adapters.checkpoint import load_checkpoint, save_checkpoint
+from sms_adapters.checkpoint import load_checkpoint, snapshot, write_checkpoint
 from sms_adapters.system_file import load_system
 from sms_online.description.schema import Harmonic, Trajectory
 from sms_online.model.base_parameters import find_base_parameters
@@ -112,7 +112,7 @@ def test_result_does_not_depend_on_how_samples_arrive(
         parts.push(Block(block.t[start:stop], block.channels, block.values[start:stop]))
         if start < 9000 <= stop:
             # A session that goes on from a file is the same session.
-            save_checkpoint(checkpoint, parts)
+            write_checkpoint(checkpoint, snapshot(parts))
             parts = Estimator(load_system("paper-planar"), block.channels, "simulation")
             load_checkpoint(checkpoint, parts)
         start = stop

@@ -12,8 +12,8 @@ import pytest
 from numpy.testing import assert_array_equal
 from one_link import TEXT, one_link
 
+from sms_adapters import checkpoint
 from sms_adapters.capture import CaptureWriter
-from sms_adapters.checkpoint import load_checkpoint, save_checkpoint
 from sms_online.bound import STEP, Motion, MotionRecord, cramer_rao_bound, session_bound
 from sms_online.description.parse import describe
 from sms_online.description.schema import Sensor, System
@@ -138,8 +138,8 @@ def test_the_same_samples_give_the_same_bits_however_they_come(
     whole.finish()
     for piece in pieces(cuts[:4]):
         stopped.push(piece)
-    save_checkpoint(tmp_path / "half.npz", stopped)
-    load_checkpoint(tmp_path / "half.npz", resumed)
+    checkpoint.write_checkpoint(tmp_path / "half.npz", checkpoint.snapshot(stopped))
+    checkpoint.load_checkpoint(tmp_path / "half.npz", resumed)
     for piece in pieces(cuts[3:]):
         resumed.push(piece)
     resumed.finish()

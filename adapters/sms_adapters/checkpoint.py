@@ -22,11 +22,6 @@ IDENTITY = "identity"
 SEPARATOR = "/"
 
 
-def save_checkpoint(path: Path, estimator: Estimator) -> None:
-    """Write an estimator's state; the file is complete or not there."""
-    write_checkpoint(path, snapshot(estimator))
-
-
 def snapshot(estimator: Estimator) -> dict[str, NDArray[Any]]:
     """An estimator's state now, as arrays of their own: the estimator may go on before they are written."""
     arrays = {

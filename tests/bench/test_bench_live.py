@@ -23,7 +23,7 @@ import pytest
 from axis import AXIS, DAMPING, INERTIA
 
 from sms_adapters.capture import CaptureWriter
-from sms_adapters.checkpoint import save_checkpoint
+from sms_adapters.checkpoint import snapshot, write_checkpoint
 from sms_adapters.clock_lanes import merger
 from sms_adapters.clock_merge import TICK
 from sms_adapters.raw import CanFrames, Raw, SerialChunk, concatenate_frames
@@ -249,7 +249,7 @@ def test_a_day_at_full_speed(tmp_path: Path, balance: str) -> None:
             block = ours.advance(tick_time(tick), [[now[int(edges[-1]) :]]])
             if block is not None:
                 yield block
-            save_checkpoint(tmp_path / "checkpoint.npz", estimator)
+            write_checkpoint(tmp_path / "checkpoint.npz", snapshot(estimator))
             if k % max(1, rounds // 24) == 0 or k == rounds - 1:
                 hours, pi, std = (k + 1) * ROUND / 3.6e6, estimator.estimate().pi, standard_deviation(estimator)
                 shown = ", ".join(f"{p:.6f} ± {2 * s:.6f}" for p, s in zip(pi, std, strict=True))
