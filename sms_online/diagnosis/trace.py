@@ -41,6 +41,10 @@ ACTS = 0.01
 LARGEST_RATIO = 1.5
 # No law of a force is true to better than 0.3 %, and what it leaves of its own gain is no other effect on its rows.
 INEXACT = 1e-5
+# Dry friction changes its sign by creeping, not in a step, and repeats to a few percent: Armstrong-Hélouvry, Dupont and
+# Canudas de Wit, Automatica 30 (1994) 1083.
+INEXACT_DRY = 1e-3
+DRY = ("coulomb_friction", "stribeck_friction", "load_friction")
 # Share of a row's variance by which that of the effects chosen has to change for rows to be weighed anew.
 SMALL_CHANGE = 0.1
 # Effects that contain a simpler one, which is to be tried first, as is everything else: they refine a law.
@@ -225,8 +229,12 @@ class Tracing:
     def _excess(self, k: int, g: Gain) -> float:
         """Gain beyond what an absent candidate reaches, and beyond what the laws of those found are uncertain by."""
         acts = self._acts(k)
-        same = [taken for other, taken in self._taken.items() if other != k and np.any(acts & self._acts(other))]
-        return g.gain - max(threshold(FALSE_ALARM, self.trials, self._Z[k].shape[1]), INEXACT * max(same, default=0.0))
+        limit = threshold(FALSE_ALARM, self.trials, self._Z[k].shape[1])
+        for other, taken in self._taken.items():
+            if other != k and np.any(acts & self._acts(other)):
+                inexact = INEXACT_DRY if self.candidates[other].effect.name in DRY else INEXACT
+                limit = max(limit, inexact * taken)
+        return g.gain - limit
 
     def _acts(self, k: int) -> NDArray[np.bool_]:
         """Speeds (n_v,) in whose rows a candidate acts."""
@@ -271,7 +279,7 @@ class Tracing:
                 continue
             refine([*chosen, best], best)
             self._take([*chosen, best])
-            chosen = self._revised([*chosen, best])
+            chosen = self._revised([*chosen, best], refused)
             if frozenset(chosen) in seen:
                 break  # effects that replace each other in turn
             seen.add(frozenset(chosen))
@@ -301,17 +309,24 @@ class Tracing:
             if candidate.key not in taken | refused and (candidate.extends is None or candidate.extends in held)
         ]
 
-    def _revised(self, chosen: list[int]) -> list[int]:
-        """The same effects without those that the last one has made superfluous, each in its best form beside them."""
+    def _revised(self, chosen: list[int], refused: set[str]) -> list[int]:
+        """The same effects without those that the last one has made superfluous, each in its best form beside them.
+
+        What takes an effect's place has to lower the residual of held-out rows, as every effect has.
+        """
         for k in list(chosen):
             others = [other for other in chosen if other != k]
             gains = self.gains(others)
             # What refines a law is a step of its own, and in place of no other effect.
-            simple = [j for j in self._eligible(others, set()) if j == k or self.candidates[j].extends is None]
+            simple = [j for j in self._eligible(others, refused) if j == k or self.candidates[j].extends is None]
             best = self._preferred(gains, [*simple, k] if k not in simple else simple)
             if best is None or self._excess(k, gains[k]) <= 0.0:
                 chosen = others
-            elif best != k and not self._near(gains[k].gain, gains[best].gain):
+            elif (
+                best != k
+                and not self._near(gains[k].gain, gains[best].gain)
+                and self.improvement(others, best) >= LEAST_IMPROVEMENT
+            ):
                 chosen = [best if other == k else other for other in chosen]
         return chosen
 

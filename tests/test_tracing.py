@@ -1,0 +1,87 @@
+"""The search among candidates, on rows that are made up: noise is white, and a candidate is a column of numbers."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from sms_online.description.schema import Effect
+from sms_online.diagnosis.trace import Candidate, Tracing
+from sms_online.model.parameters import Parameter
+from sms_online.stream import Array
+
+WINDOWS, SPEEDS = 300, 2
+FITTED = np.arange(WINDOWS) < 200
+
+
+@dataclass
+class MadeUpRows:
+    """What the search asks of a session's rows: here independent of each other, with unit noise unless weighed."""
+
+    Y: Array
+    b: Array
+    floor: Array = field(default_factory=lambda: np.zeros((WINDOWS, SPEEDS)))
+    model: Any = field(
+        default_factory=lambda: SimpleNamespace(
+            layout=SimpleNamespace(n_v=SPEEDS), system=SimpleNamespace(effects=(), sample_rate=1000.0)
+        )
+    )
+
+    @property
+    def base(self) -> Any:
+        return SimpleNamespace(n=self.Y.shape[2])
+
+    @property
+    def count(self) -> int:
+        return WINDOWS
+
+    @property
+    def std(self) -> Array:
+        return np.ones_like(self.b)
+
+    def whiten(self, floor: Array) -> None:
+        self.floor = floor
+
+    def white(self, columns: Array) -> Array:
+        return np.asarray((columns / np.sqrt(1.0 + self.floor)[..., None]).reshape(WINDOWS * SPEEDS, -1))
+
+
+def _candidate(name: str, column: Array, where: str = "joint_1") -> Candidate:
+    columns = np.zeros((WINDOWS, SPEEDS, 1))
+    columns[:, 0, 0] = column
+    return Candidate(Effect(name=name, where=where), (Parameter(name, "", "N m", 0.0),), columns)
+
+
+def _found(candidates: list[Candidate], force: Array, seed: int) -> list[str]:
+    rng = np.random.default_rng(seed)
+    Y = rng.standard_normal((WINDOWS, SPEEDS, 3))
+    b = Y @ np.array([1.0, -2.0, 0.5]) + rng.standard_normal((WINDOWS, SPEEDS))
+    b[:, 0] += force
+    tracing = Tracing(MadeUpRows(Y, b), candidates, FITTED)  # type: ignore[arg-type]
+    return [tracing.candidates[k].effect.name for k in tracing.run(lambda chosen, k: None)]
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_what_does_not_hold_on_other_windows_takes_no_place(seed: int) -> None:
+    rng = np.random.default_rng(100 + seed)
+    lasting, early = rng.standard_normal((2, WINDOWS))
+    late = rng.standard_normal(WINDOWS)
+    # Something of the fitted windows alone, which gains more than what is there all the time.
+    passing = np.where(FITTED, early, 0.0)
+    column = np.where(FITTED, early, late)
+    found = _found(
+        [_candidate("torque_offset", column), _candidate("cogging", lasting)], 3.0 * passing + 1.5 * lasting, seed
+    )
+    assert found == ["cogging"]
+
+
+@pytest.mark.parametrize(("share", "second"), [(0.02, []), (0.1, ["cogging"])])
+def test_what_dry_friction_is_off_its_law_by_is_no_second_effect(share: float, second: list[str]) -> None:
+    t = np.linspace(0.0, 20.0, WINDOWS)
+    sign, other = np.sign(np.sin(2.0 * t)), np.sqrt(2.0) * np.sin(7.3 * t)
+    candidates = [_candidate("coulomb_friction", sign), _candidate("cogging", other)]
+    assert _found(candidates, 150.0 * (sign + share * other), 1) == ["coulomb_friction", *second]
