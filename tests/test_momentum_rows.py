@@ -13,6 +13,7 @@ from sms_online.description.parse import parse_system
 from sms_online.description.schema import System
 from sms_online.model.base_parameters import find_base_parameters
 from sms_online.model.model import Model
+from sms_online.pipeline import momentum_fit
 from sms_online.pipeline.estimator import Estimator
 from sms_online.pipeline.momentum_balance import COPIES, EXPONENT, MomentumBalance, Window
 from sms_online.pipeline.weak_form import test_function as weak_test_function
@@ -191,6 +192,28 @@ def test_a_session_restored_at_any_time_gives_the_same_bits(cut: float) -> None:
     second.push(Block(block.t[split:], block.channels, block.values[split:]))
     second.finish()
     assert results_document(second, 0.0, []) == results_document(fitted(block), 0.0, [])
+
+
+def test_a_session_restored_while_new_weights_are_told_windows_gives_the_same_bits(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(momentum_fit, "SAME_NOISE", 0.0)
+    monkeypatch.setattr(momentum_fit, "WARM_UP", 0.8)
+    block = axis_session(np.arange(1600) / 200.0, noise=1e-4)
+    warm = []
+    for cut in (2.5, 3.5, 4.5):
+        split = int(np.searchsorted(block.t, cut))
+        first = Estimator(parse_system(AXIS, "axis.toml"), block.channels, "axis")
+        first.push(Block(block.t[:split], block.channels, block.values[:split]))
+        saved = first.state()
+        warm.append(saved["momentum_fit"]["warm"] >= 0)
+        second = Estimator(parse_system(AXIS, "axis.toml"), block.channels, "axis")
+        second.restore(saved)
+        second.push(Block(block.t[split:], block.channels, block.values[split:]))
+        second.finish()
+        assert results_document(second, 0.0, []) == results_document(fitted(block), 0.0, [])
+    assert any(warm)
+    assert not all(warm)
 
 
 def test_the_nominal_values_of_a_description_never_enter_the_estimate() -> None:

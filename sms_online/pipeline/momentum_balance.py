@@ -75,6 +75,24 @@ class Window:
     half_width: int
 
 
+def windows_state(name: str, windows: list[Window]) -> dict[str, Any]:
+    """Windows as arrays, to be saved under names that begin with `name`."""
+    return {
+        f"{name}_place": np.array([(w.start, w.end, w.half_width) for w in windows], dtype=np.int64).reshape(-1, 3),
+        f"{name}_Y": np.array([w.Y for w in windows]),
+        f"{name}_b": np.array([w.b for w in windows]),
+    }
+
+
+def windows_from_state(name: str, state: Mapping[str, NDArray[Any]]) -> list[Window]:
+    """The windows that `windows_state` saved."""
+    places, columns, right = (state[f"{name}_{part}"] for part in ("place", "Y", "b"))
+    return [
+        Window(int(start), int(end), np.array(Y), np.array(b), int(half_width))
+        for (start, end, half_width), Y, b in zip(places, columns, right, strict=True)
+    ]
+
+
 def momentum_pattern(model: Model) -> NDArray[np.bool_]:
     """Entries (n_v, n_pi) of a weak-form row that the structure of the model does not make zero."""
     rng = np.random.default_rng(RANDOM_SEED)

@@ -2,9 +2,9 @@
 
 Weights follow from the sensors' noise and the parameters, never from residuals: those collapse where noise is high. The
 parameters come from the fit itself: the first windows that move are held back, fitted without weights and then with
-them; from then on the estimate so far is taken now and then. A start that is 70 % off gives the same answer. Where such
-a fit leaves more than noise, for it had to tell too many parameters apart without weights, the described values are
-tried as its start, and stay in the weights until the rows determine better ones.
+them; from then on the estimate so far is taken where it would weigh rows otherwise. A start that is 70 % off gives the
+same answer. Where such a fit leaves more than noise, for it had to tell too many parameters apart without weights, the
+described values are tried as its start, and stay in the weights until the rows determine better ones.
 
 Where rows leave clearly more than the sensors' noise, the model lacks something, and neighbouring rows that share noise
 almost fully must not be subtracted from each other as if that were all: what is left over counts as an error of each
@@ -15,6 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -22,12 +23,20 @@ from numpy.typing import NDArray
 
 from sms_online.model.base_parameters import BaseParameters
 from sms_online.model.model import Model
-from sms_online.pipeline.latency import LatencyColumns, SourceGroup
-from sms_online.pipeline.momentum_balance import COPIES, HOPS, INSTANTS, Instants, MomentumBalance, Window
-from sms_online.pipeline.row_noise import RowNoise, Whitener
-from sms_online.pipeline.sensitivity import Sensitivities
+from sms_online.pipeline.latency import SourceGroup
+from sms_online.pipeline.momentum_balance import (
+    COPIES,
+    HOPS,
+    INSTANTS,
+    Instants,
+    MomentumBalance,
+    Window,
+    windows_from_state,
+    windows_state,
+)
 from sms_online.pipeline.sensor_noise import FINEST, SensorNoise, noise_from_state, noise_state
 from sms_online.pipeline.smoothing import HALF_WIDTHS
+from sms_online.pipeline.weighing import Weighed, Weighing
 from sms_online.stream import Array
 
 # Motion before weights are made, s: at the usual width, four windows side by side.
@@ -57,9 +66,17 @@ UNSTEADY = 4.0
 BENDS = 100
 # Share of a joint's torque that a fit may leave for its weights to be used.
 LARGEST_UNEXPLAINED = 0.5
-# Time from one renewal of the weights to the next, s: it doubles from the first to the latest.
+# Time from one look at the weights to the next, s: it doubles from the first to the latest.
 FIRST_RENEWAL = 1.0
 LATEST_RENEWAL = 4.0
+# Weights are renewed where a speed's rows change by this share of their size, a sensor's density of noise by more than
+# what estimates of it scatter by, or what rows leave beyond noise by a share of the whole. Less is not worth it: chains
+# whose weights differ by the scatter of an estimate take some of that for information.
+SAME_ROWS = 2e-3
+SAME_NOISE = 0.25
+SAME_MISFIT = 0.1
+# Time that new weights are told windows before their rows are taken, s: see `weighing`.
+WARM_UP = 3.2
 # Singular values below this share of the largest, of columns scaled to unit length, are not solved for.
 RANK_TOLERANCE = 1e-10
 
@@ -104,15 +121,15 @@ class MomentumFit:
         self.base = base
         self._balance = balance
         self._solve = solve
-        self._sensitivities = Sensitivities(model, readings, balance.span / INSTANTS)
-        self._noise = RowNoise(model.layout.theta_m, balance.span, clocks)
-        self._late = LatencyColumns(sources)
-        self._whitener = Whitener(model.layout.n_v, COPIES * (base.n + 1) + len(sources))
+        self._new_weighing = partial(Weighing, model, base, balance, readings, sources, clocks)
+        self._weighing = self._new_weighing()
+        self._next: Weighing | None = None  # with new weights, that takes over when it has been told enough windows
+        self._warm = 0  # windows that it has been told
         self.weights: Array | None = None  # β (n,) behind the weights
         self.unexplained: int | None = None  # joint whose torque is least explained, where that forbids weights
-        self._since = 0  # windows since they were renewed
+        self._since = 0  # windows since they were looked at
         self._moving = 0
-        self._renewal = 0  # windows from one renewal to the next
+        self._renewal = 0  # windows from one look to the next
         self._sensor_noise: SensorNoise | None = None  # behind the weights
         # Mean squares of what noise does beyond first order, by the filter's width, and of how many windows.
         self._bends = {half_width: np.zeros(model.layout.n_v) for half_width in HALF_WIDTHS}
@@ -134,17 +151,19 @@ class MomentumFit:
     def _begin_segment(self) -> None:
         layout = self.model.layout
         self._held: list[Window] = []
-        self._recent: list[Window] = []  # the windows that the next one overlaps
         self._moving = 0
+        self._last = 0  # number of the first instant that a window to come asks for, at least
         self._first = 0  # number of the first instant kept
         self._x, self._v = np.empty((0, layout.n_x)), np.empty((0, layout.n_v))
         self._signals = np.empty((0, len(layout.q) + self.model.n_states))
-        self._sensitivities.forget(0)
-        self._forget_rows()
-
-    def _forget_rows(self) -> None:
-        self._noise.begin_segment()
-        self._whitener.begin_segment()
+        if self._next is not None:
+            # A chain that begins anew need not be warmed up.
+            self._weighing, self._next = self._next, None
+            self.weights = self._weighing.beta
+        if self.weights is not None:
+            weighing = self._weighing
+            assert weighing.sensor_noise is not None
+            weighing.begin(self.weights, weighing.sensor_noise, weighing.misfit, 0)
 
     def push(self, windows: list[Window], instants: list[Instants], noise: SensorNoise) -> list[WhiteRows]:
         """Rows of the windows that a push completed, and of those held back before."""
@@ -152,11 +171,10 @@ class MomentumFit:
         self._v = np.concatenate((self._v, *(piece.v for piece in instants)))
         self._signals = np.concatenate((self._signals, *(piece.signals for piece in instants)))
         if self.weights is not None:
-            self._renew(noise)
+            if windows:
+                self._look(noise, windows[0])
             self._tell()
             out = [self._white(window) for window in windows]
-            self._recent = [*self._recent, *windows][1 - HOPS :]
-            self._since += len(out)
         else:
             self._held += windows
             self._moving += sum(self._moves(window, noise) for window in windows)
@@ -169,6 +187,7 @@ class MomentumFit:
         """Begin with weights β (n,) that are known."""
         self.weights = weights
         self._sensor_noise = noise
+        self._weighing.begin(weights, noise, self.misfit, self._first)
         self._renewal = self._count(FIRST_RENEWAL)
 
     def flush(self, noise: SensorNoise) -> list[WhiteRows]:
@@ -192,7 +211,7 @@ class MomentumFit:
                 self.weights, self.misfit, self.unexplained = weights, misfit, None
         self._retell()
         out = [self._white(window) for window in self._held]
-        self._recent = self._held[1 - HOPS :]
+        self._since = 0
         self._renewal = self._count(FIRST_RENEWAL)
         self._held = []
         return out
@@ -243,28 +262,32 @@ class MomentumFit:
         inside = slice(window.start - self._first, window.start - self._first + INSTANTS + 1)
         return bool(np.any(np.ptp(self._x[inside], axis=0) > MOTION * noise.coordinates))
 
-    def _renew(self, noise: SensorNoise) -> None:
-        """Take the estimate and the noise so far for the weights of the windows to come, now and then.
+    def _look(self, noise: SensorNoise, window: Window) -> None:
+        """Now and then, with the window to come: begin to weigh with the estimate and the noise so far, if it matters.
 
-        Rows of windows that overlap are subtracted from each other down to what their noise does not share, so the
-        windows behind the next one are weighed anew too: a hundredth of difference between their weights would pass for
-        information.
+        The chain so far goes on until the new one has been told enough windows.
         """
-        if self._since < self._renewal:
+        if self._next is not None or self._since < self._renewal:
             return
         beta = self._solve()
-        self.weights = np.where(np.isnan(beta), self._known_weights, beta)
-        self._sensor_noise = noise
-        self._judge(self.weights)
+        beta = np.where(np.isnan(beta), self._known_weights, beta)
         self._since = 0
         self._renewal = min(2 * self._renewal, self._count(LATEST_RENEWAL))
-        counted = self.plain_gram, self.plain_windows, dict(self._bends), dict(self._bent)
-        self._sensitivities.forget(self._first)
-        self._forget_rows()
-        self._tell()
-        for window in self._recent:
-            self._white(window)
-        self.plain_gram, self.plain_windows, self._bends, self._bent = counted
+        self._judge(beta)
+        if self._matters(beta, noise):
+            self._next, self._warm = self._new_weighing(), 0
+            self._next.begin(beta, noise, self.misfit, window.start)
+
+    def _matters(self, beta: Array, noise: SensorNoise) -> bool:
+        """Whether β (n,), the noise and the misfit of now would weigh rows otherwise."""
+        used = self._weighing
+        assert used.sensor_noise is not None
+        squares = np.einsum("vii->vi", self.plain_gram)[:, :-1]
+        changed, size = (np.sqrt(squares @ values**2) for values in (beta - used.beta, beta))
+        densities = [(noise.sensors, used.sensor_noise.sensors), (noise.torque, used.sensor_noise.torque)]
+        louder = any(np.any(np.abs(now - then) > SAME_NOISE * then) for now, then in densities)
+        misfit = np.abs(self.misfit - used.misfit) > SAME_MISFIT * (1.0 + used.misfit)
+        return bool(np.any(changed > SAME_ROWS * size) or louder or misfit.any())
 
     def _judge(self, beta: Array) -> None:
         """What rows leave of β (n,) beyond their predicted variance so far, where that is no accident."""
@@ -282,15 +305,18 @@ class MomentumFit:
         self.plain_gram = np.zeros_like(self.plain_gram)
         self.plain_windows = 0
         self._bent = dict.fromkeys(HALF_WIDTHS, 0)
-        self._sensitivities.forget(self._first)
-        self._forget_rows()
+        assert self._sensor_noise is not None
+        self._weighing.begin(self._known_weights, self._sensor_noise, self.misfit, self._first)
         self._tell()
 
     def _tell(self) -> None:
-        """Sensitivities of the instants that have none yet."""
-        fresh = self._sensitivities.next_instant - self._first
-        pi = self.base.physical_values(self._known_weights)
-        self._sensitivities.tell(pi, self._x[fresh:], self._v[fresh:], self._signals[fresh:])
+        """Have the states of the instants known to who weighs."""
+        for weighing in self._weighings:
+            weighing.tell(self._first, self._x, self._v, self._signals)
+
+    @property
+    def _weighings(self) -> list[Weighing]:
+        return [self._weighing] if self._next is None else [self._weighing, self._next]
 
     def _dense(self, window: Window) -> Array:
         """[Y b] (copies, n_v, n + 1)."""
@@ -301,10 +327,6 @@ class MomentumFit:
 
     def _white(self, window: Window) -> WhiteRows:
         n_v = self.model.layout.n_v
-        noise, sensitivity = self._sensor_noise, self._sensitivities.window(window.start)
-        assert noise is not None
-        age = window.end / self._balance.sample_rate
-        covariances = self._noise.covariance(sensitivity, noise.sensors, noise.torque, age)
         rows = self._dense(window)
         residual = rows[..., -1] - rows[..., :-1] @ self._known_weights
         # What noise does beyond first order, which nothing propagates: a sample of it for every row.
@@ -318,33 +340,42 @@ class MomentumFit:
         rounding = (FINEST * self._largest) ** 2 + np.finfo(np.float64).tiny
         # A narrow filter lets through no less than the wide ones do, however few windows it has been used for.
         bent = np.max([mean for wide, mean in self._bends.items() if wide >= M], axis=0)
-        covariances[-1][np.diag_indices(n_v)] += bent + rounding
-        variance = np.diag(covariances[-1]).copy()
-        plain = rows[0] / np.sqrt(variance)[:, None]
+        weighed = self._weigh(window, rows.swapaxes(0, 1).reshape(n_v, -1), bent + rounding)
+        plain = rows[0] / np.sqrt(np.diag(weighed.noise))[:, None]
         gram = plain[:, :, None] * plain[:, None, :]
         gram += self.plain_gram
         self.plain_gram = gram
         self.plain_windows += 1
-        of_noise = covariances[-1] + np.diag(UNSTEADY * bend**2)
-        covariances[-1][np.diag_indices(n_v)] += self.misfit * variance
-        side_by_side = rows.swapaxes(0, 1).reshape(n_v, -1)
-        if len(self._late):
-            side_by_side = np.concatenate((side_by_side, self._late.of(self._noise.late)), axis=1)
-        whitened = self._whitener.push(covariances, side_by_side)
-        late = whitened[:, COPIES * rows.shape[2] :]
-        white = whitened[:, : COPIES * rows.shape[2]].reshape(n_v, COPIES, -1).swapaxes(0, 1)
-        own = covariances[-1] + np.diag(UNSTEADY * bend**2)
-        return WhiteRows(white[0], white[1:], rows[0], own, of_noise, window.end, late)
+        white = weighed.rows.reshape(n_v, COPIES, -1).swapaxes(0, 1)
+        unsteady = np.diag(UNSTEADY * bend**2)
+        return WhiteRows(
+            white[0], white[1:], rows[0], weighed.covariance + unsteady, weighed.noise + unsteady, window.end,
+            weighed.late,
+        )  # fmt: skip
+
+    def _weigh(self, window: Window, rows: Array, errors: Array) -> Weighed:
+        """Rows (n_v, width) of the next window; the weighing to come is told them too, and then may take over."""
+        self._last = window.start
+        self._since += 1
+        weighed = self._weighing.push(window, rows, errors)
+        if self._next is not None:
+            self._next.push(window, rows, errors)
+            self._warm += 1
+            if self._warm >= self._count(WARM_UP):
+                self._weighing, self._next = self._next, None
+                self.weights = self._weighing.beta
+                self._since = 0
+        return weighed
 
     def _forget_instants(self) -> None:
         """Drop the states that no window to come asks for."""
-        kept = self._held or self._recent
-        needed = kept[0].start if kept else self._first
+        needed = max(self._first, self._held[0].start if self._held else self._last)
         drop = needed - self._first
         self._first = needed
         self._x, self._v, self._signals = self._x[drop:], self._v[drop:], self._signals[drop:]
         if self.weights is not None:
-            self._sensitivities.drop(needed)
+            for weighing in self._weighings:
+                weighing.drop(needed)
 
     def state(self) -> dict[str, Any]:
         """What `restore` needs to continue."""
@@ -354,9 +385,10 @@ class MomentumFit:
             "bends": np.array([*self._bends.values()]), "bent": np.array([*self._bent.values()]),
             "unexplained": -1 if self.unexplained is None else self.unexplained,
             "largest": self._largest, "misfit": self.misfit, "plain_gram": self.plain_gram,
-            "plain_windows": self.plain_windows, "renewal": self._renewal, **self._noise.state(),
-            **self._whitener.state(), **self._sensitivities.state(), **_packed("held", self._held),
-            **_packed("recent", self._recent), **noise_state("steady", self._sensor_noise),
+            "plain_windows": self.plain_windows, "renewal": self._renewal, "last": self._last,
+            "warm": -1 if self._next is None else self._warm, **self._weighing.state(), **windows_state("held", self._held),
+            **({} if self._next is None else {f"next_{name}": value for name, value in self._next.state().items()}),
+            **noise_state("steady", self._sensor_noise),
         }  # fmt: skip
 
     def restore(self, state: Mapping[str, NDArray[Any]]) -> None:
@@ -364,34 +396,20 @@ class MomentumFit:
         self.weights = np.array(state["weights"]) if state["weights"].size else None
         self._since, self._moving, self._first = int(state["since"]), int(state["moving"]), int(state["first"])
         self._x, self._v, self._signals = (np.array(state[name]) for name in ("x", "v", "signals"))
-        self._sensitivities.restore(state)
         self._largest = np.array(state["largest"])
         self._bends = dict(zip(HALF_WIDTHS, np.array(state["bends"]), strict=True))
         self._bent = dict(zip(HALF_WIDTHS, state["bent"].tolist(), strict=True))
         self.misfit = np.array(state["misfit"])
         self.unexplained = None if state["unexplained"] < 0 else int(state["unexplained"])
         self.plain_gram, self.plain_windows = np.array(state["plain_gram"]), int(state["plain_windows"])
-        self._held, self._recent = _unpacked("held", state), _unpacked("recent", state)
-        self._renewal = int(state["renewal"])
+        self._held = windows_from_state("held", state)
+        self._renewal, self._last = int(state["renewal"]), int(state["last"])
         self._sensor_noise = noise_from_state("steady", state)
-        self._noise.restore(state)
-        self._whitener.restore(state)
-
-
-def _packed(name: str, windows: list[Window]) -> dict[str, Any]:
-    return {
-        f"{name}_place": np.array([(w.start, w.end, w.half_width) for w in windows], dtype=np.int64).reshape(-1, 3),
-        f"{name}_Y": np.array([w.Y for w in windows]),
-        f"{name}_b": np.array([w.b for w in windows]),
-    }
-
-
-def _unpacked(name: str, state: Mapping[str, NDArray[Any]]) -> list[Window]:
-    places, columns, right = (state[f"{name}_{part}"] for part in ("place", "Y", "b"))
-    return [
-        Window(int(start), int(end), np.array(Y), np.array(b), int(half_width))
-        for (start, end, half_width), Y, b in zip(places, columns, right, strict=True)
-    ]
+        self._weighing.restore(state)
+        self._next = None
+        if state["warm"] >= 0:
+            self._next, self._warm = self._new_weighing(), int(state["warm"])
+            self._next.restore({name[5:]: value for name, value in state.items() if name.startswith("next_")})
 
 
 def _least_squares(rows: Array) -> tuple[Array, NDArray[np.bool_]]:

@@ -25,6 +25,9 @@ STILL_FALLING = 0.97
 EQUAL_STEPS = 1e-3
 # Median absolute deviation of a unit normal distribution.
 NORMAL_MAD = 0.674489750196082
+# Differences beyond so many standard deviations are jumps, and the variance of a unit normal distribution within them.
+OUTLIER = 3.0
+NORMAL_INSIDE = 0.9733369246625415
 # Fewer levels than this may be a switched command rather than a measured quantity on a grid of its sensor.
 LEAST_LEVELS = 8
 # Steps are multiples of one quantum when none is further than this share of it from one. A thousand steps of a
@@ -35,11 +38,11 @@ QUANTUM_TOLERANCE = 1e-2
 def noise_std(values: Array, times: Array | None = None) -> Array:
     """1σ of the white noise of each channel, (C,), from consecutive samples, values (B, C).
 
-    times (B,): their instants, s, ascending; None on a uniform grid. The spread is the median absolute deviation of the
-    differences, so that a few jumps do not count; where more than half of the differences vanish it is their root mean
-    square. A channel whose values lie on a grid of width r has at least the rounding noise r/√12 (and up to twice that
-    where it creeps from level to level). A constant channel has none. Scatter of the estimate about 5 % over 1000
-    samples.
+    times (B,): their instants, s, ascending; None on a uniform grid. The spread is the root mean square of the
+    differences within three standard deviations, told by their median absolute deviation: a few jumps do not count.
+    Where more than half of the differences vanish it is their plain root mean square. A channel whose values lie on a
+    grid of width r has at least the rounding noise r/√12 (and up to twice that where it creeps from level to level). A
+    constant channel has none. Scatter of the estimate about 3.5 % over 1000 samples.
     Limitations: a signal above f_s / 6 counts as noise; noise that a sensor has low-passed is seen only by its
     level there.
     Raises ValueError with fewer than MAX_ORDER + 2 samples.
@@ -107,6 +110,10 @@ def _spread(difference: Array) -> Array:
     # The upper median by partition: several times faster than numpy.median, and all the same over so many samples.
     middle = magnitude.shape[0] // 2
     robust: Array = np.partition(magnitude.T.copy(), middle, axis=1)[:, middle] / NORMAL_MAD
+    # The root mean square of what is no outlier by it scatters by a quarter less.
+    inside = magnitude <= OUTLIER * robust
+    mean_square = np.sum(np.square(magnitude), axis=0, where=inside) / np.maximum(1, np.count_nonzero(inside, axis=0))
+    robust = np.sqrt(mean_square / NORMAL_INSIDE)
     still = robust == 0.0
     robust[still] = np.sqrt(np.mean(magnitude[:, still] ** 2, axis=0))
     return robust

@@ -1,0 +1,117 @@
+"""Windows weighed one after the other with the same parameters: a chain of rows, each told apart from all before it.
+
+What rows of neighbouring windows do not share is what they tell, and a row is told apart from the nine windows that
+overlap its own better with what these were themselves told apart from: the noise is a moving average whose sum over
+all windows nearly vanishes, and such a one is foreseen from its whole past only. A chain that begins anew knows less
+for a second or two, and calls its rows independent of those before, which they are not.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sms_online.model.base_parameters import BaseParameters
+from sms_online.model.model import Model
+from sms_online.pipeline.latency import LatencyColumns, SourceGroup
+from sms_online.pipeline.momentum_balance import COPIES, INSTANTS, MomentumBalance, Window
+from sms_online.pipeline.row_noise import RowNoise, Whitener
+from sms_online.pipeline.sensitivity import Sensitivities
+from sms_online.pipeline.sensor_noise import SensorNoise, noise_from_state, noise_state
+from sms_online.stream import Array
+
+
+@dataclass(frozen=True)
+class Weighed:
+    """A window's rows (n_v, width), independent of all before and of each other, errors of unit variance.
+
+    late (n_v, G): columns of the sources' latencies, likewise. noise (n_v, n_v): covariance of the rows as they came,
+    as far as it is noise; covariance (n_v, n_v): with what the model lacks.
+    """
+
+    rows: Array
+    late: Array
+    noise: Array
+    covariance: Array
+
+
+class Weighing:
+    """Weighs windows with parameters β (n,), noise of the sensors, and a misfit (n_v,), see `begin`.
+
+    readings, sources, clocks: see `MomentumFit`.
+    """
+
+    def __init__(
+        self,
+        model: Model,
+        base: BaseParameters,
+        balance: MomentumBalance,
+        readings: Callable[[Array], Array],
+        sources: Sequence[SourceGroup],
+        clocks: Sequence[SourceGroup],
+    ) -> None:
+        n_v = model.layout.n_v
+        self._base = base
+        self._sample_rate = balance.sample_rate
+        self._sensitivities = Sensitivities(model, readings, balance.span / INSTANTS)
+        self._noise = RowNoise(model.layout.theta_m, balance.span, clocks)
+        self._late = LatencyColumns(sources)
+        self._whitener = Whitener(n_v, COPIES * (base.n + 1) + len(sources))
+        self.beta, self.misfit = np.zeros(base.n), np.zeros(n_v)
+        self.sensor_noise: SensorNoise | None = None
+
+    def begin(self, beta: Array, noise: SensorNoise, misfit: Array, instant: int) -> None:
+        """Begin a chain with the window that starts at an instant; no window before shares samples with it.
+
+        misfit (n_v,): variance of what the model lacks in each row, over that of the noise.
+        """
+        self.beta, self.sensor_noise, self.misfit = beta, noise, misfit
+        self._sensitivities.forget(instant)
+        self._noise.begin_segment()
+        self._whitener.begin_segment()
+
+    def tell(self, first: int, x: Array, v: Array, signals: Array) -> None:
+        """Take the states (K, ·) of the instants from number `first` on, of which it needs those not told yet."""
+        fresh = self._sensitivities.next_instant - first
+        pi = self._base.physical_values(self.beta)
+        self._sensitivities.tell(pi, x[fresh:], v[fresh:], signals[fresh:])
+
+    def drop(self, instant: int) -> None:
+        """Forget what no window that starts at an instant or later asks for."""
+        self._sensitivities.drop(instant)
+
+    def push(self, window: Window, rows: Array, errors: Array) -> Weighed:
+        """The next window's rows (n_v, width); errors (n_v,): variance of each that nothing propagates."""
+        assert self.sensor_noise is not None
+        sensitivity = self._sensitivities.window(window.start)
+        age = window.end / self._sample_rate
+        covariances = self._noise.covariance(sensitivity, self.sensor_noise.sensors, self.sensor_noise.torque, age)
+        own = covariances[-1]
+        diagonal = np.einsum("ii->i", own)
+        diagonal += errors
+        noise = own.copy()
+        diagonal += self.misfit * diagonal
+        width = rows.shape[1]
+        if len(self._late):
+            rows = np.concatenate((rows, self._late.of(self._noise.late)), axis=1)
+        white = self._whitener.push(covariances, rows)
+        return Weighed(white[:, :width], white[:, width:], noise, own)
+
+    def state(self) -> dict[str, Any]:
+        """What `restore` needs to continue."""
+        return {
+            "beta": self.beta, "weighed_misfit": self.misfit, **self._noise.state(), **self._whitener.state(),
+            **self._sensitivities.state(), **noise_state("weighed", self.sensor_noise),
+        }  # fmt: skip
+
+    def restore(self, state: Mapping[str, NDArray[Any]]) -> None:
+        """Continue from a saved state."""
+        self.beta, self.misfit = np.array(state["beta"]), np.array(state["weighed_misfit"])
+        self._sensitivities.restore(state)
+        self._noise.restore(state)
+        self._whitener.restore(state)
+        self.sensor_noise = noise_from_state("weighed", state)
