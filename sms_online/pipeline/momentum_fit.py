@@ -386,7 +386,8 @@ class MomentumFit:
             "unexplained": -1 if self.unexplained is None else self.unexplained,
             "largest": self._largest, "misfit": self.misfit, "plain_gram": self.plain_gram,
             "plain_windows": self.plain_windows, "renewal": self._renewal, "last": self._last,
-            "warm": -1 if self._next is None else self._warm, **self._weighing.state(), **windows_state("held", self._held),
+            "warm": -1 if self._next is None else self._warm, **self._weighing.state(),
+            **windows_state("held", self._held),
             **({} if self._next is None else {f"next_{name}": value for name, value in self._next.state().items()}),
             **noise_state("steady", self._sensor_noise),
         }  # fmt: skip
