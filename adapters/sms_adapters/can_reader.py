@@ -22,6 +22,8 @@ from sms_adapters.raw import (
     Clock,
     LostDevice,
     Raw,
+    Turn,
+    at_once,
     one_line,
 )
 from sms_online.description.schema import CanBus
@@ -67,14 +69,16 @@ class CanReader:
     What an interface received but could not make a frame of is delivered as an error frame, so that it is recorded and
     counted. Bus-off is a lost device: opening it again starts the controller again.
 
-    period: s; frames that the host stamps are fetched so often, shortly before its multiples on the clock.
+    period: s; frames that the host stamps are fetched so often, shortly before its multiples on the clock. turn: called
+    before each fetch.
     """
 
-    def __init__(self, source: CanBus, clock: Clock, period: float = TICK) -> None:
+    def __init__(self, source: CanBus, clock: Clock, period: float = TICK, turn: Turn = at_once) -> None:
         self.name = source.name
         self._source = source
         self._clock = clock
         self._period = period
+        self._turn = turn
         self._bus: can.BusABC | None = None
         self._garbled = 0
         self._host_stamped = source.interface in HOST_STAMPED
@@ -100,6 +104,7 @@ class CanReader:
             time.sleep(-(self._clock() + BEFORE_TICK) % self._period)
         else:
             time.sleep(max(0.0, PROMPT_INTERVAL - (time.monotonic() - self._last_read)))
+        self._turn()
         messages: list[can.Message] = []
         arrivals: list[float] = []
         while self._lost is None and len(messages) < MOST_FRAMES:

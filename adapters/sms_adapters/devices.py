@@ -8,17 +8,17 @@ from sms_adapters.can_decoder import CanDecoder
 from sms_adapters.can_reader import CanReader
 from sms_adapters.can_signals import wanted_messages
 from sms_adapters.canopen_signals import pdo_messages
-from sms_adapters.raw import Clock, Decoder, Reader
+from sms_adapters.raw import Clock, Decoder, Reader, Turn, at_once
 from sms_adapters.serial_decoder import FrameDecoder, LineDecoder
 from sms_adapters.serial_reader import SerialReader
 from sms_online.description.schema import CanopenSource, CanSource, SerialFrames, Source
 
 
-def make_reader(source: Source, clock: Clock) -> Reader:
-    """The reader of a source's device, not yet open; clock: of the session."""
+def make_reader(source: Source, clock: Clock, turn: Turn = at_once) -> Reader:
+    """The reader of a source's device, not yet open; clock: of the session. turn: called before each fetch."""
     if isinstance(source, CanSource | CanopenSource):
-        return CanReader(source, clock)
-    return SerialReader(source, clock)
+        return CanReader(source, clock, turn=turn)
+    return SerialReader(source, clock, turn)
 
 
 def make_decoder(source: Source, directory: Path | None) -> Decoder:

@@ -24,7 +24,13 @@ MOST_BYTES = 64
 
 # The session's clock: s, not decreasing.
 Clock = Callable[[], float]
+# What a reader calls before it fetches what has come: it may wait a little, while somebody else needs the interpreter.
+Turn = Callable[[], None]
 DecoderState = dict[str, NDArray[Any]]
+
+
+def at_once() -> None:
+    """The turn of a reader that has nobody to wait for."""
 
 
 @dataclass(frozen=True)

@@ -7,7 +7,7 @@ import select
 
 import serial
 
-from sms_adapters.raw import Clock, LostDevice, Raw, SerialChunk, one_line
+from sms_adapters.raw import Clock, LostDevice, Raw, SerialChunk, Turn, at_once, one_line
 from sms_online.description.schema import SerialPort
 
 # Most bytes of one read, which bounds what a flooded port can keep in memory: a second at 10 Mbit/s.
@@ -17,10 +17,11 @@ MOST_BYTES_READ = 1 << 20
 class SerialReader:
     """Bytes of a serial port, or of a URL that pyserial knows: a `Reader`; after opening it begins with a break."""
 
-    def __init__(self, source: SerialPort, clock: Clock) -> None:
+    def __init__(self, source: SerialPort, clock: Clock, turn: Turn = at_once) -> None:
         self.name = source.name
         self._source = source
         self._clock = clock
+        self._turn = turn
         self._port: serial.Serial | None = None
         self._opened = False  # and nothing read yet
 
@@ -52,14 +53,14 @@ class SerialReader:
         opened, self._opened = self._opened, False
         return chunks if opened else chunks[1:]
 
-    @staticmethod
-    def _bytes(port: serial.Serial, timeout: float) -> bytes:
+    def _bytes(self, port: serial.Serial, timeout: float) -> bytes:
         """What has come, waiting at most `timeout` s for its first byte."""
         if os.name == "posix" and type(port) is serial.Serial:
             # At every system call another thread may take the interpreter for a millisecond: two will do, pyserial
             # makes five.
             if not select.select([port.fileno()], [], [], timeout)[0]:
                 return b""
+            self._turn()
             try:
                 data = os.read(port.fileno(), MOST_BYTES_READ)
             except BlockingIOError:
@@ -70,6 +71,7 @@ class SerialReader:
         if timeout != port.timeout:  # setting it is a system call
             port.timeout = timeout
         first: bytes = port.read(1)
+        self._turn()
         # The rest in one call; what came with the first byte is there by now.
         if first and (waiting := port.in_waiting):
             return first + bytes(port.read(min(waiting, MOST_BYTES_READ)))

@@ -20,10 +20,33 @@ READ_TIMEOUT = 0.1
 FIRST_RETRY, LONGEST_RETRY = 0.1, 1.0
 # Where the loop is behind, a reader has so long to fetch what came before a tick, s, and is looked at so often.
 FETCHING, LOOK = 0.05, 5e-4
+# A reader leaves what has come with the driver while the loop computes, at most so long, s: a block takes less, and the
+# usual buffers of a socket hold 300 frames.
+COMPUTING = 0.02
 # Items that may wait for the estimator: a dozen seconds of a busy bus, for the first fit of the momentum balance takes
 # one or two. What comes when it is full is dropped: the samples that wait are then without a gap, which many small ones
 # would be worth nothing.
 MOST_WAITING = 65536
+
+
+class Interpreter:
+    """Who has the interpreter: the loop while it computes, for at every system call of a reader another thread may take
+    it for a millisecond, and both would be slower; what has come waits in the driver. Used as a context by the loop.
+    """
+
+    def __init__(self) -> None:
+        self._free = threading.Event()
+        self._free.set()
+
+    def __enter__(self) -> None:
+        self._free.clear()
+
+    def __exit__(self, *error: object) -> None:
+        self._free.set()
+
+    def await_free(self) -> None:
+        """Wait until the loop does not compute, for COMPUTING s at most."""
+        self._free.wait(COMPUTING)
 
 
 class SessionClock:

@@ -20,7 +20,7 @@ from sms_online.pipeline.estimator import Estimator
 from sms_online.results import standard_deviation
 from sms_online.stream import Block
 from sms_tools.interruption import Interruption
-from sms_tools.live.feed import READ_TIMEOUT, Feed, SessionClock
+from sms_tools.live.feed import READ_TIMEOUT, Feed, Interpreter, SessionClock
 from sms_tools.live.latency import Latencies
 from sms_tools.live.status import Leading, News, StatusWriter
 from sms_tools.session import unstated_latency
@@ -39,7 +39,8 @@ LEADING = 4
 class LiveSession:
     """Feeds, merger and estimator of one session, until it is interrupted.
 
-    start: of the session's clock in the estimator's time, s. directory: where checkpoints go, which exists.
+    start: of the session's clock in the estimator's time, s. directory: where checkpoints go, which exists. interpreter:
+    which the readers leave to the loop.
     """
 
     def __init__(
@@ -52,6 +53,7 @@ class LiveSession:
         directory: Path,
         recorder: Recorder | None = None,
         status: StatusWriter | None = None,
+        interpreter: Interpreter | None = None,
     ) -> None:
         self.latencies = Latencies()
         self.notices: Callable[[], Sequence[str]] = tuple  # further lines of the status
@@ -65,6 +67,7 @@ class LiveSession:
         self._directory = directory
         self._recorder = recorder
         self._status = status
+        self._interpreter = Interpreter() if interpreter is None else interpreter
         self._tick = 0
         self._looked = 0.0
         self._said = 0.0
@@ -128,12 +131,13 @@ class LiveSession:
                 feed.await_fetched(behind)
         items = [feed.drain(tick) for feed in self._feeds]
         started = time.perf_counter()
-        block = self._merger.advance(tick, items)
-        if block is not None:
-            yield block
-            newest = self._estimator.newest_row
-            if np.isfinite(newest):
-                self.latencies.add(self._clock() + self._start, newest)
+        with self._interpreter:
+            block = self._merger.advance(tick, items)
+            if block is not None:
+                yield block
+        newest = self._estimator.newest_row
+        if block is not None and np.isfinite(newest):
+            self.latencies.add(self._clock() + self._start, newest)
         self.busy += time.perf_counter() - started
 
     def _look_around(self) -> None:

@@ -17,7 +17,7 @@ from sms_online.description.parse import shipped_systems, shipped_text
 from sms_online.description.schema import System
 from sms_online.errors import InputError
 from sms_online.pipeline.estimator import Estimator
-from sms_tools.live.feed import Feed, SessionClock, kind_of
+from sms_tools.live.feed import Feed, Interpreter, SessionClock, kind_of
 from sms_tools.live.loop import CHECKPOINT, LiveSession
 from sms_tools.live.status import StatusWriter
 from sms_tools.session import new_estimator
@@ -68,9 +68,11 @@ def open_testbed(
     recorder = Recorder(directory, header, system_files(name, system))
     if resume is not None:
         shutil.copyfile(resume / CHECKPOINT, directory / RESUMED_FROM)
-    feeds = [Feed(make_reader(source, clock), recorder) for source in system.sources]
+    interpreter = Interpreter()
+    feeds = [Feed(make_reader(source, clock, interpreter.await_free), recorder) for source in system.sources]
     merged = merger(system, folder, start)
-    return LiveSession(clock, feeds, merged, estimator, start, directory, recorder, status), estimator, merged
+    session = LiveSession(clock, feeds, merged, estimator, start, directory, recorder, status, interpreter)
+    return session, estimator, merged
 
 
 def resumed_start(resume: Path, estimator: Estimator, epoch: int) -> float:
