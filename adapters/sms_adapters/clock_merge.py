@@ -33,8 +33,9 @@ PATIENCE = 0.3
 SILENCE = 1.0
 # At the start all wait until the clocks of all sources are known, at most so long, s.
 START_PATIENCE = 3.0
-# Rows are asked for this much before they are due by what the last ones waited, s: so much do delays scatter.
-EARLY = 4e-3
+# Rows are asked for this much before they are due by the delays of the last ones, s: half of what delays scatter by, for
+# asking in vain costs as much as asking, and asking late costs a tick.
+EARLY = 1e-3
 
 
 @dataclass(frozen=True)
@@ -159,6 +160,13 @@ class SourceLane:
         return found
 
 
+def _arrivals(item: Raw) -> tuple[float, float]:
+    """Of the first and of the last that an item holds, s."""
+    if isinstance(item, CanFrames):
+        return float(item.arrival[0]), float(item.arrival[-1])
+    return item.arrival, item.arrival
+
+
 class Merger:
     """Rows of all sources in order of time, from raw items by the tick.
 
@@ -181,7 +189,7 @@ class Merger:
         self._guards = [StuckGuard([stream.columns for stream in lane.streams]) for lane in lanes]
         self._steps = steps
         self._first_row: float | None = None  # its time
-        self._wake = -np.inf  # tick before which no row is of use
+        self._lag = [np.inf for _ in lanes]  # from the newest sample of each source to its last item
         self._items: list[list[Raw]] = [[] for _ in lanes]
         self._waiting = [(np.empty(0), np.empty((0, len(lane.decoder.channels)))) for lane in lanes]
 
@@ -195,16 +203,22 @@ class Merger:
                 self._silent[k] = too_long
             else:
                 self._heard[k], self._silent[k] = now, False
-                self._first = min(self._first, float(np.min([np.min(item.arrival) for item in raw])))
+                self._first = min(self._first, _arrivals(raw[0])[0])
                 self._items[k] += raw
-        if now < self._wake:
-            return None
-        self._decode()
-        due = self._due(now)
-        block = self._give(due)
         if self._steps is not None and self._first_row is not None:
-            self._wake = self._first_row + self._steps.after(due - self._first_row) + (now - due) - EARLY
-        return block
+            wanted = self._first_row + self._steps.after(self._given - self._first_row)
+            if self._expected(now) < wanted - EARLY:
+                return None
+        self._decode()
+        return self._give(self._due(now))
+
+    def _expected(self, now: float) -> float:
+        """What `_due` will be once the items are decoded, if they are as much delayed as the last ones were."""
+        newest = [
+            _arrivals(raw[-1])[1] - lag if raw else float(lane.newest.min())
+            for lane, raw, lag in zip(self.lanes, self._items, self._lag, strict=True)
+        ]
+        return max(min(newest) - REORDERING, now - PATIENCE)
 
     def _decode(self) -> None:
         """Take up the items that are there."""
@@ -212,6 +226,7 @@ class Merger:
             raw, self._items[k] = self._items[k], []
             if raw:
                 self._admit(k, *lane.push(raw))
+                self._lag[k] = _arrivals(raw[-1])[1] - float(lane.newest.min())
 
     def finish(self) -> Block | None:
         """The rows that are left at the end of the session."""
