@@ -104,10 +104,10 @@ class LinearLink:
     def shape(self, q_f: Array) -> Shape:
         """Shape for nodal displacements q_f (B, n_f), m and rad; tip rotation exp(θ_d×), or (13) as printed."""
         theta = q_f @ self._tip_theta.T
-        if self.first_order:
+        turn = None if self.first_order else so3.RotationVector(theta)
+        if turn is None:
             rotation, tip_spin = np.eye(3) + so3.skew(theta), self._tip_theta[None]
         else:
-            turn = so3.RotationVector(theta)
             rotation, tip_spin = turn.matrix, turn.left_jacobian @ self._tip_theta
         G = self.weights.size
         return Shape(
@@ -119,15 +119,15 @@ class LinearLink:
             tip_J=self._tip_J,
             tip_rotation=rotation,
             tip_spin=tip_spin,
+            tip_turn=turn,
         )
 
     def shape_rate(self, q_f: Array, q_f_dot: Array, shape: Shape) -> ShapeRate:
         """Rates of `shape` for q̇_f (B, n_f)."""
-        if self.first_order:
+        if shape.tip_turn is None:
             spin_rate = self._no_tip_rate
         else:
-            theta, theta_dot = q_f @ self._tip_theta.T, q_f_dot @ self._tip_theta.T
-            spin_rate = so3.RotationVector(theta).left_jacobian_rate(theta_dot) @ self._tip_theta
+            spin_rate = shape.tip_turn.left_jacobian_rate(q_f_dot @ self._tip_theta.T) @ self._tip_theta
         return ShapeRate(
             J=self._no_J_rate,
             spin=self._no_J_rate,

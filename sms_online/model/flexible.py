@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Protocol
 
+from sms_online.model.so3 import RotationVector
 from sms_online.stream import Array
 
 
@@ -14,7 +15,7 @@ class Shape:
 
     points (B, G, 3) m: quadrature points. J (B or 1, G, 3, n_f). tangent (B or 1, G, 3): unit axis of each section.
     spin (B or 1, G, 3, n_f): angular velocity of the sections. tip (B, 3), tip_J (B or 1, 3, n_f), tip_rotation (B, 3,
-    3), tip_spin (B or 1, 3, n_f): the same at x = L.
+    3), tip_spin (B or 1, 3, n_f): the same at x = L. tip_turn: behind tip_rotation, where it is made of a vector.
     """
 
     points: Array
@@ -25,6 +26,7 @@ class Shape:
     tip_J: Array
     tip_rotation: Array
     tip_spin: Array
+    tip_turn: RotationVector | None = None
 
 
 @dataclass(frozen=True)

@@ -261,27 +261,22 @@ class Model:
         P = ∂K/∂v. G collects ∂K/∂x, gravity, springs, dampers and effects. Rows of the base are those of S.
         rows: the speeds whose equations are wanted; all of them by default.
         """
-        B, n_v = x.shape[0], self.layout.n_v
-        rows = range(n_v) if rows is None else rows
-        P, G = np.zeros((B, len(rows), self.n_pi)), np.zeros((B, len(rows), self.n_pi))
+        P, G = (np.zeros((x.shape[0], self.layout.n_v, self.n_pi)) for _ in range(2))
         configuration = self.chain.configure(x)
-        self._add_forces(P, G, x, v, rows, inputs)
-        if not self.chain.moves(self._frames - 1, slice(0, 0))[list(rows)].any():
+        self._add_forces(P, G, x, v, inputs)
+        if rows is not None and not self.chain.moves(self._frames - 1, slice(0, 0))[list(rows)].any():
             # Motor sides of flexible joints alone: no frame moves with them, their momentum is all there is.
             rates = v[:, :, None]
             twists = configuration.twists(rates, self._frames)
             for body in self.bodies:
-                for row in np.flatnonzero(np.isin(rows, range(*body.speeds.indices(n_v)))):
-                    P[:, row, body.parameters] = body.momentum(body.local(twists, rates)[..., 0])[:, 6]
-            return P, G
+                P[:, body.speeds, list(body.parameters)] = body.momentum(body.local(twists, rates)[..., 0])[:, 6:]
+            return P[:, list(rows)], G[:, list(rows)]
         shape_rates = configuration.shape_rates(v)
         loads = list(self.loads(configuration, v, shape_rates, self.bodies))
         ordered = [(loads[k][0], first, *loads[k][1:]) for k, first in self._kinetic_order]
         kinetic = project(configuration, v, shape_rates, ordered, len(self._kinetic))
-        if len(rows) < n_v:
-            kinetic = kinetic[:, :, list(rows)]
         P[:, :, self._kinetic], G[:, :, self._kinetic] = kinetic
-        return P, G
+        return (P, G) if rows is None else (P[:, list(rows)], G[:, list(rows)])
 
     def loads(
         self, configuration: Configuration, v: Array, shape_rates: list[ShapeRate | None], bodies: Sequence[BodyTerm]
@@ -328,19 +323,15 @@ class Model:
                 out[:, :, axis] += np.einsum("bdv,bd->bv", J, momentum)
         return out
 
-    def _add_forces(self, P: Array, G: Array, x: Array, v: Array, rows: Sequence[int], inputs: Inputs | None) -> None:
-        place = {speed: row for row, speed in enumerate(rows)}
+    def _add_forces(self, P: Array, G: Array, x: Array, v: Array, inputs: Inputs | None) -> None:
         for springs, deflection in ((self.springs, self._spring_coordinates(x)), (self.dampers, v)):
             for spring in springs:
-                force = deflection[:, spring.speeds] @ spring.matrix
-                for k, speed in enumerate(np.arange(self.layout.n_v)[spring.speeds]):
-                    if speed in place:
-                        G[:, place[speed], spring.parameter] -= force[:, k]
+                G[:, spring.speeds, spring.parameter] -= deflection[:, spring.speeds] @ spring.matrix
         for effect, columns, own in self.acting(inputs):
-            G[:, :, columns] = effect.force(self.layout, x, v, own)[:, list(rows)]
+            G[:, :, columns] = effect.force(self.layout, x, v, own)
             momentum = effect.momentum(self.layout, x, v, own)
             if momentum is not None:
-                P[:, :, columns] = momentum[:, list(rows)]
+                P[:, :, columns] = momentum
 
     def dynamics(self, pi: Array) -> Dynamics:
         """Equations of motion for parameter values π (n_pi,): the full dynamics that the paper reconstructs."""

@@ -78,6 +78,7 @@ class Sensitivities:
         self._readings = readings
         # Central differences, one-sided at the ends, for a matrix that changes in time, per half hop.
         self._slope: Array = np.asarray(np.gradient(np.eye(INSTANTS + 1), axis=0)) / half_hop
+        self._dynamics: Dynamics | None = None  # of the last π
         self.forget(0)
 
     def forget(self, next_instant: int) -> None:
@@ -98,7 +99,9 @@ class Sensitivities:
         """Take the next instants: x (K, n_x), v (K, n_v), signals as in `Instants`, with parameters π."""
         if not len(x):
             return
-        dynamics = self.model.dynamics(pi)
+        if self._dynamics is None or not np.array_equal(self._dynamics.pi, pi):
+            self._dynamics = self.model.dynamics(pi)
+        dynamics = self._dynamics
         numbers = self.next_instant + np.arange(len(x))
         sparse = numbers % SPARSE == 0
         readings = self._readings(x)
