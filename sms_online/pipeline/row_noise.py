@@ -17,8 +17,8 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
-import scipy.linalg
 from numpy.typing import NDArray
+from scipy.linalg.lapack import dtrtrs
 
 from sms_online.pipeline.latency import SourceGroup
 from sms_online.pipeline.momentum_balance import EXPONENT, HOPS, INSTANTS
@@ -52,9 +52,10 @@ class RowNoise:
         # ∫ φ(t) φ(t + k hops) dt.
         shifted = [self._phi[: STEPS + 1 - k * STEPS_A_HOP] @ self._phi[k * STEPS_A_HOP :] for k in range(HOPS)]
         self._overlap = self._step * np.array(shifted)
-        self._before: deque[Array] = deque(maxlen=HOPS - 1)
-        self._torque_before: deque[Array] = deque(maxlen=HOPS - 1)
-        self._late_before: deque[Array] = deque(maxlen=HOPS - 1)
+        # Of the last windows, this one included.
+        self._before: deque[Array] = deque(maxlen=HOPS)
+        self._torque_before: deque[Array] = deque(maxlen=HOPS)
+        self._late_before: deque[Array] = deque(maxlen=HOPS)
         self.late = np.empty((0, 0))
 
     def _told(self, offset: int, span: float) -> Array:
@@ -95,20 +96,19 @@ class RowNoise:
         c = c.reshape(-1, n_v)
         self.late = self._lateness(kernel, window.rates)
         late = (CLOCK_ERROR if age >= CLOCK_KNOWN else YOUNG_CLOCK_ERROR) * self._by_clock(self.late)
-        out = []
-        for k in range(len(self._before), -1, -1):
-            first = k * STEPS_A_HOP * sensors
-            block = c[: len(c) - first].T @ (c if k == 0 else self._before[-k][first:])
-            torque = np.sqrt(torque_density * (torque_density if k == 0 else self._torque_before[-k]))
-            block[self._joint_rows, self._joint_rows] += self._overlap[k] * torque
-            # What windows share fades out where they no longer overlap, for the covariance to stay banded.
-            if self._clocks:
-                block += (1.0 - k / HOPS) * late @ (late if k == 0 else self._late_before[-k]).T
-            out.append(block)
         self._before.append(c)
         self._torque_before.append(torque_density)
         self._late_before.append(late)
-        return out
+        hops = np.arange(len(self._before) - 1, -1, -1)  # from each window to this one
+        out = np.empty((hops.size, n_v, n_v))
+        for block, other, first in zip(out, self._before, (hops * (STEPS_A_HOP * sensors)).tolist(), strict=True):
+            np.matmul(c[: len(c) - first].T, other[first:], out=block)
+        torque = np.sqrt(torque_density * np.array(self._torque_before))
+        out[:, self._joint_rows, self._joint_rows] += self._overlap[hops, None] * torque
+        if self._clocks:
+            # What windows share fades out where they no longer overlap, for the covariance to stay banded.
+            out += ((1.0 - hops / HOPS)[:, None, None] * late) @ np.array(self._late_before).swapaxes(1, 2)
+        return list(out)
 
     def _lateness(self, kernel: Array, rates: Array) -> Array:
         """See `late`; rates (INSTANTS + 1, sensors): of the readings."""
@@ -137,9 +137,9 @@ class RowNoise:
 
     def restore(self, state: Mapping[str, NDArray[Any]]) -> None:
         """Continue from a saved state."""
-        self._before = deque(np.array(state["before"]), maxlen=HOPS - 1)
-        self._torque_before = deque(np.array(state["torque_before"]), maxlen=HOPS - 1)
-        self._late_before = deque(np.array(state["late_before"]), maxlen=HOPS - 1)
+        self._before = deque(np.array(state["before"]), maxlen=HOPS)
+        self._torque_before = deque(np.array(state["torque_before"]), maxlen=HOPS)
+        self._late_before = deque(np.array(state["late_before"]), maxlen=HOPS)
 
 
 def _interpolation(at: Array, nodes: Array) -> Array:
@@ -159,11 +159,17 @@ def factored(L: Array, covariances: list[Array], floor: Array | float = 0.0) -> 
     size = n_v * (len(covariances) - 1)
     L = L[len(L) - size :, len(L) - size :]
     cross = np.concatenate([np.empty((n_v, 0)), *covariances[:-1]], axis=1).T  # (size, n_v)
-    X = scipy.linalg.solve_triangular(L, cross, lower=True, check_finite=False) if size else cross
+    X = _solved(L, cross) if size else cross
     grown = np.zeros((size + n_v, size + n_v))
     grown[:size, :size] = L
     grown[size:, :size], grown[size:, size:] = X.T, np.linalg.cholesky(own - X.T @ X)
     return grown
+
+
+def _solved(L: Array, right: Array) -> Array:
+    """L⁻¹ of right-hand sides for a lower triangular L: LAPACK itself, for this is asked for a hundred times a second."""
+    solution, _ = dtrtrs(L.T, right, lower=0, trans=1)
+    return np.asarray(solution)
 
 
 class Whitener:
@@ -188,7 +194,7 @@ class Whitener:
         white = self._white[len(self._white) + n_v - len(self._L) :]
         below = self._L[-n_v:]
         rows = rows - below[:, :-n_v] @ white
-        out = np.asarray(scipy.linalg.solve_triangular(below[:, -n_v:], rows, lower=True, check_finite=False))
+        out = _solved(below[:, -n_v:], rows)
         self._white = np.concatenate((white, out))
         return out
 
