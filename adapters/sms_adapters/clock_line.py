@@ -59,19 +59,19 @@ def line_below(x: Array, y: Array) -> tuple[float, float]:
 
     The slope is kept within 1 ± LARGEST_DRIFT. One point gives slope 1.
     """
-    hull: list[int] = []
-    for k in range(x.size):
+    hull: list[tuple[float, float]] = []
+    for a, b in zip(x.tolist(), y.tolist(), strict=True):  # numbers of Python, for one by one they are faster
         while len(hull) > 1:
-            i, j = hull[-2:]
-            if (y[j] - y[i]) * (x[k] - x[i]) < (y[k] - y[i]) * (x[j] - x[i]):
+            (a_i, b_i), (a_j, b_j) = hull[-2:]
+            if (b_j - b_i) * (a - a_i) < (b - b_i) * (a_j - a_i):
                 break
             hull.pop()
-        hull.append(k)
+        hull.append((a, b))
     slope = 1.0
     mean = float(np.mean(x))
-    for i, j in pairwise(hull):
-        if x[i] <= mean <= x[j]:
-            slope = float((y[j] - y[i]) / (x[j] - x[i]))
+    for (a_i, b_i), (a_j, b_j) in pairwise(hull):
+        if a_i <= mean <= a_j:
+            slope = (b_j - b_i) / (a_j - a_i)
             break
     slope = min(max(slope, 1.0 - LARGEST_DRIFT), 1.0 + LARGEST_DRIFT)
     return slope, float(np.min(y - slope * x))

@@ -135,7 +135,7 @@ class Sensing:
             by_sensor[:, angle, motor] = 1.0
         offset = layout.n_base_positions - layout.n_base_speeds
         for i, (kinematics, q_f) in enumerate(zip(self.model.chain.flexible, layout.q_f, strict=True)):
-            if kinematics is not None:
+            if kinematics is not None and not isinstance(kinematics, LinearLink):  # whose markers are its coordinates
                 own = slice(q_f.start + offset, q_f.stop + offset)
                 by_sensor[:, own, own] = np.linalg.inv(kinematics.marker_jacobian(self.model.chain.elastic(x, i)))
         every = np.repeat(x, n_x, axis=0)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import gc
 import threading
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -32,6 +32,8 @@ CHECKPOINT = "checkpoint.npz"
 OPENING = 2.0
 # News is made so often, s.
 NEWS_INTERVAL = 0.5
+# What is done now and then waits so long for the end of a block, s.
+LONGEST_BLOCK = 0.2
 # Parameters on the status line: the best known ones.
 LEADING = 4
 
@@ -100,9 +102,8 @@ class LiveSession:
         try:
             while not (interruption.requested or ended() or self._clock() >= duration):
                 interruption.sleep(tick_time(self._tick + 1) - self._clock())
-                if self._clock() >= tick_time(self._tick + 1):
-                    yield from self._advance()
-                self._look_around()
+                worked = self._clock() >= tick_time(self._tick + 1) and (yield from self._advance())
+                self._look_around(worked)
         finally:
             gc.unfreeze()
             for feed in self._feeds:
@@ -121,8 +122,8 @@ class LiveSession:
         if self._recorder is not None:
             self._recorder.close(tick_time(self._tick), self.warnings)
 
-    def _advance(self) -> Iterator[Block]:
-        """One tick."""
+    def _advance(self) -> Generator[Block, None, bool]:
+        """One tick; whether there were rows in it."""
         self._tick += 1
         tick = tick_time(self._tick)
         behind = self._clock() - tick
@@ -139,10 +140,11 @@ class LiveSession:
         if block is not None and np.isfinite(newest):
             self.latencies.add(self._clock() + self._start, newest)
         self.busy += time.perf_counter() - started
+        return block is not None
 
-    def _look_around(self) -> None:
-        """What is done now and then."""
-        now = self._clock()
+    def _look_around(self, worked: bool) -> None:
+        """What is done now and then; worked: rows were worked off just now, so that the next ones are furthest off."""
+        now = self._clock() if worked else self._clock() - LONGEST_BLOCK
         if now - self._looked >= NEWS_INTERVAL:
             self._looked = now
             self.health = {"latency": self._latency(), "clocks": self._merger.clock_offsets}
