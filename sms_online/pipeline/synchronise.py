@@ -298,7 +298,8 @@ class Synchroniser:
         """Which grid points k of a group are decided, and which of those have a value."""
         ts, now = self._time[rows], self._time[-1]
         grid = k / self.sample_rate
-        last = np.searchsorted(ts, grid + self._tolerance, side="right") - 1
+        late = grid + self._tolerance
+        last = np.searchsorted(ts, late, side="right") - 1
         if np.all(row_index == NOWHERE):  # as those of any device whose clock is not the grid's
             hit = passes = np.zeros(k.size, dtype=bool)
         else:
@@ -306,26 +307,25 @@ class Synchroniser:
             hit = padded[last + 1] == k
             passes = hit & (_run_length(padded)[last + 1] >= SIDE)
         group = _Group(columns, rows, ts, last, hit)
-        rest = np.flatnonzero(~passes)
-        if rest.size == 0:
+        if passes.all():
             return group, passes, passes
 
         # Six samples without a gap between them, as far as they have arrived.
-        begin, stop = last[rest] - (SIDE - 1), last[rest] + SIDE
-        gaps = np.concatenate([[0], np.cumsum(self._is_gap(np.diff(ts), columns[0]))])
-        inner = np.clip(np.stack([begin, stop]), 0, max(ts.size - 1, 0))
-        broken = gaps[inner[1]] > gaps[inner[0]]
-        arrived = stop < ts.size
-        stencil = (begin >= 0) & arrived & ~broken & ~np.isnan(self._period[columns[0]])
+        begin, arrived = last >= SIDE - 1, last < ts.size - SIDE
+        gap = self._is_gap(ts[1:] - ts[:-1], columns[0])
+        broken = np.zeros_like(begin)
+        if gap.any():
+            gaps = np.concatenate([[0], np.cumsum(gap)])
+            first, stop = np.maximum(last - (SIDE - 1), 0), np.minimum(last + SIDE, ts.size - 1)
+            broken = gaps[np.maximum(stop, 0)] > gaps[np.minimum(first, ts.size - 1)]
+        stencil = begin & arrived & ~broken & ~np.isnan(self._period[columns[0]])
         silent = final or (ts.size > 0 and bool(self._is_gap(now - ts[-1:], columns[0])[0]))
-        past = final | (now > grid[rest] + self._tolerance)
-        no_stencil = ((begin < 0) & past) | broken | (~arrived & silent)
-        reach = np.where(hit[rest], (SIDE - 1) / self.sample_rate, 0.0)
-        no_run = final | (now > grid[rest] + reach + self._tolerance)
-        sure, possible = np.ones_like(passes), np.ones_like(passes)
-        sure[rest] = stencil | (no_stencil & no_run)
-        possible[rest] = stencil
-        return group, sure, possible
+        past = final | (now > late)
+        no_stencil = (~begin & past) | broken | (~arrived & silent)
+        no_run = past
+        if hit.any():
+            no_run = final | (now > np.where(hit, grid + (SIDE - 1) / self.sample_rate + self._tolerance, late))
+        return group, passes | stencil | (no_stencil & no_run), passes | stencil
 
     def _is_gap(self, interval: Array, channel: int) -> Mask:
         """Intervals that are not bridged. Before the period is known only the absolute limit can tell."""
@@ -340,10 +340,11 @@ class Synchroniser:
             if chosen.size == 0:
                 break
             last, hit = group.last[chosen], group.hit[chosen]
-            if group.columns.size == values.shape[1]:
-                np.take(self._values, group.rows[last], axis=0, out=values)
-            else:
-                values[:, group.columns] = self._values[group.rows[last][:, None], group.columns]
+            if hit.any():
+                if group.columns.size == values.shape[1]:
+                    np.take(self._values, group.rows[last], axis=0, out=values)
+                else:
+                    values[:, group.columns] = self._values[group.rows[last][:, None], group.columns]
             between = np.flatnonzero(~hit)
             if between.size:
                 nodes = last[between, None] + np.arange(1 - SIDE, 1 + SIDE)
