@@ -33,8 +33,8 @@ PATIENCE = 0.3
 SILENCE = 1.0
 # At the start all wait until the clocks of all sources are known, at most so long, s.
 START_PATIENCE = 3.0
-# Rows are asked for this much before they are due by the delays of the last ones, s: half of what delays scatter by, for
-# asking in vain costs as much as asking, and asking late costs a tick.
+# Rows are asked for this much before they are due by the delays of the last ones, s: half of what delays scatter by,
+# for asking in vain costs as much as asking, and asking late costs a tick.
 EARLY = 1e-3
 
 

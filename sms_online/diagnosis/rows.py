@@ -190,9 +190,10 @@ class SessionRows:
     def _sensitivities(self, instants: list[Instants], span: float) -> Sensitivities:
         out = Sensitivities(self.model, self.sensing.displacements, span / INSTANTS)
         pi = self.base.physical_values(self.beta)
-        parts = [np.concatenate([getattr(piece, part) for piece in instants]) for part in ("x", "v", "signals")]
-        for start in range(0, len(parts[0]), TOLD):
-            out.tell(pi, *(part[start : start + TOLD] for part in parts))
+        x, v, signals = (np.concatenate([getattr(p, part) for p in instants]) for part in ("x", "v", "signals"))
+        for start in range(0, len(x), TOLD):
+            some = slice(start, start + TOLD)
+            out.tell(pi, x[some], v[some], signals[some])
         return out
 
     def noisy(self) -> list[WeakWindows]:

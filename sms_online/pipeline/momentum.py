@@ -147,7 +147,8 @@ class Momentum:
         self._decide(noise, last=False)
 
     def _process(self, piece: GridSamples, noise: SensorNoise) -> None:
-        windows, instants = self._balance.push(piece.index, self._copies(piece.values, noise), noise.coordinates)
+        copies = self._copies(piece.values, noise)
+        windows, instants = self._balance.push(piece.index, copies, noise.coordinates, self.fit.probes)
         self._absorb(self.fit.push(windows, instants, noise))
 
     def _decide(self, noise: SensorNoise, last: bool) -> None:

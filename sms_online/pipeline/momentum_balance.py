@@ -6,8 +6,8 @@ of it (windows side by side cost fifteen times the error).
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from itertools import groupby
 from operator import itemgetter
 from typing import Any
@@ -49,13 +49,22 @@ MARGIN = HALF_WIDTHS[-1]
 class Instants:
     """States at `number`, `number` + 1, …, in half hops since the segment began: x (K, n_x), v (K, n_v).
 
-    signals (K, joints + n_states): n τ, then internal states of effects.
+    signals (K, joints + n_states): n τ, then internal states of effects. probed: columns of momentum and force at the
+    states that `Probes` adds, where there are any.
     """
 
     number: int
     x: Array
     v: Array
     signals: Array
+    probed: Columns | None = None
+
+
+# Columns P and G (E, n_v, n_pi) of `Model.momentum_columns`.
+Columns = tuple[Array, Array]
+# Further states x (E, n_x), v (E, n_v), signals (E, joints + n_states) at which somebody wants them, of new instants:
+# with those of the rows in one call, for of few states a call costs more than these.
+Probes = Callable[[Instants], tuple[Array, Array, Array]]
 
 
 @dataclass(frozen=True)
@@ -172,7 +181,9 @@ class MomentumBalance:
         self._compared: list[Array] = []  # squares of the hops from the next window on
         self._smoothed: dict[int, _Smoothed] = {}
 
-    def push(self, index: NDArray[np.int64], copies: list[Array], sigma: Array) -> tuple[list[Window], list[Instants]]:
+    def push(
+        self, index: NDArray[np.int64], copies: list[Array], sigma: Array, probes: Probes | None = None
+    ) -> tuple[list[Window], list[Instants]]:
         """Windows that B consecutive samples complete, and the states at their instants.
 
         index (B,): grid index. copies: x, n τ and internal states of effects side by side (B, n_x + joints + n_states)
@@ -192,7 +203,12 @@ class MomentumBalance:
         windows: list[Window] = []
         # Windows of one width in a row are worked off together.
         for half_width, run in groupby(chosen, key=itemgetter(1)):
-            windows += self._rows(half_width, [window for window, _ in run], grid)
+            fresh = instants[0] if probes is not None and len(instants) == 1 and not windows else None
+            further = None if fresh is None or probes is None else probes(fresh)
+            rows, probed = self._rows(half_width, [window for window, _ in run], grid, further)
+            windows += rows
+            if fresh is not None:
+                instants = [replace(fresh, probed=probed)]
         drop = self._window - self._first
         if drop > 0:
             self._samples, self._first = self._samples[drop:], self._window
@@ -236,7 +252,9 @@ class MomentumBalance:
         v = layout.speeds(x.reshape(-1, layout.n_x), x_dot.reshape(-1, layout.n_x))
         return x, v.reshape(COPIES, -1, layout.n_v), values[..., layout.n_x :]
 
-    def _rows(self, half_width: int, windows: list[int], grid: int) -> list[Window]:
+    def _rows(
+        self, half_width: int, windows: list[int], grid: int, further: tuple[Array, Array, Array] | None
+    ) -> tuple[list[Window], Columns | None]:
         s = stride(half_width, self.hop)
         smoothed = self._smoothed.get(half_width)
         if smoothed is None or smoothed.first + smoothed.columns.shape[0] * s < windows[0]:
@@ -250,7 +268,7 @@ class MomentumBalance:
         smoothed.columns = smoothed.columns[skip:]
         smoothed.first += skip * s
         states = self._states([(fresh, half_width), *((ends - d, self.margin + d) for d in tail.tolist())])
-        columns = self._columns(*states)
+        columns, probed = self._columns(*states, further)
         smoothed.columns = np.concatenate((smoothed.columns, columns[: fresh.size]))
         tails = columns[fresh.size :].reshape(tail.size, len(windows), columns.shape[1])
         phi, phi_dot = self._phi[s]
@@ -263,29 +281,35 @@ class MomentumBalance:
             b = (phi @ values[:, 2 * width :]).reshape(COPIES, -1) - weak[:, self.rows.size :]
             last = grid + window + self.width + self.lead
             out.append(Window(window // self.half_hop, last, weak[:, : self.rows.size], b, half_width))
-        return out
+        return out, probed
 
     @property
     def _entries(self) -> int:
         n_v = self.model.layout.n_v
         return COPIES * (2 * self.rows.size + 3 * n_v)
 
-    def _columns(self, x: Array, v: Array, signals: Array) -> Array:
-        """P and G, each of the base parameters, packed, and of what is known, and Q, for every copy: (K, entries)."""
+    def _columns(
+        self, x: Array, v: Array, signals: Array, further: tuple[Array, Array, Array] | None
+    ) -> tuple[Array, Columns | None]:
+        """P and G, each of the base parameters, packed, and of what is known, and Q, for every copy: (K, entries).
+
+        And all columns at further states.
+        """
         K = signals.shape[1]
         # Without noise all copies are one.
         distinct = COPIES if np.any(x[1] != x[0]) else 1
         packed = []
-        inputs = self.model.inputs(signals[:distinct].reshape(-1, signals.shape[2]))
-        for part in self.model.momentum_columns(
-            x[:distinct].reshape(-1, x.shape[2]), v[:distinct].reshape(-1, v.shape[2]), inputs=inputs
-        ):
+        own = [part[:distinct].reshape(distinct * K, part.shape[2]) for part in (x, v, signals)]
+        at = own if further is None else [np.concatenate(pair) for pair in zip(own, further, strict=True)]
+        P, G = self.model.momentum_columns(at[0], at[1], inputs=self.model.inputs(at[2]))
+        for part in (P[: distinct * K], G[: distinct * K]):
             both = np.concatenate((part[:, self.rows, self._physical], self.base.known_part(part)), axis=1)
             both = both.reshape(distinct, K, -1).swapaxes(0, 1)
             packed.append(np.broadcast_to(both, (K, COPIES, both.shape[2])).reshape(K, -1))
         torque = signals[..., : len(self.model.layout.q)]
         force = self.model.generalized_force(torque.swapaxes(0, 1).reshape(-1, torque.shape[2]))
-        return np.concatenate((*packed, force.reshape(K, -1)), axis=1)
+        probed = None if further is None else (P[distinct * K :], G[distinct * K :])
+        return np.concatenate((*packed, force.reshape(K, -1)), axis=1), probed
 
     def state(self) -> dict[str, Any]:
         """What `restore` needs to continue."""

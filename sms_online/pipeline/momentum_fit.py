@@ -30,6 +30,7 @@ from sms_online.pipeline.momentum_balance import (
     INSTANTS,
     Instants,
     MomentumBalance,
+    Probes,
     Window,
     windows_from_state,
     windows_state,
@@ -173,7 +174,7 @@ class MomentumFit:
         if self.weights is not None:
             if windows:
                 self._look(noise, windows[0])
-            self._tell()
+            self._tell(instants)
             out = [self._white(window) for window in windows]
         else:
             self._held += windows
@@ -309,10 +310,15 @@ class MomentumFit:
         self._weighing.begin(self._known_weights, self._sensor_noise, self.misfit, self._first)
         self._tell()
 
-    def _tell(self) -> None:
-        """Have the states of the instants known to who weighs."""
+    @property
+    def probes(self) -> Probes | None:
+        """At which states who weighs wants columns beside those of the rows, once weights are known."""
+        return None if self.weights is None else self._weighing.probes
+
+    def _tell(self, instants: Sequence[Instants] = ()) -> None:
+        """Have the states of the instants known to who weighs; instants: those that came last."""
         for weighing in self._weighings:
-            weighing.tell(self._first, self._x, self._v, self._signals)
+            weighing.tell(self._first, self._x, self._v, self._signals, instants)
 
     @property
     def _weighings(self) -> list[Weighing]:

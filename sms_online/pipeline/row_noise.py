@@ -167,7 +167,7 @@ def factored(L: Array, covariances: list[Array], floor: Array | float = 0.0) -> 
 
 
 def _solved(L: Array, right: Array) -> Array:
-    """L⁻¹ of right-hand sides for a lower triangular L: LAPACK itself, for this is asked for a hundred times a second."""
+    """L⁻¹ times right-hand sides, L lower triangular: by LAPACK itself, for SciPy's checks take longer than it."""
     solution, _ = dtrtrs(L.T, right, lower=0, trans=1)
     return np.asarray(solution)
 

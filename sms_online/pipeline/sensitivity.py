@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from sms_online.model.dynamics import Dynamics
 from sms_online.model.model import Model
-from sms_online.pipeline.momentum_balance import INSTANTS
+from sms_online.pipeline.momentum_balance import INSTANTS, Columns, Instants
 from sms_online.stream import Array
 
 # Step of the differences that give derivatives: 1e-8 of their size is lost to curvature, as much to rounding.
@@ -45,17 +45,28 @@ def derivatives(dynamics: Dynamics, x: Array, v: Array, signals: Array | None = 
 
     signals (K, joints + n_states): n τ, then internal states, for the effects that need them.
     """
+    inputs = None if signals is None else dynamics.model.inputs(_around(signals, v.shape[1]))
+    return _differences(*dynamics.momentum_and_force(*moved_states(dynamics.model, x, v), inputs), len(x))
+
+
+def moved_states(model: Model, x: Array, v: Array) -> tuple[Array, Array]:
+    """Positions and speeds at K states, then with each displacement, then with each speed changed: K (1 + 2 n_v)."""
     K, n_v = v.shape
     x_n, v_n = np.repeat(x, n_v, axis=0), np.repeat(v, n_v, axis=0)
     moved = DIFFERENCE * np.tile(np.eye(n_v), (K, 1))
-    shifted = x_n + dynamics.model.position_rate(x_n, moved)
-    # All in one call: a session asks for few instants at a time, and then a call costs more than its states.
-    every = np.concatenate((x, shifted, x_n)), np.concatenate((v, v_n, v_n + moved))
-    inputs = None
-    if signals is not None:
-        repeated = np.repeat(signals, n_v, axis=0)
-        inputs = dynamics.model.inputs(np.concatenate((signals, repeated, repeated)))
-    p, g = dynamics.momentum_and_force(*every, inputs)
+    shifted = x_n + model.position_rate(x_n, moved)
+    return np.concatenate((x, shifted, x_n)), np.concatenate((v, v_n, v_n + moved))
+
+
+def _around(signals: Array, n_v: int) -> Array:
+    """What does not move, at the states of `moved_states`."""
+    repeated = np.repeat(signals, n_v, axis=0)
+    return np.concatenate((signals, repeated, repeated))
+
+
+def _differences(p: Array, g: Array, K: int) -> Array:
+    """See `derivatives`, from P π and G π (K (1 + 2 n_v), n_v) at the states of `moved_states`."""
+    n_v = p.shape[1]
     (p_0, p_x, _), (g_0, g_x, g_v) = (np.split(part, [K, K + K * n_v]) for part in (p, g))
     of = [part.reshape(K, n_v, n_v) - at[:, None] for part, at in ((p_x, p_0), (g_v, g_0), (g_x, g_0))]
     return np.asarray((np.concatenate(of, axis=1) / DIFFERENCE).swapaxes(1, 2))
@@ -95,8 +106,17 @@ class Sensitivities:
         """Number of the instant after the last one told."""
         return self._first + len(self._dense)
 
-    def tell(self, pi: Array, x: Array, v: Array, signals: Array) -> None:
-        """Take the next instants: x (K, n_x), v (K, n_v), signals as in `Instants`, with parameters π."""
+    def probes(self, instants: Instants) -> tuple[Array, Array, Array]:
+        """See `Probes`."""
+        sparse = (instants.number + np.arange(len(instants.x))) % SPARSE == 0
+        x, v = moved_states(self.model, instants.x[sparse], instants.v[sparse])
+        return x, v, _around(instants.signals[sparse], v.shape[1])
+
+    def tell(self, pi: Array, x: Array, v: Array, signals: Array, probed: Columns | None = None) -> None:
+        """Take the next instants: x (K, n_x), v (K, n_v), signals as in `Instants`, with parameters π.
+
+        probed: columns at their `probes`, where they are known already.
+        """
         if not len(x):
             return
         if self._dynamics is None or not np.array_equal(self._dynamics.pi, pi):
@@ -111,7 +131,10 @@ class Sensitivities:
         self._rates = np.concatenate((self._rates, (inverse @ v[:, :, None])[:, :, 0]))
         if sparse.any():
             self._numbers = np.concatenate((self._numbers, numbers[sparse]))
-            told = derivatives(dynamics, x[sparse], v[sparse], signals[sparse])
+            if probed is None:
+                told = derivatives(dynamics, x[sparse], v[sparse], signals[sparse])
+            else:
+                told = _differences(probed[0] @ pi, probed[1] @ pi, int(np.count_nonzero(sparse)))
             self._derivatives = np.concatenate((self._derivatives, told))
 
     def window(self, start: int) -> Sensitivity:

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from sms_online.model.base_parameters import BaseParameters
 from sms_online.model.model import Model
 from sms_online.pipeline.latency import LatencyColumns, SourceGroup
-from sms_online.pipeline.momentum_balance import COPIES, INSTANTS, MomentumBalance, Window
+from sms_online.pipeline.momentum_balance import COPIES, INSTANTS, Instants, MomentumBalance, Probes, Window
 from sms_online.pipeline.row_noise import RowNoise, Whitener
 from sms_online.pipeline.sensitivity import Sensitivities
 from sms_online.pipeline.sensor_noise import SensorNoise, noise_from_state, noise_state
@@ -74,11 +74,21 @@ class Weighing:
         self._noise.begin_segment()
         self._whitener.begin_segment()
 
-    def tell(self, first: int, x: Array, v: Array, signals: Array) -> None:
-        """Take the states (K, ·) of the instants from number `first` on, of which it needs those not told yet."""
-        fresh = self._sensitivities.next_instant - first
+    @property
+    def probes(self) -> Probes:
+        """At which states it wants columns of new instants."""
+        return self._sensitivities.probes
+
+    def tell(self, first: int, x: Array, v: Array, signals: Array, instants: Sequence[Instants] = ()) -> None:
+        """Take the states (K, ·) of the instants from number `first` on, of which it needs those not told yet.
+
+        instants: those that came last, with columns where they were probed.
+        """
+        needed = self._sensitivities.next_instant
+        fresh = needed - first
         pi = self._base.physical_values(self.beta)
-        self._sensitivities.tell(pi, x[fresh:], v[fresh:], signals[fresh:])
+        probed = next((piece.probed for piece in instants if piece.number == needed), None)
+        self._sensitivities.tell(pi, x[fresh:], v[fresh:], signals[fresh:], probed)
 
     def drop(self, instant: int) -> None:
         """Forget what no window that starts at an instant or later asks for."""

@@ -41,8 +41,8 @@ LEADING = 4
 class LiveSession:
     """Feeds, merger and estimator of one session, until it is interrupted.
 
-    start: of the session's clock in the estimator's time, s. directory: where checkpoints go, which exists. interpreter:
-    which the readers leave to the loop.
+    start: of the session's clock in the estimator's time, s. directory: where checkpoints go, which exists.
+    interpreter: which the readers leave to the loop.
     """
 
     def __init__(
