@@ -142,9 +142,8 @@ def in_order(arrival: Array) -> Array:
     return np.maximum.accumulate(np.rint(arrival * 1e6) * 1e-6)
 
 
-def merged(system: System, folder: Path, drive: CanFrames, encoder: list[SerialChunk]) -> tuple[Merger, list[Block]]:
-    """The rows of a session with these raw items."""
-    ours = merger(system, folder)
+def ticks(drive: CanFrames, encoder: list[SerialChunk]) -> list[tuple[list[Raw], list[Raw]]]:
+    """What arrives before each tick of a session, from the first one on."""
     by_tick: dict[int, tuple[list[Raw], list[Raw]]] = {}
     number = 1
     rest: list[Raw] = [drive] if len(drive) else []
@@ -155,7 +154,13 @@ def merged(system: System, folder: Path, drive: CanFrames, encoder: list[SerialC
     for chunk in encoder:
         number = next(k for k in itertools.count(int(chunk.arrival / tick_time(1))) if chunk.arrival < tick_time(k))
         by_tick.setdefault(number, ([], []))[1].append(chunk)
-    blocks = [ours.advance(tick_time(k), by_tick.get(k, ([], []))) for k in range(1, max(by_tick) + 1)]
+    return [by_tick.get(k, ([], [])) for k in range(1, max(by_tick) + 1)]
+
+
+def merged(system: System, folder: Path, drive: CanFrames, encoder: list[SerialChunk]) -> tuple[Merger, list[Block]]:
+    """The rows of a session with these raw items."""
+    ours = merger(system, folder)
+    blocks = [ours.advance(tick_time(k), items) for k, items in enumerate(ticks(drive, encoder), start=1)]
     return ours, [block for block in [*blocks, ours.finish()] if block is not None]
 
 

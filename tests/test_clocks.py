@@ -7,12 +7,15 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from bus_streams import AxisBus, axis_testbed, estimated, merged
+from bus_streams import AxisBus, axis_testbed, estimated, merged, ticks
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from sms_adapters.clock_lanes import lanes, merger
 from sms_adapters.clock_line import LARGEST_DRIFT, DeviceClock, line_below
+from sms_adapters.clock_merge import Merger
 from sms_adapters.clock_samples import CountedTime, NumberedTime
+from sms_adapters.recording import tick_time
 from sms_adapters.stuck import StuckGuard
 from sms_online.stream import Array
 
@@ -196,6 +199,33 @@ def test_pi_is_as_good_as_on_one_clock(tmp_path: Path) -> None:
         error.append(np.abs(pi - [0.3, 0.1]))
     assert (std[1] < 1.5 * std[0]).all()
     assert (error[1] < 4.0 * std[1]).all()
+
+
+def test_rows_come_in_the_estimators_portions_and_no_portion_later_than_it_could(tmp_path: Path) -> None:
+    """Against a merger that decodes at every tick: what a portion lacks is told by the items that wait."""
+    system = axis_testbed(tmp_path)
+    bus = AxisBus(seconds=8.0)
+    in_step, eager = merger(system, tmp_path), Merger(lanes(system, tmp_path))
+    steps = in_step.steps
+    assert steps is not None
+    out: list[tuple[Array, Array]] = []  # times of the rows, and ticks at which they come
+    portions = []
+    for ours in (in_step, eager):
+        t, came = [], []
+        for k, items in enumerate(ticks(bus.drive(), bus.encoder(system)), start=1):
+            block = ours.advance(tick_time(k), items)
+            if block is not None:
+                t.append(block.t)
+                came.append(np.full(block.t.size, k))
+        out.append((np.concatenate(t), np.concatenate(came)))
+        portions.append(len(t))
+    (t, came), (_, could) = out
+    ends = t[0] + steps.first + steps.period * np.arange(2.0 / steps.period, 6.0 / steps.period)
+    rows = np.searchsorted(t, ends) - 1  # the last of each portion
+    assert np.mean(came[rows] - could[rows]) < 0.2
+    assert np.max(came[rows] - could[rows]) <= 1
+    # A few are asked for in vain, for delays scatter.
+    assert portions[0] < 1.5 * (t[-1] - t[0]) / steps.period < portions[1]
 
 
 def test_a_sensor_that_sticks_is_noticed_and_a_coarse_encoder_is_not() -> None:

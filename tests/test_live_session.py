@@ -28,7 +28,7 @@ from sms_online.pipeline.estimator import Estimator
 from sms_online.results import results_document, standard_deviation
 from sms_tools.interruption import Interruption
 from sms_tools.live import feed as feed_module
-from sms_tools.live.feed import Feed, SessionClock
+from sms_tools.live.feed import Feed, Interpreter, SessionClock
 from sms_tools.live.latency import Latencies
 from sms_tools.live.loop import LiveSession
 from sms_tools.live.status import Leading, News, StatusWriter, line
@@ -125,6 +125,29 @@ class Bench:
 @pytest.fixture
 def system(tmp_path: Path) -> System:
     return axis_testbed(tmp_path)
+
+
+def test_readers_leave_the_interpreter_to_the_loop_while_it_computes_but_not_for_ever(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    done: list[str] = []
+    interpreter = Interpreter()
+
+    def fetch() -> None:
+        interpreter.await_free()
+        done.append("fetched")
+
+    monkeypatch.setattr(feed_module, "COMPUTING", 60.0)
+    with interpreter:
+        thread = threading.Thread(target=fetch)
+        thread.start()
+        time.sleep(0.05)
+        done.append("computed")
+    thread.join()
+    assert done == ["computed", "fetched"]
+    monkeypatch.setattr(feed_module, "COMPUTING", 0.01)
+    with interpreter:
+        fetch()
 
 
 def test_a_live_session_and_the_replay_of_its_recording_give_the_same_document(tmp_path: Path, system: System) -> None:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 from axis import AXIS
-from model_systems import paper, spatial
+from model_systems import FRICTION, paper, spatial
 from prescribed_motion import prescribed
 
 from sms_adapters.system_file import load_system
@@ -174,6 +174,26 @@ def test_a_clock_that_is_off_moves_rows_by_the_rates_of_its_readings() -> None:
     young = RowNoise(model.layout.theta_m, balance.span, (clock,))
     own = young.covariance(told.window(starts[-1]), *nothing, 0.5 * CLOCK_KNOWN)[-1]
     np.testing.assert_allclose(own, 4.0 * found[-1][-1], rtol=1e-12)
+
+
+def test_sensitivities_of_columns_told_with_the_rows_are_those_of_the_dynamics() -> None:
+    model = Model(paper(effects=FRICTION))
+    balance = MomentumBalance(model, find_base_parameters(model), model.system.sample_rate, SPAN)
+    motion = prescribed(model, balance.width + balance.lead + balance.margin + 1, seed=2)  # of one window
+    samples = np.concatenate((motion.x, np.zeros((len(motion.x), len(model.layout.q)))), axis=1)
+    by_columns, by_dynamics = (
+        Sensitivities(model, lambda x: np.tile(np.eye(model.layout.n_v), (len(x), 1, 1)), balance.span / INSTANTS)
+        for _ in range(2)
+    )
+    _, instants = balance.push(np.arange(len(samples)), [samples] * COPIES, np.ones(15), by_columns.probes)
+    (piece,) = instants
+    assert piece.probed is not None
+    by_columns.tell(model.nominal, piece.x, piece.v, piece.signals, piece.probed)
+    by_dynamics.tell(model.nominal, piece.x, piece.v, piece.signals)
+    ours, theirs = by_columns.window(0), by_dynamics.window(0)
+    for part in ("P_x", "G_v", "G_x"):
+        expected = getattr(theirs, part)
+        np.testing.assert_allclose(getattr(ours, part), expected, atol=1e-8 * np.abs(expected).max())
 
 
 def random_banded(n_v: int, windows: int, seed: int) -> list[list[Array]]:

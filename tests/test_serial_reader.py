@@ -43,6 +43,23 @@ def received(device: Reader, count: int) -> list[SerialChunk]:
     return chunks
 
 
+def test_bytes_that_come_while_a_reader_waits_for_its_turn_are_fetched_with_the_others() -> None:
+    far, name = pair()
+
+    def turn() -> None:
+        os.write(far, b"2.5\n")
+        time.sleep(0.05)
+
+    device = make_reader(source(name), time.monotonic, turn)
+    device.open()
+    assert device.read(0.01) == []
+    os.write(far, b"1.5\n")
+    chunks = [raw for raw in device.read(1.0) if isinstance(raw, SerialChunk)]
+    assert b"".join(chunk.data for chunk in chunks) == b"1.5\n2.5\n"
+    device.close()
+    os.close(far)
+
+
 def test_bytes_come_as_they_were_sent_after_a_break() -> None:
     far, name = pair()
     device = reader(name)

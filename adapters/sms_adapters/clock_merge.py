@@ -187,7 +187,7 @@ class Merger:
         self._settled = False
         self._given = -np.inf  # time up to which rows are out
         self._guards = [StuckGuard([stream.columns for stream in lane.streams]) for lane in lanes]
-        self._steps = steps
+        self.steps = steps
         self._first_row: float | None = None  # its time
         self._lag = [np.inf for _ in lanes]  # from the newest sample of each source to its last item
         self._items: list[list[Raw]] = [[] for _ in lanes]
@@ -205,8 +205,8 @@ class Merger:
                 self._heard[k], self._silent[k] = now, False
                 self._first = min(self._first, _arrivals(raw[0])[0])
                 self._items[k] += raw
-        if self._steps is not None and self._first_row is not None:
-            wanted = self._first_row + self._steps.after(self._given - self._first_row)
+        if self.steps is not None and self._first_row is not None:
+            wanted = self._first_row + self.steps.after(self._given - self._first_row)
             if self._expected(now) < wanted - EARLY:
                 return None
         self._decode()
