@@ -104,19 +104,28 @@ def decode_signal(signal: Signal, frames: NDArray[np.uint8]) -> Array:
 
 def raw_word(signal: Signal, frames: NDArray[np.uint8]) -> NDArray[np.uint64]:
     """(B,) bits of a signal from frames (B, bytes), as an unsigned number."""
-    pieces = _pieces(signal)
-    if frames.shape[1] >= CLASSIC_BYTES and max(byte for byte, _, _ in pieces) < CLASSIC_BYTES:
-        # Within the bytes of a classic frame, which are one word.
-        byte, low, _ = pieces[-1]
-        little = signal.byte_order == "little_endian"
-        whole = np.ascontiguousarray(frames[:, :CLASSIC_BYTES]).view("<u8" if little else ">u8").ravel()
-        down = 8 * (byte if little else CLASSIC_BYTES - 1 - byte) + low
-        return (whole.astype(np.uint64) >> np.uint64(down)) & np.uint64((1 << signal.length) - 1)
+    place = _in_a_word(signal)
+    if frames.shape[1] >= CLASSIC_BYTES and place is not None:
+        order, down, mask = place
+        whole = np.ascontiguousarray(frames[:, :CLASSIC_BYTES]).view(order)[:, 0]
+        return (whole.astype(np.uint64, copy=False) >> down) & mask
     raw = np.zeros(len(frames), dtype=np.uint64)
-    for byte, low, width in pieces:
+    for byte, low, width in _pieces(signal):
         piece = (frames[:, byte] >> np.uint8(low)) & np.uint8((1 << width) - 1)
         raw = (raw << np.uint64(width)) | piece
     return raw
+
+
+@cache
+def _in_a_word(signal: Signal) -> tuple[str, np.uint64, np.uint64] | None:
+    """Byte order, lowest bit and mask of a signal within the bytes of a classic frame, which are one word."""
+    pieces = _pieces(signal)
+    if max(byte for byte, _, _ in pieces) >= CLASSIC_BYTES:
+        return None
+    byte, low, _ = pieces[-1]
+    little = signal.byte_order == "little_endian"
+    down = 8 * (byte if little else CLASSIC_BYTES - 1 - byte) + low
+    return "<u8" if little else ">u8", np.uint64(down), np.uint64((1 << signal.length) - 1)
 
 
 @cache
