@@ -157,6 +157,8 @@ def test_a_can_log_needs_its_dbc(bench: Path, capsys: pytest.CaptureFixture[str]
         (("replay", "axis.toml/run.csv", "--system", "axis.toml"), "Not a directory"),
         (("replay", "run.mat", "--system", "axis.toml"), "a name ending in .csv"),
         (("replay", "run.csv", "--system", "axis.toml", "--out", "axis.toml/x"), "axis.toml is no directory"),
+        # Where permissions allow it to root, and nobody can.
+        (("replay", "run.csv", "--system", "axis.toml", "--out", "/proc/run"), "nothing can be written in /proc"),
         (("simulate", "--system", "paper-planar", "--capture", "new.csv", "--duration", "0"), "greater than 0"),
         (("simulate", "--system", "paper-planar", "--capture", "new.csv", "--grade", "D"), "'D'"),
         (("simulate", "--system", "paper-planar", "--capture", "new.csv", "--seed", "-1"), "a whole number, 0 or more"),

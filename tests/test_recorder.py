@@ -7,6 +7,7 @@ import signal
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -19,7 +20,7 @@ from sms_adapters import recorder as recorder_module
 from sms_adapters.raw import ERROR_FRAME, EXTENDED, FD_FRAME, MOST_BYTES, REMOTE_FRAME, CanFrames, SerialChunk
 from sms_adapters.recorder import Recorder
 from sms_adapters.recording import Recording
-from sms_adapters.session_log import RecordedItems, SessionHeader, read_header
+from sms_adapters.session_log import RULES, RecordedItems, SessionHeader, read_header
 from sms_adapters.sources import open_source
 from sms_online.errors import InputError
 from sms_online.stream import Array
@@ -39,6 +40,22 @@ def some_frames(count: int) -> CanFrames:
     arrival = np.array([1000 * k * 1e-6 for k in range(count)])
     stamp: Array = np.rint(arrival * 1e6 + 17) * 1e-6
     return CanFrames(arrival, stamp, id_, length, data, flags)
+
+
+def test_a_recording_made_under_other_rules_says_that_its_replay_differs(tmp_path: Path) -> None:
+    system = axis_testbed(tmp_path)
+
+    def warnings(directory: Path) -> str:
+        return " ".join(Recording(directory, system, tmp_path).warnings)
+
+    for rules in (RULES, RULES + 1):
+        Recorder(tmp_path / f"{rules}", replace(HEADER, rules=rules)).close(1.0)
+    assert "another version" not in warnings(tmp_path / f"{RULES}")
+    assert "another version" in warnings(tmp_path / f"{RULES + 1}")
+    # The first ones had no number.
+    session = tmp_path / f"{RULES}" / "session.toml"
+    session.write_text(session.read_text().replace(f"rules = {RULES}\n", ""))
+    assert "another version" in warnings(tmp_path / f"{RULES}")
 
 
 def recorded(directory: Path, frames: CanFrames, chunks: list[SerialChunk]) -> None:

@@ -11,7 +11,7 @@ import numpy as np
 from sms_adapters.clock_lanes import merger
 from sms_adapters.clock_merge import TICK, TICK_MICROSECONDS
 from sms_adapters.raw import CanFrames, Raw
-from sms_adapters.session_log import CHECKPOINT, SYSTEM, RecordedItems, from_microseconds, read_header
+from sms_adapters.session_log import CHECKPOINT, RULES, SYSTEM, RecordedItems, from_microseconds, read_header
 from sms_online.description.schema import System
 from sms_online.errors import InputError
 from sms_online.stream import Block
@@ -78,6 +78,10 @@ class Recording:
     def warnings(self) -> list[str]:
         """What was wrong with the devices, and with the recording."""
         found = self._merger.warnings
+        if self._header.rules != RULES:
+            found.append(
+                f"{self._directory.name}: recorded by another version: results differ slightly from the session's"
+            )
         if self._ending is None:
             found.append(f"{self._directory.name}: the session was killed; this is what was on disk")
             return found

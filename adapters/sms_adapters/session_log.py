@@ -27,6 +27,9 @@ from sms_online.errors import InputError
 from sms_online.stream import Array
 
 SCHEMA = "sms-online/recording/1"
+# Number of the rules by which raw items become rows: ticks, clocks, portions. A recording made under others replays with
+# slightly other times of the samples. Recordings without a number were made under the first ones.
+RULES = 2
 SESSION = "session.toml"
 SYSTEM = "system.toml"
 CHECKPOINT = "resumed-from.npz"
@@ -62,17 +65,20 @@ class SessionHeader:
 
     epoch: UTC of the session's clock zero, µs. sources: name to kind, in the order of the system file. start: time of
     the clock's zero in the estimate, s; not 0 where the session resumed an earlier one. versions: of programs, by name.
+    rules: see RULES.
     """
 
     epoch: int
     sources: dict[str, Kind]
     start: float
     versions: dict[str, str]
+    rules: int = RULES
 
 
 def header_text(header: SessionHeader) -> str:
     """session.toml of a session that begins."""
-    lines = [f'schema = "{SCHEMA}"', f"epoch_us = {header.epoch}", f"start_s = {header.start!r}", "", "[sources]"]
+    lines = [f'schema = "{SCHEMA}"', f"epoch_us = {header.epoch}", f"start_s = {header.start!r}"]
+    lines += [f"rules = {header.rules}", "", "[sources]"]
     lines += [f'{name} = "{kind}"' for name, kind in header.sources.items()]
     lines += ["", "[versions]", *(f"{json.dumps(name)} = {json.dumps(text)}" for name, text in header.versions.items())]
     return "\n".join(lines) + "\n"
@@ -95,7 +101,11 @@ def read_header(directory: Path) -> tuple[SessionHeader, dict[str, Any] | None]:
         if not set(document["sources"].values()) <= set(SUFFIXES):
             raise ValueError("a source of unknown kind")
         header = SessionHeader(
-            int(document["epoch_us"]), dict(document["sources"]), float(document["start_s"]), document["versions"]
+            int(document["epoch_us"]),
+            dict(document["sources"]),
+            float(document["start_s"]),
+            document["versions"],
+            int(document.get("rules", 1)),
         )
     except OSError as error:
         raise InputError(str(path), "", error.strerror or str(error), "a recording's session.toml") from None

@@ -53,7 +53,7 @@ def stride(half_width: int, hop: int) -> int:
 
 
 def _windows(samples: Array, length: int, first: NDArray[np.int64]) -> Array:
-    """Runs (n, C, length) of samples (B, C) from rows `first` (n,) on; the view that NumPy has for it is slow to make."""
+    """Runs (n, C, length) of samples (B, C) from rows `first` (n,) on; NumPy's own view for it is slow to make."""
     rows, columns = samples.strides
     shape = len(samples) - length + 1, samples.shape[1], length
     return np.asarray(as_strided(samples, shape, (rows, columns, rows), writeable=False)[first])

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import json
 import math
-import os
 from datetime import datetime
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 from sms_online.errors import InputError
@@ -24,8 +24,13 @@ def results_directory(out: Path | None) -> Path:
     existing = next(path for path in (directory, *directory.absolute().parents) if path.exists())
     if not existing.is_dir():
         raise InputError(str(directory), "", f"{existing} is no directory", "a directory that can be made")
-    if not os.access(existing, os.W_OK | os.X_OK):
-        raise InputError(str(directory), "", f"no permission to write in {existing}", "a directory that can be made")
+    try:
+        # Trying tells more than permissions do: of a disk that is full or read-only, and to root.
+        with TemporaryDirectory(prefix=".sms-online-", dir=existing) as tried:
+            (Path(tried) / NAME).write_text("tried\n", encoding="utf-8")
+    except OSError as error:
+        found = f"nothing can be written in {existing}: {error.strerror or error}"
+        raise InputError(str(directory), "", found, "a directory that can be made") from None
     return directory
 
 
