@@ -79,9 +79,7 @@ class Recording:
         """What was wrong with the devices, and with the recording."""
         found = self._merger.warnings
         if self._header.rules != RULES:
-            found.append(
-                f"{self._directory.name}: recorded by another version: results differ slightly from the session's"
-            )
+            found.append(f"{self._directory.name}: recorded by another version, results differ a little from its own")
         if self._ending is None:
             found.append(f"{self._directory.name}: the session was killed; this is what was on disk")
             return found
