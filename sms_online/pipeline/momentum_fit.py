@@ -255,9 +255,16 @@ class MomentumFit:
         """rms of the residual of some generalized speeds' rows over its predicted standard deviation, for β (n,)."""
         if self.plain_windows == 0:
             return None
-        w = np.append(beta, -1.0)
-        mean_square = w @ self.plain_gram[rows].mean(axis=0) @ w / self.plain_windows
+        mean_square = self._squares(beta)[rows].mean() / self.plain_windows
         return float(np.sqrt(max(0.0, mean_square)))
+
+    def _squares(self, beta: Array) -> Array:
+        """Sum (n_v,) of the squares of every speed's residual over its predicted variance, for β (n,)."""
+        w = np.append(beta, -1.0)
+        squares = np.einsum("i,vij,j->v", w, self.plain_gram, w)
+        # Where samples are exact nothing but rounding is left of the sum.
+        rounding = np.finfo(np.float64).eps * np.einsum("i,vij,j->v", np.abs(w), np.abs(self.plain_gram), np.abs(w))
+        return np.asarray(squares - ROUNDED * rounding)
 
     def _moves(self, window: Window, noise: SensorNoise) -> bool:
         inside = slice(window.start - self._first, window.start - self._first + INSTANTS + 1)
@@ -294,11 +301,7 @@ class MomentumFit:
         """What rows leave of β (n,) beyond their predicted variance so far, where that is no accident."""
         if self.plain_windows == 0:
             return
-        w = np.append(beta, -1.0)
-        squares = np.einsum("i,vij,j->v", w, self.plain_gram, w)
-        # Where samples are exact nothing but rounding is left of the sum.
-        rounding = np.finfo(np.float64).eps * np.einsum("i,vij,j->v", np.abs(w), np.abs(self.plain_gram), np.abs(w))
-        ratio = (squares - ROUNDED * rounding) / self.plain_windows
+        ratio = self._squares(beta) / self.plain_windows
         self.misfit = np.where(ratio > LARGEST_RATIO, ratio - 1.0, 0.0)
 
     def _retell(self) -> None:
