@@ -273,7 +273,8 @@ class MomentumFit:
     def _look(self, noise: SensorNoise, window: Window) -> None:
         """Now and then, with the window to come: begin to weigh with the estimate and the noise so far, if it matters.
 
-        The chain so far goes on until the new one has been told enough windows.
+        The chain so far goes on until the new one has been told enough windows. What the model lacks counts at once: it
+        is each row's own, and chains of such rows are short.
         """
         if self._next is not None or self._since < self._renewal:
             return
@@ -282,20 +283,23 @@ class MomentumFit:
         self._since = 0
         self._renewal = min(2 * self._renewal, self._count(LATEST_RENEWAL))
         self._judge(beta)
-        if self._matters(beta, noise):
+        used = self._weighing
+        if np.any(np.abs(self.misfit - used.misfit) > SAME_MISFIT * (1.0 + used.misfit)):
+            self.weights = beta
+            used.begin(beta, noise, self.misfit, window.start)
+        elif self._matters(beta, noise):
             self._next, self._warm = self._new_weighing(), 0
             self._next.begin(beta, noise, self.misfit, window.start)
 
     def _matters(self, beta: Array, noise: SensorNoise) -> bool:
-        """Whether β (n,), the noise and the misfit of now would weigh rows otherwise."""
+        """Whether β (n,) and the noise of now would weigh rows otherwise."""
         used = self._weighing
         assert used.sensor_noise is not None
         squares = np.einsum("vii->vi", self.plain_gram)[:, :-1]
         changed, size = (np.sqrt(squares @ values**2) for values in (beta - used.beta, beta))
         densities = [(noise.sensors, used.sensor_noise.sensors), (noise.torque, used.sensor_noise.torque)]
         louder = any(np.any(np.abs(now - then) > SAME_NOISE * then) for now, then in densities)
-        misfit = np.abs(self.misfit - used.misfit) > SAME_MISFIT * (1.0 + used.misfit)
-        return bool(np.any(changed > SAME_ROWS * size) or louder or misfit.any())
+        return bool(np.any(changed > SAME_ROWS * size) or louder)
 
     def _judge(self, beta: Array) -> None:
         """What rows leave of β (n,) beyond their predicted variance so far, where that is no accident."""
