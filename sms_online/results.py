@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from sms_online.description.parse import describe
+from sms_online.judgement import Facts, Finding, Judgement, judge
 from sms_online.physical import PhysicalSet, Projection
 from sms_online.pipeline.estimator import Estimator
 from sms_online.pipeline.events import Event
@@ -19,12 +21,10 @@ SCHEMA = "sms-online/results/1"
 NORMAL_95 = 1.959963984540054
 # An estimate within three standard deviations of zero is not determined by the data: not even its sign is certain.
 LARGEST_RELATIVE_STD = 1.0 / 3.0
-# A joint whose unexplained torque reaches this share of the measured one lacks an effect, whatever the error bars say.
-LARGEST_RESIDUAL = 0.5
-# Rows that hold this many times their predicted deviation bend parameters by more than bars from the residual tell.
-LARGEST_WHITENED = 3.0
 # Mean square of rows over their predicted variance that noise alone may leave: the noise itself is estimated to 5 %.
 LARGEST_ROW_VARIANCE = 1.2
+# Rows of the energy balance, for each parameter, from which on its first transient is forgotten.
+ROWS_A_PARAMETER = 10
 # Noise in the columns matters where it pulls an estimate by more than this many standard deviations.
 LARGEST_PULL = 1.0
 # Quantities that cannot be negative, as the ends of names.
@@ -77,29 +77,6 @@ def _identifiable(estimate: Estimate, std: Array) -> NDArray[np.bool_]:
     return estimate.determined & (std <= LARGEST_RELATIVE_STD * np.abs(estimate.pi))
 
 
-def doubts(parameters: list[dict[str, Any]], residual: dict[str, dict[str, float | None]]) -> list[str]:
-    """Reasons not to trust a fit that its error bars do not know of, a sentence each."""
-    out = []
-    for name, rows in residual.items():
-        relative = rows["relative"]
-        if relative is not None and relative > LARGEST_RESIDUAL:
-            share = f"{100.0 * relative:.0f} % of the torque or force of {name} is not explained"
-            out.append(f"{share}: the model lacks an effect there, and the parameters bend to replace it")
-    noise = {name: rows["whitened"] for name, rows in residual.items() if rows["whitened"] is not None}
-    worst = max(noise, key=lambda name: noise[name], default=None)
-    if worst is not None and noise[worst] > LARGEST_WHITENED:
-        out.append(
-            f"rows of {worst} hold {noise[worst]:.0f} times what the sensors' noise explains: the model or the samples "
-            "are wrong there, by more than error bars can tell"
-        )
-    for p in parameters:
-        if p["identifiable"] and p["upper95"] < 0.0 and p["name"].endswith(POSITIVE):
-            out.append(
-                f"{p['name']} is negative, which is not physical: the model lacks an effect, or the data are weak"
-            )
-    return out
-
-
 def residuals(estimator: Estimator, beta: Array) -> dict[str, dict[str, float | None]]:
     """By row type: `relative` to the measured torque or force, `whitened` over its predicted standard deviation."""
     layout, momentum = estimator.model.layout, estimator.momentum
@@ -120,24 +97,95 @@ def residuals(estimator: Estimator, beta: Array) -> dict[str, dict[str, float | 
     return out
 
 
-def pulled(estimator: Estimator) -> list[str]:
-    """Names of parameters that noise in the columns pulls by more than their standard deviation: errors in variables.
+def pulled(estimator: Estimator, estimate: Estimate, std: Array) -> list[str]:
+    """Names of parameters that noise in the columns pulls by more than their std (n,): errors in variables.
 
     The comparison is Hausman's, of least squares with an estimate that is free of this bias.
     """
     if estimator.momentum is None or not estimator.by_momentum:
         return []
-    estimate = estimator.estimate()
     shift = np.abs(estimator.momentum.bias.correction(estimate.determined)[0])
-    std = standard_deviation(estimator, estimate)
     return [p.name for p, s, d in zip(estimator.base.parameters, shift, std, strict=True) if s > LARGEST_PULL * d]
 
 
-def _pull_warning(estimator: Estimator) -> list[str]:
-    names = pulled(estimator)
-    if not names:
-        return []
-    return [f"sensor noise in the columns pulls {', '.join(names)} by more than the error bar"]
+def judged(
+    estimator: Estimator,
+    estimate: Estimate | None = None,
+    findings: Sequence[Finding] = (),
+    troubles: Sequence[str] = (),
+    projection: Projection | None = None,
+) -> Judgement:
+    """May the estimate be trusted? As known now; the answer changes while a session runs.
+
+    estimate: the estimator's own of now, where it is at hand. findings: of the diagnosis that runs beside it, if one
+    does. troubles: see `Facts`. projection: onto real bodies, where it has been made.
+    """
+    if estimate is None:
+        estimate = estimator.estimate()
+    std = standard_deviation(estimator, estimate)
+    flags = _identifiable(estimate, std)
+    names = [p.name for p in estimator.base.parameters]
+    momentum = estimator.momentum
+    lost = estimator.counters.lost_samples
+    below = flags & (estimate.pi + NORMAL_95 * np.where(flags, std, 0.0) < 0.0)
+    alarm = unweighed = None
+    if momentum is not None:
+        alarm = None if momentum.test.alarm is None else momentum.test.alarm.row
+        unweighed = None if momentum.fit.unexplained is None else momentum.fit.unexplained + 1
+    return judge(
+        Facts(
+            determined=(int(np.count_nonzero(flags)), flags.size),
+            undetermined=tuple(name for name, known in zip(names, flags, strict=True) if not known),
+            settling=_settling(estimator, estimate, bool(flags.any())),
+            residual=residuals(estimator, estimate.pi),
+            negative=tuple(
+                name for name, negative in zip(names, below, strict=True) if negative and name.endswith(POSITIVE)
+            ),
+            pulled=tuple(pulled(estimator, estimate, std)),
+            alarm=alarm,
+            unweighed=unweighed,
+            undecided=tuple(event.time for event in estimator.events if event.kind == "undecided"),
+            distance=0.0 if projection is None else projection.distance,
+            lost=lost / max(1, lost + estimator.samples),
+            findings=tuple(findings),
+            troubles=(*troubles, *_weaknesses(estimator)),
+        )
+    )
+
+
+def _settling(estimator: Estimator, estimate: Estimate, known: bool) -> str:
+    """Why the estimate will still move by more than its error bars."""
+    if not known:
+        return "no parameter is determined, for want of motion"
+    smoother, momentum = estimator.smoother, estimator.momentum
+    if smoother is not None and smoother.spans == 0 and not smoother.failures:
+        return "the smoother has not worked off its first span"
+    if estimator.by_smoother:
+        return ""
+    if momentum is None:
+        few = estimate.dof < ROWS_A_PARAMETER * estimate.pi.size
+        return "the energy balance has few rows yet" if few else ""
+    if not momentum.started:
+        return "the first fit has no weights yet, for want of motion"
+    if momentum.settled:
+        return ""
+    after = f" since the change at {estimator.events[-1].time:.1f} s" if estimator.events else ""
+    return f"the test for more than noise has seen too few rows{after}"
+
+
+def _weaknesses(estimator: Estimator) -> list[str]:
+    """What weakens an estimate by the way it is made."""
+    out = []
+    smoother, momentum = estimator.smoother, estimator.momentum
+    if smoother is not None and smoother.level > 0.0 and estimator.by_smoother:
+        out.append("samples do not agree with the equations of motion")
+    if smoother is not None and not estimator.by_smoother and estimator.sensing.missing:
+        out.append("links are taken as bent statically: estimates are off by percents")
+    late = None if momentum is None else momentum.latencies.found
+    if late is not None:
+        whose = late.source if late.size > 0.0 else f"all sources but {late.source}"
+        out.append(f"{whose}: {1e3 * abs(late.size):.2g} ms later than stated")
+    return out
 
 
 def method(estimator: Estimator) -> str:
@@ -207,12 +255,14 @@ def results_document(
     warnings: list[str],
     truth: dict[str, float] | None = None,
     bound: Array | None = None,
+    findings: Sequence[Finding] = (),
 ) -> dict[str, Any]:
     """results.json of a finished session.
 
     throughput: samples/s. truth: true values of physical parameters by name, of a simulated capture; they enter this
-    report alone. bound (n,): Cramér-Rao bound of each base parameter, where it has been computed. Numbers that do not
-    exist (the std of an undetermined parameter) are None. After an event parameters and residuals are those since then.
+    report alone. bound (n,): Cramér-Rao bound of each base parameter, where it has been computed. findings: of the
+    diagnosis that ran beside it. Numbers that do not exist (the std of an undetermined parameter) are None. After an
+    event parameters and residuals are those since then.
     """
     estimate = estimator.estimate()
     base = estimator.base
@@ -241,16 +291,17 @@ def results_document(
                 "bound": None if bound is None or k >= bound.size or not np.isfinite(bound[k]) else float(bound[k]),
             }
         )
-    residual = residuals(estimator, estimate.pi)
+    judgement = judged(estimator, estimate, findings, projection=projection)
     return {
         "schema": SCHEMA,
         "system": describe(estimator.system),
         "samples": estimator.samples,
         "duration_s": estimator.duration,
         "method": method(estimator),
+        "verdict": judgement.document(),
         "parameters": parameters,
         "events": [event_document(event) for event in estimator.events],
-        "residual": residual,
+        "residual": residuals(estimator, estimate.pi),
         "physical": None
         if projection is None
         else {"distance_std": projection.distance, "active": list(projection.active)},
@@ -259,8 +310,7 @@ def results_document(
         "lost_samples": estimator.counters.lost_samples,
         "warnings": [
             *warnings,
-            *doubts(parameters, residual),
-            *_pull_warning(estimator),
+            *(reason.full for reason in judgement.reasons if reason.full),
             *_projection_warning(projection),
             *_smoother_warnings(estimator),
         ],

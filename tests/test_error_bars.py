@@ -8,7 +8,7 @@ from axis import AXIS, DAMPING, INERTIA
 
 from sms_online.description.parse import parse_system
 from sms_online.pipeline.estimator import Estimator
-from sms_online.results import doubts, standard_deviation
+from sms_online.results import standard_deviation
 from sms_online.stream import Array, Block
 
 SEEDS = 40
@@ -43,16 +43,3 @@ def test_error_bars_are_neither_too_small_nor_too_large(torque_noise: float, pos
     rms = np.sqrt(np.mean(normalised_errors(torque_noise, position_noise) ** 2, axis=0))
     assert (rms < 1.35).all(), rms
     assert (rms > 0.2).all(), rms
-
-
-def test_rows_far_beyond_their_noise_are_a_doubt_of_their_own() -> None:
-    """The worst of them is named, though the torque is all but explained."""
-    residual: dict[str, dict[str, float | None]] = {
-        "energy": {"relative": None, "whitened": None},
-        "joint_1": {"relative": 0.01, "whitened": 1.1},
-        "base": {"relative": None, "whitened": 62.0},
-    }
-    (said,) = doubts([], residual)
-    assert said.startswith("rows of base hold 62 times")
-    residual["base"]["whitened"] = 1.3
-    assert doubts([], residual) == []

@@ -13,8 +13,9 @@ from sms_online.diagnosis.diagnose import Diagnosis
 from sms_online.diagnosis.trace import Finding
 from sms_online.effects.base import report
 from sms_online.effects.catalogue import ENTRIES, declarable
+from sms_online.judgement import Facts, Judgement, judge, judge_diagnosis
 from sms_online.model.parameters import Parameter
-from sms_online.results import LARGEST_RELATIVE_STD, NORMAL_95, results_document
+from sms_online.results import LARGEST_RELATIVE_STD, NORMAL_95, judged, results_document
 from sms_online.stream import Array
 
 SCHEMA = "sms-online/diagnosis/1"
@@ -36,6 +37,7 @@ def diagnosis_document(diagnosis: Diagnosis, warnings: list[str], truth: dict[st
         "schema": SCHEMA,
         "verdict": diagnosis.verdict,
         "summary": summary(diagnosis),
+        "judgement": judgement(diagnosis).document(),
         "effects": [_effect(diagnosis, finding) for finding in diagnosis.findings] + _by_comparison(diagnosis),
         "steps": [
             {"taken": step.taken, "effects": list(step.effects), "holdout": step.relative} for step in diagnosis.steps
@@ -73,6 +75,19 @@ def diagnosis_document(diagnosis: Diagnosis, warnings: list[str], truth: dict[st
         ],
         "warnings": [*warnings, *results["after"]["warnings"]],
     }
+
+
+def judgement(diagnosis: Diagnosis) -> Judgement:
+    """May the parameters after be trusted, and the system file?"""
+    if diagnosis.attempt.prior is None:
+        after = judged(diagnosis.estimator_after)
+    else:
+        # Parameters come from the rows of the diagnosis then, see `_posterior`.
+        known = [p["identifiable"] for p in _posterior(diagnosis.attempt, diagnosis.chosen)]
+        after = judge(Facts((sum(known), len(known)), residual=_part(diagnosis.after.fit)))
+    effects = [f"{effect['name']}@{effect['where']}" for effect in _named(diagnosis)]
+    row = None if diagnosis.unexplained is None else diagnosis.unexplained.row
+    return judge_diagnosis(diagnosis.verdict, effects, row, after)
 
 
 def summary(diagnosis: Diagnosis) -> str:

@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from sms_online.diagnosis.online_search import Named, Outcome
+from sms_online.judgement import Finding
 from sms_online.pipeline.events import Event
 
 
@@ -62,6 +63,12 @@ def line(episode: Episode) -> str:
         jumps = zip(episode.event.parameters, episode.event.sizes, episode.event.units, strict=True)
         return f"{where}: {', '.join(f'{name} {size:+.4g} {unit}' for name, size, unit in jumps)}"
     return f"{where}, not named yet"
+
+
+def finding(episode: Episode) -> Finding:
+    """An episode as the judgement of the session takes it."""
+    named = tuple(each.key for each in episode.named)
+    return Finding(episode.row, episode.noticed, episode.verdict, named, episode.adopted is not None)
 
 
 def _told(named: Named) -> str:

@@ -17,7 +17,7 @@ from sms_online.pipeline.errors_in_variables import NoiseBias
 from sms_online.pipeline.events import Event
 from sms_online.pipeline.latency import Latencies, clock_groups, source_groups
 from sms_online.pipeline.momentum_balance import COPIES, HOPS, MomentumBalance
-from sms_online.pipeline.momentum_fit import MomentumFit, WhiteRows
+from sms_online.pipeline.momentum_fit import FIRST_MOTION, MomentumFit, WhiteRows
 from sms_online.pipeline.residual_test import SequentialTest
 from sms_online.pipeline.sensing import Sensing
 from sms_online.pipeline.sensor_noise import NoiseEstimate, SensorNoise, noise_from_state, noise_state
@@ -29,6 +29,8 @@ from sms_online.trackers.square_root import RecursiveLeastSquares
 
 # The synthetic noise is the same in every session, so that the same samples give the same bits.
 SEED = 6
+# Motion, s, in which a lack that was there from the start is noticed as a rule: that of the first fit, and a second.
+TESTED = FIRST_MOTION + 1.0
 # Time from one estimate of the sensors' noise to the next, s.
 NOISE_RENEWED = 1.0
 
@@ -95,6 +97,11 @@ class Momentum:
     def started(self) -> bool:
         """Whether weights are known and rows come."""
         return self.fit.weights is not None
+
+    @property
+    def settled(self) -> bool:
+        """Whether there are rows enough since the last event for a test of what they leave."""
+        return self.started and self.fit.plain_windows * self._balance.span / HOPS >= TESTED
 
     @property
     def misfit(self) -> bool:

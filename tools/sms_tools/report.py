@@ -9,16 +9,20 @@ from typing import Any
 
 from rich.console import Console
 from rich.table import Table
+from rich.text import Text
 
 # Width of a table that goes to a file or a pipe, where there is no terminal to ask.
 FILE_WIDTH = 140
-# A terminal narrower than this has no room for the intervals, which ± std tells too.
-WIDTH_WITH_INTERVAL = 112
+# A terminal narrower than this has no room for what the intervals and errors tell too: ± std, the true values.
+WIDTH_WITH_ALL = 112
 # Significant digits of an estimate: as many as show two of its standard deviation, within these bounds.
 LEAST_DIGITS, MOST_DIGITS = 2, 7
 # Powers of ten below this one are written as such.
 SMALLEST_PLAIN = -4
 NOT_DETERMINED = "not determined"
+# Of a verdict, by its level; what is grave is red.
+LEVEL_STYLES = {"trust": "bold green", "doubt": "bold yellow", "not yet": "bold bright_black"}
+GRAVE_STYLE = "bold red"
 METHODS = {
     "energy": "energy balance",
     "momentum": "momentum balance",
@@ -34,34 +38,43 @@ def report_console(json: bool) -> Console:
     return Console(file=stream, width=None if stream.isatty() else FILE_WIDTH, highlight=False)
 
 
-def show(console: Console, *parts: Table | str) -> None:
+def show(console: Console, *parts: Table | str | Text) -> None:
     """Print; raises BrokenPipeError, which rich itself would turn into an exit code of its own."""
     with console.capture() as capture:
         for part in parts:
-            console.print(part, markup=False, soft_wrap=isinstance(part, str))
+            console.print(part, markup=False, soft_wrap=not isinstance(part, Table))
     console.file.write(capture.get())
 
 
-def parameter_table(document: Document, width: int, title: str | None = None) -> Table:
-    """Parameter, unit, estimate ± std, 95 % interval where `width` allows it, truth and error where it is known."""
+def verdict_text(verdict: Document) -> Text:
+    """Whether to trust the numbers, in its colour, and the other reasons below."""
+    style = GRAVE_STYLE if verdict["grave"] else LEVEL_STYLES[verdict["level"]]
+    return Text("\n").join([Text(verdict["sentence"], style), *(Text(f"  {each}") for each in verdict["reasons"][1:])])
+
+
+def parameter_table(document: Document, width: int, title: str | Text | None = None) -> Table:
+    """Parameter, unit, estimate, 95 % interval and, where it is known, the error; where `width` allows it also ± std
+    and the truth."""
     parameters = document["parameters"]
     simulated = any(p["true"] is not None for p in parameters)
     table = Table(title=title, title_justify="left", box=None, header_style="bold", pad_edge=False)
     table.add_column("parameter", overflow="fold")
     table.add_column("unit")
-    wide = width >= WIDTH_WITH_INTERVAL
-    headings = ["estimate", "± std"] + ["95 % interval"] * wide + ["true", "error %"] * simulated
+    wide = width >= WIDTH_WITH_ALL
+    headings = ["estimate"] + ["± std"] * wide + ["95 % interval"] + ["true"] * (simulated and wide)
+    headings += ["error %"] * simulated
     for heading in headings:
         table.add_column(heading, justify="right", no_wrap=True)
     for p in parameters:
-        cells = [p["name"], p["unit"], NOT_DETERMINED, _in_doubt(p)] + [""] * wide
+        cells = [p["name"], p["unit"]]
         if p["identifiable"]:
             shown = formatter(p["estimate"], p["std"])
-            cells[2:4] = shown(p["estimate"]), f"{p['std']:.2g}"
-            if wide:
-                cells[4] = f"{shown(p['lower95'])} … {shown(p['upper95'])}"
+            cells += [shown(p["estimate"]), *[f"{p['std']:.2g}"] * wide]
+            cells.append(f"{shown(p['lower95'])} … {shown(p['upper95'])}")
+        else:
+            cells += [NOT_DETERMINED, _in_doubt(p), *[""] * wide]
         if simulated:
-            cells.append("" if p["true"] is None else f"{p['true']:.6g}")
+            cells += ["" if p["true"] is None else f"{p['true']:.6g}"] * wide
             cells.append(_error(p))
         table.add_row(*cells, style=None if p["identifiable"] else "dim")
     return table

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import argparse
 import math
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 
 from sms_online.diagnosis.online import OnlineDiagnosis
@@ -14,7 +15,8 @@ from sms_online.stream import Block
 from sms_tools.html_report.history import History
 from sms_tools.html_report.page import write_report
 from sms_tools.interruption import Interruption
-from sms_tools.report import Document, report_console, show
+from sms_tools.report import Document, report_console, show, verdict_text
+from sms_tools.view.frames import Circumstances
 from sms_tools.view.session import Health, View, open_view, references
 
 
@@ -51,20 +53,30 @@ class Showing:
         """The same blocks, looked at on their way."""
         return iter(self._history.watch(self._view.watch(blocks)))
 
-    def follow(self, online: OnlineDiagnosis) -> None:
-        """Show what a diagnosis finds meanwhile: evidence as a plot, verdicts in the log."""
+    def follow(self, online: OnlineDiagnosis, say: Callable[[str], None] = lambda text: None) -> None:
+        """Show what a diagnosis finds meanwhile: evidence as a plot, verdicts in the log and in the judgement.
+
+        say: is told the verdicts too.
+        """
+        before = self._view.circumstances
+        self._view.circumstances = lambda: replace(before(), findings=online.findings)
 
         def evidence(t: float, scores: Mapping[str, float]) -> None:
             self._view.evidence(t, {name: math.log10(max(1.0, gain)) for name, gain in scores.items()})
 
-        online.on_evidence, online.on_verdict = evidence, self._view.event
+        def verdict(t: float, text: str) -> None:
+            self._view.event(t, text)
+            say(f"{t:.2f} s: {text}")
+
+        online.on_evidence, online.on_verdict = evidence, verdict
 
     def report(self, document: Document, interruption: Interruption) -> None:
-        """Write the page of a finished session, say where it is, and keep serving the view while that is asked for."""
+        """Write the page of a finished session, say where it is and whether to trust the numbers, and keep serving the
+        view while that is asked for."""
         self._history.finish()
         compared = references(self._estimator, self._truth)
         page = write_report(self._directory, document, self._estimator, self._history, compared, self._args.exaggerate)
-        show(report_console(self._args.json), f"report: {page}")
+        show(report_console(self._args.json), f"report: {page}", "", verdict_text(document["verdict"]))
         self._view.linger(interruption)
 
 
@@ -77,13 +89,15 @@ def showing(
     truth: Mapping[str, float] | None,
     patient: bool = False,
     health: Health | None = None,
+    troubles: Callable[[], Sequence[str]] = tuple,
 ) -> Iterator[Showing]:
     """What `--rerun` asks for, while the context lasts; the estimator has to be finished within it.
 
-    patient: the session may wait for the view, as a replay as fast as it goes does. health: of a live source.
+    patient: the session may wait for the view, as a replay as fast as it goes does. health, troubles: of a live source.
     """
     exaggeration = args.exaggerate
     with open_view(
         args.rerun, estimator, channels, directory, truth, patient=patient, exaggeration=exaggeration, health=health
     ) as view:
+        view.circumstances = lambda: Circumstances(troubles=tuple(troubles()))
         yield Showing(args, estimator, view, channels, directory, truth)

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Sequence
-from fnmatch import fnmatchcase
 from html import escape
 from pathlib import Path
 
@@ -13,10 +11,12 @@ import numpy as np
 from sms_online.diagnosis.diagnose import Diagnosis
 from sms_tools.html_report.arm_drawing import marked_arm
 from sms_tools.html_report.diagnosis_charts import AFTER, BEFORE, BOUNDS, law_charts, residual_charts
-from sms_tools.html_report.error_bars import Bar, bar_range, error_bars
-from sms_tools.html_report.page import write_page
+from sms_tools.html_report.error_bars import Bar, error_bars
+from sms_tools.html_report.page import verdict_box, write_page
 from sms_tools.html_report.svg import svg
 from sms_tools.report import NOT_DETERMINED, Document, formatter
+from sms_tools.view.parameter_groups import half_range
+from sms_tools.view.places import places_of
 from sms_tools.view.scene import Scene
 
 NAME = "diagnosis.html"
@@ -27,9 +27,6 @@ SHARE_WIDTH, SHARE_HEIGHT = 220, 14
 FOUND, LIKE, OTHER = "#b4005a", "#e3a6c6", "#c9d2dc"
 # Positions that the tip's way is drawn through.
 WAY_POINTS = 300
-# Where a channel's sensor sits; all others are the base's.
-JOINT_CHANNEL = re.compile(r"(?:q|theta_m|tau|force)_(\d+)")
-LINK_CHANNEL = re.compile(r"(link_\d+)\.")
 
 HOW_LAWS = (
     "Where an effect is a force over one variable, that force is also fitted as a free curve, with everything else as "
@@ -49,6 +46,7 @@ def write_diagnosis(
     system = diagnosis.described.system
     heading = escape(system.title or system.name)
     sections = [
+        verdict_box(document["judgement"]),
         f"<h1>{heading}</h1><p>Diagnosis of {escape(source)}: {_conditions(diagnosis)}.</p>",
         f'<p class="verdict {document["verdict"]}">{escape(document["summary"])}</p>',
         *(f'<p class="warning">{escape(warning)}</p>' for warning in document["warnings"]),
@@ -76,20 +74,6 @@ def _conditions(diagnosis: Diagnosis) -> str:
     seconds = sum(segment.index.size for segment in rows.segments) / rows.model.system.sample_rate
     held = int(np.count_nonzero(~diagnosis.after.fitted))
     return f"{seconds:.4g} s of samples in {rows.count} windows, {held} of them held out"
-
-
-def places_of(where: str, channels: Sequence[str]) -> list[str]:
-    """Where an effect is drawn on the arm, `joint_i`, `link_i`, `base` or `tip`: at the sensors of its channels."""
-    if where in ("base", "tip") or re.fullmatch(r"(joint|link)_\d+", where):
-        return [where]
-    return list(dict.fromkeys(_sensor(channel) for channel in channels if fnmatchcase(channel, where)))
-
-
-def _sensor(channel: str) -> str:
-    if joint := JOINT_CHANNEL.match(channel):
-        return f"joint_{joint[1]}"
-    link = LINK_CHANNEL.match(channel)
-    return link[1] if link else "base"
 
 
 def _where(document: Document, diagnosis: Diagnosis) -> str:
@@ -217,7 +201,7 @@ def _parameters(document: Document) -> str:
             if each is not None and each["identifiable"] and reference:
                 size = abs(reference) / 100.0
                 deviations[k, j] = (each["estimate"] - reference) / size, BOUNDS * each["std"] / size
-    limit = bar_range(np.abs(deviations).sum(axis=2).ravel())
+    limit = half_range(np.abs(deviations).sum(axis=2).ravel())
     columns = ["before", *(["after"] if changed else [])]
     headings = [f"{column} ± std" for column in columns]
     if is_true:

@@ -7,14 +7,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sms_online.stream import Array
 from sms_tools.html_report.svg import svg
 
 # Size of a picture and of each bar in it, px.
 BAR_WIDTH, BAR_HEIGHT, STEP = 190, 16, 9
-# The range of deviations, %, tried in this order until three quarters of them fit.
-BAR_RANGES = (0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0, 20.0, 50.0, 100.0)
-FITTING = 0.75
 
 
 @dataclass(frozen=True)
@@ -24,13 +20,6 @@ class Bar:
     deviation: float
     bound: float
     color: str
-
-
-def bar_range(reach: Array) -> float:
-    """Half range, %, of an axis for bars that reach so far (·,) from the reference; NaN where there is no bar."""
-    reach = reach[np.isfinite(reach)]
-    fits = [limit for limit in BAR_RANGES if reach.size and np.mean(reach <= limit) >= FITTING]
-    return fits[0] if fits else BAR_RANGES[-1]
 
 
 def error_bars(bars: Sequence[Bar], limit: float) -> str:

@@ -12,12 +12,12 @@ from sms_online.errors import InputError
 from sms_online.pipeline.estimator import Estimator
 from sms_online.stream import Array
 from sms_tools.html_report.arm_drawing import arm_drawings
-from sms_tools.html_report.error_bars import Bar, bar_range, error_bars
+from sms_tools.html_report.error_bars import Bar, error_bars
 from sms_tools.html_report.history import History
 from sms_tools.html_report.svg import Series, chart
 from sms_tools.report import NOT_DETERMINED, Document, formatter, trust_lines
 from sms_tools.view.frames import Reference
-from sms_tools.view.parameter_groups import Group, parameter_groups, shortened
+from sms_tools.view.parameter_groups import HALF_RANGES, Basis, Group, half_range, parameter_groups, shortened
 from sms_tools.view.scene import Scene
 
 NAME = "report.html"
@@ -37,6 +37,10 @@ figure { display: inline-block; margin: 0.3em; text-align: center } figcaption {
 svg { background: #fff } svg text { font: 11px system-ui, sans-serif; fill: #5a6875 }
 svg .title { font-size: 13px; fill: #1c2733 } svg .legend { text-anchor: end; paint-order: stroke; stroke: #fff;
 stroke-width: 3px } .grid { stroke: #e8edf2 } .span { fill: #f1f4f7 } .mark { stroke: #d04040; stroke-dasharray: 3 3 }
+.judgement { color: #fff; border-radius: 6px; padding: 0.7em 1.1em; margin-bottom: 1.2em }
+.judgement b { font-size: 1.3em } .judgement ul { margin: 0.4em 0 0; padding-left: 1.3em }
+.trust { background: #1e8449 } .doubt { background: #f0a41c; color: #1c2733 } .grave { background: #c0282d }
+.not_yet { background: #6d747d }
 .warning { background: #fff4e0; border-left: 4px solid #e0a030; padding: 0.3em 0.8em; margin: 0.4em 0 }
 .verdict { font-size: 1.1em; border-left: 6px solid #b4005a; background: #f8f1f5; padding: 0.5em 0.9em }
 .verdict.clean { border-color: #009e73; background: #eff8f5 }
@@ -63,6 +67,7 @@ def write_report(
     """
     system = document["system"]
     sections = [
+        verdict_box(document["verdict"]),
         f"<h1>{escape(system['title'] or system['name'])}</h1><p>{escape(system['reference'])}</p>",
         *(f'<p class="warning">{escape(warning)}</p>' for warning in document["warnings"]),
         "<h2>Parameters</h2>",
@@ -79,6 +84,14 @@ def write_report(
         "</ul>",
     ]
     return write_page(directory / NAME, f"{system['name']}: parameters", "\n".join(sections))
+
+
+def verdict_box(verdict: Document) -> str:
+    """Whether to trust the numbers, in its colour, and the reasons."""
+    kind = "grave" if verdict["grave"] else verdict["level"].replace(" ", "_")
+    others = "".join(f"<li>{escape(reason)}</li>" for reason in verdict["reasons"][1:])
+    listed = f"<ul>{others}</ul>" if others else ""
+    return f'<div class="judgement {kind}"><b>{escape(verdict["sentence"])}</b>{listed}</div>'
 
 
 def write_page(path: Path, title: str, body: str) -> Path:
@@ -98,27 +111,29 @@ def write_page(path: Path, title: str, body: str) -> Path:
 
 
 def _parameters(document: Document, references: Sequence[Reference | None]) -> str:
-    """The table, each parameter with its error bar relative to the reference."""
+    """The table, each parameter with its error bar about the true value, or where none is known about the estimate."""
     parameters = document["parameters"]
-    deviations = np.full((len(parameters), 2), np.nan)  # of estimate from reference, and 2σ, %
+    deviations, drawn = np.full((2, len(parameters), 2), np.nan)  # of the estimate from something, and 2σ, in % of that
+    is_true = False
     for k, (p, reference) in enumerate(zip(parameters, references, strict=True)):
-        if p["identifiable"] and reference is not None and reference.value:
-            size = abs(reference.value) / 100.0
-            deviations[k] = (p["estimate"] - reference.value) / size, BOUNDS * p["std"] / size
-    limit = bar_range(np.abs(deviations).sum(axis=1))
-    is_true = any(reference is not None and reference.is_true for reference in references)
+        is_true |= reference is not None and reference.is_true
+        if p["identifiable"]:
+            if reference is not None and reference.value:
+                deviations[k] = _relative(p, reference.value)
+            drawn[k] = deviations[k] if reference is not None and reference.is_true else _relative(p, p["estimate"])
+    limit = half_range(np.abs(drawn).sum(axis=1))
     compared = "true" if is_true else "nominal"
     rows = [
         '<table class="dense"><tr><th>parameter</th><th></th><th>unit</th><th>estimate</th><th>± std</th>'
         f"<th>95 % interval</th><th>{compared}</th><th>deviation %</th><th>± 2σ, axis ± {limit:g} %</th></tr>"
     ]
-    for p, reference, (deviation, bound) in zip(parameters, references, deviations, strict=True):
+    for p, reference, (deviation, _), bar in zip(parameters, references, deviations, drawn, strict=True):
         known = "" if reference is None else f"{reference.value:.6g}"
         if p["identifiable"]:
             percent = f"{deviation:+.3g}" if np.isfinite(deviation) else ""
             shown = formatter(p["estimate"], p["std"])
             numbers = [shown(p["estimate"]), f"{p['std']:.2g}", f"{shown(p['lower95'])} … {shown(p['upper95'])}"]
-            cells = [*numbers, known, percent, _bar(deviation, bound, limit)]
+            cells = [*numbers, known, percent, _bar(float(bar[0]), float(bar[1]), limit)]
         else:
             cells = [NOT_DETERMINED, "", "", known, "", ""]
         symbol = escape(shortened(p["symbol"]))
@@ -128,8 +143,14 @@ def _parameters(document: Document, references: Sequence[Reference | None]) -> s
     return "\n".join([*rows, "</table>"])
 
 
+def _relative(p: Document, value: float) -> tuple[float, float]:
+    """Deviation of an estimate from a value, and 2σ, % of it."""
+    size = abs(value) / 100.0
+    return (p["estimate"] - value) / size, BOUNDS * p["std"] / size
+
+
 def _bar(deviation: float, bound: float, limit: float) -> str:
-    """Estimate and ± 2σ on a scale of ± limit %, the reference in the middle; red where it lies outside the bounds."""
+    """Estimate and ± 2σ on a scale of ± limit %; red where what is in the middle lies outside the bounds."""
     return error_bars([Bar(deviation, bound, "#0072b2" if abs(deviation) <= bound else "#d04040")], limit)
 
 
@@ -145,13 +166,15 @@ def _convergence(estimator: Estimator, history: History, references: Sequence[Re
         estimate[k, known], std[k, known] = instant.estimate[known], instant.std[known]
     marks = [event.time for event in estimator.events]
     curves = []
-    for group in parameter_groups(estimator.base.parameters, references):
+    last = instants[-1]
+    basis = Basis(np.where(last.determined, last.estimate, np.nan), "last estimate", HALF_RANGES[-1])
+    for group in parameter_groups(estimator.base.parameters, references, basis):
         drawn = (estimate[:, group.indices] - group.zero) / group.scale
         curves.append((group, drawn, BOUNDS * std[:, group.indices] / group.scale))
     # One axis for all deviations, which holds what was known at half time and at the end: between them they settle.
     half = len(instants) // 2
     reach = [np.abs(drawn) + width for group, drawn, width in curves if group.half_range is not None]
-    limit = max(bar_range(np.concatenate([r[k] for r in reach])) for k in (half, -1)) if reach else np.nan
+    limit = max(half_range(np.concatenate([r[k] for r in reach])) for k in (half, -1)) if reach else np.nan
     return [_group_chart(group, t, drawn, width, limit, marks) for group, drawn, width in curves]
 
 

@@ -16,8 +16,9 @@ from sms_adapters.checkpoint import snapshot, write_checkpoint
 from sms_adapters.clock_merge import Merger
 from sms_adapters.recorder import Recorder
 from sms_adapters.recording import tick_time
+from sms_online.judgement import LARGEST_LOSS, Finding
 from sms_online.pipeline.estimator import Estimator
-from sms_online.results import standard_deviation
+from sms_online.results import judged, standard_deviation
 from sms_online.stream import Block
 from sms_tools.interruption import Interruption
 from sms_tools.live.feed import READ_TIMEOUT, Feed, Interpreter, SessionClock
@@ -34,6 +35,8 @@ OPENING = 2.0
 NEWS_INTERVAL = 0.5
 # What is done now and then waits so long for the end of a block, s.
 LONGEST_BLOCK = 0.2
+# Estimates are late from so many seconds on, which no filter or window takes.
+LARGEST_LATENCY = 1.0
 # Parameters on the status line: the best known ones.
 LEADING = 4
 
@@ -59,6 +62,7 @@ class LiveSession:
     ) -> None:
         self.latencies = Latencies()
         self.notices: Callable[[], Sequence[str]] = tuple  # further lines of the status
+        self.findings: Callable[[], Sequence[Finding]] = tuple  # of a diagnosis beside the session
         self.busy = 0.0  # s spent on samples
         self.health: Mapping[str, Mapping[str, float]] = {}  # latency and clock offsets, ms, by name; replaced when new
         self._clock = clock
@@ -187,6 +191,20 @@ class LiveSession:
             found.append(f"{self._recorder.unrecorded} items could not be recorded{why}")
         return found
 
+    @property
+    def troubles(self) -> list[str]:
+        """What is wrong with the devices, the recording or the machine just now."""
+        found = [f"{feed.name}: gone ({feed.lost}), tried again" for feed in self._feeds if feed.lost is not None]
+        found += [f"{name}: silent" for name in self._merger.silent(tick_time(self._tick))]
+        if self._recorder is not None and self._recorder.problem is not None:
+            found.append(f"not recorded: {self._recorder.problem}")
+        late, behind = sum(self._merger.late), self.latencies.quantile(0.99)
+        if late > LARGEST_LOSS * self._estimator.samples:
+            found.append(f"{late} samples came too late to be used: the machine or a source is too slow")
+        if behind is not None and behind > LARGEST_LATENCY:
+            found.append(f"estimates come {behind:.1f} s late: the machine is too slow")
+        return found
+
     def _publish(self) -> None:
         if self._status is None:
             return
@@ -197,10 +215,7 @@ class LiveSession:
         best = [k for k in np.argsort(relative)[:LEADING].tolist() if np.isfinite(std[k])]
         parameters = self._estimator.base.parameters
         residuals = [joint.relative(estimate.pi) for joint in self._estimator.joint_residuals]
-        troubles = [f"{feed.name}: gone ({feed.lost}), tried again" for feed in self._feeds if feed.lost is not None]
-        troubles += [f"{name}: silent" for name in self._merger.silent(tick_time(self._tick))]
-        if self._recorder is not None and self._recorder.problem is not None:
-            troubles.append(f"not recorded: {self._recorder.problem}")
+        troubles = self.troubles
         news = News(
             time=now,
             rate=(self._estimator.samples - self._said_samples) / max(now - self._said, 1e-9),
@@ -218,6 +233,7 @@ class LiveSession:
                 *self.warnings,
                 *unstated_latency(self._estimator),
             ],
+            judgement=judged(self._estimator, estimate, self.findings(), troubles),
         )
         self._said, self._said_samples = now, self._estimator.samples
         self._status.publish(news)

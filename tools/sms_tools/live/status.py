@@ -10,6 +10,9 @@ from dataclasses import dataclass
 from rich.console import Console
 from rich.table import Table
 
+from sms_online.judgement import Judgement
+from sms_tools.report import verdict_text
+
 # News a second: more than anybody reads; where there is no terminal, a line every so many seconds.
 INTERVAL, LINE_INTERVAL = 0.5, 5.0
 # Longest wait for a last line that nobody takes, s.
@@ -30,7 +33,8 @@ class Leading:
 @dataclass(frozen=True)
 class News:
     """What there is to say. rate: samples/s; latency: p99, s, or None; lost: samples; residual: largest share of a
-    joint's torque or force that is not explained, or None; leading: the best known parameters; troubles: what is wrong.
+    joint's torque or force that is not explained, or None; leading: the best known parameters; troubles: what is wrong;
+    judgement: of all of it.
     """
 
     time: float
@@ -41,6 +45,7 @@ class News:
     determined: tuple[int, int]
     leading: Sequence[Leading]
     troubles: Sequence[str]
+    judgement: Judgement
 
 
 def summary(news: News) -> str:
@@ -57,7 +62,7 @@ def summary(news: News) -> str:
 def line(news: News) -> str:
     """All of it on one line, for a log."""
     shown = [f"{p.name} {p.estimate:.6g} ± {2.0 * p.std:.2g} {p.unit}" for p in news.leading]
-    return "; ".join([summary(news), *shown, *news.troubles])
+    return "; ".join([summary(news), news.judgement.sentence, *shown, *news.troubles])
 
 
 def screen(news: News, width: int) -> str:
@@ -72,6 +77,7 @@ def screen(news: News, width: int) -> str:
             console.print(table)
         for trouble in news.troubles:
             console.print(trouble, style="yellow", markup=False)
+        console.print(verdict_text(news.judgement.document()))
     return capture.get()
 
 

@@ -11,7 +11,7 @@ from statistics import median
 from tempfile import TemporaryDirectory
 from time import perf_counter
 
-from rich.console import Console
+from rich.console import Console, Group
 from rich.live import Live
 
 from sms_adapters.session_log import SESSION
@@ -22,7 +22,7 @@ from sms_tools.interruption import Interruption
 from sms_tools.live.signals import termination_interrupts
 from sms_tools.live.simulated import SimulatedArm, write_testbed
 from sms_tools.live.testbed import open_testbed
-from sms_tools.report import Document, parameter_table, report_console, show
+from sms_tools.report import Document, parameter_table, report_console, show, verdict_text
 from sms_tools.results_file import results_directory
 from sms_tools.session import conclude, described_system, document_of
 from sms_tools.showing import showing
@@ -68,7 +68,15 @@ def _watch(args: argparse.Namespace, arm: SimulatedArm, file: Path, directory: P
         else:
             tell = _tell(console, estimator, document)
         shown = stack.enter_context(
-            showing(args, estimator, merger.channels, directory, truth, health=lambda: session.health)
+            showing(
+                args,
+                estimator,
+                merger.channels,
+                directory,
+                truth,
+                health=lambda: session.health,
+                troubles=lambda: session.troubles,
+            )
         )
         for block in shown.watch(session.blocks(interruption, ended=arm.ended, ready=arm.start)):
             estimator.push(block)
@@ -92,7 +100,10 @@ def _draw(live: Live, document: Callable[[float], Document], duration: float) ->
         if perf_counter() - drawn >= TABLE_INTERVAL:
             now = document(0.0)
             title = f"{now['system']['title']}: {now['duration_s']:.1f} of {duration:g} s"
-            live.update(parameter_table(now, live.console.width, title), refresh=True)
+            table = parameter_table(now, live.console.width, title)
+            # Before it has settled an estimate may be off by any number of its bars.
+            table.style = "dim" if now["verdict"]["level"] == "not yet" else ""
+            live.update(Group(table, verdict_text(now["verdict"])), refresh=True)
             drawn = perf_counter()
 
     return draw
@@ -106,12 +117,13 @@ def _tell(console: Console, estimator: Estimator, document: Callable[[float], Do
         nonlocal told
         if estimator.duration >= told + LINE_INTERVAL:
             told = estimator.duration
-            parameters = document(0.0)["parameters"]
+            now = document(0.0)
+            parameters = now["parameters"]
             determined = [p for p in parameters if p["identifiable"]]
             line = f"{told:5.1f} s: {len(determined)} of {len(parameters)} parameters determined"
             errors = [abs(p["estimate"] / p["true"] - 1.0) for p in determined if p["true"]]
             if errors:
                 line += f", errors {100.0 * median(errors):.2g} % (median), {100.0 * max(errors):.2g} % (largest)"
-            show(console, line)
+            show(console, f"{line}; {now['verdict']['sentence']}")
 
     return tell

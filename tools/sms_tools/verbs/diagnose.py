@@ -9,13 +9,14 @@ from pathlib import Path
 from typing import Any
 
 from rich.table import Table
+from rich.text import Text
 
 from sms_adapters.sources import open_source
 from sms_adapters.truth import read_truth
 from sms_online.description.schema import System
 from sms_online.diagnosis.attempt import PriorOf
 from sms_online.diagnosis.diagnose import Diagnosis, diagnose
-from sms_online.diagnosis.document import diagnosis_document
+from sms_online.diagnosis.document import diagnosis_document, judgement
 from sms_online.errors import InputError
 from sms_online.pipeline.estimator import Estimator
 from sms_online.stream import Block
@@ -25,7 +26,7 @@ from sms_tools.exit_codes import NOTHING_DETERMINED, OK
 from sms_tools.html_report.diagnosis_page import write_diagnosis
 from sms_tools.interruption import Interruption
 from sms_tools.priors import base_prior
-from sms_tools.report import Document, parameter_table, report_console, show
+from sms_tools.report import Document, parameter_table, report_console, show, verdict_text
 from sms_tools.results_file import results_directory, to_json, write_document
 from sms_tools.session import check_part, described_system, stream
 from sms_tools.true_values import true_values
@@ -70,7 +71,7 @@ def run(args: argparse.Namespace) -> int:
     document = diagnosis_document(diagnosis, warnings, true)
     view = None if args.rerun == "off" else _watched(args, diagnosis, document, blocks, directory, prior, true)
     document["warnings"] += [] if view is None else view.warnings
-    lines: list[Table | str] = ["", document["summary"], ""]
+    lines: list[Table | str | Text] = ["", document["summary"], ""]
     if document["effects"]:
         lines += [_effects(document), ""]
     lines += [_residuals(document), "", parameter_table(document["after"], console.width, title="after"), ""]
@@ -82,7 +83,7 @@ def run(args: argparse.Namespace) -> int:
         added = added_lines(args.system, text)
         lines.append(f"system file with what was found: {write_adopted(directory, text)}")
     page = write_diagnosis(directory, document, diagnosis, args.capture.name, added)
-    show(console, *lines, f"diagnosis: {path}", f"page: {page}")
+    show(console, *lines, f"diagnosis: {path}", f"page: {page}", "", verdict_text(document["judgement"]))
     if args.json:
         print(to_json(document))
     if view is not None:
@@ -120,7 +121,7 @@ def _watched(
             true,
             patient=True,
             exaggeration=args.exaggerate,
-            diagnosed=Diagnosed(told),
+            diagnosed=Diagnosed(told, judgement(diagnosis)),
         ) as view,
     ):
         stream(estimator, view.watch(blocks), interruption)

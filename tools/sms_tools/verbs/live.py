@@ -32,10 +32,19 @@ def run(args: argparse.Namespace) -> int:
     sys.setswitchinterval(SWITCH_INTERVAL)
     with Interruption() as interruption, termination_interrupts():
         with (
-            showing(args, estimator, merger.channels, directory, None, health=lambda: session.health) as shown,
+            showing(
+                args,
+                estimator,
+                merger.channels,
+                directory,
+                None,
+                health=lambda: session.health,
+                troubles=lambda: session.troubles,
+            ) as shown,
             closing(SearchProcess(directory, args.adopt)) as searches,
         ):
             online = OnlineDiagnosis(estimator, searches, args.adopt)
+            session.findings = lambda: online.findings
             session.notices = lambda: [*online.notices, *shown.notices]
             shown.follow(online)
             blocks = session.blocks(interruption, math.inf if args.duration is None else args.duration)
@@ -48,14 +57,14 @@ def run(args: argparse.Namespace) -> int:
         throughput = estimator.samples / session.busy if session.busy else 0.0
         warnings = [*merger.warnings, *session.warnings, *shown.warnings]
         warnings += [] if searches.problem is None else [searches.problem]
-        document = document_of(estimator, throughput, warnings, None)
+        document = document_of(estimator, throughput, warnings, None, findings=online.findings)
         document["diagnosis"] = online.document()
         write_named(args, online, directory)
         code = conclude(args, document, directory, interrupted=False)
+        half, nearly_all = session.latencies.quantile(0.5), session.latencies.quantile(0.99)
+        if half is not None and nearly_all is not None:
+            latency = f"median {1e3 * half:.0f} ms, p99 {1e3 * nearly_all:.0f} ms, over the last seconds"
+            show(report_console(args.json), f"latency, arrival to estimate: {latency}")
         shown.report(document, interruption)
-    half, nearly_all = session.latencies.quantile(0.5), session.latencies.quantile(0.99)
-    if half is not None and nearly_all is not None:
-        latency = f"median {1e3 * half:.0f} ms, p99 {1e3 * nearly_all:.0f} ms, over the last seconds"
-        show(report_console(args.json), f"latency, arrival to estimate: {latency}")
     # That is how a session without an end ends, and no reason to doubt its results.
     return INTERRUPTED if interruption.requested else code

@@ -75,13 +75,15 @@ def run(args: argparse.Namespace) -> int:
             with showing(args, estimator, source.channels, directory, parameters, patient) as shown:
                 searcher = searcher_of(capture, args.adopt) if args.start is args.stop is None else Immediate()
                 online = OnlineDiagnosis(estimator, searcher, args.adopt)
-                shown.follow(online)
+                # A bar of progress stays below what is told.
+                console = Console(stderr=True, highlight=False) if progress is None else progress.console
+                shown.follow(online, lambda text: console.print(text, markup=False, soft_wrap=True))
                 stream(estimator, shown.watch(blocks), interruption)
                 online.finish()
                 wall = perf_counter() - opened
         bound = None if record is None else session_bound(estimator, record)
         warnings = [*source.warnings, *shown.warnings]
-        document = document_of(estimator, estimator.samples / wall, warnings, parameters, bound)
+        document = document_of(estimator, estimator.samples / wall, warnings, parameters, bound, online.findings)
         document["diagnosis"] = online.document()
         write_named(args, online, directory)
         code = conclude(args, document, directory, interruption.requested)

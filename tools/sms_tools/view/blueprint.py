@@ -1,4 +1,4 @@
-"""The one layout of all sessions: arm, parameters, residual, evidence, health, log, on fixed axes."""
+"""The one layout of all sessions: judgement, arm, parameters, residual, evidence, health, log, on fixed axes."""
 
 from __future__ import annotations
 
@@ -8,14 +8,16 @@ import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
 
-from sms_tools.view import number_log, style
+from sms_tools.view import banner, number_log, style
 from sms_tools.view.arm_log import ARM, TIMELINE, TIP
-from sms_tools.view.parameter_groups import Group
+from sms_tools.view.number_log import ParameterLog
 from sms_tools.view.scene import Drawing, Scene
 
 # Plots show so much of the past, s: the whole of the example's motion, and of longer sessions what a person remembers;
 # and so much beyond now, or the last label of their axis would be cut.
 WINDOW, AHEAD = 20.0, 1.5
+# Share of the height for the judgement: a heading and a line.
+BANNER = 0.125
 # The same across: room beyond the range of what is drawn.
 MARGIN = 1.1
 # Past of the tip that is drawn, s: a good part of one swing.
@@ -31,12 +33,19 @@ OBLIQUE = np.array((0.35, -0.8, 0.5))
 
 
 def layout(
-    scene: Scene, groups: Sequence[Group], first: Drawing, live: bool = False, diagnosed: bool = False
+    scene: Scene,
+    parameters: ParameterLog,
+    first: Drawing,
+    begin: float | None,
+    live: bool = False,
+    diagnosed: bool = False,
 ) -> rrb.Blueprint:
     """Layout for an arm that is first seen as the first picture of `first` shows it.
 
-    live: with plots of the source's latency and clocks. diagnosed: verdict and evidence are in front.
+    begin: s, where the plots begin while the session is shorter than their window, None from then on. live: with plots
+    of the source's latency and clocks. diagnosed: verdict and evidence are in front.
     """
+    plots = _Plots(begin)
     shown = rrb.TextLogColumns(
         timeline_columns=[rrb.encodings.TimelineColumn(TIMELINE, visible=False)],
         text_log_columns=["LogLevel", "Body"],
@@ -45,15 +54,29 @@ def layout(
     table = rrb.TextDocumentView(origin=number_log.TABLE, name="Parameters")
     told = rrb.Tabs(table, log, active_tab=int(diagnosed))
     left = rrb.Vertical(_arm(scene, first), told, row_shares=[11, 9])
-    below = rrb.Tabs(_residual(), _evidence(), _health(live), active_tab=int(diagnosed))
-    right = rrb.Vertical(_parameters(groups), below, row_shares=[7, 3])
+    below = rrb.Tabs(plots.residual(), plots.evidence(), plots.health(live), active_tab=int(diagnosed))
+    right = rrb.Vertical(plots.parameters(parameters), below, row_shares=[7, 3])
+    session = rrb.Horizontal(left, right, column_shares=[2, 3])
     return rrb.Blueprint(
-        rrb.Horizontal(left, right, column_shares=[2, 3]),
+        rrb.Vertical(_judgement(), session, row_shares=[BANNER, 1.0 - BANNER]),
         rrb.BlueprintPanel(state="collapsed"),
         rrb.SelectionPanel(state="collapsed"),
         rrb.TimePanel(state="collapsed", timeline=TIMELINE, play_state="following"),
         auto_views=False,
     )
+
+
+def _judgement() -> rrb.Horizontal:
+    """May the numbers be trusted?"""
+    seen = (-banner.LAMP_SHOWN, banner.LAMP_SHOWN)
+    lamp = rrb.Spatial2DView(
+        origin=banner.LAMP,
+        name="May the numbers be trusted?",
+        visual_bounds=rrb.VisualBounds2D(x_range=seen, y_range=seen),
+        titlebar=False,
+    )
+    words = rrb.TextDocumentView(origin=banner.WORDS, name="Verdict", titlebar=False)
+    return rrb.Horizontal(lamp, words, column_shares=[1, 15])
 
 
 def _arm(scene: Scene, first: Drawing) -> rrb.Spatial3DView:
@@ -74,6 +97,9 @@ def _arm(scene: Scene, first: Drawing) -> rrb.Spatial3DView:
         kind=rrb.Eye3DKind.Orbital, position=middle + EYE_DISTANCE * extent * direction, look_target=middle, eye_up=up
     )
     grid = 10.0 ** np.floor(np.log10(scene.reach))
+    trail = rr.TimeRange(
+        start=rr.TimeRangeBoundary.cursor_relative(seconds=-TRAIL), end=rr.TimeRangeBoundary.cursor_relative(seconds=0)
+    )
     factor = f", deflections × {scene.exaggeration:g}" if scene.exaggeration != 1.0 else ""
     return rrb.Spatial3DView(
         origin=ARM,
@@ -81,82 +107,88 @@ def _arm(scene: Scene, first: Drawing) -> rrb.Spatial3DView:
         eye_controls=eye,
         background=style.BACKGROUND,
         line_grid=rrb.LineGrid3D(visible=True, spacing=grid),
-        overrides={TIP: rrb.VisibleTimeRanges([rr.VisibleTimeRange(TIMELINE, _range(TRAIL))])},
+        overrides={TIP: rrb.VisibleTimeRanges([rr.VisibleTimeRange(TIMELINE, trail)])},
     )
 
 
-def _range(seconds: float, ahead: float = 0.0) -> rr.TimeRange:
-    """The last seconds before the instant that the viewer shows, and some beyond it."""
-    return rr.TimeRange(
-        start=rr.TimeRangeBoundary.cursor_relative(seconds=-seconds),
-        end=rr.TimeRangeBoundary.cursor_relative(seconds=ahead),
-    )
+class _Plots:
+    """Plots over time. begin: see `layout`."""
 
+    def __init__(self, begin: float | None) -> None:
+        start = rr.TimeRangeBoundary.cursor_relative(seconds=-WINDOW)
+        if begin is not None:
+            start = rr.TimeRangeBoundary.absolute(seconds=begin)
+        end, ahead = (rr.TimeRangeBoundary.cursor_relative(seconds=seconds) for seconds in (0.0, AHEAD))
+        self._axis = rrb.TimeAxis(view_range=rr.TimeRange(start=start, end=ahead))
+        self._ranges = rrb.VisibleTimeRanges([rr.VisibleTimeRange(TIMELINE, rr.TimeRange(start=start, end=end))])
 
-def _plot(
-    name: str, contents: Sequence[str], y: tuple[float, float] | None = None, legend: bool = True
-) -> rrb.TimeSeriesView:
-    return rrb.TimeSeriesView(
-        origin="/",
-        contents=list(contents),
-        name=name,
-        axis_y=rrb.ScalarAxis(range=y) if y is not None else None,
-        # Over the past, of which the first seconds have no estimate yet.
-        plot_legend=rrb.PlotLegend(corner=rrb.Corner2D.LeftTop, visible=legend),
-        axis_x=rrb.TimeAxis(view_range=_range(WINDOW, AHEAD)),
-        time_ranges=rrb.VisibleTimeRanges([rr.VisibleTimeRange(TIMELINE, _range(WINDOW))]),
-    )
+    def _plot(
+        self, name: str, contents: Sequence[str], y: tuple[float, float] | None = None, legend: bool = True
+    ) -> rrb.TimeSeriesView:
+        return rrb.TimeSeriesView(
+            origin="/",
+            contents=list(contents),
+            name=name,
+            axis_y=rrb.ScalarAxis(range=y) if y is not None else None,
+            # Over the past, of which the first seconds have no estimate yet.
+            plot_legend=rrb.PlotLegend(corner=rrb.Corner2D.LeftTop, visible=legend),
+            axis_x=self._axis,
+            time_ranges=self._ranges,
+        )
 
+    def parameters(self, parameters: ParameterLog) -> rrb.Container:
+        """A plot for each group; in tabs where there are many."""
+        plots: dict[str, list[rrb.TimeSeriesView]] = {}
+        for group in parameters.groups:
+            path = parameters.drawn(group)
+            y = None if group.half_range is None else (-MARGIN * group.half_range, MARGIN * group.half_range)
+            contents = [f"{path}/deviation", f"{path}/two_sigma", f"{path}/events"]
+            plots.setdefault(group.kind, []).append(self._plot(group.title[:1].upper() + group.title[1:], contents, y))
+        together = [plot for kind in plots.values() for plot in kind]
+        if len(together) <= MOST_PLOTS:
+            return rrb.Grid(*together, grid_columns=2)
+        tabs: list[tuple[list[str], list[rrb.TimeSeriesView]]] = []
+        for kind, members in plots.items():
+            if tabs and len(tabs[-1][1]) + len(members) <= MOST_PLOTS:
+                tabs[-1][0].append(kind)
+                tabs[-1][1].extend(members)
+            else:
+                tabs.append(([kind], members))
+        return rrb.Tabs(*(rrb.Grid(*shown, grid_columns=2, name=", ".join(kinds)) for kinds, shown in tabs))
 
-def _parameters(groups: Sequence[Group]) -> rrb.Container:
-    plots: dict[str, list[rrb.TimeSeriesView]] = {}
-    for group in groups:
-        path = f"{number_log.PARAMETERS}/{group.path}"
-        y = None if group.half_range is None else (-MARGIN * group.half_range, MARGIN * group.half_range)
-        contents = [f"{path}/deviation", f"{path}/two_sigma", f"{path}/events"]
-        plots.setdefault(group.kind, []).append(_plot(group.title[:1].upper() + group.title[1:], contents, y))
-    together = [plot for kind in plots.values() for plot in kind]
-    if len(together) <= MOST_PLOTS:
-        return rrb.Grid(*together, grid_columns=2)
-    tabs: list[tuple[list[str], list[rrb.TimeSeriesView]]] = []
-    for kind, members in plots.items():
-        if tabs and len(tabs[-1][1]) + len(members) <= MOST_PLOTS:
-            tabs[-1][0].append(kind)
-            tabs[-1][1].extend(members)
-        else:
-            tabs.append(([kind], members))
-    return rrb.Tabs(*(rrb.Grid(*shown, grid_columns=2, name=", ".join(kinds)) for kinds, shown in tabs))
+    def residual(self) -> rrb.Container:
+        """What is not explained; red where it is too much."""
+        residual = number_log.RESIDUAL
+        relative = self._plot(
+            "Unexplained torque, share",
+            [f"{residual}/relative{each}" for each in ("", "_limit", "_beyond", "_events")],
+            number_log.RELATIVE_RANGE,
+        )
+        whitened = self._plot(
+            "Rows over their noise, log10",
+            [
+                f"{residual}/{each}"
+                for each in ("whitened/**", "noise", *(f"whitened_{part}" for part in ("limit", "beyond", "events")))
+            ],
+            number_log.WHITENED_RANGE,
+        )
+        energy = self._plot("Energy residual, rms, J", [f"{residual}/energy"], legend=False)
+        return rrb.Horizontal(relative, whitened, energy, name="Residual")
 
+    def evidence(self) -> rrb.TimeSeriesView:
+        """Candidates for what the model lacks."""
+        return self._plot("Evidence for missing effects, log10 of the gain", [f"{number_log.EVIDENCE}/**"])
 
-def _residual() -> rrb.Container:
-    residual = number_log.RESIDUAL
-    relative = _plot(
-        "Unexplained torque, share",
-        [f"{residual}/relative", f"{residual}/relative_events"],
-        number_log.RELATIVE_RANGE,
-    )
-    whitened = _plot(
-        "Rows over their noise, log10",
-        [f"{residual}/whitened/**", f"{residual}/noise", f"{residual}/whitened_events"],
-        number_log.WHITENED_RANGE,
-    )
-    energy = _plot("Energy residual, rms, J", [f"{residual}/energy"], legend=False)
-    return rrb.Horizontal(relative, whitened, energy, name="Residual")
-
-
-def _evidence() -> rrb.TimeSeriesView:
-    return _plot("Evidence for missing effects, log10 of the gain", [f"{number_log.EVIDENCE}/**"])
-
-
-def _health(live: bool) -> rrb.Container:
-    health = number_log.HEALTH
-    plots = [
-        _plot("Rate, samples/s", [f"{health}/rates/**"], legend=False),
-        _plot("Lost, dropped, bridged, counts", [f"{health}/counts/**"]),
-    ]
-    if live:
-        plots += [
-            _plot("Latency, ms", [f"{health}/latency/**"]),
-            _plot("Clock offsets, ms", [f"{health}/clocks/**"]),
+    def health(self, live: bool) -> rrb.Container:
+        """Of the data and, live, of their source."""
+        health = number_log.HEALTH
+        plots = [
+            self._plot("Rate, samples/s", [f"{health}/rates/**"], legend=False),
+            self._plot("Lost, dropped, bridged, counts", [f"{health}/counts/**"]),
         ]
-    return rrb.Horizontal(*plots, name="Health")
+        if live:
+            plots += [
+                self._plot("Latency, ms", [f"{health}/latency/**"]),
+                self._plot("Clock offsets, ms", [f"{health}/clocks/**"]),
+            ]
+        return rrb.Horizontal(*plots, name="Health")

@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
+from sms_online.judgement import Finding, Judgement
 from sms_online.stream import Block
 from sms_tools.view.choice import Choice
 from sms_tools.view.snapshot import Snapshot
@@ -28,10 +29,19 @@ class Diagnosed:
     """That the session has been diagnosed before it is shown: verdict and evidence are in front.
 
     parameters: estimate and standard deviation by name, to be shown instead of what the session tells; empty where that
-    tells the same.
+    tells the same. judgement: of the diagnosis.
     """
 
     parameters: Mapping[str, tuple[float, float]]
+    judgement: Judgement
+
+
+@dataclass(frozen=True)
+class Circumstances:
+    """What the judgement of a session takes from beside its estimator: see `judgement.Facts`."""
+
+    findings: tuple[Finding, ...] = ()
+    troubles: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -63,6 +73,7 @@ class Picture:
     blocks: tuple[Block, ...]
     state: Snapshot | None
     health: Mapping[str, Mapping[str, float]]
+    circumstances: Circumstances
     wall: float
     dropped: int
 
@@ -89,6 +100,7 @@ class End:
 
     t: float
     state: Snapshot
+    circumstances: Circumstances
 
 
 Frame = Start | Picture | Event | Evidence | End

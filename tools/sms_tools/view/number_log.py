@@ -20,6 +20,10 @@ BOUNDS = 2.0  # standard deviations
 # Of plots of residuals. A relative one of 1 says that the model explains nothing. Whitened ones are drawn in decades:
 # noise is 0, and a model that lacks an effect leaves hundreds of times as much.
 RELATIVE_RANGE, WHITENED_RANGE = (-0.1, 1.2), (-0.5, 3.5)
+# Half height of an event's mark where the axis follows the data.
+UNKNOWN_RANGE = 1.0
+# Instants that are drawn again on another axis, at most.
+MOST_REDRAWN = 600
 # An event is drawn as a line from bottom to top of a plot: two values this far apart, s.
 MARK_WIDTH = 1e-9
 
@@ -80,7 +84,7 @@ class NumberLog:
         self.describe(path, ["event"], [style.EVENT], width=1.0, aggregated=False)
 
     def mark(self, path: str, t: float, low: float, high: float) -> None:
-        """A vertical line at an instant."""
+        """A vertical line at an instant, s."""
         for k, value in enumerate((low, high, np.nan)):
             self.add(path, t + k * MARK_WIDTH, np.array([value]))
 
@@ -106,42 +110,75 @@ class NumberLog:
         self._stream.send_columns(LOG, times(np.array([t])), line)
 
 
+@dataclass(frozen=True)
+class Known:
+    """Estimate (n,), standard deviation (n,) and what is determined (n,) at t, s."""
+
+    t: float
+    estimate: Array
+    std: Array
+    determined: NDArray[np.bool_]
+
+
 class ParameterLog:
     """Estimates in SI units, exact, and what is drawn of them: deviations with their bounds, beside a reference."""
 
     def __init__(self, numbers: NumberLog, groups: Sequence[Group]) -> None:
         self._numbers = numbers
+        self._past: list[Known] = []  # thinned, to be drawn again about another reference
+        self._marks: list[float] = []
+        self._drawings = -1
+        self.arrange(groups)
+
+    def arrange(self, groups: Sequence[Group]) -> None:
+        """Draw in these groups from now on, and once more in them what has been drawn so far."""
         self.groups = groups
-        self._extent: dict[str, tuple[float, float]] = {}  # of what is drawn now, by group
+        self._drawings += 1
         for group in groups:
             colors = [style.LINES[k % len(style.LINES)] for k in range(len(group.labels))]
-            path = f"{PARAMETERS}/{group.path}"
-            numbers.describe(f"{path}/estimate", group.labels, colors)
-            numbers.describe(f"{path}/std", group.labels, colors)
-            numbers.describe(f"{path}/deviation", group.labels, colors, width=2.5)
-            numbers.describe_events(f"{path}/events")
+            for number in ("estimate", "std"):
+                self._numbers.describe(f"{PARAMETERS}/{group.path}/{number}", group.labels, colors)
+            self._numbers.describe(f"{self.drawn(group)}/deviation", group.labels, colors, width=2.5)
+            self._numbers.describe_events(f"{self.drawn(group)}/events")
             bounds = [style.translucent(color) for color in colors]
-            numbers.describe(f"{path}/two_sigma", ["± 2σ"] * len(bounds * 2), bounds * 2, width=1.0)
+            self._numbers.describe(f"{self.drawn(group)}/two_sigma", ["± 2σ"] * len(bounds * 2), bounds * 2, width=1.0)
+        for known in self._past:
+            self._draw(known)
+        for t in self._marks:
+            self._mark(t)
 
-    def add(self, t: float, estimate: Array, std: Array, determined: NDArray[np.bool_]) -> None:
-        """Estimates (n,) and their standard deviations (n,); only what is determined (n,) is drawn."""
-        shown, deviation = np.where(determined, estimate, np.nan), np.where(determined, std, np.nan)
+    def drawn(self, group: Group) -> str:
+        """The entity below which a group is drawn now."""
+        return f"{PARAMETERS}/{group.path}/drawing_{self._drawings}"
+
+    def add(self, known: Known) -> None:
+        """Estimates of an instant; only what is determined is drawn."""
         for group in self.groups:
-            k, path = group.indices, f"{PARAMETERS}/{group.path}"
-            self._numbers.add(f"{path}/estimate", t, estimate[k])
-            self._numbers.add(f"{path}/std", t, std[k])
-            drawn = (shown[k] - group.zero) / group.scale
-            width = BOUNDS * deviation[k] / group.scale
-            self._numbers.add(f"{path}/deviation", t, drawn)
-            self._numbers.add(f"{path}/two_sigma", t, np.concatenate((drawn + width, drawn - width)))
-            if determined[k].any():
-                self._extent[group.path] = float(np.nanmin(drawn - width)), float(np.nanmax(drawn + width))
+            self._numbers.add(f"{PARAMETERS}/{group.path}/estimate", known.t, known.estimate[group.indices])
+            self._numbers.add(f"{PARAMETERS}/{group.path}/std", known.t, known.std[group.indices])
+        self._draw(known)
+        self._past.append(known)
+        if len(self._past) > MOST_REDRAWN:
+            self._past = self._past[::2]
+
+    def _draw(self, known: Known) -> None:
+        # There were fewer before an event has added some.
+        n = sum(group.indices.size for group in self.groups)
+        estimate, std = np.full((2, n), np.nan)
+        there = np.flatnonzero(known.determined)
+        estimate[there], std[there] = known.estimate[there], known.std[there]
+        for group in self.groups:
+            drawn = (estimate[group.indices] - group.zero) / group.scale
+            width = BOUNDS * std[group.indices] / group.scale
+            self._numbers.add(f"{self.drawn(group)}/deviation", known.t, drawn)
+            self._numbers.add(f"{self.drawn(group)}/two_sigma", known.t, np.concatenate((drawn + width, drawn - width)))
 
     def mark(self, t: float) -> None:
-        """A vertical line in every plot of parameters: over a fixed axis, or over what is drawn just now."""
+        """A vertical line in every plot of parameters."""
+        self._marks.append(t)
+        self._mark(t)
+
+    def _mark(self, t: float) -> None:
         for group in self.groups:
-            extent = self._extent.get(group.path)
-            if group.half_range is not None:
-                extent = -group.half_range, group.half_range
-            if extent is not None:
-                self._numbers.mark(f"{PARAMETERS}/{group.path}/events", t, *extent)
+            half = UNKNOWN_RANGE if group.half_range is None else group.half_range
+            self._numbers.mark(f"{self.drawn(group)}/events", t, -half, half)

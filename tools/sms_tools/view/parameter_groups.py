@@ -1,4 +1,4 @@
-"""Which parameters share a plot: those of one kind of body, as deviations where a reference is known, else by unit."""
+"""Which parameters share a plot: those of one kind of body, in % of what they are compared with."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sms_online.model.parameters import Parameter
+from sms_online.stream import Array
 from sms_tools.view.frames import Reference
 
 # Lines that a person can tell apart in one plot.
@@ -18,16 +19,32 @@ MOST_LINES = 6
 LONGEST_LABEL = 18
 KINDS = {"spacecraft": "spacecraft", "joint": "joints", "motor": "motors", "link": "links", "payload": "payload"}
 EFFECTS = "effects"
-# Half width of a plot of deviations, %: around true values estimates come close, around nominal ones who knows.
-TRUE_RANGE, NOMINAL_RANGE = 0.2, 100.0
+# Half width of a plot of deviations from true values, %: estimates come close to them.
+TRUE_RANGE = 0.2
+# Half ranges of other axes, %, tried in this order until so large a share of what is drawn fits. The viewer labels
+# powers of ten alone, so that of an axis to 5 only its zero would be told.
+HALF_RANGES = (*(float(f"{step}e{power}") for power in range(-4, 2) for step in (1, 2)), 100.0)
+FITTING = 0.75
+
+
+@dataclass(frozen=True)
+class Basis:
+    """What estimates without a true value are compared with, and how far around it, %.
+
+    about (n,): NaN where there is nothing to compare with, and nothing is drawn. name: of it, for titles.
+    """
+
+    about: Array
+    name: str
+    half_range: float
 
 
 @dataclass(frozen=True)
 class Group:
     """Parameters (by index) of one plot.
 
-    path: entity. scale: what an estimate is divided by after its reference is subtracted. unit: of the plot, `%` for
-    deviations. half_range: of the plot's axis, None where nothing tells.
+    path: entity. scale: what an estimate is divided by after its reference `zero` is subtracted. unit: of the plot, `%`
+    for deviations. half_range: of the plot's axis, None where a true value of zero leaves no measure for it.
     """
 
     path: str
@@ -35,53 +52,52 @@ class Group:
     title: str
     indices: NDArray[np.int64]
     labels: tuple[str, ...]
-    zero: NDArray[np.float64]
-    scale: NDArray[np.float64]
+    zero: Array
+    scale: Array
     unit: str
     half_range: float | None
 
 
-def parameter_groups(parameters: Sequence[Parameter], references: Sequence[Reference | None]) -> list[Group]:
-    """Groups of the base parameters, in their order."""
-    sets: dict[tuple[str, str], list[int]] = {}
+def half_range(reach: Array) -> float:
+    """Half range, %, of an axis for what reaches so far (·,) from its middle; the largest where that is nothing."""
+    reach = reach[np.isfinite(reach)]
+    fits = [limit for limit in HALF_RANGES if reach.size and np.mean(reach <= limit) >= FITTING]
+    return fits[0] if fits else HALF_RANGES[-1]
+
+
+def parameter_groups(
+    parameters: Sequence[Parameter], references: Sequence[Reference | None], basis: Basis
+) -> list[Group]:
+    """Groups of the base parameters, in their order: about true values where they are known, else about the basis."""
+    sets: dict[tuple[str, str, bool], list[int]] = {}
     for k, (parameter, reference) in enumerate(zip(parameters, references, strict=True)):
-        unit = "%" if reference is not None and reference.value != 0.0 else parameter.unit
-        sets.setdefault((_kind(parameter), unit), []).append(k)
+        true = reference is not None and reference.is_true
+        unit = parameter.unit if true and reference is not None and reference.value == 0.0 else "%"
+        sets.setdefault((_kind(parameter), unit, true), []).append(k)
     groups = []
-    for (kind, unit), members in sets.items():
+    for (kind, unit, true), members in sets.items():
+        # One name whether or not there is a truth, but two where only some have one.
+        name = f"{kind}_own" if not true and (kind, "%", True) in sets else kind
         parts = np.array_split(np.array(members), -(-len(members) // MOST_LINES))
         for number, indices in enumerate(parts, start=1):
             which = f" ({number} of {len(parts)})" if len(parts) > 1 else ""
-            groups.append(_group(kind, unit, which, indices, parameters, references))
+            path = re.sub(r"\W", "_", f"{name}_{unit}{which}").strip("_")
+            labels = tuple(shortened(parameters[k].symbol) for k in indices)
+            title, zero, half = f"{kind}{which}: estimate ± 2σ, {unit}", np.zeros(indices.size), None
+            scale = np.ones(indices.size)
+            if unit == "%":
+                truth = [reference.value for k in indices if (reference := references[k]) is not None and true]
+                zero = np.array(truth) if true else basis.about[indices]
+                half = TRUE_RANGE if true else basis.half_range
+                title = f"{kind}{which}: from the {'true value' if true else basis.name} ± 2σ, %"
+                scale = np.abs(zero) / 100.0
+            groups.append(Group(path, kind, title, indices, labels, zero, scale, unit, half))
     return groups
 
 
 def shortened(symbol: str) -> str:
     """A symbol that fits beside a plot: of a combination what it begins with."""
     return symbol if len(symbol) <= LONGEST_LABEL else symbol[: LONGEST_LABEL - 1] + "…"
-
-
-def _group(
-    kind: str,
-    unit: str,
-    which: str,
-    indices: NDArray[np.int64],
-    parameters: Sequence[Parameter],
-    references: Sequence[Reference | None],
-) -> Group:
-    zero, scale = np.zeros(indices.size), np.ones(indices.size)
-    labels = tuple(shortened(parameters[k].symbol) for k in indices)
-    half_range = None
-    title = f"{kind}{which}: estimate ± 2σ, {unit}"
-    if unit == "%":
-        found = [reference for k in indices if (reference := references[k]) is not None]
-        zero = np.array([reference.value for reference in found])
-        scale = np.abs(zero) / 100.0
-        half_range = TRUE_RANGE if all(reference.is_true for reference in found) else NOMINAL_RANGE
-        compared = "true" if half_range == TRUE_RANGE else "nominal"
-        title = f"{kind}{which}: ± 2σ from the {compared} value, %"
-    path = re.sub(r"\W", "_", f"{kind}_{unit}{which}").strip("_")
-    return Group(path, kind, title, indices, labels, zero, scale, unit, half_range)
 
 
 def _kind(parameter: Parameter) -> str:

@@ -5,29 +5,44 @@ from __future__ import annotations
 import pickle
 from collections import deque
 from collections.abc import Callable
+from itertools import groupby
+from operator import itemgetter
 
 import numpy as np
 import rerun.blueprint as rrb
 from numpy.typing import NDArray
 
+from sms_online.judgement import LARGEST_RESIDUAL, LARGEST_WHITENED, Judgement
 from sms_online.pipeline.estimator import Estimator
-from sms_online.results import LARGEST_RELATIVE_STD, event_document, residuals, results_document, standard_deviation
+from sms_online.results import (
+    LARGEST_RELATIVE_STD,
+    event_document,
+    judged,
+    projected,
+    residuals,
+    results_document,
+    standard_deviation,
+)
 from sms_online.stream import Array
 from sms_tools.report import event_line
 from sms_tools.view import style
 from sms_tools.view.arm_log import ArmLog
-from sms_tools.view.blueprint import layout
-from sms_tools.view.frames import End, Event, Evidence, Picture, Start
+from sms_tools.view.banner import Banner
+from sms_tools.view.blueprint import WINDOW, layout
+from sms_tools.view.frames import Circumstances, End, Event, Evidence, Picture, Start
 from sms_tools.view.number_log import (
     EVIDENCE,
     HEALTH,
     RELATIVE_RANGE,
     RESIDUAL,
     WHITENED_RANGE,
+    Known,
     NumberLog,
     ParameterLog,
 )
-from sms_tools.view.parameter_groups import parameter_groups
+from sms_tools.view.own_scale import OwnScale
+from sms_tools.view.parameter_groups import Group, parameter_groups
+from sms_tools.view.places import drawn_marks
 from sms_tools.view.readings import Readings
 from sms_tools.view.residuals import RecentResidual
 from sms_tools.view.scene import Scene
@@ -37,8 +52,9 @@ from sms_tools.view.table import markdown_table
 
 # The table, and residuals of all rows so far, which move slowly: s of the session.
 SLOW_INTERVAL = 1.0
-# Plots of residuals in which events are marked, and how far across.
+# Plots of residuals in which events are marked, and how far across; and from where on they are a reason to doubt.
 RANGES = {"relative": RELATIVE_RANGE, "whitened": WHITENED_RANGE}
+LIMITS = {"relative": LARGEST_RESIDUAL, "whitened": float(np.log10(LARGEST_WHITENED))}
 # The rate of samples is stated over so many states: five seconds of a live session.
 RATE_STATES = 20
 
@@ -58,53 +74,65 @@ class Recorder:
         self._opened: Callable[[str], None] | None = opened
         self._scene = Scene(estimator.model, start.exaggeration)
         self._readings = Readings(estimator.sensing, start.channels)
-        self._groups = parameter_groups(estimator.base.parameters, start.references)
+        self._scale = OwnScale(start.references)
         system = estimator.system
         self._sink = Sink(start.choice, start.recording, system.title or system.name)
-        self._arm: list[tuple[Array, Array, Array]] = []  # t, x, relative residual of each link's rows
+        # t, x, relative residual of each link's rows, marks and their colour.
+        self._arm: list[tuple[Array, Array, Array, dict[str, str], style.Color]] = []
+        self._marks: dict[str, str] = {}
+        self._judgement: Judgement | None = None
+        self._circumstances = Circumstances()
         self._residual = np.full(len(system.joints), np.nan)
         self._recent = RecentResidual()
         self._events = 0  # marked and told so far
         self._determined: NDArray[np.bool_] = np.zeros(estimator.base.n, dtype=bool)
         self._gaps = 0
+        self._beyond: set[str] = set()  # plots of residuals in which something was too much
         self._slow_due = -np.inf
         self._clock: deque[tuple[int, float]] = deque(maxlen=RATE_STATES)  # samples and wall clock of the last states
 
-    def _open(self, x: Array) -> None:
+    def _open(self, t: float, x: Array) -> None:
         """Begin to log: the layout looks at where the arm is first seen."""
         if self._opened is None:
             return
         self._first = self._scene.draw(x[:1])
+        self._begin: float | None = t
+        stream = self._sink.stream
+        self._numbers = NumberLog(stream)
+        self._parameters = ParameterLog(self._numbers, self._groups())
         self._opened(self._sink.open(self._layout()))
         self._opened = None
-        stream = self._sink.stream
-        self._arm_log = ArmLog(stream, self._scene)
-        self._numbers = NumberLog(stream)
-        self._parameters = ParameterLog(self._numbers, self._groups)
+        self._arm_log, self._banner = ArmLog(stream, self._scene), Banner(stream)
         joints = [f"joint {i}" for i in range(1, len(self._estimator.system.joints) + 1)]
         self._numbers.describe(f"{RESIDUAL}/relative", joints)
         self._numbers.describe(f"{RESIDUAL}/energy", ["energy"])
         self._numbers.describe(f"{RESIDUAL}/noise", ["noise"], [style.REFERENCE], width=1.0)
         for plot in RANGES:
             self._numbers.describe_events(f"{RESIDUAL}/{plot}_events")
+            self._numbers.describe(f"{RESIDUAL}/{plot}_limit", ["limit"], [style.GRAVE], width=1.0)
         self._numbers.describe(f"{HEALTH}/rates/samples", ["samples/s"])
         counts = ["samples lost", "rows dropped", "gaps", "cells interpolated", "pictures dropped"]
         self._numbers.describe(f"{HEALTH}/counts/all", counts)
 
+    def _groups(self) -> list[Group]:
+        return parameter_groups(self._estimator.base.parameters, self._references, self._scale.basis)
+
     def _layout(self) -> rrb.Blueprint:
-        return layout(self._scene, self._groups, self._first, self._live, self._diagnosed is not None)
+        diagnosed = self._diagnosed is not None
+        return layout(self._scene, self._parameters, self._first, self._begin, self._live, diagnosed)
 
     def picture(self, picture: Picture) -> None:
         """Take in the samples and, where one comes with them, the estimator's state."""
         for block in picture.blocks:
             t, x = self._readings.push(block)
             if t.size:
-                self._open(x)
-                self._arm.append((t, x, np.broadcast_to(self._residual, (t.size, self._residual.size))))
+                self._open(float(t[0]), x)
+                residual = np.broadcast_to(self._residual, (t.size, self._residual.size))
+                self._arm.append((t, x, residual, self._marks, self._color))
                 self.waiting += t.size
         if picture.state is not None and self._opened is None:
             t_state = float(picture.blocks[-1].t[-1])
-            self._take(t_state, picture.state)
+            self._take(t_state, picture.state, picture.circumstances)
             samples = self._estimator.samples
             self._clock.append((samples, picture.wall))
             took = picture.wall - self._clock[0][1]
@@ -132,10 +160,10 @@ class Recorder:
         """Send what waits."""
         if self._opened is not None:
             return
-        if self._arm:
-            t, x, residual = (np.concatenate(column) for column in zip(*self._arm, strict=True))
-            self._arm_log.write(t, x, residual)
-            self._arm.clear()
+        for (marks, color), pictures in groupby(self._arm, key=itemgetter(3, 4)):
+            t, x, residual = (np.concatenate(column) for column in list(zip(*pictures, strict=True))[:3])
+            self._arm_log.write(t, x, residual, marks, color)
+        self._arm.clear()
         self.waiting = 0
         self._numbers.send()
         self._sink.flush()
@@ -143,29 +171,63 @@ class Recorder:
     def end(self, end: End | None) -> None:
         """The session's last state, with what its results warn of; None where it was cut off."""
         if end is not None and self._opened is None:
-            self._slow_due = -np.inf
-            self._take(end.t, end.state)
+            self._take(end.t, end.state, end.circumstances, last=True)
             for warning in results_document(self._estimator, 0.0, [])["warnings"]:
                 self._numbers.tell(end.t, warning, warning=True)
         self.write()
         if self._opened is None:
             self._sink.close()
 
-    def _take(self, t: float, state: Snapshot) -> None:
+    def _take(self, t: float, state: Snapshot, circumstances: Circumstances, last: bool = False) -> None:
         estimator = self._estimator
         apply(state, estimator)
-        self._follow_events()
+        more = self._follow_events()
         estimate, std = self._estimate()
         determined = std <= LARGEST_RELATIVE_STD * np.abs(estimate)
-        self._parameters.add(t, estimate, std, determined)
+        slow = t >= self._slow_due or last
+        if slow or circumstances != self._circumstances:
+            self._circumstances = circumstances
+            self._judge(t, last)
+        settled = self._judgement is not None and self._judgement.level != "not yet"
+        self._arrange(t, more, self._scale.follow(t, estimate, std, determined, settled, last))
+        self._parameters.add(Known(t, estimate, std, determined))
         self._residual = self._recent.push(t, estimator, estimate)
         self._numbers.add(f"{RESIDUAL}/relative", t, self._residual)
         self._tell_changes(t, estimate, std, determined)
-        if t >= self._slow_due:
+        if slow:
             parameters = estimator.base.parameters
             self._numbers.table(t, markdown_table(parameters, self._references, estimate, std, determined))
             self._whole_residuals(t, estimate)
             self._slow_due = t + SLOW_INTERVAL
+
+    def _arrange(self, t: float, more: bool, rescaled: bool) -> None:
+        """A new layout where there are more parameters, another scale, or more past than a plot shows."""
+        long = self._begin is not None and t - self._begin > WINDOW
+        if long:
+            self._begin = None
+        if more or rescaled:
+            self._parameters.arrange(self._groups())
+        if more or rescaled or long:
+            self._sink.arrange(self._layout())
+
+    def _judge(self, t: float, last: bool) -> None:
+        """May the numbers be trusted? Shown on top, marked on the arm, and told where the answer is another one."""
+        before = self._judgement
+        if self._diagnosed is not None:
+            now = self._diagnosed.judgement
+        else:
+            estimate, circumstances = self._estimator.estimate(), self._circumstances
+            projection = None
+            if last:
+                # It takes too long to be made at every step.
+                std = standard_deviation(self._estimator, estimate)
+                projection = projected(self._estimator, estimate, std)
+            now = judged(self._estimator, estimate, circumstances.findings, circumstances.troubles, projection)
+        self._judgement = now
+        self._banner.show(t, now)
+        self._marks = drawn_marks(now.marks, self._estimator.sensing.channels)
+        if last or before is None or (before.level, before.grave, before.marks) != (now.level, now.grave, now.marks):
+            self._numbers.tell(t, now.sentence, warning=now.level == "doubt")
 
     def _estimate(self) -> tuple[Array, Array]:
         """Estimate (n,) and standard deviation (n,) of the base parameters: the session's, or a diagnosis's."""
@@ -184,21 +246,23 @@ class Recorder:
         for plot, extent in RANGES.items():
             self._numbers.mark(f"{RESIDUAL}/{plot}_events", t, *extent)
 
-    def _follow_events(self) -> None:
-        """Mark and tell new events; the plots take in the parameters that they have added."""
+    @property
+    def _color(self) -> style.Color:
+        return style.NOT_YET if self._judgement is None else style.verdict_color(self._judgement)
+
+    def _follow_events(self) -> bool:
+        """Mark and tell new events; whether they have added parameters."""
         base = self._estimator.base
         more = base.n - len(self._references)
         if more > 0:
             self._references = (*self._references, *[None] * more)
             self._determined = np.append(self._determined, np.zeros(more, dtype=bool))
-            self._groups = parameter_groups(base.parameters, self._references)
-            self._parameters = ParameterLog(self._numbers, self._groups)
-            self._sink.arrange(self._layout())
         events = self._estimator.events
         for event in events[self._events :]:
             self._mark(event.time)
             self._numbers.tell(event.time, event_line(event_document(event)), warning=True)
         self._events = len(events)
+        return more > 0
 
     def _whole_residuals(self, t: float, estimate: Array) -> None:
         """Residuals of all rows so far: over their predicted deviation, in decades, and of the energy balance."""
@@ -206,6 +270,18 @@ class Recorder:
         known = {rows: np.log10(value) for rows, r in whole.items() if (value := r["whitened"])}
         self._numbers.add_named(f"{RESIDUAL}/whitened", t, known)
         self._numbers.add(f"{RESIDUAL}/noise", t, np.zeros(1))
+        shares = [share for r in whole.values() if (share := r["relative"]) is not None]
+        for plot, values in (("relative", shares), ("whitened", [*known.values()])):
+            limit, (_, top) = LIMITS[plot], RANGES[plot]
+            worst = max(values, default=-np.inf)
+            self._numbers.add(f"{RESIDUAL}/{plot}_limit", t, np.array([limit]))
+            if worst > limit and plot not in self._beyond:
+                # Only now, so that no legend names it before.
+                self._beyond.add(plot)
+                self._numbers.describe(f"{RESIDUAL}/{plot}_beyond", ["too much"], [style.GRAVE], width=5.0)
+            if plot in self._beyond:
+                beyond = min(worst, top) if worst > limit else np.nan
+                self._numbers.add(f"{RESIDUAL}/{plot}_beyond", t, np.array([beyond]))
         energy = self._estimator.energy_tracker.estimate()
         rms = np.sqrt(energy.rss / energy.dof) if energy.dof > 0.0 else np.nan
         self._numbers.add(f"{RESIDUAL}/energy", t, np.array([rms]))

@@ -22,7 +22,7 @@ from sms_online.pipeline.estimator import Estimator
 from sms_online.stream import Block
 from sms_tools.interruption import Interruption
 from sms_tools.view.choice import EXPECTED, Choice, parse_choice
-from sms_tools.view.frames import Diagnosed, End, Event, Evidence, Frame, Picture, Reference, Start
+from sms_tools.view.frames import Circumstances, Diagnosed, End, Event, Evidence, Frame, Picture, Reference, Start
 from sms_tools.view.handover import Handover
 from sms_tools.view.snapshot import take
 
@@ -49,12 +49,14 @@ Health = Callable[[], Mapping[str, Mapping[str, float]]]
 class View:
     """Shows one session, or with `off` nothing at all.
 
-    status: one line for people, empty while all is well. warnings: what went wrong, for the results.
+    status: one line for people, empty while all is well. warnings: what went wrong, for the results. circumstances: is
+    asked for with every state.
     """
 
     def __init__(self, estimator: Estimator, start: Start | None, patient: bool, health: Health | None) -> None:
         self.status = ""
         self.warnings: list[str] = []
+        self.circumstances: Callable[[], Circumstances] = Circumstances
         self._estimator = estimator
         self._patience = STALL if patient else 0.0
         self._health = health
@@ -132,7 +134,7 @@ class View:
         if self._handover is None:
             return
         if kind is None:
-            self._put(End(self._t, take(self._estimator)))
+            self._put(End(self._t, take(self._estimator), self.circumstances()))
             self._close(self._handover)
         self._handover.close()
         if self._handover.dropped:
@@ -153,7 +155,8 @@ class View:
         assert self._handover is not None
         health = self._health() if with_state and self._health is not None else {}
         state = take(self._estimator) if with_state else None
-        self._put(Picture(blocks, state, health, perf_counter(), self._handover.dropped))
+        circumstances = self.circumstances() if with_state else Circumstances()
+        self._put(Picture(blocks, state, health, circumstances, perf_counter(), self._handover.dropped))
 
     def _put(self, frame: Frame) -> None:
         if self._handover is None or self.status:

@@ -15,6 +15,7 @@ from sms_online.pipeline.estimator import Estimator
 from sms_online.pipeline.events import Event
 from sms_online.pipeline.joint_balance import SquaredResidual
 from sms_online.pipeline.momentum import Momentum
+from sms_online.pipeline.residual_test import Alarm
 from sms_online.stream import Array
 from sms_online.trackers.interface import State
 
@@ -22,7 +23,8 @@ from sms_online.trackers.interface import State
 class MomentumSnapshot(NamedTuple):
     """Of the momentum balance: its tracker, the bias of noisy columns, and the sums behind whitened residuals.
 
-    added: names of the parameters that events have added. adopted: effects that were taken up.
+    added: names of the parameters that events have added. adopted: effects that were taken up. alarm: of the sequential
+    test. unexplained: joint that forbids weights. latencies: of the sources.
     """
 
     events: tuple[Event, ...]
@@ -36,6 +38,9 @@ class MomentumSnapshot(NamedTuple):
     misfit: Array
     plain_gram: Array
     plain_windows: int
+    alarm: Alarm | None
+    unexplained: int | None
+    latencies: dict[str, Any]
 
 
 class Snapshot(NamedTuple):
@@ -85,6 +90,9 @@ def _take_momentum(momentum: Momentum) -> MomentumSnapshot:
         fit.misfit,
         fit.plain_gram,
         fit.plain_windows,
+        momentum.test.alarm,
+        fit.unexplained,
+        momentum.latencies.state(),
     )
 
 
@@ -107,3 +115,5 @@ def apply(snapshot: Snapshot, replica: Estimator) -> None:
         fit = momentum.fit
         fit.weights, fit.misfit = known.weights, known.misfit
         fit.plain_gram, fit.plain_windows = known.plain_gram, known.plain_windows
+        momentum.test.alarm, fit.unexplained = known.alarm, known.unexplained
+        momentum.latencies.restore(known.latencies)

@@ -5,14 +5,14 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from sms_online.results import LARGEST_RESIDUAL
+from sms_online.judgement import LARGEST_RESIDUAL, Judgement
 from sms_online.stream import Array
 
 Color = tuple[int, int, int]
 BASE: Color = (110, 120, 135)
 LINK: Color = (235, 235, 235)
 GHOST: Color = (85, 95, 110)
-JOINT: Color = (250, 170, 60)
+JOINT: Color = (120, 150, 200)
 TIP: Color = (90, 200, 250)
 TRACKED: Color = (190, 130, 250)
 EVENT: Color = (240, 90, 90)
@@ -30,7 +30,19 @@ LINES: tuple[Color, ...] = (
 # Of the arm's view, whatever theme the viewer has.
 BACKGROUND: Color = (14, 17, 22)
 BOUNDS_ALPHA = 110
+# Of a verdict.
+TRUST: Color = (32, 150, 70)
+CAUTION: Color = (225, 150, 20)
+GRAVE: Color = (205, 35, 35)
+NOT_YET: Color = (110, 115, 125)
 GOOD, BAD = np.array((60.0, 190.0, 120.0)), np.array((235.0, 60.0, 60.0))
+
+
+def verdict_color(judgement: Judgement) -> Color:
+    """Green, amber, red, or grey while it is too early."""
+    if judgement.level == "doubt":
+        return GRAVE if judgement.grave else CAUTION
+    return TRUST if judgement.level == "trust" else NOT_YET
 
 
 def translucent(color: Color) -> tuple[int, int, int, int]:

@@ -1,0 +1,299 @@
+"""May these numbers be trusted? One judgement of a session, of everything that is known against its estimate.
+
+It is made here alone. What people see (the view, the status line, the pages) and `verdict` in results.json are this
+judgement, so that none of them is calmer than another.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any, Literal
+
+# A joint whose unexplained torque reaches this share of the measured one lacks an effect, whatever the error bars say.
+LARGEST_RESIDUAL = 0.5
+# Rows that hold this many times their predicted deviation bend parameters by more than bars from the residual tell.
+LARGEST_WHITENED = 3.0
+# Share of the samples that may be lost before the rest is no fair part of the motion.
+LARGEST_LOSS = 0.01
+# Further from the nearest real bodies than this, in standard deviations, no noise brings an estimate.
+LARGEST_DISTANCE = 3.0
+# A sentence is read at a glance, and fits on a line.
+LONGEST_SENTENCE = 100
+# Names in a sentence; the others are counted.
+NAMED = 2
+
+Level = Literal["trust", "doubt", "not yet"]
+# By row type, `relative` and `whitened`, see `results.residuals`.
+Residual = Mapping[str, Mapping[str, float | None]]
+
+
+@dataclass(frozen=True)
+class Finding:
+    """What the diagnosis of a running session says of one episode: see `diagnosis.episodes.Episode`.
+
+    row: type of the rows that leave most. noticed: s. effects: what was named, `name@where`; adopted: and taken up.
+    """
+
+    row: str
+    noticed: float
+    verdict: str
+    effects: tuple[str, ...] = ()
+    adopted: bool = False
+
+
+@dataclass(frozen=True)
+class Facts:
+    """What is known of a session for or against its estimate.
+
+    determined: parameters that the data determine, and of how many. undetermined: names of the others. settling: why
+    the estimate will still move by more than its error bars, empty where it will not. negative: names of estimates that
+    are negative and must not be. pulled: names of those that noise in the columns pulls beyond their bars. alarm: type
+    of the rows that the sequential test finds more than noise in, of a session without diagnosis. unweighed: joint
+    (from 1) whose torque is explained so little that rows get no weights. undecided: times, s, of changes that the
+    session ended too early to tell. distance: from the nearest real bodies, in standard deviations. lost: share of the
+    samples. troubles: whatever else, a short sentence each, such as of the devices of a live session.
+    """
+
+    determined: tuple[int, int]
+    undetermined: tuple[str, ...] = ()
+    settling: str = ""
+    residual: Residual = field(default_factory=dict)
+    negative: tuple[str, ...] = ()
+    pulled: tuple[str, ...] = ()
+    alarm: str | None = None
+    unweighed: int | None = None
+    undecided: tuple[float, ...] = ()
+    distance: float = 0.0
+    lost: float = 0.0
+    findings: tuple[Finding, ...] = ()
+    troubles: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class Reason:
+    """Why to doubt: a short sentence; grave where the error bars cannot tell how wrong the numbers are.
+
+    places: where on the arm it sits, `joint_i`, `link_i`, `base`, `tip` or a channel; empty where nowhere. mark: a word
+    or two for there. full: the same with what it means, for results.json's warnings; empty where they say it otherwise.
+    """
+
+    text: str
+    grave: bool
+    places: tuple[str, ...] = ()
+    mark: str = ""
+    full: str = ""
+
+
+@dataclass(frozen=True)
+class Judgement:
+    """May the numbers be trusted, and the reasons, the strongest first; of trust, what it rests on.
+
+    grave: of a doubt, that the numbers may be wrong by more than any error bar says.
+    """
+
+    level: Level
+    reasons: tuple[Reason, ...]
+    grave: bool = False
+
+    @property
+    def sentence(self) -> str:
+        """The level and the strongest reason, on a line."""
+        return _fitted(f"{self.level.capitalize()}: {self.reasons[0].text}")
+
+    @property
+    def others(self) -> list[str]:
+        """The other reasons."""
+        return [reason.text for reason in self.reasons[1:]]
+
+    @property
+    def marks(self) -> dict[str, str]:
+        """Where on the arm reasons to doubt sit, and a word or two for there: the strongest of each place."""
+        marks: dict[str, str] = {}
+        for reason in self.reasons:
+            for place in reason.places:
+                marks.setdefault(place, reason.mark)
+        return marks
+
+    def document(self) -> dict[str, Any]:
+        """As results.json holds it."""
+        reasons = [reason.text for reason in self.reasons]
+        return {"level": self.level, "grave": self.grave, "sentence": self.sentence, "reasons": reasons}
+
+
+def judge(facts: Facts) -> Judgement:
+    """The judgement of a session.
+
+    What has been shown to be wrong counts from when it is shown. Residuals of an estimate that is still settling show
+    nothing: it was made of other, poorer rows.
+    """
+    settled = not facts.settling
+    doubts = [*_named(facts.findings)]
+    if settled or facts.unweighed is not None:
+        doubts += _unexplained_torques(facts.residual)
+    doubts += _unnamed(facts.findings)
+    if facts.alarm is not None and not facts.findings:
+        doubts.append(
+            Reason(f"the residual of {facts.alarm} is more than noise", True, (facts.alarm,), "more than noise")
+        )
+    if settled:
+        doubts += [*_loud_rows(facts.residual), *_negative(facts.negative)]
+    if doubts:
+        return Judgement("doubt", (*doubts, *_cautions(facts)), grave=True)
+    if facts.settling:
+        return Judgement("not yet", (Reason(facts.settling, False), *_cautions(facts)))
+    cautions = tuple(_cautions(facts))
+    return Judgement("doubt", cautions) if cautions else Judgement("trust", tuple(_grounds(facts)))
+
+
+def judge_diagnosis(verdict: str, effects: Sequence[str], row: str | None, after: Judgement) -> Judgement:
+    """The judgement of a diagnosed capture.
+
+    verdict: `clean`, `named` or `unexplained`. effects: what was named, `name@where`. row: type of the rows that most
+    of what is not explained acts on. after: of the session with what was named.
+    """
+    if verdict == "clean":
+        return after
+    each = [Reason(f"it lacks {effect}", after.grave, (_place(effect),), _kind(effect)) for effect in effects]
+    if verdict == "unexplained":
+        where = "" if row is None else f" on {row}"
+        text = f"something acts{where} that no known effect explains"
+        found = [Reason(text, True, () if row is None else (row,), "unexplained"), *each]
+    else:
+        what, them = (effects[0], "it") if len(effects) == 1 else (f"{len(effects)} effects", "them")
+        told = f"the system file lacks {what}" + ("" if after.grave else f"; trust the parameters with {them}")
+        found = [replace(each[0], text=told)] if len(each) == 1 else [Reason(told, after.grave), *each]
+    rest = after.reasons if after.level != "trust" else ()
+    return Judgement("doubt", (*found, *rest), grave=found[0].grave)
+
+
+def _named(findings: Iterable[Finding]) -> list[Reason]:
+    """Effects that the model is known to lack."""
+    out = []
+    for finding in findings:
+        if finding.verdict == "named" and not finding.adopted:
+            places = tuple(_place(effect) for effect in finding.effects)
+            mark = ", ".join(dict.fromkeys(_kind(effect) for effect in finding.effects))
+            out.append(Reason(f"the model lacks {_listed(finding.effects)}", True, places, mark))
+    return out
+
+
+def _unnamed(findings: Iterable[Finding]) -> list[Reason]:
+    """Rows that leave more than noise, of which nobody knows why."""
+    out = []
+    for finding in findings:
+        if finding.verdict in ("noticed", "unexplained"):
+            why = "not named yet" if finding.verdict == "noticed" else "no known effect explains it"
+            text = f"more than noise in the residual of {finding.row} since {finding.noticed:.1f} s, {why}"
+            out.append(Reason(text, True, (finding.row,), "more than noise"))
+    return out
+
+
+def _unexplained_torques(residual: Residual) -> list[Reason]:
+    shares = {name: share for name, rows in residual.items() if (share := rows["relative"]) is not None}
+    out = []
+    for name, share in sorted(shares.items(), key=lambda item: -item[1]):
+        if share > LARGEST_RESIDUAL:
+            percent = f"{100.0 * share:.0f} % of the torque or force of {name} is not explained"
+            means = "the model lacks an effect there, and the parameters bend to replace it"
+            out.append(Reason(percent, True, (name,), f"{100.0 * share:.0f} % unexplained", f"{percent}: {means}"))
+    return out
+
+
+def _loud_rows(residual: Residual) -> list[Reason]:
+    """The rows that are furthest beyond their noise."""
+    worst, noise = _loudest(residual)
+    if worst is None or noise <= LARGEST_WHITENED:
+        return []
+    full = (
+        f"rows of {worst} hold {noise:.0f} times what the sensors' noise explains: the model or the samples are wrong "
+        "there, by more than error bars can tell"
+    )
+    return [Reason(f"the residual of {worst} is {noise:.0f} × noise", True, (worst,), f"{noise:.0f} × noise", full)]
+
+
+def _loudest(residual: Residual) -> tuple[str | None, float]:
+    noise = {name: value for name, rows in residual.items() if (value := rows["whitened"]) is not None}
+    worst = max(noise, key=lambda name: noise[name], default=None)
+    return worst, noise[worst] if worst is not None else 0.0
+
+
+def _negative(names: Sequence[str]) -> list[Reason]:
+    return [
+        Reason(
+            f"{name} is negative, which is not physical",
+            True,
+            place_of(name),
+            "negative",
+            f"{name} is negative, which is not physical: the model lacks an effect, or the data are weak",
+        )
+        for name in names
+    ]
+
+
+def _cautions(facts: Facts) -> list[Reason]:
+    """What makes some of the numbers, or their bars, worse than they look."""
+    out = [Reason(trouble, False) for trouble in facts.troubles]
+    if facts.pulled:
+        names = ", ".join(facts.pulled)
+        out.append(
+            Reason(
+                f"sensor noise pulls {_listed(facts.pulled)} beyond the error bar",
+                False,
+                full=f"sensor noise in the columns pulls {names} by more than the error bar",
+            )
+        )
+    out += [Reason(f"a change at {t:.1f} s came too late to be told: values of before", False) for t in facts.undecided]
+    for finding in facts.findings:
+        if finding.verdict == "passed":
+            out.append(Reason(f"the residual of {finding.row} was more than noise for a time", False))
+    if facts.distance > LARGEST_DISTANCE:
+        out.append(Reason(f"no real bodies are nearer than {facts.distance:.0f} standard deviations", False))
+    if facts.lost > LARGEST_LOSS:
+        out.append(Reason(f"{100.0 * facts.lost:.0f} % of the samples are lost", False))
+    return out
+
+
+def _grounds(facts: Facts) -> list[Reason]:
+    """What trust rests on, and what it does not reach to."""
+    known, of = facts.determined
+    worst, noise = _loudest(facts.residual)
+    shares = [share for rows in facts.residual.values() if (share := rows["relative"]) is not None]
+    rests = f", residual at most {noise:.2g} × noise" if worst is not None else ""
+    if worst is None and shares:
+        rests = f", {100.0 * max(shares):.2g} % of a torque or force unexplained"
+    out = [Reason(f"{known} of {of} parameters determined{rests}", False)]
+    if facts.undetermined:
+        out.append(Reason(f"not determined: {_listed(facts.undetermined)}", False))
+    return out
+
+
+def place_of(parameter: str) -> tuple[str, ...]:
+    """Where on the arm a parameter sits, from its name: `joint_i`, `link_i`, `base` or `tip`."""
+    owner, _, where = parameter.rsplit(".", 1)[0].partition("@")
+    if where:
+        return (where,)
+    owner = owner.replace("motor_", "joint_")
+    return ({"spacecraft": "base", "payload": "tip"}.get(owner, owner),)
+
+
+def _place(effect: str) -> str:
+    """Where an effect acts."""
+    return effect.partition("@")[2]
+
+
+def _kind(effect: str) -> str:
+    """An effect without its place."""
+    return effect.partition("@")[0].replace("_", " ")
+
+
+def _listed(names: Sequence[str]) -> str:
+    more = f" and {len(names) - NAMED} more" if len(names) > NAMED else ""
+    return ", ".join(names[:NAMED]) + more
+
+
+def _fitted(text: str) -> str:
+    """Cut at a word where it is too long to be read at a glance."""
+    if len(text) <= LONGEST_SENTENCE:
+        return text
+    return text[: LONGEST_SENTENCE - 1].rsplit(" ", 1)[0] + "…"

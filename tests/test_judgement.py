@@ -1,0 +1,189 @@
+"""May the numbers be trusted? What speaks against them, in which order, and what is said while it is too early."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+from axis import AXIS, axis_block
+
+from sms_online.description.parse import parse_system
+from sms_online.judgement import LONGEST_SENTENCE, Facts, Finding, Residual, judge, judge_diagnosis, place_of
+from sms_online.pipeline.estimator import Estimator
+from sms_online.results import judged, results_document
+
+QUIET: Residual = {
+    "energy": {"relative": None, "whitened": None},
+    "joint_1": {"relative": 0.01, "whitened": 1.1},
+    "joint_2": {"relative": 0.02, "whitened": 0.9},
+}
+GOOD = Facts(determined=(15, 16), undetermined=("motor_2.stator_inertia",), residual=QUIET)
+LACKING = Finding("joint_2", 2.7, "named", ("coulomb_friction@joint_2",))
+
+
+def with_row(row: str, **values: float) -> Facts:
+    return replace(GOOD, residual={**QUIET, row: {**QUIET[row], **values}})
+
+
+def test_what_nothing_speaks_against_is_trusted_and_its_reach_is_told() -> None:
+    judgement = judge(GOOD)
+    assert (judgement.level, judgement.grave, judgement.marks) == ("trust", False, {})
+    assert judgement.sentence == "Trust: 15 of 16 parameters determined, residual at most 1.1 × noise"
+    assert judgement.others == ["not determined: motor_2.stator_inertia"]
+
+
+@pytest.mark.parametrize(
+    ("facts", "said", "marks"),
+    [
+        (with_row("joint_2", whitened=62.0), "the residual of joint_2 is 62 × noise", {"joint_2": "62 × noise"}),
+        (with_row("joint_1", relative=0.96), "96 % of the torque or force of joint_1", {"joint_1": "96 % unexplained"}),
+        (replace(GOOD, findings=(LACKING,)), "lacks coulomb_friction@joint_2", {"joint_2": "coulomb friction"}),
+        (replace(GOOD, findings=(Finding("link_1", 3.0, "noticed"),)), "not named yet", {"link_1": "more than noise"}),
+        (
+            replace(GOOD, findings=(Finding("base", 3.0, "unexplained"),)),
+            "no known effect",
+            {"base": "more than noise"},
+        ),
+        (replace(GOOD, alarm="base"), "the residual of base is more than noise", {"base": "more than noise"}),
+        (replace(GOOD, negative=("motor_2.mass",)), "motor_2.mass is negative", {"joint_2": "negative"}),
+    ],
+)
+def test_what_error_bars_do_not_know_of_is_a_grave_doubt(facts: Facts, said: str, marks: dict[str, str]) -> None:
+    judgement = judge(facts)
+    assert (judgement.level, judgement.grave) == ("doubt", True)
+    assert said in judgement.sentence
+    assert judgement.marks == marks
+
+
+@pytest.mark.parametrize(
+    ("facts", "said"),
+    [
+        (replace(GOOD, pulled=("motor_2.mass",)), "noise pulls motor_2.mass beyond the error bar"),
+        (replace(GOOD, undecided=(19.2,)), "a change at 19.2 s"),
+        (replace(GOOD, findings=(Finding("base", 3.0, "passed"),)), "more than noise for a time"),
+        (replace(GOOD, distance=39.0), "no real bodies are nearer than 39 standard deviations"),
+        (replace(GOOD, lost=0.2), "20 % of the samples are lost"),
+        (replace(GOOD, troubles=("drive: silent",)), "drive: silent"),
+    ],
+)
+def test_what_harms_some_numbers_is_a_doubt_that_is_not_grave(facts: Facts, said: str) -> None:
+    judgement = judge(facts)
+    assert (judgement.level, judgement.grave) == ("doubt", False)
+    assert said in judgement.sentence
+
+
+@pytest.mark.parametrize(
+    "facts",
+    [
+        replace(GOOD, findings=(replace(LACKING, adopted=True), Finding("base", 9.0, "change"))),
+        replace(GOOD, lost=1e-4, distance=1.0),
+        with_row("joint_1", relative=0.4, whitened=2.9),
+    ],
+)
+def test_what_is_explained_or_harmless_leaves_trust(facts: Facts) -> None:
+    assert judge(facts).level == "trust"
+
+
+def test_the_named_effect_comes_before_the_residual_that_it_leaves() -> None:
+    facts = replace(with_row("joint_2", whitened=19.0), findings=(LACKING,), pulled=("motor_2.mass",))
+    judgement = judge(facts)
+    assert "coulomb_friction" in judgement.sentence
+    assert judgement.others[0] == "the residual of joint_2 is 19 × noise"
+    assert "motor_2.mass" in judgement.others[-1]
+    assert judgement.marks == {"joint_2": "coulomb friction"}
+
+
+def test_residuals_of_an_estimate_that_is_settling_show_nothing() -> None:
+    loud = replace(with_row("joint_1", relative=3.0, whitened=80.0), settling="too few rows")
+    assert judge(loud).level == "not yet"
+    assert judge(loud).sentence == "Not yet: too few rows"
+    # Unless no fit explains the torques at all, or a test says so.
+    assert judge(replace(loud, unweighed=1)).grave
+    assert judge(replace(loud, alarm="joint_1")).grave
+
+
+def test_an_alarm_that_the_diagnosis_has_dealt_with_is_no_doubt() -> None:
+    assert judge(replace(GOOD, alarm="joint_2", findings=(replace(LACKING, adopted=True),))).level == "trust"
+
+
+def test_a_sentence_is_read_at_a_glance() -> None:
+    many = tuple(f"torsional_hysteresis@joint_{i}" for i in range(9))
+    sentence = judge(replace(GOOD, findings=(replace(LACKING, effects=many),))).sentence
+    assert "and 7 more" in sentence
+    assert len(judge(replace(GOOD, troubles=("much ado " * 50,))).sentence) <= LONGEST_SENTENCE
+
+
+@pytest.mark.parametrize(
+    ("parameter", "place"),
+    [
+        ("spacecraft.first_moment_x", "base"),
+        ("motor_2.rotor_inertia", "joint_2"),
+        ("link_1.flexural_rigidity", "link_1"),
+        ("payload.mass", "tip"),
+        ("viscous_friction@joint_1.damping", "joint_1"),
+    ],
+)
+def test_a_parameter_sits_at_its_body(parameter: str, place: str) -> None:
+    assert place_of(parameter) == (place,)
+
+
+TRUSTED, DOUBTED = judge(GOOD), judge(with_row("joint_2", whitened=5.0))
+
+
+def test_a_clean_capture_is_judged_by_its_session() -> None:
+    assert judge_diagnosis("clean", [], None, TRUSTED) == TRUSTED
+    assert judge_diagnosis("clean", [], None, DOUBTED) == DOUBTED
+
+
+def test_a_named_effect_makes_the_system_file_doubtful_and_the_parameters_with_it_good() -> None:
+    judgement = judge_diagnosis("named", ["sensor_lag@link_1.*"], None, TRUSTED)
+    assert (judgement.level, judgement.grave) == ("doubt", False)
+    assert "trust the parameters with it" in judgement.sentence
+    assert judgement.marks == {"link_1.*": "sensor lag"}
+    still = judge_diagnosis("named", ["backlash@joint_1", "cogging@joint_2"], None, DOUBTED)
+    assert still.grave
+    assert "trust" not in still.sentence
+    assert still.marks == {"joint_1": "backlash", "joint_2": "cogging"}
+
+
+def test_what_nothing_explains_is_marked_where_it_acts() -> None:
+    judgement = judge_diagnosis("unexplained", [], "link_1", TRUSTED)
+    assert judgement.grave
+    assert judgement.marks == {"link_1": "unexplained"}
+
+
+def session(coulomb: float, seconds: float) -> Estimator:
+    block = axis_block(coulomb)
+    estimator = Estimator(parse_system(AXIS, "axis.toml"), block.channels, "test")
+    kept = block.t < seconds
+    estimator.push(type(block)(block.t[kept], block.channels, block.values[kept]))
+    return estimator
+
+
+def test_a_session_goes_from_too_early_to_trust() -> None:
+    levels = [judged(session(0.0, seconds)).level for seconds in (0.5, 1.5, 12.0)]
+    assert levels == ["not yet", "not yet", "trust"]
+
+
+def test_a_session_whose_model_lacks_friction_is_doubted_where_it_acts() -> None:
+    judgement = judged(session(0.2, 12.0))
+    assert judgement.grave
+    assert [*judgement.marks] == ["joint_1"]
+
+
+def test_results_hold_the_judgement_and_warn_of_the_reasons() -> None:
+    estimator = session(0.2, 12.0)
+    estimator.finish()
+    document = results_document(estimator, 0.0, [])
+    assert document["verdict"] == judged(estimator).document()
+    assert any(warning.startswith("rows of joint_1 hold") for warning in document["warnings"])
+
+
+def test_a_judgement_is_plain_data_in_results() -> None:
+    document = judge(with_row("joint_2", whitened=5.0)).document()
+    assert document == {
+        "level": "doubt",
+        "grave": True,
+        "sentence": "Doubt: the residual of joint_2 is 5 × noise",
+        "reasons": ["the residual of joint_2 is 5 × noise"],
+    }

@@ -1,0 +1,68 @@
+"""Axes of plots without true values: about the estimates themselves, as far as their error bars reach."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sms_online.stream import Array
+from sms_tools.view.frames import Reference
+from sms_tools.view.parameter_groups import HALF_RANGES, Basis, half_range
+
+BOUNDS = 2.0  # standard deviations
+# An axis reaches so many times as far as the error bars: estimates move within them.
+ROOM = 2.0
+# Bars this many times shorter than their axis has room for get a new one: a viewer that is told to change its layout
+# forgets what a person has changed in it.
+SHRUNK = 10.0
+# For the same reason, and because what has been drawn is drawn again, an axis stays for so long at least, s, and for
+# this share of the session so far.
+LEAST_REST, REST = 2.0, 0.25
+
+
+class OwnScale:
+    """What estimates without a true value are compared with: first nominal values, then the estimates of some instant.
+
+    basis: the one that holds, see `Basis`. Its values are filled in for what is determined later.
+    """
+
+    def __init__(self, references: Sequence[Reference | None]) -> None:
+        self._compared: NDArray[np.bool_] = np.array([r is None or not r.is_true for r in references], dtype=bool)
+        nominal = [np.nan if r is None or r.is_true else r.value or np.nan for r in references]
+        self.basis = Basis(np.array(nominal), "nominal value", HALF_RANGES[-1])
+        self._own = False
+        self._begun, self._due = np.inf, -np.inf  # s
+
+    def follow(
+        self, t: float, estimate: Array, std: Array, determined: NDArray[np.bool_], settled: bool, last: bool = False
+    ) -> bool:
+        """Take in what is known at t, s: estimate (n,), std (n,), determined (n,); whether there is another basis now.
+
+        settled: the estimate moves within its error bars. last: of the session.
+        """
+        more = estimate.size - self._compared.size
+        if more > 0:
+            # An event has added parameters.
+            self._compared = np.append(self._compared, np.ones(more, dtype=bool))
+            about = np.append(self.basis.about, np.full(more, np.nan))
+            self.basis = Basis(about, self.basis.name, self.basis.half_range)
+        basis = self.basis
+        drawn = determined & self._compared & (estimate != 0.0)
+        known = np.where(drawn, estimate, np.nan)
+        self._begun = min(self._begun, t)
+        if drawn.any() and (last or (settled and t >= self._due)):
+            bars = 100.0 * BOUNDS * std / np.abs(known)
+            wanted = half_range(ROOM * bars)
+            shrunk = wanted * SHRUNK <= basis.half_range
+            beyond = half_range(100.0 * np.abs(known / basis.about - 1.0) + bars) > basis.half_range
+            if last or not self._own or shrunk or beyond:
+                self.basis = Basis(known, f"estimate at {t:.1f} s", wanted)
+                self._own = True
+                self._due = t + max(LEAST_REST, REST * (t - self._begun))
+                return True
+        if self._own:
+            fresh = np.isnan(basis.about) & drawn
+            basis.about[fresh] = known[fresh]
+        return False
