@@ -23,9 +23,10 @@ from sms_online.model.model import Model
 from sms_tools.adopted_system import added_lines, adopted_text
 from sms_tools.cli import main
 from sms_tools.html_report.arm_drawing import MARK, marked_arm
-from sms_tools.html_report.diagnosis_page import places_of, write_diagnosis
+from sms_tools.html_report.diagnosis_page import write_diagnosis
 from sms_tools.report import Document
 from sms_tools.true_values import true_values
+from sms_tools.view.places import places_of
 from sms_tools.view.scene import Scene
 
 COULOMB = 0.2  # N m

@@ -41,7 +41,7 @@ def document(diagnosed: Path) -> dict[str, Any]:
 def test_the_recording_ends_with_the_parameters_after(diagnosed: Path, document: dict[str, Any]) -> None:
     found = {p["symbol"]: (p["estimate"], p["std"]) for p in document["after"]["parameters"]}
     shown = {}
-    for group in ("links", "effects", "effects_N_m"):  # what was found has no nominal value, so a plot of its own
+    for group in ("links", "effects"):
         recording, entity = diagnosed / "session.rrd", f"/parameters/{group}"
         names = columns(recording, f"{entity}/estimate")[0]["SeriesLines:names"]
         last = [scalars(recording, f"{entity}/{number}")[1][-1].tolist() for number in ("estimate", "std")]
@@ -65,3 +65,17 @@ def test_evidence_is_drawn_over_the_whole_session_and_the_effect_has_the_most(
 def test_the_verdict_is_in_the_log(diagnosed: Path, document: dict[str, Any]) -> None:
     told = [row["TextLog:text"][0] for row in columns(diagnosed / "session.rrd", "/log") if row.get("TextLog:text")]
     assert f"11.99 s: {document['summary']}" in told
+
+
+def test_the_judgement_is_on_top_and_marked_on_the_arm(diagnosed: Path, document: dict[str, Any]) -> None:
+    words = [row["TextDocument:text"][0] for row in columns(diagnosed / "session.rrd", "/verdict/words")]
+    assert words[-1].startswith("# DOUBT: the system file lacks coulomb\\_friction@joint\\_1")
+    assert document["judgement"]["sentence"].startswith("Doubt: the system file lacks coulomb_friction@joint_1")
+    (texts,) = {
+        tuple(row["Points3D:labels"])
+        for row in columns(diagnosed / "session.rrd", "/arm/mark_texts")
+        if row.get("Points3D:labels")
+    }
+    assert texts == ("coulomb friction",)
+    page = (diagnosed / "diagnosis.html").read_text()
+    assert page.index('class="judgement') < page.index("<h1>")

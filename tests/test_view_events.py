@@ -73,15 +73,33 @@ def test_the_recording_goes_on_with_the_parameter_that_an_event_has_added(shown:
     assert any(re.search(r"s: event at 10\.0\d+ s: payload payload.inertia", text) for text in told)
 
 
-def test_an_event_is_marked_in_plots_of_parameters_and_residuals(shown: Path) -> None:
+def test_an_event_is_marked_in_every_plot(shown: Path) -> None:
+    """Of each group of parameters in its last drawing, that of the parameter which the event has added too."""
     (event,) = json.loads((shown / "results.json").read_text())["events"]
-    for entity in ("/parameters/links/events", "/residual/relative_events", "/residual/whitened_events"):
+    drawings: dict[str, list[str]] = {}
+    for entity in {chunk.entity_path for chunk in RrdReader(str(shown / "session.rrd")).stream()}:
+        if entity.startswith("/parameters") and entity.endswith("/deviation"):
+            group, drawing, _ = entity.removeprefix("/parameters/").split("/")
+            drawings.setdefault(group, []).append(drawing)
+    assert {"links", "payload"} <= drawings.keys()
+    last = {group: max(found, key=lambda name: int(name.rpartition("_")[2])) for group, found in drawings.items()}
+    parameters = [f"/parameters/{group}/{drawing}/events" for group, drawing in last.items()]
+    for entity in (*parameters, "/residual/relative_events", "/residual/whitened_events"):
         t, values = scalars(shown / "session.rrd", entity)
         at = t[np.isfinite(values[:, 0])]
         assert event["time"] == pytest.approx(at[0], abs=1e-6), entity
 
 
+def test_the_last_drawing_holds_what_was_before_the_event(shown: Path) -> None:
+    entities = {chunk.entity_path for chunk in RrdReader(str(shown / "session.rrd")).stream()}
+    last = max(e for e in entities if e.startswith("/parameters/links/") and e.endswith("/deviation"))
+    t, values = scalars(shown / "session.rrd", last)
+    assert t[0] < CHANGE < t[-1]
+    # About the last estimate.
+    np.testing.assert_allclose(values[-1], 0.0, atol=1e-9)
+
+
 def test_the_page_draws_all_parameters_of_a_changed_session(shown: Path) -> None:
     page = (shown / "report.html").read_text()
-    assert "payload: estimate ± 2σ" in page
+    assert "payload: from the last estimate ± 2σ" in page
     assert 'class="mark"' in page

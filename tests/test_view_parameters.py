@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -17,37 +18,106 @@ from sms_online.pipeline.events import Event
 from sms_online.pipeline.joint_balance import SquaredResidual
 from sms_tools.view.frames import Reference
 from sms_tools.view.number_log import NumberLog
-from sms_tools.view.parameter_groups import MOST_LINES, parameter_groups, shortened
+from sms_tools.view.own_scale import OwnScale
+from sms_tools.view.parameter_groups import MOST_LINES, Basis, parameter_groups, shortened
 from sms_tools.view.residuals import RecentResidual
 from sms_tools.view.style import BAD, GOOD, residual_colors
 from sms_tools.view.table import markdown_table
 
 
+def about(parameters: Sequence[Parameter]) -> Basis:
+    """The nominal values, where they are something."""
+    return Basis(np.array([p.nominal or np.nan for p in parameters]), "nominal value", 100.0)
+
+
+@pytest.mark.parametrize("truth", [False, True])
 @pytest.mark.parametrize("name", ["paper-planar", "seven-joint", "quanser-2dsfl", "emps"])
-def test_every_parameter_is_in_one_plot_of_one_unit(name: str) -> None:
+def test_every_parameter_is_in_one_plot_of_one_unit(name: str, truth: bool) -> None:
     parameters = find_base_parameters(Model(load_system(name))).parameters
-    groups = parameter_groups(parameters, [Reference(p.nominal, False) if p.nominal else None for p in parameters])
+    groups = parameter_groups(parameters, [Reference(p.nominal, truth) for p in parameters], about(parameters))
     members = np.concatenate([group.indices for group in groups])
     assert sorted(members.tolist()) == list(range(len(parameters)))
     assert len({group.path for group in groups}) == len(groups)
     for group in groups:
         assert len(group.indices) <= MOST_LINES
-        units = {"%" if parameters[k].nominal else parameters[k].unit for k in group.indices}
+        # A true value of zero is no measure of anything.
+        units = {"%" if parameters[k].nominal or not truth else parameters[k].unit for k in group.indices}
         assert units == {group.unit}
         assert group.unit in group.title
 
 
+def test_what_only_some_have_a_true_value_of_is_drawn_apart() -> None:
+    parameters = [Parameter(f"link_{i}.mass", f"m_{i}", "kg", 1.0) for i in (1, 2)]
+    first, second = parameter_groups(parameters, [Reference(1.0, True), None], about(parameters))
+    assert (first.path, second.path) == ("links", "links_own")
+    assert "true value" in first.title
+    assert "nominal value" in second.title
+
+
 def test_a_deviation_is_in_percent_of_its_reference() -> None:
     parameter = Parameter("link_1.first_moment_x", "m_1 c_1x", "kg m", 1.0)
-    (group,) = parameter_groups([parameter], [Reference(-2.0, True)])
+    (group,) = parameter_groups([parameter], [Reference(-2.0, True)], about([parameter]))
     assert (-2.1 - group.zero[0]) / group.scale[0] == pytest.approx(-5.0)
 
 
-def test_without_a_reference_a_plot_shows_the_value_itself() -> None:
+def test_without_anything_to_compare_with_nothing_is_drawn_and_the_axis_is_that_of_the_others() -> None:
     parameter = Parameter("coulomb_friction@joint_1.torque", "c_1", "N m", 0.0)
-    (group,) = parameter_groups([parameter], [None])
-    assert (group.zero[0], group.scale[0], group.unit, group.half_range) == (0.0, 1.0, "N m", None)
-    assert group.kind == "effects"
+    (group,) = parameter_groups([parameter], [None], about([parameter]))
+    assert np.isnan((3.0 - group.zero[0]) / group.scale[0])
+    assert (group.kind, group.unit, group.half_range) == ("effects", "%", 100.0)
+
+
+KNOWN = np.ones(4, dtype=bool)
+
+
+def followed(scale: OwnScale, t: float, estimate: list[float], percent: float, settled: bool = True) -> bool:
+    """An instant at which every error bar (1σ) is so many percent long."""
+    values = np.array(estimate)
+    return scale.follow(t, values, np.abs(values) * percent / 100.0, KNOWN, settled)
+
+
+def test_an_axis_is_about_the_estimate_once_it_has_settled_and_as_wide_as_its_bars_ask_for() -> None:
+    scale = OwnScale([Reference(10.0, False)] * 4)
+    assert not followed(scale, 1.0, [12.0] * 4, 1.0, settled=False)
+    assert (scale.basis.half_range, scale.basis.about[0]) == (100.0, 10.0)
+    assert followed(scale, 2.0, [12.0] * 4, 1.0)
+    assert scale.basis.about.tolist() == [12.0] * 4
+    # Twice ± 2 %, on the next axis there is.
+    assert scale.basis.half_range == 10.0
+    assert "2.0 s" in scale.basis.name
+
+
+def test_an_axis_stays_until_bars_are_ten_times_shorter_or_estimates_leave_it() -> None:
+    scale = OwnScale([None] * 4)
+    assert followed(scale, 0.0, [12.0] * 4, 1.0)
+    assert not followed(scale, 10.0, [12.1] * 4, 0.5)
+    assert followed(scale, 20.0, [12.1] * 4, 0.1)
+    assert scale.basis.half_range == 1.0
+    assert not followed(scale, 40.0, [20.0, 12.1, 12.1, 12.1], 0.1)  # one of four may
+    assert followed(scale, 60.0, [20.0, 20.0, 12.1, 12.1], 0.1)
+
+
+def test_an_axis_of_a_restless_estimate_changes_ever_more_rarely() -> None:
+    """What was drawn is drawn again each time, so an hour must not hold thousands of them."""
+    scale = OwnScale([None] * 4)
+    changes = [t for t in range(3600) if followed(scale, float(t), [1.0 + t % 2] * 4, 0.1)]
+    assert len(changes) < 40
+    assert changes[-1] > 2000
+
+
+def test_what_is_determined_later_joins_the_axis_of_the_others() -> None:
+    scale = OwnScale([None] * 2)
+    some = np.array([True, False])
+    assert scale.follow(1.0, np.array([5.0, 7.0]), np.array([0.01, np.inf]), some, True)
+    assert np.isnan(scale.basis.about[1])
+    assert not scale.follow(2.0, np.array([5.0, 7.0]), np.array([0.01, 0.01]), np.array([True, True]), True)
+    assert scale.basis.about.tolist() == [5.0, 7.0]
+
+
+def test_where_all_true_values_are_known_the_axis_never_changes() -> None:
+    scale = OwnScale([Reference(1.0, True)] * 4)
+    assert not followed(scale, 5.0, [12.0] * 4, 1.0)
+    assert not scale.follow(9.0, np.full(4, 12.0), np.full(4, 0.1), KNOWN, True, last=True)
 
 
 def test_long_combinations_are_cut_to_a_label() -> None:
