@@ -14,6 +14,8 @@ from typing import Any, Literal
 LARGEST_RESIDUAL = 0.5
 # Rows that hold this many times their predicted deviation bend parameters by more than bars from the residual tell.
 LARGEST_WHITENED = 3.0
+# Up to here a multiple of the noise is not told: it is rounded to one, or samples are exact and there is no noise.
+JUST_NOISE = 1.05
 # Share of the samples that may be lost before the rest is no fair part of the motion.
 LARGEST_LOSS = 0.01
 # Further from the nearest real bodies than this, in standard deviations, no noise brings an estimate.
@@ -259,7 +261,9 @@ def _grounds(facts: Facts) -> list[Reason]:
     known, of = facts.determined
     worst, noise = _loudest(facts.residual)
     shares = [share for rows in facts.residual.values() if (share := rows["relative"]) is not None]
-    rests = f", residual at most {noise:.2g} × noise" if worst is not None else ""
+    rests = ""
+    if worst is not None:
+        rests = ", residual " + ("no more than noise" if noise < JUST_NOISE else f"at most {noise:.2g} × noise")
     if worst is None and shares:
         rests = f", {100.0 * max(shares):.2g} % of a torque or force unexplained"
     out = [Reason(f"{known} of {of} parameters determined{rests}", False)]

@@ -24,6 +24,7 @@ from sms_adapters.recording import split
 from sms_adapters.session_log import SessionHeader, from_microseconds
 from sms_adapters.sources import open_source
 from sms_online.description.schema import System
+from sms_online.judgement import Facts, judge
 from sms_online.pipeline.estimator import Estimator
 from sms_online.results import results_document, standard_deviation
 from sms_tools.interruption import Interruption
@@ -31,7 +32,7 @@ from sms_tools.live import feed as feed_module
 from sms_tools.live.feed import Feed, Interpreter, SessionClock
 from sms_tools.live.latency import Latencies
 from sms_tools.live.loop import LiveSession
-from sms_tools.live.status import Leading, News, StatusWriter, line
+from sms_tools.live.status import Leading, News, StatusWriter, line, screen
 
 SPEED = 10.0
 
@@ -325,11 +326,15 @@ def test_latency_counts_each_sample_once_and_forgets_the_start() -> None:
 
 def test_the_status_line_says_what_matters() -> None:
     leading = [Leading("link_1.inertia", "kg m²", 0.3, 0.01)]
-    news = News(12.0, 1234.0, 0.12, 3, 0.02, (1, 2), leading, ["drive: gone (unplugged), tried again"])
+    gone = "drive: gone (unplugged), tried again"
+    doubt = judge(Facts(determined=(1, 2), troubles=(gone,)))
+    news = News(12.0, 1234.0, 0.12, 3, 0.02, (1, 2), leading, [gone], doubt)
     said = line(news)
     for part in ("12.0 s", "1,234 samples/s", "p99 120 ms", "lost 3", "residual 2 %", "1 of 2 determined",
-                 "link_1.inertia 0.3 ± 0.02 kg m²", "drive: gone (unplugged)"):  # fmt: skip
+                 f"Doubt: {gone}", "link_1.inertia 0.3 ± 0.02 kg m²"):  # fmt: skip
         assert part in said
+    *_, last = screen(news, 80).splitlines()
+    assert f"Doubt: {gone}" in last
 
 
 @pytest.fixture(autouse=True)
