@@ -22,6 +22,7 @@ from sms_tools.cli import main
 from sms_tools.html_report import history as history_module
 from sms_tools.html_report import svg
 from sms_tools.html_report.arm_drawing import arm_drawings
+from sms_tools.html_report.error_bars import Bar, error_bars
 from sms_tools.html_report.history import History
 from sms_tools.html_report.page import write_report
 from sms_tools.html_report.paper_example import figure_6
@@ -158,3 +159,13 @@ def test_any_arm_can_be_drawn(name: str) -> None:
 def test_figure_6_shows_angles_rates_and_torques(planar_session: Simulation) -> None:
     drawings = re.findall(r"<svg.*?</svg>", figure_6(planar_session), re.DOTALL)
     assert [len(polylines(drawing)) for drawing in drawings] == [4, 4, 2]
+
+
+def test_a_bar_that_goes_on_beyond_its_scale_says_so() -> None:
+    inside, right, both = (error_bars([Bar(*bar, "#000")], 1.0) for bar in ((0.0, 0.9), (0.5, 0.9), (0.0, 3.0)))
+    assert [drawing.count("<path") for drawing in (inside, right, both)] == [0, 1, 2]
+
+
+def test_the_judgement_is_the_first_thing_on_the_page(page: str) -> None:
+    assert page.index('class="judgement trust"') < page.index("<h1>")
+    assert "Trust: 16 of 16 parameters determined" in page

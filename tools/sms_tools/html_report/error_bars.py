@@ -23,7 +23,10 @@ class Bar:
 
 
 def error_bars(bars: Sequence[Bar], limit: float) -> str:
-    """Bars below each other on a scale of ± limit %, the reference in the middle; nothing where none is known."""
+    """Bars below each other on a scale of ± limit %, the reference in the middle; nothing where none is known.
+
+    An arrow where one goes on beyond the scale.
+    """
     bars = [bar for bar in bars if np.isfinite(bar.deviation) and np.isfinite(bar.bound)]
     if not bars:
         return ""
@@ -40,5 +43,9 @@ def error_bars(bars: Sequence[Bar], limit: float) -> str:
             f'<line x1="{left:.1f}" x2="{right:.1f}" y1="{y}" y2="{y}" stroke="{bar.color}" stroke-width="3"/>'
             f'<circle cx="{middle:.1f}" cy="{y}" r="3.5" fill="{bar.color}"/>'
         )
+        if bar.deviation - bar.bound < -limit:
+            parts.append(f'<path d="M0 {y} l7 -5 v10 z" fill="{bar.color}"/>')
+        if bar.deviation + bar.bound > limit:
+            parts.append(f'<path d="M{BAR_WIDTH} {y} l-7 -5 v10 z" fill="{bar.color}"/>')
     axis = f'<line x1="{center}" x2="{center}" y1="1" y2="{height - 1}" stroke="#8895a3"/>'
     return svg(BAR_WIDTH, height, "".join([*grid, axis, *parts]))
