@@ -49,7 +49,7 @@ EFFECTS = (
     "cubic_stiffness@joint_1:stiffness=5000",
     "sensor_lag@link_1.*:corner=100",
 )
-PAGE_WIDTH, PAGE_HEIGHT = 1200, 2025
+PAGE_WIDTH, PAGE_HEIGHT = 1200, 1885
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
