@@ -143,6 +143,9 @@ def test_only_plausible_coefficients_are_taken() -> None:
     assert plausible("coulomb_friction", np.array([0.1]), 1000.0)
     assert not plausible("coulomb_friction", np.array([-0.1]), 1000.0)
     assert not plausible("torque_gain", np.array([-1.0]), 1000.0)
+    assert plausible("torque_gain", np.array([-0.02]), 1000.0)
+    # No torque is known to this.
+    assert not plausible("torque_gain", np.array([2e-4]), 1000.0)
     assert plausible("cubic_stiffness", np.array([-100.0]), 1000.0)
     # What a held command does is no sensor's lag.
     assert not plausible("sensor_lag", np.array([4e-4]), 1000.0)

@@ -17,6 +17,9 @@ POSITIVE = frozenset(
 # Largest coefficients. With a gain of -1 a measured torque explains itself and the arm weighs nothing; a channel that
 # is later than half a window of the planar example, s, is no channel of this session.
 LARGEST = {"torque_gain": 0.5, "torque_ripple": 0.5, "sensor_lag": 0.2, "torque_delay": 0.2}
+# Smallest ones. Torque sensors, and models of what a torque moves, are right to a thousandth at best: a gain or ripple
+# below that is no fault of theirs.
+SMALLEST = {"torque_gain": 1e-3, "torque_ripple": 1e-3}
 
 # A drive that holds its command over a sample acts half a sample late: a lag up to that, in samples, is no sensor's.
 HELD = 0.5
@@ -28,4 +31,4 @@ def plausible(name: str, coefficients: Array, sample_rate: float) -> bool:
         return False
     if name == "sensor_lag" and coefficients[0] <= HELD / sample_rate:
         return False
-    return bool(np.linalg.norm(coefficients) <= LARGEST.get(name, np.inf))
+    return bool(SMALLEST.get(name, 0.0) <= np.linalg.norm(coefficients) <= LARGEST.get(name, np.inf))

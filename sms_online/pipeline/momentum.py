@@ -101,12 +101,12 @@ class Momentum:
     @property
     def settled(self) -> bool:
         """Whether there are rows enough since the last event for a test of what they leave."""
-        return self.started and self.fit.plain_windows * self._balance.span / HOPS >= TESTED
+        return self.started and self.fit.plain.windows * self._balance.span / HOPS >= TESTED
 
     @property
     def misfit(self) -> bool:
         """Whether rows leave clearly more than the sensors' noise."""
-        return bool(self.fit.misfit.any())
+        return bool(self.fit.plain.misfit.any())
 
     def estimate(self) -> Estimate:
         """The base parameters as known now, free of what noise in the columns does; with a prior, as the rows say."""
@@ -222,7 +222,7 @@ class Momentum:
 
     def whitened(self, rows: list[int], beta: Array) -> float | None:
         """rms of the residual of some generalized speeds' rows over its predicted standard deviation, for β (n,)."""
-        return self.fit.whitened(rows, beta)
+        return self.fit.plain.whitened(rows, beta)
 
     def state(self) -> dict[str, dict[str, Any]]:
         """Everything that `restore` needs to continue to the same bits."""

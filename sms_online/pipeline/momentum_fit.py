@@ -35,6 +35,7 @@ from sms_online.pipeline.momentum_balance import (
     windows_from_state,
     windows_state,
 )
+from sms_online.pipeline.plain_rows import PlainRows
 from sms_online.pipeline.sensor_noise import FINEST, SensorNoise, noise_from_state, noise_state
 from sms_online.pipeline.smoothing import HALF_WIDTHS
 from sms_online.pipeline.weighing import Weighed, Weighing
@@ -54,11 +55,6 @@ PASSES_DESCRIBED = 1
 DETERMINED = 3.0
 # A window moves when a coordinate spans this many σ in it; noise alone spans 6.
 MOTION = 20.0
-# Mean square of a coordinate's residual over its predicted variance beyond which the model lacks something there: a
-# second of windows scatters by 20 %, the noise behind the prediction by 10 %.
-LARGEST_RATIO = 2.0
-# Rounding of a sum of products, in units of its last place.
-ROUNDED = 16.0
 # Multiple of the square of one sample of what noise does beyond first order in a row that stands for its variance in
 # the row's own covariance.
 UNSTEADY = 4.0
@@ -136,11 +132,7 @@ class MomentumFit:
         self._bends = {half_width: np.zeros(model.layout.n_v) for half_width in HALF_WIDTHS}
         self._bent = dict.fromkeys(HALF_WIDTHS, 0)
         self._largest = np.zeros(model.layout.n_v)  # largest sum of a row's terms
-        # Gram matrices of rows [Y b] over their own standard deviations, by generalized speed, and how many windows. No
-        # array is written twice, so whoever keeps one has the sum of then: of a large arm they are 3 MB.
-        self.plain_gram = np.zeros((model.layout.n_v, base.n + 1, base.n + 1))
-        self.plain_windows = 0
-        self.misfit = np.zeros(model.layout.n_v)  # excess over one of the mean square of such rows' residual
+        self.plain = PlainRows(model.layout.n_v, base.n)
         self._begin_segment()
 
     def end_segment(self, noise: SensorNoise) -> list[WhiteRows]:
@@ -188,7 +180,7 @@ class MomentumFit:
         """Begin with weights β (n,) that are known."""
         self.weights = weights
         self._sensor_noise = noise
-        self._weighing.begin(weights, noise, self.misfit, self._first)
+        self._weighing.begin(weights, noise, self.plain.misfit, self._first)
         self._renewal = self._count(FIRST_RENEWAL)
 
     def flush(self, noise: SensorNoise) -> list[WhiteRows]:
@@ -202,14 +194,14 @@ class MomentumFit:
         unweighted, _ = _least_squares(np.concatenate([self._dense(window)[0] for window in self._held]))
         if not (self._explains_torques(unweighted) and self._settle(unweighted, PASSES, partly=False)):
             self.weights = None
-            self.misfit, self.plain_gram = np.zeros_like(self.misfit), np.zeros_like(self.plain_gram)
-            self.plain_windows = 0
+            self.plain.clear()
+            self.plain.misfit = np.zeros_like(self.plain.misfit)
             return []
-        if self.misfit.any():
-            weights, misfit = self.weights, self.misfit
+        if self.plain.misfit.any():
+            weights, misfit = self.weights, self.plain.misfit
             described = self.base.values(self.model.nominal)
-            if not self._settle(described, PASSES_DESCRIBED, partly=True) or self.misfit.sum() >= misfit.sum():
-                self.weights, self.misfit, self.unexplained = weights, misfit, None
+            if not self._settle(described, PASSES_DESCRIBED, partly=True) or self.plain.misfit.sum() >= misfit.sum():
+                self.weights, self.plain.misfit, self.unexplained = weights, misfit, None
         self._retell()
         out = [self._white(window) for window in self._held]
         self._since = 0
@@ -222,13 +214,13 @@ class MomentumFit:
 
         partly: weights take what the rows determine, and keep the rest.
         """
-        self.weights, self.misfit = start, np.zeros(self.model.layout.n_v)
+        self.weights, self.plain.misfit = start, np.zeros(self.model.layout.n_v)
         for _ in range(passes):
             self._retell()
             fitted, determined = _least_squares(np.concatenate([self._white(window).Y for window in self._held]))
             if not self._explains_torques(fitted):
                 return False
-            self._judge(fitted)
+            self.plain.judge(fitted)
             self.weights = np.where(determined, fitted, self.weights) if partly else fitted
         return True
 
@@ -251,21 +243,6 @@ class MomentumFit:
         """Windows that begin in so many seconds."""
         return max(1, round(seconds * HOPS / self._balance.span))
 
-    def whitened(self, rows: list[int], beta: Array) -> float | None:
-        """rms of the residual of some generalized speeds' rows over its predicted standard deviation, for β (n,)."""
-        if self.plain_windows == 0:
-            return None
-        mean_square = self._squares(beta)[rows].mean() / self.plain_windows
-        return float(np.sqrt(max(0.0, mean_square)))
-
-    def _squares(self, beta: Array) -> Array:
-        """Sum (n_v,) of the squares of every speed's residual over its predicted variance, for β (n,)."""
-        w = np.append(beta, -1.0)
-        squares = np.einsum("i,vij,j->v", w, self.plain_gram, w)
-        # Where samples are exact nothing but rounding is left of the sum.
-        rounding = np.finfo(np.float64).eps * np.einsum("i,vij,j->v", np.abs(w), np.abs(self.plain_gram), np.abs(w))
-        return np.asarray(squares - ROUNDED * rounding)
-
     def _moves(self, window: Window, noise: SensorNoise) -> bool:
         inside = slice(window.start - self._first, window.start - self._first + INSTANTS + 1)
         return bool(np.any(np.ptp(self._x[inside], axis=0) > MOTION * noise.coordinates))
@@ -282,39 +259,31 @@ class MomentumFit:
         beta = np.where(np.isnan(beta), self._known_weights, beta)
         self._since = 0
         self._renewal = min(2 * self._renewal, self._count(LATEST_RENEWAL))
-        self._judge(beta)
+        self.plain.judge(beta)
         used = self._weighing
-        if np.any(np.abs(self.misfit - used.misfit) > SAME_MISFIT * (1.0 + used.misfit)):
+        if np.any(np.abs(self.plain.misfit - used.misfit) > SAME_MISFIT * (1.0 + used.misfit)):
             self.weights = beta
-            used.begin(beta, noise, self.misfit, window.start)
+            used.begin(beta, noise, self.plain.misfit, window.start)
         elif self._matters(beta, noise):
             self._next, self._warm = self._new_weighing(), 0
-            self._next.begin(beta, noise, self.misfit, window.start)
+            self._next.begin(beta, noise, self.plain.misfit, window.start)
 
     def _matters(self, beta: Array, noise: SensorNoise) -> bool:
         """Whether β (n,) and the noise of now would weigh rows otherwise."""
         used = self._weighing
         assert used.sensor_noise is not None
-        squares = np.einsum("vii->vi", self.plain_gram)[:, :-1]
+        squares = np.einsum("vii->vi", self.plain.gram)[:, :-1]
         changed, size = (np.sqrt(squares @ values**2) for values in (beta - used.beta, beta))
         densities = [(noise.sensors, used.sensor_noise.sensors), (noise.torque, used.sensor_noise.torque)]
         louder = any(np.any(np.abs(now - then) > SAME_NOISE * then) for now, then in densities)
         return bool(np.any(changed > SAME_ROWS * size) or louder)
 
-    def _judge(self, beta: Array) -> None:
-        """What rows leave of β (n,) beyond their predicted variance so far, where that is no accident."""
-        if self.plain_windows == 0:
-            return
-        ratio = self._squares(beta) / self.plain_windows
-        self.misfit = np.where(ratio > LARGEST_RATIO, ratio - 1.0, 0.0)
-
     def _retell(self) -> None:
         """Work off the windows held back from the first one on."""
-        self.plain_gram = np.zeros_like(self.plain_gram)
-        self.plain_windows = 0
+        self.plain.clear()
         self._bent = dict.fromkeys(HALF_WIDTHS, 0)
         assert self._sensor_noise is not None
-        self._weighing.begin(self._known_weights, self._sensor_noise, self.misfit, self._first)
+        self._weighing.begin(self._known_weights, self._sensor_noise, self.plain.misfit, self._first)
         self._tell()
 
     @property
@@ -354,11 +323,7 @@ class MomentumFit:
         # A narrow filter lets through no less than the wide ones do, however few windows it has been used for.
         bent = np.max([mean for wide, mean in self._bends.items() if wide >= M], axis=0)
         weighed = self._weigh(window, rows.swapaxes(0, 1).reshape(n_v, -1), bent + rounding)
-        plain = rows[0] / np.sqrt(np.diag(weighed.noise))[:, None]
-        gram = plain[:, :, None] * plain[:, None, :]
-        gram += self.plain_gram
-        self.plain_gram = gram
-        self.plain_windows += 1
+        self.plain.add(rows[0], np.diag(weighed.noise))
         white = weighed.rows.reshape(n_v, COPIES, -1).swapaxes(0, 1)
         unsteady = np.diag(UNSTEADY * bend**2)
         return WhiteRows(
@@ -397,8 +362,7 @@ class MomentumFit:
             "moving": self._moving, "first": self._first, "x": self._x, "v": self._v, "signals": self._signals,
             "bends": np.array([*self._bends.values()]), "bent": np.array([*self._bent.values()]),
             "unexplained": -1 if self.unexplained is None else self.unexplained,
-            "largest": self._largest, "misfit": self.misfit, "plain_gram": self.plain_gram,
-            "plain_windows": self.plain_windows, "renewal": self._renewal, "last": self._last,
+            "largest": self._largest, **self.plain.state(), "renewal": self._renewal, "last": self._last,
             "warm": -1 if self._next is None else self._warm, **self._weighing.state(),
             **windows_state("held", self._held),
             **({} if self._next is None else {f"next_{name}": value for name, value in self._next.state().items()}),
@@ -413,9 +377,8 @@ class MomentumFit:
         self._largest = np.array(state["largest"])
         self._bends = dict(zip(HALF_WIDTHS, np.array(state["bends"]), strict=True))
         self._bent = dict(zip(HALF_WIDTHS, state["bent"].tolist(), strict=True))
-        self.misfit = np.array(state["misfit"])
+        self.plain.restore(state)
         self.unexplained = None if state["unexplained"] < 0 else int(state["unexplained"])
-        self.plain_gram, self.plain_windows = np.array(state["plain_gram"]), int(state["plain_windows"])
         self._held = windows_from_state("held", state)
         self._renewal, self._last = int(state["renewal"]), int(state["last"])
         self._sensor_noise = noise_from_state("steady", state)

@@ -87,9 +87,9 @@ def _take_momentum(momentum: Momentum) -> MomentumSnapshot:
         momentum.tracker.state(),
         momentum.bias.state(),
         fit.weights,
-        fit.misfit,
-        fit.plain_gram,
-        fit.plain_windows,
+        fit.plain.misfit,
+        fit.plain.gram,
+        fit.plain.windows,
         momentum.test.alarm,
         fit.unexplained,
         momentum.latencies.state(),
@@ -113,7 +113,7 @@ def apply(snapshot: Snapshot, replica: Estimator) -> None:
         momentum.tracker.restore(known.tracker)
         momentum.bias.restore(known.bias)
         fit = momentum.fit
-        fit.weights, fit.misfit = known.weights, known.misfit
-        fit.plain_gram, fit.plain_windows = known.plain_gram, known.plain_windows
+        fit.weights, fit.plain.misfit = known.weights, known.misfit
+        fit.plain.gram, fit.plain.windows = known.plain_gram, known.plain_windows
         momentum.test.alarm, fit.unexplained = known.alarm, known.unexplained
         momentum.latencies.restore(known.latencies)

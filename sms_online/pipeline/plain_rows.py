@@ -1,0 +1,72 @@
+"""Rows of a session over their own standard deviations: what they leave of an estimate beyond what noise does."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sms_online.stream import Array
+
+# Mean square of a coordinate's residual over its predicted variance beyond which the model lacks something there: a
+# second of windows scatters by 20 %, the noise behind the prediction by 10 %.
+LARGEST_RATIO = 2.0
+# Rounding of a sum of products, in units of its last place.
+ROUNDED = 16.0
+
+
+class PlainRows:
+    """Sums over windows, by generalized speed.
+
+    gram (n_v, n + 1, n + 1): Gram matrices of rows [Y b] over their deviations. windows: how many. misfit (n_v,):
+    excess over one of the mean square of such rows' residual, zero where it may be chance.
+    """
+
+    def __init__(self, n_v: int, n: int) -> None:
+        # No array is written twice, so whoever keeps one has the sum of then: of a large arm they are 3 MB.
+        self.gram = np.zeros((n_v, n + 1, n + 1))
+        self.windows = 0
+        self.misfit = np.zeros(n_v)
+
+    def clear(self) -> None:
+        """Forget the windows, not the misfit."""
+        self.gram, self.windows = np.zeros_like(self.gram), 0
+
+    def add(self, rows: Array, variance: Array) -> None:
+        """Rows [Y b] (n_v, n + 1) of a window, and what noise makes of each (n_v,)."""
+        plain = rows / np.sqrt(variance)[:, None]
+        gram = plain[:, :, None] * plain[:, None, :]
+        gram += self.gram
+        self.gram = gram
+        self.windows += 1
+
+    def _squares(self, beta: Array) -> Array:
+        """Sum (n_v,) of the squares of every speed's residual for β (n,), over its predicted variance."""
+        w = np.append(beta, -1.0)
+        squares = np.einsum("i,vij,j->v", w, self.gram, w)
+        # Where samples are exact nothing but rounding is left of the sum.
+        rounding = np.finfo(np.float64).eps * np.einsum("i,vij,j->v", np.abs(w), np.abs(self.gram), np.abs(w))
+        return np.asarray(squares - ROUNDED * rounding)
+
+    def whitened(self, rows: list[int], beta: Array) -> float | None:
+        """rms of the residual of some generalized speeds' rows over its predicted standard deviation, for β (n,)."""
+        if self.windows == 0:
+            return None
+        return float(np.sqrt(max(0.0, self._squares(beta)[rows].mean() / self.windows)))
+
+    def judge(self, beta: Array) -> None:
+        """Tell the misfit of β (n,) from the windows so far."""
+        if self.windows:
+            ratio = self._squares(beta) / self.windows
+            self.misfit = np.where(ratio > LARGEST_RATIO, ratio - 1.0, 0.0)
+
+    def state(self) -> dict[str, Any]:
+        """What `restore` needs to continue."""
+        return {"misfit": self.misfit, "plain_gram": self.gram, "plain_windows": self.windows}
+
+    def restore(self, state: Mapping[str, NDArray[Any]]) -> None:
+        """Continue from a saved state."""
+        self.misfit, self.gram = np.array(state["misfit"]), np.array(state["plain_gram"])
+        self.windows = int(state["plain_windows"])
