@@ -132,9 +132,12 @@ def judge(facts: Facts) -> Judgement:
     settled = not facts.settling
     doubts = [*_named(facts.findings)]
     if settled or facts.unweighed is not None:
-        doubts += _unexplained_torques(facts.residual)
+        torques = _unexplained_torques(facts.residual)
+        doubts += torques
+        if facts.unweighed is not None and f"joint_{facts.unweighed}" not in [reason.places[0] for reason in torques]:
+            doubts.append(_unweighed(facts.unweighed))
     doubts += _unnamed(facts.findings)
-    if facts.alarm is not None and not facts.findings:
+    if facts.alarm is not None and not any(_open(finding) for finding in facts.findings):
         doubts.append(
             Reason(f"the residual of {facts.alarm} is more than noise", True, (facts.alarm,), "more than noise")
         )
@@ -163,10 +166,21 @@ def judge_diagnosis(verdict: str, effects: Sequence[str], row: str | None, after
         found = [Reason(text, True, () if row is None else (row,), "unexplained"), *each]
     else:
         what, them = (effects[0], "it") if len(effects) == 1 else (f"{len(effects)} effects", "them")
-        told = f"the system file lacks {what}" + ("" if after.grave else f"; trust the parameters with {them}")
+        trusted = f"; trust the parameters with {them}" + (" but for what follows" if after.level == "doubt" else "")
+        told = f"the system file lacks {what}" + ("" if after.grave or after.level == "not yet" else trusted)
         found = [replace(each[0], text=told)] if len(each) == 1 else [Reason(told, after.grave), *each]
     rest = after.reasons if after.level != "trust" else ()
     return Judgement("doubt", (*found, *rest), grave=found[0].grave)
+
+
+def _open(finding: Finding) -> bool:
+    """Whether an alarm is this episode's. A test that alarms after an effect was taken up tells of something else."""
+    return not finding.adopted and finding.verdict != "change"
+
+
+def _unweighed(joint: int) -> Reason:
+    text = f"no weights: by a first fit, most of the torque or force of joint_{joint} is not explained"
+    return Reason(text, True, (f"joint_{joint}",), "not explained")
 
 
 def _named(findings: Iterable[Finding]) -> list[Reason]:

@@ -21,7 +21,7 @@ SCHEMA = "sms-online/results/1"
 NORMAL_95 = 1.959963984540054
 # An estimate within three standard deviations of zero is not determined by the data: not even its sign is certain.
 LARGEST_RELATIVE_STD = 1.0 / 3.0
-# Mean square of rows over their predicted variance that noise alone may leave: the noise itself is estimated to 5 %.
+# Mean square of rows over their predicted variance that noise alone may leave: that of the noise is estimated to 7 %.
 LARGEST_ROW_VARIANCE = 1.2
 # Rows of the energy balance, for each parameter, from which on its first transient is forgotten.
 ROWS_A_PARAMETER = 10
@@ -167,7 +167,7 @@ def _settling(estimator: Estimator, estimate: Estimate, known: bool) -> str:
         return "the energy balance has few rows yet" if few else ""
     if not momentum.started:
         return "the first fit has no weights yet, for want of motion"
-    if momentum.settled:
+    if momentum.settled or (estimator.events and estimator.events[-1].kind == "undecided"):
         return ""
     after = f" since the change at {estimator.events[-1].time:.1f} s" if estimator.events else ""
     return f"the test for more than noise has seen too few rows{after}"
@@ -179,6 +179,8 @@ def _weaknesses(estimator: Estimator) -> list[str]:
     smoother, momentum = estimator.smoother, estimator.momentum
     if smoother is not None and smoother.level > 0.0 and estimator.by_smoother:
         out.append("samples do not agree with the equations of motion")
+    if momentum is None and not estimator.by_smoother:
+        out.append("by the energy balance alone, nothing tests whether the model lacks something")
     if smoother is not None and not estimator.by_smoother and estimator.sensing.missing:
         out.append("links are taken as bent statically: estimates are off by percents")
     late = None if momentum is None else momentum.latencies.found

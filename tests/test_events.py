@@ -18,7 +18,7 @@ from sms_online.pipeline.estimator import Estimator
 from sms_online.pipeline.event_hypotheses import opened
 from sms_online.pipeline.events import Event
 from sms_online.pipeline.momentum_balance import HOPS, MARGIN
-from sms_online.results import results_document, standard_deviation
+from sms_online.results import judged, results_document, standard_deviation
 from sms_online.stream import Array, Block
 from sms_online.trackers.factor import solve, triangular_factor
 from sms_sim.simulate import Simulation
@@ -199,6 +199,7 @@ def test_a_session_that_ends_upon_a_change_keeps_what_was_known_before() -> None
     early = block.t < CHANGE + 0.9
     estimator, _ = run(Block(block.t[early], block.channels, block.values[early]), system=SYSTEM)
     assert only_event(estimator).kind == "undecided"
+    assert "a change at 10.0 s came too late" in judged(estimator).sentence
     errors = np.abs(estimator.estimate().pi - [INERTIA, DAMPING])
     assert (errors < 4.0 * standard_deviation(estimator)).all()
 

@@ -102,8 +102,27 @@ def test_residuals_of_an_estimate_that_is_settling_show_nothing() -> None:
     assert judge(replace(loud, alarm="joint_1")).grave
 
 
-def test_an_alarm_that_the_diagnosis_has_dealt_with_is_no_doubt() -> None:
-    assert judge(replace(GOOD, alarm="joint_2", findings=(replace(LACKING, adopted=True),))).level == "trust"
+def test_an_alarm_is_that_of_what_the_diagnosis_looks_into_and_a_doubt_of_its_own_else() -> None:
+    looked_into = judge(replace(GOOD, alarm="joint_2", findings=(Finding("joint_2", 3.0, "noticed"),)))
+    assert len(looked_into.reasons) == 1
+    # What was taken up is in the model, and the test began anew with it.
+    assert judge(replace(GOOD, alarm="joint_1", findings=(replace(LACKING, adopted=True),))).grave
+
+
+def test_a_torque_that_forbids_weights_is_a_grave_doubt_whatever_the_energy_balance_says_of_it() -> None:
+    judgement = judge(replace(GOOD, settling="no weights", unweighed=2))
+    assert judgement.grave
+    assert judgement.marks == {"joint_2": "not explained"}
+
+
+def test_the_energy_balance_alone_is_never_trusted() -> None:
+    """Its residual is scaled by itself: nothing tells a lacking effect from noise."""
+    block = axis_block(0.1)
+    session = Estimator(parse_system('balance = "energy"\n' + AXIS, "axis.toml"), block.channels, "axis")
+    session.push(block)
+    session.finish()
+    assert judged(session).level == "doubt"
+    assert "energy balance alone" in judged(session).sentence
 
 
 def test_a_sentence_is_read_at_a_glance() -> None:
@@ -140,6 +159,13 @@ def test_a_named_effect_makes_the_system_file_doubtful_and_the_parameters_with_i
     assert (judgement.level, judgement.grave) == ("doubt", False)
     assert "trust the parameters with it" in judgement.sentence
     assert judgement.marks == {"link_1.*": "sensor lag"}
+    caution = judge(replace(GOOD, pulled=("motor_2.mass",)))
+    assert (
+        "trust the parameters with it but for what follows"
+        in judge_diagnosis("named", ["slosh@base"], None, caution).sentence
+    )
+    early = judge(replace(GOOD, settling="few rows"))
+    assert "trust" not in judge_diagnosis("named", ["slosh@base"], None, early).sentence
     still = judge_diagnosis("named", ["backlash@joint_1", "cogging@joint_2"], None, DOUBTED)
     assert still.grave
     assert "trust" not in still.sentence

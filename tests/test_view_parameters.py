@@ -18,7 +18,7 @@ from sms_online.pipeline.events import Event
 from sms_online.pipeline.joint_balance import SquaredResidual
 from sms_tools.view.frames import Reference
 from sms_tools.view.number_log import NumberLog
-from sms_tools.view.own_scale import OwnScale
+from sms_tools.view.own_scale import LEAST_REST, OwnScale
 from sms_tools.view.parameter_groups import MOST_LINES, Basis, parameter_groups, shortened
 from sms_tools.view.residuals import RecentResidual
 from sms_tools.view.style import BAD, GOOD, residual_colors
@@ -110,7 +110,10 @@ def test_what_is_determined_later_joins_the_axis_of_the_others() -> None:
     some = np.array([True, False])
     assert scale.follow(1.0, np.array([5.0, 7.0]), np.array([0.01, np.inf]), some, True)
     assert np.isnan(scale.basis.about[1])
-    assert not scale.follow(2.0, np.array([5.0, 7.0]), np.array([0.01, 0.01]), np.array([True, True]), True)
+    later = np.array([5.0, 7.0]), np.array([0.01, 0.01]), np.array([True, True]), True
+    # Everything is drawn anew then, so not at every moment.
+    assert not scale.follow(1.0, *later)
+    assert scale.follow(1.0 + LEAST_REST, *later)
     assert scale.basis.about.tolist() == [5.0, 7.0]
 
 

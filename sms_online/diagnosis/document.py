@@ -15,7 +15,7 @@ from sms_online.effects.base import report
 from sms_online.effects.catalogue import ENTRIES, declarable
 from sms_online.judgement import Facts, Judgement, judge, judge_diagnosis
 from sms_online.model.parameters import Parameter
-from sms_online.results import LARGEST_RELATIVE_STD, NORMAL_95, judged, results_document
+from sms_online.results import LARGEST_RELATIVE_STD, NORMAL_95, judged, projected, results_document, standard_deviation
 from sms_online.stream import Array
 
 SCHEMA = "sms-online/diagnosis/1"
@@ -80,7 +80,10 @@ def diagnosis_document(diagnosis: Diagnosis, warnings: list[str], truth: dict[st
 def judgement(diagnosis: Diagnosis) -> Judgement:
     """May the parameters after be trusted, and the system file?"""
     if diagnosis.attempt.prior is None:
-        after = judged(diagnosis.estimator_after)
+        session = diagnosis.estimator_after
+        estimate = session.estimate()
+        projection = projected(session, estimate, standard_deviation(session, estimate))
+        after = judged(session, estimate, projection=projection)
     else:
         # Parameters come from the rows of the diagnosis then, see `_posterior`.
         known = [p["identifiable"] for p in _posterior(diagnosis.attempt, diagnosis.chosen)]

@@ -36,7 +36,7 @@ from sms_online.pipeline.momentum_balance import (
     windows_state,
 )
 from sms_online.pipeline.plain_rows import PlainRows
-from sms_online.pipeline.sensor_noise import FINEST, SensorNoise, noise_from_state, noise_state
+from sms_online.pipeline.sensor_noise import FINEST, SensorNoise
 from sms_online.pipeline.smoothing import HALF_WIDTHS
 from sms_online.pipeline.weighing import Weighed, Weighing
 from sms_online.stream import Array
@@ -66,11 +66,12 @@ LARGEST_UNEXPLAINED = 0.5
 # Time from one look at the weights to the next, s: it doubles from the first to the latest.
 FIRST_RENEWAL = 1.0
 LATEST_RENEWAL = 4.0
-# Weights are renewed where a speed's rows change by this share of their size, a sensor's density of noise by more than
-# what estimates of it scatter by, or what rows leave beyond noise by a share of the whole. Less is not worth it: chains
-# whose weights differ by the scatter of an estimate take some of that for information.
+# Weights are renewed where a speed's rows change by this share of their size, or a sensor's density of noise by more
+# than what estimates of it scatter by. Less is not worth it: chains whose weights differ by the scatter of an estimate
+# take some of that for information.
 SAME_ROWS = 2e-3
 SAME_NOISE = 0.25
+# A chain begins anew where what rows leave beyond noise changes by this share of their variance.
 SAME_MISFIT = 0.1
 # Time that new weights are told windows before their rows are taken, s: see `weighing`.
 WARM_UP = 3.2
@@ -127,7 +128,6 @@ class MomentumFit:
         self._since = 0  # windows since they were looked at
         self._moving = 0
         self._renewal = 0  # windows from one look to the next
-        self._sensor_noise: SensorNoise | None = None  # behind the weights
         # Mean squares of what noise does beyond first order, by the filter's width, and of how many windows.
         self._bends = {half_width: np.zeros(model.layout.n_v) for half_width in HALF_WIDTHS}
         self._bent = dict.fromkeys(HALF_WIDTHS, 0)
@@ -179,7 +179,6 @@ class MomentumFit:
     def go_on(self, weights: Array, noise: SensorNoise) -> None:
         """Begin with weights β (n,) that are known."""
         self.weights = weights
-        self._sensor_noise = noise
         self._weighing.begin(weights, noise, self.plain.misfit, self._first)
         self._renewal = self._count(FIRST_RENEWAL)
 
@@ -190,9 +189,8 @@ class MomentumFit:
         π, would win, and weights that follow π would shrink it to zero. More motion is waited for.
         """
         self._moving = 0
-        self._sensor_noise = noise
         unweighted, _ = _least_squares(np.concatenate([self._dense(window)[0] for window in self._held]))
-        if not (self._explains_torques(unweighted) and self._settle(unweighted, PASSES, partly=False)):
+        if not (self._explains_torques(unweighted) and self._settle(unweighted, noise, PASSES, partly=False)):
             self.weights = None
             self.plain.clear()
             self.plain.misfit = np.zeros_like(self.plain.misfit)
@@ -200,23 +198,24 @@ class MomentumFit:
         if self.plain.misfit.any():
             weights, misfit = self.weights, self.plain.misfit
             described = self.base.values(self.model.nominal)
-            if not self._settle(described, PASSES_DESCRIBED, partly=True) or self.plain.misfit.sum() >= misfit.sum():
+            settled = self._settle(described, noise, PASSES_DESCRIBED, partly=True)
+            if not settled or self.plain.misfit.sum() >= misfit.sum():
                 self.weights, self.plain.misfit, self.unexplained = weights, misfit, None
-        self._retell()
+        self._retell(noise)
         out = [self._white(window) for window in self._held]
         self._since = 0
         self._renewal = self._count(FIRST_RENEWAL)
         self._held = []
         return out
 
-    def _settle(self, start: Array, passes: int, partly: bool) -> bool:
+    def _settle(self, start: Array, noise: SensorNoise, passes: int, partly: bool) -> bool:
         """Fit the windows held back with the weights of β = start (n,), then of the fit before; False where one fails.
 
         partly: weights take what the rows determine, and keep the rest.
         """
         self.weights, self.plain.misfit = start, np.zeros(self.model.layout.n_v)
         for _ in range(passes):
-            self._retell()
+            self._retell(noise)
             fitted, determined = _least_squares(np.concatenate([self._white(window).Y for window in self._held]))
             if not self._explains_torques(fitted):
                 return False
@@ -253,18 +252,18 @@ class MomentumFit:
         The chain so far goes on until the new one has been told enough windows. What the model lacks counts at once: it
         is each row's own, and chains of such rows are short.
         """
-        if self._next is not None or self._since < self._renewal:
+        if self._since < self._renewal:
             return
         beta = self._solve()
         beta = np.where(np.isnan(beta), self._known_weights, beta)
         self._since = 0
         self._renewal = min(2 * self._renewal, self._count(LATEST_RENEWAL))
         self.plain.judge(beta)
-        used = self._weighing
-        if np.any(np.abs(self.plain.misfit - used.misfit) > SAME_MISFIT * (1.0 + used.misfit)):
-            self.weights = beta
-            used.begin(beta, noise, self.plain.misfit, window.start)
-        elif self._matters(beta, noise):
+        used, misfit = self._weighing, self.plain.misfit
+        if np.any(np.abs(misfit - used.misfit) > SAME_MISFIT * (1.0 + used.misfit)):
+            self.weights, self._next = beta, None
+            used.begin(beta, noise, misfit, window.start)
+        elif self._next is None and self._matters(beta, noise):
             self._next, self._warm = self._new_weighing(), 0
             self._next.begin(beta, noise, self.plain.misfit, window.start)
 
@@ -278,12 +277,11 @@ class MomentumFit:
         louder = any(np.any(np.abs(now - then) > SAME_NOISE * then) for now, then in densities)
         return bool(np.any(changed > SAME_ROWS * size) or louder)
 
-    def _retell(self) -> None:
+    def _retell(self, noise: SensorNoise) -> None:
         """Work off the windows held back from the first one on."""
         self.plain.clear()
         self._bent = dict.fromkeys(HALF_WIDTHS, 0)
-        assert self._sensor_noise is not None
-        self._weighing.begin(self._known_weights, self._sensor_noise, self.plain.misfit, self._first)
+        self._weighing.begin(self._known_weights, noise, self.plain.misfit, self._first)
         self._tell()
 
     @property
@@ -366,7 +364,6 @@ class MomentumFit:
             "warm": -1 if self._next is None else self._warm, **self._weighing.state(),
             **windows_state("held", self._held),
             **({} if self._next is None else {f"next_{name}": value for name, value in self._next.state().items()}),
-            **noise_state("steady", self._sensor_noise),
         }  # fmt: skip
 
     def restore(self, state: Mapping[str, NDArray[Any]]) -> None:
@@ -381,7 +378,6 @@ class MomentumFit:
         self.unexplained = None if state["unexplained"] < 0 else int(state["unexplained"])
         self._held = windows_from_state("held", state)
         self._renewal, self._last = int(state["renewal"]), int(state["last"])
-        self._sensor_noise = noise_from_state("steady", state)
         self._weighing.restore(state)
         self._next = None
         if state["warm"] >= 0:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from sms_online.stream import Array
 
 # Mean square of a coordinate's residual over its predicted variance beyond which the model lacks something there: a
-# second of windows scatters by 20 %, the noise behind the prediction by 10 %.
+# second of windows scatters by 20 %, the noise behind the prediction by 7 %.
 LARGEST_RATIO = 2.0
 # Rounding of a sum of products, in units of its last place.
 ROUNDED = 16.0

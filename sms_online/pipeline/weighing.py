@@ -65,7 +65,7 @@ class Weighing:
         self.sensor_noise: SensorNoise | None = None
 
     def begin(self, beta: Array, noise: SensorNoise, misfit: Array, instant: int) -> None:
-        """Begin a chain with the window that starts at an instant; no window before shares samples with it.
+        """Begin a chain with the window that starts at an instant, as if no window before shared samples with it.
 
         misfit (n_v,): variance of what the model lacks in each row, over that of the noise.
         """

@@ -199,6 +199,9 @@ class LiveSession:
         if self._recorder is not None and self._recorder.problem is not None:
             found.append(f"not recorded: {self._recorder.problem}")
         late, behind = sum(self._merger.late), self.latencies.quantile(0.99)
+        dropped = sum(feed.dropped for feed in self._feeds)
+        if dropped:
+            found.append(f"{dropped} items were recorded but not used: the machine is too slow")
         if late > LARGEST_LOSS * self._estimator.samples:
             found.append(f"{late} samples came too late to be used: the machine or a source is too slow")
         if behind is not None and behind > LARGEST_LATENCY:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -64,5 +65,8 @@ class OwnScale:
                 return True
         if self._own:
             fresh = np.isnan(basis.about) & drawn
-            basis.about[fresh] = known[fresh]
+            if fresh.any() and t >= self._due:
+                self.basis = replace(basis, about=np.where(fresh, known, basis.about))
+                self._due = t + max(LEAST_REST, REST * (t - self._begun))
+                return True
         return False
