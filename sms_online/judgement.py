@@ -100,8 +100,9 @@ class Judgement:
 
     @property
     def sentence(self) -> str:
-        """The level and the strongest reason, on a line."""
-        return _fitted(f"{self.level.capitalize()}: {self.reasons[0].text}")
+        """The level, by which a grave doubt is told from another, and the strongest reason, on a line."""
+        heading = "Do not trust" if self.grave else self.level.capitalize()
+        return _fitted(f"{heading}: {self.reasons[0].text}")
 
     @property
     def others(self) -> list[str]:
@@ -136,18 +137,22 @@ def judge(facts: Facts) -> Judgement:
         doubts += torques
         if facts.unweighed is not None and f"joint_{facts.unweighed}" not in [reason.places[0] for reason in torques]:
             doubts.append(_unweighed(facts.unweighed))
+    if settled:
+        doubts += _loud_rows(facts.residual)
     doubts += _unnamed(facts.findings)
     if facts.alarm is not None and not any(_open(finding) for finding in facts.findings):
         doubts.append(
             Reason(f"the residual of {facts.alarm} is more than noise", True, (facts.alarm,), "more than noise")
         )
     if settled:
-        doubts += [*_loud_rows(facts.residual), *_negative(facts.negative)]
+        doubts += _negative(facts.negative)
+    # What befell the samples comes before what that may have done to the estimate.
+    losses = _losses(facts.lost)
     if doubts:
-        return Judgement("doubt", (*doubts, *_cautions(facts)), grave=True)
+        return Judgement("doubt", (*losses, *doubts, *_cautions(facts)), grave=True)
     if facts.settling:
-        return Judgement("not yet", (Reason(facts.settling, False), *_cautions(facts)))
-    cautions = tuple(_cautions(facts))
+        return Judgement("not yet", (Reason(facts.settling, False), *losses, *_cautions(facts)))
+    cautions = (*losses, *_cautions(facts))
     return Judgement("doubt", cautions) if cautions else Judgement("trust", tuple(_grounds(facts)))
 
 
@@ -265,9 +270,11 @@ def _cautions(facts: Facts) -> list[Reason]:
             out.append(Reason(f"the residual of {finding.row} was more than noise for a time", False))
     if facts.distance > LARGEST_DISTANCE:
         out.append(Reason(f"no real bodies are nearer than {facts.distance:.0f} standard deviations", False))
-    if facts.lost > LARGEST_LOSS:
-        out.append(Reason(f"{100.0 * facts.lost:.0f} % of the samples are lost", False))
     return out
+
+
+def _losses(share: float) -> list[Reason]:
+    return [Reason(f"{100.0 * share:.0f} % of the samples are lost", False)] if share > LARGEST_LOSS else []
 
 
 def _grounds(facts: Facts) -> list[Reason]:

@@ -93,6 +93,12 @@ def test_the_named_effect_comes_before_the_residual_that_it_leaves() -> None:
     assert judgement.marks == {"joint_2": "coulomb friction"}
 
 
+def test_lost_samples_come_before_the_residual_that_they_may_have_made() -> None:
+    judgement = judge(replace(with_row("joint_2", whitened=19.0), lost=0.02))
+    assert judgement.sentence == "Do not trust: 2 % of the samples are lost"
+    assert judgement.others == ["the residual of joint_2 is 19 × noise"]
+
+
 def test_residuals_of_an_estimate_that_is_settling_show_nothing() -> None:
     loud = replace(with_row("joint_1", relative=3.0, whitened=80.0), settling="too few rows")
     assert judge(loud).level == "not yet"
@@ -165,10 +171,10 @@ def test_a_named_effect_makes_the_system_file_doubtful_and_the_parameters_with_i
         in judge_diagnosis("named", ["slosh@base"], None, caution).sentence
     )
     early = judge(replace(GOOD, settling="few rows"))
-    assert "trust" not in judge_diagnosis("named", ["slosh@base"], None, early).sentence
+    assert "trust the parameters" not in judge_diagnosis("named", ["slosh@base"], None, early).sentence
     still = judge_diagnosis("named", ["backlash@joint_1", "cogging@joint_2"], None, DOUBTED)
     assert still.grave
-    assert "trust" not in still.sentence
+    assert "trust the parameters" not in still.sentence
     assert still.marks == {"joint_1": "backlash", "joint_2": "cogging"}
 
 
@@ -210,6 +216,6 @@ def test_a_judgement_is_plain_data_in_results() -> None:
     assert document == {
         "level": "doubt",
         "grave": True,
-        "sentence": "Doubt: the residual of joint_2 is 5 × noise",
+        "sentence": "Do not trust: the residual of joint_2 is 5 × noise",
         "reasons": ["the residual of joint_2 is 5 × noise"],
     }
