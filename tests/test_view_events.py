@@ -92,7 +92,8 @@ def test_an_event_is_marked_in_every_plot(shown: Path) -> None:
 
 def test_the_last_drawing_holds_what_was_before_the_event(shown: Path) -> None:
     entities = {chunk.entity_path for chunk in RrdReader(str(shown / "session.rrd")).stream()}
-    last = max(e for e in entities if e.startswith("/parameters/links/") and e.endswith("/deviation"))
+    drawn = [e for e in entities if e.startswith("/parameters/links/") and e.endswith("/deviation")]
+    last = max(drawn, key=lambda e: [int(number) for number in re.findall(r"\d+", e)])
     t, values = scalars(shown / "session.rrd", last)
     assert t[0] < CHANGE < t[-1]
     # About the last estimate.
