@@ -35,8 +35,8 @@ OPENING = 2.0
 NEWS_INTERVAL = 0.5
 # What is done now and then waits so long for the end of a block, s.
 LONGEST_BLOCK = 0.2
-# Estimates are late from so many seconds on, which no filter or window takes.
-LARGEST_LATENCY = 1.0
+# Estimates are late from so many seconds on: the first ones wait for the clocks, a window and the filters.
+LARGEST_LATENCY = 3.0
 # Parameters on the status line: the best known ones.
 LEADING = 4
 
