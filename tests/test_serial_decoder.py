@@ -120,6 +120,13 @@ def test_after_a_break_what_was_cut_is_dropped() -> None:
     assert faults(decoder) == {"cut_line": 2, "lost_counter": 2}
 
 
+def test_a_sender_that_begins_with_a_delimiter_loses_nothing_after_a_break() -> None:
+    decoder = make_decoder(FRAMES, None)
+    samples = push(decoder, b"", b"\0" + frame(0) + frame(1))
+    assert len(samples.values) == 2
+    assert faults(decoder) == {}
+
+
 def test_lines_become_channels() -> None:
     decoder = make_decoder(
         lines({"tick": 1e-3, "wrap": 1000}, {}, {"channel": "q", "scale": 2.0}, {"channel": "tau"}), None

@@ -15,7 +15,7 @@ FAULTS = {
     "crc": ("frames skipped", "their checksum is wrong"),
     "non_utf8": ("lines skipped", "they are not text"),
     "bad_number": ("lines skipped", "they are not the described numbers"),
-    "too_long": ("bytes skipped", "no frame or line is as long as that"),
+    "too_long": ("stretches skipped", "no frame or line is as long as they are"),
     "cut_line": ("lines skipped", "their beginning was not received"),
     "repeated_counter": ("frames skipped", "their counter repeats the one before"),
     "late_counter": ("frames skipped", "their counter goes back"),

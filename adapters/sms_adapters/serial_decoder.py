@@ -21,6 +21,8 @@ LONGEST_LINE = 4096
 # COBS makes of 254 bytes at most 255, and adds one.
 _COBS_RUN = 254
 _CRC_BYTES = 4
+# What COBS has no byte of.
+FRAME_END = b"\0"
 # What the CRC-32 of any bytes followed by their own CRC-32, little-endian, comes to.
 _CRC_RESIDUE = 0x2144DF1C
 # Wrap of a count that is never said to wrap: where float64 ends to hold every whole number.
@@ -33,7 +35,8 @@ _XOR = re.compile(rb"\$?([^*]*)\*([0-9A-Fa-f]{2})[ \t]*")
 class Items:
     """Cuts a stream of bytes at a delimiter, with bounded memory: pieces longer than `longest` are dropped and counted.
 
-    After a break (see SerialChunk) the first piece is dropped, for nothing shows that it is whole (cut_line).
+    After a break (see SerialChunk) the first piece is dropped, for nothing shows that it is whole (cut_line): a sender
+    that begins with a delimiter loses nothing by that.
     """
 
     def __init__(self, delimiter: bytes, longest: int, counters: dict[str, int]) -> None:
@@ -51,7 +54,8 @@ class Items:
             return []
         *pieces, tail = (self._tail + data).split(self._delimiter)
         if pieces and (self._cut or self._overlong):
-            self._counters["cut_line" if self._cut else "too_long"] += 1
+            if pieces[0] or self._overlong:
+                self._counters["cut_line" if self._cut else "too_long"] += 1
             self._cut = self._overlong = False
             del pieces[0]
         self._overlong |= len(tail) > self._longest
@@ -193,7 +197,7 @@ class FrameDecoder(_SerialDecoder):
         self._size = self._layout.itemsize
         moduli = [1 << int(field.type[1:]) if field.type[0] == "u" else 0 for field in source.fields]
         longest = self._size + self._size // _COBS_RUN + 1
-        super().__init__(Items(b"\0", longest, counters), Fields(source.fields, moduli, counters), counters)
+        super().__init__(Items(FRAME_END, longest, counters), Fields(source.fields, moduli, counters), counters)
 
     def _numbers(self, pieces: list[bytes]) -> tuple[list[int], Array]:
         good: list[int] = []
@@ -269,4 +273,4 @@ def frame_layout(fields: Iterable[FrameField]) -> np.dtype[np.void]:
 def encode_frames(words: NDArray[np.void]) -> list[bytes]:
     """Frames as a device sends them, delimiters included, of words (M,) of a `frame_layout`."""
     payloads = (word.tobytes() for word in words)
-    return [cobs.encode(data + zlib.crc32(data).to_bytes(_CRC_BYTES, "little")) + b"\0" for data in payloads]
+    return [cobs.encode(data + zlib.crc32(data).to_bytes(_CRC_BYTES, "little")) + FRAME_END for data in payloads]

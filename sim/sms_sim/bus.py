@@ -354,6 +354,10 @@ def main(arguments: list[str] | None = None) -> int:
         if args.capture is None:
             bus.take(blocks, ahead=0.0 if args.commanded else AHEAD)
         bus.run(duration, args.speed)
+        if args.wait:
+            # Devices whose arm rests are there still.
+            print("done", flush=True)
+            sys.stdin.readline()
     except KeyboardInterrupt:
         return 130
     finally:
@@ -376,7 +380,11 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--latency", type=float, default=0.0, help="constant delay of the transport, s")
     parser.add_argument("--jitter", type=float, default=0.0, help="uniform delay from 0 to this, s")
     parser.add_argument("--speed", type=float, default=1.0, help="times as fast as real time")
-    parser.add_argument("--wait", action="store_true", help="say ready, and move once a line comes on stdin")
+    parser.add_argument(
+        "--wait",
+        action="store_true",
+        help="say ready, move once a line comes on stdin, say done and stay until another comes",
+    )
     return parser
 
 

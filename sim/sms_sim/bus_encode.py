@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from sms_adapters.can_signals import WantedMessage, wanted_messages
 from sms_adapters.raw import MOST_BYTES, CanFrames
-from sms_adapters.serial_decoder import encode_frames, frame_layout
+from sms_adapters.serial_decoder import FRAME_END, encode_frames, frame_layout
 from sms_online.description.schema import CanSource, SerialFrames, Signal, System
 from sms_online.errors import InputError
 from sms_online.stream import Array, Block
@@ -99,8 +99,12 @@ class SerialDevice:
         words = np.zeros(rows.size, dtype=self._layout)
         for k, field in enumerate(self._fields):
             words[f"f{k}"] = self._words(field.type, *self._column(k, block, rows))
+        frames = encode_frames(words)
+        if self._count == 0 and frames:
+            # A reader that was there before then knows the first one to be whole.
+            frames[0] = FRAME_END + frames[0]
         self._count += rows.size
-        return block.t[rows], encode_frames(words)
+        return block.t[rows], frames
 
     def _column(self, k: int, block: Block, rows: NDArray[np.intp]) -> tuple[Array, float]:
         """Numbers of field k, and what they count modulo; infinity where they do not wrap."""

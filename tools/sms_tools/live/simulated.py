@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import select
 import socket
 import subprocess
 import sys
@@ -85,9 +86,12 @@ class SimulatedArm:
 
     def ended(self) -> bool:
         """Whether the motion is over and what was sent has arrived."""
-        if self._process.poll() is None:
-            return False
-        self._ended = monotonic() if self._ended is None else self._ended
+        if self._ended is None:
+            assert self._process.stdout is not None
+            # Where it has died that is readable too.
+            if not select.select([self._process.stdout], [], [], 0.0)[0]:
+                return False
+            self._ended = monotonic()
         return monotonic() >= self._ended + LINGERING
 
     def stop(self) -> None:
