@@ -130,6 +130,16 @@ def test_geometric_stiffening_is_a_system_with_exact_links() -> None:
     assert np.array_equal(stiffened.rate(np.zeros(5), states), exact.rate(np.zeros(5), states))
 
 
+def test_geometric_stiffening_of_one_link_is_sampled_and_estimated() -> None:
+    """The model's own system has that link exact already, where the effect could not be declared."""
+    system = declaring("geometric_stiffening@link_1")
+    blocks = list(sampled_blocks(simulate(system, 0.05), "A", seed=1))
+    estimator = Estimator(Model(system).system, blocks[0].channels, "one link")
+    for block in blocks:
+        estimator.push(block)
+    assert estimator.samples == sum(block.t.size for block in blocks)
+
+
 # Identification
 
 

@@ -189,8 +189,8 @@ def channel_effects(system: System) -> tuple[ChannelEffect, ...]:
     """Effects of kind channel that a system declares, in its order; InputError as `build_effects`."""
     out: list[ChannelEffect] = []
     for k, effect in enumerate(system.effects, start=1):
-        check_effect(system, effect, f"effect {k}", system.name)
         if effect.name in _CHANNELS:
+            check_effect(system, effect, f"effect {k}", system.name)
             out.append(_CHANNELS[effect.name](effect.where, with_shapes(effect, system).coefficients))
     return tuple(out)
 

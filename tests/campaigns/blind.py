@@ -37,6 +37,7 @@ from sms_online.diagnosis.evidence import angle, basis
 from sms_online.diagnosis.record import SampleRecord
 from sms_online.diagnosis.rows import SessionRows
 from sms_online.effects.catalogue import ENTRIES, candidates
+from sms_online.errors import InputError
 from sms_online.model.base_parameters import find_base_parameters
 from sms_online.model.model import Model
 from sms_online.pipeline.estimator import Estimator
@@ -222,9 +223,6 @@ def _case(system: System, block: Block, effect: Effect) -> Record:
         finding.candidate.key: {name: value for name, (value, _) in coefficients(found, finding).items()}
         for finding in found.findings
     }
-    declared = Estimator(disguised(system.model_copy(update={"effects": (effect,)})), block.channels, "declared")
-    declared.push(block)
-    declared.finish()
     return {
         "name": effect.name,
         "where": effect.where,
@@ -237,9 +235,20 @@ def _case(system: System, block: Block, effect: Effect) -> Record:
         "after": {row: test.whitened for row, test in found.after.test.items()},
         "holdout": found.after.holdout.whitened,
         "errors": _errors(system, found.estimator_after),
-        "declared": _errors(system, declared),
+        "declared": _declared(system, block, effect),
         "seconds": seconds,
     }
+
+
+def _declared(system: System, block: Block, effect: Effect) -> dict[str, float]:
+    """Errors of the parameters where the effect is declared from the start; of none where it cannot be."""
+    try:
+        told = Estimator(disguised(system.model_copy(update={"effects": (effect,)})), block.channels, "declared")
+    except InputError:
+        return {}
+    told.push(block)
+    told.finish()
+    return _errors(system, told)
 
 
 def _errors(system: System, session: Estimator) -> dict[str, float]:
@@ -331,7 +340,7 @@ def _against_declared(singles: list[Record]) -> list[str]:
     lines = ["median error of a parameter over that with the effect declared from the start, the worst parameter:"]
     for name in dict.fromkeys(r["name"] for r in singles):
         cases = [r for r in singles if r["name"] == name]
-        ratios = {}
+        ratios = {"none, for it cannot be declared": 0.0}
         for parameter in set.intersection(*(r["errors"].keys() & r["declared"].keys() for r in cases)):
             after, declared = (np.median([abs(r[way][parameter]) for r in cases]) for way in ("errors", "declared"))
             ratios[parameter] = after / max(declared, float(np.finfo(np.float64).eps))
