@@ -2,25 +2,30 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+
+import numpy as np
 
 from sms_online.description.schema import Effect, System
 from sms_online.diagnosis.attempt import LARGEST_SHARE_LEFT, Attempt, Case, PriorOf, State, Step
 from sms_online.diagnosis.constants import stands
 from sms_online.diagnosis.late_sensors import LateSensor, find_late
 from sms_online.diagnosis.record import SampleRecord
-from sms_online.diagnosis.trace import Finding, Ranked
+from sms_online.diagnosis.residuals import RowResidual
+from sms_online.diagnosis.trace import DECISIVE, DRY, INEXACT, INEXACT_DRY, Finding, Ranked
 from sms_online.diagnosis.unexplained import Unexplained, describe_residual
-from sms_online.effects.catalogue import ENTRIES, places
+from sms_online.effects.catalogue import GEOMETRIC_STIFFENING, places
 from sms_online.errors import InputError
 from sms_online.pipeline.estimator import Estimator
-from sms_online.stream import Block
+from sms_online.stream import Array, Block
 
 # Times that the constants of channels' effects are improved, each with samples corrected by those found before.
 CORRECTIONS = 3
 # Part of a session that tells which kinematics of links are nearer, and improves channels' constants, s.
 SOME = 8.0
+# No right effect leaves a row type more than this multiple of its noise, unless that is a small share of what it took.
+MOST_LEFT = 2.0
 
 
 @dataclass(frozen=True)
@@ -59,13 +64,50 @@ def _left(before: State, after: State) -> float:
     return max(0.0, after.excess) / max(before.excess, 1.0)
 
 
-def _exact(system: System) -> System | None:
-    """The system with all its links exact, by effects that say so; None where there is no linear one."""
-    links = places(system, ENTRIES["geometric_stiffening"].at)
-    effects = tuple(Effect(name="geometric_stiffening", where=where) for where in links)
-    declared = {(effect.name, effect.where) for effect in system.effects}
-    fresh = tuple(effect for effect in effects if (effect.name, effect.where) not in declared)
-    return system.model_copy(update={"effects": (*system.effects, *fresh)}) if fresh else None
+def _verdict(named: bool, left: float, rows: Mapping[str, RowResidual], findings: Sequence[Finding]) -> str:
+    """What may be said where effects were named or not, and leave this share of what was beyond noise."""
+    if not any(row.beyond for row in rows.values()):
+        return "named" if named else "clean"
+    if not named or left > LARGEST_SHARE_LEFT:
+        return "unexplained"
+    dry = any(finding.candidate.effect.name in DRY for finding in findings)
+    by_law = left <= (INEXACT_DRY if dry else INEXACT)
+    return "named" if by_law or all(row.whitened <= MOST_LEFT for row in rows.values()) else "unexplained"
+
+
+def _exact(system: System, links: Sequence[str]) -> System:
+    """The system with these links exact, by effects that say so."""
+    effects = (Effect(name=GEOMETRIC_STIFFENING.name, where=where) for where in links)
+    return system.model_copy(update={"effects": (*system.effects, *effects)})
+
+
+def _stiffened(case: Case, attempt: Attempt, beta: Array, chosen: Sequence[int]) -> Attempt | None:
+    """The attempt with those links exact that the samples ask for; None where it explains more as it is.
+
+    All links together first, for one may hide what another lacks; then without those that take nothing away.
+    """
+    declared = {(effect.name, effect.where) for effect in attempt.system.effects}
+    every = places(attempt.system, GEOMETRIC_STIFFENING.at)
+    links = [where for where in every if (GEOMETRIC_STIFFENING.name, where) not in declared]
+    if not links:
+        return None
+
+    def excess(links: Sequence[str]) -> float:
+        try:
+            return Attempt(case, _exact(attempt.system, links), (), beta, (), SOME).excess(())
+        except np.linalg.LinAlgError:
+            return np.inf  # the readings are those of links that are straight
+
+    first = [attempt.tracing.candidates[k].effect for k in chosen[:1]]
+    linear = Attempt(case, attempt.system, (), beta, first, SOME).excess(range(len(first)))
+    least = excess(links)
+    while len(links) > 1:
+        fewer = {where: excess([other for other in links if other != where]) for where in links}
+        dropped = min(fewer, key=lambda where: fewer[where])
+        if fewer[dropped] > least + DECISIVE:
+            break
+        links, least = [where for where in links if where != dropped], fewer[dropped]
+    return Attempt(case, _exact(attempt.system, links), (), beta) if least < linear else None
 
 
 def diagnose(
@@ -99,7 +141,10 @@ def diagnose(
     held = _session(system, holdout, source, prior)[1].segments() if holdout else []
     case = Case(source, before, before.momentum.sensor_noise, record.segments(), held, prior)
     progress("tracing what it leaves")
-    attempt = described = Attempt(case, system)
+    try:
+        attempt = described = Attempt(case, system)
+    except np.linalg.LinAlgError as error:
+        raise InputError(source, "", str(error), "the links' own markers, in their frames") from error
     n = described.rows.base.n
     late: list[LateSensor] = []
     while not (before.by_momentum or before.by_smoother) and (
@@ -118,14 +163,11 @@ def diagnose(
     attempt.tracing.settle([])
     ranking = attempt.tracing.ranking()
     attempt.tracing.settle(chosen)
-    exact = _exact(attempt.system)
-    if exact is not None and beyond:
+    if beyond and places(attempt.system, GEOMETRIC_STIFFENING.at):
         progress("comparing exact links")
-        beta = described.rows.beta
-        first = [attempt.tracing.candidates[k].effect for k in chosen[:1]]
-        linear = Attempt(case, attempt.system, (), beta, first, SOME).excess(range(len(first)))
-        if Attempt(case, exact, (), beta, (), SOME).excess(()) < linear:
-            attempt = Attempt(case, exact, (), beta)
+        exact = _stiffened(case, attempt, described.rows.beta, chosen)
+        if exact is not None:
+            attempt = exact
             chosen = attempt.search()
     findings: list[Finding] = []
     while any(attempt.tracing.candidates[k].constant for k in chosen):
@@ -152,9 +194,7 @@ def diagnose(
     named = after.system != system
     estimator_after = _session(after.system, blocks, source, prior)[0] if named else before
     left = _left(bare, after)
-    beyond = any(row.beyond for row in after.test.values())
-    unknown = beyond and (not named or left > LARGEST_SHARE_LEFT)
-    verdict = "unexplained" if unknown else "named" if named else "clean"
+    verdict = _verdict(named, left, after.test, findings)
     unexplained = None
     if verdict == "unexplained":
         unexplained = describe_residual(attempt.rows, attempt.tracing.columns(chosen), after.residual)

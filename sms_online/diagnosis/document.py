@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from sms_online.diagnosis.attempt import Attempt, Part
+from sms_online.diagnosis.attempt import LARGEST_SHARE_LEFT, Attempt, Part
 from sms_online.diagnosis.constants import deviations
 from sms_online.diagnosis.diagnose import Diagnosis
 from sms_online.diagnosis.trace import Finding
@@ -106,13 +106,16 @@ def summary(diagnosis: Diagnosis) -> str:
         return f"The model lacks {', '.join(keys)}: with {'them' if len(keys) > 1 else 'it'} {falls}."
     unexplained = diagnosis.unexplained
     assert unexplained is not None
+    rest = f"acts on {unexplained.row} ({unexplained.speed}) and depends on {unexplained.variable}"
+    if keys and diagnosis.left <= LARGEST_SHARE_LEFT:
+        return (
+            f"What the model lacks comes near {', '.join(keys)}, but is more or something else: {falls}, and most of "
+            f"what is left {rest}."
+        )
     tried = (
         f" The nearest known effects ({', '.join(keys)}) leave {100.0 * diagnosis.left:.0f} % of it." if keys else ""
     )
-    return (
-        f"The model lacks something that no known effect explains: most of it acts on {unexplained.row} "
-        f"({unexplained.speed}) and depends on {unexplained.variable}.{tried}"
-    )
+    return f"The model lacks something that no known effect explains: most of it {rest}.{tried}"
 
 
 def _times(value: float) -> str:

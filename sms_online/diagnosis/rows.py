@@ -32,6 +32,8 @@ from sms_online.stream import Array
 TOLD = 64
 # The synthetic noise that tells what noise does beyond first order is the same in every diagnosis.
 SEED = 6
+# Beyond any force times a second; squares of it are numbers still.
+LARGEST = 1e50
 # What channels' effects add to a reading y, for a unit of a coefficient: names of `SessionRows.responses`.
 DISPLACEMENTS = ("one", "sine", "cosine", "rate")
 
@@ -75,7 +77,9 @@ class SessionRows:
         segments: Sequence[Segment],
         beta: Array | None = None,
     ) -> None:
-        """beta (n,): to weigh the rows with at once."""
+        """beta (n,): to weigh the rows with at once. Raises numpy.linalg.LinAlgError on readings that no shape of the
+        links gives, from which rows are no numbers.
+        """
         self.model, self.base, self.sensing, self.noise = model, base, sensing, noise
         self.segments = list(segments)
         self._rate = rate = model.system.sample_rate
@@ -83,6 +87,8 @@ class SessionRows:
         self.followed = FollowedMotion(sensing, self.segments, rate)
         added = self._noise_samples(np.random.default_rng(SEED))
         self._told = [self._of_segment(k, *part) for k, part in enumerate(zip(self.segments, added, strict=True))]
+        if not all(np.all(np.abs(told.copies) < LARGEST) for told in self._told):
+            raise np.linalg.LinAlgError("readings that no shape of the links gives")
         windows = [(number, window) for number, told in enumerate(self._told) for window in told.windows]
         n_v = model.layout.n_v
         stacked = np.concatenate([np.empty((0, n_v, base.n + 1)), *(told.copies[:, 0] for told in self._told)])

@@ -290,6 +290,10 @@ def _struck(system: System, block: Block, effect: Effect, draw: Draw) -> Record:
         "found": _keys(found),
         "row": None if found.unexplained is None else found.unexplained.row,
         "worst": worst,
+        "left": found.left,
+        "before": {row: test.whitened for row, test in found.before.test.items()},
+        "after": {row: test.whitened for row, test in found.after.test.items()},
+        "holdout": found.after.holdout.whitened,
     }
 
 
