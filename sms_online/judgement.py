@@ -31,8 +31,8 @@ Residual = Mapping[str, Mapping[str, float | None]]
 
 
 @dataclass(frozen=True)
-class Finding:
-    """What the diagnosis of a running session says of one episode: see `diagnosis.episodes.Episode`.
+class Discrepancy:
+    """Rows of a running session that leave more than noise, as diagnosed so far: see `diagnosis.episodes.Episode`.
 
     row: type of the rows that leave most. noticed: s. effects: what was named, `name@where`; adopted: and taken up.
     """
@@ -68,7 +68,7 @@ class Facts:
     undecided: tuple[float, ...] = ()
     distance: float = 0.0
     lost: float = 0.0
-    findings: tuple[Finding, ...] = ()
+    discrepancies: tuple[Discrepancy, ...] = ()
     troubles: tuple[str, ...] = ()
 
 
@@ -131,7 +131,7 @@ def judge(facts: Facts) -> Judgement:
     nothing: it was made of other, poorer rows.
     """
     settled = not facts.settling
-    doubts = [*_named(facts.findings)]
+    doubts = [*_named(facts.discrepancies)]
     if settled or facts.unweighed is not None:
         torques = _unexplained_torques(facts.residual)
         doubts += torques
@@ -139,8 +139,8 @@ def judge(facts: Facts) -> Judgement:
             doubts.append(_unweighed(facts.unweighed))
     if settled:
         doubts += _loud_rows(facts.residual)
-    doubts += _unnamed(facts.findings)
-    if facts.alarm is not None and not any(_open(finding) for finding in facts.findings):
+    doubts += _unnamed(facts.discrepancies)
+    if facts.alarm is not None and not any(_open(discrepancy) for discrepancy in facts.discrepancies):
         doubts.append(
             Reason(f"the residual of {facts.alarm} is more than noise", True, (facts.alarm,), "more than noise")
         )
@@ -178,9 +178,9 @@ def judge_diagnosis(verdict: str, effects: Sequence[str], row: str | None, after
     return Judgement("doubt", (*found, *rest), grave=found[0].grave)
 
 
-def _open(finding: Finding) -> bool:
+def _open(discrepancy: Discrepancy) -> bool:
     """Whether an alarm is this episode's. A test that alarms after an effect was taken up tells of something else."""
-    return not finding.adopted and finding.verdict != "change"
+    return not discrepancy.adopted and discrepancy.verdict != "change"
 
 
 def _unweighed(joint: int) -> Reason:
@@ -188,25 +188,25 @@ def _unweighed(joint: int) -> Reason:
     return Reason(text, True, (f"joint_{joint}",), "not explained")
 
 
-def _named(findings: Iterable[Finding]) -> list[Reason]:
+def _named(discrepancies: Iterable[Discrepancy]) -> list[Reason]:
     """Effects that the model is known to lack."""
     out = []
-    for finding in findings:
-        if finding.verdict == "named" and not finding.adopted:
-            places = tuple(_place(effect) for effect in finding.effects)
-            mark = ", ".join(dict.fromkeys(_kind(effect) for effect in finding.effects))
-            out.append(Reason(f"the model lacks {_listed(finding.effects)}", True, places, mark))
+    for discrepancy in discrepancies:
+        if discrepancy.verdict == "named" and not discrepancy.adopted:
+            places = tuple(_place(effect) for effect in discrepancy.effects)
+            mark = ", ".join(dict.fromkeys(_kind(effect) for effect in discrepancy.effects))
+            out.append(Reason(f"the model lacks {_listed(discrepancy.effects)}", True, places, mark))
     return out
 
 
-def _unnamed(findings: Iterable[Finding]) -> list[Reason]:
+def _unnamed(discrepancies: Iterable[Discrepancy]) -> list[Reason]:
     """Rows that leave more than noise, of which nobody knows why."""
     out = []
-    for finding in findings:
-        if finding.verdict in ("noticed", "unexplained"):
-            why = "not named yet" if finding.verdict == "noticed" else "no known effect explains it"
-            text = f"more than noise in the residual of {finding.row} since {finding.noticed:.1f} s, {why}"
-            out.append(Reason(text, True, (finding.row,), "more than noise"))
+    for discrepancy in discrepancies:
+        if discrepancy.verdict in ("noticed", "unexplained"):
+            why = "not named yet" if discrepancy.verdict == "noticed" else "no known effect explains it"
+            text = f"more than noise in the residual of {discrepancy.row} since {discrepancy.noticed:.1f} s, {why}"
+            out.append(Reason(text, True, (discrepancy.row,), "more than noise"))
     return out
 
 
@@ -265,9 +265,9 @@ def _cautions(facts: Facts) -> list[Reason]:
             )
         )
     out += [Reason(f"a change at {t:.1f} s came too late to be told: values of before", False) for t in facts.undecided]
-    for finding in facts.findings:
-        if finding.verdict == "passed":
-            out.append(Reason(f"the residual of {finding.row} was more than noise for a time", False))
+    for discrepancy in facts.discrepancies:
+        if discrepancy.verdict == "passed":
+            out.append(Reason(f"the residual of {discrepancy.row} was more than noise for a time", False))
     if facts.distance > LARGEST_DISTANCE:
         out.append(Reason(f"no real bodies are nearer than {facts.distance:.0f} standard deviations", False))
     return out

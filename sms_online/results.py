@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sms_online.description.parse import describe
-from sms_online.judgement import Facts, Finding, Judgement, judge
+from sms_online.judgement import Discrepancy, Facts, Judgement, judge
 from sms_online.physical import PhysicalSet, Projection
 from sms_online.pipeline.estimator import Estimator
 from sms_online.pipeline.events import Event
@@ -111,14 +111,14 @@ def pulled(estimator: Estimator, estimate: Estimate, std: Array) -> list[str]:
 def judged(
     estimator: Estimator,
     estimate: Estimate | None = None,
-    findings: Sequence[Finding] = (),
+    discrepancies: Sequence[Discrepancy] = (),
     troubles: Sequence[str] = (),
     projection: Projection | None = None,
 ) -> Judgement:
     """May the estimate be trusted? As known now; the answer changes while a session runs.
 
-    estimate: the estimator's own of now, where it is at hand. findings: of the diagnosis that runs beside it, if one
-    does. troubles: see `Facts`. projection: onto real bodies, where it has been made.
+    estimate: the estimator's own of now, where it is at hand. discrepancies: of the diagnosis that runs beside it, if
+    one does. troubles: see `Facts`. projection: onto real bodies, where it has been made.
     """
     if estimate is None:
         estimate = estimator.estimate()
@@ -147,7 +147,7 @@ def judged(
             undecided=tuple(event.time for event in estimator.events if event.kind == "undecided"),
             distance=0.0 if projection is None else projection.distance,
             lost=lost / max(1, lost + estimator.samples),
-            findings=tuple(findings),
+            discrepancies=tuple(discrepancies),
             troubles=(*troubles, *_weaknesses(estimator)),
         )
     )
@@ -257,12 +257,12 @@ def results_document(
     warnings: list[str],
     truth: dict[str, float] | None = None,
     bound: Array | None = None,
-    findings: Sequence[Finding] = (),
+    discrepancies: Sequence[Discrepancy] = (),
 ) -> dict[str, Any]:
     """results.json of a finished session.
 
     throughput: samples/s. truth: true values of physical parameters by name, of a simulated capture; they enter this
-    report alone. bound (n,): Cramér-Rao bound of each base parameter, where it has been computed. findings: of the
+    report alone. bound (n,): Cramér-Rao bound of each base parameter, where it has been computed. discrepancies: of the
     diagnosis that ran beside it. Numbers that do not exist (the std of an undetermined parameter) are None. After an
     event parameters and residuals are those since then.
     """
@@ -293,7 +293,7 @@ def results_document(
                 "bound": None if bound is None or k >= bound.size or not np.isfinite(bound[k]) else float(bound[k]),
             }
         )
-    judgement = judged(estimator, estimate, findings, projection=projection)
+    judgement = judged(estimator, estimate, discrepancies, projection=projection)
     return {
         "schema": SCHEMA,
         "system": describe(estimator.system),

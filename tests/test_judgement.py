@@ -8,7 +8,7 @@ import pytest
 from axis import AXIS, axis_block
 
 from sms_online.description.parse import parse_system
-from sms_online.judgement import LONGEST_SENTENCE, Facts, Finding, Residual, judge, judge_diagnosis, place_of
+from sms_online.judgement import LONGEST_SENTENCE, Discrepancy, Facts, Residual, judge, judge_diagnosis, place_of
 from sms_online.pipeline.estimator import Estimator
 from sms_online.results import judged, results_document
 
@@ -18,7 +18,7 @@ QUIET: Residual = {
     "joint_2": {"relative": 0.02, "whitened": 0.9},
 }
 GOOD = Facts(determined=(15, 16), undetermined=("motor_2.stator_inertia",), residual=QUIET)
-LACKING = Finding("joint_2", 2.7, "named", ("coulomb_friction@joint_2",))
+LACKING = Discrepancy("joint_2", 2.7, "named", ("coulomb_friction@joint_2",))
 
 
 def with_row(row: str, **values: float) -> Facts:
@@ -37,10 +37,14 @@ def test_what_nothing_speaks_against_is_trusted_and_its_reach_is_told() -> None:
     [
         (with_row("joint_2", whitened=62.0), "the residual of joint_2 is 62 × noise", {"joint_2": "62 × noise"}),
         (with_row("joint_1", relative=0.96), "96 % of the torque or force of joint_1", {"joint_1": "96 % unexplained"}),
-        (replace(GOOD, findings=(LACKING,)), "lacks coulomb_friction@joint_2", {"joint_2": "coulomb friction"}),
-        (replace(GOOD, findings=(Finding("link_1", 3.0, "noticed"),)), "not named yet", {"link_1": "more than noise"}),
+        (replace(GOOD, discrepancies=(LACKING,)), "lacks coulomb_friction@joint_2", {"joint_2": "coulomb friction"}),
         (
-            replace(GOOD, findings=(Finding("base", 3.0, "unexplained"),)),
+            replace(GOOD, discrepancies=(Discrepancy("link_1", 3.0, "noticed"),)),
+            "not named yet",
+            {"link_1": "more than noise"},
+        ),
+        (
+            replace(GOOD, discrepancies=(Discrepancy("base", 3.0, "unexplained"),)),
             "no known effect",
             {"base": "more than noise"},
         ),
@@ -60,7 +64,7 @@ def test_what_error_bars_do_not_know_of_is_a_grave_doubt(facts: Facts, said: str
     [
         (replace(GOOD, pulled=("motor_2.mass",)), "noise pulls motor_2.mass beyond the error bar"),
         (replace(GOOD, undecided=(19.2,)), "a change at 19.2 s"),
-        (replace(GOOD, findings=(Finding("base", 3.0, "passed"),)), "more than noise for a time"),
+        (replace(GOOD, discrepancies=(Discrepancy("base", 3.0, "passed"),)), "more than noise for a time"),
         (replace(GOOD, distance=39.0), "no real bodies are nearer than 39 standard deviations"),
         (replace(GOOD, lost=0.2), "20 % of the samples are lost"),
         (replace(GOOD, troubles=("drive: silent",)), "drive: silent"),
@@ -75,7 +79,7 @@ def test_what_harms_some_numbers_is_a_doubt_that_is_not_grave(facts: Facts, said
 @pytest.mark.parametrize(
     "facts",
     [
-        replace(GOOD, findings=(replace(LACKING, adopted=True), Finding("base", 9.0, "change"))),
+        replace(GOOD, discrepancies=(replace(LACKING, adopted=True), Discrepancy("base", 9.0, "change"))),
         replace(GOOD, lost=1e-4, distance=1.0),
         with_row("joint_1", relative=0.4, whitened=2.9),
     ],
@@ -85,7 +89,7 @@ def test_what_is_explained_or_harmless_leaves_trust(facts: Facts) -> None:
 
 
 def test_the_named_effect_comes_before_the_residual_that_it_leaves() -> None:
-    facts = replace(with_row("joint_2", whitened=19.0), findings=(LACKING,), pulled=("motor_2.mass",))
+    facts = replace(with_row("joint_2", whitened=19.0), discrepancies=(LACKING,), pulled=("motor_2.mass",))
     judgement = judge(facts)
     assert "coulomb_friction" in judgement.sentence
     assert judgement.others[0] == "the residual of joint_2 is 19 × noise"
@@ -109,10 +113,10 @@ def test_residuals_of_an_estimate_that_is_settling_show_nothing() -> None:
 
 
 def test_an_alarm_is_that_of_what_the_diagnosis_looks_into_and_a_doubt_of_its_own_else() -> None:
-    looked_into = judge(replace(GOOD, alarm="joint_2", findings=(Finding("joint_2", 3.0, "noticed"),)))
+    looked_into = judge(replace(GOOD, alarm="joint_2", discrepancies=(Discrepancy("joint_2", 3.0, "noticed"),)))
     assert len(looked_into.reasons) == 1
     # What was taken up is in the model, and the test began anew with it.
-    assert judge(replace(GOOD, alarm="joint_1", findings=(replace(LACKING, adopted=True),))).grave
+    assert judge(replace(GOOD, alarm="joint_1", discrepancies=(replace(LACKING, adopted=True),))).grave
 
 
 def test_a_torque_that_forbids_weights_is_a_grave_doubt_whatever_the_energy_balance_says_of_it() -> None:
@@ -133,7 +137,7 @@ def test_the_energy_balance_alone_is_never_trusted() -> None:
 
 def test_a_sentence_is_read_at_a_glance() -> None:
     many = tuple(f"torsional_hysteresis@joint_{i}" for i in range(9))
-    sentence = judge(replace(GOOD, findings=(replace(LACKING, effects=many),))).sentence
+    sentence = judge(replace(GOOD, discrepancies=(replace(LACKING, effects=many),))).sentence
     assert "and 7 more" in sentence
     assert len(judge(replace(GOOD, troubles=("much ado " * 50,))).sentence) <= LONGEST_SENTENCE
 

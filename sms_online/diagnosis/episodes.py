@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from sms_online.diagnosis.online_search import Named, Outcome
-from sms_online.judgement import Finding
+from sms_online.judgement import Discrepancy
 from sms_online.pipeline.events import Event
 
 
@@ -65,10 +65,10 @@ def line(episode: Episode) -> str:
     return f"{where}, not named yet"
 
 
-def finding(episode: Episode) -> Finding:
+def discrepancy(episode: Episode) -> Discrepancy:
     """An episode as the judgement of the session takes it."""
     named = tuple(each.key for each in episode.named)
-    return Finding(episode.row, episode.noticed, episode.verdict, named, episode.adopted is not None)
+    return Discrepancy(episode.row, episode.noticed, episode.verdict, named, episode.adopted is not None)
 
 
 def _told(named: Named) -> str:

@@ -17,12 +17,12 @@ from numpy.typing import NDArray
 
 from sms_online.description.schema import Effect, System
 from sms_online.diagnosis.constants import applied, is_constant
-from sms_online.diagnosis.episodes import Episode, Evidence, episode_document, finding, line
+from sms_online.diagnosis.episodes import Episode, Evidence, discrepancy, episode_document, line
 from sms_online.diagnosis.followed import least_samples
 from sms_online.diagnosis.online_search import Named, Outcome, Request, search
 from sms_online.diagnosis.record import Segment, joined
 from sms_online.effects.catalogue import ENTRIES
-from sms_online.judgement import Finding
+from sms_online.judgement import Discrepancy
 from sms_online.model.model import Model
 from sms_online.pipeline.estimator import Estimator
 from sms_online.pipeline.events import Event
@@ -136,9 +136,9 @@ class OnlineDiagnosis:
         return [line(episode) for episode in self.episodes]
 
     @property
-    def findings(self) -> tuple[Finding, ...]:
+    def discrepancies(self) -> tuple[Discrepancy, ...]:
         """The episodes as the judgement of the session takes them."""
-        return tuple(finding(episode) for episode in self.episodes)
+        return tuple(discrepancy(episode) for episode in self.episodes)
 
     def document(self) -> list[dict[str, Any]]:
         """The episodes as results.json holds them."""

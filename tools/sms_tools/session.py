@@ -14,7 +14,7 @@ from sms_adapters.system_file import load_system
 from sms_online.description.schema import System
 from sms_online.diagnosis.online import OnlineDiagnosis
 from sms_online.errors import InputError
-from sms_online.judgement import Finding
+from sms_online.judgement import Discrepancy
 from sms_online.pipeline.estimator import Estimator
 from sms_online.results import results_document
 from sms_online.stream import Array, Block
@@ -121,11 +121,11 @@ def document_of(
     warnings: list[str],
     truth: dict[str, float] | None,
     bound: Array | None = None,
-    findings: Sequence[Finding] = (),
+    discrepancies: Sequence[Discrepancy] = (),
 ) -> Document:
     """results.json of a session, with what the synchroniser and the sensing noticed among its warnings.
 
-    findings: of the diagnosis beside it.
+    discrepancies: of the diagnosis beside it.
     """
     counters = estimator.counters
     noticed = []
@@ -152,4 +152,4 @@ def document_of(
         missing = next(name for name in names if name not in truth)
         noticed.append(f"no comparison with the truth: it does not hold {missing}")
         truth = None
-    return results_document(estimator, throughput, [*warnings, *noticed], truth, bound, findings)
+    return results_document(estimator, throughput, [*warnings, *noticed], truth, bound, discrepancies)

@@ -59,7 +59,7 @@ class Showing:
         say: is told the verdicts too.
         """
         before = self._view.circumstances
-        self._view.circumstances = lambda: replace(before(), findings=online.findings)
+        self._view.circumstances = lambda: replace(before(), discrepancies=online.discrepancies)
 
         def evidence(t: float, scores: Mapping[str, float]) -> None:
             self._view.evidence(t, {name: math.log10(max(1.0, gain)) for name, gain in scores.items()})

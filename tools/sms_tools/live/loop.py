@@ -16,7 +16,7 @@ from sms_adapters.checkpoint import snapshot, write_checkpoint
 from sms_adapters.clock_merge import Merger
 from sms_adapters.recorder import Recorder
 from sms_adapters.recording import tick_time
-from sms_online.judgement import LARGEST_LOSS, Finding
+from sms_online.judgement import LARGEST_LOSS, Discrepancy
 from sms_online.pipeline.estimator import Estimator
 from sms_online.results import judged, standard_deviation
 from sms_online.stream import Block
@@ -62,7 +62,7 @@ class LiveSession:
     ) -> None:
         self.latencies = Latencies()
         self.notices: Callable[[], Sequence[str]] = tuple  # further lines of the status
-        self.findings: Callable[[], Sequence[Finding]] = tuple  # of a diagnosis beside the session
+        self.discrepancies: Callable[[], Sequence[Discrepancy]] = tuple  # of a diagnosis beside the session
         self.busy = 0.0  # s spent on samples
         self.health: Mapping[str, Mapping[str, float]] = {}  # latency and clock offsets, ms, by name; replaced when new
         self._clock = clock
@@ -236,7 +236,7 @@ class LiveSession:
                 *self.warnings,
                 *unstated_latency(self._estimator),
             ],
-            judgement=judged(self._estimator, estimate, self.findings(), troubles),
+            judgement=judged(self._estimator, estimate, self.discrepancies(), troubles),
         )
         self._said, self._said_samples = now, self._estimator.samples
         self._status.publish(news)

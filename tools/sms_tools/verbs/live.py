@@ -44,7 +44,7 @@ def run(args: argparse.Namespace) -> int:
             closing(SearchProcess(directory, args.adopt)) as searches,
         ):
             online = OnlineDiagnosis(estimator, searches, args.adopt)
-            session.findings = lambda: online.findings
+            session.discrepancies = lambda: online.discrepancies
             session.notices = lambda: [*online.notices, *shown.notices]
             shown.follow(online)
             blocks = session.blocks(interruption, math.inf if args.duration is None else args.duration)
@@ -57,7 +57,7 @@ def run(args: argparse.Namespace) -> int:
         throughput = estimator.samples / session.busy if session.busy else 0.0
         warnings = [*merger.warnings, *session.warnings, *shown.warnings]
         warnings += [] if searches.problem is None else [searches.problem]
-        document = document_of(estimator, throughput, warnings, None, findings=online.findings)
+        document = document_of(estimator, throughput, warnings, None, discrepancies=online.discrepancies)
         document["diagnosis"] = online.document()
         write_named(args, online, directory)
         code = conclude(args, document, directory, interrupted=False)

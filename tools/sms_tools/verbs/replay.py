@@ -83,7 +83,7 @@ def run(args: argparse.Namespace) -> int:
                 wall = perf_counter() - opened
         bound = None if record is None else session_bound(estimator, record)
         warnings = [*source.warnings, *shown.warnings]
-        document = document_of(estimator, estimator.samples / wall, warnings, parameters, bound, online.findings)
+        document = document_of(estimator, estimator.samples / wall, warnings, parameters, bound, online.discrepancies)
         document["diagnosis"] = online.document()
         write_named(args, online, directory)
         code = conclude(args, document, directory, interruption.requested)

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
-from sms_online.judgement import Finding, Judgement
+from sms_online.judgement import Discrepancy, Judgement
 from sms_online.stream import Block
 from sms_tools.view.choice import Choice
 from sms_tools.view.snapshot import Snapshot
@@ -40,7 +40,7 @@ class Diagnosed:
 class Circumstances:
     """What the judgement of a session takes from beside its estimator: see `judgement.Facts`."""
 
-    findings: tuple[Finding, ...] = ()
+    discrepancies: tuple[Discrepancy, ...] = ()
     troubles: tuple[str, ...] = ()
 
 

@@ -222,7 +222,7 @@ class Recorder:
                 # It takes too long to be made at every step.
                 std = standard_deviation(self._estimator, estimate)
                 projection = projected(self._estimator, estimate, std)
-            now = judged(self._estimator, estimate, circumstances.findings, circumstances.troubles, projection)
+            now = judged(self._estimator, estimate, circumstances.discrepancies, circumstances.troubles, projection)
         self._judgement = now
         self._banner.show(t, now)
         self._marks = drawn_marks(now.marks, self._estimator.sensing.channels)
