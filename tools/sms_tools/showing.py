@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 import math
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -15,9 +15,10 @@ from sms_online.stream import Block
 from sms_tools.html_report.history import History
 from sms_tools.html_report.page import write_report
 from sms_tools.interruption import Interruption
+from sms_tools.live.loop import LiveSession
 from sms_tools.report import Document, report_console, show, verdict_text
 from sms_tools.view.frames import Circumstances
-from sms_tools.view.session import Health, View, open_view, references
+from sms_tools.view.session import View, open_view, references
 
 
 class Showing:
@@ -88,16 +89,18 @@ def showing(
     directory: Path,
     truth: Mapping[str, float] | None,
     patient: bool = False,
-    health: Health | None = None,
-    troubles: Callable[[], Sequence[str]] = tuple,
+    live: LiveSession | None = None,
 ) -> Iterator[Showing]:
     """What `--rerun` asks for, while the context lasts; the estimator has to be finished within it.
 
-    patient: the session may wait for the view, as a replay as fast as it goes does. health, troubles: of a live source.
+    patient: the session may wait for the view, as a replay as fast as it goes does. live: it comes from devices, whose
+    health and troubles are shown with it.
     """
     exaggeration = args.exaggerate
+    health = None if live is None else lambda: live.health
     with open_view(
         args.rerun, estimator, channels, directory, truth, patient=patient, exaggeration=exaggeration, health=health
     ) as view:
-        view.circumstances = lambda: Circumstances(troubles=tuple(troubles()))
+        if live is not None:
+            view.circumstances = lambda: Circumstances(troubles=tuple(live.troubles))
         yield Showing(args, estimator, view, channels, directory, truth)

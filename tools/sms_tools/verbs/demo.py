@@ -67,17 +67,7 @@ def _watch(args: argparse.Namespace, arm: SimulatedArm, file: Path, directory: P
             tell = _draw(live, document, system.trajectory.duration)
         else:
             tell = _tell(console, estimator, document)
-        shown = stack.enter_context(
-            showing(
-                args,
-                estimator,
-                merger.channels,
-                directory,
-                truth,
-                health=lambda: session.health,
-                troubles=lambda: session.troubles,
-            )
-        )
+        shown = stack.enter_context(showing(args, estimator, merger.channels, directory, truth, live=session))
         for block in shown.watch(session.blocks(interruption, ended=arm.ended, ready=arm.start)):
             estimator.push(block)
             tell()

@@ -32,15 +32,7 @@ def run(args: argparse.Namespace) -> int:
     sys.setswitchinterval(SWITCH_INTERVAL)
     with Interruption() as interruption, termination_interrupts():
         with (
-            showing(
-                args,
-                estimator,
-                merger.channels,
-                directory,
-                None,
-                health=lambda: session.health,
-                troubles=lambda: session.troubles,
-            ) as shown,
+            showing(args, estimator, merger.channels, directory, None, live=session) as shown,
             closing(SearchProcess(directory, args.adopt)) as searches,
         ):
             online = OnlineDiagnosis(estimator, searches, args.adopt)
