@@ -30,6 +30,11 @@ class Block:
                 f"values {self.values.shape} do not fit {self.t.size} samples x {len(self.channels)} channels"
             )
 
+    def pieces(self, rows: int) -> Iterator[Block]:
+        """The same samples in blocks of at most so many."""
+        for k in range(0, self.t.size, rows):
+            yield Block(self.t[k : k + rows], self.channels, self.values[k : k + rows])
+
 
 class Source(Protocol):
     """Anything that yields blocks in order of time: a capture file, a CAN log, a live bus."""

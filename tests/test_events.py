@@ -45,11 +45,11 @@ def friction(name: str, joint: int, **coefficients: float) -> System:
 def run(block: Block, size: int = 64, system: System = PLANAR) -> tuple[Estimator, float]:
     """The session's estimator, and when (s) the newest sample had come with which a change was noticed, inf if none."""
     estimator, noticed = Estimator(system, block.channels, "test"), np.inf
-    for k in range(0, block.t.size, size):
-        estimator.push(Block(block.t[k : k + size], block.channels, block.values[k : k + size]))
+    for piece in block.pieces(size):
+        estimator.push(piece)
         assert estimator.momentum is not None
         if estimator.momentum.changes.detector.alarm is not None:
-            noticed = min(noticed, float(block.t[min(k + size, block.t.size) - 1]))
+            noticed = min(noticed, float(piece.t[-1]))
     estimator.finish()
     return estimator, noticed
 

@@ -26,7 +26,7 @@ from sms_online.errors import InputError
 from sms_online.pipeline.estimator import Estimator
 from sms_online.pipeline.momentum_balance import HOPS
 from sms_online.results import results_document
-from sms_online.stream import Array, Block
+from sms_online.stream import Array
 from sms_tools.cli import main
 from sms_tools.live.searches import NAME, Repeated, SearchProcess, searcher_of
 
@@ -97,8 +97,8 @@ def test_answers_that_came_late_are_used_as_late_in_the_repetition(tmp_path: Pat
     for searcher, size in zip(searchers, (64, 1000, 64), strict=True):
         estimator = Estimator(SYSTEM, block.channels, "session")
         online = OnlineDiagnosis(estimator, searcher(), adopt=True)
-        for k in range(0, block.t.size, size):
-            estimator.push(Block(block.t[k : k + size], block.channels, block.values[k : k + size]))
+        for piece in block.pieces(size):
+            estimator.push(piece)
         estimator.finish()
         assert online.episodes[0].adopted is not None
         told.append(json.dumps([online.document(), results_document(estimator, 0.0, [])]))

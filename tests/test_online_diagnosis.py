@@ -29,8 +29,8 @@ BEGIN = 8.0  # s
 def watched(system: System, block: Block, adopt: bool = True, size: int = 64) -> tuple[Estimator, OnlineDiagnosis]:
     estimator = Estimator(system, block.channels, "test")
     online = OnlineDiagnosis(estimator, Immediate(), adopt)
-    for k in range(0, block.t.size, size):
-        estimator.push(Block(block.t[k : k + size], block.channels, block.values[k : k + size]))
+    for piece in block.pieces(size):
+        estimator.push(piece)
     estimator.finish()
     return estimator, online
 

@@ -125,11 +125,8 @@ def test_a_channel_keeps_its_last_reading() -> None:
 def test_pictures_come_at_their_rate_however_samples_are_split(planar_block: Block, size: int) -> None:
     model = Model(load_system("paper-planar"))
     readings = Readings(Sensing(model, planar_block.channels, "test"), planar_block.channels)
-    times, values = planar_block.t[:2000], planar_block.values[:2000]
-    t = [
-        readings.push(Block(times[k : k + size], planar_block.channels, values[k : k + size]))[0]
-        for k in range(0, 2000, size)
-    ]
+    block = Block(planar_block.t[:2000], planar_block.channels, planar_block.values[:2000])
+    t = [readings.push(piece)[0] for piece in block.pieces(size)]
     np.testing.assert_allclose(np.concatenate(t), np.arange(0.0, 1.9999, 0.05), rtol=0, atol=1.1e-3)
 
 

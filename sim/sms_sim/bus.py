@@ -315,8 +315,7 @@ def capture_blocks(path: Path, duration: float, rows: int = 64) -> Iterator[Bloc
     first: float | None = None
     for block in CaptureReader(path, stop=duration):
         first = float(block.t[0]) if first is None else first
-        for k in range(0, block.t.size, rows):
-            yield Block(block.t[k : k + rows] - first, block.channels, block.values[k : k + rows])
+        yield from Block(block.t - first, block.channels, block.values).pieces(rows)
 
 
 def main(arguments: list[str] | None = None) -> int:

@@ -76,8 +76,7 @@ def test_single_pushes(grade: str) -> None:
     estimator = Estimator(system, blocks[0].channels, "bench")
     took = []
     for block in blocks:
-        for k in range(block.t.size):
-            sample = Block(block.t[k : k + 1], block.channels, block.values[k : k + 1])
+        for sample in block.pieces(1):
             start = perf_counter()
             estimator.push(sample)
             took.append(1e3 * (perf_counter() - start))

@@ -51,12 +51,7 @@ def test_hand_over(tmp_path: Path, name: str, monkeypatch: pytest.MonkeyPatch) -
     monkeypatch.setattr(View, "_show", timed)
     with open_view("save", estimator, blocks[0].channels, tmp_path) as view:
         begun = perf_counter()
-        source = (
-            Block(b.t[k : k + DELIVERED], b.channels, b.values[k : k + DELIVERED])
-            for b in blocks
-            for k in range(0, b.t.size, DELIVERED)
-        )
-        for block in view.watch(source):
+        for block in view.watch(piece for delivered in blocks for piece in delivered.pieces(DELIVERED)):
             sleep(max(0.0, begun + float(block.t[-1]) - perf_counter()))
             estimator.push(block)
         wall = perf_counter() - begun

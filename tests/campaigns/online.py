@@ -75,8 +75,8 @@ def watched(system: System, block: Block, adopt: bool) -> tuple[Estimator, Onlin
     """The session of a description whose nominal values are not the true ones, with what was found meanwhile."""
     estimator = Estimator(disguised(system), block.channels, "case")
     online = OnlineDiagnosis(estimator, Immediate(), adopt)
-    for k in range(0, block.t.size, PIECE):
-        estimator.push(Block(block.t[k : k + PIECE], block.channels, block.values[k : k + PIECE]))
+    for piece in block.pieces(PIECE):
+        estimator.push(piece)
     estimator.finish()
     return estimator, online
 

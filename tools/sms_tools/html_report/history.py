@@ -49,8 +49,7 @@ class History:
         """The same samples, in pieces no longer than the interval; each is looked at once it has been used."""
         longest = max(1, round(self._estimator.system.sample_rate / RATE))
         for block in blocks:
-            for k in range(0, block.t.size, longest):
-                piece = Block(block.t[k : k + longest], block.channels, block.values[k : k + longest])
+            for piece in block.pieces(longest):
                 yield piece
                 self._look(piece)
 

@@ -67,11 +67,10 @@ def run(args: argparse.Namespace) -> int:
             record = MotionRecord(system.sample_rate) if args.bound else None
             if record is not None:
                 estimator.on_motion = record.add
-            if args.speed == "1":
-                blocks = _paced(_pieces(source, max(1, round(PACE * system.sample_rate))), interruption)
-            else:
-                blocks = _pieces(source, PIECE)
             patient = args.speed == "max"
+            rows = PIECE if patient else max(1, round(PACE * system.sample_rate))
+            pieces = (piece for block in source for piece in block.pieces(rows))
+            blocks = pieces if patient else _paced(pieces, interruption)
             with showing(args, estimator, source.channels, directory, parameters, patient) as shown:
                 searcher = searcher_of(capture, args.adopt) if args.start is args.stop is None else Immediate()
                 online = OnlineDiagnosis(estimator, searcher, args.adopt)
@@ -98,13 +97,6 @@ def _progress(capture: Path, always: bool) -> Progress | None:
         return None
     text = TextColumn("{task.description}")
     return Progress(text, BarColumn(), DownloadColumn(), TimeRemainingColumn(), console=console, transient=True)
-
-
-def _pieces(blocks: Iterable[Block], rows: int) -> Iterator[Block]:
-    """The same samples in blocks of at most so many rows; the estimator's result does not depend on it."""
-    for block in blocks:
-        for k in range(0, block.t.size, rows):
-            yield Block(block.t[k : k + rows], block.channels, block.values[k : k + rows])
 
 
 def _paced(blocks: Iterable[Block], interruption: Interruption) -> Iterator[Block]:

@@ -97,8 +97,7 @@ class View:
         shown = stated = -1
         waiting: list[Block] = []
         for block in blocks:
-            for k in range(0, block.t.size, longest):
-                piece = Block(block.t[k : k + longest], block.channels, block.values[k : k + longest])
+            for piece in block.pieces(longest):
                 yield piece
                 waiting.append(piece)
                 self._t = float(piece.t[-1])
