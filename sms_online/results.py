@@ -67,14 +67,9 @@ def standard_deviation(estimator: Estimator, estimate: Estimate | None = None) -
     return std
 
 
-def identifiable(estimator: Estimator) -> NDArray[np.bool_]:
-    """Which parameters (n,) the data determine: in the span of the rows, and three standard deviations from zero."""
-    estimate = estimator.estimate()
-    return _identifiable(estimate, standard_deviation(estimator, estimate))
-
-
-def _identifiable(estimate: Estimate, std: Array) -> NDArray[np.bool_]:
-    return estimate.determined & (std <= LARGEST_RELATIVE_STD * np.abs(estimate.pi))
+def identifiable(beta: Array, std: Array) -> NDArray[np.bool_]:
+    """Which parameters β (n,) the data determine: std (n,) is finite, and β three of it from zero."""
+    return np.asarray(std <= LARGEST_RELATIVE_STD * np.abs(beta))
 
 
 def residuals(estimator: Estimator, beta: Array) -> dict[str, dict[str, float | None]]:
@@ -123,7 +118,7 @@ def judged(
     if estimate is None:
         estimate = estimator.estimate()
     std = standard_deviation(estimator, estimate)
-    flags = _identifiable(estimate, std)
+    flags = identifiable(estimate.pi, std)
     names = [p.name for p in estimator.base.parameters]
     momentum = estimator.momentum
     lost = estimator.counters.lost_samples
@@ -272,7 +267,7 @@ def results_document(
     if truth is not None and all(p.name in truth for p in base.physical):
         true = base.values(np.array([truth[p.name] for p in base.physical]))
     deviations = standard_deviation(estimator, estimate)
-    flags = _identifiable(estimate, deviations)
+    flags = identifiable(estimate.pi, deviations)
     projection = projected(estimator, estimate, deviations)
     parameters = []
     for k, p in enumerate(base.parameters):

@@ -40,7 +40,7 @@ def test_two_link_arm_gives_every_parameter_that_is_not_zero() -> None:
     present = truth != 0.0
     assert present.sum() == 40
     assert (error[present] < ACCURACY * np.abs(truth[present])).all()
-    assert identifiable(estimator)[present].all()
+    assert identifiable(estimate.pi, standard_deviation(estimator, estimate))[present].all()
     # Three products of inertia of a stator are zero; its moments are 6e-3 kg m² and more.
     assert (error[~present] < ACCURACY * 6e-3).all()
 
@@ -74,7 +74,7 @@ def test_seven_joint_arm_gives_what_the_motion_excites() -> None:
     assert excited.sum() >= 50
     assert (error[excited] < ACCURACY * np.abs(truth[excited])).all()
     # The others are flagged, or come with an error bar that holds.
-    assert (~identifiable(estimator) | (error < 5.0 * std))[~excited].all()
+    assert (~identifiable(estimate.pi, std) | (error < 5.0 * std))[~excited].all()
 
 
 @pytest.mark.slow

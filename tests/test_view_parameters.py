@@ -17,6 +17,7 @@ from sms_online.model.parameters import Parameter
 from sms_online.pipeline.events import Event
 from sms_online.pipeline.joint_balance import SquaredResidual
 from sms_tools.view.frames import Reference
+from sms_tools.view.known import Known
 from sms_tools.view.number_log import NumberLog
 from sms_tools.view.own_scale import LEAST_REST, OwnScale
 from sms_tools.view.parameter_groups import MOST_LINES, Basis, parameter_groups, shortened
@@ -67,13 +68,10 @@ def test_without_anything_to_compare_with_nothing_is_drawn_and_the_axis_is_that_
     assert (group.kind, group.unit, group.half_range) == ("effects", "%", 100.0)
 
 
-KNOWN = np.ones(4, dtype=bool)
-
-
 def followed(scale: OwnScale, t: float, estimate: list[float], percent: float, settled: bool = True) -> bool:
     """An instant at which every error bar (1σ) is so many percent long."""
     values = np.array(estimate)
-    return scale.follow(t, values, np.abs(values) * percent / 100.0, KNOWN, settled)
+    return scale.follow(Known(t, values, np.abs(values) * percent / 100.0), settled)
 
 
 def test_an_axis_is_about_the_estimate_once_it_has_settled_and_as_wide_as_its_bars_ask_for() -> None:
@@ -107,20 +105,19 @@ def test_an_axis_of_a_restless_estimate_changes_ever_more_rarely() -> None:
 
 def test_what_is_determined_later_joins_the_axis_of_the_others() -> None:
     scale = OwnScale([None] * 2)
-    some = np.array([True, False])
-    assert scale.follow(1.0, np.array([5.0, 7.0]), np.array([0.01, np.inf]), some, True)
+    values, std = np.array([5.0, 7.0]), np.array([0.01, 0.01])
+    assert scale.follow(Known(1.0, values, np.array([0.01, np.inf])), settled=True)
     assert np.isnan(scale.basis.about[1])
-    later = np.array([5.0, 7.0]), np.array([0.01, 0.01]), np.array([True, True]), True
     # Everything is drawn anew then, so not at every moment.
-    assert not scale.follow(1.0, *later)
-    assert scale.follow(1.0 + LEAST_REST, *later)
+    assert not scale.follow(Known(1.0, values, std), settled=True)
+    assert scale.follow(Known(1.0 + LEAST_REST, values, std), settled=True)
     assert scale.basis.about.tolist() == [5.0, 7.0]
 
 
 def test_where_all_true_values_are_known_the_axis_never_changes() -> None:
     scale = OwnScale([Reference(1.0, True)] * 4)
     assert not followed(scale, 5.0, [12.0] * 4, 1.0)
-    assert not scale.follow(9.0, np.full(4, 12.0), np.full(4, 0.1), KNOWN, True, last=True)
+    assert not scale.follow(Known(9.0, np.full(4, 12.0), np.full(4, 0.1)), settled=True, last=True)
 
 
 def test_long_combinations_are_cut_to_a_label() -> None:
@@ -131,9 +128,8 @@ def test_long_combinations_are_cut_to_a_label() -> None:
 
 def test_a_table_tells_no_number_of_what_is_not_determined() -> None:
     parameters = [Parameter("joint_1.stiffness", "k_1", "N m/rad", 1000.0)] * 2
-    known = [Reference(1000.0, True), None]
-    estimate, std = np.array([1010.0, 7.0]), np.array([5.0, np.inf])
-    lines = markdown_table(parameters, known, estimate, std, np.array([True, False])).splitlines()
+    now = Known(1.0, np.array([1010.0, 7.0]), np.array([5.0, np.inf]))
+    lines = markdown_table(parameters, [Reference(1000.0, True), None], now).splitlines()
     assert lines[2] == "| k_1 | N m/rad | 1010 | 5 | 1000 | +1 % |"
     assert lines[3] == "| k_1 | N m/rad | – | – | – | – |"
 

@@ -15,7 +15,7 @@ from sms_online.effects.base import report
 from sms_online.effects.catalogue import ENTRIES, declarable
 from sms_online.judgement import Facts, Judgement, judge, judge_diagnosis
 from sms_online.model.parameters import Parameter
-from sms_online.results import LARGEST_RELATIVE_STD, NORMAL_95, judged, projected, results_document, standard_deviation
+from sms_online.results import NORMAL_95, identifiable, judged, projected, results_document, standard_deviation
 from sms_online.stream import Array
 
 SCHEMA = "sms-online/diagnosis/1"
@@ -232,9 +232,9 @@ def _posterior(attempt: Attempt, chosen: Sequence[int]) -> list[dict[str, Any]]:
             "lower95": float(value - NORMAL_95 * std) if np.isfinite(std) else None,
             "upper95": float(value + NORMAL_95 * std) if np.isfinite(std) else None,
             "true": None,
-            "identifiable": bool(std <= LARGEST_RELATIVE_STD * abs(value)),
+            "identifiable": bool(known),
         }
-        for p, value, std in zip(parameters, values, stds, strict=True)
+        for p, value, std, known in zip(parameters, values, stds, identifiable(values, stds), strict=True)
     ]
 
 

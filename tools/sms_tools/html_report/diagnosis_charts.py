@@ -13,9 +13,9 @@ from sms_online.diagnosis.weak_windows import Windows
 from sms_online.model.layout import row_types
 from sms_online.stream import Array
 from sms_tools.html_report.svg import Series, chart
+from sms_tools.view.known import BOUNDS
 
 BEFORE, AFTER, NOISE, LAW = "#d55e00", "#0072b2", "#7a8794", "#1c2733"
-BOUNDS = 2.0  # standard deviations
 # Half range of a residual drawn to see noise, in standard deviations.
 CLOSE_UP = 5.0
 # Of the residuals drawn close up so many stay inside where noise is left far behind.

@@ -10,11 +10,12 @@ import numpy as np
 
 from sms_online.diagnosis.diagnose import Diagnosis
 from sms_tools.html_report.arm_drawing import marked_arm
-from sms_tools.html_report.diagnosis_charts import AFTER, BEFORE, BOUNDS, law_charts, residual_charts
+from sms_tools.html_report.diagnosis_charts import AFTER, BEFORE, law_charts, residual_charts
 from sms_tools.html_report.error_bars import Bar, error_bars
 from sms_tools.html_report.page import verdict_box, write_page
 from sms_tools.html_report.svg import svg
 from sms_tools.report import NOT_DETERMINED, Document, formatter
+from sms_tools.view.known import BOUNDS
 from sms_tools.view.parameter_groups import half_range
 from sms_tools.view.places import places_of
 from sms_tools.view.scene import Scene

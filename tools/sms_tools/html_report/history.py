@@ -6,11 +6,11 @@ from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sms_online.pipeline.estimator import Estimator
-from sms_online.results import LARGEST_RELATIVE_STD, standard_deviation
+from sms_online.results import standard_deviation
 from sms_online.stream import Array, Block
+from sms_tools.view.known import Known
 from sms_tools.view.readings import last_readings
 from sms_tools.view.residuals import RecentResidual
 
@@ -21,13 +21,9 @@ MOST_INSTANTS = 400
 
 
 @dataclass(frozen=True)
-class Instant:
-    """t, s; estimate (n,), its std (n,) and whether it is determined (n,); relative residuals (joints,); x (n_x,)."""
+class Instant(Known):
+    """With what is known, relative residuals (joints,) and positions x (n_x,)."""
 
-    t: float
-    estimate: Array
-    std: Array
-    determined: NDArray[np.bool_]
     residual: Array
     x: Array
 
@@ -77,11 +73,8 @@ class History:
     def _add(self) -> None:
         estimator = self._estimator
         now = estimator.estimate()
-        estimate = now.pi
-        residual = self._recent.push(self._t, estimator, estimate)
+        residual = self._recent.push(self._t, estimator, now.pi)
         x = np.full(estimator.model.layout.n_x, np.nan)
         if np.isfinite(self._last).all():
             x = estimator.sensing.coordinates(self._last[None])[0]
-        std = standard_deviation(estimator, now)
-        determined = std <= LARGEST_RELATIVE_STD * np.abs(estimate)
-        self.instants.append(Instant(self._t, estimate, std, determined, residual, x))
+        self.instants.append(Instant(self._t, now.pi, standard_deviation(estimator, now), residual, x))

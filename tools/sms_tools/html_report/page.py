@@ -17,13 +17,13 @@ from sms_tools.html_report.history import History
 from sms_tools.html_report.svg import Series, chart
 from sms_tools.report import NOT_DETERMINED, Document, formatter, trust_lines
 from sms_tools.view.frames import Reference
+from sms_tools.view.known import BOUNDS
 from sms_tools.view.parameter_groups import HALF_RANGES, Basis, Group, half_range, parameter_groups, shortened
 from sms_tools.view.scene import Scene
 
 NAME = "report.html"
 # Pictures of the arm: at the start, at the end, and evenly between.
 PICTURES = 5
-BOUNDS = 2.0  # standard deviations
 # Candidates in a chart: more lines than that nobody tells apart.
 MOST_CANDIDATES = 6
 

@@ -18,7 +18,7 @@ from sms_adapters.recorder import Recorder
 from sms_adapters.recording import tick_time
 from sms_online.judgement import LARGEST_LOSS, Discrepancy
 from sms_online.pipeline.estimator import Estimator
-from sms_online.results import judged, standard_deviation
+from sms_online.results import identifiable, judged, standard_deviation
 from sms_online.stream import Block
 from sms_tools.interruption import Interruption
 from sms_tools.live.feed import READ_TIMEOUT, Feed, Interpreter, SessionClock
@@ -225,7 +225,7 @@ class LiveSession:
             latency=self.latencies.quantile(0.99),
             lost=self._estimator.counters.lost_samples,
             residual=max((r for r in residuals if r is not None), default=None),
-            determined=(int(np.count_nonzero(relative < 1.0 / 3.0)), len(parameters)),
+            determined=(int(np.count_nonzero(identifiable(estimate.pi, std))), len(parameters)),
             leading=[
                 Leading(parameters[k].name, parameters[k].unit, float(estimate.pi[k]), float(std[k])) for k in best
             ],

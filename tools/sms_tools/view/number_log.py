@@ -7,16 +7,15 @@ from dataclasses import dataclass, field
 
 import numpy as np
 import rerun as rr
-from numpy.typing import NDArray
 
 from sms_online.stream import Array
 from sms_tools.view import style
 from sms_tools.view.arm_log import times
+from sms_tools.view.known import BOUNDS, Known
 from sms_tools.view.parameter_groups import Group
 
 PARAMETERS, RESIDUAL, HEALTH, EVIDENCE = "parameters", "residual", "health", "evidence"
 TABLE, LOG = "table", "log"
-BOUNDS = 2.0  # standard deviations
 # Of plots of residuals. A relative one of 1 says that the model explains nothing. Whitened ones are drawn in decades:
 # noise is 0, and a model that lacks an effect leaves hundreds of times as much.
 RELATIVE_RANGE, WHITENED_RANGE = (-0.1, 1.2), (-0.5, 3.5)
@@ -108,16 +107,6 @@ class NumberLog:
         """A line of the log; it begins with the time, for the viewer's own column of it is too narrow to be read."""
         line = rr.TextLog.columns(text=[f"{t:.2f} s: {text}"], level=["WARN" if warning else "INFO"])
         self._stream.send_columns(LOG, times(np.array([t])), line)
-
-
-@dataclass(frozen=True)
-class Known:
-    """Estimate (n,), standard deviation (n,) and what is determined (n,) at t, s."""
-
-    t: float
-    estimate: Array
-    std: Array
-    determined: NDArray[np.bool_]
 
 
 class ParameterLog:

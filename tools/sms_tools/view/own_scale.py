@@ -8,11 +8,10 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from sms_online.stream import Array
 from sms_tools.view.frames import Reference
+from sms_tools.view.known import BOUNDS, Known
 from sms_tools.view.parameter_groups import HALF_RANGES, Basis, half_range
 
-BOUNDS = 2.0  # standard deviations
 # An axis reaches so many times as far as the error bars: estimates move within them.
 ROOM = 2.0
 # Bars this many times shorter than their axis has room for get a new one: a viewer that is told to change its layout
@@ -36,13 +35,12 @@ class OwnScale:
         self._own = False
         self._begun, self._due = np.inf, -np.inf  # s
 
-    def follow(
-        self, t: float, estimate: Array, std: Array, determined: NDArray[np.bool_], settled: bool, last: bool = False
-    ) -> bool:
-        """Take in what is known at t, s: estimate (n,), std (n,), determined (n,); whether there is another basis now.
+    def follow(self, now: Known, settled: bool, last: bool = False) -> bool:
+        """Take in what is known now; whether there is another basis for it.
 
         settled: the estimate moves within its error bars. last: of the session.
         """
+        t, estimate = now.t, now.estimate
         more = estimate.size - self._compared.size
         if more > 0:
             # An event has added parameters.
@@ -50,11 +48,11 @@ class OwnScale:
             about = np.append(self.basis.about, np.full(more, np.nan))
             self.basis = Basis(about, self.basis.name, self.basis.half_range)
         basis = self.basis
-        drawn = determined & self._compared & (estimate != 0.0)
+        drawn = now.determined & self._compared & (estimate != 0.0)
         known = np.where(drawn, estimate, np.nan)
         self._begun = min(self._begun, t)
         if drawn.any() and (last or (settled and t >= self._due)):
-            bars = 100.0 * BOUNDS * std / np.abs(known)
+            bars = 100.0 * BOUNDS * now.std / np.abs(known)
             wanted = half_range(ROOM * bars)
             shrunk = wanted * SHRUNK <= basis.half_range
             beyond = half_range(100.0 * np.abs(known / basis.about - 1.0) + bars) > basis.half_range

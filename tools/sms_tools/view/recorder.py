@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 from sms_online.judgement import LARGEST_RESIDUAL, LARGEST_WHITENED, Judgement
 from sms_online.pipeline.estimator import Estimator
 from sms_online.results import (
-    LARGEST_RELATIVE_STD,
     event_document,
     judged,
     projected,
@@ -30,13 +29,13 @@ from sms_tools.view.arm_log import ArmLog
 from sms_tools.view.banner import Banner
 from sms_tools.view.blueprint import WINDOW, layout
 from sms_tools.view.frames import Circumstances, End, Event, Evidence, Picture, Start
+from sms_tools.view.known import Known
 from sms_tools.view.number_log import (
     EVIDENCE,
     HEALTH,
     RELATIVE_RANGE,
     RESIDUAL,
     WHITENED_RANGE,
-    Known,
     NumberLog,
     ParameterLog,
 )
@@ -182,22 +181,21 @@ class Recorder:
         estimator = self._estimator
         apply(state, estimator)
         more = self._follow_events()
-        estimate, std = self._estimate()
-        determined = std <= LARGEST_RELATIVE_STD * np.abs(estimate)
+        known = self._known(t)
         slow = t >= self._slow_due or last
         if slow or circumstances != self._circumstances:
             self._circumstances = circumstances
             self._judge(t, last)
         settled = self._judgement is not None and self._judgement.level != "not yet"
-        self._arrange(t, more, self._scale.follow(t, estimate, std, determined, settled, last))
-        self._parameters.add(Known(t, estimate, std, determined))
-        self._residual = self._recent.push(t, estimator, estimate)
+        self._arrange(t, more, self._scale.follow(known, settled, last))
+        self._parameters.add(known)
+        self._residual = self._recent.push(t, estimator, known.estimate)
         self._numbers.add(f"{RESIDUAL}/relative", t, self._residual)
-        self._tell_changes(t, estimate, std, determined)
+        self._tell_changes(known)
         if slow:
             parameters = estimator.base.parameters
-            self._numbers.table(t, markdown_table(parameters, self._references, estimate, std, determined))
-            self._whole_residuals(t, estimate)
+            self._numbers.table(t, markdown_table(parameters, self._references, known))
+            self._whole_residuals(t, known.estimate)
             self._slow_due = t + SLOW_INTERVAL
 
     def _arrange(self, t: float, more: bool, rescaled: bool) -> None:
@@ -229,16 +227,16 @@ class Recorder:
         if last or before is None or (before.level, before.grave, before.marks) != (now.level, now.grave, now.marks):
             self._numbers.tell(t, now.sentence, warning=now.level == "doubt")
 
-    def _estimate(self) -> tuple[Array, Array]:
-        """Estimate (n,) and standard deviation (n,) of the base parameters: the session's, or a diagnosis's."""
+    def _known(self, t: float) -> Known:
+        """What is known of the base parameters at t, s: by the session, or by a diagnosis."""
         estimator = self._estimator
         if self._diagnosed is not None and self._diagnosed.parameters:
             unknown = np.nan, np.inf
-            known = [self._diagnosed.parameters.get(p.name, unknown) for p in estimator.base.parameters]
-            estimate, std = np.array(known).T
-            return estimate, std
+            told = [self._diagnosed.parameters.get(p.name, unknown) for p in estimator.base.parameters]
+            estimate, std = np.array(told).T
+            return Known(t, estimate, std)
         now = estimator.estimate()
-        return now.pi, standard_deviation(estimator, now)
+        return Known(t, now.pi, standard_deviation(estimator, now))
 
     def _mark(self, t: float) -> None:
         """A vertical line in all plots of parameters and residuals."""
@@ -286,12 +284,13 @@ class Recorder:
         rms = np.sqrt(energy.rss / energy.dof) if energy.dof > 0.0 else np.nan
         self._numbers.add(f"{RESIDUAL}/energy", t, np.array([rms]))
 
-    def _tell_changes(self, t: float, estimate: Array, std: Array, determined: NDArray[np.bool_]) -> None:
+    def _tell_changes(self, now: Known) -> None:
         """What has become known or has been lost since the last state."""
+        t, determined = now.t, now.determined
         for k in np.flatnonzero(determined != self._determined):
             p = self._estimator.base.parameters[k]
             if determined[k]:
-                self._numbers.tell(t, f"{p.name} is determined: {estimate[k]:.4g} ± {std[k]:.2g} {p.unit}")
+                self._numbers.tell(t, f"{p.name} is determined: {now.estimate[k]:.4g} ± {now.std[k]:.2g} {p.unit}")
             else:
                 self._numbers.tell(t, f"{p.name} is not determined any more", warning=True)
         self._determined = determined

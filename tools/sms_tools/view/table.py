@@ -4,23 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-import numpy as np
-from numpy.typing import NDArray
-
 from sms_online.model.parameters import Parameter
-from sms_online.stream import Array
 from sms_tools.view.frames import Reference
+from sms_tools.view.known import Known
 from sms_tools.view.parameter_groups import shortened
 
 
-def markdown_table(
-    parameters: Sequence[Parameter],
-    references: Sequence[Reference | None],
-    estimate: Array,
-    std: Array,
-    determined: NDArray[np.bool_],
-) -> str:
-    """Symbol, unit, estimate ± std (n,) and the reference; a dash where the data determine nothing."""
+def markdown_table(parameters: Sequence[Parameter], references: Sequence[Reference | None], now: Known) -> str:
+    """Symbol, unit, estimate ± std and the reference; a dash where the data determine nothing."""
+    estimate, std, determined = now.estimate, now.std, now.determined
     compared = "true" if any(reference is not None and reference.is_true for reference in references) else "nominal"
     lines = [f"| parameter | unit | estimate | ± std | {compared} | deviation |", "|:--|:--|--:|--:|--:|--:|"]
     for k, (p, reference) in enumerate(zip(parameters, references, strict=True)):

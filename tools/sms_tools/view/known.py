@@ -1,0 +1,28 @@
+"""What is known of the parameters at an instant, as plots, tables and the log take it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sms_online.results import identifiable
+from sms_online.stream import Array
+
+# Error bars and bands are drawn so far to either side, in standard deviations.
+BOUNDS = 2.0
+
+
+@dataclass(frozen=True)
+class Known:
+    """Estimate (n,) and standard deviation (n,), inf where the data determine nothing, at t, s."""
+
+    t: float
+    estimate: Array
+    std: Array
+
+    @property
+    def determined(self) -> NDArray[np.bool_]:
+        """What the data determine (n,)."""
+        return identifiable(self.estimate, self.std)
