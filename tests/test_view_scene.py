@@ -12,7 +12,7 @@ from sms_online.model.model import Model
 from sms_online.model.so3 import RotationVector
 from sms_online.pipeline.sensing import Sensing
 from sms_online.stream import Array, Block
-from sms_tools.view.readings import Readings, last_readings
+from sms_tools.view.readings import Readings, SampleAndHold
 from sms_tools.view.scene import Scene
 
 SEED = 11
@@ -117,8 +117,14 @@ def test_the_spacecraft_holds_joint_1_and_its_tracked_point() -> None:
 
 
 def test_a_channel_keeps_its_last_reading() -> None:
-    values = np.array([[1.0, np.nan], [np.nan, 2.0], [3.0, np.nan]])
-    np.testing.assert_array_equal(last_readings(values, np.array([np.nan, 9.0])), [[1.0, 9.0], [1.0, 2.0], [3.0, 2.0]])
+    channels = ("q_2", "tau_1", "q_1")
+    held = SampleAndHold(["q_1", "q_2"], channels)
+    assert np.isnan(held.last).all()
+    first = np.array([[9.0, 0.0, np.nan]])
+    np.testing.assert_array_equal(held.push(Block(np.zeros(1), channels, first)), [[np.nan, 9.0]])
+    later = np.array([[np.nan, 0.0, 1.0], [2.0, 0.0, np.nan], [np.nan, 0.0, 3.0]])
+    np.testing.assert_array_equal(held.push(Block(np.ones(3), channels, later)), [[1.0, 9.0], [1.0, 2.0], [3.0, 2.0]])
+    np.testing.assert_array_equal(held.last, [3.0, 2.0])
 
 
 @pytest.mark.parametrize("size", [1, 7, 400])

@@ -11,7 +11,7 @@ from sms_online.pipeline.estimator import Estimator
 from sms_online.results import standard_deviation
 from sms_online.stream import Array, Block
 from sms_tools.view.known import Known
-from sms_tools.view.readings import last_readings
+from sms_tools.view.readings import SampleAndHold
 from sms_tools.view.residuals import RecentResidual
 
 # Instants a second to begin with: estimates change by internal blocks of a quarter second.
@@ -34,8 +34,7 @@ class History:
     def __init__(self, estimator: Estimator, channels: tuple[str, ...]) -> None:
         self.instants: list[Instant] = []
         self._estimator = estimator
-        self._columns = [channels.index(name) for name in estimator.sensing.channels]
-        self._last = np.full(len(self._columns), np.nan)
+        self._held = SampleAndHold(estimator.sensing.channels, channels)
         self._interval = 1.0 / RATE
         self._due = -np.inf
         self._t = np.nan
@@ -57,10 +56,7 @@ class History:
             self._add()
 
     def _look(self, block: Block) -> None:
-        values = block.values[:, self._columns]
-        if np.isnan(values[-1]).any():
-            values = last_readings(values, self._last)
-        self._last = values[-1]
+        self._held.push(block)
         self._t = float(block.t[-1])
         if self._t < self._due:
             return
@@ -75,6 +71,6 @@ class History:
         now = estimator.estimate()
         residual = self._recent.push(self._t, estimator, now.pi)
         x = np.full(estimator.model.layout.n_x, np.nan)
-        if np.isfinite(self._last).all():
-            x = estimator.sensing.coordinates(self._last[None])[0]
+        if np.isfinite(self._held.last).all():
+            x = estimator.sensing.coordinates(self._held.last[None])[0]
         self.instants.append(Instant(self._t, now.pi, standard_deviation(estimator, now), residual, x))
