@@ -49,7 +49,7 @@ def test_a_chain_that_was_told_enough_windows_weighs_like_one_that_knows_them_al
 
     def told_from(first: int) -> Array:
         """Information about each parameter in the windows compared, by a chain that begins with window `first`."""
-        chain = Weighing(model, base, balance, sensing.displacements, (), ())
+        chain = Weighing(model, base, balance, sensing.displacements)
         chain.begin(base.values(model.nominal), noise, np.zeros(model.layout.n_v), windows[first].start)
         chain.tell(0, x, v, signals)
         white = []

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -31,6 +32,7 @@ from sms_online.pipeline.momentum_fit import MomentumFit
 from sms_online.pipeline.sensing import Sensing
 from sms_online.pipeline.sensor_noise import SensorNoise
 from sms_online.pipeline.synchronise import GridSamples
+from sms_online.pipeline.weighing import Weighing
 from sms_online.stream import Array
 from sms_online.trackers.factor import solve
 from sms_online.trackers.interface import Prior
@@ -153,8 +155,9 @@ class Changes:
         # What the rows before left decides, where it is more than noise.
         freedom = max(1, before.windows * model.layout.n_v - n)
         left = max(1.0, abs(before.factor[-1, -1]) / np.sqrt(freedom))
+        new_weighing = partial(Weighing, model, base, balance, self._sensing.displacements)
         for _ in range(PASSES):
-            fit = MomentumFit(model, base, balance, self._sensing.displacements, weights.copy)
+            fit = MomentumFit(model, base, balance, new_weighing, weights.copy)
             fit.go_on(weights, noise)
             rows = np.concatenate([white.Y for white in fit.push(windows, instants, noise)])
             explanation = explain(before.factor / left, rows / left, jumps)

@@ -15,7 +15,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -23,7 +22,6 @@ from numpy.typing import NDArray
 
 from sms_online.model.base_parameters import BaseParameters
 from sms_online.model.model import Model
-from sms_online.pipeline.latency import SourceGroup
 from sms_online.pipeline.momentum_balance import (
     COPIES,
     HOPS,
@@ -100,9 +98,8 @@ class WhiteRows:
 class MomentumFit:
     """Whitens the windows of a session, segment by segment.
 
-    solve: gives the estimate of β so far (n,), NaN where nothing is known of it. readings: x (K, n_x) to the
-    displacements (K, n_v, sensors) that unit noise of each position sensor makes. sources: whose latencies are told.
-    clocks: see `RowNoise`.
+    new_weighing: makes who weighs, for the same model, base and balance. solve: gives the estimate of β so far (n,),
+    NaN where nothing is known of it. weighing: who weighs now.
     """
 
     def __init__(
@@ -110,20 +107,17 @@ class MomentumFit:
         model: Model,
         base: BaseParameters,
         balance: MomentumBalance,
-        readings: Callable[[Array], Array],
+        new_weighing: Callable[[], Weighing],
         solve: Callable[[], Array],
-        sources: Sequence[SourceGroup] = (),
-        clocks: Sequence[SourceGroup] = (),
     ) -> None:
         self.model = model
         self.base = base
         self._balance = balance
         self._solve = solve
-        self._new_weighing = partial(Weighing, model, base, balance, readings, sources, clocks)
-        self._weighing = self._new_weighing()
+        self._new_weighing = new_weighing
+        self.weighing = new_weighing()
         self._next: Weighing | None = None  # with new weights, that takes over when it has been told enough windows
         self._warm = 0  # windows that it has been told
-        self.weights: Array | None = None  # β (n,) behind the weights
         self.unexplained: int | None = None  # joint whose torque is least explained, where that forbids weights
         self._since = 0  # windows since they were looked at
         self._moving = 0
@@ -151,12 +145,8 @@ class MomentumFit:
         self._signals = np.empty((0, len(layout.q) + self.model.n_states))
         if self._next is not None:
             # A chain that begins anew need not be warmed up.
-            self._weighing, self._next = self._next, None
-            self.weights = self._weighing.beta
-        if self.weights is not None:
-            weighing = self._weighing
-            assert weighing.sensor_noise is not None
-            weighing.begin(self.weights, weighing.sensor_noise, weighing.misfit, 0)
+            self.weighing, self._next = self._next, None
+        self.weighing.begin_segment()
 
     def push(self, windows: list[Window], instants: list[Instants], noise: SensorNoise) -> list[WhiteRows]:
         """Rows of the windows that a push completed, and of those held back before."""
@@ -178,8 +168,7 @@ class MomentumFit:
 
     def go_on(self, weights: Array, noise: SensorNoise) -> None:
         """Begin with weights β (n,) that are known."""
-        self.weights = weights
-        self._weighing.begin(weights, noise, self.plain.misfit, self._first)
+        self.weighing.begin(weights, noise, self.plain.misfit, self._first)
         self._renewal = self._count(FIRST_RENEWAL)
 
     def flush(self, noise: SensorNoise) -> list[WhiteRows]:
@@ -190,38 +179,40 @@ class MomentumFit:
         """
         self._moving = 0
         unweighted, _ = _least_squares(np.concatenate([self._dense(window)[0] for window in self._held]))
-        if not (self._explains_torques(unweighted) and self._settle(unweighted, noise, PASSES, partly=False)):
-            self.weights = None
+        weights = self._settled(unweighted, noise, PASSES, partly=False) if self._explains_torques(unweighted) else None
+        if weights is None:
+            self.weighing = self._new_weighing()
             self.plain.clear()
             self.plain.misfit = np.zeros_like(self.plain.misfit)
             return []
         if self.plain.misfit.any():
-            weights, misfit = self.weights, self.plain.misfit
-            described = self.base.values(self.model.nominal)
-            settled = self._settle(described, noise, PASSES_DESCRIBED, partly=True)
-            if not settled or self.plain.misfit.sum() >= misfit.sum():
-                self.weights, self.plain.misfit, self.unexplained = weights, misfit, None
-        self._retell(noise)
+            misfit = self.plain.misfit
+            described = self._settled(self.base.values(self.model.nominal), noise, PASSES_DESCRIBED, partly=True)
+            if described is not None and self.plain.misfit.sum() < misfit.sum():
+                weights = described
+            else:
+                self.plain.misfit, self.unexplained = misfit, None
+        self._retell(weights, noise)
         out = [self._white(window) for window in self._held]
         self._since = 0
         self._renewal = self._count(FIRST_RENEWAL)
         self._held = []
         return out
 
-    def _settle(self, start: Array, noise: SensorNoise, passes: int, partly: bool) -> bool:
-        """Fit the windows held back with the weights of β = start (n,), then of the fit before; False where one fails.
+    def _settled(self, weights: Array, noise: SensorNoise, passes: int, partly: bool) -> Array | None:
+        """Weights (n,) from fits of the windows held back, each with those of the fit before; None where one fails.
 
-        partly: weights take what the rows determine, and keep the rest.
+        weights: of the first fit. partly: they take what the rows determine, and keep the rest.
         """
-        self.weights, self.plain.misfit = start, np.zeros(self.model.layout.n_v)
+        self.plain.misfit = np.zeros(self.model.layout.n_v)
         for _ in range(passes):
-            self._retell(noise)
+            self._retell(weights, noise)
             fitted, determined = _least_squares(np.concatenate([self._white(window).Y for window in self._held]))
             if not self._explains_torques(fitted):
-                return False
+                return None
             self.plain.judge(fitted)
-            self.weights = np.where(determined, fitted, self.weights) if partly else fitted
-        return True
+            weights = np.where(determined, fitted, weights) if partly else fitted
+        return weights
 
     def _explains_torques(self, beta: Array) -> bool:
         """Whether β (n,) explains every joint's torque over the windows held back, by and large."""
@@ -232,6 +223,11 @@ class MomentumFit:
         explained = bool(np.all(left_norm <= LARGEST_UNEXPLAINED * torque))
         self.unexplained = None if explained else int(np.argmax(left_norm / np.maximum(torque, np.finfo(float).tiny)))
         return explained
+
+    @property
+    def weights(self) -> Array | None:
+        """β (n,) behind the weights, None while there are none."""
+        return self.weighing.beta
 
     @property
     def _known_weights(self) -> Array:
@@ -259,9 +255,9 @@ class MomentumFit:
         self._since = 0
         self._renewal = min(2 * self._renewal, self._count(LATEST_RENEWAL))
         self.plain.judge(beta)
-        used, misfit = self._weighing, self.plain.misfit
+        used, misfit = self.weighing, self.plain.misfit
         if np.any(np.abs(misfit - used.misfit) > SAME_MISFIT * (1.0 + used.misfit)):
-            self.weights, self._next = beta, None
+            self._next = None
             used.begin(beta, noise, misfit, window.start)
         elif self._next is None and self._matters(beta, noise):
             self._next, self._warm = self._new_weighing(), 0
@@ -269,25 +265,25 @@ class MomentumFit:
 
     def _matters(self, beta: Array, noise: SensorNoise) -> bool:
         """Whether β (n,) and the noise of now would weigh rows otherwise."""
-        used = self._weighing
+        used = self.weighing
         assert used.sensor_noise is not None
         squares = np.einsum("vii->vi", self.plain.gram)[:, :-1]
-        changed, size = (np.sqrt(squares @ values**2) for values in (beta - used.beta, beta))
+        changed, size = (np.sqrt(squares @ values**2) for values in (beta - self._known_weights, beta))
         densities = [(noise.sensors, used.sensor_noise.sensors), (noise.torque, used.sensor_noise.torque)]
         louder = any(np.any(np.abs(now - then) > SAME_NOISE * then) for now, then in densities)
         return bool(np.any(changed > SAME_ROWS * size) or louder)
 
-    def _retell(self, noise: SensorNoise) -> None:
-        """Work off the windows held back from the first one on."""
+    def _retell(self, weights: Array, noise: SensorNoise) -> None:
+        """Work off the windows held back from the first one on, with weights β (n,)."""
         self.plain.clear()
         self._bent = dict.fromkeys(HALF_WIDTHS, 0)
-        self._weighing.begin(self._known_weights, noise, self.plain.misfit, self._first)
+        self.weighing.begin(weights, noise, self.plain.misfit, self._first)
         self._tell()
 
     @property
     def probes(self) -> Probes | None:
         """At which states who weighs wants columns beside those of the rows, once weights are known."""
-        return None if self.weights is None else self._weighing.probes
+        return None if self.weights is None else self.weighing.probes
 
     def _tell(self, instants: Sequence[Instants] = ()) -> None:
         """Have the states of the instants known to who weighs; instants: those that came last."""
@@ -296,7 +292,7 @@ class MomentumFit:
 
     @property
     def _weighings(self) -> list[Weighing]:
-        return [self._weighing] if self._next is None else [self._weighing, self._next]
+        return [self.weighing] if self._next is None else [self.weighing, self._next]
 
     def _dense(self, window: Window) -> Array:
         """[Y b] (copies, n_v, n + 1)."""
@@ -333,13 +329,12 @@ class MomentumFit:
         """Rows (n_v, width) of the next window; the weighing to come is told them too, and then may take over."""
         self._last = window.start
         self._since += 1
-        weighed = self._weighing.push(window, rows, errors)
+        weighed = self.weighing.push(window, rows, errors)
         if self._next is not None:
             self._next.push(window, rows, errors)
             self._warm += 1
             if self._warm >= self._count(WARM_UP):
-                self._weighing, self._next = self._next, None
-                self.weights = self._weighing.beta
+                self.weighing, self._next = self._next, None
                 self._since = 0
         return weighed
 
@@ -356,19 +351,18 @@ class MomentumFit:
     def state(self) -> dict[str, Any]:
         """What `restore` needs to continue."""
         return {
-            "weights": np.empty(0) if self.weights is None else self.weights, "since": self._since,
-            "moving": self._moving, "first": self._first, "x": self._x, "v": self._v, "signals": self._signals,
+            "since": self._since, "moving": self._moving, "first": self._first,
+            "x": self._x, "v": self._v, "signals": self._signals,
             "bends": np.array([*self._bends.values()]), "bent": np.array([*self._bent.values()]),
             "unexplained": -1 if self.unexplained is None else self.unexplained,
             "largest": self._largest, **self.plain.state(), "renewal": self._renewal, "last": self._last,
-            "warm": -1 if self._next is None else self._warm, **self._weighing.state(),
+            "warm": -1 if self._next is None else self._warm, **self.weighing.state(),
             **windows_state("held", self._held),
             **({} if self._next is None else {f"next_{name}": value for name, value in self._next.state().items()}),
         }  # fmt: skip
 
     def restore(self, state: Mapping[str, NDArray[Any]]) -> None:
         """Continue from a saved state."""
-        self.weights = np.array(state["weights"]) if state["weights"].size else None
         self._since, self._moving, self._first = int(state["since"]), int(state["moving"]), int(state["first"])
         self._x, self._v, self._signals = (np.array(state[name]) for name in ("x", "v", "signals"))
         self._largest = np.array(state["largest"])
@@ -378,7 +372,7 @@ class MomentumFit:
         self.unexplained = None if state["unexplained"] < 0 else int(state["unexplained"])
         self._held = windows_from_state("held", state)
         self._renewal, self._last = int(state["renewal"]), int(state["last"])
-        self._weighing.restore(state)
+        self.weighing.restore(state)
         self._next = None
         if state["warm"] >= 0:
             self._next, self._warm = self._new_weighing(), int(state["warm"])

@@ -42,7 +42,8 @@ class Weighed:
 class Weighing:
     """Weighs windows with parameters β (n,), noise of the sensors, and a misfit (n_v,), see `begin`.
 
-    readings, sources, clocks: see `MomentumFit`.
+    readings: x (K, n_x) to the displacements (K, n_v, sensors) that unit noise of each position sensor makes. sources:
+    whose latencies are told. clocks: see `RowNoise`. beta: β, None before it has begun.
     """
 
     def __init__(
@@ -51,8 +52,8 @@ class Weighing:
         base: BaseParameters,
         balance: MomentumBalance,
         readings: Callable[[Array], Array],
-        sources: Sequence[SourceGroup],
-        clocks: Sequence[SourceGroup],
+        sources: Sequence[SourceGroup] = (),
+        clocks: Sequence[SourceGroup] = (),
     ) -> None:
         n_v = model.layout.n_v
         self._base = base
@@ -61,7 +62,8 @@ class Weighing:
         self._noise = RowNoise(model.layout.theta_m, balance.span, clocks)
         self._late = LatencyColumns(sources)
         self._whitener = Whitener(n_v, COPIES * (base.n + 1) + len(sources))
-        self.beta, self.misfit = np.zeros(base.n), np.zeros(n_v)
+        self.beta: Array | None = None
+        self.misfit = np.zeros(n_v)
         self.sensor_noise: SensorNoise | None = None
 
     def begin(self, beta: Array, noise: SensorNoise, misfit: Array, instant: int) -> None:
@@ -70,6 +72,10 @@ class Weighing:
         misfit (n_v,): variance of what the model lacks in each row, over that of the noise.
         """
         self.beta, self.sensor_noise, self.misfit = beta, noise, misfit
+        self.begin_segment(instant)
+
+    def begin_segment(self, instant: int = 0) -> None:
+        """The window that starts at an instant is the next, and shares no samples with those before."""
         self._sensitivities.forget(instant)
         self._noise.begin_segment()
         self._whitener.begin_segment()
@@ -86,6 +92,7 @@ class Weighing:
         """
         needed = self._sensitivities.next_instant
         fresh = needed - first
+        assert self.beta is not None
         pi = self._base.physical_values(self.beta)
         probed = next((piece.probed for piece in instants if piece.number == needed), None)
         self._sensitivities.tell(pi, x[fresh:], v[fresh:], signals[fresh:], probed)
@@ -114,13 +121,15 @@ class Weighing:
     def state(self) -> dict[str, Any]:
         """What `restore` needs to continue."""
         return {
-            "beta": self.beta, "weighed_misfit": self.misfit, **self._noise.state(), **self._whitener.state(),
+            "weights": np.empty(0) if self.beta is None else self.beta, "weighed_misfit": self.misfit,
+            **self._noise.state(), **self._whitener.state(),
             **self._sensitivities.state(), **noise_state("weighed", self.sensor_noise),
         }  # fmt: skip
 
     def restore(self, state: Mapping[str, NDArray[Any]]) -> None:
         """Continue from a saved state."""
-        self.beta, self.misfit = np.array(state["beta"]), np.array(state["weighed_misfit"])
+        self.beta = np.array(state["weights"]) if state["weights"].size else None
+        self.misfit = np.array(state["weighed_misfit"])
         self._sensitivities.restore(state)
         self._noise.restore(state)
         self._whitener.restore(state)
