@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from sms_online.pipeline.periods import LONGEST_HOLE, Periods
 from sms_online.stream import Array, Block
 
 Indices = NDArray[np.int64]
@@ -26,11 +27,6 @@ SIDE = 3
 # samples lost. White noise of the nodes then reaches the middle of the hole 2.8 times; beyond that the hole ends
 # the segment.
 GAP_LIMIT = 5
-# First intervals of a channel whose median is its period: four of nine may be disturbed.
-PERIOD_INTERVALS = 9
-# A channel silent for longer than this, s, has a gap whatever its period; it bounds what is held back for a silent
-# channel.
-LONGEST_HOLE = 1.0
 # Grid index of a row that lies on no grid point.
 NOWHERE = -2
 
@@ -101,21 +97,19 @@ class Synchroniser:
         count = len(channels)
         self.channels = tuple(channels)
         self.sample_rate = sample_rate
-        self.gap_limit = gap_limit
         self.counters = SyncCounters()
         self._t0 = np.nan
         self._time = np.empty(0)  # s after t0, of the rows still needed
         self._values = np.empty((0, count))
         self._last_time = np.full(count, -np.inf)  # of each channel's last sample
-        self._intervals = np.full((count, PERIOD_INTERVALS), np.nan)
-        self._period = np.full(count, np.nan)
+        self._periods = Periods(count, gap_limit)
         self._next = 0  # first grid point not yet decided
         self._delivered = -1  # last grid point delivered
 
     @property
     def periods(self) -> Array:
         """Sample period of each channel (C,), s, from its first intervals; NaN while it is not known."""
-        return self._period.copy()
+        return self._periods.known.copy()
 
     @property
     def start_time(self) -> float:
@@ -156,8 +150,7 @@ class Synchroniser:
             "time": self._time.copy(),
             "values": self._values.copy(),
             "last_time": self._last_time.copy(),
-            "intervals": self._intervals.copy(),
-            "period": self._period.copy(),
+            **self._periods.state(),
             "position": np.array([self._next, self._delivered]),
             "counters": np.array([getattr(self.counters, field.name) for field in fields(SyncCounters)]),
         }
@@ -166,8 +159,8 @@ class Synchroniser:
         """Continue from a saved state of a synchroniser with the same channels, rate and gap limit."""
         self._t0 = float(state["t0"])
         self._time, self._values = state["time"].copy(), state["values"].copy()
-        self._last_time, self._intervals = state["last_time"].copy(), state["intervals"].copy()
-        self._period = state["period"].copy()
+        self._last_time = state["last_time"].copy()
+        self._periods.restore(state)
         self._next, self._delivered = (int(k) for k in state["position"])
         self.counters = SyncCounters(*(int(count) for count in state["counters"]))
 
@@ -183,7 +176,7 @@ class Synchroniser:
             self._delivered == self._next - 1
             and tail.shape[0] == SIDE
             and self._on_consecutive_points(self._time[-SIDE:], self._next - SIDE)
-            and not np.isnan(self._period).any()
+            and not np.isnan(self._periods.known).any()
             and not np.isnan(tail).any()
             and not np.isnan(values).any()
             and self._on_consecutive_points(time, self._next)
@@ -215,7 +208,7 @@ class Synchroniser:
         twice = (~missing[: starts[0] if starts.size else None]).any(axis=0)
         if 0 < starts.size < time.size:
             twice |= np.add.reduceat(~missing, starts, axis=0, dtype=np.int64).max(axis=0) > 1
-        judged = np.flatnonzero(twice | np.isnan(self._period))
+        judged = np.flatnonzero(twice | np.isnan(self._periods.known))
         if judged.size:
             values = values.copy()
             for channel in judged.tolist():
@@ -224,36 +217,17 @@ class Synchroniser:
                 duplicate = interval <= self._tolerance
                 self.counters.duplicates += int(np.count_nonzero(duplicate))
                 values[rows[duplicate], channel] = np.nan
-                self._learn_period(channel, interval[~duplicate & np.isfinite(interval)])
+                self._periods.learn(channel, interval[~duplicate & np.isfinite(interval)])
         sampled = ~missing.all(axis=0)
         last_row = time.size - 1 - np.argmin(missing[::-1], axis=0)
         self._last_time[sampled] = time[last_row[sampled]]
         return values
 
-    def _learn_period(self, channel: int, intervals: Array) -> None:
-        """Take a channel's next intervals until nine are known, or a hole ends those that are."""
-        known = self._intervals[channel]
-        for interval in intervals:
-            if not np.isnan(self._period[channel]):
-                return
-            count = np.count_nonzero(~np.isnan(known))
-            if interval > LONGEST_HOLE:
-                self._settle_period(channel)
-            else:
-                known[count] = interval
-                if count + 1 == PERIOD_INTERVALS:
-                    self._settle_period(channel)
-
-    def _settle_period(self, channel: int) -> None:
-        known = self._intervals[channel]
-        if not np.isnan(known[0]):
-            self._period[channel] = np.nanmedian(known)
-
     def _advance(self, final: bool) -> list[GridSamples]:
         """Decide grid points as far as the samples allow; deliver those that every channel has."""
         silent = self._time[-1] - self._last_time > LONGEST_HOLE
-        for channel in np.flatnonzero(np.isnan(self._period) & (silent | final)).tolist():
-            self._settle_period(channel)
+        for channel in np.flatnonzero(np.isnan(self._periods.known) & (silent | final)).tolist():
+            self._periods.settle(channel)
         k = self._candidates()
         decided = np.ones(k.size, dtype=bool)
         complete = np.ones(k.size, dtype=bool)
@@ -289,7 +263,7 @@ class Synchroniser:
         bits = np.packbits(present, axis=0)
         members: dict[tuple[bytes, bytes], list[int]] = {}
         for column in range(len(self.channels)):
-            members.setdefault((bits[:, column].tobytes(), self._period[column].tobytes()), []).append(column)
+            members.setdefault((bits[:, column].tobytes(), self._periods.known[column].tobytes()), []).append(column)
         return [(np.array(columns), np.flatnonzero(present[:, columns[0]])) for columns in members.values()]
 
     def _judge(
@@ -312,26 +286,20 @@ class Synchroniser:
 
         # Six samples without a gap between them, as far as they have arrived.
         begin, arrived = last >= SIDE - 1, last < ts.size - SIDE
-        gap = self._is_gap(ts[1:] - ts[:-1], columns[0])
+        gap = self._periods.is_gap(ts[1:] - ts[:-1], columns[0])
         broken = np.zeros_like(begin)
         if gap.any():
             gaps = np.concatenate([[0], np.cumsum(gap)])
             first, stop = np.maximum(last - (SIDE - 1), 0), np.minimum(last + SIDE, ts.size - 1)
             broken = gaps[np.maximum(stop, 0)] > gaps[np.minimum(first, ts.size - 1)]
-        stencil = begin & arrived & ~broken & ~np.isnan(self._period[columns[0]])
-        silent = final or (ts.size > 0 and bool(self._is_gap(now - ts[-1:], columns[0])[0]))
+        stencil = begin & arrived & ~broken & ~np.isnan(self._periods.known[columns[0]])
+        silent = final or (ts.size > 0 and bool(self._periods.is_gap(now - ts[-1:], columns[0])[0]))
         past = final | (now > late)
         no_stencil = (~begin & past) | broken | (~arrived & silent)
         no_run = past
         if hit.any():
             no_run = final | (now > np.where(hit, grid + (SIDE - 1) / self.sample_rate + self._tolerance, late))
         return group, passes | stencil | (no_stencil & no_run), passes | stencil
-
-    def _is_gap(self, interval: Array, channel: int) -> Mask:
-        """Intervals that are not bridged. Before the period is known only the absolute limit can tell."""
-        gap = interval > LONGEST_HOLE
-        period = self._period[channel]
-        return gap if np.isnan(period) else gap | (np.rint(interval / period) > self.gap_limit)
 
     def _fill(self, k: Indices, chosen: Indices, groups: list[_Group]) -> Array:
         """Values at the chosen candidates k: (len(k), C)."""
