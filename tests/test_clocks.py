@@ -30,9 +30,7 @@ def corrected(clock: DeviceClock, device: Array, arrival: Array) -> Array:
     return np.concatenate([*parts, clock.finish()])
 
 
-def pairs(
-    rate: float, seconds: float, drift: float, offset: float, seed: int, jitter: float = 2e-3
-) -> tuple[Array, Array, Array]:
+def pairs(rate: float, seconds: float, drift: float, offset: float, seed: int) -> tuple[Array, Array, Array]:
     """Instants, device times and arrivals of samples whose transport keeps their order."""
     random = np.random.default_rng(seed)
     t = 1.0 + np.arange(round(rate * seconds)) / rate

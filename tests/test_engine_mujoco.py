@@ -235,10 +235,6 @@ def test_noise_of_a_grade_comes_on_top() -> None:
 
 # The fit
 
-# Width, s, exponent and hop, s, of the windows of the momentum rows.
-WINDOW, EXPONENT, HOP = 0.4, 6, 0.02
-COLUMN_SAMPLES = 1000  # at once: what fits in a cache
-
 
 def test_the_estimator_finds_the_parameters_that_the_engine_was_built_with(engine_capture: Block) -> None:
     estimator = Estimator(SYSTEM, engine_capture.channels, "engine")

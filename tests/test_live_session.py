@@ -248,7 +248,7 @@ def test_a_checkpoint_is_there_while_the_session_runs_and_goes_on_to_the_same_bi
     assert standard_deviation(resumed).tobytes() == standard_deviation(bench.estimator).tobytes()
 
 
-def test_arrivals_never_go_back_behind_a_tick_that_was_worked_off(system: System, tmp_path: Path) -> None:
+def test_arrivals_never_go_back_behind_a_tick_that_was_worked_off() -> None:
     chunk = SerialChunk(0.5, b"a")
     feed = Feed(Played("encoder", [], FastClock()), None)
     assert feed.drain(1.0) == []

@@ -25,9 +25,9 @@ RATE = 1000.0
 UNSTATED = np.full(3, np.nan)
 
 
-def motion(count: int, frequency: float = 5.0, start: int = 0) -> tuple[Array, Array]:
+def motion(count: int, frequency: float = 5.0) -> tuple[Array, Array]:
     """Positions and rates (count, 3) of 0.3 rad at about one frequency, Hz."""
-    phase = 2 * np.pi * frequency * np.array([0.6, 0.8, 1.0]) * (np.arange(start, start + count) / RATE)[:, None]
+    phase = 2 * np.pi * frequency * np.array([0.6, 0.8, 1.0]) * (np.arange(count) / RATE)[:, None]
     rate = 2 * np.pi * frequency * np.array([0.6, 0.8, 1.0])
     return 0.3 * np.sin(phase + 1.0), 0.3 * rate * np.cos(phase + 1.0)
 

@@ -37,13 +37,14 @@ from sms_tools.live.simulated import SimulatedArm, write_testbed
 MOVED = AXIS + MOTION
 
 
-def on_a_bus(text: str, folder: Path, name: str = "testbed.toml") -> System:
+def on_a_bus(text: str, folder: Path) -> System:
     """A description on a bus that nobody has opened."""
-    channels = Plant(parse_system(text, name)).channels
+    file = folder / "testbed.toml"
+    channels = Plant(parse_system(text, file.name)).channels
     ports = {port: str(folder / port) for port in ("base", "markers")}
-    (folder / name).write_text(text + source_tables(channels, {"interface": "virtual", "channel": "test"}, ports))
+    file.write_text(text + source_tables(channels, {"interface": "virtual", "channel": "test"}, ports))
     (folder / DBC).write_text(dbc_text(channels))
-    return load_system(str(folder / name))
+    return load_system(str(file))
 
 
 @pytest.mark.parametrize("name", ["paper-planar", "spatial-two-link", "seven-joint", "emps"])
@@ -93,7 +94,7 @@ def test_a_reading_beyond_the_range_of_its_word_saturates(tmp_path: Path) -> Non
     assert np.nanmin(values, axis=0).tolist() == pytest.approx([-8388.608, -8.388608])
 
 
-def test_the_moving_arm_is_the_simulated_one(tmp_path: Path) -> None:
+def test_the_moving_arm_is_the_simulated_one() -> None:
     system = parse_system(MOVED, "moved.toml")
     moving = list(MovingArm(system, 1.0, "A", seed=3))
     exact = list(sampled_blocks(simulate(system, 1.0), "A", seed=3))
@@ -232,7 +233,7 @@ def test_live_needs_sources(tmp_path: Path, capsys: pytest.CaptureFixture[str]) 
     assert "[[source]] for each device" in capsys.readouterr().err
 
 
-def test_frames_reach_another_node_of_the_bus(arm: tuple[SimulatedArm, Path], tmp_path: Path) -> None:
+def test_frames_reach_another_node_of_the_bus(arm: tuple[SimulatedArm, Path]) -> None:
     moving, file = arm
     source = load_system(str(file)).sources[0]
     assert isinstance(source, CanSource)

@@ -50,10 +50,10 @@ class MadeUpRows:
         return np.asarray((columns / np.sqrt(1.0 + self.floor)[..., None]).reshape(WINDOWS * SPEEDS, -1))
 
 
-def _candidate(name: str, column: Array, where: str = "joint_1") -> Candidate:
+def _candidate(name: str, column: Array) -> Candidate:
     columns = np.zeros((WINDOWS, SPEEDS, 1))
     columns[:, 0, 0] = column
-    return Candidate(Effect(name=name, where=where), (Parameter(name, "", "N m", 0.0),), columns)
+    return Candidate(Effect(name=name, where="joint_1"), (Parameter(name, "", "N m", 0.0),), columns)
 
 
 def _found(candidates: list[Candidate], force: Array, seed: int) -> list[str]:
