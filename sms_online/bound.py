@@ -14,14 +14,13 @@ innovations and ch. 12 for the square-root array form used here.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from sms_online.errors import InputError
-from sms_online.linearised import linearise
+from sms_online.linearised import Motion, linearise
 from sms_online.model.base_parameters import BaseParameters
 from sms_online.model.dynamics import Dynamics
 from sms_online.model.model import Model
@@ -53,20 +52,6 @@ TAYLOR_ORDER = 10
 RANK_TOLERANCE = 1e-8
 # Share of a parameter in an undetermined direction above which it is itself undetermined.
 UNDETERMINED_SHARE = 1e-6
-
-
-@dataclass(frozen=True)
-class Motion:
-    """A motion at a uniform step: t (B,) s, x (B, n_x), v (B, n_v) in the order of the model's layout."""
-
-    t: Array
-    x: Array
-    v: Array
-
-    @property
-    def step(self) -> float:
-        """Time from one instant to the next, s."""
-        return float((self.t[-1] - self.t[0]) / (self.t.size - 1))
 
 
 class MotionRecord:

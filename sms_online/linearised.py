@@ -27,6 +27,20 @@ DIFFERENCE = 1e-5
 
 
 @dataclass(frozen=True)
+class Motion:
+    """A motion at a uniform step: t (B,) s, x (B, n_x), v (B, n_v) in the order of the model's layout."""
+
+    t: Array
+    x: Array
+    v: Array
+
+    @property
+    def step(self) -> float:
+        """Time from one instant to the next, s."""
+        return float((self.t[-1] - self.t[0]) / (self.t.size - 1))
+
+
+@dataclass(frozen=True)
 class LinearSystem:
     """The linearised system at B instants, m = 2 n_v states.
 

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from sms_online.bound import DERIVATIVES_INTERVAL, Motion, cramer_rao_bound, discretise
+from sms_online.bound import DERIVATIVES_INTERVAL, cramer_rao_bound, discretise
 from sms_online.description.parse import parse_system, shipped_text
 from sms_online.errors import InputError
-from sms_online.linearised import linearise
+from sms_online.linearised import Motion, linearise
 from sms_online.model.base_parameters import BaseParameters, find_base_parameters, random_states
 from sms_online.model.model import Model
 from sms_online.model.so3 import from_euler_parameters, logarithm

@@ -7,7 +7,8 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
 from sms_adapters.system_file import load_system
-from sms_online.bound import STEP, Motion, MotionRecord, cramer_rao_bound, session_bound
+from sms_online.bound import STEP, MotionRecord, cramer_rao_bound, session_bound
+from sms_online.linearised import Motion
 from sms_online.pipeline.estimator import Estimator
 from sms_online.results import results_document
 from sms_online.sensor_set import sensor_set

@@ -12,13 +12,14 @@ from numpy.testing import assert_allclose
 from scipy.integrate import solve_ivp
 
 from sms_adapters.truth import read_truth
-from sms_online.bound import Motion, cramer_rao_bound
+from sms_online.bound import cramer_rao_bound
 from sms_online.description.parse import parse_system, shipped_text
 from sms_online.description.schema import System
 from sms_online.effects.base import report
 from sms_online.effects.catalogue import channel_effects, parse_effect
 from sms_online.effects.channel import EncoderEccentricity, SensorLag
 from sms_online.errors import InputError
+from sms_online.linearised import Motion
 from sms_online.model.base_parameters import find_base_parameters
 from sms_online.model.model import Model
 from sms_online.pipeline.conditioning import Conditioning

@@ -14,9 +14,10 @@ from one_link import TEXT, one_link
 
 from sms_adapters import checkpoint
 from sms_adapters.capture import CaptureWriter
-from sms_online.bound import STEP, Motion, MotionRecord, cramer_rao_bound, session_bound
+from sms_online.bound import STEP, MotionRecord, cramer_rao_bound, session_bound
 from sms_online.description.parse import describe
 from sms_online.description.schema import Sensor, System
+from sms_online.linearised import Motion
 from sms_online.pipeline.estimator import Estimator
 from sms_online.results import results_document, standard_deviation
 from sms_online.sensor_set import sensor_set

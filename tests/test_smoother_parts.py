@@ -10,10 +10,11 @@ from one_link import one_link
 from sms_online.description.channels import channels
 from sms_online.description.parse import parse_system, shipped_text
 from sms_online.errors import InputError
+from sms_online.linearised import Motion
 from sms_online.model.model import Model
 from sms_online.model.static_shape import SensedShape
 from sms_online.pipeline.sensing import Sensing
-from sms_online.smoother.collocation import Trajectory, Transitions, defects
+from sms_online.smoother.collocation import Transitions, defects
 from sms_online.smoother.filter import FixedIntervalSmoother
 from sms_online.stream import Array
 from sms_sim.simulate import Simulation, exact_states, simulate
@@ -90,7 +91,7 @@ def test_an_exact_motion_meets_the_collocation_to_its_order(simulation: Simulati
         pair = (fine[1] - fine[0]) / 3.0 * (torque[:-2:2] + 4.0 * torque[1:-1:2] + torque[2::2])
         impulse = np.concatenate((np.zeros((1, 1)), np.cumsum(pair, axis=0)))[::2]
         force = plant.model.generalized_force
-        lacking = defects(plant.dynamics, Trajectory(t, exact.x, exact.v), force(impulse[::2]), force(impulse[1::2]))
+        lacking = defects(plant.dynamics, Motion(t, exact.x, exact.v), force(impulse[::2]), force(impulse[1::2]))
         return float(np.abs(lacking[:, plant.model.layout.n_v :]).max())
 
     ratio = largest(0.01) / largest(0.005)

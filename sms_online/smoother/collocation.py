@@ -16,26 +16,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sms_online.linearised import LinearSystem
+from sms_online.linearised import LinearSystem, Motion
 from sms_online.model.dynamics import Dynamics
 from sms_online.stream import Array
 
 # States worked off together: enough to hide the cost of a call, little memory.
 STATES_PER_CALL = 512
-
-
-@dataclass(frozen=True)
-class Trajectory:
-    """A motion at evenly spaced nodes: t (K + 1,) s, x (K + 1, n_x), v (K + 1, n_v); ẋ = v."""
-
-    t: Array
-    x: Array
-    v: Array
-
-    @property
-    def step(self) -> float:
-        """Time from one node to the next, s."""
-        return float((self.t[-1] - self.t[0]) / (self.t.size - 1))
 
 
 @dataclass(frozen=True)
@@ -58,12 +44,12 @@ def momenta_and_forces(dynamics: Dynamics, x: Array, v: Array) -> tuple[Array, A
     return np.concatenate([p for p, _ in parts]), np.concatenate([g for _, g in parts])
 
 
-def defects(dynamics: Dynamics, trajectory: Trajectory, impulse: Array, impulse_m: Array) -> Array:
-    """What the steps of a motion lack, (K, 2 n_v): h/6 (f_k + 4 f_m + f_{k+1}) - (s_{k+1} - s_k).
+def defects(dynamics: Dynamics, motion: Motion, impulse: Array, impulse_m: Array) -> Array:
+    """What the K steps of a motion lack, (K, 2 n_v): h/6 (f_k + 4 f_m + f_{k+1}) - (s_{k+1} - s_k).
 
     impulse (K + 1, n_v), impulse_m (K, n_v): of the motors, at the nodes and at the midpoints.
     """
-    h, x, v = trajectory.step, trajectory.x, trajectory.v
+    h, x, v = motion.step, motion.x, motion.v
     p, g = momenta_and_forces(dynamics, x, v)
     p = p - impulse
     x_m = 0.5 * (x[1:] + x[:-1]) + h / 8.0 * (v[:-1] - v[1:])

@@ -15,13 +15,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sms_online.linearised import linearise
+from sms_online.linearised import Motion, linearise
 from sms_online.model.base_parameters import BaseParameters
 from sms_online.model.dynamics import Dynamics
 from sms_online.model.model import Model
 from sms_online.physical import PhysicalSet
 from sms_online.sensor_set import Readings
-from sms_online.smoother.collocation import Trajectory, defects, momenta_and_forces, transitions
+from sms_online.smoother.collocation import defects, momenta_and_forces, transitions
 from sms_online.smoother.filter import FixedIntervalSmoother
 from sms_online.smoother.span import Innovations, Span, interpolated
 from sms_online.stream import Array
@@ -138,15 +138,15 @@ class _Search:
         self.std = np.full(beta.size, np.inf)
         self.mean_square = np.inf
         t = span.nodes(ROUGH_STEP)
-        self.trajectory = Trajectory(t, *span.guess(t))
-        _, force = momenta_and_forces(smoother.dynamics(beta), self.trajectory.x, self.trajectory.v)
-        self._usual_force, self._usual_speed = _usual(force), _usual(self.trajectory.v)
+        self.motion = Motion(t, *span.guess(t))
+        _, force = momenta_and_forces(smoother.dynamics(beta), self.motion.x, self.motion.v)
+        self._usual_force, self._usual_speed = _usual(force), _usual(self.motion.v)
         if not self._has_mass(beta):
             raise DivergedError("the first fit's mass matrix is not positive definite")
         self._use_nodes()
 
     def _use_nodes(self) -> None:
-        t = self.trajectory.t
+        t = self.motion.t
         self._innovations = Innovations(self._span, t, self._smoother._readings, self._smoother._sigma)
         impulse = self._span.impulse
         of_motors = self._model.generalized_force
@@ -156,24 +156,24 @@ class _Search:
     def refine(self, step: float) -> None:
         """Put the motion on nodes at no more than `step`, s."""
         t = self._span.nodes(step)
-        old = self.trajectory
+        old = self.motion
         if t.size == old.t.size:
             return
-        self.trajectory = Trajectory(t, interpolated(old.t, old.x, t), interpolated(old.t, old.v, t))
+        self.motion = Motion(t, interpolated(old.t, old.x, t), interpolated(old.t, old.v, t))
         self._use_nodes()
 
     def tightened(self, steps: tuple[float, ...]) -> SpanFit:
         """The fit with equations that hold, or that hold as well as the samples allow."""
         for k, step in enumerate(steps):
             self.refine(step)
-            before = self.beta, self.trajectory
+            before = self.beta, self.motion
             if not self.settled(0.0):
                 break
             if k and np.all(np.abs(self.beta - before[0]) <= REFINED * self.std):
                 break
         for level in (0.0, *ALLOWED):
             if level:
-                self.beta, self.trajectory = before
+                self.beta, self.motion = before
                 if not self.settled(level):
                     continue
             if self.mean_square <= LARGEST_MEAN_SQUARE:
@@ -202,22 +202,22 @@ class _Search:
 
     def advance(self, level: float, tame: bool = True) -> None:
         """One step of Gauss-Newton with white forces of a level, which `tame` ones bound by what they do to speeds."""
-        trajectory, base = self.trajectory, self._base
+        motion, base = self.motion, self._base
         dynamics = self._smoother.dynamics(self.beta)
-        differences = self._innovations(trajectory.x, trajectory.v)
-        lacking = defects(dynamics, trajectory, self._impulse, self._impulse_m)
+        differences = self._innovations(motion.x, motion.v)
+        lacking = defects(dynamics, motion, self._impulse, self._impulse_m)
         kalman = FixedIntervalSmoother(self._first_state(dynamics), base.n)
-        every = max(1, round(DERIVATIVES_INTERVAL / trajectory.step))
+        every = max(1, round(DERIVATIVES_INTERVAL / motion.step))
         nodes = every * max(1, 512 // every)
         drive, joints = self._drive(dynamics, level, tame), self._smoother._motors.shape[1]
         n_v = self._model.layout.n_v
         rows, speeds = [], []
-        for start in range(0, len(trajectory.t), nodes):
+        for start in range(0, len(motion.t), nodes):
             piece = slice(start, start + nodes)  # and one more, which ends the last step
             wide = slice(start, start + nodes + 1)
-            linear = linearise(dynamics, base, self._smoother._readings, trajectory.x[wide], trajectory.v[wide], every)
+            linear = linearise(dynamics, base, self._smoother._readings, motion.x[wide], motion.v[wide], every)
             weights = self._innovations.weights[piece, :, None]
-            steps = transitions(linear, trajectory.step, drive, joints, lacking[piece])
+            steps = transitions(linear, motion.step, drive, joints, lacking[piece])
             count = len(weights)
             speeds.append((linear.A[:count, :n_v], linear.E[:count, :n_v, joints:]))
             rows.append(kalman.push(differences[piece], weights * linear.C[:count], weights * linear.D[:count], steps))
@@ -236,8 +236,8 @@ class _Search:
             by_s @ s[k : k + len(by_s), :, None] + by_beta @ delta[:, None]
             for k, (by_s, by_beta) in zip(range(0, len(s), nodes), speeds, strict=True)
         ]
-        v = trajectory.v + np.concatenate(moved)[..., 0]
-        self.trajectory = Trajectory(trajectory.t, trajectory.x + s[:, :n_v], v)
+        v = motion.v + np.concatenate(moved)[..., 0]
+        self.motion = Motion(motion.t, motion.x + s[:, :n_v], v)
         self.beta = beta
         self.iterations += 1
 
@@ -245,7 +245,7 @@ class _Search:
         """Root of the covariance that leaves the first state free to move, (2 n_v, 2 n_v)."""
         n_v = self._model.layout.n_v
         root = np.diag(np.concatenate((np.full(n_v, FREE_POSITION), self._usual_speed)))
-        root[n_v:, n_v:] @= dynamics.mass_matrix(self.trajectory.x[:1])[0]
+        root[n_v:, n_v:] @= dynamics.mass_matrix(self.motion.x[:1])[0]
         return root
 
     def _drive(self, dynamics: Dynamics, level: float, tame: bool) -> Array:
@@ -254,7 +254,7 @@ class _Search:
         if level:
             forces = self._tame_forces(dynamics) if tame else np.diag(self._usual_force)
             noise = np.concatenate((noise, level * np.sqrt(CORRELATION) * forces), axis=1)
-        return np.concatenate((np.zeros_like(noise), np.sqrt(self.trajectory.step) * noise))
+        return np.concatenate((np.zeros_like(noise), np.sqrt(self.motion.step) * noise))
 
     def _tame_forces(self, dynamics: Dynamics) -> Array:
         """Root (n_v, n_v) of the covariance of forces that are as usual and change speeds by no more than is usual."""
@@ -293,7 +293,7 @@ class _Search:
 
     def _sparse_motion(self) -> Array:
         """Positions (B, n_x) every now and then."""
-        return self.trajectory.x[:: max(1, round(MASS_INTERVAL / self.trajectory.step))]
+        return self.motion.x[:: max(1, round(MASS_INTERVAL / self.motion.step))]
 
 
 def _usual(samples: Array) -> Array:

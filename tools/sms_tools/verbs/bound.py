@@ -11,10 +11,11 @@ import numpy as np
 from rich.table import Table
 
 from sms_adapters.sources import open_source
-from sms_online.bound import STEP, Motion, MotionRecord, cramer_rao_bound, session_bound
+from sms_online.bound import STEP, MotionRecord, cramer_rao_bound, session_bound
 from sms_online.description.channels import sensed_channels
 from sms_online.description.schema import System
 from sms_online.errors import InputError
+from sms_online.linearised import Motion
 from sms_online.model.base_parameters import find_base_parameters
 from sms_online.model.parameters import Parameter
 from sms_online.sensor_set import SensorSet, readable_channels, sensor_set
