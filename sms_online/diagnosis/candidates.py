@@ -12,7 +12,8 @@ import numpy as np
 from sms_online.description.schema import Effect, System
 from sms_online.diagnosis.constants import is_constant
 from sms_online.diagnosis.rows import SessionRows
-from sms_online.diagnosis.trace import Candidate
+from sms_online.diagnosis.standstill import Standstill
+from sms_online.diagnosis.trace import DRY, Candidate
 from sms_online.diagnosis.weak_windows import Motion, WeakWindows
 from sms_online.effects.base import Inputs, Ranges
 from sms_online.effects.catalogue import ENTRIES, candidates
@@ -40,7 +41,7 @@ class CandidateColumns:
         """weak: windows that columns are wanted in, in place of the rows'."""
         self.rows, self.system = rows, system
         self._weak = rows.weak if weak is None else weak
-        self._noisy: list[CandidateColumns] | None = None
+        self._noisy: list[WeakWindows] | None = None
         self._own = {p.name for p in rows.model.parameters}
 
     def within(self, weak: WeakWindows) -> CandidateColumns:
@@ -111,11 +112,12 @@ class CandidateColumns:
 
     def of(self, effect: Effect) -> Candidate:
         """The candidate of one declaration."""
-        declared = self.system.model_copy(update={"effects": (*self.system.effects, effect)})
         if ENTRIES[effect.name].kind == "channel":
             return self._channel(effect)
         # What becomes a constant is linear only beside parameters that are known.
-        model = Model(declared, self.rows.base.physical_values(self.rows.beta) if is_constant(effect) else None)
+        model = Model(
+            self._declaring(effect), self.rows.base.physical_values(self.rows.beta) if is_constant(effect) else None
+        )
         added = [k for k, p in enumerate(model.parameters) if p.name not in self._own]
         parameters = tuple(model.parameters[k] for k in added)
         if ENTRIES[effect.name].kind == "inertia":
@@ -125,31 +127,52 @@ class CandidateColumns:
                 return P[..., added], G[..., added]
 
             return Candidate(effect, parameters, self._weak.columns(inertia))
+        return Candidate(effect, parameters, self._force(model))
+
+    def _force(self, model: Model, held: Standstill | None = None) -> Array:
+        """Columns (W, n_v, c) of a model's last effect; held: breaking loose, and only where its axis stands still."""
         force = model.effects[-1]
 
         def columns(motion: Motion) -> tuple[Array | None, Array]:
             inputs = self._inputs(model, motion)
             inputs = replace(inputs, states=inputs.states[:, model.state_slices[-1]])
-            P = force.momentum(model.layout, motion.x, motion.v, inputs)
-            return P, force.force(model.layout, motion.x, motion.v, inputs)
+            if held is None:
+                P = force.momentum(model.layout, motion.x, motion.v, inputs)
+                return P, force.force(model.layout, motion.x, motion.v, inputs)
+            v = motion.v.copy()
+            v[:, held.motor] = held.slow
+            G = force.force(model.layout, motion.x, v, inputs)
+            return None, np.where(held.at(motion)[:, None, None], G, 0.0)
 
-        return Candidate(effect, parameters, self._weak.columns(columns, dense=True))
+        return self._weak.columns(columns, dense=True)
 
     def variance(self, candidate: Candidate, coefficients: Array) -> Array:
         """Variance (W, n_v) of the rows for what the sensors' noise makes of a force with coefficients (c,).
 
         Two samples of it in every window, averaged over the windows that a window overlaps: the noise of a force that
-        jumps with the sign of a rate is that of its reversals, and no derivative tells it.
+        jumps with the sign of a rate is that of its reversals, and no derivative tells it. Where its axis stands still
+        dry friction takes any value up to that of its law.
         """
         if ENTRIES[candidate.effect.name].kind != "force" or is_constant(candidate.effect) or self.rows.noise.exact:
             return np.zeros_like(self.rows.b)
         if self._noisy is None:
-            self._noisy = [self.within(weak) for weak in self.rows.noisy()]
-        changes = [(noisy.of(candidate.effect).columns - candidate.columns) @ coefficients for noisy in self._noisy]
+            self._noisy = self.rows.noisy()
+        noisy = [self.within(weak).of(candidate.effect).columns for weak in self._noisy]
+        changes = [(columns - candidate.columns) @ coefficients for columns in noisy]
         squares = np.mean(np.square(changes), axis=0)
         near = np.ones(2 * HOPS - 1)
         count = np.convolve(np.ones(len(squares)), near, mode="same")
-        return np.stack([np.convolve(column, near, mode="same") / count for column in squares.T], axis=1)
+        out = np.stack([np.convolve(column, near, mode="same") / count for column in squares.T], axis=1)
+        if candidate.effect.name in DRY:
+            model = Model(self._declaring(candidate.effect))
+            joint = int(candidate.effect.where.removeprefix("joint_")) - 1
+            held = Standstill(self.rows, self._noisy[0], model.layout.theta_m[joint])
+            out += np.square(self._force(model, held) @ coefficients)
+        return out
+
+    def _declaring(self, effect: Effect) -> System:
+        """The system with one more effect."""
+        return self.system.model_copy(update={"effects": (*self.system.effects, effect)})
 
     def _channel(self, effect: Effect) -> Candidate:
         """What is added to readings, times the rows' response to it; in other windows than the rows' there is none.

@@ -24,6 +24,8 @@ from sms_online.stream import Array, Block
 CORRECTIONS = 3
 # Part of a session that tells which kinematics of links are nearer, and improves channels' constants, s.
 SOME = 8.0
+# Exact links have to take this share of what straight ones leave beyond noise.
+STIFFENING_TAKES = 0.1
 # No right effect leaves a row type more than this multiple of its noise, unless that is a small share of what it took.
 MOST_LEFT = 2.0
 
@@ -92,14 +94,16 @@ def _stiffened(case: Case, attempt: Attempt, beta: Array, chosen: Sequence[int])
     if not links:
         return None
 
+    # What was found may be there beside it, or may only have stood for it.
+    effects = [attempt.tracing.candidates[k].effect for k in chosen]
+
     def excess(links: Sequence[str]) -> float:
         try:
-            return Attempt(case, _exact(attempt.system, links), (), beta, (), SOME).excess(())
+            some = Attempt(case, _exact(attempt.system, links), (), beta, effects, SOME)
         except np.linalg.LinAlgError:
             return np.inf  # the readings are those of links that are straight
+        return some.excess(range(len(effects)))
 
-    first = [attempt.tracing.candidates[k].effect for k in chosen[:1]]
-    linear = Attempt(case, attempt.system, (), beta, first, SOME).excess(range(len(first)))
     least = excess(links)
     while len(links) > 1:
         fewer = {where: excess([other for other in links if other != where]) for where in links}
@@ -107,7 +111,8 @@ def _stiffened(case: Case, attempt: Attempt, beta: Array, chosen: Sequence[int])
         if fewer[dropped] > least + DECISIVE:
             break
         links, least = [where for where in links if where != dropped], fewer[dropped]
-    return Attempt(case, _exact(attempt.system, links), (), beta) if least < linear else None
+    explained = least < (1.0 - STIFFENING_TAKES) * excess([])
+    return Attempt(case, _exact(attempt.system, links), (), beta) if explained else None
 
 
 def diagnose(

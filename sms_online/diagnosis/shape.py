@@ -11,8 +11,9 @@ from sms_online.diagnosis.candidates import CandidateColumns
 from sms_online.diagnosis.trace import Candidate, Tracing
 from sms_online.effects.catalogue import ENTRIES
 
-# Relative accuracy of a shape constant, and evaluations at most.
-TOLERANCE = 1e-3
+# Relative accuracy of a shape constant, at which a mass that rings at 3 Hz is off by 0.01 rad after a minute, and
+# evaluations at most.
+TOLERANCE = 1e-5
 EVALUATIONS = 25
 # Constants that count something (of a cogging's period, say) are not refined.
 COUNTED = ("order",)

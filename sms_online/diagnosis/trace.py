@@ -278,6 +278,8 @@ class Tracing:
                 refused.add(self.candidates[best].key)
                 continue
             refine([*chosen, best], best)
+            # Its own noise may be what others were taken for, at a standstill say.
+            self.settle([*chosen, best])
             self._take([*chosen, best])
             chosen = self._revised([*chosen, best], refused)
             if frozenset(chosen) in seen:
@@ -312,8 +314,10 @@ class Tracing:
     def _revised(self, chosen: list[int], refused: set[str]) -> list[int]:
         """The same effects without those that the last one has made superfluous, each in its best form beside them.
 
-        What takes an effect's place has to lower the residual of held-out rows, as every effect has.
+        What takes an effect's place has to lower the residual of held-out rows, as every effect has. The last one stays
+        though its own noise, which the rows bear by now, may leave little of its gain: that of an axis that stuck.
         """
+        last = chosen[-1]
         for k in list(chosen):
             others = [other for other in chosen if other != k]
             gains = self.gains(others)
@@ -321,7 +325,7 @@ class Tracing:
             simple = [j for j in self._eligible(others, refused) if j == k or self.candidates[j].extends is None]
             best = self._preferred(gains, [*simple, k] if k not in simple else simple)
             if best is None or self._excess(k, gains[k]) <= 0.0:
-                chosen = others
+                chosen = chosen if k == last else others
             elif (
                 best != k
                 and not self._near(gains[k].gain, gains[best].gain)
@@ -348,6 +352,7 @@ class Tracing:
         own = gains[k]
         taken = {self.candidates[other].key for other in chosen}
         found = self.candidates[k]
+        limit = threshold(FALSE_ALARM, self.trials, self._Z[k].shape[1])
         ambiguous = dict.fromkeys(
             candidate.key
             for j, candidate in enumerate(self.candidates)
@@ -356,8 +361,8 @@ class Tracing:
             and candidate.extends != found.key
             and gains[j].seen
             and self._near(gains[j].gain, own.gain)
+            and own.gain > limit
         )
-        limit = threshold(FALSE_ALARM, self.trials, self._Z[k].shape[1])
         return Finding(self.candidates[k], own, limit, improvement, tuple(ambiguous))
 
     def ranking(self) -> list[Ranked]:

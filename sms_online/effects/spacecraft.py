@@ -143,9 +143,19 @@ class CableSpring(Force):
         return f
 
 
-# Of the liquid in small tanks, rad/s: a tenth of a hertz to three.
-SLOSH_FREQUENCIES = tuple(float(2.0 * np.pi * hertz) for hertz in (0.1, 0.2, 0.3, 0.5, 0.8, 1.2, 2.0, 3.0))
-SLOSH_DEFAULT = SLOSH_FREQUENCIES[3]
+# Frequencies of the liquid in small tanks, rad/s: a tenth of a hertz to three, by default half a hertz.
+SLOSH_LOWEST, SLOSH_HIGHEST = 2.0 * np.pi * 0.1, 2.0 * np.pi * 3.0
+SLOSH_DEFAULT = 2.0 * np.pi * 0.5
+# An undamped mass rings on, so in T seconds a frequency is told from another that is 2 π / T away. Those tried are this
+# share of it apart, or in a long session so many.
+SLOSH_APART, SLOSH_MOST = 0.75, 96
+
+
+def _slosh_frequencies(ranges: Ranges) -> tuple[float, ...]:
+    """Frequencies to try in a session, rad/s."""
+    apart = SLOSH_APART * 2.0 * np.pi / ranges.duration
+    count = min(max(round((SLOSH_HIGHEST - SLOSH_LOWEST) / apart), 2), SLOSH_MOST)
+    return tuple(np.linspace(SLOSH_LOWEST, SLOSH_HIGHEST, count).tolist())
 
 
 class Slosh(Force):
@@ -160,7 +170,7 @@ class Slosh(Force):
     entry = Entry(
         "slosh", "force", "base", {"mass": "kg", "stiffness": "N/m"},
         "motion of the base below and above the liquid's frequency",
-        {"frequency": Shape("rad/s", SLOSH_DEFAULT, lambda ranges: SLOSH_FREQUENCIES)},
+        {"frequency": Shape("rad/s", SLOSH_DEFAULT, _slosh_frequencies)},
     )  # fmt: skip
 
     def __init__(self, site: Site, given: Mapping[str, float]) -> None:

@@ -62,6 +62,7 @@ class ExactRod:
                 self.stiffness[RIGIDITY[field]] = (chi * self.weights[:, None]).T @ chi
         # With one active field rotations commute and R is the exponential of the integrated strain.
         self._commuting = len(set(self._axis)) == 1
+        self._turn = so3.turn_basis(np.eye(3)[self._axis[0]])
         self._fields = np.zeros((self.n_f, 3, self._G))  # strain at the Gauss points per coordinate
         self._fields[np.arange(self.n_f), self._axis] = self._chi.T
         zero = np.zeros((1, self.n_f))
@@ -69,10 +70,11 @@ class ExactRod:
 
     def _rotations(self, q_f: Array) -> Array:
         """R (B, stations, 3, 3) of the sections."""
+        if self._commuting:
+            angle = q_f @ (self._integrate @ self._chi).T
+            return so3.about(self._turn, angle.ravel()).reshape(*angle.shape, 3, 3)
         kappa = np.tensordot(q_f, self._fields, axes=(1, 0)).transpose(0, 2, 1)  # (B, G, 3)
         R = so3.RotationVector(self._integrate @ kappa).matrix
-        if self._commuting:
-            return R
         K = so3.skew(kappa)
         G = self._G
         for _ in range(PICARD_ITERATIONS):

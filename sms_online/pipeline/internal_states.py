@@ -29,8 +29,9 @@ class InternalStates:
 
     def begin_segment(self) -> None:
         """Forget the motion before a gap."""
-        self._rate = np.empty(0)  # ż at the last sample
         self._z = np.empty(0)
+        self._A = np.empty((0, self.model.n_states, self.model.n_states))  # of the last sample: ż = A z + b
+        self._b = np.empty((0, self.model.n_states))
 
     def push(self, x: Array, v: Array) -> Array:
         """z (B, n_states) at consecutive samples x (B, n_x), v (B, n_v)."""
@@ -41,23 +42,26 @@ class InternalStates:
         b = self.model.state_rate(x, v, np.zeros((len(x), n)))
         units = [np.broadcast_to(unit, (len(x), n)) for unit in np.eye(n)]
         A = np.stack([self.model.state_rate(x, v, unit) - b for unit in units], axis=2)
-        implicit = np.linalg.inv(np.eye(n) - self._half * A)
-        for k in range(len(x)):
-            if self._z.size == 0:
-                self._z = self.model.initial_state(x[k])
-            else:
-                self._z = implicit[k] @ (self._z + self._half * (self._rate + b[k]))
-            self._rate = A[k] @ self._z + b[k]
-            out[k] = self._z
+        begun = 0 if self._z.size else 1
+        if begun:
+            self._z = out[0] = self.model.initial_state(x[0])
+        before, added = np.concatenate((self._A, A))[: len(x) - begun], np.concatenate((self._b, b))
+        implicit = np.linalg.inv(np.eye(n) - self._half * A[begun:])
+        step = implicit @ (np.eye(n) + self._half * before)
+        push = (implicit @ (self._half * (added[:-1] + added[1:]))[..., None])[..., 0]
+        z = self._z
+        for k in range(len(step)):
+            out[begun + k] = z = step[k] @ z + push[k]
+        self._z, self._A, self._b = z, A[-1:], b[-1:]
         return out
 
     def state(self) -> dict[str, Array]:
         """What `restore` needs to continue."""
-        return {"z": self._z, "z_rate": self._rate}
+        return {"z": self._z, "z_A": self._A, "z_b": self._b}
 
     def restore(self, state: Mapping[str, NDArray[Any]]) -> None:
         """Continue from a saved state."""
-        self._z, self._rate = np.array(state["z"]), np.array(state["z_rate"])
+        self._z, self._A, self._b = (np.array(state[name]) for name in ("z", "z_A", "z_b"))
 
 
 class FollowedStates:
