@@ -85,3 +85,26 @@ def test_what_dry_friction_is_off_its_law_by_is_no_second_effect(share: float, s
     sign, other = np.sign(np.sin(2.0 * t)), np.sqrt(2.0) * np.sin(7.3 * t)
     candidates = [_candidate("coulomb_friction", sign), _candidate("cogging", other)]
     assert _found(candidates, 150.0 * (sign + share * other), 1) == ["coulomb_friction", *second]
+
+
+def test_an_effect_whose_own_noise_hides_what_it_takes_stays_and_what_stood_for_it_goes() -> None:
+    """An axis that sticks in a tenth of the windows: there friction takes any value, and a ripple fits it better."""
+    rng = np.random.default_rng(7)
+    stuck = rng.random(WINDOWS) < 0.1
+    held = np.where(stuck, 30.0 * rng.uniform(0.5, 1.0, WINDOWS), 0.0)
+    slips = np.where(stuck, 1.0, 0.05) * np.ones(WINDOWS)
+    friction, ripple = _candidate("stribeck_friction", slips), _candidate("cogging", held + 5.0 * stuck)
+    Y = rng.standard_normal((WINDOWS, SPEEDS, 3))
+    b = Y @ np.array([1.0, -2.0, 0.5]) + rng.standard_normal((WINDOWS, SPEEDS))
+    b[:, 0] += held + np.where(stuck, 0.0, 0.05 * 25.0)
+
+    def variance(candidate: Candidate, coefficients: Array) -> Array:
+        out = np.zeros((WINDOWS, SPEEDS))
+        out[:, 0] = 0.0 if candidate is ripple else np.where(stuck, coefficients[0], 0.0) ** 2
+        return out
+
+    rows: Any = MadeUpRows(Y, b)
+    tracing = Tracing(rows, [friction, ripple], FITTED, variance=variance)
+    found = tracing.run(lambda chosen, k: None)
+    assert [taken for taken, _ in tracing.path] == [1, 0]
+    assert found == [0]
