@@ -103,7 +103,7 @@ def test_an_effect_whose_own_noise_hides_what_it_takes_stays_and_what_stood_for_
 
     def variance(candidate: Candidate, coefficients: Array) -> Array:
         out = np.zeros((WINDOWS, SPEEDS))
-        out[:, 0] = 0.0 if candidate is ripple else np.where(stuck, 3.0 * coefficients[0], 0.0) ** 2
+        out[:, 0] = 0.0 if candidate is ripple else np.where(stuck, 10.0 * coefficients[0], 0.0) ** 2
         return out
 
     rows: Any = MadeUpRows(Y, b)
