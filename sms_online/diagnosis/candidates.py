@@ -37,16 +37,19 @@ class CandidateColumns:
     Columns of those that become constants hold the parameters behind the noise of the rows, and follow them.
     """
 
-    def __init__(self, rows: SessionRows, system: System, weak: WeakWindows | None = None) -> None:
-        """weak: windows that columns are wanted in, in place of the rows'."""
+    def __init__(self, rows: SessionRows, system: System, weak: WeakWindows | None = None, since: int = 0) -> None:
+        """weak: windows that columns are wanted in, in place of the rows'. since: number of the first segment that an
+        effect may act in.
+        """
         self.rows, self.system = rows, system
+        self._since = since
         self._weak = rows.weak if weak is None else weak
         self._noisy: list[WeakWindows] | None = None
         self._own = {p.name for p in rows.model.parameters}
 
     def within(self, weak: WeakWindows) -> CandidateColumns:
         """The same for other windows of the session."""
-        return CandidateColumns(self.rows, self.system, weak)
+        return CandidateColumns(self.rows, self.system, weak, self._since)
 
     def inputs(self, motion: Motion) -> Inputs:
         """What the effects that the system declares need beside the motion."""
@@ -108,7 +111,9 @@ class CandidateColumns:
             speed = max(speed, float(np.abs(motion.v[:, theta_m]).max()))
             deflection = max(deflection, float(np.abs(motion.x[:, theta_m + offset] - motion.x[:, q + offset]).max()))
         rate = self.system.sample_rate
-        return Ranges(speed, deflection, sum(segment.index.size for segment in self.rows.segments) / rate, rate)
+        return Ranges(
+            speed, deflection, sum(segment.index.size for segment in self.rows.segments[self._since :]) / rate, rate
+        )
 
     def of(self, effect: Effect) -> Candidate:
         """The candidate of one declaration."""

@@ -115,7 +115,7 @@ class LateColumns(CandidateColumns):
     """Candidates that act from a segment on."""
 
     def __init__(self, rows: SessionRows, system: System, late: int) -> None:
-        super().__init__(rows, system)
+        super().__init__(rows, system, since=late)
         self._before = rows.weak.windows.segment < late
 
     def of(self, effect: Effect) -> Candidate:
@@ -141,7 +141,7 @@ def _search(request: Request) -> Outcome | None:
     late = rows.weak.windows.segment >= request.late
     if int(late.sum()) < LEAST_WINDOWS or rows.count * rows.model.layout.n_v < 2 * rows.base.n:
         return None
-    everything = CandidateColumns(rows, system).all()
+    everything = CandidateColumns(rows, system, since=request.late).all()
     outcome = _trace(request, rows, everything, request.late)
     for _ in range(0 if request.weighed else REWEIGHED):
         # Nothing was known of the rows' noise that was worth the name, for nothing explained the torques.
