@@ -1,6 +1,6 @@
-"""A minute live on the simulated bus, hours of the arm and a day of one axis at full speed. Run on demand.
+"""A minute live on the simulated bus, effects that begin meanwhile, hours of the arm and a day of one axis at once.
 
-pytest tests/bench/test_bench_live.py --override-ini addopts= -s
+Run on demand, the hours at full speed: pytest tests/bench/test_bench_live.py --override-ini addopts= -s
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ import resource
 import subprocess
 import sys
 import time
+import tomllib
 from collections.abc import Iterator
 from dataclasses import replace
 from itertools import pairwise
@@ -21,6 +22,7 @@ from time import perf_counter
 import numpy as np
 import pytest
 from axis import AXIS, DAMPING, INERTIA
+from changed_session import changed_session
 
 from sms_adapters.capture import CaptureWriter
 from sms_adapters.checkpoint import snapshot, write_checkpoint
@@ -31,6 +33,7 @@ from sms_adapters.recording import tick_time
 from sms_adapters.system_file import load_system
 from sms_online.description.parse import shipped_text
 from sms_online.description.schema import System
+from sms_online.effects.catalogue import parse_effect
 from sms_online.pipeline.estimator import Estimator
 from sms_online.results import standard_deviation
 from sms_online.stream import Array, Block
@@ -39,6 +42,7 @@ from sms_sim.bus_layout import messages
 from sms_sim.bus_motion import MovingArm
 from sms_sim.plant import Plant
 from sms_sim.sensors import Sensors
+from sms_sim.simulate import simulate
 from sms_tools.html_report.history import History
 from sms_tools.live.simulated import SimulatedArm, write_testbed
 
@@ -96,6 +100,43 @@ def test_a_minute_live(tmp_path: Path, seconds: float) -> None:
     gaps = [warning for warning in document["warnings"] if "gaps too long" in warning]
     # Without a gap they are those before the first and behind the last full stencil of the slowest channel.
     print(f"lost samples: {document['lost_samples']}, {gaps[0] if gaps else 'none of them inside'}")
+
+
+# When an effect begins, and how long the session lasts, s.
+BEGIN, END = 8.0, 18.0
+
+
+@pytest.mark.parametrize(
+    "text", ["coulomb_friction@joint_1:torque=2", "air_drag@base:damping=60", "cubic_stiffness@joint_1:stiffness=300"]
+)
+def test_an_effect_that_begins_live(tmp_path: Path, text: str) -> None:
+    """When it is noticed and named, by the clock of the session: what searches take counts."""
+    file, system = bench_system(tmp_path)
+    exact = changed_session(
+        simulate(system, END),
+        system.model_copy(update={"effects": (*system.effects, parse_effect(text, system))}),
+        BEGIN,
+        END,
+    )
+    sensors = Sensors(system, exact.channels, None, 1)
+    with CaptureWriter(tmp_path / "arm.csv", sensors.channels) as writer:
+        writer.write(Block(exact.t, sensors.channels, sensors.read(0, exact.values)))
+    arm = SimulatedArm(file, ["--capture", str(tmp_path / "arm.csv"), "--latency", "0.004", "--duration", str(END)])
+    command = [sys.executable, "-m", "sms_tools", "live", "--system", str(file), "--out", str(tmp_path / "run")]
+    process = subprocess.Popen([*command, "--duration", str(END + 8)], stdout=subprocess.DEVNULL)
+    time.sleep(5.0)
+    arm.start()
+    process.wait()
+    arm.stop()
+    # The session's clock runs since before the arm moved; its first frame is that of t = 0.
+    first = float((tmp_path / "run" / "can.log").read_text().partition(")")[0].removeprefix("("))
+    epoch = tomllib.loads((tmp_path / "run" / "session.toml").read_text())["epoch_us"]
+    begin = first - 1e-6 * epoch - 0.004 + BEGIN
+    document = json.loads((tmp_path / "run" / "results.json").read_text())
+    print(f"\n{text}, {document['duration_s']:.2f} of {END:g} s used")
+    for episode in document["diagnosis"]:
+        named = "not named" if episode["named"] is None else f"named after {episode['named'] - begin:.2f}"
+        print(f"noticed after {episode['noticed'] - begin:.2f}, {named} s: {episode['summary']}")
 
 
 def cpu(pid: int) -> float:
