@@ -15,7 +15,7 @@ from sms_online.pipeline.sensing import Sensing
 from sms_online.pipeline.smoothing import smooth
 from sms_online.stream import Array
 
-# States are advanced once in so many samples: at 1 kHz the trapezoidal rule is off by 5e-4 of what changes at 3 Hz.
+# States are advanced once in so many samples: at 1 kHz what changes at 3 Hz is told 80 times a period.
 STEP = 4
 # Half width of the filter of the motion behind them: passes 70 Hz at 1 kHz.
 HALF_WIDTH = 28

@@ -1,7 +1,8 @@
 """Internal states of effects (hysteresis, slosh), advanced along the smoothed motion from sample to sample.
 
-Every ż is affine in z, so the trapezoidal rule needs no iteration: at the sample interval h it is off by (ω h)² / 12 of
-what changes at the rate ω, 1e-5 for a liquid at 10 rad/s and 1 kHz.
+Every ż = A z + b is affine in z, so over a sample interval h, with A at its mean and b linear in time, z follows from
+the matrix exponential of h A, here its Padé approximant (2, 2): a liquid at ω keeps its frequency to (ω h)⁴ / 720.
+Source: Hochbruck and Ostermann, Exponential integrators, Acta Numerica 19 (2010) 209.
 """
 
 from __future__ import annotations
@@ -24,7 +25,7 @@ class InternalStates:
 
     def __init__(self, model: Model, sample_rate: float) -> None:
         self.model = model
-        self._half = 0.5 / sample_rate
+        self._h = 1.0 / sample_rate
         self.begin_segment()
 
     def begin_segment(self) -> None:
@@ -45,10 +46,13 @@ class InternalStates:
         begun = 0 if self._z.size else 1
         if begun:
             self._z = out[0] = self.model.initial_state(x[0])
-        before, added = np.concatenate((self._A, A))[: len(x) - begun], np.concatenate((self._b, b))
-        implicit = np.linalg.inv(np.eye(n) - self._half * A[begun:])
-        step = implicit @ (np.eye(n) + self._half * before)
-        push = (implicit @ (self._half * (added[:-1] + added[1:]))[..., None])[..., 0]
+        A_both, b_both = np.concatenate((self._A, A)), np.concatenate((self._b, b))
+        X = 0.5 * self._h * (A_both[:-1] + A_both[1:])
+        one, twelfth = np.eye(n), X @ X / 12.0
+        inverse = np.linalg.inv(one - 0.5 * X + twelfth)
+        step = inverse @ (one + 0.5 * X + twelfth)
+        change = (b_both[1:] - b_both[:-1])[..., None]
+        push = self._h * (inverse @ (b_both[:-1, :, None] + (0.5 * one - X / 12.0) @ change))[..., 0]
         z = self._z
         for k in range(len(step)):
             out[begun + k] = z = step[k] @ z + push[k]
