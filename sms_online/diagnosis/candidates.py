@@ -38,8 +38,8 @@ class CandidateColumns:
     """
 
     def __init__(self, rows: SessionRows, system: System, weak: WeakWindows | None = None, since: int = 0) -> None:
-        """weak: windows that columns are wanted in, in place of the rows'. since: number of the first segment that an
-        effect may act in.
+        """weak: windows that columns are wanted in, in place of the rows'. since: number of the first segment whose
+        length tells frequencies apart.
         """
         self.rows, self.system = rows, system
         self._since = since
@@ -49,7 +49,7 @@ class CandidateColumns:
 
     def within(self, weak: WeakWindows) -> CandidateColumns:
         """The same for other windows of the session."""
-        return CandidateColumns(self.rows, self.system, weak, self._since)
+        return CandidateColumns(self.rows, self.system, weak)
 
     def inputs(self, motion: Motion) -> Inputs:
         """What the effects that the system declares need beside the motion."""
@@ -111,9 +111,8 @@ class CandidateColumns:
             speed = max(speed, float(np.abs(motion.v[:, theta_m]).max()))
             deflection = max(deflection, float(np.abs(motion.x[:, theta_m + offset] - motion.x[:, q + offset]).max()))
         rate = self.system.sample_rate
-        return Ranges(
-            speed, deflection, sum(segment.index.size for segment in self.rows.segments[self._since :]) / rate, rate
-        )
+        longest = max(segment.index.size for segment in self.rows.segments[self._since :])
+        return Ranges(speed, deflection, longest / rate, rate)
 
     def of(self, effect: Effect) -> Candidate:
         """The candidate of one declaration."""
@@ -135,7 +134,7 @@ class CandidateColumns:
         return Candidate(effect, parameters, self._force(model))
 
     def _force(self, model: Model, held: Standstill | None = None) -> Array:
-        """Columns (W, n_v, c) of a model's last effect; held: breaking loose, and only where its axis stands still."""
+        """Columns (W, n_v, c) of a model's last effect; held: breaking loose where its axis stands still, alone."""
         force = model.effects[-1]
 
         def columns(motion: Motion) -> tuple[Array | None, Array]:
@@ -147,7 +146,7 @@ class CandidateColumns:
             v = motion.v.copy()
             v[:, held.motor] = held.slow
             G = force.force(model.layout, motion.x, v, inputs)
-            return None, np.where(held.at(motion)[:, None, None], G, 0.0)
+            return None, np.where(held.at(motion.segment, motion.samples)[:, None, None], G, 0.0)
 
         return self._weak.columns(columns, dense=True)
 
@@ -170,10 +169,16 @@ class CandidateColumns:
         out = np.stack([np.convolve(column, near, mode="same") / count for column in squares.T], axis=1)
         if candidate.effect.name in DRY:
             model = Model(self._declaring(candidate.effect))
-            joint = int(candidate.effect.where.removeprefix("joint_")) - 1
-            held = Standstill(self.rows, self._noisy[0], model.layout.theta_m[joint])
+            held = self._standstill(int(candidate.effect.where.removeprefix("joint_")) - 1)
             out += np.square(self._force(model, held) @ coefficients)
         return out
+
+    def _standstill(self, joint: int) -> Standstill:
+        """Of a joint's motor, by number from 0."""
+        layout = self.rows.model.layout
+        motor = layout.theta_m[joint]
+        noise = float(self.rows.noise.coordinates[motor + layout.n_base_positions - layout.n_base_speeds])
+        return Standstill(self.rows.followed, motor, noise, self.system.sample_rate)
 
     def _declaring(self, effect: Effect) -> System:
         """The system with one more effect."""

@@ -18,6 +18,7 @@ from sms_online.diagnosis.unexplained import Unexplained, describe_residual
 from sms_online.effects.catalogue import GEOMETRIC_STIFFENING, places
 from sms_online.errors import InputError
 from sms_online.pipeline.estimator import Estimator
+from sms_online.pipeline.momentum_balance import HOPS
 from sms_online.stream import Array, Block
 
 # Times that the constants of channels' effects are improved, each with samples corrected by those found before.
@@ -26,7 +27,7 @@ CORRECTIONS = 3
 SOME = 8.0
 # Exact links have to take this share of what straight ones leave beyond noise.
 STIFFENING_TAKES = 0.1
-# No right effect leaves a row type more than this multiple of its noise, unless that is a small share of what it took.
+# No right effect leaves a row type more than this multiple of its noise, unless that is a small share of all there was.
 MOST_LEFT = 2.0
 
 
@@ -84,9 +85,9 @@ def _exact(system: System, links: Sequence[str]) -> System:
 
 
 def _stiffened(case: Case, attempt: Attempt, beta: Array, chosen: Sequence[int]) -> Attempt | None:
-    """The attempt with those links exact that the samples ask for; None where it explains more as it is.
+    """The attempt with those links exact that the samples ask for; None where these take too little away.
 
-    All links together first, for one may hide what another lacks; then without those that take nothing away.
+    All links together first, for one may hide what another lacks; then without those that take no more than chance.
     """
     declared = {(effect.name, effect.where) for effect in attempt.system.effects}
     every = places(attempt.system, GEOMETRIC_STIFFENING.at)
@@ -102,17 +103,24 @@ def _stiffened(case: Case, attempt: Attempt, beta: Array, chosen: Sequence[int])
             some = Attempt(case, _exact(attempt.system, links), (), beta, effects, SOME)
         except np.linalg.LinAlgError:
             return np.inf  # the readings are those of links that are straight
-        return some.excess(range(len(effects)))
+        return some.excess(range(len(some.tracing.candidates)))
 
+    # Squares of rows that overlap count the same evidence once for each.
+    chance = DECISIVE * HOPS
     least = excess(links)
     while len(links) > 1:
         fewer = {where: excess([other for other in links if other != where]) for where in links}
         dropped = min(fewer, key=lambda where: fewer[where])
-        if fewer[dropped] > least + DECISIVE:
+        if fewer[dropped] > least + chance:
             break
         links, least = [where for where in links if where != dropped], fewer[dropped]
-    explained = least < (1.0 - STIFFENING_TAKES) * excess([])
-    return Attempt(case, _exact(attempt.system, links), (), beta) if explained else None
+    straight = excess([])
+    if straight - least <= max(chance, STIFFENING_TAKES * straight):
+        return None
+    try:
+        return Attempt(case, _exact(attempt.system, links), (), beta)
+    except np.linalg.LinAlgError:
+        return None
 
 
 def diagnose(

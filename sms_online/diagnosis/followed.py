@@ -41,6 +41,11 @@ class FollowedMotion:
             smoothed, rates = smooth(x, samples, HALF_WIDTH, sample_rate)
             self._motions.append((samples, smoothed, layout.speeds(smoothed, rates)))
 
+    def speeds(self, number: int) -> tuple[NDArray[np.int64], Array]:
+        """Samples (K,) of a segment, one in STEP of them, and the speeds (K, n_v) there."""
+        samples, _, v = self._motions[number]
+        return samples, v
+
     def states(self, model: Model, number: int, at: NDArray[np.int64] | None = None) -> Array:
         """Internal states (K, n_states) of a model at samples `at` (K,) of a segment, at all of them unless given.
 

@@ -115,7 +115,7 @@ class LateColumns(CandidateColumns):
     """Candidates that act from a segment on."""
 
     def __init__(self, rows: SessionRows, system: System, late: int) -> None:
-        super().__init__(rows, system, since=late)
+        super().__init__(rows, system)
         self._before = rows.weak.windows.segment < late
 
     def of(self, effect: Effect) -> Candidate:

@@ -5,31 +5,31 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from sms_online.diagnosis.rows import SessionRows
-from sms_online.diagnosis.weak_windows import Motion, WeakWindows
+from sms_online.diagnosis.followed import HALF_WIDTH, FollowedMotion
+from sms_online.pipeline.smoothing import kernel
 
-# An axis stands still where its rate is below this multiple of the rate's noise for so long, s: a reversal takes less,
-# and so do the filters that tell the rate.
-STILL, REVERSAL = 4.0, 0.05
+# An axis stands still where its rate is below this multiple of the rate's noise for so long, s: half a usual window. At
+# a reversal it is for less, unless the axis is turned round by less than a third of a rad/s².
+STILL, LASTING = 4.0, 0.2
 
 
 class Standstill:
-    """Where one motor stands still in a session; motor: its index in the speeds.
+    """Where one motor stands still in a session.
 
-    noisy: the rows' windows over the same session with synthetic noise of the sensors added.
+    motion: of the whole session. motor: its index in the speeds. noise: σ of its position, rad. slow: the rate below
+    which it stands still, rad/s.
     """
 
-    def __init__(self, rows: SessionRows, noisy: WeakWindows, motor: int) -> None:
-        self.motor = motor
-        pairs = zip(noisy.motions(dense=True), rows.weak.motions(dense=True), strict=True)
-        noise = np.concatenate([moved.v[:, motor] - motion.v[:, motor] for (moved, _), (motion, _) in pairs])
-        self.slow = STILL * float(np.sqrt(np.mean(np.square(noise))))  # rad/s
-        self._least = round(REVERSAL * rows.model.system.sample_rate)
+    def __init__(self, motion: FollowedMotion, motor: int, noise: float, sample_rate: float) -> None:
+        self.motor, self._motion = motor, motion
+        self.slow = STILL * noise * float(np.linalg.norm(kernel(HALF_WIDTH)[:, 1])) * sample_rate
+        self._least = LASTING * sample_rate
 
-    def at(self, motion: Motion) -> NDArray[np.bool_]:
-        """At which samples (K,) it does."""
-        edges = np.flatnonzero(np.diff(np.abs(motion.v[:, self.motor]) < self.slow, prepend=False, append=False))
-        out = np.zeros(len(motion.v), dtype=bool)
+    def at(self, number: int, samples: NDArray[np.int64]) -> NDArray[np.bool_]:
+        """At which samples (K,) of a segment it does."""
+        seen, v = self._motion.speeds(number)
+        edges = np.flatnonzero(np.diff(np.abs(v[:, self.motor]) < self.slow, prepend=False, append=False))
+        still = np.zeros(len(seen), dtype=bool)
         for begin, end in edges.reshape(-1, 2).tolist():
-            out[begin:end] = end - begin >= self._least
-        return out
+            still[begin:end] = seen[end - 1] - seen[begin] >= self._least
+        return still[np.clip(np.searchsorted(seen, samples), 0, len(seen) - 1)]

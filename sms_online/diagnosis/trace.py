@@ -282,13 +282,13 @@ class Tracing:
             self.settle([*chosen, best])
             self._take([*chosen, best])
             chosen = self._revised([*chosen, best], refused)
+            self.settle(chosen)
+            # What the laws found are uncertain by is told in the rows' new weights.
+            self._take(chosen)
             if frozenset(chosen) in seen:
                 break  # effects that replace each other in turn
             seen.add(frozenset(chosen))
             self.path.append((best, list(chosen)))
-            self.settle(chosen)
-            # What the laws found are uncertain by is told in the rows' new weights.
-            self._take(chosen)
             if self.candidates[best].constant:
                 # What it leaves while it is only approximately taken off must not be given to others.
                 break
@@ -360,8 +360,9 @@ class Tracing:
             if candidate.key not in taken | {found.extends}
             and candidate.extends != found.key
             and gains[j].seen
-            and self._near(gains[j].gain, own.gain)
+            # What its own noise hides has no rivals to compare it with.
             and own.gain > limit
+            and self._near(gains[j].gain, own.gain)
         )
         return Finding(self.candidates[k], own, limit, improvement, tuple(ambiguous))
 

@@ -78,7 +78,8 @@ class ForceEffect(Protocol):
 class Ranges:
     """How far a motion goes where an effect sits, for grids of shape constants.
 
-    speed: largest motor rate, rad/s. deflection: largest joint deflection, rad. duration: s. sample_rate: Hz.
+    speed: largest motor rate, rad/s. deflection: largest joint deflection, rad. duration: of the longest part without a
+    gap, s. sample_rate: Hz.
     """
 
     speed: float

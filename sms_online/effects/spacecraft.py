@@ -164,7 +164,8 @@ class Slosh(Force):
     c: `stiffness`, N/m; reported with `mass` m, kg. ω: shape constant `frequency`, rad/s, or √(stiffness/mass).
     Internal states p, ṗ (inertial), at first p = r_S and ṗ = 0.
     Source: Abramson, NASA SP-106 (1966), chapter 6 (equivalent mechanical models).
-    Limitations: undamped, at S, so what the start stirs up stays; r_S moves with no rotation's arm.
+    Limitations: undamped, at S, so what the start stirs up stays; r_S moves with no rotation's arm. Beyond 25 s without
+    a gap frequencies are tried so far apart that the right one may be passed over.
     """
 
     entry = Entry(

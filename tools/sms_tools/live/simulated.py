@@ -100,7 +100,9 @@ class SimulatedArm:
             return
         self._stopped = True
         failed = self._process.poll() not in (None, 0)
-        self._process.terminate()
+        if self._ended is None:
+            self._process.terminate()
+        # Where it has done all it had to, the end of its input ends it, and its ports with it.
         words = self._last_words()
         if failed:
             raise InputError("the simulated arm", "", words, "an arm that moves on its bus to the end")
