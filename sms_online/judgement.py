@@ -156,11 +156,14 @@ def judge(facts: Facts) -> Judgement:
     return Judgement("doubt", cautions) if cautions else Judgement("trust", tuple(_grounds(facts)))
 
 
-def judge_diagnosis(verdict: str, effects: Sequence[str], row: str | None, after: Judgement) -> Judgement:
+def judge_diagnosis(
+    verdict: str, effects: Sequence[str], row: str | None, after: Judgement, near: bool = False
+) -> Judgement:
     """The judgement of a diagnosed capture.
 
     verdict: `clean`, `named` or `unexplained`. effects: what was named, `name@where`. row: type of the rows that most
-    of what is not explained acts on. after: of the session with what was named.
+    of what is not explained acts on. after: of the session with what was named. near: whether effects that are named
+    in an unexplained session leave little of it.
     """
     if verdict == "clean":
         return after
@@ -168,6 +171,9 @@ def judge_diagnosis(verdict: str, effects: Sequence[str], row: str | None, after
     if verdict == "unexplained":
         where = "" if row is None else f" on {row}"
         text = f"something acts{where} that no known effect explains"
+        if near:
+            text = f"what acts{where} is near {_listed(effects)}, but is more or something else"
+            each = []
         found = [Reason(text, True, () if row is None else (row,), "unexplained"), *each]
     else:
         what, them = (effects[0], "it") if len(effects) == 1 else (f"{len(effects)} effects", "them")

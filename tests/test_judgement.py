@@ -188,6 +188,13 @@ def test_what_nothing_explains_is_marked_where_it_acts() -> None:
     assert judgement.marks == {"link_1": "unexplained"}
 
 
+def test_an_effect_that_does_not_explain_all_is_called_near() -> None:
+    judgement = judge_diagnosis("unexplained", ["cogging@joint_1"], "joint_1", TRUSTED, near=True)
+    assert judgement.grave
+    assert "is near cogging@joint_1, but is more or something else" in judgement.sentence
+    assert "lacks" not in judgement.sentence
+
+
 def session(coulomb: float, seconds: float) -> Estimator:
     block = axis_block(coulomb)
     estimator = Estimator(parse_system(AXIS, "axis.toml"), block.channels, "test")

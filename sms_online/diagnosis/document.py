@@ -90,7 +90,7 @@ def judgement(diagnosis: Diagnosis) -> Judgement:
         after = judge(Facts((sum(known), len(known)), residual=_part(diagnosis.after.fit)))
     effects = [f"{effect['name']}@{effect['where']}" for effect in _named(diagnosis)]
     row = None if diagnosis.unexplained is None else diagnosis.unexplained.row
-    return judge_diagnosis(diagnosis.verdict, effects, row, after)
+    return judge_diagnosis(diagnosis.verdict, effects, row, after, _near(diagnosis))
 
 
 def summary(diagnosis: Diagnosis) -> str:
@@ -107,7 +107,7 @@ def summary(diagnosis: Diagnosis) -> str:
     unexplained = diagnosis.unexplained
     assert unexplained is not None
     rest = f"acts on {unexplained.row} ({unexplained.speed}) and depends on {unexplained.variable}"
-    if keys and diagnosis.left <= LARGEST_SHARE_LEFT:
+    if _near(diagnosis):
         return (
             f"What the model lacks comes near {', '.join(keys)}, but is more or something else: {falls}, and most of "
             f"what is left {rest}."
@@ -116,6 +116,11 @@ def summary(diagnosis: Diagnosis) -> str:
         f" The nearest known effects ({', '.join(keys)}) leave {100.0 * diagnosis.left:.0f} % of it." if keys else ""
     )
     return f"The model lacks something that no known effect explains: most of it {rest}.{tried}"
+
+
+def _near(diagnosis: Diagnosis) -> bool:
+    """Whether the effects named leave little, though it is no noise and no error of their laws."""
+    return bool(_named(diagnosis)) and diagnosis.left <= LARGEST_SHARE_LEFT
 
 
 def _times(value: float) -> str:

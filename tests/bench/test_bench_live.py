@@ -124,16 +124,20 @@ def test_an_effect_that_begins_live(tmp_path: Path, text: str) -> None:
     arm = SimulatedArm(file, ["--capture", str(tmp_path / "arm.csv"), "--latency", "0.004", "--duration", str(END)])
     command = [sys.executable, "-m", "sms_tools", "live", "--system", str(file), "--out", str(tmp_path / "run")]
     process = subprocess.Popen([*command, "--duration", str(END + 8)], stdout=subprocess.DEVNULL)
-    time.sleep(5.0)
-    arm.start()
-    process.wait()
-    arm.stop()
+    try:
+        time.sleep(5.0)
+        arm.start()
+        assert process.wait(timeout=5 * END) == 0
+    finally:
+        process.kill()
+        arm.stop()
     # The session's clock runs since before the arm moved; its first frame is that of t = 0.
     first = float((tmp_path / "run" / "can.log").read_text().partition(")")[0].removeprefix("("))
     epoch = tomllib.loads((tmp_path / "run" / "session.toml").read_text())["epoch_us"]
     begin = first - 1e-6 * epoch - 0.004 + BEGIN
     document = json.loads((tmp_path / "run" / "results.json").read_text())
     print(f"\n{text}, {document['duration_s']:.2f} of {END:g} s used")
+    assert document["diagnosis"]
     for episode in document["diagnosis"]:
         named = "not named" if episode["named"] is None else f"named after {episode['named'] - begin:.2f}"
         print(f"noticed after {episode['noticed'] - begin:.2f}, {named} s: {episode['summary']}")

@@ -1,0 +1,28 @@
+"""Internal states of effects along a motion, against closed forms."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.testing import assert_allclose
+
+from sms_adapters.system_file import load_system
+from sms_online.effects.catalogue import parse_effect
+from sms_online.model.model import Model
+from sms_online.pipeline.internal_states import InternalStates
+
+RATE = 250.0
+
+
+def test_a_liquid_keeps_its_frequency_for_minutes() -> None:
+    """In a base that moves off at 1 m/s: p - r_S = -sin(ω t) / ω on either axis, also in pieces to the same bits."""
+    system = load_system("paper-planar")
+    effect = parse_effect("slosh@base:mass=1,stiffness=324", system)
+    model = Model(system.model_copy(update={"effects": (effect,)}))
+    t = np.arange(round(120.0 * RATE)) / RATE
+    x, v = np.zeros((t.size, model.layout.n_x)), np.zeros((t.size, model.layout.n_v))
+    x[:, :2], v[:, :2] = t[:, None], 1.0
+    z = InternalStates(model, RATE).push(x, v)
+    assert_allclose(z[:, :2] - x[:, :2], np.stack([-np.sin(18.0 * t) / 18.0] * 2, axis=1), atol=1e-4 / 18.0)
+    again = InternalStates(model, RATE)
+    pieces = [again.push(x[k : k + 701], v[k : k + 701]) for k in range(0, t.size, 701)]
+    assert np.array_equal(np.concatenate(pieces), z)
