@@ -180,8 +180,10 @@ def diagnose(
         progress("comparing exact links")
         exact = _stiffened(case, attempt, described.rows.beta, chosen)
         if exact is not None:
-            attempt = exact
-            chosen = attempt.search()
+            beside = exact.search()
+            # Links that are exact because of what another effect did would keep that one from being found.
+            if exact.excess(beside) < attempt.excess(chosen):
+                attempt, chosen = exact, beside
     findings: list[Finding] = []
     while any(attempt.tracing.candidates[k].constant for k in chosen):
         progress("improving constants")
