@@ -17,29 +17,43 @@ from sms_online.diagnosis.residuals import RowResidual
 from sms_online.diagnosis.standstill import Standstill
 
 
-def _finding(name: str) -> Any:
-    return SimpleNamespace(candidate=SimpleNamespace(effect=Effect(name=name, where="joint_1")))
+def _finding(name: str, where: str) -> Any:
+    return SimpleNamespace(candidate=SimpleNamespace(effect=Effect(name=name, where=where)))
 
 
 @pytest.mark.parametrize(
-    ("found", "left", "times_noise", "verdict"),
+    ("found", "left", "before", "after", "verdict"),
     [
-        ([], 0.0, 1.0, "clean"),
-        ([], 1.0, 4.0, "unexplained"),
-        (["cogging"], 0.0, 1.0, "named"),
-        (["cogging"], 0.2, 4.0, "unexplained"),
+        # Multiples of the noise of the rows of joint 1.
+        ([], 0.0, 1.0, 1.0, "clean"),
+        ([], 1.0, 4.0, 4.0, "unexplained"),
+        (["cogging"], 0.0, 20.0, 1.0, "named"),
+        (["cogging"], 0.2, 9.0, 4.0, "unexplained"),
         # The right effect leaves hardly more than noise; one that is near it leaves a share that noise is not.
-        (["cogging"], 0.005, 1.6, "named"),
-        (["cogging"], 0.005, 14.0, "unexplained"),
+        (["cogging"], 0.005, 20.0, 1.6, "named"),
+        (["cogging"], 0.005, 200.0, 14.0, "unexplained"),
         # No law is exact, and that of dry friction least.
-        (["cogging"], 1e-6, 14.0, "named"),
-        (["cogging"], 5e-4, 14.0, "unexplained"),
-        (["coulomb_friction"], 5e-4, 14.0, "named"),
+        (["cogging"], 1e-6, 14_000.0, 14.0, "named"),
+        (["cogging"], 5e-4, 600.0, 14.0, "unexplained"),
+        (["coulomb_friction"], 5e-4, 600.0, 14.0, "named"),
     ],
 )
-def test_the_verdict_follows_from_what_is_left(found: list[str], left: float, times_noise: float, verdict: str) -> None:
-    rows = {"joint_1": RowResidual(times_noise, 1.2), "base": RowResidual(1.0, 1.2)}
-    assert diagnose._verdict(bool(found), left, rows, [_finding(name) for name in found]) == verdict
+def test_the_verdict_follows_from_what_is_left(
+    found: list[str], left: float, before: float, after: float, verdict: str
+) -> None:
+    rows = [{"joint_1": RowResidual(times, 1.2), "base": RowResidual(1.0, 1.2)} for times in (before, after)]
+    findings = [_finding(name, "joint_1") for name in found]
+    assert diagnose._verdict(bool(found), left, rows[0], rows[1], findings) == verdict
+
+
+def test_friction_of_one_joint_excuses_nothing_at_another() -> None:
+    before, after = (
+        {f"joint_{k}": RowResidual(times, 1.2) for k, times in enumerate(each, start=1)}
+        for each in ((600.0, 600.0), (1.0, 14.0))
+    )
+    for where, verdict in (("joint_1", "unexplained"), ("joint_2", "named")):
+        findings = [_finding("coulomb_friction", where)]
+        assert diagnose._verdict(True, 5e-4, before, after, findings) == verdict
 
 
 @pytest.mark.parametrize(

@@ -27,7 +27,7 @@ CORRECTIONS = 3
 SOME = 8.0
 # Exact links have to take this share of what straight ones leave beyond noise.
 STIFFENING_TAKES = 0.1
-# No right effect leaves a row type more than this multiple of its noise, unless that is a small share of all there was.
+# No right effect leaves a row type more than this multiple of its noise, unless that is what its law is uncertain by.
 MOST_LEFT = 2.0
 
 
@@ -67,15 +67,25 @@ def _left(before: State, after: State) -> float:
     return max(0.0, after.excess) / max(before.excess, 1.0)
 
 
-def _verdict(named: bool, left: float, rows: Mapping[str, RowResidual], findings: Sequence[Finding]) -> str:
+def _verdict(
+    named: bool,
+    left: float,
+    before: Mapping[str, RowResidual],
+    after: Mapping[str, RowResidual],
+    findings: Sequence[Finding],
+) -> str:
     """What may be said where effects were named or not, and leave this share of what was beyond noise."""
-    if not any(row.beyond for row in rows.values()):
+    if not any(row.beyond for row in after.values()):
         return "named" if named else "clean"
     if not named or left > LARGEST_SHARE_LEFT:
         return "unexplained"
-    dry = any(finding.candidate.effect.name in DRY for finding in findings)
-    by_law = left <= (INEXACT_DRY if dry else INEXACT)
-    return "named" if by_law or all(row.whitened <= MOST_LEFT for row in rows.values()) else "unexplained"
+    # Friction of a joint acts on the rows of that joint.
+    dry = {finding.candidate.effect.where for finding in findings if finding.candidate.effect.name in DRY}
+    for name, row in after.items():
+        inexact = INEXACT_DRY if name in dry else INEXACT
+        if row.whitened > MOST_LEFT and row.whitened**2 > inexact * before[name].whitened ** 2:
+            return "unexplained"
+    return "named"
 
 
 def _exact(system: System, links: Sequence[str]) -> System:
@@ -209,7 +219,7 @@ def diagnose(
     named = after.system != system
     estimator_after = _session(after.system, blocks, source, prior)[0] if named else before
     left = _left(bare, after)
-    verdict = _verdict(named, left, after.test, findings)
+    verdict = _verdict(named, left, bare.test, after.test, findings)
     unexplained = None
     if verdict == "unexplained":
         unexplained = describe_residual(attempt.rows, attempt.tracing.columns(chosen), after.residual)
