@@ -48,6 +48,9 @@ def test_the_friction_of_emps_is_found_from_its_mass_alone(tmp_path: Path) -> No
     # Of the part that was fitted; the other has slower motion, and friction that depends on the place.
     assert document["after"]["fit"]["joint_1"]["relative"] < 0.031
     assert document["after"]["holdout"]["joint_1"]["relative"] < 0.035
+    # What is left is more than noise, and no torque that explains itself.
+    assert document["verdict"] == "unexplained"
+    assert "torque" not in document["unexplained"]["variable"]
     # The file with what was found is a system of its own.
     adopted = parse_system((tmp_path / "out" / "system.toml").read_text(), "system.toml")
     assert {effect.name for effect in adopted.effects} == set(found)

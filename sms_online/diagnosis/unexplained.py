@@ -45,7 +45,7 @@ def describe_residual(rows: SessionRows, columns: Array, residual: Array) -> Une
     Q = basis((columns / rows.std[..., None]).reshape(-1, columns.shape[2]))
     r = free_of(Q, residual.reshape(-1, 1))[:, 0]
     best = None
-    for name, variable in _variables(rows).items():
+    for name, variable in _variables(rows, speed).items():
         knots = _knots(rows, variable)
         if knots is None:
             continue
@@ -60,8 +60,11 @@ def describe_residual(rows: SessionRows, columns: Array, residual: Array) -> Une
     return Unexplained(row, layout.speed_names[speed], name, share, at, design(at, knots) @ found.coefficients)
 
 
-def _variables(rows: SessionRows) -> dict[str, Variable]:
-    """What a force may depend on: positions and speeds, deflections of joints and their rates, torques, time."""
+def _variables(rows: SessionRows, speed: int) -> dict[str, Variable]:
+    """What a force on a speed may depend on: positions and speeds, deflections of joints, torques, time.
+
+    Not the torque on that very speed, which explains itself, with an arm that weighs nothing.
+    """
     layout = rows.model.layout
     offset = layout.n_base_positions - layout.n_base_speeds
     out: dict[str, Variable] = {}
@@ -72,7 +75,8 @@ def _variables(rows: SessionRows) -> dict[str, Variable]:
     for i, (q, theta_m) in enumerate(zip(layout.q, layout.theta_m, strict=True)):
         if q != theta_m:
             out[f"deflection of joint_{i + 1}"] = _difference(theta_m + offset, q + offset)
-        out[f"torque of joint_{i + 1}"] = _torque(i)
+        if speed not in (q, theta_m):
+            out[f"torque of joint_{i + 1}"] = _torque(i)
     rate = rows.model.system.sample_rate
     out["time"] = lambda motion: (rows.segments[motion.segment].index[0] + motion.samples) / rate
     return out

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+import sys
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
@@ -25,6 +26,8 @@ from sms_tools.session import new_estimator
 PROGRAMS = ("sms-online", "numpy", "python-can", "pyserial", "cantools")
 # After the last sample before a resumption, s: longer than any hole that the synchroniser bridges.
 PAUSE = 2.0
+# Threads give way to each other after so long, s; by default it is 5 ms, in which a bus sends a dozen frames.
+SWITCH_INTERVAL = 1e-3
 
 
 def versions() -> dict[str, str]:
@@ -57,8 +60,9 @@ def open_testbed(
     """The session of a system, its devices not yet opened; it records into `directory`.
 
     name: of the system, as given. folder: where its file stands. resume: directory of an earlier session, from whose
-    last checkpoint this one goes on. Raises InputError for a system without sources, files that do not fit, a directory
-    that cannot be written, a checkpoint of another system.
+    last checkpoint this one goes on. Threads of this process give way to each other sooner from now on. Raises
+    InputError for a system without sources, files that do not fit, a directory that cannot be written, a checkpoint of
+    another system.
     """
     channels = merger(system, folder).channels
     estimator = new_estimator(system, channels, name)
@@ -69,6 +73,7 @@ def open_testbed(
     if resume is not None:
         shutil.copyfile(resume / CHECKPOINT, directory / RESUMED_FROM)
     interpreter = Interpreter()
+    sys.setswitchinterval(SWITCH_INTERVAL)
     feeds = [Feed(make_reader(source, clock, interpreter.await_free), recorder) for source in system.sources]
     merged = merger(system, folder, start)
     session = LiveSession(clock, feeds, merged, estimator, start, directory, recorder, status, interpreter)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import math
-import sys
 from contextlib import closing
 
 from sms_online.diagnosis.online import OnlineDiagnosis
@@ -19,9 +18,6 @@ from sms_tools.results_file import results_directory
 from sms_tools.session import conclude, described_system, document_of, write_named
 from sms_tools.showing import showing
 
-# Threads give way to each other after so long, s; by default it is 5 ms, in which a bus sends a dozen frames.
-SWITCH_INTERVAL = 1e-3
-
 
 def run(args: argparse.Namespace) -> int:
     """Read, record and estimate until interrupted; 130 then, 0 or 3 at the end of --duration."""
@@ -29,7 +25,6 @@ def run(args: argparse.Namespace) -> int:
     directory = results_directory(args.out)
     status = StatusWriter()
     session, estimator, merger = open_testbed(args.system, system, folder, directory, args.resume, status)
-    sys.setswitchinterval(SWITCH_INTERVAL)
     with Interruption() as interruption, termination_interrupts():
         with (
             showing(args, estimator, merger.channels, directory, None, live=session) as shown,
