@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import math
 from collections.abc import Callable
-from contextlib import ExitStack
+from contextlib import ExitStack, closing
 from pathlib import Path
 from statistics import median
 from tempfile import TemporaryDirectory
@@ -17,8 +17,10 @@ from rich.live import Live
 from sms_adapters.session_log import SESSION
 from sms_adapters.system_file import load_system
 from sms_adapters.truth import write_truth
+from sms_online.diagnosis.online import OnlineDiagnosis
 from sms_online.pipeline.estimator import Estimator
 from sms_tools.interruption import Interruption
+from sms_tools.live.searches import SearchProcess
 from sms_tools.live.signals import termination_interrupts
 from sms_tools.live.simulated import SimulatedArm, write_testbed
 from sms_tools.live.testbed import open_testbed
@@ -56,11 +58,16 @@ def _watch(args: argparse.Namespace, arm: SimulatedArm, file: Path, directory: P
     truth = {parameter.name: parameter.nominal for parameter in estimator.base.physical}
     write_truth(directory / SESSION, truth, {})
 
+    searches = SearchProcess(directory, adopt=False)
+    online = OnlineDiagnosis(estimator, searches, adopt=False)
+
     def document(throughput: float) -> Document:
-        return document_of(estimator, throughput, [*merger.warnings, *session.warnings], truth)
+        warnings = [*merger.warnings, *session.warnings]
+        return document_of(estimator, throughput, warnings, truth, discrepancies=online.discrepancies)
 
     console = report_console(args.json)
     with Interruption() as interruption, termination_interrupts(), ExitStack() as stack:
+        stack.enter_context(closing(searches))
         if console.is_terminal:
             live = stack.enter_context(Live(console=console, auto_refresh=False, transient=True))
             assert system.trajectory is not None  # the arm moves
@@ -68,14 +75,18 @@ def _watch(args: argparse.Namespace, arm: SimulatedArm, file: Path, directory: P
         else:
             tell = _tell(console, estimator, document)
         shown = stack.enter_context(showing(args, estimator, merger.channels, directory, truth, live=session))
+        shown.follow(online)
         for block in shown.watch(session.blocks(interruption, ended=arm.ended, ready=arm.start)):
             estimator.push(block)
             tell()
         estimator.finish()
+        online.finish()
         session.close()
         stack.close()
         result = document(estimator.samples / session.busy)
         result["warnings"] += shown.warnings
+        result["warnings"] += [] if searches.problem is None else [searches.problem]
+        result["diagnosis"] = online.document()
         code = conclude(args, result, directory, interruption.requested)
         shown.report(result, interruption)
     return code
