@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -149,10 +150,11 @@ class Attempt:
         if enough == 0:
             expected = "stretches without a gap of several windows, to fit and to check"
             raise InputError(case.source, "", f"too few windows of {span:g} s: {self.rows.count}", expected)
-        self._sought = None if candidates is None else {(effect.name, effect.where) for effect in candidates}
         self._fitted_windows = fitted
-        forces = [effect for effect in candidates or () if not is_constant(effect)]
-        made = self.make.forces() if candidates is None else [self.make.of(effect) for effect in forces]
+        effects = list(self.make.effects()) if candidates is None else candidates
+        self._lasting = [effect for effect in effects if is_constant(effect)]
+        forces = [effect for effect in effects if not is_constant(effect)]
+        made = self.make.seen(forces) if candidates is None else [self.make.of(effect) for effect in forces]
         if beta is None:
             self._start(made)
         else:
@@ -176,8 +178,7 @@ class Attempt:
 
     def _trace(self, forces: Sequence[Candidate]) -> None:
         """Begin to trace with the weights that the rows have now."""
-        sought = self._sought
-        constants = [c for c in self.make.constants() if sought is None or (c.effect.name, c.effect.where) in sought]
+        constants = self.make.seen(self._lasting)
         self.fixed = [self.make.of(effect) for effect in self.constants]
         parts = self._fitted_windows, self.prior, self.fixed, self.make.variance
         self.tracing = Tracing(self.rows, [*constants, *forces], *parts)
@@ -242,14 +243,26 @@ class Attempt:
         effects = [self.tracing.candidates[k].effect for k in chosen]
         return described.model_copy(update={"effects": (*described.effects, *effects)})
 
+    @cached_property
+    def _joints(self) -> RelativeResiduals:
+        return RelativeResiduals(self.rows, self.make)
+
+    def test(self, chosen: Sequence[int]) -> dict[str, RowResidual]:
+        """Residuals of the model with the effects chosen, by row type, against noise."""
+        self.tracing.settle(chosen)
+        return ResidualTest(self.rows).of(self.tracing.residual(chosen, self._checked(chosen)))
+
+    def _checked(self, chosen: Sequence[int]) -> Array:
+        """Parameters and coefficients fitted to the fitted windows alone."""
+        return self.tracing.solution(chosen, self.tracing.fitted)
+
     def state(self, chosen: Sequence[int]) -> State:
         """Residuals of the model with the effects chosen."""
-        rows, tracing = self.rows, self.tracing
+        rows, tracing, joints = self.rows, self.tracing, self._joints
         tracing.settle(chosen)
         fitted = tracing.fitted
-        solution = tracing.solution(chosen, fitted)
+        solution = self._checked(chosen)
         residual = tracing.residual(chosen, solution)
-        joints = RelativeResiduals(rows, self.make)
         joints.declare([*self.constants, *(tracing.candidates[k].effect for k in chosen)])
         early = self._fitted(joints.times, joints.segment)
         return State(
@@ -265,12 +278,12 @@ class Attempt:
 
     def steps(self) -> list[Step]:
         """The way of the last search."""
-        joints = RelativeResiduals(self.rows, self.make)
+        joints = self._joints
         held = ~self._fitted(joints.times, joints.segment)
         out = []
         for taken, chosen in self.tracing.path:
             effects = [self.tracing.candidates[k] for k in chosen]
             joints.declare([*self.constants, *(candidate.effect for candidate in effects)])
-            relative = joints.of(self.tracing.solution(chosen, self.tracing.fitted), held)
+            relative = joints.of(self._checked(chosen), held)
             out.append(Step(self.tracing.candidates[taken].key, tuple(c.key for c in effects), relative))
         return out

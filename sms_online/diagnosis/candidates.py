@@ -59,18 +59,14 @@ class CandidateColumns:
         return Inputs(motion.torque, self.rows.followed.states(model, motion.segment, motion.samples))
 
     def all(self) -> list[Candidate]:
-        """Each effect at each place, with each shape constant of its grid; those that leave no trace left out."""
-        return self.constants() + self.forces()
+        """Each effect at each place, with each shape constant of its grid, those that become constants first.
 
-    def forces(self) -> list[Candidate]:
-        """Those that become unknowns of π."""
-        return self._seen(effect for effect in self.effects() if not is_constant(effect))
+        The rows have to be weighed for these.
+        """
+        return self.seen(sorted(self.effects(), key=lambda effect: not is_constant(effect)))
 
-    def constants(self) -> list[Candidate]:
-        """Those that become constants of the description; the rows have to be weighed."""
-        return self._seen(effect for effect in self.effects() if is_constant(effect))
-
-    def _seen(self, effects: Iterable[Effect]) -> list[Candidate]:
+    def seen(self, effects: Iterable[Effect]) -> list[Candidate]:
+        """Candidates of the declarations; those that leave no trace left out."""
         made = [self.of(effect) for effect in effects]
         return [candidate for candidate in made if np.any(candidate.columns)]
 

@@ -181,7 +181,7 @@ def diagnose(
     if late:
         # Weighed alike, so that before and after are in the same measure.
         described = Attempt(case, system, (), attempt.rows.beta, ())
-    beyond = any(row.beyond for row in attempt.state(chosen).test.values())
+    beyond = any(row.beyond for row in attempt.test(chosen).values())
     bare = described.state([])
     attempt.tracing.settle([])
     ranking = attempt.tracing.ranking()
@@ -222,7 +222,7 @@ def diagnose(
     verdict = _verdict(named, left, bare.test, after.test, findings)
     unexplained = None
     if verdict == "unexplained":
-        unexplained = describe_residual(attempt.rows, attempt.tracing.columns(chosen), after.residual)
+        unexplained = describe_residual(attempt.rows, attempt.tracing.columns(chosen), after.residual, bare.test)
     return Diagnosis(
         verdict=verdict,
         findings=findings,

@@ -10,7 +10,7 @@ without its lag bring that share down as nothing else would.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from fnmatch import fnmatchcase
 
 import numpy as np
@@ -82,6 +82,9 @@ class Motions:
         self._channels = rows.sensing.channels
         model = rows.model
         known = {p.name for p in model.parameters} & set(model.system.known)
+        # One filter for all windows: that many fewer smoothed motions for each lag that is tried.
+        windows = rows.weak.windows
+        self._windows = replace(windows, half_width=np.full(rows.count, np.sort(windows.half_width)[rows.count // 2]))
         self._springs = [k for k, p in enumerate(model.parameters) if p.quantity in STIFFNESS]
         self._masses = [k for k, p in enumerate(model.parameters) if k not in self._springs and p.name not in known]
         self._still = [v for v in range(model.layout.n_v) if v not in model.layout.theta_m]
@@ -103,7 +106,7 @@ class Motions:
         if where is not None:
             segments = [self._without(where, corner, segment) for segment in segments]
         model, rows = self._rows.model, self._rows
-        weak = WeakWindows(rows.weak.windows, model.layout, rows.sensing, segments, model.system.sample_rate)
+        weak = WeakWindows(self._windows, model.layout, rows.sensing, segments, model.system.sample_rate)
 
         def columns(motion: Motion) -> tuple[Array, Array]:
             return model.momentum_columns(motion.x, motion.v, self._still, self._make.inputs(motion))

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
 
 from sms_online.diagnosis.evidence import basis, free_of, gain
+from sms_online.diagnosis.residuals import RowResidual
 from sms_online.diagnosis.rows import SessionRows
 from sms_online.diagnosis.splines import DEGREE, Variable, design, spline_columns
 from sms_online.model.layout import row_types
@@ -22,9 +24,9 @@ POINTS = 25
 class Unexplained:
     """A force that stands in for what is not known.
 
-    row: row type with most of the residual; speed: the generalized speed in it. variable: what the force depends on
-    most clearly. share: of the residual's excess over noise in all rows that it takes away. at, force
-    (POINTS,): the force over the variable's range, in N m (N).
+    row: row type with most of the residual, before and after what was found; speed: the generalized speed in it.
+    variable: what the force depends on most clearly. share: of the residual's excess over noise in all rows that it
+    takes away. at, force (POINTS,): the force over the variable's range, in N m (N).
     """
 
     row: str
@@ -35,11 +37,20 @@ class Unexplained:
     force: Array
 
 
-def describe_residual(rows: SessionRows, columns: Array, residual: Array) -> Unexplained:
-    """Find row and variable. columns (W, n_v, n): of the model with what was adopted; residual (W, n_v): of it."""
+def describe_residual(
+    rows: SessionRows, columns: Array, residual: Array, before: Mapping[str, RowResidual]
+) -> Unexplained:
+    """Find row and variable.
+
+    columns (W, n_v, n): of the model with what was adopted; residual (W, n_v): of it; before: of the model without, by
+    row type.
+    """
     layout = rows.model.layout
     excess = np.sum(residual**2 - 1.0, axis=0)
-    by_type = {name: float(excess[speeds].sum()) for name, speeds in row_types(layout).items()}
+    # A wrong effect clears rows of the right one at the cost of others: the row is one that had much and still has.
+    by_type = {
+        name: float(excess[speeds].sum()) * before[name].whitened ** 2 for name, speeds in row_types(layout).items()
+    }
     row = max(by_type, key=lambda name: by_type[name])
     speed = max(row_types(layout)[row], key=lambda k: excess[k])
     Q = basis((columns / rows.std[..., None]).reshape(-1, columns.shape[2]))

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from fnmatch import fnmatchcase
+from functools import lru_cache
 from typing import Protocol
 
 import numpy as np
@@ -156,26 +157,8 @@ class SensorLag(_Channel):
         return np.asarray(lfilter(b, a, samples, zi=start)[0])
 
     def kernel(self, sample_rate: float) -> Array:
-        """Weights (2M + 1,) of the samples about an instant in what was before the lag there, y + √2 ẏ / ω + ÿ / ω².
-
-        Least squares against the inverse of the low-pass over the frequencies that are to come back, relative to it,
-        with a small weight on noise; exact for parabolas.
-        """
-        corner, omega = self.coefficients["corner"], self.omega
-        M = max(4, round(sample_rate / corner))
-        k = np.arange(-M, M + 1)
-        f = np.linspace(0.0, min(max(PASSBAND * corner, LEAST_BAND), HIGHEST * sample_rate), FREQUENCIES)
-        s = 1j * f / corner
-        inverse = 1.0 + np.sqrt(2.0) * s + s**2
-        response = np.exp(2j * np.pi * np.outer(f, k) / sample_rate) / np.abs(inverse)[:, None]
-        wanted = inverse / np.abs(inverse)
-        A, b = np.concatenate((response.real, response.imag)), np.concatenate((wanted.real, wanted.imag))
-        moments = (k / M) ** np.arange(3)[:, None]
-        step = sample_rate / (M * omega)
-        exact = np.array([1.0, np.sqrt(2.0) * step, 2.0 * step**2])
-        gram = A.T @ A + NOISE_WEIGHT * f.size * np.eye(k.size)
-        bordered = np.block([[gram, moments.T], [moments, np.zeros((3, 3))]])
-        return np.asarray(np.linalg.solve(bordered, np.concatenate((A.T @ b, exact)))[: k.size])
+        """Weights (2M + 1,) of the samples about an instant in what was before the lag there, y + √2 ẏ / ω + ÿ / ω²."""
+        return _inverse_low_pass(self.coefficients["corner"], sample_rate)
 
     def correct(self, samples: Array, sample_rate: float) -> Array:
         """What was before the lag; beyond its ends the record goes on as its own point reflection."""
@@ -183,3 +166,27 @@ class SensorLag(_Channel):
         M = kernel.size // 2
         padded = np.pad(samples, M, mode="reflect", reflect_type="odd")
         return np.asarray(correlate1d(padded, kernel, mode="nearest")[M:-M])
+
+
+@lru_cache(maxsize=16)
+def _inverse_low_pass(corner: float, sample_rate: float) -> Array:
+    """See `SensorLag.kernel`; for a corner and a sample rate, Hz.
+
+    Least squares against the inverse of the low-pass over the frequencies that are to come back, relative to it, with a
+    small weight on noise; exact for parabolas.
+    """
+    omega = 2.0 * np.pi * corner
+    M = max(4, round(sample_rate / corner))
+    k = np.arange(-M, M + 1)
+    f = np.linspace(0.0, min(max(PASSBAND * corner, LEAST_BAND), HIGHEST * sample_rate), FREQUENCIES)
+    s = 1j * f / corner
+    inverse = 1.0 + np.sqrt(2.0) * s + s**2
+    response = np.exp(2j * np.pi * np.outer(f, k) / sample_rate) / np.abs(inverse)[:, None]
+    wanted = inverse / np.abs(inverse)
+    A, b = np.concatenate((response.real, response.imag)), np.concatenate((wanted.real, wanted.imag))
+    moments = (k / M) ** np.arange(3)[:, None]
+    step = sample_rate / (M * omega)
+    exact = np.array([1.0, np.sqrt(2.0) * step, 2.0 * step**2])
+    gram = A.T @ A + NOISE_WEIGHT * f.size * np.eye(k.size)
+    bordered = np.block([[gram, moments.T], [moments, np.zeros((3, 3))]])
+    return np.asarray(np.linalg.solve(bordered, np.concatenate((A.T @ b, exact)))[: k.size])

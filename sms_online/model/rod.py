@@ -65,8 +65,8 @@ class ExactRod:
         self._turn = so3.turn_basis(np.eye(3)[self._axis[0]])
         self._fields = np.zeros((self.n_f, 3, self._G))  # strain at the Gauss points per coordinate
         self._fields[np.arange(self.n_f), self._axis] = self._chi.T
-        zero = np.zeros((1, self.n_f))
-        self._linear_map = self._marker_jacobian(self.shape_at_stations(zero))[0]
+        self._one_field = self._one_field_markers() if self._commuting else None
+        self._linear_map = self.marker_jacobian(np.zeros((1, self.n_f)))[0]
 
     def _rotations(self, q_f: Array) -> Array:
         """R (B, stations, 3, 3) of the sections."""
@@ -128,38 +128,74 @@ class ExactRod:
             tip_angular=(shape.tip_spin @ rates)[..., 0],
         )
 
-    def _markers_of(self, stations: tuple[Array, Array, Array, Array]) -> Array:
-        R, r, _, _ = stations
-        G = self._G
+    def _one_field_markers(self) -> _OneFieldMarkers:
+        G, angles = self._G, self._integrate @ self._chi
+        # By the integrals of sin and 1 - cos of the angle, and by the angle itself.
+        nodal = np.zeros((3, 6))
+        nodal[:2, :3] = self._turn.reshape(3, 3, 3)[1:, :, 0]
+        nodal[2, 3 + self._axis[0]] = 1.0
+        displacement, rotation = np.split(nodal[:, self._nodal_rows], [2])
+        return _OneFieldMarkers(
+            angles[:G], self._integrate[G:], displacement, np.multiply.outer(angles[G:], rotation[0])
+        )
+
+    def _read(self, q_f: Array) -> tuple[Array, Array]:
+        """Markers (B, n_markers · per node) and their derivatives by q_f (B, n_markers · per node, n_f)."""
+        if self._one_field is not None:
+            return self._one_field(q_f)
+        R, r, spin, J = self.shape_at_stations(q_f)
+        G, B = self._G, len(q_f)
         displacement = r[:, G:].copy()
         displacement[..., 0] -= self._s[G:]
-        nodal = np.concatenate((displacement, so3.logarithm(R[:, G:])), axis=2)
-        return np.asarray(nodal[:, :, self._nodal_rows].reshape(R.shape[0], -1))
-
-    def _marker_jacobian(self, stations: tuple[Array, Array, Array, Array]) -> Array:
-        """∂ markers/∂ q_f (B, n_markers · per node, n_f)."""
-        R, _, spin, J = stations
-        G = self._G
-        rotation = np.linalg.solve(so3.RotationVector(so3.logarithm(R[:, G:])).left_jacobian, spin[:, G:])
-        nodal = np.concatenate((J[:, G:], rotation), axis=2)[:, :, self._nodal_rows]
-        return np.asarray(nodal.reshape(nodal.shape[0], -1, self.n_f))
+        rotation = so3.logarithm(R[:, G:])
+        turned = np.linalg.solve(so3.RotationVector(rotation).left_jacobian, spin[:, G:])
+        markers = np.concatenate((displacement, rotation), axis=2)[:, :, self._nodal_rows]
+        by_q_f = np.concatenate((J[:, G:], turned), axis=2)[:, :, self._nodal_rows]
+        return markers.reshape(B, -1), by_q_f.reshape(B, -1, self.n_f)
 
     def markers(self, q_f: Array) -> Array:
         """Displacements (m) and rotation vectors (rad) of the markers, (B, n_markers · per node), in {i}."""
-        return self._markers_of(self.shape_at_stations(q_f))
+        return self._read(q_f)[0]
 
     def marker_jacobian(self, q_f: Array) -> Array:
         """Derivatives of `markers` by q_f, (B, n_markers · per node, n_f)."""
-        return self._marker_jacobian(self.shape_at_stations(q_f))
+        return self._read(q_f)[1]
 
     def coordinates(self, markers: Array) -> Array:
         """Strain coefficients q_f (B, n_f) that reproduce the markers' readings, by Newton's method."""
         q_f = np.linalg.solve(self._linear_map, markers.T).T
         for _ in range(NEWTON_STEPS):
-            stations = self.shape_at_stations(q_f)
-            misfit = markers - self._markers_of(stations)
-            q_f = q_f + np.linalg.solve(self._marker_jacobian(stations), misfit[..., None])[..., 0]
+            told, by_q_f = self._read(q_f)
+            q_f = q_f + np.linalg.solve(by_q_f, (markers - told)[..., None])[..., 0]
         return q_f
+
+
+class _OneFieldMarkers:
+    """Markers of a rod that turns about one axis: sines and cosines of its angles, times constant matrices.
+
+    As what every sample of a session is inverted by, they are told without the rest of the shape.
+    """
+
+    def __init__(self, angles: Array, integrate: Array, displacement: Array, rotation: Array) -> None:
+        """angles (G, n_f): of the sections at the Gauss points by q_f. integrate (M, G): from there to the M markers.
+        displacement (2, per node): of a reading by the integrated sin and 1 - cos. rotation (M, n_f, per node): by q_f.
+        """
+        self._angles = angles
+        G, self._n_f = angles.shape
+        by_point = np.einsum("mg,kr->kgmr", integrate, displacement).reshape(2, G, -1)
+        self._sine, self._versine = by_point
+        self._rotation = rotation.transpose(1, 0, 2).reshape(self._n_f, -1)
+        self._by_sine, self._by_versine = (
+            np.einsum("gj,gf->gjf", part, angles).reshape(G, -1) for part in (self._sine, self._versine)
+        )
+
+    def __call__(self, q_f: Array) -> tuple[Array, Array]:
+        """As `ExactRod._read`."""
+        angle = q_f @ self._angles.T
+        sine, cosine = np.sin(angle), np.cos(angle)
+        markers = sine @ self._sine + (1.0 - cosine) @ self._versine + q_f @ self._rotation
+        by_q_f = (cosine @ self._by_sine + sine @ self._by_versine).reshape(len(q_f), -1, self._n_f)
+        return markers, by_q_f + self._rotation.T
 
 
 def _cumulative_integration(length: float, nodes: Array, weights: Array, ends: Array) -> Array:
