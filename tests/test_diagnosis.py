@@ -81,6 +81,8 @@ def test_a_session_that_the_model_explains_is_clean() -> None:
         pytest.param("torsional_hysteresis@joint_1:torque=5,width=0.02", 0.02, marks=pytest.mark.slow),
         pytest.param("tip_payload@tip:mass=0.5", 0.02, marks=pytest.mark.slow),
         ("sensor_lag@q_1:corner=40", 0.01),
+        # Far beyond first order in the delay.
+        pytest.param("torque_delay@joint_2:time=0.03", 0.01, marks=pytest.mark.slow),
         # It rings a hundred radians on: a frequency a few percent off would have nothing in common with it.
         pytest.param("slosh@base:mass=3,stiffness=867", 0.02, marks=pytest.mark.slow),
         pytest.param("encoder_offset@theta_m_2:offset=0.01", 0.02, marks=pytest.mark.slow),

@@ -11,7 +11,7 @@ from numpy.testing import assert_allclose
 from sms_adapters.system_file import load_system
 from sms_online.description.schema import Effect
 from sms_online.diagnosis.candidates import CandidateColumns
-from sms_online.diagnosis.constants import corrected, deviations, improved
+from sms_online.diagnosis.constants import corrected, deviations, improved, stands
 from sms_online.diagnosis.evidence import angle, basis, free_of, gain, threshold
 from sms_online.diagnosis.plausible import plausible
 from sms_online.diagnosis.record import SampleRecord, Segment, excerpts
@@ -68,6 +68,7 @@ def test_whitened_rows_give_the_estimate_of_the_stream() -> None:
     [
         (Effect(name="encoder_offset", where="q_1", coefficients={"offset": 1e-3}), 1e-3),
         (Effect(name="sensor_lag", where="theta_m_2", coefficients={"corner": 150.0}), np.sqrt(2.0) / (300.0 * np.pi)),
+        (Effect(name="torque_delay", where="joint_2", coefficients={"time": 5e-4}), 5e-4),
     ],
 )
 def test_a_channels_column_is_the_change_of_the_rows_when_it_is_corrected(effect: Effect, linear: float) -> None:
@@ -130,6 +131,9 @@ def test_excerpts_are_spread_evenly_and_keep_what_fits() -> None:
 def test_constants_are_improved_by_what_is_left_of_them() -> None:
     lag = improved(Effect(name="sensor_lag", where="q_1"), np.array([0.01]))
     assert improved(lag, np.array([0.002])).coefficients["corner"] == pytest.approx(np.sqrt(2.0) / (2 * np.pi * 0.012))
+    late = improved(Effect(name="torque_delay", where="joint_1"), np.array([0.02]))
+    assert improved(late, np.array([-0.004])).coefficients == {"time": pytest.approx(0.016)}
+    assert not stands(improved(late, np.array([-0.03])), 1000.0)
     disc = improved(Effect(name="encoder_eccentricity", where="q_1"), np.array([3e-3, 0.0]))
     disc = improved(disc, np.array([0.0, 4e-3]))
     assert disc.coefficients["amplitude"] == pytest.approx(5e-3)

@@ -32,9 +32,9 @@ class Motion:
     def __init__(self, model: Model) -> None:
         rng = np.random.default_rng(21)
         self.x, self.v = random_states(model.layout, STATES, seed=21)
-        self.tau, self.tau_rate = rng.normal(size=(2, STATES, 2))
+        self.tau = rng.normal(size=(STATES, 2))
         self.z = rng.normal(size=(STATES, model.n_states))
-        self.inputs = Inputs(self.tau, self.z, self.tau_rate)
+        self.inputs = Inputs(self.tau, self.z)
         self.delta = self.x[:, M_1] - self.x[:, Q_1]
         self.rate = self.v[:, M_1]
         self.theta_m = self.x[:, M_1]
@@ -166,21 +166,6 @@ def test_a_point_mass_at_the_tip_is_a_payload_of_no_size() -> None:
     )
 
 
-def test_a_delayed_torque_enters_as_its_rate() -> None:
-    """d/dt(P d) = -d n τ̇ on the left is + d n τ̇ on the right; its power is that torque's."""
-    model = with_effect("torque_delay@joint_2:time=0.003")
-    s = Motion(model)
-    own = model.effect_slices[0]
-    P, G = model.momentum_columns(s.x, s.v, inputs=s.inputs)
-    assert_allclose(P[:, M_2, own] @ model.nominal[own], -0.003 * s.tau[:, 1])
-    assert not np.delete(P, M_2, axis=1)[..., own].any()
-    assert not G[..., own].any()
-    power = model.power_columns(s.x, s.v, s.inputs)[:, own] @ model.nominal[own]
-    assert_allclose(power, -0.003 * s.tau_rate[:, 1] * s.v[:, M_2])
-    with pytest.raises(ValueError, match="torque's rate"):
-        model.power_columns(s.x, s.v, Inputs(s.tau, s.z))
-
-
 def test_an_effect_that_lacks_its_inputs_says_so() -> None:
     for text in ("torque_gain@joint_2:ratio=0.1", "torsional_hysteresis@joint_1:torque=1"):
         model = with_effect(text)
@@ -214,7 +199,6 @@ REPORTED = (
     *LAWS,
     "link_damping@link_2:time=0.002",
     "link_mass_damping@link_1:rate=0.7",
-    "torque_delay@joint_1:time=0.1",
     "table_tilt@base:gravity_x=0.2,gravity_y=-0.3",
 )
 

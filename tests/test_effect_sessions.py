@@ -17,7 +17,7 @@ from sms_online.description.parse import parse_system, shipped_text
 from sms_online.description.schema import System
 from sms_online.effects.base import report
 from sms_online.effects.catalogue import channel_effects, parse_effect
-from sms_online.effects.channel import EncoderEccentricity, SensorLag
+from sms_online.effects.channel import EncoderEccentricity, SensorLag, TorqueDelay
 from sms_online.errors import InputError
 from sms_online.linearised import Motion
 from sms_online.model.base_parameters import find_base_parameters
@@ -195,19 +195,6 @@ def test_friction_by_direction_and_by_speed_is_found_without_noise() -> None:
     assert_allclose(estimator.estimate().pi[-3:], [2.0, 1.5, 1.0], rtol=0.01)
 
 
-def test_a_late_torque_is_told_from_its_neighbours_lag() -> None:
-    """A delay of one sample, 1 ms: first order in it leaves 2 %."""
-    true = declaring("torque_delay@joint_2:time=0.001")
-    blocks = list(sampled_blocks(simulate(true, 2.5), "A", seed=2))
-    estimator = Estimator(declaring("torque_delay@joint_2", "torque_delay@joint_1"), blocks[0].channels, "session")
-    for block in blocks:
-        estimator.push(block)
-    estimator.finish()
-    found = dict(zip([p.name for p in estimator.base.parameters], estimator.estimate().pi, strict=True))
-    assert found["torque_delay@joint_2.time"] == pytest.approx(0.001, rel=0.03)
-    assert abs(found["torque_delay@joint_1.time"]) < 3e-5
-
-
 def test_effects_with_internal_states_are_identified_and_survive_a_restart() -> None:
     """Within 1 % at grade A (seed 1); saved and restored in the middle, the session ends with the same bits."""
     true = declaring("torsional_hysteresis@joint_1:torque=5,width=0.01", "slosh@base:mass=20,stiffness=500")
@@ -310,11 +297,25 @@ def test_a_correction_gives_back_what_was_distorted() -> None:
     assert_allclose(lag.correct(late, 1000.0)[300:-M], angle[300:-M], rtol=0, atol=2e-6)
 
 
+def test_a_late_torque_is_given_back() -> None:
+    """A cubic through samples of a millisecond is off by 3/128 (ω h)⁴ of 3 Hz, straight lines by (ω h)² / 8."""
+    t, delay = np.arange(4000) / 1000.0, TorqueDelay("joint_1", {"time": 0.0123})
+    assert delay.acts_on("tau_1")
+    assert not delay.acts_on("tau_2")
+    assert not delay.acts_on("theta_m_1")
+    omega = 2 * np.pi * 3.0
+    late = np.sin(omega * (t - 0.0123))
+    M = delay.kernel(1000.0).size // 2
+    assert_allclose(delay.correct(late, 1000.0)[M:-M], np.sin(omega * t)[M:-M], rtol=0, atol=3 / 128 * 0.0189**4)
+    assert_allclose(delay.distort(np.sin(omega * t), 1000.0)[20:], late[20:], rtol=0, atol=5e-5)
+
+
 def test_conditioning_is_the_same_however_samples_arrive_and_after_a_restart() -> None:
-    system = declaring("sensor_lag@q_1:corner=40", "encoder_offset@q_1:offset=0.1", "encoder_offset@q_2:offset=0.2")
-    values = np.random.default_rng(8).normal(size=(400, 2))
+    effects = "sensor_lag@q_1:corner=40", "encoder_offset@q_1:offset=0.1", "encoder_offset@q_2:offset=0.2"
+    system = declaring(*effects, "torque_delay@joint_1:time=0.003")
+    values = np.random.default_rng(8).normal(size=(400, 3))
     index = np.arange(400, dtype=np.int64) + 7
-    channels = ("q_1", "q_2")
+    channels = ("q_1", "q_2", "tau_1")
     (whole,) = Conditioning(system, channels).push(GridSamples(index, values, 0))
     stage = Conditioning(system, channels)
     pieces = []
@@ -327,6 +328,7 @@ def test_conditioning_is_the_same_however_samples_arrive_and_after_a_restart() -
     assert np.array_equal(np.concatenate([piece.index for piece in pieces]), whole.index)
     # All channels are passed on for the same instants, and a gap begins anew.
     assert_allclose(whole.values[:, 1], values[stage.margin : -stage.margin, 1] - 0.2)
+    assert_allclose(whole.values[:, 2], values[stage.margin + 3 : 3 - stage.margin, 2], atol=1e-12)
     assert stage.push(GridSamples(index[: stage.margin] + 500, values[: stage.margin], 1)) == []
 
 
@@ -345,6 +347,29 @@ def test_stated_corrections_give_the_estimate_of_a_clean_session(clean_motion: S
 
     assert stiffness(declaring(*texts)) == pytest.approx(1000.0, rel=1e-3)
     assert abs(stiffness(declaring()) / 1000.0 - 1.0) > 0.02
+
+
+def test_a_stated_delay_of_a_torque_is_taken_off(clean_motion: Simulation) -> None:
+    """15 ms of joint 2: declared, its rotor's inertia comes out within 0.2 %, undeclared not within 2 %."""
+    text = "torque_delay@joint_2:time=0.015"
+    blocks = list(sampled_blocks(distorted(clean_motion, text), "A", seed=2))
+
+    def rotor(system: System) -> float:
+        estimator = Estimator(system, blocks[0].channels, "session")
+        for block in blocks:
+            estimator.push(block)
+        estimator.finish()
+        names = [p.name for p in estimator.base.parameters]
+        return float(estimator.estimate().pi[names.index("motor_2.rotor_inertia")])
+
+    true = declaring().motors[1].rotor_inertia
+    assert rotor(declaring(text)) == pytest.approx(true, rel=2e-3)
+    assert abs(rotor(declaring()) / true - 1.0) > 0.02
+
+
+def test_a_negative_delay_is_bad_input() -> None:
+    with pytest.raises(InputError, match="0 s or more"):
+        declaring("torque_delay@joint_1:time=-0.001")
 
 
 def test_a_system_file_declares_an_effect_on_a_group_of_channels() -> None:

@@ -68,9 +68,8 @@ class Plant:
 
     def inputs(self, t: Array, y: Array) -> Inputs:
         """What effects need beside positions and speeds at instants t (B,), s, in states y."""
-        layout, torque = self.model.layout, self.torque(t, y)
-        # A delayed torque is its sensor's affair: the arm feels what acts.
-        return Inputs(torque, y[:, layout.n_x + layout.n_v :], np.zeros_like(torque))
+        layout = self.model.layout
+        return Inputs(self.torque(t, y), y[:, layout.n_x + layout.n_v :])
 
     def torque(self, t: Array, y: Array) -> Array:
         """Torque after the gear n τ (B, joints), N m (N), at instants t (B,), s."""

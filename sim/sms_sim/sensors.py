@@ -8,8 +8,8 @@ import numpy as np
 
 from sms_online.description.channels import drive_channel, sensed_channels
 from sms_online.description.schema import Sensor, System
-from sms_online.effects.catalogue import check_effect
-from sms_online.effects.drive import TorqueDelay
+from sms_online.effects.catalogue import channel_effects
+from sms_online.effects.channel import TorqueDelay
 from sms_online.errors import InputError
 from sms_online.stream import Array
 
@@ -78,13 +78,9 @@ class Sensors:
 def _torque_delays(system: System, channels: tuple[str, ...]) -> Array:
     """Delays (channels,) of drives that the effect torque_delay states, s."""
     out = np.zeros(len(channels))
-    for k, effect in enumerate(system.effects, start=1):
-        if effect.name == TorqueDelay.entry.name:
-            check_effect(system, effect, f"effect {k}", system.name)
-            time = effect.coefficients.get("time", 0.0)
-            if time < 0.0:
-                raise InputError(system.name, f"effect {k}", f"time = {time:g} s of torque_delay", "0 s or more")
-            out[channels.index(drive_channel(system, int(effect.where.removeprefix("joint_"))))] += time
+    for effect in channel_effects(system):
+        if isinstance(effect, TorqueDelay):
+            out += [effect.coefficients["time"] * effect.acts_on(channel) for channel in channels]
     return out
 
 

@@ -5,18 +5,21 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
 from fnmatch import fnmatchcase
+from functools import cached_property
 from itertools import product
 
 import numpy as np
 
 from sms_online.description.schema import Effect, System
 from sms_online.diagnosis.constants import is_constant
+from sms_online.diagnosis.followed import FollowedMotion
 from sms_online.diagnosis.rows import SessionRows
 from sms_online.diagnosis.standstill import Standstill
 from sms_online.diagnosis.trace import DRY, Candidate
 from sms_online.diagnosis.weak_windows import Motion, WeakWindows
 from sms_online.effects.base import Inputs, Ranges
 from sms_online.effects.catalogue import ENTRIES, candidates
+from sms_online.effects.channel import TorqueDelay
 from sms_online.model.model import Model
 from sms_online.model.parameters import Parameter
 from sms_online.pipeline.momentum_balance import HOPS
@@ -56,7 +59,18 @@ class CandidateColumns:
         return self._inputs(self.rows.model, motion)
 
     def _inputs(self, model: Model, motion: Motion) -> Inputs:
-        return Inputs(motion.torque, self.rows.followed.states(model, motion.segment, motion.samples))
+        states = np.zeros((len(motion.samples), 0))
+        if model.n_states:
+            states = self._followed.states(model, motion.segment, motion.samples)
+        return Inputs(motion.torque, states)
+
+    @cached_property
+    def _followed(self) -> FollowedMotion:
+        """The motion that internal states follow: that of the windows' own samples, noise added to them included."""
+        rows = self.rows
+        if self._weak.segments is rows.segments:
+            return rows.followed
+        return FollowedMotion(rows.sensing, self._weak.segments, rows.model.system.sample_rate)
 
     def all(self) -> list[Candidate]:
         """Each effect at each place, with each shape constant of its grid, those that become constants first.
@@ -137,8 +151,7 @@ class CandidateColumns:
             inputs = self._inputs(model, motion)
             inputs = replace(inputs, states=inputs.states[:, model.state_slices[-1]])
             if held is None:
-                P = force.momentum(model.layout, motion.x, motion.v, inputs)
-                return P, force.force(model.layout, motion.x, motion.v, inputs)
+                return None, force.force(model.layout, motion.x, motion.v, inputs)
             v = motion.v.copy()
             v[:, held.motor] = held.slow
             G = force.force(model.layout, motion.x, v, inputs)
@@ -180,12 +193,27 @@ class CandidateColumns:
         """The system with one more effect."""
         return self.system.model_copy(update={"effects": (*self.system.effects, effect)})
 
+    def _late_torque(self, where: str) -> Array:
+        """Columns (W, n_v, 1) of a delay of a joint's torque: its rate, in the momentum."""
+        i = int(where.removeprefix("joint_")) - 1
+        motor = self.rows.model.layout.theta_m[i]
+
+        def columns(motion: Motion) -> tuple[Array, Array]:
+            P = np.zeros((*motion.v.shape, 1))
+            P[:, motor, 0] = -motion.torque[:, i]
+            return P, np.zeros_like(P)
+
+        return self._weak.columns(columns, dense=True)
+
     def _channel(self, effect: Effect) -> Candidate:
         """What is added to readings, times the rows' response to it; in other windows than the rows' there is none.
 
         An effect y = x + c d(x) on a reading y is taken off by y - c d, so rows of readings lack -c times the response.
         """
         layout = self.rows.model.layout
+        if effect.name == TorqueDelay.entry.name:
+            parameter = Parameter(f"{effect.name}@{effect.where}.time", "time", "s", 0.0)
+            return Candidate(effect, (parameter,), self._late_torque(effect.where))
         columns, parameters = [], []
         for quantity, unit, displacement, sign in LINEAR[effect.name]:
             names = [self.rows.sensing.channels[k] for k in self.rows.sensing.position_columns]

@@ -39,6 +39,8 @@ def improved(effect: Effect, increments: Array) -> Effect:
         case "sensor_lag":
             delay = (delay_of(c["corner"]) if "corner" in c else 0.0) + float(increments[0])
             changed = {"corner": delay_of(min(LONGEST_DELAY, max(SHORTEST_DELAY, delay)))}
+        case "torque_delay":
+            changed = {"time": min(LONGEST_DELAY, max(0.0, c.get("time", 0.0) + float(increments[0])))}
         case "table_tilt":
             names = ("gravity_x", "gravity_y")
             changed = {name: c.get(name, 0.0) + float(g) for name, g in zip(names, increments, strict=True)}
@@ -49,9 +51,12 @@ def improved(effect: Effect, increments: Array) -> Effect:
 
 def stands(effect: Effect, sample_rate: float) -> bool:
     """Whether constants that were improved are still of an effect, on samples at so many Hz."""
-    if effect.name != "sensor_lag":
-        return True
-    return plausible(effect.name, np.array([delay_of(effect.coefficients["corner"])]), sample_rate)
+    match effect.name:
+        case "sensor_lag":
+            return plausible(effect.name, np.array([delay_of(effect.coefficients["corner"])]), sample_rate)
+        case "torque_delay":
+            return effect.coefficients["time"] > 0.0
+    return True
 
 
 def deviations(effect: Effect, covariance: Array) -> dict[str, float]:

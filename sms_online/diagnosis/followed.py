@@ -17,8 +17,9 @@ from sms_online.stream import Array
 
 # States are advanced once in so many samples: at 1 kHz what changes at 3 Hz is told 80 times a period.
 STEP = 4
-# Half width of the filter of the motion behind them: passes 70 Hz at 1 kHz.
-HALF_WIDTH = 28
+# Half width of the filter of the motion behind them: passes 30 Hz at 1 kHz. A hysteresis forgets with every way that
+# its spring goes, noise's too.
+HALF_WIDTH = 64
 
 
 def least_samples(system: System) -> int:

@@ -29,12 +29,11 @@ class Inputs:
     """What an effect may need besides positions and speeds, at B instants.
 
     torque (B, joints): n τ as measured, N m (N). states (B, n_z): internal states, to the model those of all effects in
-    their order, to an effect its own. torque_rate (B, joints): of n τ, N m/s; only the power of a delay asks for it.
+    their order, to an effect its own.
     """
 
     torque: Array
     states: Array
-    torque_rate: Array | None = None
 
 
 class ForceEffect(Protocol):
@@ -54,9 +53,6 @@ class ForceEffect(Protocol):
 
     def force(self, layout: Layout, x: Array, v: Array, inputs: Inputs | None) -> Array:
         """Columns f_j (B, n_v, coefficients): generalized force of one unit of each coefficient."""
-
-    def momentum(self, layout: Layout, x: Array, v: Array, inputs: Inputs | None) -> Array | None:
-        """Columns (B, n_v, coefficients) of P in d/dt(P π) - G π = Q; None where the effect has none."""
 
     def power(self, layout: Layout, x: Array, v: Array, inputs: Inputs | None) -> Array:
         """Power (B, coefficients) that one unit of each coefficient takes out, W."""
@@ -147,7 +143,7 @@ class Site:
 
 
 class Force:
-    """What most force effects share: no torque, no internal state, no momentum, coefficients reported as they are."""
+    """What most force effects share: no torque, no internal state, coefficients reported as they are."""
 
     entry: ClassVar[Entry]
     needs_torque = False
@@ -168,10 +164,6 @@ class Force:
     def force(self, layout: Layout, x: Array, v: Array, inputs: Inputs | None) -> Array:
         """See `ForceEffect`."""
         raise NotImplementedError
-
-    def momentum(self, layout: Layout, x: Array, v: Array, inputs: Inputs | None) -> Array | None:
-        """None."""
-        return None
 
     def power(self, layout: Layout, x: Array, v: Array, inputs: Inputs | None) -> Array:
         """-f · v."""

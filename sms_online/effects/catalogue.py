@@ -14,8 +14,8 @@ from sms_online.description.channels import channels, drive_channel, strain_chan
 from sms_online.description.explain import hint, nearest
 from sms_online.description.schema import Effect, FlexibleLink, System
 from sms_online.effects.base import Entry, ForceEffect, Place, Site
-from sms_online.effects.channel import ChannelEffect, EncoderEccentricity, EncoderOffset, SensorLag
-from sms_online.effects.drive import Cogging, TorqueDelay, TorqueGain, TorqueOffset, TorqueRipple
+from sms_online.effects.channel import ChannelEffect, EncoderEccentricity, EncoderOffset, SensorLag, TorqueDelay
+from sms_online.effects.drive import Cogging, TorqueGain, TorqueOffset, TorqueRipple
 from sms_online.effects.friction import (
     CoulombFriction,
     DirectionFriction,
@@ -34,9 +34,9 @@ from sms_online.stream import Array
 FORCES = (
     CoulombFriction, ViscousFriction, StribeckFriction, LoadFriction, DirectionFriction, TorsionalHysteresis,
     CubicStiffness, Backlash, KinematicError, Cogging, TorqueRipple, LinkDamping, LinkMassDamping, ReactionWheel,
-    ThrusterLeak, TableTilt, AirDrag, CableSpring, Slosh, TorqueGain, TorqueOffset, TorqueDelay,
+    ThrusterLeak, TableTilt, AirDrag, CableSpring, Slosh, TorqueGain, TorqueOffset,
 )  # fmt: skip
-CHANNELS = (EncoderOffset, EncoderEccentricity, SensorLag)
+CHANNELS = (EncoderOffset, EncoderEccentricity, SensorLag, TorqueDelay)
 CLASSES = (*FORCES, TipPayload, *CHANNELS)
 # The step from `linear` to `exact` kinematics of a link; it has no coefficients and no class.
 GEOMETRIC_STIFFENING = Entry("geometric_stiffening", "kinematics", "linear link", {}, SEPARATED_BY)
@@ -50,6 +50,7 @@ _CHANNELS: dict[str, Callable[[str, Mapping[str, float]], ChannelEffect]] = {
     EncoderOffset.entry.name: EncoderOffset,
     EncoderEccentricity.entry.name: EncoderEccentricity,
     SensorLag.entry.name: SensorLag,
+    TorqueDelay.entry.name: TorqueDelay,
 }
 
 
@@ -112,6 +113,8 @@ def check_effect(system: System, effect: Effect, place: str, source: str) -> Non
             raise InputError(source, place, f"coefficient {name!r} of {effect.name}", expected)
         if name in entry.shapes and value <= 0.0 < entry.shapes[name].default:
             raise InputError(source, place, f"{name} = {value:g} of {effect.name}", "a number greater than 0")
+        if name == "time" and effect.name == TorqueDelay.entry.name and value < 0.0:
+            raise InputError(source, place, f"{name} = {value:g} s of {effect.name}", "0 s or more")
 
 
 def with_shapes(effect: Effect, system: System) -> Effect:
@@ -221,7 +224,7 @@ def _groups(system: System, entry: Entry) -> Iterable[str]:
     if entry.name == EncoderOffset.entry.name:
         return (*places(system, "angle"), *gauges)
     if entry.name != SensorLag.entry.name:
-        return places(system, "angle")
+        return places(system, entry.at)
     positions = places(system, "position")
     # What one device delivers: an encoder its angle, a tracker the base's position, a camera a link's markers.
     devices = [next((p for p in DEVICES if fnmatchcase(c, p)), c) for c in positions]

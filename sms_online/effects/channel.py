@@ -1,4 +1,4 @@
-"""Effects on measured position channels: offset, eccentricity, lag. A declared one is taken off the samples.
+"""Effects on measured channels: offset, eccentricity, lag of positions, delay of torques, taken off where declared.
 
 They are corrections by stated constants, no unknowns of π: their columns are differences of whole corrected sessions.
 """
@@ -113,13 +113,28 @@ class EncoderEccentricity(_Channel):
         return angle
 
 
+class Late(_Channel):
+    """What weights of the samples on both sides take off."""
+
+    def kernel(self, sample_rate: float) -> Array:
+        """Weights (2M + 1,) of the samples about an instant in what was there."""
+        raise NotImplementedError
+
+    def correct(self, samples: Array, sample_rate: float) -> Array:
+        """What was before the effect; beyond its ends the record goes on as its own point reflection."""
+        kernel = self.kernel(sample_rate)
+        M = kernel.size // 2
+        padded = np.pad(samples, M, mode="reflect", reflect_type="odd")
+        return np.asarray(correlate1d(padded, kernel, mode="nearest")[M:-M])
+
+
 def _corners(ranges: Ranges) -> tuple[float, ...]:
     """From where hardly anything is left of a motion of some hertz to where hardly anything is lost of it."""
     hertz = (3.0, 5.0, 8.0, 12.0, 20.0, 30.0, 50.0, 80.0, 120.0)
     return tuple(f for f in hertz if f < 0.25 * ranges.sample_rate)
 
 
-class SensorLag(_Channel):
+class SensorLag(Late):
     """A reading behind a second-order Butterworth low-pass, ÿ = ω² (x - y) - √2 ω ẏ, ω = 2π f, f `corner` in Hz.
 
     Below the corner that is a delay of √2 / ω.
@@ -160,12 +175,40 @@ class SensorLag(_Channel):
         """Weights (2M + 1,) of the samples about an instant in what was before the lag there, y + √2 ẏ / ω + ÿ / ω²."""
         return _inverse_low_pass(self.coefficients["corner"], sample_rate)
 
-    def correct(self, samples: Array, sample_rate: float) -> Array:
-        """What was before the lag; beyond its ends the record goes on as its own point reflection."""
-        kernel = self.kernel(sample_rate)
-        M = kernel.size // 2
-        padded = np.pad(samples, M, mode="reflect", reflect_type="odd")
-        return np.asarray(correlate1d(padded, kernel, mode="nearest")[M:-M])
+
+class TorqueDelay(Late):
+    """A reading of τ(t - d) for a joint's torque τ(t), d `time` ≥ 0, s; `where` is the joint.
+
+    The simulator samples the exact torque d earlier. The column is that of the reading's rate, which goes into the
+    momentum, P = -n τ, so that nothing is differentiated.
+    Limitations: constant; what a torque does between samples is a cubic.
+    """
+
+    entry = Entry("torque_delay", "channel", "joint", {"time": "s"}, "fast reversals of the torque")
+
+    def __init__(self, where: str, given: Mapping[str, float]) -> None:
+        super().__init__(self.entry.name, where, {"time": given.get("time", 0.0)})
+
+    def acts_on(self, channel: str) -> bool:
+        """Whether the channel is the torque or force of a joint of `where`."""
+        kind, _, joint = channel.partition("_")
+        return kind in ("tau", "force") and fnmatchcase(f"joint_{joint}", self.where)
+
+    def distort(self, samples: Array, sample_rate: float) -> Array:
+        """τ(t - d), the first sample before the record."""
+        seconds = np.arange(samples.size) / sample_rate
+        return np.asarray(np.interp(seconds - self.coefficients["time"], seconds, samples))
+
+    def kernel(self, sample_rate: float) -> Array:
+        """Weights (2M + 1,) of the samples about an instant in the cubic through the four around d later."""
+        ahead, part = divmod(self.coefficients["time"] * sample_rate, 1.0)
+        M = int(ahead) + 2
+        nodes = np.arange(-1, 3)
+        weights = np.zeros(2 * M + 1)
+        for node in nodes:
+            others = nodes[nodes != node]
+            weights[M + int(ahead) + node] = np.prod((part - others) / (node - others))
+        return weights
 
 
 @lru_cache(maxsize=16)

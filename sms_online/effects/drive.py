@@ -1,4 +1,4 @@
-"""Torque of a motor and its measurement: cogging, ripple, offset, gain, delay.
+"""Torque of a motor and its measurement: cogging, ripple, offset, gain; a delay is one of the channel.
 
 Source: Holtz, Springob, IEEE Trans. Industrial Electronics 43 (1996) 309 (cogging and ripple of servo motors).
 """
@@ -109,36 +109,3 @@ class TorqueGain(MotorSide):
         """n τ."""
         assert inputs is not None
         return inputs.torque[:, self.index - 1, None]
-
-
-class TorqueDelay(MotorSide):
-    """The measured torque is late by d: the arm feels n τ + d · d(n τ)/dt, d: `time`, s.
-
-    The rate of the torque goes into the momentum, P = -n τ, so nothing is differentiated in momentum rows. The
-    simulator delays the measured channel instead, see `latency`.
-    Limitations: first order in d, so d must be short against the torque's own changes.
-    """
-
-    entry = Entry("torque_delay", "force", "joint", {"time": "s"}, "fast reversals of the torque")
-    needs_torque = True
-
-    def __init__(self, site: Site, given: Mapping[str, float]) -> None:
-        super().__init__(site, {"time": (f"t_{site.index}", "s", given.get("time", 0.0))})
-
-    def along(self, layout: Layout, x: Array, v: Array, inputs: Inputs | None) -> Array:
-        """0: all is in the momentum."""
-        return np.zeros((v.shape[0], 1))
-
-    def momentum(self, layout: Layout, x: Array, v: Array, inputs: Inputs | None) -> Array:
-        """-n τ."""
-        assert inputs is not None
-        P = np.zeros((*v.shape, 1))
-        P[:, layout.theta_m[self.index - 1], 0] = -inputs.torque[:, self.index - 1]
-        return P
-
-    def power(self, layout: Layout, x: Array, v: Array, inputs: Inputs | None) -> Array:
-        """-θ̇_m d(n τ)/dt; ValueError where the torque's rate is not given."""
-        assert inputs is not None
-        if inputs.torque_rate is None:
-            raise ValueError(f"{self.name}@{self.where} needs the torque's rate")
-        return -(inputs.torque_rate[:, self.index - 1] * self.rate(layout, v))[:, None]

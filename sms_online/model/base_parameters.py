@@ -92,8 +92,7 @@ def random_states(model: Model, count: int, rng: np.random.Generator) -> tuple[A
 
 def random_inputs(model: Model, count: int, rng: np.random.Generator) -> Inputs:
     """Random torques and internal states for the effects of `count` random states."""
-    joints = (count, len(model.layout.q))
-    return Inputs(rng.normal(size=joints), rng.normal(size=(count, model.n_states)), rng.normal(size=joints))
+    return Inputs(rng.normal(size=(count, len(model.layout.q))), rng.normal(size=(count, model.n_states)))
 
 
 def find_base_parameters(model: Model) -> BaseParameters:

@@ -112,9 +112,6 @@ class Dynamics:
         g -= model._spring_coordinates(x) @ self.stiffness + v @ self.damping
         for effect, columns, own in model.acting(inputs):
             g += effect.force(model.layout, x, v, own) @ self.pi[columns]
-            effect_momentum = effect.momentum(model.layout, x, v, own)
-            if effect_momentum is not None:
-                p += effect_momentum @ self.pi[columns]
         return p, g
 
     def acceleration(self, x: Array, v: Array, Q: Array, inputs: Inputs | None = None) -> Array:

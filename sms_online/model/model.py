@@ -175,10 +175,10 @@ class Model:
         """ẋ (B, n_x)."""
         return self.layout.position_rate(x, v)
 
-    def inputs(self, signals: Array, torque_rate: Array | None = None) -> Inputs:
+    def inputs(self, signals: Array) -> Inputs:
         """Inputs of the effects from signals (B, joints + n_states), n τ and then internal states."""
         joints = len(self.layout.q)
-        return Inputs(signals[:, :joints], signals[:, joints:], torque_rate)
+        return Inputs(signals[:, :joints], signals[:, joints:])
 
     def generalized_force(self, joint_torque: Array) -> Array:
         """Q of (41), (B, n_v), for torques after the gear n τ (B, joints), N m (N)."""
@@ -263,7 +263,7 @@ class Model:
         """
         P, G = (np.zeros((x.shape[0], self.layout.n_v, self.n_pi)) for _ in range(2))
         configuration = self.chain.configure(x)
-        self._add_forces(P, G, x, v, inputs)
+        self._add_forces(G, x, v, inputs)
         if rows is not None and not self.chain.moves(self._frames - 1, slice(0, 0))[list(rows)].any():
             # Motor sides of flexible joints alone: no frame moves with them, their momentum is all there is.
             rates = v[:, :, None]
@@ -323,15 +323,12 @@ class Model:
                 out[:, :, axis] += np.einsum("bdv,bd->bv", J, momentum)
         return out
 
-    def _add_forces(self, P: Array, G: Array, x: Array, v: Array, inputs: Inputs | None) -> None:
+    def _add_forces(self, G: Array, x: Array, v: Array, inputs: Inputs | None) -> None:
         for springs, deflection in ((self.springs, self._spring_coordinates(x)), (self.dampers, v)):
             for spring in springs:
                 G[:, spring.speeds, spring.parameter] -= deflection[:, spring.speeds] @ spring.matrix
         for effect, columns, own in self.acting(inputs):
             G[:, :, columns] = effect.force(self.layout, x, v, own)
-            momentum = effect.momentum(self.layout, x, v, own)
-            if momentum is not None:
-                P[:, :, columns] = momentum
 
     def dynamics(self, pi: Array) -> Dynamics:
         """Equations of motion for parameter values π (n_pi,): the full dynamics that the paper reconstructs."""

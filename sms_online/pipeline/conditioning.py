@@ -1,7 +1,7 @@
 """Declared effects on channels, taken off the grid samples before anything is made of them.
 
-Offsets and eccentricities are functions of a sample; lags ask for samples on both sides, so that every channel is
-passed on as much later, and what lies so close to a gap is lost.
+Offsets and eccentricities are functions of a sample; lags and delays ask for samples on both sides, so that every
+channel is passed on as much later, and what lies so close to a gap is lost.
 """
 
 from __future__ import annotations
@@ -11,22 +11,22 @@ from scipy.ndimage import correlate1d
 
 from sms_online.description.schema import System
 from sms_online.effects.catalogue import channel_effects
-from sms_online.effects.channel import SensorLag
+from sms_online.effects.channel import Late
 from sms_online.pipeline.synchronise import GridSamples, StageState
 
 
 class Conditioning:
     """Corrects the channels of one session by the constants that its system file states.
 
-    Lags come off first, for they act on what the sensor reads. InputError as `channel_effects`.
+    Lags and delays come off first, for they act on what the sensor reads. InputError as `channel_effects`.
     """
 
     def __init__(self, system: System, channels: tuple[str, ...]) -> None:
         self._sample_rate = system.sample_rate
         effects = [(k, e) for e in channel_effects(system) for k, channel in enumerate(channels) if e.acts_on(channel)]
-        self._lags = [(k, e.kernel(system.sample_rate)) for k, e in effects if isinstance(e, SensorLag)]
-        self._of_value = [(k, effect) for k, effect in effects if not isinstance(effect, SensorLag)]
-        self.margin = max((kernel.size // 2 for _, kernel in self._lags), default=0)
+        self._late = [(k, e.kernel(system.sample_rate)) for k, e in effects if isinstance(e, Late)]
+        self._of_value = [(k, effect) for k, effect in effects if not isinstance(effect, Late)]
+        self.margin = max((kernel.size // 2 for _, kernel in self._late), default=0)
         self._values = np.empty((0, len(channels)))
         self._segment = -1
 
@@ -41,7 +41,7 @@ class Conditioning:
         if inner.stop <= inner.start:
             return []
         corrected = values[inner].copy()
-        for column, kernel in self._lags:
+        for column, kernel in self._late:
             corrected[:, column] = correlate1d(values[:, column], kernel, mode="nearest")[inner]
         for column, effect in reversed(self._of_value):
             corrected[:, column] = effect.correct(corrected[:, column], self._sample_rate)

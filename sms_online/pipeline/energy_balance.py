@@ -137,18 +137,17 @@ class EnergyBalance:
         v: Array,
         signals: Array,
         torque_noise: Array,
-        torque_rate: Array | None = None,
     ) -> BalanceRows:
         """Rows that B consecutive samples complete: grid index (B,), x (B, n_x), v (B, n_v).
 
         signals (B, joints + n_states): n τ, then internal states of effects. torque_noise (joints,): white noise of
-        n τ, 1σ per sample. torque_rate (B, joints): of n τ, for the effect torque_delay.
+        n τ, 1σ per sample.
         """
         motor_rates = v[:, list(self.model.layout.theta_m)]
         work = np.einsum("bj,bj->b", signals[:, : motor_rates.shape[1]], motor_rates)
         # The last column gathers the variance of the work's noise; its rate is per sample, not per second.
         noise = (motor_rates**2 @ torque_noise**2) / self.sample_rate
-        taken = self.model.power_columns(x, v, self.model.inputs(signals, torque_rate))
+        taken = self.model.power_columns(x, v, self.model.inputs(signals))
         power = np.column_stack((taken[:, self._columns[:-1]], work, noise))
         x, v = np.concatenate((self._x, x)), np.concatenate((self._v, v))
         power = np.concatenate((self._power, power))

@@ -293,7 +293,7 @@ class Estimator:
         if self.on_motion is not None:
             self.on_motion(rates.index, rates.segment, x, v)
         signals = np.concatenate((torque, self._followed.push(rates, x, v)), axis=1)
-        rows = self._energy.push(rates.index, x, v, signals, self._rates.sigma[n_x:], rates.rates[:, n_x:])
+        rows = self._energy.push(rates.index, x, v, signals, self._rates.sigma[n_x:])
         finite = np.isfinite(rows.Y).all(axis=1) & np.isfinite(rows.b)
         self.dropped_rows += int(np.sum(~finite))
         if finite.any():
