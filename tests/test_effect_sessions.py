@@ -350,21 +350,22 @@ def test_stated_corrections_give_the_estimate_of_a_clean_session(clean_motion: S
 
 
 def test_a_stated_delay_of_a_torque_is_taken_off(clean_motion: Simulation) -> None:
-    """15 ms of joint 2: declared, its rotor's inertia comes out within 0.2 %, undeclared not within 2 %."""
+    """15 ms of joint 2 at grade A: declared, its rows leave no more than noise, undeclared ten times as much."""
     text = "torque_delay@joint_2:time=0.015"
     blocks = list(sampled_blocks(distorted(clean_motion, text), "A", seed=2))
 
-    def rotor(system: System) -> float:
+    def left(system: System) -> float:
         estimator = Estimator(system, blocks[0].channels, "session")
         for block in blocks:
             estimator.push(block)
         estimator.finish()
-        names = [p.name for p in estimator.base.parameters]
-        return float(estimator.estimate().pi[names.index("motor_2.rotor_inertia")])
+        assert estimator.momentum is not None
+        whitened = estimator.momentum.whitened([estimator.model.layout.theta_m[1]], estimator.estimate().pi)
+        assert whitened is not None
+        return whitened
 
-    true = declaring().motors[1].rotor_inertia
-    assert rotor(declaring(text)) == pytest.approx(true, rel=2e-3)
-    assert abs(rotor(declaring()) / true - 1.0) > 0.02
+    assert left(declaring(text)) < 1.2
+    assert left(declaring()) > 10.0
 
 
 def test_a_negative_delay_is_bad_input() -> None:
