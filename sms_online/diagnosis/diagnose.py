@@ -19,7 +19,7 @@ from sms_online.effects.catalogue import GEOMETRIC_STIFFENING, places
 from sms_online.errors import InputError
 from sms_online.pipeline.estimator import Estimator
 from sms_online.pipeline.momentum_balance import HOPS
-from sms_online.stream import Array, Block
+from sms_online.stream import Block
 
 # Times that the constants of channels' effects are improved, each with samples corrected by those found before.
 CORRECTIONS = 3
@@ -94,8 +94,8 @@ def _exact(system: System, links: Sequence[str]) -> System:
     return system.model_copy(update={"effects": (*system.effects, *effects)})
 
 
-def _stiffened(case: Case, attempt: Attempt, beta: Array, chosen: Sequence[int]) -> Attempt | None:
-    """The attempt with those links exact that the samples ask for; None where these take too little away.
+def _stiffened(case: Case, attempt: Attempt, chosen: Sequence[int]) -> Attempt | None:
+    """An attempt with those links exact that the samples ask for, and nothing else; None where these take too little.
 
     All links together first, for one may hide what another lacks; then without those that take no more than chance.
     """
@@ -105,12 +105,13 @@ def _stiffened(case: Case, attempt: Attempt, beta: Array, chosen: Sequence[int])
     if not links:
         return None
 
+    beta = attempt.rows.beta
     # What was found may be there beside it, or may only have stood for it.
     effects = [attempt.tracing.candidates[k].effect for k in chosen]
 
     def excess(links: Sequence[str]) -> float:
         try:
-            some = Attempt(case, _exact(attempt.system, links), (), beta, effects, SOME)
+            some = Attempt(case, _exact(attempt.system, links), attempt.constants, beta, effects, SOME)
         except np.linalg.LinAlgError:
             return np.inf  # the readings are those of links that are straight
         return some.excess(range(len(some.tracing.candidates)))
@@ -131,6 +132,36 @@ def _stiffened(case: Case, attempt: Attempt, beta: Array, chosen: Sequence[int])
         return Attempt(case, _exact(attempt.system, links), (), beta)
     except np.linalg.LinAlgError:
         return None
+
+
+def _with_constants(
+    case: Case, attempt: Attempt, chosen: list[int], progress: Callable[[str], None]
+) -> tuple[Attempt, list[int], list[Finding]]:
+    """The attempt with constants in place of the effects found that become such, what is found beside them, and these.
+
+    Samples are corrected by the constants, and what these leave, or have hidden, is searched again.
+    """
+    n = attempt.rows.base.n
+    findings: list[Finding] = []
+    while any(attempt.tracing.candidates[k].constant for k in chosen):
+        progress("improving constants")
+        findings += [attempt.tracing.finding(chosen, k) for k in chosen if attempt.tracing.candidates[k].constant]
+        solution = attempt.solution(chosen)
+        fresh, forces = attempt.found(chosen, solution)
+        constants, beta = [*attempt.constants, *fresh], solution[:n]
+        for _ in range(CORRECTIONS):
+            fewer = Attempt(case, attempt.system, constants, beta, forces, SOME)
+            solution = fewer.solution(range(len(forces)))
+            constants, beta = fewer.improved(solution), solution[:n]
+        keys = {(effect.name, effect.where) for effect in constants}
+        constants = [effect for effect in constants if stands(effect, case.session.system.sample_rate)]
+        tried = [candidate.effect for candidate in attempt.tracing.candidates]
+        others = [effect for effect in tried if (effect.name, effect.where) not in keys]
+        attempt = Attempt(case, attempt.system, constants, beta, others)
+        chosen = attempt.search()
+    standing = {(effect.name, effect.where) for effect in attempt.constants}
+    findings = [f for f in findings if (f.candidate.effect.name, f.candidate.effect.where) in standing]
+    return attempt, chosen, findings
 
 
 def diagnose(
@@ -168,7 +199,6 @@ def diagnose(
         attempt = described = Attempt(case, system)
     except np.linalg.LinAlgError as error:
         raise InputError(source, "", str(error), "the links' own markers, in their frames") from error
-    n = described.rows.base.n
     late: list[LateSensor] = []
     while not (before.by_momentum or before.by_smoother) and (
         found := find_late(attempt.rows, attempt.make, attempt.tracing.fitted)
@@ -181,40 +211,22 @@ def diagnose(
     if late:
         # Weighed alike, so that before and after are in the same measure.
         described = Attempt(case, system, (), attempt.rows.beta, ())
-    beyond = any(row.beyond for row in attempt.test(chosen).values())
     bare = described.state([])
     attempt.tracing.settle([])
     ranking = attempt.tracing.ranking()
     attempt.tracing.settle(chosen)
+    attempt, chosen, constants = _with_constants(case, attempt, chosen, progress)
+    beyond = any(row.beyond for row in attempt.test(chosen).values())
     if beyond and places(attempt.system, GEOMETRIC_STIFFENING.at):
         progress("comparing exact links")
-        exact = _stiffened(case, attempt, described.rows.beta, chosen)
+        exact = _stiffened(case, attempt, chosen)
         if exact is not None:
-            beside = exact.search()
+            beside = _with_constants(case, exact, exact.search(), progress)
             # Links that are exact because of what another effect did would keep that one from being found.
-            if exact.excess(beside) < attempt.excess(chosen):
-                attempt, chosen = exact, beside
-    findings: list[Finding] = []
-    while any(attempt.tracing.candidates[k].constant for k in chosen):
-        progress("improving constants")
-        findings += [attempt.tracing.finding(chosen, k) for k in chosen if attempt.tracing.candidates[k].constant]
-        solution = attempt.solution(chosen)
-        fresh, forces = attempt.found(chosen, solution)
-        constants, beta = [*attempt.constants, *fresh], solution[:n]
-        for _ in range(CORRECTIONS):
-            fewer = Attempt(case, attempt.system, constants, beta, forces, SOME)
-            solution = fewer.solution(range(len(forces)))
-            constants, beta = fewer.improved(solution), solution[:n]
-        keys = {(effect.name, effect.where) for effect in constants}
-        constants = [effect for effect in constants if stands(effect, system.sample_rate)]
-        tried = [candidate.effect for candidate in attempt.tracing.candidates]
-        others = [effect for effect in tried if (effect.name, effect.where) not in keys]
-        attempt = Attempt(case, attempt.system, constants, beta, others)
-        chosen = attempt.search()
+            if beside[0].excess(beside[1]) < attempt.excess(chosen):
+                attempt, chosen, constants = beside
     after = attempt.state(chosen)
-    standing = {(effect.name, effect.where) for effect in attempt.constants}
-    findings = [f for f in findings if (f.candidate.effect.name, f.candidate.effect.where) in standing]
-    findings += [attempt.tracing.finding(chosen, k) for k in chosen]
+    findings = [*constants, *(attempt.tracing.finding(chosen, k) for k in chosen)]
     progress("fitting the model with what was found")
     named = after.system != system
     estimator_after = _session(after.system, blocks, source, prior)[0] if named else before
