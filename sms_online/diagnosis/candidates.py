@@ -20,6 +20,7 @@ from sms_online.diagnosis.weak_windows import Motion, WeakWindows
 from sms_online.effects.base import Inputs, Ranges
 from sms_online.effects.catalogue import ENTRIES, candidates
 from sms_online.effects.channel import TorqueDelay
+from sms_online.effects.spacecraft import TableTilt
 from sms_online.model.model import Model
 from sms_online.model.parameters import Parameter
 from sms_online.pipeline.momentum_balance import HOPS
@@ -157,7 +158,8 @@ class CandidateColumns:
             G = force.force(model.layout, motion.x, v, inputs)
             return None, np.where(held.at(motion.segment, motion.samples)[:, None, None], G, 0.0)
 
-        return self._weak.columns(columns, dense=True)
+        # Gravity is as smooth as the motion.
+        return self._weak.columns(columns, dense=force.name != TableTilt.entry.name)
 
     def variance(self, candidate: Candidate, coefficients: Array) -> Array:
         """Variance (W, n_v) of the rows for what the sensors' noise makes of a force with coefficients (c,).

@@ -12,19 +12,24 @@ from sms_online.diagnosis.record import Segment
 from sms_online.model.model import Model
 from sms_online.pipeline.internal_states import InternalStates
 from sms_online.pipeline.sensing import Sensing
-from sms_online.pipeline.smoothing import smooth
+from sms_online.pipeline.smoothing import HALF_WIDTHS, smooth
 from sms_online.stream import Array
 
 # States are advanced once in so many samples: at 1 kHz what changes at 3 Hz is told 80 times a period.
 STEP = 4
-# Half width of the filter of the motion behind them: passes 30 Hz at 1 kHz. A hysteresis forgets with every way that
-# its spring goes, noise's too.
-HALF_WIDTH = 64
+# Half width of the filter of the motion behind them, s, which passes 30 Hz: a hysteresis forgets with every way that
+# its spring goes, noise's too. Of short windows it is this multiple at most.
+HALF_WIDTH, OF_WINDOW = 0.064, 1.4
 
 
 def least_samples(system: System) -> int:
     """Samples of a segment that give any window: of the widest filter, a tenth of a window more than none."""
-    return round(1.5 * system.windows.momentum * system.sample_rate) + 2 * HALF_WIDTH
+    return round(1.5 * system.windows.momentum * system.sample_rate) + 2 * half_width(system)
+
+
+def half_width(system: System) -> int:
+    """Half width of the filter of the motion that internal states follow, in samples."""
+    return max(HALF_WIDTHS[0], round(min(HALF_WIDTH, OF_WINDOW * system.windows.momentum) * system.sample_rate))
 
 
 class FollowedMotion:
@@ -35,11 +40,12 @@ class FollowedMotion:
         layout = sensing.model.layout
         self._motions = []
         self._last: tuple[Model, dict[int, Array]] | None = None
+        self.half_width = M = half_width(sensing.model.system)
         self._sizes = [segment.index.size for segment in segments]
         for segment in segments:
             x = sensing.coordinates(segment.values)
-            samples = np.arange(HALF_WIDTH, len(x) - HALF_WIDTH, STEP)
-            smoothed, rates = smooth(x, samples, HALF_WIDTH, sample_rate)
+            samples = np.arange(M, len(x) - M, STEP)
+            smoothed, rates = smooth(x, samples, M, sample_rate)
             self._motions.append((samples, smoothed, layout.speeds(smoothed, rates)))
 
     def speeds(self, number: int) -> tuple[NDArray[np.int64], Array]:

@@ -31,6 +31,8 @@ from sms_online.stream import Array
 # Corners that are tried first, Hz, from that of the longest delay on; quicker lags are found to first order in their
 # delay, beside the forces.
 CORNERS = (delay_of(LONGEST_DELAY), 2.0, 3.5, 6.0)
+# Where masses follow the springs to this share none of these corners is in any sensor: 6 Hz would leave 5 % at least.
+FOLLOWED = 0.02
 # A sensor is late where its lag leaves less than this share of what no masses can follow.
 LARGEST_LEFT = 0.5
 # Probability that any sensor seems late by accident.
@@ -155,6 +157,8 @@ def find_late(rows: SessionRows, make: CandidateColumns, fitted: NDArray[np.bool
     if not places:
         return None
     fit, held = motions.unfollowed()
+    if held < FOLLOWED:
+        return None
     tried = [(motions.unfollowed(where, corner)[0], where, corner) for where in places for corner in CORNERS]
     best, where, corner = min(tried)
     limit = threshold(FALSE_ALARM, len(tried), 1)

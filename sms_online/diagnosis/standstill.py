@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from sms_online.diagnosis.followed import HALF_WIDTH, FollowedMotion
+from sms_online.diagnosis.followed import FollowedMotion
 from sms_online.pipeline.smoothing import kernel
 
 # An axis stands still where its rate is below this multiple of the rate's noise for so long, s: half a usual window. At
@@ -22,7 +22,7 @@ class Standstill:
 
     def __init__(self, motion: FollowedMotion, motor: int, noise: float, sample_rate: float) -> None:
         self.motor, self._motion = motor, motion
-        self.slow = STILL * noise * float(np.linalg.norm(kernel(HALF_WIDTH)[:, 1])) * sample_rate
+        self.slow = STILL * noise * float(np.linalg.norm(kernel(motion.half_width)[:, 1])) * sample_rate
         self._least = LASTING * sample_rate
 
     def at(self, number: int, samples: NDArray[np.int64]) -> NDArray[np.bool_]:
