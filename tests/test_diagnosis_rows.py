@@ -78,7 +78,7 @@ def test_a_channels_column_is_the_change_of_the_rows_when_it_is_corrected(effect
     parts = [corrected(system, rows.sensing.channels, segment) for segment in rows.segments]
     moved = SessionRows(rows.model, rows.base, rows.sensing, rows.noise, parts, rows.beta)
     inner = slice(5, -5)  # corrections begin at the record's ends
-    change = ((moved.Y - rows.Y) @ rows.beta)[inner]
+    change = ((moved.Y - rows.Y) @ rows.beta - (moved.b - rows.b))[inner]
     same = (moved.weak.windows.half_width == rows.weak.windows.half_width)[inner]
     column = CandidateColumns(rows, rows.model.system).of(effect.model_copy(update={"coefficients": {}})).columns
     expected = column[inner, :, 0] * linear

@@ -11,10 +11,10 @@ import pytest
 from sms_adapters.system_file import load_system
 from sms_online.description.schema import Effect, System
 from sms_online.diagnosis import diagnose
-from sms_online.diagnosis.followed import FollowedMotion
 from sms_online.diagnosis.record import Segment
 from sms_online.diagnosis.residuals import RowResidual
 from sms_online.diagnosis.standstill import Standstill
+from sms_online.pipeline.smoothing import smooth
 
 
 def _finding(name: str, where: str) -> Any:
@@ -86,9 +86,10 @@ def test_links_stiffen_that_take_something_away(
             return self.left
 
     monkeypatch.setattr(diagnose, "Attempt", Attempted)
-    attempt: Any = SimpleNamespace(system=load_system("paper-planar"))
+    rows = SimpleNamespace(beta=np.zeros(1))
+    attempt: Any = SimpleNamespace(system=load_system("paper-planar"), rows=rows, constants=())
     case: Any = None
-    found: Any = diagnose._stiffened(case, attempt, np.zeros(1), [])
+    found: Any = diagnose._stiffened(case, attempt, [])
     assert (None if found is None else found.links) == exact
 
 
@@ -99,11 +100,10 @@ def test_an_axis_stands_still_where_its_rate_is_noise_for_longer_than_a_reversal
     rest = ((t >= 1.0) & (t < 1.6)) | ((t >= 2.5) & (t < 2.6))
     rate = np.where(t < 1.0, np.cos(2.0 * np.pi * t), np.where(rest, 0.0, 1.0))
     position = np.cumsum(rate)[:, None] / 1000.0 + noise * np.random.default_rng(5).standard_normal((t.size, 1))
-    layout = SimpleNamespace(speeds=lambda x, v: v)
+    layout = SimpleNamespace(theta_m=(0,), n_base_positions=3, n_base_speeds=3)
     sensing: Any = SimpleNamespace(model=SimpleNamespace(layout=layout), coordinates=lambda values: values)
-    motion = FollowedMotion(sensing, [Segment(np.arange(t.size), position)], 1000.0)
-    held = Standstill(motion, 0, noise, 1000.0)
-    rested = motion.speeds(0)[1][280:380]  # from 1.15 to 1.55 s
+    held = Standstill(sensing, [Segment(np.arange(t.size), position)], 0, noise, 1000.0)
+    rested = smooth(position, np.arange(1150, 1550, 4), 28, 1000.0)[1]
     assert held.slow == pytest.approx(4.0 * rested.std(), rel=0.35)
     seen = np.arange(100, 2900)
     still = held.at(0, seen)

@@ -186,10 +186,10 @@ class CandidateColumns:
 
     def _standstill(self, joint: int) -> Standstill:
         """Of a joint's motor, by number from 0."""
-        layout = self.rows.model.layout
-        motor = layout.theta_m[joint]
-        noise = float(self.rows.noise.coordinates[motor + layout.n_base_positions - layout.n_base_speeds])
-        return Standstill(self.rows.followed, motor, noise, self.system.sample_rate)
+        rows, layout = self.rows, self.rows.model.layout
+        column = layout.theta_m[joint] + layout.n_base_positions - layout.n_base_speeds
+        noise = float(rows.noise.coordinates[column])
+        return Standstill(rows.sensing, rows.segments, joint, noise, self.system.sample_rate)
 
     def _declaring(self, effect: Effect) -> System:
         """The system with one more effect."""

@@ -40,18 +40,13 @@ class FollowedMotion:
         layout = sensing.model.layout
         self._motions = []
         self._last: tuple[Model, dict[int, Array]] | None = None
-        self.half_width = M = half_width(sensing.model.system)
+        M = half_width(sensing.model.system)
         self._sizes = [segment.index.size for segment in segments]
         for segment in segments:
             x = sensing.coordinates(segment.values)
             samples = np.arange(M, len(x) - M, STEP)
             smoothed, rates = smooth(x, samples, M, sample_rate)
             self._motions.append((samples, smoothed, layout.speeds(smoothed, rates)))
-
-    def speeds(self, number: int) -> tuple[NDArray[np.int64], Array]:
-        """Samples (K,) of a segment, one in STEP of them, and the speeds (K, n_v) there."""
-        samples, _, v = self._motions[number]
-        return samples, v
 
     def states(self, model: Model, number: int, at: NDArray[np.int64] | None = None) -> Array:
         """Internal states (K, n_states) of a model at samples `at` (K,) of a segment, at all of them unless given.

@@ -2,33 +2,47 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from numpy.typing import NDArray
 
-from sms_online.diagnosis.followed import FollowedMotion
-from sms_online.pipeline.smoothing import kernel
+from sms_online.diagnosis.record import Segment
+from sms_online.pipeline.sensing import Sensing
+from sms_online.pipeline.smoothing import HALF_WIDTHS, kernel, smooth
 
 # An axis stands still where its rate is below this multiple of the rate's noise for so long, s: half a usual window. At
 # a reversal it is for less, unless the axis is turned round by less than a third of a rad/s².
 STILL, LASTING = 4.0, 0.2
+# Half width of the filter of that rate, s; it is told once in so many samples.
+HALF_WIDTH, STEP = 0.028, 4
 
 
 class Standstill:
     """Where one motor stands still in a session.
 
-    motion: of the whole session. motor: its index in the speeds. noise: σ of its position, rad. slow: the rate below
-    which it stands still, rad/s.
+    joint: of the motor, by number from 0. noise: σ of its position, rad. slow: the rate below which it stands still,
+    rad/s.
     """
 
-    def __init__(self, motion: FollowedMotion, motor: int, noise: float, sample_rate: float) -> None:
-        self.motor, self._motion = motor, motion
-        self.slow = STILL * noise * float(np.linalg.norm(kernel(motion.half_width)[:, 1])) * sample_rate
+    def __init__(
+        self, sensing: Sensing, segments: Sequence[Segment], joint: int, noise: float, sample_rate: float
+    ) -> None:
+        layout = sensing.model.layout
+        self.motor = layout.theta_m[joint]
+        self._column = self.motor + layout.n_base_positions - layout.n_base_speeds
+        self._sensing, self._segments, self._rate = sensing, segments, sample_rate
+        self._half_width = max(HALF_WIDTHS[0], round(HALF_WIDTH * sample_rate))
+        self.slow = STILL * noise * float(np.linalg.norm(kernel(self._half_width)[:, 1])) * sample_rate
         self._least = LASTING * sample_rate
 
     def at(self, number: int, samples: NDArray[np.int64]) -> NDArray[np.bool_]:
         """At which samples (K,) of a segment it does."""
-        seen, v = self._motion.speeds(number)
-        edges = np.flatnonzero(np.diff(np.abs(v[:, self.motor]) < self.slow, prepend=False, append=False))
+        M = self._half_width
+        angle = self._sensing.coordinates(self._segments[number].values)[:, [self._column]]
+        seen = np.arange(M, len(angle) - M, STEP)
+        rate = smooth(angle, seen, M, self._rate)[1][:, 0]
+        edges = np.flatnonzero(np.diff(np.abs(rate) < self.slow, prepend=False, append=False))
         still = np.zeros(len(seen), dtype=bool)
         for begin, end in edges.reshape(-1, 2).tolist():
             still[begin:end] = seen[end - 1] - seen[begin] >= self._least
