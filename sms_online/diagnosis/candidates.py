@@ -19,19 +19,20 @@ from sms_online.diagnosis.trace import DRY, Candidate
 from sms_online.diagnosis.weak_windows import Motion, WeakWindows
 from sms_online.effects.base import Inputs, Ranges
 from sms_online.effects.catalogue import ENTRIES, candidates
-from sms_online.effects.channel import TorqueDelay
 from sms_online.effects.spacecraft import TableTilt
 from sms_online.model.model import Model
 from sms_online.model.parameters import Parameter
 from sms_online.pipeline.momentum_balance import HOPS
 from sms_online.stream import Array
 
+TORQUE_RATE = "torque rate"
 # Linear coefficients of effects on channels: quantity, unit, what a unit of it adds to a reading, with its sign. A lag
-# of a delay T reads x - T ẋ, an eccentric disc x + a sin x + b cos x.
+# of a delay T reads x - T ẋ, a late torque τ - T τ̇, an eccentric disc x + a sin x + b cos x.
 LINEAR = {
     "encoder_offset": (("offset", "rad", "one", -1.0),),
     "encoder_eccentricity": (("sine", "rad", "sine", -1.0), ("cosine", "rad", "cosine", -1.0)),
     "sensor_lag": (("delay", "s", "rate", 1.0),),
+    "torque_delay": (("time", "s", TORQUE_RATE, -1.0),),
 }
 
 
@@ -195,17 +196,17 @@ class CandidateColumns:
         """The system with one more effect."""
         return self.system.model_copy(update={"effects": (*self.system.effects, effect)})
 
-    def _late_torque(self, where: str) -> Array:
-        """Columns (W, n_v, 1) of a delay of a joint's torque: its rate, in the momentum."""
+    def _torque_rate(self, where: str) -> Array:
+        """∫ φ d(n τ)/dt dt of a joint in its motor's row (W, n_v), differentiated by way of φ."""
         i = int(where.removeprefix("joint_")) - 1
         motor = self.rows.model.layout.theta_m[i]
 
         def columns(motion: Motion) -> tuple[Array, Array]:
             P = np.zeros((*motion.v.shape, 1))
-            P[:, motor, 0] = -motion.torque[:, i]
+            P[:, motor, 0] = motion.torque[:, i]
             return P, np.zeros_like(P)
 
-        return self._weak.columns(columns, dense=True)
+        return self._weak.columns(columns, dense=True)[..., 0]
 
     def _channel(self, effect: Effect) -> Candidate:
         """What is added to readings, times the rows' response to it; in other windows than the rows' there is none.
@@ -213,15 +214,14 @@ class CandidateColumns:
         An effect y = x + c d(x) on a reading y is taken off by y - c d, so rows of readings lack -c times the response.
         """
         layout = self.rows.model.layout
-        if effect.name == TorqueDelay.entry.name:
-            parameter = Parameter(f"{effect.name}@{effect.where}.time", "time", "s", 0.0)
-            return Candidate(effect, (parameter,), self._late_torque(effect.where))
         columns, parameters = [], []
         for quantity, unit, displacement, sign in LINEAR[effect.name]:
             names = [self.rows.sensing.channels[k] for k in self.rows.sensing.position_columns]
             acts = [k for k, name in enumerate(names) if fnmatchcase(name, effect.where)]
             response = np.zeros((self._weak.count, layout.n_v))
-            if self._weak is self.rows.weak:
+            if displacement == TORQUE_RATE:
+                response = sign * self._torque_rate(effect.where)
+            elif self._weak is self.rows.weak:
                 response = sign * self.rows.responses[displacement][:, :, acts].sum(axis=2)
             columns.append(response)
             parameters.append(Parameter(f"{effect.name}@{effect.where}.{quantity}", quantity, unit, 0.0))
