@@ -129,11 +129,11 @@ def test_the_adopted_system_file_holds_what_was_found() -> None:
     diagnosis = diagnosed("table_tilt@base:gravity_x=0.003,gravity_y=-0.002")
     system = load_system("paper-planar")
     found = diagnosis.after.system
-    text = adopted_text("paper-planar", system, system.model_copy(update={"gravity": found.gravity}))
+    text = adopted_text("paper-planar", system, system.model_copy(update={"gravity": found.gravity}), {})
     assert_allclose(parse_system(text, "adopted").gravity, found.gravity, rtol=1e-8)
     diagnosis = diagnosed("torsional_hysteresis@joint_1:torque=5,width=0.02")
     adopted = system.model_copy(update={"effects": diagnosis.after.system.effects})
-    (effect,) = parse_system(adopted_text("paper-planar", system, adopted), "adopted").effects
+    (effect,) = parse_system(adopted_text("paper-planar", system, adopted, {}), "adopted").effects
     assert (effect.name, effect.where) == ("torsional_hysteresis", "joint_1")
     assert effect.coefficients["width"] == pytest.approx(0.02, rel=0.02)
 

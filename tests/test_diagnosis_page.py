@@ -124,7 +124,7 @@ def test_what_a_system_file_gains_is_told_alone() -> None:
     system = load_system("paper-planar")
     found = Effect(name="cubic_stiffness", where="joint_1")
     after = system.model_copy(update={"effects": (*system.effects, found)})
-    added = added_lines("paper-planar", adopted_text("paper-planar", system, after))
+    added = added_lines("paper-planar", adopted_text("paper-planar", system, after, {}))
     assert [line for line in added if line] == ["[[effect]]", 'name = "cubic_stiffness"', 'where = "joint_1"']
 
 

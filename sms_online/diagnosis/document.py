@@ -98,10 +98,10 @@ def summary(diagnosis: Diagnosis) -> str:
     if diagnosis.verdict == "clean":
         return "Nothing but noise is left: the model explains the capture."
     keys = [f"{effect['name']} at {effect['where']}" for effect in _named(diagnosis)]
-    before, after = diagnosis.before, diagnosis.after
-    row = max(before.test, key=lambda name: before.test[name].whitened)
-    fall = f"from {_times(before.test[row].whitened)} to {_times(after.test[row].whitened)} times noise"
-    falls = f"the residual of {row} falls {fall}"
+    before, after = diagnosis.before.holdout.whitened, diagnosis.after.holdout.whitened
+    row = max(before, key=lambda name: before[name])
+    fall = f"from {_times(before[row])} to {_times(after[row])} times noise"
+    falls = f"the residual of {row} falls {fall} on data not fitted"
     if diagnosis.verdict == "named":
         return f"The model lacks {', '.join(keys)}: with {'them' if len(keys) > 1 else 'it'} {falls}."
     unexplained = diagnosis.unexplained

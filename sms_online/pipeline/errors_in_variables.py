@@ -94,7 +94,8 @@ class NoiseBias:
         # Each cluster's part of it, to first order.
         parts = np.linalg.solve(gram[:-1, :-1], (clusters[:, :-1] @ np.append(biased, -1.0)).T)
         scatter = np.sum(parts**2, axis=1)
-        certain = np.maximum(0.0, 1.0 - EVIDENCE**2 * scatter / np.maximum(whole**2, np.finfo(np.float64).tiny))
+        doubt = EVIDENCE**2 * scatter
+        certain = 1.0 - np.divide(doubt, whole**2, out=np.ones_like(doubt), where=whole**2 > doubt)
         unit = size[-1] / size[:-1]
         shift[kept] = certain * whole * unit
         count = parts.shape[1]

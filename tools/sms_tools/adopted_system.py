@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Iterable, Mapping
 from difflib import ndiff
 from pathlib import Path
+from typing import Any
 
 from sms_online.description.parse import shipped_systems, shipped_text
 from sms_online.description.schema import System
@@ -15,8 +17,11 @@ NAME = "system.toml"
 ONLINE_NAME = "adopted.toml"
 
 
-def adopted_text(described: str, before: System, after: System) -> str:
-    """TOML of the system `after`: the text of `described`, file or name of the system `before`, and what is new."""
+def adopted_text(described: str, before: System, after: System, remarks: Mapping[str, str]) -> str:
+    """TOML of the system `after`: the text of `described`, file or name of the system `before`, and what is new.
+
+    remarks: what to say of an effect, by name@where; its values there are for people, the next session estimates them.
+    """
     lines = _text(described).rstrip().splitlines()
     if after.gravity != before.gravity:
         stated = [k for k, line in enumerate(lines) if re.match(r"\s*gravity\s*=", line)]
@@ -34,7 +39,30 @@ def adopted_text(described: str, before: System, after: System) -> str:
             if effect.coefficients:
                 inside = ", ".join(f"{name} = {value:.9g}" for name, value in effect.coefficients.items())
                 lines.append(f"coefficients = {{ {inside} }}")
+            if remark := remarks.get(f"{effect.name}@{effect.where}"):
+                lines.append(f"# found: {remark}")
     return "\n".join(lines) + "\n"
+
+
+def remarks(effects: Iterable[Mapping[str, Any]]) -> dict[str, str]:
+    """What was found of effects, as a document tells them, for a line of text each, by name@where."""
+    return {
+        f"{effect['name']}@{effect['where']}": ", ".join(
+            " ".join((name, *_told(value))) for name, value in effect["coefficients"].items()
+        )
+        for effect in effects
+    }
+
+
+def _told(value: Mapping[str, Any]) -> list[str]:
+    estimate, std, unit = cells_of(value)
+    return [estimate, *([f"± {std}"] if std else []), *([unit] if unit else [])]
+
+
+def cells_of(value: Mapping[str, Any]) -> list[str]:
+    """A coefficient's estimate, its deviation, empty where it has none, and its unit."""
+    std = value["std"]
+    return [f"{value['estimate']:.5g}", "" if std is None else f"{std:.2g}", value["unit"]]
 
 
 def added_lines(described: str, adopted: str) -> list[str]:

@@ -18,7 +18,7 @@ from sms_online.judgement import Discrepancy
 from sms_online.pipeline.estimator import Estimator
 from sms_online.results import results_document
 from sms_online.stream import Array, Block
-from sms_tools.adopted_system import ONLINE_NAME, adopted_text, write_adopted
+from sms_tools.adopted_system import ONLINE_NAME, adopted_text, remarks, write_adopted
 from sms_tools.exit_codes import INTERRUPTED, NOTHING_DETERMINED, OK
 from sms_tools.interruption import Interruption
 from sms_tools.priors import base_prior
@@ -98,7 +98,8 @@ def write_named(args: argparse.Namespace, online: OnlineDiagnosis, directory: Pa
     system = online.system
     described = load_system(args.system)
     if args.adopt and system != described:
-        path = write_adopted(directory, adopted_text(args.system, described, system), ONLINE_NAME)
+        found = [effect for episode in online.document() for effect in episode["effects"]]
+        path = write_adopted(directory, adopted_text(args.system, described, system, remarks(found)), ONLINE_NAME)
         show(report_console(args.json), f"system file with what was found: {path}")
 
 

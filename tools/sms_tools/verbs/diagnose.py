@@ -6,7 +6,6 @@ import argparse
 import math
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
 
 from rich.table import Table
 from rich.text import Text
@@ -21,7 +20,7 @@ from sms_online.errors import InputError
 from sms_online.pipeline.estimator import Estimator
 from sms_online.stream import Block
 from sms_online.trackers.interface import Prior
-from sms_tools.adopted_system import added_lines, adopted_text, write_adopted
+from sms_tools.adopted_system import added_lines, adopted_text, cells_of, remarks, write_adopted
 from sms_tools.exit_codes import NOTHING_DETERMINED, OK
 from sms_tools.html_report.diagnosis_page import write_diagnosis
 from sms_tools.interruption import Interruption
@@ -79,7 +78,7 @@ def run(args: argparse.Namespace) -> int:
     path = write_document(directory / NAME, document)
     added: list[str] = []
     if diagnosis.after.system != system:
-        text = adopted_text(args.system, system, diagnosis.after.system)
+        text = adopted_text(args.system, system, diagnosis.after.system, remarks(document["effects"]))
         added = added_lines(args.system, text)
         lines.append(f"system file with what was found: {write_adopted(directory, text)}")
     page = write_diagnosis(directory, document, diagnosis, args.capture.name, added)
@@ -131,9 +130,10 @@ def _watched(
         for t in (begin, end):
             view.evidence(t, scores)
         view.event(end, document["summary"])
+        told_of = remarks(document["effects"])
         for effect in document["effects"]:
-            values = (f"{name} {' '.join(_told(value))}" for name, value in effect["coefficients"].items())
-            view.event(end, ", ".join((f"{effect['name']}@{effect['where']}", *values)))
+            key = f"{effect['name']}@{effect['where']}"
+            view.event(end, ", ".join(filter(None, (key, told_of[key]))))
     return view
 
 
@@ -168,30 +168,19 @@ def _effects(document: Document) -> Table:
         others = ", ".join(effect["ambiguous_with"][:SHOWN])
         first = True
         for name, value in effect["coefficients"].items() or [("", None)]:
-            cells = ["", "", ""] if value is None else _cells(value)
+            cells = ["", "", ""] if value is None else cells_of(value)
             table.add_row(f"{effect['name']}@{effect['where']}" if first else "", name, *cells, others if first else "")
             first = False
     return table
 
 
-def _told(value: dict[str, Any]) -> list[str]:
-    """A coefficient's value, its deviation where it has one, and unit, for a line of text."""
-    estimate, std, unit = _cells(value)
-    return [estimate, *([f"± {std}"] if std else []), *([unit] if unit else [])]
-
-
-def _cells(value: dict[str, Any]) -> list[str]:
-    std = value["std"]
-    return [f"{value['estimate']:.5g}", "" if std is None else f"{std:.2g}", value["unit"]]
-
-
 def _residuals(document: Document) -> Table:
-    table = Table(title="residual", title_justify="left", box=None, header_style="bold", pad_edge=False)
-    for heading in ("rows", "× noise before", "after", "after, held out", "share of torque before", "after, held out"):
+    title = "residual on data not fitted"
+    table = Table(title=title, title_justify="left", box=None, header_style="bold", pad_edge=False)
+    for heading in ("rows", "× noise before", "after", "share of torque before", "after"):
         table.add_column(heading, justify="left" if heading == "rows" else "right")
-    before, after = document["before"], document["after"]
-    for row, fit in before["fit"].items():
-        whitened = [part[row]["whitened"] for part in (before["fit"], after["fit"], after["holdout"])]
-        relative = [fit["relative"], after["holdout"][row]["relative"]]
+    parts = [document[state]["holdout"] for state in ("before", "after")]
+    for row in parts[0]:
+        whitened, relative = ([part[row][measure] for part in parts] for measure in ("whitened", "relative"))
         table.add_row(row, *(f"{w:.3g}" for w in whitened), *("" if r is None else f"{r:.3g}" for r in relative))
     return table

@@ -32,6 +32,7 @@ from sms_tools.session import (
     write_named,
 )
 from sms_tools.showing import showing
+from sms_tools.true_values import true_values
 
 # A progress bar appears from this size on, bytes: a second of work.
 LONG_FILE = 20_000_000
@@ -60,7 +61,7 @@ def run(args: argparse.Namespace) -> int:
 
             source = open_source(capture, system, args.start, args.stop, on_bytes, folder)
             truth = read_truth(capture / SESSION if capture.is_dir() else capture)
-            parameters = None if truth is None else truth["parameters"]
+            true = None if truth is None else true_values(truth, system, system)
             estimator = new_estimator(system, source.channels, str(capture), args.prior)
             if isinstance(source, Recording) and source.checkpoint is not None:
                 load_checkpoint(source.checkpoint, estimator)
@@ -71,7 +72,7 @@ def run(args: argparse.Namespace) -> int:
             rows = PIECE if patient else max(1, round(PACE * system.sample_rate))
             pieces = (piece for block in source for piece in block.pieces(rows))
             blocks = pieces if patient else _paced(pieces, interruption)
-            with showing(args, estimator, source.channels, directory, parameters, patient) as shown:
+            with showing(args, estimator, source.channels, directory, true, patient) as shown:
                 searcher = searcher_of(capture, args.adopt) if args.start is args.stop is None else Immediate()
                 online = OnlineDiagnosis(estimator, searcher, args.adopt)
                 # A bar of progress stays below what is told.
@@ -82,7 +83,9 @@ def run(args: argparse.Namespace) -> int:
                 wall = perf_counter() - opened
         bound = None if record is None else session_bound(estimator, record)
         warnings = [*source.warnings, *shown.warnings]
-        document = document_of(estimator, estimator.samples / wall, warnings, parameters, bound, online.discrepancies)
+        # Of effects that were taken up, too.
+        true = None if truth is None else true_values(truth, system, online.system)
+        document = document_of(estimator, estimator.samples / wall, warnings, true, bound, online.discrepancies)
         document["diagnosis"] = online.document()
         write_named(args, online, directory)
         code = conclude(args, document, directory, interruption.requested)
