@@ -73,24 +73,35 @@ def diagnosis_document(diagnosis: Diagnosis, warnings: list[str], truth: dict[st
             }
             for ranked in diagnosis.ranking
         ],
-        "warnings": [*warnings, *results["after"]["warnings"]],
+        "warnings": [
+            *warnings,
+            # Those of a session are of the session's parameters, which with a prior are not what is told.
+            *(results["after"]["warnings"] if diagnosis.attempt.prior is None else _fully(_after(diagnosis))),
+        ],
     }
 
 
-def judgement(diagnosis: Diagnosis) -> Judgement:
-    """May the parameters after be trusted, and the system file?"""
+def _fully(judged: Judgement) -> list[str]:
+    return [reason.full for reason in judged.reasons if reason.full]
+
+
+def _after(diagnosis: Diagnosis) -> Judgement:
+    """May the parameters after be trusted?"""
     if diagnosis.attempt.prior is None:
         session = diagnosis.estimator_after
         estimate = session.estimate()
         projection = projected(session, estimate, standard_deviation(session, estimate))
-        after = judged(session, estimate, projection=projection)
-    else:
-        # Parameters come from the rows of the diagnosis then, see `_posterior`.
-        known = [p["identifiable"] for p in _posterior(diagnosis.attempt, diagnosis.chosen)]
-        after = judge(Facts((sum(known), len(known)), residual=_part(diagnosis.after.fit)))
+        return judged(session, estimate, projection=projection)
+    # Parameters come from the rows of the diagnosis then, see `_posterior`.
+    known = [p["identifiable"] for p in _posterior(diagnosis.attempt, diagnosis.chosen)]
+    return judge(Facts((sum(known), len(known)), residual=_part(diagnosis.after.fit)))
+
+
+def judgement(diagnosis: Diagnosis) -> Judgement:
+    """May the parameters after be trusted, and the system file?"""
     effects = [f"{effect['name']}@{effect['where']}" for effect in _named(diagnosis)]
     row = None if diagnosis.unexplained is None else diagnosis.unexplained.row
-    return judge_diagnosis(diagnosis.verdict, effects, row, after, _near(diagnosis))
+    return judge_diagnosis(diagnosis.verdict, effects, row, _after(diagnosis), _near(diagnosis))
 
 
 def summary(diagnosis: Diagnosis) -> str:
