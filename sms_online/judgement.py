@@ -171,10 +171,12 @@ def judge_diagnosis(
     if verdict == "unexplained":
         where = "" if row is None else f" on {row}"
         text = f"something acts{where} that no known effect explains"
+        # These are no findings, so they are not told as such one by one.
+        like = [Reason(f"some of it looks like {_listed(effects)}", True)] if effects else []
         if near:
             text = f"what acts{where} is near {_listed(effects)}, but is more or something else"
-            each = []
-        found = [Reason(text, True, () if row is None else (row,), "unexplained"), *each]
+            like = []
+        found = [Reason(text, True, () if row is None else (row,), "unexplained"), *like]
     else:
         what, them = (effects[0], "it") if len(effects) == 1 else (f"{len(effects)} effects", "them")
         trusted = f"; trust the parameters with {them}" + (" but for what follows" if after.level == "doubt" else "")

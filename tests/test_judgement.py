@@ -189,6 +189,8 @@ def test_what_nothing_explains_is_marked_where_it_acts() -> None:
 
 
 def test_an_effect_that_does_not_explain_all_is_called_near() -> None:
+    judgement = judge_diagnosis("unexplained", ["cogging@joint_1"], "joint_1", TRUSTED)
+    assert judgement.reasons[1].text == "some of it looks like cogging@joint_1"
     judgement = judge_diagnosis("unexplained", ["cogging@joint_1"], "joint_1", TRUSTED, near=True)
     assert judgement.grave
     assert "is near cogging@joint_1, but is more or something else" in judgement.sentence
