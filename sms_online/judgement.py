@@ -161,8 +161,8 @@ def judge_diagnosis(
 ) -> Judgement:
     """The judgement of a diagnosed capture.
 
-    verdict: `clean`, `named` or `unexplained`. effects: what was named, `name@where`. row: type of the rows that most
-    of what is not explained acts on. after: of the session with what was named. near: whether effects that are named
+    verdict: `clean`, `named` or `unexplained`. effects: what was named, `name@where`. row: type of the rows that
+    what is not explained acts on. after: of the session with what was named. near: whether effects that are named
     in an unexplained session leave little of it.
     """
     if verdict == "clean":

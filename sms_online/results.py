@@ -196,7 +196,8 @@ def _smoother_warnings(estimator: Estimator) -> list[str]:
     """What the smoother replaced, and where it failed."""
     smoother = estimator.smoother
     if smoother is None:
-        return []
+        asked = estimator.system.balance == "smoother"
+        return ["no smoother: it does not know of the effects on channels that are declared"] if asked else []
     out = [f"the smoother left out {failure}" for failure in smoother.failures]
     missing = ", ".join(estimator.sensing.missing)
     if estimator.by_smoother:

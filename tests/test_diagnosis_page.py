@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 from pathlib import Path
+from typing import Any
 from xml.etree import ElementTree
 
 import numpy as np
@@ -20,7 +21,7 @@ from sms_online.diagnosis.diagnose import Diagnosis, diagnose
 from sms_online.diagnosis.document import diagnosis_document
 from sms_online.diagnosis.force_curves import added_variables, force_curves
 from sms_online.model.model import Model
-from sms_tools.adopted_system import added_lines, adopted_text
+from sms_tools.adopted_system import added_lines, adopted_text, remarks
 from sms_tools.cli import main
 from sms_tools.html_report.arm_drawing import MARK, marked_arm
 from sms_tools.html_report.diagnosis_page import write_diagnosis
@@ -128,6 +129,22 @@ def test_what_a_system_file_gains_is_told_alone() -> None:
     assert [line for line in added if line] == ["[[effect]]", 'name = "cubic_stiffness"', 'where = "joint_1"']
 
 
+def test_what_was_found_is_remarked_in_the_system_file_unless_it_states_it() -> None:
+    def told(name: str, estimate: float) -> dict[str, Any]:
+        value = {"estimate": estimate, "std": 0.5, "unit": "N m"}
+        return {"name": name, "where": "joint_1", "coefficients": {"torque": value}}
+
+    found = remarks([told("coulomb_friction", 20.0), told("coulomb_friction", 21.0), told("torque_delay", 0.02)])
+    assert found["coulomb_friction@joint_1"] == "torque 20 ± 0.5 N m"
+    system = load_system("paper-planar")
+    late = Effect(name="torque_delay", where="joint_1", coefficients={"time": 0.02})
+    after = system.model_copy(update={"effects": (Effect(name="coulomb_friction", where="joint_1"), late)})
+    text = adopted_text("paper-planar", system, after, found)
+    assert text.count("# found: ") == 1
+    assert "# found: torque 20 ± 0.5 N m" in text
+    assert parse_system(text, "adopted").effects == after.effects
+
+
 def test_effects_that_were_not_injected_are_truly_zero() -> None:
     system = load_system("paper-planar")
     named = [Effect(name="coulomb_friction", where=f"joint_{i}") for i in (1, 2)]
@@ -137,3 +154,7 @@ def test_effects_that_were_not_injected_are_truly_zero() -> None:
     assert true["coulomb_friction@joint_1.torque"] == 0.0
     assert true["coulomb_friction@joint_2.torque"] == 1.5
     assert true["link_1.mass"] == 2.0
+    # What was injected where this system has no place for it is not compared.
+    elsewhere = {"name": "coulomb_friction", "where": "joint_9", "coefficients": {"torque": 1.5}}
+    compared = true_values({"parameters": {}, "effects": [elsewhere]}, system, adopted)
+    assert "coulomb_friction@joint_9.torque" not in compared

@@ -15,8 +15,11 @@ from sms_online.diagnosis.constants import corrected, deviations, improved, stan
 from sms_online.diagnosis.evidence import angle, basis, free_of, gain, threshold
 from sms_online.diagnosis.plausible import plausible
 from sms_online.diagnosis.record import SampleRecord, Segment, excerpts
+from sms_online.diagnosis.residuals import RowResidual
 from sms_online.diagnosis.rows import SessionRows
+from sms_online.diagnosis.unexplained import describe_residual
 from sms_online.effects.base import Inputs
+from sms_online.model.layout import row_types
 from sms_online.pipeline.estimator import Estimator
 from sms_online.results import standard_deviation
 from sms_online.stream import Array
@@ -84,6 +87,20 @@ def test_a_channels_column_is_the_change_of_the_rows_when_it_is_corrected(effect
     expected = column[inner, :, 0] * linear
     scale = np.sqrt(np.mean(expected**2))
     assert np.sqrt(np.mean((change[same] - expected[same]) ** 2)) < 0.03 * scale
+
+
+def test_what_is_unexplained_acts_on_the_row_that_had_and_has_residual() -> None:
+    """A stand-in that cleared most of joint 2 and threw link 1 off, which had been near its noise."""
+    _, rows = session()
+    residual = np.random.default_rng(3).standard_normal(rows.b.shape)
+    layout = rows.model.layout
+    residual[:, layout.theta_m[1]] *= 3.0
+    residual[:, layout.q_f[0]] *= 6.0
+    before = {name: RowResidual(300.0 if name == "joint_2" else 1.5, 1.2) for name in row_types(layout)}
+    found = describe_residual(rows, rows.Y, residual, before)
+    assert (found.row, found.speed) == ("joint_2", "theta_m_2")
+    level = {name: RowResidual(10.0, 1.2) for name in before}
+    assert describe_residual(rows, rows.Y, residual, level).row == "link_1"
 
 
 def test_a_gain_is_what_least_squares_takes_off_the_residual() -> None:

@@ -15,6 +15,8 @@ from sms_adapters.truth import read_truth
 from sms_online.bound import cramer_rao_bound
 from sms_online.description.parse import parse_system, shipped_text
 from sms_online.description.schema import System
+from sms_online.diagnosis.constants import corrected
+from sms_online.diagnosis.record import Segment
 from sms_online.effects.base import report
 from sms_online.effects.catalogue import channel_effects, parse_effect
 from sms_online.effects.channel import EncoderEccentricity, SensorLag, TorqueDelay
@@ -368,9 +370,29 @@ def test_a_stated_delay_of_a_torque_is_taken_off(clean_motion: Simulation) -> No
     assert left(declaring()) > 10.0
 
 
-def test_a_negative_delay_is_bad_input() -> None:
-    with pytest.raises(InputError, match="0 s or more"):
-        declaring("torque_delay@joint_1:time=-0.001")
+def test_effects_on_one_channel_come_off_one_after_the_other() -> None:
+    system = declaring("torque_delay@joint_*:time=0.01", "torque_delay@joint_1:time=0.005")
+    values = np.random.default_rng(8).normal(size=(400, 1))
+    stage = Conditioning(system, ("tau_1",))
+    (out,) = stage.push(GridSamples(np.arange(400), values, 0))
+    assert_allclose(out.values, values[15 + out.index], atol=1e-12)
+    segment = Segment(np.arange(400), values)
+    assert_allclose(corrected(system, ("tau_1",), segment).values[out.index], out.values, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("torque_delay@joint_1:time=-0.001", "0 to 1 s"),
+        ("torque_delay@joint_1:time=20", "0 to 1 s"),
+        # Nothing would come off, and nobody would look for it.
+        ("torque_delay@joint_1", "without coefficients; expected time"),
+        ("encoder_offset@q_1", "without coefficients; expected offset"),
+    ],
+)
+def test_constants_of_a_channel_have_to_be_stated(text: str, words: str) -> None:
+    with pytest.raises(InputError, match=words):
+        channel_effects(declaring(text))
 
 
 def test_a_system_file_declares_an_effect_on_a_group_of_channels() -> None:

@@ -89,6 +89,17 @@ def test_jacobians_are_derivatives_of_the_shape(link: LinkKinematics) -> None:
         np.testing.assert_allclose(found, np.broadcast_to(change(name), found.shape), atol=atol)
 
 
+@pytest.mark.parametrize("free_end", [False, True])
+def test_markers_of_one_field_are_those_of_the_whole_shape(free_end: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    rod = ExactRod(planar_link(kinematics="exact"), free_end)
+    q_f = np.random.default_rng(4).uniform(-0.3, 0.3, size=(20, rod.n_f))
+    markers, by_q_f = rod.markers(q_f), rod.marker_jacobian(q_f)
+    np.testing.assert_allclose(rod.coordinates(markers), q_f, rtol=0, atol=1e-13)
+    monkeypatch.setattr(rod, "_one_field", None)
+    np.testing.assert_allclose(rod.markers(q_f), markers, rtol=0, atol=1e-14)
+    np.testing.assert_allclose(rod.marker_jacobian(q_f), by_q_f, rtol=0, atol=1e-14)
+
+
 @pytest.mark.parametrize("link", [link for link in rods().values() if isinstance(link, ExactRod)])
 def test_sections_turn_with_the_tangent(link: ExactRod) -> None:
     """The spin Jacobian of a section carries its tangent: d tangent/dt = spin × tangent; tangents stay unit vectors."""

@@ -14,9 +14,12 @@ from one_link import TEXT, one_link
 
 from sms_adapters import checkpoint
 from sms_adapters.capture import CaptureWriter
+from sms_adapters.system_file import load_system
 from sms_online.bound import STEP, MotionRecord, cramer_rao_bound, session_bound
+from sms_online.description.channels import channels
 from sms_online.description.parse import describe
-from sms_online.description.schema import Sensor, System
+from sms_online.description.schema import Effect, Sensor, System
+from sms_online.errors import InputError
 from sms_online.linearised import Motion
 from sms_online.pipeline.estimator import Estimator
 from sms_online.results import results_document, standard_deviation
@@ -213,6 +216,19 @@ def test_all_coordinates_measured_are_smoothed_only_where_that_is_asked_for(simu
     assert smoothed.by_smoother
     assert not smoothed.sensing.missing
     assert np.all(np.abs(normalised(smoothed)) < 4.0)
+
+
+def test_the_smoother_is_not_asked_where_effects_on_channels_are_declared() -> None:
+    """It reads channels as they come: the momentum balance tells then, and without all coordinates nothing does."""
+    offset = Effect(name="encoder_offset", where="theta_m_1", coefficients={"offset": 0.01})
+    system = load_system("paper-planar").model_copy(update={"balance": "smoother", "effects": (offset,)})
+    names = tuple(channels(system))
+    estimator = Estimator(system, names, "test")
+    assert estimator.smoother is None
+    assert any("effects on channels" in warning for warning in results_document(estimator, 0.0, [])["warnings"])
+    fewer = tuple(name for name in names if name != "link_1.marker_1.theta_z")
+    with pytest.raises(InputError, match=r"encoder_offset@theta_m_1, and no link_1\.marker_1\.theta_z"):
+        Estimator(system, fewer, "test")
 
 
 def test_replay_of_a_capture_without_slopes(

@@ -7,7 +7,7 @@ import scipy.signal
 
 from sms_online.description.schema import System
 from sms_online.effects.catalogue import channel_effects
-from sms_online.effects.channel import Late, SensorLag
+from sms_online.effects.channel import Convolved, SensorLag
 from sms_online.stream import Array
 
 # A lag is integrated on so many exact values a sample, joined by straight lines: at 1 kHz and 10 rad/s² they are off by
@@ -17,7 +17,8 @@ OVERSAMPLING = 8
 
 class Distortion:
     """Effects that a system declares on `channels` (C names): those of a value alone first, then lags.
-    A torque's delay is a sensor's latency.
+
+    A torque's delay is none of these, but a latency of its sensor.
 
     oversampling: exact values that a sample asks for, ending with its own; 1 where no channel lags, or where `single`
     says that there are no others. Values have to come in order of time.
@@ -25,7 +26,7 @@ class Distortion:
 
     def __init__(self, system: System, channels: tuple[str, ...], single: bool = False) -> None:
         effects = [(k, e) for e in channel_effects(system) for k, channel in enumerate(channels) if e.acts_on(channel)]
-        self._of_value = [(k, effect) for k, effect in effects if not isinstance(effect, Late)]
+        self._of_value = [(k, effect) for k, effect in effects if not isinstance(effect, Convolved)]
         lags = [(k, effect) for k, effect in effects if isinstance(effect, SensorLag)]
         self.oversampling = OVERSAMPLING if lags and not single else 1
         rate = self.oversampling * system.sample_rate

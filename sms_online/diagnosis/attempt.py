@@ -134,13 +134,13 @@ class Attempt:
         most = min(most, MOST_WINDOWS * span / HOPS)
         length, longest = (round(seconds * system.sample_rate) for seconds in (STRETCH * span, most))
         least = least_samples(system)
-        fitting, held = (
-            [part for part in excerpts(each, length, longest) if part.index.size > least]
-            for each in (case.segments, case.held)
-        )
+        # Corrections reach beyond a stretch.
         channels = session.sensing.channels
-        values = [corrected(described, channels, segment) for segment in (*fitting, *held)]
-        self.rows = SessionRows(estimator.model, estimator.base, estimator.sensing, noise, values)
+        whole = ([corrected(described, channels, segment) for segment in each] for each in (case.segments, case.held))
+        fitting, held = (
+            [part for part in excerpts(each, length, longest) if part.index.size > least] for each in whole
+        )
+        self.rows = SessionRows(estimator.model, estimator.base, estimator.sensing, noise, (*fitting, *held))
         self.make = CandidateColumns(self.rows, described)
         self._fitting = len(fitting)
         first, last = self.rows.time[:1].sum(), self.rows.time[-1:].sum()

@@ -19,7 +19,6 @@ from sms_online.diagnosis.trace import DRY, Candidate
 from sms_online.diagnosis.weak_windows import Motion, WeakWindows
 from sms_online.effects.base import Inputs, Ranges
 from sms_online.effects.catalogue import ENTRIES, candidates
-from sms_online.effects.spacecraft import TableTilt
 from sms_online.model.model import Model
 from sms_online.model.parameters import Parameter
 from sms_online.pipeline.momentum_balance import HOPS
@@ -49,7 +48,8 @@ class CandidateColumns:
         self.rows, self.system = rows, system
         self._since = since
         self._weak = rows.weak if weak is None else weak
-        self._noisy: list[WeakWindows] | None = None
+        self._noisy: list[CandidateColumns] = []
+        self._held: dict[int, Standstill] = {}
         self._own = {p.name for p in rows.model.parameters}
 
     def within(self, weak: WeakWindows) -> CandidateColumns:
@@ -159,8 +159,7 @@ class CandidateColumns:
             G = force.force(model.layout, motion.x, v, inputs)
             return None, np.where(held.at(motion.segment, motion.samples)[:, None, None], G, 0.0)
 
-        # Gravity is as smooth as the motion.
-        return self._weak.columns(columns, dense=force.name != TableTilt.entry.name)
+        return self._weak.columns(columns, dense=not force.smooth)
 
     def variance(self, candidate: Candidate, coefficients: Array) -> Array:
         """Variance (W, n_v) of the rows for what the sensors' noise makes of a force with coefficients (c,).
@@ -171,9 +170,9 @@ class CandidateColumns:
         """
         if ENTRIES[candidate.effect.name].kind != "force" or is_constant(candidate.effect) or self.rows.noise.exact:
             return np.zeros_like(self.rows.b)
-        if self._noisy is None:
-            self._noisy = self.rows.noisy()
-        noisy = [self.within(weak).of(candidate.effect).columns for weak in self._noisy]
+        if not self._noisy:
+            self._noisy = [self.within(weak) for weak in self.rows.noisy()]
+        noisy = [make.of(candidate.effect).columns for make in self._noisy]
         changes = [(columns - candidate.columns) @ coefficients for columns in noisy]
         squares = np.mean(np.square(changes), axis=0)
         near = np.ones(2 * HOPS - 1)
@@ -190,7 +189,9 @@ class CandidateColumns:
         rows, layout = self.rows, self.rows.model.layout
         column = layout.theta_m[joint] + layout.n_base_positions - layout.n_base_speeds
         noise = float(rows.noise.coordinates[column])
-        return Standstill(rows.sensing, rows.segments, joint, noise, self.system.sample_rate)
+        if joint not in self._held:
+            self._held[joint] = Standstill(rows.sensing, rows.segments, joint, noise, self.system.sample_rate)
+        return self._held[joint]
 
     def _declaring(self, effect: Effect) -> System:
         """The system with one more effect."""
@@ -209,7 +210,7 @@ class CandidateColumns:
         return self._weak.columns(columns, dense=True)[..., 0]
 
     def _channel(self, effect: Effect) -> Candidate:
-        """What is added to readings, times the rows' response to it; in other windows than the rows' there is none.
+        """What is added to readings, times the rows' response to it; other windows than the rows' tell torques alone.
 
         An effect y = x + c d(x) on a reading y is taken off by y - c d, so rows of readings lack -c times the response.
         """

@@ -51,12 +51,9 @@ def improved(effect: Effect, increments: Array) -> Effect:
 
 def stands(effect: Effect, sample_rate: float) -> bool:
     """Whether constants that were improved are still of an effect, on samples at so many Hz."""
-    match effect.name:
-        case "sensor_lag":
-            return plausible(effect.name, np.array([delay_of(effect.coefficients["corner"])]), sample_rate)
-        case "torque_delay":
-            return effect.coefficients["time"] > 0.0
-    return True
+    c = effect.coefficients
+    late = {"sensor_lag": lambda: delay_of(c["corner"]), "torque_delay": lambda: c["time"]}.get(effect.name)
+    return late is None or plausible(effect.name, np.array([late()]), sample_rate)
 
 
 def deviations(effect: Effect, covariance: Array) -> dict[str, float]:

@@ -96,9 +96,8 @@ def _exact(system: System, links: Sequence[str]) -> System:
 
 
 def _some(system: System, effects: Sequence[Effect]) -> float:
-    """s of the session that tell what there is to be told beside these effects."""
-    forces = tuple(effect for effect in effects if not is_constant(effect))
-    # Internal states would begin at rest in each stretch.
+    """s of the session to use: stretches, or all of it where internal states would begin at rest in each stretch."""
+    forces = tuple(effect for effect in (*system.effects, *effects) if not is_constant(effect))
     return LONGEST if Model(system.model_copy(update={"effects": forces})).n_states else SOME
 
 

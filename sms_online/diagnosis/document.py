@@ -120,13 +120,13 @@ def summary(diagnosis: Diagnosis) -> str:
     rest = f"acts on {unexplained.row} ({unexplained.speed}) and depends on {unexplained.variable}"
     if _near(diagnosis):
         return (
-            f"What the model lacks comes near {', '.join(keys)}, but is more or something else: {falls}, and most of "
+            f"What the model lacks comes near {', '.join(keys)}, but is more or something else: {falls}, and "
             f"what is left {rest}."
         )
     tried = (
         f" The nearest known effects ({', '.join(keys)}) leave {100.0 * diagnosis.left:.0f} % of it." if keys else ""
     )
-    return f"The model lacks something that no known effect explains: most of it {rest}.{tried}"
+    return f"The model lacks something that no known effect explains: it {rest}.{tried}"
 
 
 def _near(diagnosis: Diagnosis) -> bool:

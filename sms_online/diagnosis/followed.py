@@ -23,7 +23,7 @@ HALF_WIDTH, OF_WINDOW = 0.064, 1.4
 
 
 def least_samples(system: System) -> int:
-    """Samples of a segment that give any window: of the widest filter, a tenth of a window more than none."""
+    """Samples of a segment that give any window, and a motion that internal states can follow."""
     return round(1.5 * system.windows.momentum * system.sample_rate) + 2 * half_width(system)
 
 

@@ -157,7 +157,7 @@ def find_late(rows: SessionRows, make: CandidateColumns, fitted: NDArray[np.bool
     if not places:
         return None
     fit, held = motions.unfollowed()
-    if held < FOLLOWED:
+    if max(fit, held) < FOLLOWED:
         return None
     tried = [(motions.unfollowed(where, corner)[0], where, corner) for where in places for corner in CORNERS]
     best, where, corner = min(tried)

@@ -18,8 +18,8 @@ POSITIVE = frozenset(
 # is later than half a window of the planar example, s, is no channel of this session.
 LARGEST = {"torque_gain": 0.5, "torque_ripple": 0.5, "sensor_lag": 0.2, "torque_delay": 0.2}
 # Smallest ones. Torque sensors, and models of what a torque moves, are right to a thousandth at best: a gain or ripple
-# below that is no fault of theirs.
-SMALLEST = {"torque_gain": 1e-3, "torque_ripple": 1e-3}
+# below that is no fault of theirs. A delay of less than a microsecond is none.
+SMALLEST = {"torque_gain": 1e-3, "torque_ripple": 1e-3, "torque_delay": 1e-6}
 
 # A drive that holds its command over a sample acts half a sample late: a lag up to that, in samples, is no sensor's.
 HELD = 0.5

@@ -30,20 +30,21 @@ class Standstill:
     ) -> None:
         layout = sensing.model.layout
         self.motor = layout.theta_m[joint]
-        self._column = self.motor + layout.n_base_positions - layout.n_base_speeds
-        self._sensing, self._segments, self._rate = sensing, segments, sample_rate
-        self._half_width = max(HALF_WIDTHS[0], round(HALF_WIDTH * sample_rate))
-        self.slow = STILL * noise * float(np.linalg.norm(kernel(self._half_width)[:, 1])) * sample_rate
-        self._least = LASTING * sample_rate
+        column = self.motor + layout.n_base_positions - layout.n_base_speeds
+        M = max(HALF_WIDTHS[0], round(HALF_WIDTH * sample_rate))
+        self.slow = STILL * noise * float(np.linalg.norm(kernel(M)[:, 1])) * sample_rate
+        self._still = []
+        for segment in segments:
+            angle = sensing.coordinates(segment.values)[:, [column]]
+            seen = np.arange(M, len(angle) - M, STEP)
+            rate = smooth(angle, seen, M, sample_rate)[1][:, 0]
+            edges = np.flatnonzero(np.diff(np.abs(rate) < self.slow, prepend=False, append=False))
+            still = np.zeros(len(seen), dtype=bool)
+            for begin, end in edges.reshape(-1, 2).tolist():
+                still[begin:end] = seen[end - 1] - seen[begin] >= LASTING * sample_rate
+            self._still.append((seen, still))
 
     def at(self, number: int, samples: NDArray[np.int64]) -> NDArray[np.bool_]:
         """At which samples (K,) of a segment it does."""
-        M = self._half_width
-        angle = self._sensing.coordinates(self._segments[number].values)[:, [self._column]]
-        seen = np.arange(M, len(angle) - M, STEP)
-        rate = smooth(angle, seen, M, self._rate)[1][:, 0]
-        edges = np.flatnonzero(np.diff(np.abs(rate) < self.slow, prepend=False, append=False))
-        still = np.zeros(len(seen), dtype=bool)
-        for begin, end in edges.reshape(-1, 2).tolist():
-            still[begin:end] = seen[end - 1] - seen[begin] >= self._least
+        seen, still = self._still[number]
         return still[np.clip(np.searchsorted(seen, samples), 0, len(seen) - 1)]

@@ -40,7 +40,8 @@ class ForceEffect(Protocol):
     """An effect of kind `force`.
 
     parameters: the linear coefficients as they enter π. shapes: shape constants. relative_to: names of the model's
-    parameters that reported coefficients are divided by. n_states: number of internal states.
+    parameters that reported coefficients are divided by. n_states: number of internal states. smooth: whether it is as
+    smooth as the motion.
     """
 
     name: str
@@ -50,6 +51,7 @@ class ForceEffect(Protocol):
     relative_to: tuple[str, ...]
     needs_torque: bool
     n_states: int
+    smooth: bool
 
     def force(self, layout: Layout, x: Array, v: Array, inputs: Inputs | None) -> Array:
         """Columns f_j (B, n_v, coefficients): generalized force of one unit of each coefficient."""
@@ -148,6 +150,7 @@ class Force:
     entry: ClassVar[Entry]
     needs_torque = False
     n_states = 0
+    smooth = False
 
     def __init__(
         self, site: Site, linear: Mapping[str, tuple[str, str, float]], shapes: Mapping[str, float] | None = None

@@ -14,7 +14,14 @@ from sms_online.description.channels import channels, drive_channel, strain_chan
 from sms_online.description.explain import hint, nearest
 from sms_online.description.schema import Effect, FlexibleLink, System
 from sms_online.effects.base import Entry, ForceEffect, Place, Site
-from sms_online.effects.channel import ChannelEffect, EncoderEccentricity, EncoderOffset, SensorLag, TorqueDelay
+from sms_online.effects.channel import (
+    LONGEST_DELAY,
+    ChannelEffect,
+    EncoderEccentricity,
+    EncoderOffset,
+    SensorLag,
+    TorqueDelay,
+)
 from sms_online.effects.drive import Cogging, TorqueGain, TorqueOffset, TorqueRipple
 from sms_online.effects.friction import (
     CoulombFriction,
@@ -113,8 +120,8 @@ def check_effect(system: System, effect: Effect, place: str, source: str) -> Non
             raise InputError(source, place, f"coefficient {name!r} of {effect.name}", expected)
         if name in entry.shapes and value <= 0.0 < entry.shapes[name].default:
             raise InputError(source, place, f"{name} = {value:g} of {effect.name}", "a number greater than 0")
-        if name == "time" and effect.name == TorqueDelay.entry.name and value < 0.0:
-            raise InputError(source, place, f"{name} = {value:g} s of {effect.name}", "0 s or more")
+        if name == "time" and effect.name == TorqueDelay.entry.name and not 0.0 <= value <= LONGEST_DELAY:
+            raise InputError(source, place, f"{name} = {value:g} s of {effect.name}", f"0 to {LONGEST_DELAY:g} s")
 
 
 def with_shapes(effect: Effect, system: System) -> Effect:
@@ -194,6 +201,10 @@ def channel_effects(system: System) -> tuple[ChannelEffect, ...]:
     for k, effect in enumerate(system.effects, start=1):
         if effect.name in _CHANNELS:
             check_effect(system, effect, f"effect {k}", system.name)
+            entry = ENTRIES[effect.name]
+            if not (entry.shapes or effect.coefficients):
+                expected = f"{' and '.join(entry.coefficients)}, to correct the samples by"
+                raise InputError(system.name, f"effect {k}", f"{effect.name} without coefficients", expected)
             out.append(_CHANNELS[effect.name](effect.where, with_shapes(effect, system).coefficients))
     return tuple(out)
 

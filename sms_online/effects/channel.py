@@ -1,6 +1,6 @@
 """Effects on measured channels: offset, eccentricity, lag of positions, delay of torques, taken off where declared.
 
-They are corrections by stated constants, no unknowns of π: their columns are differences of whole corrected sessions.
+They are corrections by stated constants, no unknowns of π: their columns are the response of rows to their derivatives.
 """
 
 from __future__ import annotations
@@ -25,6 +25,8 @@ PASSBAND, HIGHEST, NOISE_WEIGHT = 1.0, 0.4, 1e-6
 LEAST_BAND = 8.0
 # Frequencies that are compared: a kernel of the slowest corner resolves 15.
 FREQUENCIES = 400
+# Samples wait for as long as a torque is late: more than this, s, is no delay of a drive.
+LONGEST_DELAY = 1.0
 # Fixed-point steps from a reading back to the angle; the error falls by the amplitude (rad) each.
 INVERSIONS = 20
 
@@ -113,7 +115,7 @@ class EncoderEccentricity(_Channel):
         return angle
 
 
-class Late(_Channel):
+class Convolved(_Channel):
     """What weights of the samples on both sides take off."""
 
     def kernel(self, sample_rate: float) -> Array:
@@ -134,7 +136,7 @@ def _corners(ranges: Ranges) -> tuple[float, ...]:
     return tuple(f for f in hertz if f < 0.25 * ranges.sample_rate)
 
 
-class SensorLag(Late):
+class SensorLag(Convolved):
     """A reading behind a second-order Butterworth low-pass, ÿ = ω² (x - y) - √2 ω ẏ, ω = 2π f, f `corner` in Hz.
 
     Below the corner that is a delay of √2 / ω.
@@ -176,11 +178,10 @@ class SensorLag(Late):
         return _inverse_low_pass(self.coefficients["corner"], sample_rate)
 
 
-class TorqueDelay(Late):
+class TorqueDelay(Convolved):
     """A reading of τ(t - d) for a joint's torque τ(t), d `time` ≥ 0, s; `where` is the joint.
 
-    The simulator samples the exact torque d earlier. The column is that of the reading's rate, which goes into the
-    momentum, P = -n τ, so that nothing is differentiated.
+    The simulator samples the exact torque d earlier, as with a sensor's latency.
     Limitations: constant; what a torque does between samples is a cubic.
     """
 

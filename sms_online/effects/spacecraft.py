@@ -85,6 +85,7 @@ class TableTilt(Force):
         "table_tilt", "force", "base", {"gravity_x": "m/s²", "gravity_y": "m/s²"},
         "a base that turns by a quarter turn or more: gravity does not turn with it, a leak does",
     )  # fmt: skip
+    smooth = True
 
     def __init__(self, site: Site, given: Mapping[str, float]) -> None:
         names = ("gravity_x", "gravity_y")

@@ -11,8 +11,9 @@ from scipy.ndimage import correlate1d
 
 from sms_online.description.schema import System
 from sms_online.effects.catalogue import channel_effects
-from sms_online.effects.channel import Late
+from sms_online.effects.channel import Convolved
 from sms_online.pipeline.synchronise import GridSamples, StageState
+from sms_online.stream import Array
 
 
 class Conditioning:
@@ -24,9 +25,14 @@ class Conditioning:
     def __init__(self, system: System, channels: tuple[str, ...]) -> None:
         self._sample_rate = system.sample_rate
         effects = [(k, e) for e in channel_effects(system) for k, channel in enumerate(channels) if e.acts_on(channel)]
-        self._late = [(k, e.kernel(system.sample_rate)) for k, e in effects if isinstance(e, Late)]
-        self._of_value = [(k, effect) for k, effect in effects if not isinstance(effect, Late)]
-        self.margin = max((kernel.size // 2 for _, kernel in self._late), default=0)
+        self._kernels: dict[int, Array] = {}
+        for k, effect in effects:
+            if isinstance(effect, Convolved):
+                # One after the other is one by both.
+                kernel = effect.kernel(system.sample_rate)
+                self._kernels[k] = np.convolve(self._kernels[k], kernel) if k in self._kernels else kernel
+        self._of_value = [(k, effect) for k, effect in effects if not isinstance(effect, Convolved)]
+        self.margin = max((kernel.size // 2 for kernel in self._kernels.values()), default=0)
         self._values = np.empty((0, len(channels)))
         self._segment = -1
 
@@ -41,7 +47,7 @@ class Conditioning:
         if inner.stop <= inner.start:
             return []
         corrected = values[inner].copy()
-        for column, kernel in self._late:
+        for column, kernel in self._kernels.items():
             corrected[:, column] = correlate1d(values[:, column], kernel, mode="nearest")[inner]
         for column, effect in reversed(self._of_value):
             corrected[:, column] = effect.correct(corrected[:, column], self._sample_rate)

@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sms_online.description.schema import System
+from sms_online.effects.catalogue import channel_effects
 from sms_online.effects.spacecraft import TableTilt
 from sms_online.errors import InputError
 from sms_online.model.base_parameters import BaseParameters, find_base_parameters
@@ -71,7 +72,12 @@ class Estimator:
         self.on_samples: SampleSink | None = None
         self.on_block: Callable[[], None] | None = None  # when an internal block is through
         self.smoother: Smoother | None = None
-        if system.balance == "smoother" or (self.sensing.missing and system.balance != "energy"):
+        # It reads the channels as they come.
+        distorted = channel_effects(system)
+        if distorted and self.sensing.missing and system.balance != "energy":
+            found = f"{distorted[0].name}@{distorted[0].where}, and no {self.sensing.missing[0]}"
+            raise InputError(source, "", found, 'balance = "energy", or all coordinates measured')
+        if not distorted and (system.balance == "smoother" or (self.sensing.missing and system.balance != "energy")):
             self.smoother = Smoother(model, base, self.sensing, channels)
         self.channels = tuple(dict.fromkeys((*self.sensing.channels, *self._smoothed_channels)))
         self._columns = [channels.index(name) for name in self.channels]

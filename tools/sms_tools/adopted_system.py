@@ -20,7 +20,7 @@ ONLINE_NAME = "adopted.toml"
 def adopted_text(described: str, before: System, after: System, remarks: Mapping[str, str]) -> str:
     """TOML of the system `after`: the text of `described`, file or name of the system `before`, and what is new.
 
-    remarks: what to say of an effect, by name@where; its values there are for people, the next session estimates them.
+    remarks: what to say of an effect without coefficients, by name@where, for people: a session estimates them anew.
     """
     lines = _text(described).rstrip().splitlines()
     if after.gravity != before.gravity:
@@ -39,19 +39,18 @@ def adopted_text(described: str, before: System, after: System, remarks: Mapping
             if effect.coefficients:
                 inside = ", ".join(f"{name} = {value:.9g}" for name, value in effect.coefficients.items())
                 lines.append(f"coefficients = {{ {inside} }}")
-            if remark := remarks.get(f"{effect.name}@{effect.where}"):
+            elif remark := remarks.get(f"{effect.name}@{effect.where}"):
                 lines.append(f"# found: {remark}")
     return "\n".join(lines) + "\n"
 
 
 def remarks(effects: Iterable[Mapping[str, Any]]) -> dict[str, str]:
-    """What was found of effects, as a document tells them, for a line of text each, by name@where."""
-    return {
-        f"{effect['name']}@{effect['where']}": ", ".join(
-            " ".join((name, *_told(value))) for name, value in effect["coefficients"].items()
-        )
-        for effect in effects
-    }
+    """What was found of effects, as a document tells them, for a line of text each, by name@where; first come first."""
+    out: dict[str, str] = {}
+    for effect in effects:
+        values = (" ".join((name, *_told(value))) for name, value in effect["coefficients"].items())
+        out.setdefault(f"{effect['name']}@{effect['where']}", ", ".join(values))
+    return out
 
 
 def _told(value: Mapping[str, Any]) -> list[str]:

@@ -5,13 +5,26 @@ from __future__ import annotations
 from typing import Any
 
 from sms_online.description.schema import Effect, System
+from sms_online.effects.catalogue import check_effect
+from sms_online.errors import InputError
 from sms_online.model.model import Model
 
 
 def true_values(truth: dict[str, Any], described: System, adopted: System) -> dict[str, float]:
-    """By name, of `truth` as read beside a capture; the effects of `adopted` that were not injected are truly zero."""
-    injected = tuple(Effect.model_validate(effect) for effect in truth.get("effects", ()))
+    """By name, of `truth` as read beside a capture; the effects of `adopted` that were not injected are truly zero.
+
+    Effects that were injected into a system of another kind are left out.
+    """
+    injected = tuple(e for e in map(Effect.model_validate, truth.get("effects", ())) if _fits(described, e))
     declared = described.model_copy(update={"effects": (*described.effects, *injected)})
     stated = {p.name: p.nominal for p in Model(declared).parameters if "@" in p.name}
     absent = {p.name: 0.0 for p in Model(adopted).parameters if "@" in p.name}
     return absent | stated | dict(truth["parameters"])
+
+
+def _fits(system: System, effect: Effect) -> bool:
+    try:
+        check_effect(system, effect, "", "truth")
+    except InputError:
+        return False
+    return True
