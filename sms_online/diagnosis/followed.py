@@ -17,9 +17,9 @@ from sms_online.stream import Array
 
 # States are advanced once in so many samples: at 1 kHz what changes at 3 Hz is told 80 times a period.
 STEP = 4
-# Half width of the filter of the motion behind them, s, which passes 30 Hz: a hysteresis forgets with every way that
+# Half width of the filter of the motion behind them, s, which passes 50 Hz: a hysteresis forgets with every way that
 # its spring goes, noise's too. Of short windows it is this multiple at most.
-HALF_WIDTH, OF_WINDOW = 0.064, 1.4
+HALF_WIDTH, OF_WINDOW = 0.040, 1.4
 
 
 def least_samples(system: System) -> int:

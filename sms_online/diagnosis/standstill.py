@@ -11,9 +11,9 @@ from sms_online.diagnosis.record import Segment
 from sms_online.pipeline.sensing import Sensing
 from sms_online.pipeline.smoothing import HALF_WIDTHS, kernel, smooth
 
-# An axis stands still where its rate is below this multiple of the rate's noise for so long, s: half a usual window. At
-# a reversal it is for less, unless the axis is turned round by less than a third of a rad/s².
-STILL, LASTING = 4.0, 0.2
+# An axis stands still where its rate is below this multiple of the rate's noise for so long, s. At a reversal it is for
+# less, unless it sticks there, or is turned round by less than 1 rad/s² (noise of 1e-4 rad at 1 kHz).
+STILL, LASTING = 4.0, 0.06
 # Half width of the filter of that rate, s; it is told once in so many samples.
 HALF_WIDTH, STEP = 0.028, 4
 
