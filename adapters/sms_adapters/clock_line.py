@@ -3,17 +3,19 @@
     arrival = (1 + drift) device + offset + latency + delay,    delay >= 0
 
 The constant latency is stated in the system file; the delay scatters, by milliseconds on a busy bus, but now and then a
-sample comes through almost undelayed. So the clock is the line below all pairs that is closest to them: a linear
-program, solved by the edge of the lower convex hull over the mean of the device's times. Its error falls with the
-number n of samples as delay / n, where a mean would give delay / sqrt(n).
-Source: Moon, Skelly, Towsley, Estimation and removal of clock skew from network delay measurements, INFOCOM 1999.
+sample comes through almost undelayed. So the clock is a line below all pairs and close to them. With delays whose
+density falls exponentially the likeliest one is that with the least sum of distances, an edge of the lower convex hull,
+whose error falls with the number n of samples as delay / n, where a mean would give delay / sqrt(n). But while points
+are few the edge leans on two of them, one of which may be early by luck, and its slope throws the times between two
+lines: the mean over all lines by their likelihood, and by what crystals drift, errs half as much in the first seconds.
+Sources: Moon, Skelly, Towsley, Estimation and removal of clock skew from network delay measurements, INFOCOM 1999 (the
+line below); Bayes, with a flat density of offsets and a normal one of drifts.
 """
 
 from __future__ import annotations
 
 from collections import deque
 from dataclasses import dataclass
-from itertools import pairwise
 
 import numpy as np
 
@@ -29,6 +31,14 @@ SETTLING = 4
 SETTLING_AFTER_JUMP = 2
 # No clock worth the name is further off than this; a line through a few late samples could be.
 LARGEST_DRIFT = 2e-4
+# What two crystals of 20 ppm are off by against each other, 1σ.
+CRYSTALS = 3e-5
+# Neighbouring intervals are late together, for the machine is busy in both: each counts as so much of an own one.
+INDEPENDENT = 0.5
+# Drifts that the mean is taken over: enough of them, as likely as e^-LEAST_LIKELY of the likeliest one at least.
+DRIFTS, ENOUGH, LEAST_LIKELY = 101, 25, 18.0
+# Delays are not told finer than this, s: clocks of the machine are read to it.
+FINEST_DELAY = 1e-7
 # Device times that run ahead of the line or go back by more than this are a jump, s. Delays are positive, so the first
 # cannot be one; and no bus turns the order of samples so far apart.
 JUMP = 0.05
@@ -54,27 +64,38 @@ class ClockCounters:
     corrupt: int = 0
 
 
-def line_below(x: Array, y: Array) -> tuple[float, float]:
-    """Slope and value at x = 0 of the line below the points (n,) with the least sum of distances; x increasing.
+def likely_line(x: Array, y: Array) -> tuple[float, float]:
+    """Slope and value at x = 0 of the mean line below the points (n,), x increasing; slope within 1 ± LARGEST_DRIFT.
 
-    The slope is kept within 1 ± LARGEST_DRIFT. One point gives slope 1.
+    For a drift g the line touches the lowest point, y - x - g x = m(g); with delays of the mean s its likelihood is
+    exp(-Σ (y - x - g x - m) / s), a concave function of g in the exponent. One point gives slope 1.
     """
-    hull: list[tuple[float, float]] = []
-    for a, b in zip(x.tolist(), y.tolist(), strict=True):  # numbers of Python, for one by one they are faster
-        while len(hull) > 1:
-            (a_i, b_i), (a_j, b_j) = hull[-2:]
-            if (b_j - b_i) * (a - a_i) < (b - b_i) * (a_j - a_i):
-                break
-            hull.pop()
-        hull.append((a, b))
-    slope = 1.0
-    mean = float(np.mean(x))
-    for (a_i, b_i), (a_j, b_j) in pairwise(hull):
-        if a_i <= mean <= a_j:
-            slope = (b_j - b_i) / (a_j - a_i)
+    ahead, since_last = y - x, x - x[-1]
+
+    def distances(drift: Array) -> tuple[Array, Array]:
+        """Of each point from the line (drifts, n), and the lines' values at the last point."""
+        left = ahead - drift[:, None] * since_last
+        lowest = left.min(axis=1)
+        return left - lowest[:, None], lowest
+
+    low, high = -LARGEST_DRIFT, LARGEST_DRIFT
+    delay = np.inf
+    while True:
+        drift = np.linspace(low, high, DRIFTS)
+        distance, lowest = distances(drift)
+        total = distance.sum(axis=1)
+        # The median of an exponential density, which no stall moves, of the line with the least sum of distances.
+        closest = distance[np.argmin(total)]
+        delay = max(min(delay, float(np.median(closest)) / np.log(2.0)), FINEST_DELAY)
+        log_likelihood = -INDEPENDENT * total / delay - 0.5 * (drift / CRYSTALS) ** 2
+        likely = np.flatnonzero(log_likelihood > log_likelihood.max() - LEAST_LIKELY)
+        if likely.size >= ENOUGH:
             break
-    slope = min(max(slope, 1.0 - LARGEST_DRIFT), 1.0 + LARGEST_DRIFT)
-    return slope, float(np.min(y - slope * x))
+        low, high = float(drift[max(likely[0] - 1, 0)]), float(drift[min(likely[-1] + 1, DRIFTS - 1)])
+    weight = np.exp(log_likelihood - log_likelihood.max())
+    weight /= weight.sum()
+    mean, value = float(weight @ drift), float(weight @ lowest)
+    return 1.0 + mean, value - mean * float(x[-1])
 
 
 class DeviceClock:
@@ -261,7 +282,7 @@ class DeviceClock:
         order = np.argsort(points[:, 0], kind="stable")
         x, y = points[order].T
         if x.size >= SETTLING:
-            self._slope, self._offset = line_below(x, y)
+            self._slope, self._offset = likely_line(x, y)
         else:
             self._offset = float(np.min(y - self._slope * x))
         self._settled = self._bins >= self._settling

@@ -46,6 +46,8 @@ AHEAD = 30.0
 # sending slows it down by this much; FIRST_LEAD, s, is enough to measure its pace by.
 FIRST_LEAD = 0.5
 SLOWED = 2.0
+# Of the process that solves: what is due, and who reads it, go first.
+NICENESS = 15
 # Longest wait between two looks at what is due, s.
 PATIENCE = 0.05
 # Torque commands are fetched so often, s.
@@ -298,6 +300,7 @@ def _solved(process: BaseProcess, pipe: Connection) -> Iterator[Block]:
 
 def _solve(arm: MovingArm, pipe: Connection, others: Connection) -> None:
     others.close()  # or the death of the process that reads would go unnoticed
+    os.nice(NICENESS)
     try:
         pipe.recv()
         for block in arm:
