@@ -152,7 +152,7 @@ def test_the_line_is_below_all_points(steps: list[tuple[float, float]]) -> None:
     x = np.cumsum(gaps)
     y = x * (1.0 + 30e-6) + delays
     slope, offset = likely_line(x, y)
-    assert -1e-12 < np.min(y - slope * x - offset)
+    assert np.min(y - slope * x - offset) > -1e-12
     assert abs(slope - 1.0) <= LARGEST_DRIFT
 
 

@@ -45,9 +45,9 @@ AHEAD = 30.0
 # The arm sets out once its motion is solved so far ahead that solving stays in front of sending to the end, where
 # sending slows it down by this much; FIRST_LEAD, s, is enough to measure its pace by.
 FIRST_LEAD = 0.5
-SLOWED = 2.0
+SLOWED = 3.0
 # Of the process that solves: what is due, and who reads it, go first.
-NICENESS = 15
+NICENESS = 10
 # Longest wait between two looks at what is due, s.
 PATIENCE = 0.05
 # Torque commands are fetched so often, s.
