@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
@@ -21,12 +21,17 @@ from sms_online.diagnosis.rows import SessionRows
 from sms_online.diagnosis.shape import refine
 from sms_online.diagnosis.trace import Candidate, Tracing, together
 from sms_online.errors import InputError
+from sms_online.model.model import Model
 from sms_online.pipeline.estimator import Estimator
 from sms_online.pipeline.momentum_balance import HOPS
 from sms_online.pipeline.sensor_noise import SensorNoise
 from sms_online.stream import Array
 from sms_online.trackers.interface import Prior
 
+# Part of a session that tells which kinematics of links are nearer, and improves channels' constants, s.
+SOME = 8.0
+# Constants are improved as far as the data tell when they move by less than this share of their deviation.
+SETTLED = 0.1
 # Share of a session that coefficients are fitted to where no other capture is held out; the rest checks them.
 FITTED = 2.0 / 3.0
 # A verdict names effects that take away all but this share of what is beyond noise: a wrong one that is 10° from the
@@ -118,11 +123,12 @@ class Attempt:
         beta: Array | None = None,
         candidates: Sequence[Effect] | None = None,
         most: float = LONGEST,
+        bends: Mapping[int, Array] | None = None,
     ) -> None:
         """constants: see that module. beta (n,): behind the noise of rows, from the rows themselves unless given.
-        candidates: all by default. most: s of the session that are used.
+        candidates: all by default. most: s of the session that are used. bends: see `SessionRows`.
         """
-        self.system, self.constants = system, list(constants)
+        self.case, self.system, self.constants = case, system, list(constants)
         session = case.session
         described = applied(system, constants)
         same = described == session.system
@@ -140,7 +146,9 @@ class Attempt:
         fitting, held = (
             [part for part in excerpts(each, length, longest) if part.index.size > least] for each in whole
         )
-        self.rows = SessionRows(estimator.model, estimator.base, estimator.sensing, noise, (*fitting, *held))
+        self.rows = SessionRows(
+            estimator.model, estimator.base, estimator.sensing, noise, (*fitting, *held), bends=bends
+        )
         self.make = CandidateColumns(self.rows, described)
         self._fitting = len(fitting)
         first, last = self.rows.time[:1].sum(), self.rows.time[-1:].sum()
@@ -160,6 +168,15 @@ class Attempt:
         else:
             self.rows.weigh(beta)
         self._trace(made)
+
+    def trial(self, system: System, constants: Sequence[Effect], beta: Array, effects: Sequence[Effect]) -> Attempt:
+        """A quick attempt with no candidates but some effects, on stretches of the session.
+
+        On all of it where internal states would begin at rest in each stretch.
+        """
+        forces = tuple(effect for effect in (*system.effects, *effects) if not is_constant(effect))
+        states = Model(system.model_copy(update={"effects": forces})).n_states
+        return Attempt(self.case, system, constants, beta, effects, LONGEST if states else SOME, self.rows.bends)
 
     def _start(self, candidates: Sequence[Candidate]) -> None:
         """Weigh the rows with what the model and all candidates together make of them.
@@ -217,9 +234,13 @@ class Attempt:
         residual = self.tracing.residual(chosen, self.solution(chosen))
         return float(np.sum(residual**2) - residual.size)
 
-    def improved(self, solution: Array) -> list[Effect]:
-        """The constants improved by a solution."""
-        return self._improved(self.fixed, solution[self.rows.base.n :])
+    def improved(self, solution: Array) -> tuple[list[Effect], bool]:
+        """The constants improved by a solution, and whether there is nothing more to improve."""
+        n = self.rows.base.n
+        own = slice(n, n + sum(len(candidate.parameters) for candidate in self.fixed))
+        everything = range(len(self.tracing.candidates))
+        std = np.sqrt(np.diag(self.tracing.covariance(everything))[own])
+        return self._improved(self.fixed, solution[n:]), bool(np.all(np.abs(solution[own]) < SETTLED * std))
 
     def found(self, chosen: Sequence[int], solution: Array) -> tuple[list[Effect], list[Effect]]:
         """Of the effects chosen, those that become constants, with their values, and the others."""

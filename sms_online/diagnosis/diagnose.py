@@ -9,23 +9,20 @@ import numpy as np
 
 from sms_online.description.schema import Effect, System
 from sms_online.diagnosis.attempt import LARGEST_SHARE_LEFT, Attempt, Case, PriorOf, State, Step
-from sms_online.diagnosis.constants import is_constant, stands
+from sms_online.diagnosis.constants import stands
 from sms_online.diagnosis.late_sensors import LateSensor, find_late
-from sms_online.diagnosis.record import LONGEST, SampleRecord
+from sms_online.diagnosis.record import SampleRecord
 from sms_online.diagnosis.residuals import RowResidual
 from sms_online.diagnosis.trace import DECISIVE, DRY, INEXACT, INEXACT_DRY, Finding, Ranked
 from sms_online.diagnosis.unexplained import Unexplained, describe_residual
 from sms_online.effects.catalogue import GEOMETRIC_STIFFENING, places
 from sms_online.errors import InputError
-from sms_online.model.model import Model
 from sms_online.pipeline.estimator import Estimator
 from sms_online.pipeline.momentum_balance import HOPS
 from sms_online.stream import Block
 
 # Times that the constants of channels' effects are improved, each with samples corrected by those found before.
 CORRECTIONS = 3
-# Part of a session that tells which kinematics of links are nearer, and improves channels' constants, s.
-SOME = 8.0
 # Exact links have to take this share of what straight ones leave beyond noise.
 STIFFENING_TAKES = 0.1
 # No right effect leaves a row type more than this multiple of its noise, unless that is what its law is uncertain by.
@@ -95,12 +92,6 @@ def _exact(system: System, links: Sequence[str]) -> System:
     return system.model_copy(update={"effects": (*system.effects, *effects)})
 
 
-def _some(system: System, effects: Sequence[Effect]) -> float:
-    """s of the session to use: stretches, or all of it where internal states would begin at rest in each stretch."""
-    forces = tuple(effect for effect in (*system.effects, *effects) if not is_constant(effect))
-    return LONGEST if Model(system.model_copy(update={"effects": forces})).n_states else SOME
-
-
 def _stiffened(case: Case, attempt: Attempt, chosen: Sequence[int]) -> Attempt | None:
     """An attempt with those links exact that the samples ask for, and nothing else; None where these take too little.
 
@@ -116,11 +107,9 @@ def _stiffened(case: Case, attempt: Attempt, chosen: Sequence[int]) -> Attempt |
     # What was found may be there beside it, or may only have stood for it.
     effects = [attempt.tracing.candidates[k].effect for k in chosen]
 
-    span = _some(attempt.system, effects)
-
     def excess(links: Sequence[str]) -> float:
         try:
-            some = Attempt(case, _exact(attempt.system, links), attempt.constants, beta, effects, span)
+            some = attempt.trial(_exact(attempt.system, links), attempt.constants, beta, effects)
         except np.linalg.LinAlgError:
             return np.inf  # the readings are those of links that are straight
         return some.excess(range(len(some.tracing.candidates)))
@@ -159,9 +148,12 @@ def _with_constants(
         fresh, forces = attempt.found(chosen, solution)
         constants, beta = [*attempt.constants, *fresh], solution[:n]
         for _ in range(CORRECTIONS):
-            fewer = Attempt(case, attempt.system, constants, beta, forces, _some(attempt.system, forces))
-            solution = fewer.solution(range(len(forces)))
-            constants, beta = fewer.improved(solution), solution[:n]
+            some = attempt.trial(attempt.system, constants, beta, forces)
+            solution = some.solution(range(len(forces)))
+            constants, settled = some.improved(solution)
+            beta = solution[:n]
+            if settled:
+                break
         keys = {(effect.name, effect.where) for effect in constants}
         constants = [effect for effect in constants if stands(effect, case.session.system.sample_rate)]
         tried = [candidate.effect for candidate in attempt.tracing.candidates]

@@ -6,7 +6,7 @@ them is a column Z: Y β + Z c = b. Columns pass the same test functions and the
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -61,11 +61,13 @@ class SessionRows:
 
     Y (W, n_v, n), b (W, n_v): rows as they are. time (W,): the windows' middles, s since grid index 0. weak: evaluates
     further columns. Once they are weighed: beta (n,), values behind their noise; std (W, n_v), their own predicted
-    deviation; responses, name to (W, n_v, sensors): of the rows to so much added to each position sensor's reading.
+    deviation; bends, half width of the filter to (n_v,): variance of what noise does beyond first order; responses,
+    name to (W, n_v, sensors): of the rows to so much added to each position sensor's reading.
     """
 
     beta: Array
     std: Array
+    bends: Mapping[int, Array]
     responses: dict[str, Array]
 
     def __init__(
@@ -76,15 +78,18 @@ class SessionRows:
         noise: SensorNoise,
         segments: Sequence[Segment],
         beta: Array | None = None,
+        bends: Mapping[int, Array] | None = None,
     ) -> None:
-        """beta (n,): to weigh the rows with at once. Raises numpy.linalg.LinAlgError on readings that no shape of the
-        links gives, from which rows are no numbers.
+        """beta (n,): to weigh the rows with at once. bends: as other rows of the session have told them, from synthetic
+        noise unless given, which takes three times as long. Raises numpy.linalg.LinAlgError on readings that no shape
+        of the links gives, from which rows are no numbers.
         """
         self.model, self.base, self.sensing, self.noise = model, base, sensing, noise
         self.segments = list(segments)
         self._rate = rate = model.system.sample_rate
         self._balance = balance = MomentumBalance(model, base, rate, model.system.windows.momentum, prompt=False)
         self.followed = FollowedMotion(sensing, self.segments, rate)
+        self._given = bends
         added = self._noise_samples(np.random.default_rng(SEED))
         self._told = [self._of_segment(k, *part) for k, part in enumerate(zip(self.segments, added, strict=True))]
         if not all(np.all(np.abs(told.copies) < LARGEST) for told in self._told):
@@ -122,7 +127,7 @@ class SessionRows:
         followed = self.followed.states(self.model, number)
         measured = self.sensing.motion(np.concatenate((segment.values, followed), axis=1))
         copies = [measured] * COPIES
-        if not noise.exact:
+        if not noise.exact and self._given is None:
             copies[1:] = [
                 self.sensing.motion(np.concatenate((segment.values + sign * added, followed), axis=1))
                 for sign in (1.0, -1.0)
@@ -145,6 +150,7 @@ class SessionRows:
         """Tell the noise of the rows for parameters beta (n,), and make them independent of each other."""
         n_v, noise, span = self.model.layout.n_v, self.noise, self._balance.span
         self.beta = beta
+        self.bends = self._bends()
         self._covariances: list[list[Array]] = []
         responses: list[Array] = []
         for told in self._told:
@@ -152,8 +158,8 @@ class SessionRows:
                 continue
             sensitivities = self._sensitivities(told.instants, span)
             row_noise = RowNoise(self.model.layout.theta_m, span, clock_groups(self.sensing))
-            extra = self._beyond_first_order(told.copies, [window.half_width for window in told.windows])
-            for window, variance, added in zip(told.windows, extra, told.displacements, strict=True):
+            beyond = self._beyond_first_order(told)
+            for window, variance, added in zip(told.windows, beyond, told.displacements, strict=True):
                 sensitivity = sensitivities.window(window.start)
                 age = window.end / self._rate
                 covariances = row_noise.covariance(sensitivity, noise.sensors, noise.torque, age)
@@ -167,17 +173,28 @@ class SessionRows:
         self.responses = dict(zip(DISPLACEMENTS, np.moveaxis(stacked, 1, 0), strict=True))
         self.whiten(np.zeros_like(self.std))
 
-    def _beyond_first_order(self, dense: Array, half_widths: list[int]) -> Array:
-        """Variance (W, n_v) of what noise does beyond first order, by filter width, and of rounding, as in the fit."""
-        residual = dense[..., -1] - dense[..., :-1] @ self.beta
-        squares = (0.5 * (residual[:, 1] + residual[:, 2]) - residual[:, 0]) ** 2
-        widths = np.array(half_widths)
-        means = {M: squares[widths == M].mean(axis=0) for M in set(half_widths)}
+    def _bends(self) -> Mapping[int, Array]:
+        """See `bends`, as in the fit."""
+        if self._given is not None:
+            return self._given
+        squares = np.concatenate([self._bending(told.copies) for told in self._told if told.windows])
+        widths = self.weak.windows.half_width
+        means = {M: squares[widths == M].mean(axis=0) for M in np.unique(widths).tolist()}
         # A narrow filter lets through no less than the wide ones do, however few windows it has been used for.
-        bent = {M: np.max([mean for wide, mean in means.items() if wide >= M], axis=0) for M in means}
-        size = np.abs(dense[:, 0, :, :-1]) @ np.abs(self.beta) + np.abs(dense[:, 0, :, -1])
+        return {M: np.max([mean for wide, mean in means.items() if wide >= M], axis=0) for M in means}
+
+    def _bending(self, copies: Array) -> Array:
+        """Squares (W, n_v) of what is the same in the rows of noise and of its negative."""
+        residual = copies[..., -1] - copies[..., :-1] @ self.beta
+        return np.asarray((0.5 * (residual[:, 1] + residual[:, 2]) - residual[:, 0]) ** 2)
+
+    def _beyond_first_order(self, told: _Told) -> Array:
+        """Variance (W, n_v) of a segment's rows beyond first order, and of rounding."""
+        size = np.abs(told.copies[:, 0, :, :-1]) @ np.abs(self.beta) + np.abs(told.copies[:, 0, :, -1])
         rounding = (FINEST * np.maximum.accumulate(size, axis=0)) ** 2 + np.finfo(np.float64).tiny
-        return np.array([bent[M] for M in half_widths]) + rounding
+        # A width that nobody has told of yet counts as the nearest one.
+        widths = [min(self.bends, key=lambda M: abs(M - window.half_width)) for window in told.windows]
+        return np.array([self.bends[M] for M in widths]) + rounding
 
     def _readings(self, segment: Segment, half_width: int) -> Callable[[Array], tuple[Array, Array]]:
         """Smoothed readings (T, sensors) of the position sensors, and their rates, at instants (T,) of a segment, s."""

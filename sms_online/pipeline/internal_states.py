@@ -35,7 +35,7 @@ class InternalStates:
         self._b = np.empty((0, self.model.n_states))
 
     def push(self, x: Array, v: Array) -> Array:
-        """z (B, n_states) at consecutive samples x (B, n_x), v (B, n_v)."""
+        """z (B, n_states) at consecutive samples x (B, n_x), v (B, n_v); other pieces give other last digits."""
         n = self.model.n_states
         out = np.empty((len(x), n))
         if n == 0 or len(x) == 0:
@@ -53,10 +53,8 @@ class InternalStates:
         step = inverse @ (one + 0.5 * X + twelfth)
         change = (b_both[1:] - b_both[:-1])[..., None]
         push = self._h * (inverse @ (b_both[:-1, :, None] + (0.5 * one - X / 12.0) @ change))[..., 0]
-        z = self._z
-        for k in range(len(step)):
-            out[begun + k] = z = step[k] @ z + push[k]
-        self._z, self._A, self._b = z, A[-1:], b[-1:]
+        out[begun:] = _along(step, push, self._z)
+        self._z, self._A, self._b = out[-1].copy(), A[-1:], b[-1:]
         return out
 
     def state(self) -> dict[str, Array]:
@@ -66,6 +64,30 @@ class InternalStates:
     def restore(self, state: Mapping[str, NDArray[Any]]) -> None:
         """Continue from a saved state."""
         self._z, self._A, self._b = (np.array(state[name]) for name in ("z", "z_A", "z_b"))
+
+
+def _along(step: Array, push: Array, z: Array) -> Array:
+    """z_k = step_k z_(k-1) + push_k (N, n) from z (n,); step (N, n, n), push (N, n).
+
+    In runs of the root of their number, all runs side by side: from their beginnings first, then from where the one
+    before has ended.
+    """
+    count, n = push.shape
+    length = max(1, int(np.sqrt(count)))
+    runs = -(-count // length)
+    spare = runs * length - count
+    steps = np.concatenate((step, np.broadcast_to(np.eye(n), (spare, n, n)))).reshape(runs, length, n, n)
+    pushes = np.concatenate((push, np.zeros((spare, n)))).reshape(runs, length, n, 1)
+    turned, pushed = np.empty_like(steps), np.empty_like(pushes)
+    turned[:, 0], pushed[:, 0] = steps[:, 0], pushes[:, 0]
+    for k in range(1, length):
+        turned[:, k] = steps[:, k] @ turned[:, k - 1]
+        pushed[:, k] = steps[:, k] @ pushed[:, k - 1] + pushes[:, k]
+    begin = np.empty((runs, 1, n, 1))
+    begin[0, 0, :, 0] = z
+    for k in range(1, runs):
+        begin[k] = turned[k - 1, -1] @ begin[k - 1] + pushed[k - 1, -1]
+    return np.asarray((turned @ begin + pushed).reshape(-1, n)[:count])
 
 
 class FollowedStates:
