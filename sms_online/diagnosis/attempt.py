@@ -22,6 +22,7 @@ from sms_online.diagnosis.shape import refine
 from sms_online.diagnosis.trace import Candidate, Tracing, together
 from sms_online.errors import InputError
 from sms_online.model.model import Model
+from sms_online.pipeline.conditioning import noise_gains
 from sms_online.pipeline.estimator import Estimator
 from sms_online.pipeline.momentum_balance import HOPS
 from sms_online.pipeline.sensor_noise import SensorNoise
@@ -112,6 +113,16 @@ class Case:
     prior: PriorOf
 
 
+def _noise_behind(described: Estimator, case: Case) -> SensorNoise:
+    """The noise of the samples of a case, corrected as another session describes it."""
+    sensing = described.sensing
+    columns = [*sensing.position_columns, *sensing.torque_columns]
+    own, before = (noise_gains(each.system, sensing.channels)[columns] for each in (described, case.session))
+    grid = case.noise.grid * own / before
+    coordinates = sensing.coordinate_noise(grid[: len(sensing.position_columns)])
+    return replace(case.noise, grid=grid, coordinates=coordinates)
+
+
 class Attempt:
     """One description of the system against the samples of a session."""
 
@@ -134,8 +145,7 @@ class Attempt:
         same = described == session.system
         estimator = session if same else Estimator(described, session.sensing.channels, case.source)
         self.prior = case.prior(estimator)
-        positions = case.noise.grid[: len(estimator.sensing.position_columns)]
-        noise = replace(case.noise, coordinates=estimator.sensing.coordinate_noise(positions))
+        noise = _noise_behind(estimator, case)
         span = system.windows.momentum
         most = min(most, MOST_WINDOWS * span / HOPS)
         length, longest = (round(seconds * system.sample_rate) for seconds in (STRETCH * span, most))

@@ -6,6 +6,8 @@ channel is passed on as much later, and what lies so close to a gap is lost.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from scipy.ndimage import correlate1d
 
@@ -14,6 +16,30 @@ from sms_online.effects.catalogue import channel_effects
 from sms_online.effects.channel import Convolved
 from sms_online.pipeline.synchronise import GridSamples, StageState
 from sms_online.stream import Array
+
+
+def channel_kernels(system: System, channels: Sequence[str]) -> dict[int, Array]:
+    """Weights of the samples on both sides that take lags and delays off, by the channel's number."""
+    kernels: dict[int, Array] = {}
+    for effect in channel_effects(system):
+        for k, channel in enumerate(channels):
+            if isinstance(effect, Convolved) and effect.acts_on(channel):
+                # One after the other is one by both.
+                kernel = effect.kernel(system.sample_rate)
+                kernels[k] = np.convolve(kernels[k], kernel) if k in kernels else kernel
+    return kernels
+
+
+def noise_gains(system: System, channels: Sequence[str]) -> Array:
+    """By how much more noise a corrected sample of each channel has at least (channels,), than its density says.
+
+    What takes a lag off lets slow noise pass as it is and enlarges fast noise. Where it makes less of that, near its
+    corner it still makes more, so that the gain is 1 at least.
+    """
+    gains = np.ones(len(channels))
+    for k, kernel in channel_kernels(system, channels).items():
+        gains[k] = max(1.0, float(np.linalg.norm(kernel)))
+    return gains
 
 
 class Conditioning:
@@ -25,12 +51,7 @@ class Conditioning:
     def __init__(self, system: System, channels: tuple[str, ...]) -> None:
         self._sample_rate = system.sample_rate
         effects = [(k, e) for e in channel_effects(system) for k, channel in enumerate(channels) if e.acts_on(channel)]
-        self._kernels: dict[int, Array] = {}
-        for k, effect in effects:
-            if isinstance(effect, Convolved):
-                # One after the other is one by both.
-                kernel = effect.kernel(system.sample_rate)
-                self._kernels[k] = np.convolve(self._kernels[k], kernel) if k in self._kernels else kernel
+        self._kernels = channel_kernels(system, channels)
         self._of_value = [(k, effect) for k, effect in effects if not isinstance(effect, Convolved)]
         self.margin = max((kernel.size // 2 for kernel in self._kernels.values()), default=0)
         self._values = np.empty((0, len(channels)))

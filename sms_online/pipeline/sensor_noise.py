@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from sms_online.pipeline.conditioning import noise_gains
 from sms_online.pipeline.noise import noise_std
 from sms_online.pipeline.sensing import Sensing
 from sms_online.stream import Array
@@ -29,9 +30,9 @@ class SensorNoise:
     """Noise of position sensors and joint torques.
 
     sensors (n_x,), torque (joints,): densities σ² T_s of each position sensor, in the order of the coordinates, and of
-    n τ. coordinates (n_x,): 1σ of the coordinates x a grid sample, had they white noise of those densities. grid
-    (n_x + joints,): the same of the readings of position sensors and of torques. exact: positions have none, but for
-    rounding.
+    n τ. coordinates (n_x,): 1σ of the coordinates x a grid sample, had they white noise of those densities, and what
+    taking lags off adds. grid (n_x + joints,): the same of the readings of position sensors and of torques. exact:
+    positions have none, but for rounding.
     """
 
     sensors: Array
@@ -117,7 +118,8 @@ class NoiseEstimate:
         sensors = density[positions]
         torque = self._sensing.joint_torque(np.sqrt(density)[None])[0] ** 2
         columns = [*positions, *self._sensing.torque_columns]
-        grid = np.sqrt(density[columns] * self._sample_rate)
+        gains = noise_gains(self._sensing.model.system, self._sensing.channels)
+        grid = (gains * np.sqrt(density * self._sample_rate))[columns]
         coordinates = self._sensing.coordinate_noise(grid[: len(positions)])
         return SensorNoise(sensors, torque, coordinates, grid, exact)
 
