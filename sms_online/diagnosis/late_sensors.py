@@ -43,6 +43,8 @@ SAME_SHARE = 0.03
 TOLERANCE, EVALUATIONS = 3e-3, 15
 # Step of the logarithm of a corner to tell how sharp its optimum is.
 SHARPNESS_STEP = 0.05
+# Windows in a row that are asked, of three times as many: a sensor that is so late shows everywhere.
+STRETCH = 3 * HOPS
 STIFFNESS = ("stiffness", "flexural_rigidity", "flexural_rigidity_y", "flexural_rigidity_z", "torsional_rigidity")
 # A column acts on rows that hold this share of its squares at least.
 ACTS = 0.01
@@ -80,13 +82,22 @@ class Motions:
     """Asks how well the masses can follow the springs, for readings with a lag taken off."""
 
     def __init__(self, rows: SessionRows, make: CandidateColumns, fitted: NDArray[np.bool_]) -> None:
-        self._rows, self._make, self._fitted = rows, make, fitted
+        some = np.arange(rows.count) // STRETCH % 3 == 0
+        if not (fitted[some].any() and not fitted[some].all()):
+            some = np.ones(rows.count, dtype=bool)
+        self._rows, self._make, self._fitted = rows, make, fitted[some]
         self._channels = rows.sensing.channels
         model = rows.model
         known = {p.name for p in model.parameters} & set(model.system.known)
         # One filter for all windows: that many fewer smoothed motions for each lag that is tried.
         windows = rows.weak.windows
-        self._windows = replace(windows, half_width=np.full(rows.count, np.sort(windows.half_width)[rows.count // 2]))
+        middle = np.sort(windows.half_width)[rows.count // 2]
+        self._windows = replace(
+            windows,
+            segment=windows.segment[some],
+            start=windows.start[some],
+            half_width=np.full(np.count_nonzero(some), middle),
+        )
         self._springs = [k for k, p in enumerate(model.parameters) if p.quantity in STIFFNESS]
         self._masses = [k for k, p in enumerate(model.parameters) if k not in self._springs and p.name not in known]
         self._still = [v for v in range(model.layout.n_v) if v not in model.layout.theta_m]

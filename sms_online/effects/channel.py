@@ -11,7 +11,6 @@ from functools import lru_cache
 from typing import Protocol
 
 import numpy as np
-from scipy.ndimage import correlate1d
 
 from sms_online.effects.base import Entry, Ranges, Shape
 from sms_online.stream import Array
@@ -124,10 +123,11 @@ class Convolved(_Channel):
 
     def correct(self, samples: Array, sample_rate: float) -> Array:
         """What was before the effect; beyond its ends the record goes on as its own point reflection."""
+        from scipy.signal import oaconvolve  # here, see `SensorLag.filter`
+
         kernel = self.kernel(sample_rate)
-        M = kernel.size // 2
-        padded = np.pad(samples, M, mode="reflect", reflect_type="odd")
-        return np.asarray(correlate1d(padded, kernel, mode="nearest")[M:-M])
+        padded = np.pad(samples, kernel.size // 2, mode="reflect", reflect_type="odd")
+        return np.asarray(oaconvolve(padded, kernel[::-1], mode="valid"))
 
 
 def _corners(ranges: Ranges) -> tuple[float, ...]:
