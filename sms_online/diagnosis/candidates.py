@@ -13,6 +13,7 @@ import numpy as np
 from sms_online.description.schema import Effect, System
 from sms_online.diagnosis.constants import is_constant
 from sms_online.diagnosis.followed import FollowedMotion
+from sms_online.diagnosis.reversals import Reversals
 from sms_online.diagnosis.rows import SessionRows
 from sms_online.diagnosis.standstill import Standstill
 from sms_online.diagnosis.trace import DRY, Candidate
@@ -25,6 +26,8 @@ from sms_online.pipeline.momentum_balance import HOPS
 from sms_online.stream import Array
 
 TORQUE_RATE = "torque rate"
+# Forces that jump with the sign of a motor's rate.
+REVERSING = (*DRY, "direction_friction")
 # Linear coefficients of effects on channels: quantity, unit, what a unit of it adds to a reading, with its sign. A lag
 # of a delay T reads x - T ẋ, a late torque τ - T τ̇, an eccentric disc x + a sin x + b cos x.
 LINEAR = {
@@ -50,6 +53,7 @@ class CandidateColumns:
         self._weak = rows.weak if weak is None else weak
         self._noisy: list[CandidateColumns] = []
         self._held: dict[int, Standstill] = {}
+        self._turned: dict[str, Reversals] = {}
         self._own = {p.name for p in rows.model.parameters}
 
     def within(self, weak: WeakWindows) -> CandidateColumns:
@@ -152,12 +156,17 @@ class CandidateColumns:
         def columns(motion: Motion) -> tuple[Array | None, Array]:
             inputs = self._inputs(model, motion)
             inputs = replace(inputs, states=inputs.states[:, model.state_slices[-1]])
+
+            def along(v: Array) -> Array:
+                return force.force(model.layout, motion.x, v, inputs)
+
+            if held is None and force.name in REVERSING:
+                return None, self._reversals(force.where).mean(along, motion)
             if held is None:
-                return None, force.force(model.layout, motion.x, motion.v, inputs)
+                return None, along(motion.v)
             v = motion.v.copy()
             v[:, held.motor] = held.slow
-            G = force.force(model.layout, motion.x, v, inputs)
-            return None, np.where(held.at(motion.segment, motion.samples)[:, None, None], G, 0.0)
+            return None, np.where(held.at(motion.segment, motion.samples)[:, None, None], along(v), 0.0)
 
         return self._weak.columns(columns, dense=not force.smooth)
 
@@ -178,20 +187,42 @@ class CandidateColumns:
         near = np.ones(2 * HOPS - 1)
         count = np.convolve(np.ones(len(squares)), near, mode="same")
         out = np.stack([np.convolve(column, near, mode="same") / count for column in squares.T], axis=1)
-        if candidate.effect.name in DRY:
+        if candidate.effect.name in REVERSING:
             model = Model(self._declaring(candidate.effect))
+            force, turned = model.effects[-1], self._reversals(candidate.effect.where)
+
+            def off(motion: Motion) -> Array:
+                inputs = self._inputs(model, motion)
+                return turned.squares(lambda v: force.force(model.layout, motion.x, v, inputs) @ coefficients, motion)
+
+            out = np.maximum(out, self._weak.variance(off))
+        if candidate.effect.name in DRY:
             held = self._standstill(int(candidate.effect.where.removeprefix("joint_")) - 1)
             out += np.square(self._force(model, held) @ coefficients)
         return out
 
     def _standstill(self, joint: int) -> Standstill:
         """Of a joint's motor, by number from 0."""
-        rows, layout = self.rows, self.rows.model.layout
-        column = layout.theta_m[joint] + layout.n_base_positions - layout.n_base_speeds
-        noise = float(rows.noise.coordinates[column])
+        rows = self.rows
         if joint not in self._held:
+            noise = self._noise_of(joint)
             self._held[joint] = Standstill(rows.sensing, rows.segments, joint, noise, self.system.sample_rate)
         return self._held[joint]
+
+    def _reversals(self, where: str) -> Reversals:
+        """Of a joint's motor, in the windows' own samples."""
+        if where not in self._turned:
+            rows, joint = self.rows, int(where.removeprefix("joint_")) - 1
+            noise = self._noise_of(joint)
+            self._turned[where] = Reversals(rows.sensing, self._weak.segments, joint, noise, self.system.sample_rate)
+        return self._turned[where]
+
+    def _noise_of(self, joint: int) -> float:
+        """σ of the position of a joint's motor, rad."""
+        layout = self.rows.model.layout
+        return float(
+            self.rows.noise.coordinates[layout.theta_m[joint] + layout.n_base_positions - layout.n_base_speeds]
+        )
 
     def _declaring(self, effect: Effect) -> System:
         """The system with one more effect."""

@@ -21,10 +21,12 @@ from sms_online.stream import Array
 class Motion:
     """Smoothed motion at the samples that some windows see.
 
-    segment: its number. samples (K,): numbers in the segment. x (K, n_x), v (K, n_v), torque (K, joints): n τ.
+    segment: its number. half_width: of the filter, samples. samples (K,): numbers in the segment. x (K, n_x), v (K,
+    n_v), torque (K, joints): n τ.
     """
 
     segment: int
+    half_width: int
     samples: NDArray[np.int64]
     x: Array
     v: Array
@@ -96,7 +98,7 @@ class WeakWindows:
             smoothed, rates = smooth(signals, seen, M, self._rate)
         x = smoothed[:, :n_x]
         v = self._layout.speeds(x, rates[:, :n_x])
-        return Motion(number, seen, x, v, smoothed[:, n_x:]), which
+        return Motion(number, M, seen, x, v, smoothed[:, n_x:]), which
 
     def columns(self, weak: WeakColumns, dense: bool = False) -> Array:
         """Rows (W, n_v, c).
@@ -117,6 +119,13 @@ class WeakWindows:
                 acts = np.flatnonzero(np.any(flat, axis=0))
                 out.reshape(self.count, -1)[np.ix_(which, acts)] -= operator @ flat[:, acts]
         assert out is not None
+        return out
+
+    def variance(self, squares: Callable[[Motion], Array]) -> Array:
+        """Variance of the rows (W, n_v) for squares (K, n_v) of what a force is off by at single samples."""
+        out = np.zeros((self.count, self._layout.n_v))
+        for (motion, which), (by_force, _) in zip(self.motions(dense=True), self._sums(dense=True), strict=True):
+            out[which] = by_force.power(2) @ squares(motion)
         return out
 
     def _sums(self, dense: bool) -> list[tuple[scipy.sparse.csr_array, scipy.sparse.csr_array]]:
