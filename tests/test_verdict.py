@@ -13,7 +13,9 @@ from sms_online.description.schema import Effect, System
 from sms_online.diagnosis import diagnose
 from sms_online.diagnosis.record import Segment
 from sms_online.diagnosis.residuals import RowResidual
+from sms_online.diagnosis.reversals import Reversals
 from sms_online.diagnosis.standstill import Standstill
+from sms_online.diagnosis.weak_windows import Motion
 from sms_online.pipeline.smoothing import smooth
 
 
@@ -85,9 +87,12 @@ def test_links_stiffen_that_take_something_away(
         def excess(self, chosen: Any) -> float | None:
             return self.left
 
+    def trial(system: System, constants: Any, beta: Any, effects: Any) -> Attempted:
+        return Attempted(None, system)
+
     monkeypatch.setattr(diagnose, "Attempt", Attempted)
     rows = SimpleNamespace(beta=np.zeros(1))
-    attempt: Any = SimpleNamespace(system=load_system("paper-planar"), rows=rows, constants=())
+    attempt: Any = SimpleNamespace(system=load_system("paper-planar"), rows=rows, constants=(), trial=trial)
     case: Any = None
     found: Any = diagnose._stiffened(case, attempt, [])
     assert (None if found is None else found.links) == exact
@@ -109,3 +114,26 @@ def test_an_axis_stands_still_where_its_rate_is_noise_for_longer_than_a_reversal
     still = held.at(0, seen)
     edges = t[seen[np.flatnonzero(np.diff(still, prepend=False, append=False)[: still.size])]]
     assert edges == pytest.approx([1.0, 1.6, 2.5, 2.6], abs=0.03)
+
+
+@pytest.mark.parametrize("noise", [1e-12, 1e-5, 1e-4])
+def test_the_integral_of_a_sign_is_known_as_well_as_it_is_told(noise: float) -> None:
+    """A rate that falls by 6 rad/s² to zero and by 2 beyond, as of a motor that dry friction has slowed down."""
+    random = np.random.default_rng(8)
+    layout = SimpleNamespace(theta_m=(0,), n_base_positions=3, n_base_speeds=3)
+    sensing: Any = SimpleNamespace(model=SimpleNamespace(layout=layout), coordinates=lambda values: values)
+    t = np.arange(400) / 1000.0
+    off, told = [], []
+    for turn in random.uniform(0.19, 0.21, 60):
+        angle = np.where(t < turn, -3.0, -1.0) * (t - turn) ** 2 + noise * random.standard_normal(t.size)
+        reversals = Reversals(sensing, [Segment(np.arange(t.size), angle[:, None])], 0, noise, 1000.0)
+        samples = np.arange(100, 300)
+        nothing = np.zeros((samples.size, 1))
+        motion = Motion(0, 80, samples, nothing, nothing, nothing)
+        sign = reversals.mean(lambda v: np.tanh(v / 1e-4)[..., None], motion)[:, 0, 0]
+        # Cells of half a sample beyond both ends.
+        true = (turn - t[100] + 0.5e-3) - (t[299] + 0.5e-3 - turn)
+        off.append(sign.sum() / 1000.0 - true)
+        told.append(np.sqrt(reversals.squares(lambda v: np.tanh(v / 1e-4), motion).sum()) / 1000.0)
+    share = np.sqrt(np.mean(np.square(off))) / np.sqrt(np.mean(np.square(told)))
+    assert 0.4 < share < 1.5

@@ -3,7 +3,7 @@
 What dry friction does when its motor turns round bends the motor's rate, and a filter as wide as the smooth motion
 allows rounds the bend off: the zero of the rate is told milliseconds beside the true one, in every reversal on the same
 side. So the rate comes through a narrow filter, whose noise scatters, and what is left of both is told by the rate's
-noise and by what a yet narrower filter says. And an integral over samples knows a jump to half a sample; forces are
+noise and by what a wider filter says. And an integral over samples knows a jump to half a sample; forces are
 averaged over instants between them.
 """
 
@@ -26,8 +26,6 @@ from sms_online.stream import Array
 HALF_WIDTH = 0.028
 # Instants of a sample, in samples from its middle, that a force is averaged over.
 WITHIN = (-0.4, -0.2, 0.0, 0.2, 0.4)
-# The filter that tells what this one rounds off, as a share of its width.
-NARROWER = 0.7
 # A reversal is off by no more than this, s: an axis that turns round more slowly stands still.
 LARGEST = 0.06
 # Rates on both sides of a jump, in multiples of what counts as standstill.
@@ -59,6 +57,16 @@ class Reversals:
         known = self._known[key]
         return np.asarray(np.interp(at, np.arange(known.size) + M, known))
 
+    def _deviation(self, motion: Motion, M: int) -> Array:
+        """1σ (K,) of the rate by noise, and what the filter rounds off, rad/s.
+
+        That is in proportion to its width: one of twice the width rounds off as much again.
+        """
+        own, wide = kernel(M)[:, 1], kernel(2 * M)[:, 1]
+        alone, between = (self._noise * float(np.linalg.norm(w)) * self._rate for w in (own, wide - np.pad(own, M)))
+        more = self._rates(motion, 2 * M, motion.samples) - self._rates(motion, M, motion.samples)
+        return np.asarray(np.sqrt(alone**2 + np.maximum(0.0, more**2 - between**2)))
+
     def mean(self, force: Callable[[Array], Array], motion: Motion) -> Array:
         """Forces (K, n_v, c) of speeds (K, n_v), averaged over each sample of a motion."""
         M = min(motion.half_width, self._widest)
@@ -77,11 +85,8 @@ class Reversals:
         turns = (np.diff(np.sign(rate), append=np.sign(rate[-1:])) != 0.0) & (
             np.diff(motion.samples, append=motion.samples[-1:]) == 1
         )
-        narrow = max(HALF_WIDTHS[0], round(NARROWER * M))
-        own = self._noise * float(np.linalg.norm(kernel(M)[:, 1])) * self._rate
-        rounded = self._rates(motion, narrow, motion.samples) - rate
         off = np.zeros_like(rate)  # in samples
-        off[turns] = np.minimum(np.hypot(own, rounded[turns]) / np.abs(slope[turns]), LARGEST * self._rate)
+        off[turns] = np.minimum(self._deviation(motion, M)[turns] / np.abs(slope[turns]), LARGEST * self._rate)
         sides = []
         for side in (BESIDE * STANDSTILL, -BESIDE * STANDSTILL):
             v = motion.v.copy()
