@@ -285,6 +285,14 @@ class Tracing:
             self.settle(chosen)
             # What the laws found are uncertain by is told in the rows' new weights.
             self._take(chosen)
+            # In those weights, beside the others, an effect may have to be what it cannot be.
+            impossible = {k for k in chosen if self._taken[k] == 0.0}
+            if impossible:
+                refused |= {self.candidates[k].key for k in impossible}
+                chosen = [k for k in chosen if k not in impossible]
+                self.settle(chosen)
+                self._take(chosen)
+                continue
             if frozenset(chosen) in seen:
                 break  # effects that replace each other in turn
             seen.add(frozenset(chosen))
@@ -299,7 +307,8 @@ class Tracing:
         self._taken = {}
         for k in chosen:
             Q = basis(self._columns([other for other in chosen if other != k]))
-            self._taken[k] = gain(Q, free_of(Q, self._b[:, None])[:, 0], self._Z[k]).gain
+            found = gain(Q, free_of(Q, self._b[:, None])[:, 0], self._Z[k])
+            self._taken[k] = self._plausible(self.candidates[k], found).gain
 
     def _eligible(self, chosen: Sequence[int], refused: set[str]) -> list[int]:
         """Candidates that may come to those chosen; one that extends another comes after it, and then replaces it."""
