@@ -70,7 +70,9 @@ def likely_line(x: Array, y: Array) -> tuple[float, float]:
     For a drift g the line touches the lowest point, y - x - g x = m(g); with delays of the mean s its likelihood is
     exp(-Σ (y - x - g x - m) / s), a concave function of g in the exponent. One point gives slope 1.
     """
-    ahead, since_last = y - x, x - x[-1]
+    # About the last point, for clocks may be decades apart.
+    since_last = x - x[-1]
+    ahead = (y - y[-1]) - since_last
 
     def distances(drift: Array) -> tuple[Array, Array]:
         """Of each point from the line (drifts, n), and the lines' values at the last point."""
@@ -89,13 +91,14 @@ def likely_line(x: Array, y: Array) -> tuple[float, float]:
         delay = max(min(delay, float(np.median(closest)) / np.log(2.0)), FINEST_DELAY)
         log_likelihood = -INDEPENDENT * total / delay - 0.5 * (drift / CRYSTALS) ** 2
         likely = np.flatnonzero(log_likelihood > log_likelihood.max() - LEAST_LIKELY)
-        if likely.size >= ENOUGH:
-            break
+        before = high - low
         low, high = float(drift[max(likely[0] - 1, 0)]), float(drift[min(likely[-1] + 1, DRIFTS - 1)])
+        if likely.size >= ENOUGH or high - low >= before:
+            break
     weight = np.exp(log_likelihood - log_likelihood.max())
     weight /= weight.sum()
     mean, value = float(weight @ drift), float(weight @ lowest)
-    return 1.0 + mean, value - mean * float(x[-1])
+    return 1.0 + mean, value + float(y[-1] - (1.0 + mean) * x[-1])
 
 
 class DeviceClock:
@@ -104,8 +107,8 @@ class DeviceClock:
     latency: constant delay between the instant of a sample and its arrival, s, as stated.
 
     A jump of the device's clock (a restart, a correction) is recognised within CONFIRMED samples, after which times are
-    held back until the offset is known again; the drift is kept. Times are a function of the pairs and of how they are
-    split over calls, nothing else.
+    held back until the offset is known again; the drift is kept until then. Times are a function of the pairs and of
+    how they are split over calls, nothing else.
     Limitation: a latency that is not stated and a constant part of the delay are taken for offset.
     """
 

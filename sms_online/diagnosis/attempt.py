@@ -182,7 +182,8 @@ class Attempt:
     def trial(self, system: System, constants: Sequence[Effect], beta: Array, effects: Sequence[Effect]) -> Attempt:
         """A quick attempt with no candidates but some effects, on stretches of the session.
 
-        On all of it where internal states would begin at rest in each stretch.
+        On all of it where internal states would begin at rest in each stretch. Noise beyond first order is that of this
+        attempt's rows, whatever else becomes of them: the same measure for all that are compared.
         """
         forces = tuple(effect for effect in (*system.effects, *effects) if not is_constant(effect))
         states = Model(system.model_copy(update={"effects": forces})).n_states

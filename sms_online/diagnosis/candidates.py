@@ -26,7 +26,7 @@ from sms_online.pipeline.momentum_balance import HOPS
 from sms_online.stream import Array
 
 TORQUE_RATE = "torque rate"
-# Forces that jump with the sign of a motor's rate.
+# Forces whose law is another for either sign of a motor's rate.
 REVERSING = (*DRY, "direction_friction")
 # Linear coefficients of effects on channels: quantity, unit, what a unit of it adds to a reading, with its sign. A lag
 # of a delay T reads x - T ẋ, a late torque τ - T τ̇, an eccentric disc x + a sin x + b cos x.

@@ -83,7 +83,7 @@ class Motions:
 
     def __init__(self, rows: SessionRows, make: CandidateColumns, fitted: NDArray[np.bool_]) -> None:
         some = np.arange(rows.count) // STRETCH % 3 == 0
-        if not (fitted[some].any() and not fitted[some].all()):
+        if min(np.count_nonzero(fitted[some]), np.count_nonzero(~fitted[some])) < STRETCH:
             some = np.ones(rows.count, dtype=bool)
         self._rows, self._make, self._fitted = rows, make, fitted[some]
         self._channels = rows.sensing.channels

@@ -51,7 +51,11 @@ class Reversals:
 
     @cached_property
     def _half_width(self) -> int:
-        """Of the filter that tells all the reversals best; too narrow a one sees more than there are."""
+        """Of the filter that tells all changes of sign best, which are the more the narrower it is.
+
+        Where an axis rests those of noise count too: then it is narrower than need be, and rows near reversals count
+        for less.
+        """
         # Twice the width has to lie within the segments.
         shortest = min(len(angle) for angle in self._angles)
         widths = [M for M in HALF_WIDTHS if shortest > 4 * M + 2] or HALF_WIDTHS[:1]

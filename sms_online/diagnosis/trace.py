@@ -286,12 +286,12 @@ class Tracing:
             # What the laws found are uncertain by is told in the rows' new weights.
             self._take(chosen)
             # In those weights, beside the others, an effect may have to be what it cannot be.
-            impossible = {k for k in chosen if self._taken[k] == 0.0}
-            if impossible:
+            while impossible := [k for k in chosen if self._taken[k] == 0.0]:
                 refused |= {self.candidates[k].key for k in impossible}
                 chosen = [k for k in chosen if k not in impossible]
                 self.settle(chosen)
                 self._take(chosen)
+            if self.candidates[best].key in refused:
                 continue
             if frozenset(chosen) in seen:
                 break  # effects that replace each other in turn

@@ -31,10 +31,10 @@ def channel_kernels(system: System, channels: Sequence[str]) -> dict[int, Array]
 
 
 def noise_gains(system: System, channels: Sequence[str]) -> Array:
-    """By how much more noise a corrected sample of each channel has at least (channels,), than its density says.
+    """By how much more white noise a corrected sample of each channel has, 1 at least (channels,), than one as read.
 
-    What takes a lag off lets slow noise pass as it is and enlarges fast noise. Where it makes less of that, near its
-    corner it still makes more, so that the gain is 1 at least.
+    What takes a lag off lets slow noise pass as it is and enlarges that near its corner. Limitation: of all frequencies
+    together; a filter behind it hears more of a lag of some 5 to 50 Hz, and less of a quicker one.
     """
     gains = np.ones(len(channels))
     for k, kernel in channel_kernels(system, channels).items():

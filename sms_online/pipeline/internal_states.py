@@ -73,6 +73,8 @@ def _along(step: Array, push: Array, z: Array) -> Array:
     before has ended.
     """
     count, n = push.shape
+    if count == 0:
+        return push
     length = max(1, int(np.sqrt(count)))
     runs = -(-count // length)
     spare = runs * length - count

@@ -345,7 +345,7 @@ def summary(records: list[Record]) -> str:
 
 def _over_floor(singles: list[Record], cleans: list[Record]) -> list[str]:
     """Held-out residuals beside those of clean sessions with the same noise: what its few windows happen to hold."""
-    floor = {r["seed"]: r["holdout"] for r in cleans}
+    floor = {r["seed"]: r["holdout"] for r in cleans if "holdout" in r}
     over = [
         max(value / floor[r["seed"]][row] for row, value in r["holdout"].items()) for r in singles if r["seed"] in floor
     ]
