@@ -253,6 +253,14 @@ class Attempt:
         std = np.sqrt(np.diag(self.tracing.covariance(everything))[own])
         return self._improved(self.fixed, solution[n:]), bool(np.all(np.abs(solution[own]) < SETTLED * std))
 
+    def conclude(self, chosen: Sequence[int]) -> None:
+        """Improve the constants by all the rows, once more: they were found on stretches.
+
+        The rows stay, whose columns tell to second order what so small a change makes of them.
+        """
+        n, size = self.rows.base.n, sum(len(candidate.parameters) for candidate in self.fixed)
+        self.constants = self._improved(self.fixed, self.solution(chosen)[n : n + size])
+
     def found(self, chosen: Sequence[int], solution: Array) -> tuple[list[Effect], list[Effect]]:
         """Of the effects chosen, those that become constants, with their values, and the others."""
         size = sum(len(candidate.parameters) for candidate in self.fixed)

@@ -160,6 +160,7 @@ def _with_constants(
         others = [effect for effect in tried if (effect.name, effect.where) not in keys]
         attempt = Attempt(case, attempt.system, constants, beta, others)
         chosen = attempt.search()
+        attempt.conclude(chosen)
     standing = {(effect.name, effect.where) for effect in attempt.constants}
     findings = [f for f in findings if (f.candidate.effect.name, f.candidate.effect.where) in standing]
     return attempt, chosen, findings
