@@ -447,3 +447,16 @@ def test_a_wrong_effect_on_the_command_line_is_bad_input(tmp_path: Path, capsys:
     message = capsys.readouterr().err
     assert "cubic_stiffness at 'joint_9'; expected one of joint_1, joint_2" in message
     assert len(message.strip().splitlines()) == 1
+
+
+def test_an_effect_without_a_size_is_warned_of(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """As diagnosis writes them, for an estimator to find their size."""
+    file = tmp_path / "found.toml"
+    effects = '[[effect]]\nname = "coulomb_friction"\nwhere = "joint_2"\n'
+    effects += '[[effect]]\nname = "viscous_friction"\nwhere = "joint_1"\ncoefficients = { damping = 2.0 }\n'
+    file.write_text(f"{shipped_text('paper-planar')}\n{effects}", encoding="utf-8")
+    capture = str(tmp_path / "run.csv")
+    assert main(["simulate", "--system", str(file), "--capture", capture, "--duration", "0.05"]) == 0
+    warnings = [line for line in capsys.readouterr().out.splitlines() if line.startswith("warning")]
+    assert len(warnings) == 1
+    assert "coulomb_friction@joint_2 does nothing" in warnings[0]

@@ -64,6 +64,9 @@ def run(args: argparse.Namespace) -> int:
         conserved = "not conserved here (fixed base, gravity, or effects on the base)"
         text = conserved if value is None else f"{value:.1e} of what base and arm exchange"
         lines.append(f"{what} momentum drift: {text}")
+    # As in what a diagnosis writes: the values of its effects are for the estimator to find.
+    idle = [e for e in Model(described).effects if e.parameters and all(p.nominal == 0.0 for p in e.parameters)]
+    lines += [f"warning: {e.name}@{e.where} does nothing, for {args.system} states no size of it" for e in idle]
     show(report_console(args.json), *lines)
     if args.json:
         print(to_json(document))
