@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from sms_online.diagnosis.record import Segment
 from sms_online.diagnosis.weak_windows import Motion
+from sms_online.effects.base import position
 from sms_online.effects.friction import STANDSTILL
 from sms_online.pipeline.sensing import Sensing
 from sms_online.pipeline.smoothing import HALF_WIDTHS, kernel, smooth_all
@@ -44,8 +45,7 @@ class Reversals:
     ) -> None:
         layout = sensing.model.layout
         self.motor = layout.theta_m[joint]
-        column = self.motor + layout.n_base_positions - layout.n_base_speeds
-        self._angles = [sensing.coordinates(segment.values)[:, [column]] for segment in segments]
+        self._angles = [position(layout, sensing.coordinates(each.values), self.motor)[:, None] for each in segments]
         self._noise, self._rate = noise, sample_rate
         self._known: dict[tuple[int, int], Array] = {}
 

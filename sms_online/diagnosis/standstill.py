@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sms_online.diagnosis.record import Segment
+from sms_online.effects.base import position
 from sms_online.pipeline.sensing import Sensing
 from sms_online.pipeline.smoothing import HALF_WIDTHS, kernel, smooth
 
@@ -30,12 +31,11 @@ class Standstill:
     ) -> None:
         layout = sensing.model.layout
         self.motor = layout.theta_m[joint]
-        column = self.motor + layout.n_base_positions - layout.n_base_speeds
         M = max(HALF_WIDTHS[0], round(HALF_WIDTH * sample_rate))
         self.slow = STILL * noise * float(np.linalg.norm(kernel(M)[:, 1])) * sample_rate
         self._still = []
         for segment in segments:
-            angle = sensing.coordinates(segment.values)[:, [column]]
+            angle = position(layout, sensing.coordinates(segment.values), self.motor)[:, None]
             seen = np.arange(M, len(angle) - M, STEP)
             rate = smooth(angle, seen, M, sample_rate)[1][:, 0]
             edges = np.flatnonzero(np.diff(np.abs(rate) < self.slow, prepend=False, append=False))
