@@ -247,25 +247,28 @@ class Attempt:
 
     def improved(self, solution: Array) -> tuple[list[Effect], bool]:
         """The constants improved by a solution, and whether there is nothing more to improve."""
-        n = self.rows.base.n
-        own = slice(n, n + sum(len(candidate.parameters) for candidate in self.fixed))
+        own = self._of_constants
         everything = range(len(self.tracing.candidates))
         std = np.sqrt(np.diag(self.tracing.covariance(everything))[own])
-        return self._improved(self.fixed, solution[n:]), bool(np.all(np.abs(solution[own]) < SETTLED * std))
+        return self._improved(self.fixed, solution[own]), bool(np.all(np.abs(solution[own]) < SETTLED * std))
 
     def conclude(self, chosen: Sequence[int]) -> None:
         """Improve the constants by all the rows, once more: they were found on stretches.
 
         The rows stay, whose columns tell to second order what so small a change makes of them.
         """
-        n, size = self.rows.base.n, sum(len(candidate.parameters) for candidate in self.fixed)
-        self.constants = self._improved(self.fixed, self.solution(chosen)[n : n + size])
+        self.constants = self._improved(self.fixed, self.solution(chosen)[self._of_constants])
+
+    @property
+    def _of_constants(self) -> slice:
+        """Where a solution holds what the constants change by."""
+        n = self.rows.base.n
+        return slice(n, n + sum(len(candidate.parameters) for candidate in self.fixed))
 
     def found(self, chosen: Sequence[int], solution: Array) -> tuple[list[Effect], list[Effect]]:
         """Of the effects chosen, those that become constants, with their values, and the others."""
-        size = sum(len(candidate.parameters) for candidate in self.fixed)
         candidates = [self.tracing.candidates[k] for k in chosen]
-        everything = self._improved(candidates, solution[self.rows.base.n + size :])
+        everything = self._improved(candidates, solution[self._of_constants.stop :])
         return [e for e in everything if is_constant(e)], [e for e in everything if not is_constant(e)]
 
     @staticmethod

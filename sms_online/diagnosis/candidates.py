@@ -18,7 +18,7 @@ from sms_online.diagnosis.rows import SessionRows
 from sms_online.diagnosis.standstill import Standstill
 from sms_online.diagnosis.trace import DRY, Candidate
 from sms_online.diagnosis.weak_windows import Motion, WeakWindows
-from sms_online.effects.base import Inputs, Ranges
+from sms_online.effects.base import Inputs, Ranges, position
 from sms_online.effects.catalogue import ENTRIES, candidates
 from sms_online.model.model import Model
 from sms_online.model.parameters import Parameter
@@ -220,9 +220,7 @@ class CandidateColumns:
     def _noise_of(self, joint: int) -> float:
         """σ of the position of a joint's motor, rad."""
         layout = self.rows.model.layout
-        return float(
-            self.rows.noise.coordinates[layout.theta_m[joint] + layout.n_base_positions - layout.n_base_speeds]
-        )
+        return float(position(layout, self.rows.noise.coordinates[None], layout.theta_m[joint])[0])
 
     def _declaring(self, effect: Effect) -> System:
         """The system with one more effect."""

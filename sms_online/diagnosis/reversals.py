@@ -44,8 +44,8 @@ class Reversals:
         self, sensing: Sensing, segments: Sequence[Segment], joint: int, noise: float, sample_rate: float
     ) -> None:
         layout = sensing.model.layout
-        self.motor = layout.theta_m[joint]
-        self._angles = [position(layout, sensing.coordinates(each.values), self.motor)[:, None] for each in segments]
+        self._motor = layout.theta_m[joint]
+        self._angles = [position(layout, sensing.coordinates(each.values), self._motor)[:, None] for each in segments]
         self._noise, self._rate = noise, sample_rate
         self._known: dict[tuple[int, int], Array] = {}
 
@@ -95,7 +95,7 @@ class Reversals:
         v = motion.v.copy()
         total: Array | float = 0.0
         for part in WITHIN:
-            v[:, self.motor] = self._rates(motion.segment, M, motion.samples + part)
+            v[:, self._motor] = self._rates(motion.segment, M, motion.samples + part)
             total = total + force(v)
         return np.asarray(total / len(WITHIN))
 
@@ -105,7 +105,7 @@ class Reversals:
         sides = []
         for side in (BESIDE * STANDSTILL, -BESIDE * STANDSTILL):
             v = motion.v.copy()
-            v[:, self.motor] = side
+            v[:, self._motor] = side
             sides.append(force(v))
         out = np.zeros_like(motion.v)
         out[turns] = ((sides[0] - sides[1])[turns] * off[:, None]) ** 2

@@ -39,7 +39,8 @@ def run(args: argparse.Namespace) -> int:
             writer.write(block)
             samples += block.t.size
     drift = simulation.drift
-    truth = {p.name: p.nominal for p in Model(described).parameters}
+    model = Model(described)
+    truth = {p.name: p.nominal for p in model.parameters}
     injected = [effect.model_dump(mode="json") for effect in system.effects[len(described.effects) :]]
     provenance = {
         "system": system.name, "grade": args.grade, "seed": args.seed, "duration_s": simulation.duration,
@@ -65,7 +66,7 @@ def run(args: argparse.Namespace) -> int:
         text = conserved if value is None else f"{value:.1e} of what base and arm exchange"
         lines.append(f"{what} momentum drift: {text}")
     # As in what a diagnosis writes: the values of its effects are for the estimator to find.
-    idle = [e for e in Model(described).effects if e.parameters and all(p.nominal == 0.0 for p in e.parameters)]
+    idle = [e for e in model.effects if e.parameters and all(p.nominal == 0.0 for p in e.parameters)]
     lines += [f"warning: {e.name}@{e.where} does nothing, for {args.system} states no size of it" for e in idle]
     show(report_console(args.json), *lines)
     if args.json:
