@@ -103,6 +103,45 @@ def test_what_is_unexplained_acts_on_the_row_that_had_and_has_residual() -> None
     assert describe_residual(rows, rows.Y, residual, level).row == "link_1"
 
 
+def test_what_takes_the_course_of_something_found_belongs_to_its_row() -> None:
+    """A gear's error, taken for a cogging of the motor alone, is left in the link's rows; another course is not."""
+    _, rows = session()
+    layout = rows.model.layout
+    candidate = CandidateColumns(rows, rows.model.system).of(
+        Effect(name="cogging", where="joint_1", coefficients={"order": 4.0})
+    )
+    columns = np.concatenate((rows.Y, candidate.columns), axis=2)
+    course = candidate.columns[:, layout.theta_m[0]] @ [0.6, -0.8] / rows.std[:, layout.q[0]]
+    random = np.random.default_rng(4)
+    for force, row in ((course, "joint_1"), (random.permuted(course), "link_1")):
+        residual = random.standard_normal(rows.b.shape)
+        residual[:, layout.q[0]] += 20.0 * force / np.std(force)
+        before = {name: RowResidual(10.0, 1.2) for name in row_types(layout)}
+        found = describe_residual(rows, columns, residual, before)
+        assert (found.row, found.speed) == (row, "q_1")
+
+
+@pytest.mark.parametrize(
+    ("name", "shape", "coefficients"),
+    [("cogging", {"order": 18.0}, [80.0, 50.0]), ("torque_ripple", {"order": 24.0}, [0.2, -0.1])],
+)
+def test_noise_of_a_phase_is_told_to_first_order(
+    name: str, shape: dict[str, float], coefficients: list[float], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Against sixty draws of the sensors' noise: in all to 5 %, and single rows as a χ² of so many scatters."""
+    _, rows = session()
+    make = CandidateColumns(rows, rows.model.system)
+    candidate = make.of(Effect(name=name, where="joint_1", coefficients=shape))
+    told = make.variance(candidate, np.array(coefficients))
+    monkeypatch.setattr("sms_online.diagnosis.rows.NOISES", 60)
+    drawn = [make.within(weak).of(candidate.effect).columns - candidate.columns for weak in rows.noisy()]
+    motor = rows.model.layout.theta_m[0]
+    ratio = np.mean(np.square(drawn @ np.array(coefficients)), axis=0)[:, motor] / told[:, motor]
+    assert np.mean(ratio) == pytest.approx(1.0, abs=0.05)
+    assert np.std(ratio) < 1.3 * np.sqrt(2.0 / 60.0)
+    assert not told[:, [k for k in range(told.shape[1]) if k != motor]].any()
+
+
 def test_a_gain_is_what_least_squares_takes_off_the_residual() -> None:
     rng = np.random.default_rng(5)
     Y, Z = rng.normal(size=(200, 4)), rng.normal(size=(200, 2))

@@ -173,33 +173,71 @@ class CandidateColumns:
     def variance(self, candidate: Candidate, coefficients: Array) -> Array:
         """Variance (W, n_v) of the rows for what the sensors' noise makes of a force with coefficients (c,).
 
-        Two samples of it in every window, averaged over the windows that a window overlaps: the noise of a force that
-        jumps with the sign of a rate is that of its reversals, and no derivative tells it. Where its axis stands still
-        dry friction takes any value up to that of its law.
+        To first order where a joint's position and rate tell the force. Else by two samples of it in every window,
+        averaged over the windows that a window overlaps: the noise of a force that jumps with the sign of a rate is
+        that of its reversals, and no derivative tells it. Where its axis stands still dry friction takes any value up
+        to that of its law.
         """
-        if ENTRIES[candidate.effect.name].kind != "force" or is_constant(candidate.effect) or self.rows.noise.exact:
+        effect = candidate.effect
+        if ENTRIES[effect.name].kind != "force" or is_constant(effect) or self.rows.noise.exact:
             return np.zeros_like(self.rows.b)
+        model = Model(self._declaring(effect))
+        if effect.where.startswith("joint_") and effect.name not in REVERSING and not model.effects[-1].n_states:
+            return self._spread(model, coefficients)
         if not self._noisy:
             self._noisy = [self.within(weak) for weak in self.rows.noisy()]
-        noisy = [make.of(candidate.effect).columns for make in self._noisy]
+        noisy = [make.of(effect).columns for make in self._noisy]
         changes = [(columns - candidate.columns) @ coefficients for columns in noisy]
         squares = np.mean(np.square(changes), axis=0)
         near = np.ones(2 * HOPS - 1)
         count = np.convolve(np.ones(len(squares)), near, mode="same")
         out = np.stack([np.convolve(column, near, mode="same") / count for column in squares.T], axis=1)
-        if candidate.effect.name in REVERSING:
-            model = Model(self._declaring(candidate.effect))
-            force, turned = model.effects[-1], self._reversals(candidate.effect.where)
+        if effect.name in REVERSING:
+            force, turned = model.effects[-1], self._reversals(effect.where)
 
             def off(motion: Motion) -> Array:
                 inputs = self._inputs(model, motion)
                 return turned.squares(lambda v: force.force(model.layout, motion.x, v, inputs) @ coefficients, motion)
 
             out = np.maximum(out, self._weak.variance(off))
-        if candidate.effect.name in DRY:
-            held = self._standstill(int(candidate.effect.where.removeprefix("joint_")) - 1)
+        if effect.name in DRY:
+            held = self._standstill(int(effect.where.removeprefix("joint_")) - 1)
             out += np.square(self._force(model, held) @ coefficients)
         return out
+
+    def _spread(self, model: Model, coefficients: Array) -> Array:
+        """Variance (W, n_v) of the rows for a model's last effect, of a joint, to first order in the sensors' noise."""
+        force, layout, noise, rate = model.effects[-1], model.layout, self.rows.noise, self.system.sample_rate
+        joint = int(force.where.removeprefix("joint_")) - 1
+        offset = layout.n_base_positions - layout.n_base_speeds
+        torque = np.zeros_like(noise.torque)
+        torque[joint] = np.sqrt(noise.torque[joint] * rate)
+
+        def slopes(motion: Motion) -> tuple[Array, Array]:
+            inputs = self._inputs(model, motion)
+
+            def change(x: Array | float, v: Array | float, torque: Array | float) -> Array:
+                ends = [
+                    force.force(
+                        layout,
+                        motion.x + sign * x,
+                        motion.v + sign * v,
+                        replace(inputs, torque=inputs.torque + sign * torque),
+                    )
+                    for sign in (0.5, -0.5)
+                ]
+                return np.asarray((ends[0] - ends[1]) @ coefficients)
+
+            by_value, by_rate = [change(0.0, 0.0, torque)], [np.zeros_like(motion.v)]
+            for speed in {layout.q[joint], layout.theta_m[joint]}:
+                x, v = np.zeros(layout.n_x), np.zeros(layout.n_v)
+                x[speed + offset] = noise.coordinates[speed + offset]
+                v[speed] = noise.coordinates[speed + offset] * rate
+                by_value.append(change(x, 0.0, 0.0))
+                by_rate.append(change(0.0, v, 0.0))
+            return np.array(by_value), np.array(by_rate)
+
+        return self._weak.spread(slopes)
 
     def _standstill(self, joint: int) -> Standstill:
         """Of a joint's motor, by number from 0."""

@@ -32,6 +32,8 @@ from sms_online.stream import Array
 TOLD = 64
 # The synthetic noise that tells what noise does beyond first order is the same in every diagnosis.
 SEED = 6
+# How many times it is added to tell what it makes of a force: one row's variance is then known to a third.
+NOISES = 4
 # Beyond any force times a second; squares of it are numbers still.
 LARGEST = 1e50
 # What channels' effects add to a reading y, for a unit of a coefficient: names of `SessionRows.responses`.
@@ -220,14 +222,12 @@ class SessionRows:
         return out
 
     def noisy(self) -> list[WeakWindows]:
-        """The windows over the same session with synthetic noise of the sensors added and subtracted."""
-        added = self._noise_samples(np.random.default_rng(SEED))
-        weak = self.weak
-        out = []
-        for sign in (1.0, -1.0):
+        """The windows over the same session with synthetic noise of the sensors added, each time another one."""
+        random, weak, out = np.random.default_rng(SEED), self.weak, []
+        for _ in range(NOISES):
             moved = [
-                Segment(segment.index, segment.values + sign * each)
-                for segment, each in zip(self.segments, added, strict=True)
+                Segment(segment.index, segment.values + added)
+                for segment, added in zip(self.segments, self._noise_samples(random), strict=True)
             ]
             out.append(WeakWindows(weak.windows, self.model.layout, self.sensing, moved, self._rate))
         return out

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sms_online.diagnosis.evidence import basis, free_of, gain
+from sms_online.diagnosis.evidence import basis, free_of, gain, least_squares
 from sms_online.diagnosis.residuals import RowResidual
 from sms_online.diagnosis.rows import SessionRows
 from sms_online.diagnosis.splines import DEGREE, Variable, design, spline_columns
@@ -16,6 +16,8 @@ from sms_online.stream import Array
 
 # Cubic splines on so many intervals of a variable's range.
 INTERVALS = 8
+# A residual takes its course from something that was found where this explains more of its squares than not.
+SAME_COURSE = 0.5
 # Points at which a spline is reported.
 POINTS = 25
 
@@ -24,9 +26,10 @@ POINTS = 25
 class Unexplained:
     """A force that stands in for what is not known.
 
-    row: row type with most of the residual, before and after what was found; speed: the generalized speed in it.
-    variable: what the force depends on most clearly. share: of the residual's excess over noise in all rows that it
-    takes away. at, force (POINTS,): the force over the variable's range, in N m (N).
+    row: row type with most of the residual, before and after what was found, or in which something was found that takes
+    the same course. speed: the generalized speed whose rows hold it still. variable: what the force depends on most
+    clearly. share: of the residual's excess over noise in all rows that it takes away. at, force (POINTS,): the force
+    over the variable's range, in N m (N).
     """
 
     row: str
@@ -53,6 +56,8 @@ def describe_residual(
     }
     row = max(by_type, key=lambda name: by_type[name])
     speed = max(row_types(layout)[row], key=lambda k: excess[k])
+    aside = _taken_aside(rows, columns[..., rows.base.n :], residual[:, speed], speed)
+    row = row if aside is None else next(name for name, speeds in row_types(layout).items() if aside in speeds)
     Q = basis((columns / rows.std[..., None]).reshape(-1, columns.shape[2]))
     r = free_of(Q, residual.reshape(-1, 1))[:, 0]
     best = None
@@ -69,6 +74,23 @@ def describe_residual(
     at = np.linspace(knots[DEGREE], knots[-1 - DEGREE], POINTS)
     share = min(1.0, found.gain / max(float(excess.sum()), float(np.finfo(np.float64).tiny)))
     return Unexplained(row, layout.speed_names[speed], name, share, at, design(at, knots) @ found.coefficients)
+
+
+def _taken_aside(rows: SessionRows, columns: Array, left: Array, speed: int) -> int | None:
+    """The speed in whose rows something took part of one force that acts there and on another speed, if there is one.
+
+    columns (W, n_v, c): of what was found; left (W,): residual of the other speed. A gear's error drives the motor and
+    the link: what takes it for a force on the motor alone leaves the same course in the link's rows.
+    """
+    main = np.argmax(np.sum((columns / rows.std[..., None]) ** 2, axis=0), axis=0)
+    scaled = columns[:, main, np.arange(main.size)] / rows.std[:, [speed]]
+    sizes = np.linalg.norm(scaled, axis=0)
+    if not np.any(sizes):
+        return None
+    coefficients = least_squares(scaled, left)
+    if 1.0 - np.sum((left - scaled @ coefficients) ** 2) / np.sum(left**2) < SAME_COURSE:
+        return None
+    return int(main[np.argmax(np.abs(coefficients) * sizes)])
 
 
 def _variables(rows: SessionRows, speed: int) -> dict[str, Variable]:

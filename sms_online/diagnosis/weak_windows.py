@@ -8,11 +8,12 @@ from dataclasses import dataclass
 import numpy as np
 import scipy.sparse
 from numpy.typing import NDArray
+from scipy.signal import oaconvolve
 
 from sms_online.diagnosis.record import Segment
 from sms_online.model.layout import Layout
 from sms_online.pipeline.sensing import Sensing
-from sms_online.pipeline.smoothing import smooth, smooth_all
+from sms_online.pipeline.smoothing import kernel, smooth, smooth_all
 from sms_online.pipeline.weak_form import test_function
 from sms_online.stream import Array
 
@@ -126,6 +127,25 @@ class WeakWindows:
         out = np.zeros((self.count, self._layout.n_v))
         for (motion, which), (by_force, _) in zip(self.motions(dense=True), self._sums(dense=True), strict=True):
             out[which] = by_force.power(2) @ squares(motion)
+        return out
+
+    def spread(self, slopes: Callable[[Motion], tuple[Array, Array]]) -> Array:
+        """Variance of the rows (W, n_v) for white noise of some readings, to first order.
+
+        slopes: gives (S, K, n_v) of a force by the smoothed value of each of S readings, and by its change from sample
+        to sample, times the deviation of a sample.
+        """
+        out = np.zeros((self.count, self._layout.n_v))
+        for (motion, which), (by_force, _) in zip(self.motions(dense=True), self._sums(dense=True), strict=True):
+            seen = by_force.indices.reshape(which.size, -1)
+            weights = by_force.data.reshape(which.size, -1)
+            for parts in zip(*slopes(motion), strict=True):
+                for row in np.flatnonzero(np.any(parts, axis=(0, 1))):
+                    filtered = [
+                        oaconvolve(weights * part[seen, row], column[None], axes=1)
+                        for part, column in zip(parts, kernel(motion.half_width).T, strict=True)
+                    ]
+                    out[which, row] += np.sum(np.square(sum(filtered)), axis=1)
         return out
 
     def _sums(self, dense: bool) -> list[tuple[scipy.sparse.csr_array, scipy.sparse.csr_array]]:
