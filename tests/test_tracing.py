@@ -8,9 +8,11 @@ from typing import Any
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from sms_online.description.schema import Effect
-from sms_online.diagnosis.trace import Candidate, Tracing
+from sms_online.diagnosis.candidate import DRY, Candidate
+from sms_online.diagnosis.trace import Tracing
 from sms_online.model.parameters import Parameter
 from sms_online.stream import Array
 
@@ -48,6 +50,23 @@ class MadeUpRows:
 
     def white(self, columns: Array) -> Array:
         return np.asarray((columns / np.sqrt(1.0 + self.floor)[..., None]).reshape(WINDOWS * SPEEDS, -1))
+
+
+@dataclass
+class Sticking:
+    """What friction leaves open: any value up to its law's where its axis is stuck, in a share of the session."""
+
+    stuck: NDArray[np.bool_]
+    share: float
+
+    def variance(self, candidate: Candidate, coefficients: Array) -> Array:
+        out = np.zeros((WINDOWS, SPEEDS))
+        if candidate.effect.name in DRY:
+            out[:, 0] = np.where(self.stuck, 10.0 * coefficients[0], 0.0) ** 2
+        return out
+
+    def at_rest(self, candidate: Candidate) -> float:
+        return self.share
 
 
 def _candidate(name: str, column: Array) -> Candidate:
@@ -100,13 +119,28 @@ def test_an_effect_whose_own_noise_hides_what_it_takes_stays_and_what_stood_for_
     b = Y @ np.array([1.0, -2.0, 0.5]) + rng.standard_normal((WINDOWS, SPEEDS))
     b[:, 0] += held
 
-    def variance(candidate: Candidate, coefficients: Array) -> Array:
-        out = np.zeros((WINDOWS, SPEEDS))
-        out[:, 0] = 0.0 if candidate is ripple else np.where(stuck, 10.0 * coefficients[0], 0.0) ** 2
-        return out
-
     rows: Any = MadeUpRows(Y, b)
-    tracing = Tracing(rows, [friction, ripple], FITTED, variance=variance)
+    tracing = Tracing(rows, [friction, ripple], FITTED, noise=Sticking(stuck, 0.0))
     found = tracing.run(lambda chosen, k: None)
     assert [taken for taken, _ in tracing.path] == [1, 0]
     assert found == [0]
+
+
+@pytest.mark.parametrize("level", [30.0, 0.5])
+def test_friction_that_holds_an_axis_much_of_the_time_is_found_beside_what_fits_it_better(level: float) -> None:
+    """It takes any value there, and moves nothing elsewhere; below the noise it is no friction, and a ripple stays."""
+    rng = np.random.default_rng(8)
+    stuck = rng.random(WINDOWS) < 0.6
+    held = np.where(stuck, level * rng.uniform(-1.0, 1.0, WINDOWS), 0.0)
+    ripple = rng.standard_normal(WINDOWS)
+    b = rng.standard_normal((WINDOWS, SPEEDS))
+    b[:, 0] += held + 2.0 * ripple
+    candidates = [
+        _candidate("stribeck_friction", np.sign(held)),
+        _candidate("cogging", np.where(stuck, held + 0.1 * level * rng.standard_normal(WINDOWS), 0.0)),
+        _candidate("torque_offset", ripple),
+    ]
+    rows: Any = MadeUpRows(rng.standard_normal((WINDOWS, SPEEDS, 3)), b)
+    tracing = Tracing(rows, candidates, FITTED, noise=Sticking(stuck, 0.6))
+    found = {tracing.candidates[k].effect.name for k in tracing.run(lambda chosen, k: None)}
+    assert found == ({"torque_offset"} if level < 1.0 else {"stribeck_friction", "torque_offset"})

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sms_online.description.schema import Effect, System
+from sms_online.diagnosis.candidate import Candidate
 from sms_online.diagnosis.candidates import CandidateColumns
 from sms_online.diagnosis.constants import applied, corrected, improved, is_constant
 from sms_online.diagnosis.followed import least_samples
@@ -19,7 +20,7 @@ from sms_online.diagnosis.relative import RelativeResiduals
 from sms_online.diagnosis.residuals import ResidualTest, RowResidual, whitened
 from sms_online.diagnosis.rows import SessionRows
 from sms_online.diagnosis.shape import refine
-from sms_online.diagnosis.trace import Candidate, Tracing, together
+from sms_online.diagnosis.trace import Tracing, together
 from sms_online.errors import InputError
 from sms_online.model.model import Model
 from sms_online.pipeline.conditioning import noise_gains
@@ -208,7 +209,7 @@ class Attempt:
         """Begin to trace with the weights that the rows have now."""
         constants = self.make.seen(self._lasting)
         self.fixed = [self.make.of(effect) for effect in self.constants]
-        parts = self._fitted_windows, self.prior, self.fixed, self.make.variance
+        parts = self._fitted_windows, self.prior, self.fixed, self.make
         self.tracing = Tracing(self.rows, [*constants, *forces], *parts)
 
     def _fitted(self, time: NDArray[np.floating[Any]], segment: NDArray[np.int64]) -> NDArray[np.bool_]:

@@ -11,12 +11,12 @@ from itertools import product
 import numpy as np
 
 from sms_online.description.schema import Effect, System
+from sms_online.diagnosis.candidate import DRY, Candidate
 from sms_online.diagnosis.constants import is_constant
 from sms_online.diagnosis.followed import FollowedMotion
 from sms_online.diagnosis.reversals import Reversals
 from sms_online.diagnosis.rows import SessionRows
 from sms_online.diagnosis.standstill import Standstill
-from sms_online.diagnosis.trace import DRY, Candidate
 from sms_online.diagnosis.weak_windows import Motion, WeakWindows
 from sms_online.effects.base import Inputs, Ranges, position
 from sms_online.effects.catalogue import ENTRIES, candidates
@@ -238,6 +238,10 @@ class CandidateColumns:
             return np.array(by_value), np.array(by_rate)
 
         return self._weak.spread(slopes)
+
+    def at_rest(self, candidate: Candidate) -> float:
+        """Share of the session in which the axis of a law of dry friction stands still."""
+        return self._standstill(int(candidate.effect.where.removeprefix("joint_")) - 1).share
 
     def _standstill(self, joint: int) -> Standstill:
         """Of a joint's motor, by number from 0."""

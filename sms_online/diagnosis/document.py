@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 
 from sms_online.diagnosis.attempt import LARGEST_SHARE_LEFT, Attempt, Part
+from sms_online.diagnosis.candidate import Finding
 from sms_online.diagnosis.constants import deviations
 from sms_online.diagnosis.diagnose import Diagnosis
-from sms_online.diagnosis.trace import Finding
 from sms_online.effects.base import report
 from sms_online.effects.catalogue import ENTRIES, declarable
 from sms_online.judgement import Facts, Judgement, judge, judge_diagnosis

@@ -14,10 +14,10 @@ import numpy as np
 
 from sms_online.description.schema import Effect
 from sms_online.diagnosis.attempt import Attempt
+from sms_online.diagnosis.candidate import Candidate
 from sms_online.diagnosis.diagnose import Diagnosis
 from sms_online.diagnosis.evidence import basis, free_of, gain
 from sms_online.diagnosis.splines import DEGREE, Variable, design, spline_columns
-from sms_online.diagnosis.trace import Candidate
 from sms_online.diagnosis.weak_windows import Motion
 from sms_online.effects.base import Inputs, position
 from sms_online.stream import Array

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from sms_online.description.schema import Effect, System
 from sms_online.diagnosis.attempt import FITTED, LARGEST_SHARE_LEFT, MOST_WINDOWS, REWEIGHED, STRETCH
+from sms_online.diagnosis.candidate import Candidate
 from sms_online.diagnosis.candidates import LINEAR, CandidateColumns
 from sms_online.diagnosis.constants import applied, corrected, deviations, improved, stands
 from sms_online.diagnosis.diagnose import CORRECTIONS
@@ -22,7 +23,7 @@ from sms_online.diagnosis.record import Segment, excerpts
 from sms_online.diagnosis.residuals import ResidualTest
 from sms_online.diagnosis.rows import SessionRows
 from sms_online.diagnosis.shape import refine
-from sms_online.diagnosis.trace import Candidate, Tracing
+from sms_online.diagnosis.trace import Tracing
 from sms_online.effects.base import report
 from sms_online.effects.catalogue import ENTRIES, declarable
 from sms_online.effects.spacecraft import TableTilt

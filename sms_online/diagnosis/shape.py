@@ -7,8 +7,9 @@ from collections.abc import Sequence
 import numpy as np
 from scipy.optimize import minimize_scalar
 
+from sms_online.diagnosis.candidate import Candidate
 from sms_online.diagnosis.candidates import CandidateColumns
-from sms_online.diagnosis.trace import Candidate, Tracing
+from sms_online.diagnosis.trace import Tracing
 from sms_online.effects.catalogue import ENTRIES
 
 # Relative accuracy of a shape constant, at which a mass that rings at 3 Hz is off by 0.01 rad after a minute, and

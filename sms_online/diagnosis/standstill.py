@@ -44,6 +44,11 @@ class Standstill:
                 still[begin:end] = seen[end - 1] - seen[begin] >= LASTING * sample_rate
             self._still.append((seen, still))
 
+    @property
+    def share(self) -> float:
+        """Share of the session in which it does."""
+        return float(np.mean(np.concatenate([still for _, still in self._still])))
+
     def at(self, number: int, samples: NDArray[np.int64]) -> NDArray[np.bool_]:
         """At which samples (K,) of a segment it does."""
         seen, still = self._still[number]

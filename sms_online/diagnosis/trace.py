@@ -10,17 +10,16 @@ Source of the selection: Pati, Rezaiifar and Krishnaprasad, Asilomar Conf. Signa
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from sms_online.description.schema import Effect
-from sms_online.diagnosis.constants import is_constant
+from sms_online.diagnosis.candidate import DRY, Candidate, Finding, Ranked
 from sms_online.diagnosis.evidence import Gain, basis, free_of, gain, least_squares, threshold
 from sms_online.diagnosis.plausible import plausible
 from sms_online.diagnosis.rows import SessionRows
-from sms_online.model.parameters import Parameter
 from sms_online.pipeline.momentum_balance import HOPS
 from sms_online.stream import Array
 from sms_online.trackers.factor import prior_factor, solve
@@ -44,67 +43,12 @@ INEXACT = 1e-5
 # Dry friction changes its sign by creeping, not in a step, and repeats to a few percent: Armstrong-Hélouvry, Dupont and
 # Canudas de Wit, Automatica 30 (1994) 1083.
 INEXACT_DRY = 1e-3
-DRY = ("coulomb_friction", "stribeck_friction", "load_friction")
 # Share of a row's variance by which that of the effects chosen has to change for rows to be weighed anew.
 SMALL_CHANGE = 0.1
-# Effects that contain a simpler one, which is to be tried first, as is everything else: they refine a law.
-EXTENDS = {"direction_friction": "viscous_friction"}
+# Dry friction is told by what it leaves open where its axis stands still for at least this share of a session.
+MUCH_REST = 0.05
 # At most so many effects are looked for in turn.
 MOST_EFFECTS = 8
-
-
-@dataclass(frozen=True, eq=False)
-class Candidate:
-    """An effect that may be missing.
-
-    effect: as a system file would declare it, shape constants included. parameters: its linear coefficients (c,).
-    columns (W, n_v, c): what one unit of each adds to the rows.
-    """
-
-    effect: Effect
-    parameters: tuple[Parameter, ...]
-    columns: Array
-
-    @property
-    def key(self) -> str:
-        """name@where."""
-        return f"{self.effect.name}@{self.effect.where}"
-
-    @property
-    def extends(self) -> str | None:
-        """Key of a simpler effect that it contains."""
-        simpler = EXTENDS.get(self.effect.name)
-        return None if simpler is None else f"{simpler}@{self.effect.where}"
-
-    @property
-    def constant(self) -> bool:
-        """Whether its coefficients become constants of the description, no unknowns of π: see `constants`."""
-        return is_constant(self.effect)
-
-
-@dataclass(frozen=True)
-class Finding:
-    """An effect that the data show.
-
-    gain: beside everything else that was found, whitened. limit: what the best of all absent candidates would reach.
-    improvement: share by which the rms of held-out rows that it acts on falls. ambiguous: keys of candidates that take
-    nearly as much in its place.
-    """
-
-    candidate: Candidate
-    gain: Gain
-    limit: float
-    improvement: float
-    ambiguous: tuple[str, ...]
-
-
-@dataclass(frozen=True)
-class Ranked:
-    """A candidate in the first comparison: share of the residual's excess that it alone takes away, and its gain."""
-
-    candidate: Candidate
-    gain: float
-    share: float
 
 
 def together(columns: Array, b: Array, prior: Prior | None) -> Array:
@@ -123,6 +67,16 @@ def together(columns: Array, b: Array, prior: Prior | None) -> Array:
     return solution
 
 
+class OwnNoise(Protocol):
+    """What a candidate's law leaves open."""
+
+    def variance(self, candidate: Candidate, coefficients: Array) -> Array:
+        """Variance (W, n_v) of the rows for what noise makes of a candidate with coefficients (c,)."""
+
+    def at_rest(self, candidate: Candidate) -> float:
+        """Share of the session in which the axis of a law of dry friction stands still."""
+
+
 class Tracing:
     """Searches the candidates for what the rows of a session leave.
 
@@ -136,13 +90,11 @@ class Tracing:
         fitted: NDArray[np.bool_],
         prior: Prior | None = None,
         fixed: Sequence[Candidate] = (),
-        variance: Callable[[Candidate, Array], Array] | None = None,
+        noise: OwnNoise | None = None,
     ) -> None:
-        """fixed: effects that belong to the model already, whose columns come right after its parameters'. variance:
-        gives (W, n_v) of the rows for what noise makes of a candidate with coefficients (c,); none unless given.
-        """
+        """fixed: effects that belong to the model already, whose columns come right after its parameters'."""
         self.rows, self.candidates, self.fitted = rows, list(candidates), fitted
-        self._variance, self._prior = variance, prior
+        self._noise, self._prior = noise, prior
         self._n_v = rows.model.layout.n_v
         self._model = np.concatenate([rows.Y, *(candidate.columns for candidate in fixed)], axis=2)
         self.trials = len(self.candidates)
@@ -154,13 +106,13 @@ class Tracing:
 
     def settle(self, chosen: Sequence[int]) -> None:
         """Weigh the rows with what noise makes of the effects chosen too: of a rate's sign near a reversal, say."""
-        if self._variance is None:
+        if self._noise is None:
             return
         own = np.zeros_like(self.rows.std)
         at, solution = self._model.shape[2], self.solution(chosen, np.ones(self.rows.count, dtype=bool))
         for k in chosen:
             c = len(self.candidates[k].parameters)
-            own += self._variance(self.candidates[k], solution[at : at + c])
+            own += self._noise.variance(self.candidates[k], solution[at : at + c])
             at += c
         if np.any(np.abs(own - self._own) > SMALL_CHANGE * (self.rows.std**2 + self._own)):
             self._own = own
@@ -274,9 +226,11 @@ class Tracing:
             best = self._preferred(gains, eligible) if best is None else best
             if best is None:
                 break
-            if self.improvement(chosen, best) < LEAST_IMPROVEMENT:
+            law = self._holding(chosen, best, gains, eligible)
+            if law is None and self.improvement(chosen, best) < LEAST_IMPROVEMENT:
                 refused.add(self.candidates[best].key)
                 continue
+            best = best if law is None else law
             refine([*chosen, best], best)
             # Its own noise may be what others were taken for, at a standstill say.
             self.settle([*chosen, best])
@@ -301,6 +255,39 @@ class Tracing:
                 # What it leaves while it is only approximately taken off must not be given to others.
                 break
         return chosen
+
+    def _holding(self, chosen: Sequence[int], best: int, gains: Sequence[Gain], allowed: Sequence[int]) -> int | None:
+        """The dry friction that holds its axis much of the time where that tells held-out rows better than the best.
+
+        Friction that holds an axis is any value, which many a column explains better than its law does. So these are
+        compared by their likelihoods, with what each leaves open.
+        """
+        if self._noise is None:
+            return None
+        acts, noise = self._acts(best), self._noise
+        laws = [
+            k
+            for k in allowed
+            if self.candidates[k].effect.name in DRY
+            and self._excess(k, gains[k]) > 0.0
+            and np.any(acts & self._acts(k))
+            and noise.at_rest(self.candidates[k]) > MUCH_REST
+        ]
+        if not laws:
+            return None
+        law = max(laws, key=lambda k: gains[k].gain)
+        others = [self._surprise(each) for each in ([*chosen, best], chosen) if law not in each]
+        surprise = self._surprise([*chosen, law])
+        if surprise < min(others):
+            return law
+        self.settle(chosen)
+        return None
+
+    def _surprise(self, chosen: Sequence[int]) -> float:
+        """Minus twice the log of the likelihood of held-out rows, as if they were independent, up to a constant."""
+        self.settle(chosen)
+        left = self.residual(chosen, self.solution(chosen, self.fitted))
+        return float(np.sum((left**2 + 2.0 * np.log(self.std))[~self.fitted]))
 
     def _take(self, chosen: Sequence[int]) -> None:
         """Remember what each of the effects chosen takes beside the others."""

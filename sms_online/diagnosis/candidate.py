@@ -1,0 +1,70 @@
+"""A candidate for what is missing, and what a search says of it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from sms_online.description.schema import Effect
+from sms_online.diagnosis.constants import is_constant
+from sms_online.diagnosis.evidence import Gain
+from sms_online.model.parameters import Parameter
+from sms_online.stream import Array
+
+# Laws of dry friction: what they give at a standstill is any value up to that of the law.
+DRY = ("coulomb_friction", "stribeck_friction", "load_friction")
+# Effects that contain a simpler one, which is to be tried first, as is everything else: they refine a law.
+EXTENDS = {"direction_friction": "viscous_friction"}
+
+
+@dataclass(frozen=True, eq=False)
+class Candidate:
+    """An effect that may be missing.
+
+    effect: as a system file would declare it, shape constants included. parameters: its linear coefficients (c,).
+    columns (W, n_v, c): what one unit of each adds to the rows.
+    """
+
+    effect: Effect
+    parameters: tuple[Parameter, ...]
+    columns: Array
+
+    @property
+    def key(self) -> str:
+        """name@where."""
+        return f"{self.effect.name}@{self.effect.where}"
+
+    @property
+    def extends(self) -> str | None:
+        """Key of a simpler effect that it contains."""
+        simpler = EXTENDS.get(self.effect.name)
+        return None if simpler is None else f"{simpler}@{self.effect.where}"
+
+    @property
+    def constant(self) -> bool:
+        """Whether its coefficients become constants of the description, no unknowns of π: see `constants`."""
+        return is_constant(self.effect)
+
+
+@dataclass(frozen=True)
+class Finding:
+    """An effect that the data show.
+
+    gain: beside everything else that was found, whitened. limit: what the best of all absent candidates would reach.
+    improvement: share by which the rms of held-out rows that it acts on falls. ambiguous: keys of candidates that take
+    nearly as much in its place.
+    """
+
+    candidate: Candidate
+    gain: Gain
+    limit: float
+    improvement: float
+    ambiguous: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class Ranked:
+    """A candidate in the first comparison: share of the residual's excess that it alone takes away, and its gain."""
+
+    candidate: Candidate
+    gain: float
+    share: float
