@@ -225,12 +225,17 @@ class Attempt:
             if self._same_weights(beta) or self.excess(chosen) > LARGEST_SHARE_LEFT * self.excess([]):
                 break
             self.rows.weigh(beta)
-            self._trace([candidate for candidate in self.tracing.candidates if not candidate.constant])
-            chosen = self._search()
+            chosen = self._search_again()
+        if self.excess(chosen) > LARGEST_SHARE_LEFT * self.excess([]) and self.tracing.sticks:
+            chosen = self._search_again(sticking=True)
         return chosen
 
-    def _search(self) -> list[int]:
-        return self.tracing.run(lambda chosen, k: refine(self.tracing, self.make, chosen, k))
+    def _search_again(self, sticking: bool = False) -> list[int]:
+        self._trace([candidate for candidate in self.tracing.candidates if not candidate.constant])
+        return self._search(sticking)
+
+    def _search(self, sticking: bool = False) -> list[int]:
+        return self.tracing.run(lambda chosen, k: refine(self.tracing, self.make, chosen, k), sticking)
 
     def _same_weights(self, beta: Array) -> bool:
         """Whether rows would be weighed alike with beta (n,): their noise goes with the size of their terms."""

@@ -210,10 +210,11 @@ class Tracing:
         candidate = self.candidates[k]
         return max(len(candidate.parameters), len(candidate.effect.coefficients))
 
-    def run(self, refine: Callable[[Sequence[int], int], None]) -> list[int]:
+    def run(self, refine: Callable[[Sequence[int], int], None], sticking: bool = False) -> list[int]:
         """Numbers of the candidates found, in the order of what they explain.
 
-        refine: improves the shape constants of one of those chosen, before what it leaves is given to others.
+        refine: improves the shape constants of one of those chosen, before what it leaves is given to others. sticking:
+        whether dry friction that holds its axis comes before what explains more, see `_holding`.
         """
         chosen: list[int] = []
         self.path = []
@@ -226,7 +227,7 @@ class Tracing:
             best = self._preferred(gains, eligible) if best is None else best
             if best is None:
                 break
-            law = self._holding(chosen, best, gains, eligible)
+            law = self._holding(chosen, best, gains, eligible) if sticking else None
             if law is None and self.improvement(chosen, best) < LEAST_IMPROVEMENT:
                 refused.add(self.candidates[best].key)
                 continue
@@ -262,26 +263,27 @@ class Tracing:
         Friction that holds an axis is any value, which many a column explains better than its law does. So these are
         compared by their likelihoods, with what each leaves open.
         """
-        if self._noise is None:
-            return None
-        acts, noise = self._acts(best), self._noise
+        acts = self._acts(best)
         laws = [
-            k
-            for k in allowed
-            if self.candidates[k].effect.name in DRY
-            and self._excess(k, gains[k]) > 0.0
-            and np.any(acts & self._acts(k))
-            and noise.at_rest(self.candidates[k]) > MUCH_REST
+            k for k in allowed if self._excess(k, gains[k]) > 0.0 and np.any(acts & self._acts(k)) and self._holds(k)
         ]
         if not laws:
             return None
         law = max(laws, key=lambda k: gains[k].gain)
         others = [self._surprise(each) for each in ([*chosen, best], chosen) if law not in each]
         surprise = self._surprise([*chosen, law])
-        if surprise < min(others):
-            return law
+        # Its shape is told by all rows, those too in which it may take any value.
         self.settle(chosen)
-        return None
+        return law if surprise < min(others) else None
+
+    @property
+    def sticks(self) -> bool:
+        """Whether any candidate is dry friction that holds its axis much of the time."""
+        return any(self._holds(k) for k in range(len(self.candidates)))
+
+    def _holds(self, k: int) -> bool:
+        candidate = self.candidates[k]
+        return self._noise is not None and candidate.effect.name in DRY and self._noise.at_rest(candidate) > MUCH_REST
 
     def _surprise(self, chosen: Sequence[int]) -> float:
         """Minus twice the log of the likelihood of held-out rows, as if they were independent, up to a constant."""

@@ -57,7 +57,8 @@ def describe_residual(
     row = max(by_type, key=lambda name: by_type[name])
     speed = max(row_types(layout)[row], key=lambda k: excess[k])
     aside = _taken_aside(rows, columns[..., rows.base.n :], residual[:, speed], speed)
-    row = row if aside is None else next(name for name, speeds in row_types(layout).items() if aside in speeds)
+    beside = next((name for name, speeds in row_types(layout).items() if aside in speeds), row)
+    row = max(row, beside, key=lambda name: before[name].whitened)
     Q = basis((columns / rows.std[..., None]).reshape(-1, columns.shape[2]))
     r = free_of(Q, residual.reshape(-1, 1))[:, 0]
     best = None
