@@ -277,10 +277,20 @@ def march(
 
 
 def solve(
-    f: RightHandSide, y0: Array, duration: float, tolerance: Array, stages: int = STAGES, longest: float = np.inf
+    f: RightHandSide,
+    y0: Array,
+    duration: float,
+    tolerance: Array,
+    stages: int = STAGES,
+    longest: float = np.inf,
+    progress: Callable[[float], None] = lambda t: None,
 ) -> Dense:
-    """All of `march` as one solution."""
-    return dense(stages, 0.0, y0, list(march(f, y0, duration, tolerance, stages, longest)))
+    """All of `march` as one solution; progress: told the end of each step, s."""
+    steps = []
+    for step in march(f, y0, duration, tolerance, stages, longest):
+        steps.append(step)
+        progress(step.t)
+    return dense(stages, 0.0, y0, steps)
 
 
 def dense(stages: int, t0: float, y0: Array, steps: Sequence[Step]) -> Dense:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -126,12 +126,13 @@ def simulate(
     parameters: Array | None = None,
     initial: tuple[Array, Array] | None = None,
     position_tolerance: float = POSITION_TOLERANCE,
+    progress: Callable[[float], None] = lambda t: None,
 ) -> Simulation:
     """Integrate a described system in closed loop, to `position_tolerance` (m, rad) a step.
 
     duration: s, the reference's own by default. parameters: π (n_pi,) in place of the nominal ones. initial: x (n_x,)
-    and v (n_v,) in place of rest. Raises InputError where nothing states the duration, ArithmeticError where the motion
-    cannot be followed.
+    and v (n_v,) in place of rest. progress: told how far it is, s, step by step. Raises InputError where
+    nothing states the duration, ArithmeticError where the motion cannot be followed.
     """
     if duration is None:
         if system.trajectory is None:
@@ -140,7 +141,7 @@ def simulate(
     plant = Plant(system, parameters)
     start = plant.rest if initial is None else plant.state(*initial)
     bounds = tolerance(plant, position_tolerance)
-    return Simulation(plant, solve(plant.rate, start, duration, bounds, longest=LONGEST_STEP))
+    return Simulation(plant, solve(plant.rate, start, duration, bounds, longest=LONGEST_STEP, progress=progress))
 
 
 def tolerance(plant: Plant, position: float = POSITION_TOLERANCE) -> Array:

@@ -66,6 +66,7 @@ def _watch(args: argparse.Namespace, arm: SimulatedArm, file: Path, directory: P
         return document_of(estimator, throughput, warnings, truth, discrepancies=online.discrepancies)
 
     console = report_console(args.json)
+    console.print("solving the arm's motion ahead …", style="dim")
     with Interruption() as interruption, termination_interrupts(), ExitStack() as stack:
         stack.enter_context(closing(searches))
         if console.is_terminal:

@@ -3,7 +3,12 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
+
+from rich.console import Console
+from rich.progress import Progress, TextColumn, TimeElapsedColumn
 
 from sms_adapters.capture import CaptureWriter
 from sms_adapters.truth import truth_path, write_truth
@@ -19,6 +24,19 @@ from sms_tools.results_file import to_json
 from sms_tools.session import described_system
 
 
+@contextmanager
+def _solving(console: Console) -> Iterator[Callable[[float], None]]:
+    """Tells how far the motion is solved, or at least that it is being solved, for it takes as long as the motion."""
+    if not console.is_terminal:
+        console.print("solving the motion …", style="dim")
+        yield lambda t: None
+        return
+    told = Progress(TextColumn("{task.description}"), TimeElapsedColumn(), console=console, transient=True)
+    with told:
+        task = told.add_task("solving the motion")
+        yield lambda t: told.update(task, description=f"solving the motion, {t:.1f} s of it are known")
+
+
 def run(args: argparse.Namespace) -> int:
     """Simulate a session and write FILE.csv and FILE.csv.truth.json."""
     described, _ = described_system(args)
@@ -30,7 +48,8 @@ def run(args: argparse.Namespace) -> int:
     # The writer comes first: a name that cannot be written is known before a long simulation.
     with CaptureWriter(capture, channels) as writer:
         try:
-            simulation = simulate(system, args.duration)
+            with _solving(report_console(args.json)) as progress:
+                simulation = simulate(system, args.duration, progress=progress)
         except ArithmeticError as error:
             expected = "a motion that the integrator can follow"
             raise InputError(args.system, "trajectory and controller", str(error), expected) from None
