@@ -21,6 +21,7 @@ from sms_online.diagnosis.diagnose import Diagnosis, diagnose
 from sms_online.diagnosis.document import coefficients, diagnosis_document
 from sms_online.effects.catalogue import parse_effect
 from sms_online.errors import InputError
+from sms_online.pipeline.momentum_balance import HOPS
 from sms_online.stream import Block
 from sms_sim.simulate import sampled_blocks, simulate
 from sms_tools.adopted_system import adopted_text
@@ -160,6 +161,17 @@ def test_a_capture_that_is_too_short_is_refused(samples: int, words: str) -> Non
     short = Block(block.t[:samples], block.channels, block.values[:samples])
     with pytest.raises(InputError, match=words):
         diagnose(unlike(load_system("paper-planar")), [short], "short.csv", lambda estimator: None)
+
+
+def test_a_second_of_samples_is_enough_where_dry_friction_acts() -> None:
+    """Fewer windows than overlap one: the noise of friction's law is averaged over those that there are."""
+    system = load_system("paper-planar")
+    friction = Effect(name="coulomb_friction", where="joint_2", coefficients={"torque": 8.0})
+    rubbing = system.model_copy(update={"effects": (friction,)})
+    blocks = list(sampled_blocks(simulate(rubbing, 1.0, position_tolerance=1e-8), "B", seed=1))
+    found = diagnose(unlike(system), blocks, "test", lambda estimator: None)
+    assert found.after.residual.shape[0] < 2 * HOPS - 1
+    assert found.verdict != "clean"
 
 
 def test_a_session_without_momentum_rows_is_refused() -> None:

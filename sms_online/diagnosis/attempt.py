@@ -167,7 +167,10 @@ class Attempt:
         fitted = self._fitted(self.rows.time, self.rows.weak.windows.segment)
         enough = min(int(fitted.sum()) * self.rows.model.layout.n_v // (2 * self.rows.base.n), int((~fitted).sum()))
         if enough == 0:
-            expected = "stretches without a gap of several windows, to fit and to check"
+            # Windows begin a hop apart; those fitted give twice as many rows as there are parameters.
+            hops = 2 * self.rows.base.n / self.rows.model.layout.n_v / FITTED
+            seconds = least / system.sample_rate + hops * span / HOPS
+            expected = f"some {seconds:.1f} s without a gap, to fit and to check"
             raise InputError(case.source, "", f"too few windows of {span:g} s: {self.rows.count}", expected)
         self._fitted_windows = fitted
         effects = list(self.make.effects()) if candidates is None else candidates

@@ -189,9 +189,12 @@ class CandidateColumns:
         noisy = [make.of(effect).columns for make in self._noisy]
         changes = [(columns - candidate.columns) @ coefficients for columns in noisy]
         squares = np.mean(np.square(changes), axis=0)
-        near = np.ones(2 * HOPS - 1)
-        count = np.convolve(np.ones(len(squares)), near, mode="same")
-        out = np.stack([np.convolve(column, near, mode="same") / count for column in squares.T], axis=1)
+        near = slice(HOPS - 1, HOPS - 1 + len(squares))
+        sums, counts = (
+            np.stack([np.convolve(column, np.ones(2 * HOPS - 1))[near] for column in each.T], axis=1)
+            for each in (squares, np.ones_like(squares))
+        )
+        out = np.asarray(sums / counts)
         if effect.name in REVERSING:
             force, turned = model.effects[-1], self._reversals(effect.where)
 
