@@ -14,13 +14,14 @@ from sms_online.description.schema import Effect, System
 from sms_online.diagnosis.candidate import Candidate
 from sms_online.diagnosis.candidates import CandidateColumns
 from sms_online.diagnosis.constants import applied, corrected, improved, is_constant
+from sms_online.diagnosis.evidence import together
 from sms_online.diagnosis.followed import least_samples
 from sms_online.diagnosis.record import LONGEST, Segment, excerpts
 from sms_online.diagnosis.relative import RelativeResiduals
 from sms_online.diagnosis.residuals import ResidualTest, RowResidual, whitened
 from sms_online.diagnosis.rows import SessionRows
 from sms_online.diagnosis.shape import refine
-from sms_online.diagnosis.trace import Tracing, together
+from sms_online.diagnosis.trace import Tracing
 from sms_online.errors import InputError
 from sms_online.model.model import Model
 from sms_online.pipeline.conditioning import noise_gains
@@ -168,7 +169,7 @@ class Attempt:
         enough = min(int(fitted.sum()) * self.rows.model.layout.n_v // (2 * self.rows.base.n), int((~fitted).sum()))
         if enough == 0:
             # Windows begin a hop apart; those fitted give twice as many rows as there are parameters.
-            hops = 2 * self.rows.base.n / self.rows.model.layout.n_v / FITTED
+            hops = 2 * self.rows.base.n / self.rows.model.layout.n_v / (1.0 if held else FITTED)
             seconds = least / system.sample_rate + hops * span / HOPS
             expected = f"some {seconds:.1f} s without a gap, to fit and to check"
             raise InputError(case.source, "", f"too few windows of {span:g} s: {self.rows.count}", expected)
@@ -229,8 +230,21 @@ class Attempt:
                 break
             self.rows.weigh(beta)
             chosen = self._search_again()
-        if self.excess(chosen) > LARGEST_SHARE_LEFT * self.excess([]) and self.tracing.sticks:
-            chosen = self._search_again(sticking=True)
+        return self._search_sticking(chosen) if self.tracing.sticks else chosen
+
+    def _search_sticking(self, chosen: list[int]) -> list[int]:
+        """Another search where an axis sticks and much was left, unless it leaves more than the first."""
+        first = self.tracing
+        beyond = any(row.beyond for row in self.test([]).values())
+        first.settle(chosen)
+        left = self.excess(chosen)
+        if not beyond or left <= LARGEST_SHARE_LEFT * self.excess([]):
+            return chosen
+        again = self._search_again(sticking=True)
+        if self.excess(again) < left:
+            return again
+        self.tracing = first
+        first.weigh()
         return chosen
 
     def _search_again(self, sticking: bool = False) -> list[int]:

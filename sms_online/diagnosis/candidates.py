@@ -26,6 +26,8 @@ from sms_online.pipeline.momentum_balance import HOPS
 from sms_online.stream import Array
 
 TORQUE_RATE = "torque rate"
+# Step of a force's derivative along a sensor's noise, of its deviation: no phase turns within it.
+SMALL = 0.01
 # Forces whose law is another for either sign of a motor's rate.
 REVERSING = (*DRY, "direction_friction")
 # Linear coefficients of effects on channels: quantity, unit, what a unit of it adds to a reading, with its sign. A lag
@@ -173,8 +175,8 @@ class CandidateColumns:
     def variance(self, candidate: Candidate, coefficients: Array) -> Array:
         """Variance (W, n_v) of the rows for what the sensors' noise makes of a force with coefficients (c,).
 
-        To first order where a joint's position and rate tell the force. Else by two samples of it in every window,
-        averaged over the windows that a window overlaps: the noise of a force that jumps with the sign of a rate is
+        To first order where a joint's positions, rates and torque tell the force. Else by a few draws of it in every
+        window, averaged over the windows that a window overlaps: the noise of a force that jumps with a rate's sign is
         that of its reversals, and no derivative tells it. Where its axis stands still dry friction takes any value up
         to that of its law.
         """
@@ -190,11 +192,8 @@ class CandidateColumns:
         changes = [(columns - candidate.columns) @ coefficients for columns in noisy]
         squares = np.mean(np.square(changes), axis=0)
         near = slice(HOPS - 1, HOPS - 1 + len(squares))
-        sums, counts = (
-            np.stack([np.convolve(column, np.ones(2 * HOPS - 1))[near] for column in each.T], axis=1)
-            for each in (squares, np.ones_like(squares))
-        )
-        out = np.asarray(sums / counts)
+        sums = [np.convolve(column, np.ones(2 * HOPS - 1))[near] for column in (np.ones(len(squares)), *squares.T)]
+        out = np.stack(sums[1:], axis=1) / sums[0][:, None]
         if effect.name in REVERSING:
             force, turned = model.effects[-1], self._reversals(effect.where)
 
@@ -210,11 +209,12 @@ class CandidateColumns:
 
     def _spread(self, model: Model, coefficients: Array) -> Array:
         """Variance (W, n_v) of the rows for a model's last effect, of a joint, to first order in the sensors' noise."""
-        force, layout, noise, rate = model.effects[-1], model.layout, self.rows.noise, self.system.sample_rate
+        force, layout, noise, sensing = model.effects[-1], model.layout, self.rows.noise, self.rows.sensing
         joint = int(force.where.removeprefix("joint_")) - 1
         offset = layout.n_base_positions - layout.n_base_speeds
-        torque = np.zeros_like(noise.torque)
-        torque[joint] = np.sqrt(noise.torque[joint] * rate)
+        readings = np.zeros((1, len(sensing.channels)))
+        readings[0, sensing.torque_columns[joint]] = noise.grid[len(sensing.position_columns) + joint]
+        torque = sensing.joint_torque(readings)[0]
 
         def slopes(motion: Motion) -> tuple[Array, Array]:
             inputs = self._inputs(model, motion)
@@ -223,21 +223,22 @@ class CandidateColumns:
                 ends = [
                     force.force(
                         layout,
-                        motion.x + sign * x,
-                        motion.v + sign * v,
-                        replace(inputs, torque=inputs.torque + sign * torque),
+                        motion.x + part * x,
+                        motion.v + part * v,
+                        replace(inputs, torque=inputs.torque + part * torque),
                     )
-                    for sign in (0.5, -0.5)
+                    for part in (0.5 * SMALL, -0.5 * SMALL)
                 ]
-                return np.asarray((ends[0] - ends[1]) @ coefficients)
+                return np.asarray((ends[0] - ends[1]) @ coefficients / SMALL)
 
             by_value, by_rate = [change(0.0, 0.0, torque)], [np.zeros_like(motion.v)]
-            for speed in {layout.q[joint], layout.theta_m[joint]}:
-                x, v = np.zeros(layout.n_x), np.zeros(layout.n_v)
-                x[speed + offset] = noise.coordinates[speed + offset]
-                v[speed] = noise.coordinates[speed + offset] * rate
+            # A reading of the motor moves the joint too where that is read as an angle beyond it.
+            along = sensing.displacements(motion.x[:1])[0]
+            for sensor in {layout.q[joint] + offset, layout.theta_m[joint] + offset}:
+                v = along[:, sensor] * noise.grid[sensor]
+                x = np.concatenate((np.zeros(layout.n_base_positions), v[layout.n_base_speeds :]))
                 by_value.append(change(x, 0.0, 0.0))
-                by_rate.append(change(0.0, v, 0.0))
+                by_rate.append(change(0.0, v * self.system.sample_rate, 0.0))
             return np.array(by_value), np.array(by_rate)
 
         return self._weak.spread(slopes)

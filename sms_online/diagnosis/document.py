@@ -117,7 +117,7 @@ def summary(diagnosis: Diagnosis) -> str:
         return f"The model lacks {', '.join(keys)}: with {'them' if len(keys) > 1 else 'it'} {falls}."
     unexplained = diagnosis.unexplained
     assert unexplained is not None
-    rest = f"acts on {unexplained.row} ({unexplained.speed}) and depends on {unexplained.variable}"
+    rest = f"acts on {unexplained.row} (seen in {unexplained.speed}) and depends on {unexplained.variable}"
     if _near(diagnosis):
         return (
             f"What the model lacks comes near {', '.join(keys)}, but is more or something else: {falls}, and "

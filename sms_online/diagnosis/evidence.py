@@ -13,6 +13,7 @@ import numpy as np
 from scipy.stats import chi2
 
 from sms_online.stream import Array
+from sms_online.trackers.interface import Prior
 
 # A column of which the model leaves less than this share is a combination of what it has.
 FREE = 1e-5
@@ -41,6 +42,22 @@ def least_squares(columns: Array, b: Array) -> Array:
     size[size == 0.0] = 1.0
     R = np.asarray(np.linalg.qr(np.column_stack((columns / size, b)), mode="r"))
     return np.asarray(np.linalg.lstsq(R[:, :-1], R[:, -1], rcond=RANK_TOLERANCE)[0] / size)
+
+
+def together(columns: Array, b: Array, prior: Prior | None) -> Array:
+    """Solution (n + c,) for columns (W, n_v, n + c) of a model and of all candidates, and b (W, n_v).
+
+    Parameters that are known beforehand keep their values: where a model lacks much, parameters that shrink to zero
+    would explain rows without a torque.
+    """
+    known = np.zeros(columns.shape[2], dtype=bool)
+    solution = np.zeros(columns.shape[2])
+    if prior is not None:
+        known[: prior.known.size] = prior.known
+        solution[known] = prior.value[prior.known]
+    left = b - columns[..., known] @ solution[known]
+    solution[~known] = least_squares(columns[..., ~known].reshape(b.size, -1), left.ravel())
+    return solution
 
 
 @dataclass(frozen=True)

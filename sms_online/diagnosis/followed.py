@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.interpolate import CubicSpline
 
 from sms_online.description.schema import System
 from sms_online.diagnosis.record import Segment
@@ -32,6 +33,17 @@ def half_width(system: System) -> int:
     return max(HALF_WIDTHS[0], round(min(HALF_WIDTH, OF_WINDOW * system.windows.momentum) * system.sample_rate))
 
 
+def _smooth_from_the_start(x: Array, samples: NDArray[np.int64], M: int, sample_rate: float) -> tuple[Array, Array]:
+    """As `smooth` with half width M, but near the beginning with as much of the ladder of widths as it allows.
+
+    A mass that rings keeps for good what it has missed of a motion's beginning.
+    """
+    widths = [m for m in HALF_WIDTHS if m < M]
+    own = np.append(widths, M)[np.searchsorted([*widths[1:], M], samples, side="right")]
+    parts = [smooth(x, samples[own == m], m, sample_rate) for m in np.unique(own).tolist()]
+    return np.concatenate([part[0] for part in parts]), np.concatenate([part[1] for part in parts])
+
+
 class FollowedMotion:
     """The smoothed motion of each segment, once in STEP samples, for any model's internal states."""
 
@@ -44,8 +56,8 @@ class FollowedMotion:
         self._sizes = [segment.index.size for segment in segments]
         for segment in segments:
             x = sensing.coordinates(segment.values)
-            samples = np.arange(M, len(x) - M, STEP)
-            smoothed, rates = smooth(x, samples, M, sample_rate)
+            samples = np.arange(M - STEP * ((M - HALF_WIDTHS[0]) // STEP), len(x) - M, STEP)
+            smoothed, rates = _smooth_from_the_start(x, samples, M, sample_rate)
             self._motions.append((samples, smoothed, layout.speeds(smoothed, rates)))
 
     def states(self, model: Model, number: int, at: NDArray[np.int64] | None = None) -> Array:
@@ -64,4 +76,4 @@ class FollowedMotion:
         if number not in known:
             known[number] = InternalStates(model, self._rate / STEP).push(x, v)
         z = known[number]
-        return np.stack([np.interp(at, samples, column) for column in z.T], axis=1)
+        return np.asarray(CubicSpline(samples, z)(np.clip(at, samples[0], samples[-1])))

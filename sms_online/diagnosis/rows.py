@@ -32,7 +32,8 @@ from sms_online.stream import Array
 TOLD = 64
 # The synthetic noise that tells what noise does beyond first order is the same in every diagnosis.
 SEED = 6
-# How many times it is added to tell what it makes of a force: one row's variance is then known to a third.
+# How many times it is added to tell what it makes of a force: averaged over the windows that a window overlaps, a row's
+# variance is then known to two fifths.
 NOISES = 4
 # Beyond any force times a second; squares of it are numbers still.
 LARGEST = 1e50

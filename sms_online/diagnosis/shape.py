@@ -12,10 +12,10 @@ from sms_online.diagnosis.candidates import CandidateColumns
 from sms_online.diagnosis.trace import Tracing
 from sms_online.effects.catalogue import ENTRIES
 
-# Relative accuracy of a shape constant, at which a mass that rings at 3 Hz is off by 0.01 rad after a minute, and
-# evaluations at most.
-TOLERANCE = 1e-5
-EVALUATIONS = 25
+# Relative accuracy of a shape constant: twenty seconds tell the frequency of a mass that rings with 100 N to 1e-7, and
+# a phase that is off moves the parameters. And evaluations at most.
+TOLERANCE = 1e-7
+EVALUATIONS = 40
 # Constants that count something (of a cogging's period, say) are not refined.
 COUNTED = ("order",)
 

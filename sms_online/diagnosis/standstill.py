@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -44,7 +45,7 @@ class Standstill:
                 still[begin:end] = seen[end - 1] - seen[begin] >= LASTING * sample_rate
             self._still.append((seen, still))
 
-    @property
+    @cached_property
     def share(self) -> float:
         """Share of the session in which it does."""
         return float(np.mean(np.concatenate([still for _, still in self._still])))

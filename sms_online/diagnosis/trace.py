@@ -1,8 +1,9 @@
 """From a residual to the effects behind it: greedy selection, checked on held-out rows, with honest doubt.
 
 Candidates compete for what the model leaves of the whitened rows. The best is taken where its gain is no accident among
-all that were tried and where it also lowers the residual of windows that it was not fitted to; then the rest compete
-for what is left. A candidate that takes nearly as much as the one taken is named beside it as indistinguishable.
+all that were tried and where it also lowers the residual of windows that it was not fitted to, or where it is friction
+that holds its axis and makes them likelier; then the rest compete for what is left. A candidate that takes nearly as
+much as the one taken is named beside it as indistinguishable.
 Source of the selection: Pati, Rezaiifar and Krishnaprasad, Asilomar Conf. Signals, Systems and Computers (1993) 40
 (orthogonal matching pursuit); of the correction for many candidates: Bonferroni's inequality.
 """
@@ -17,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sms_online.diagnosis.candidate import DRY, Candidate, Finding, Ranked
-from sms_online.diagnosis.evidence import Gain, basis, free_of, gain, least_squares, threshold
+from sms_online.diagnosis.evidence import Gain, basis, free_of, gain, least_squares, threshold, together
 from sms_online.diagnosis.plausible import plausible
 from sms_online.diagnosis.rows import SessionRows
 from sms_online.pipeline.momentum_balance import HOPS
@@ -51,24 +52,8 @@ MUCH_REST = 0.05
 MOST_EFFECTS = 8
 
 
-def together(columns: Array, b: Array, prior: Prior | None) -> Array:
-    """Solution (n + c,) for columns (W, n_v, n + c) of a model and of all candidates, and b (W, n_v).
-
-    Parameters that are known beforehand keep their values: where a model lacks much, parameters that shrink to zero
-    would explain rows without a torque.
-    """
-    known = np.zeros(columns.shape[2], dtype=bool)
-    solution = np.zeros(columns.shape[2])
-    if prior is not None:
-        known[: prior.known.size] = prior.known
-        solution[known] = prior.value[prior.known]
-    left = b - columns[..., known] @ solution[known]
-    solution[~known] = least_squares(columns[..., ~known].reshape(b.size, -1), left.ravel())
-    return solution
-
-
-class OwnNoise(Protocol):
-    """What a candidate's law leaves open."""
+class LeftOpen(Protocol):
+    """What a candidate's law leaves open: the sensors' noise in it, and any value of friction at a standstill."""
 
     def variance(self, candidate: Candidate, coefficients: Array) -> Array:
         """Variance (W, n_v) of the rows for what noise makes of a candidate with coefficients (c,)."""
@@ -90,9 +75,12 @@ class Tracing:
         fitted: NDArray[np.bool_],
         prior: Prior | None = None,
         fixed: Sequence[Candidate] = (),
-        noise: OwnNoise | None = None,
+        noise: LeftOpen | None = None,
     ) -> None:
-        """fixed: effects that belong to the model already, whose columns come right after its parameters'."""
+        """fixed: effects that belong to the model already, whose columns come right after its parameters'.
+
+        noise: without it candidates leave nothing open.
+        """
         self.rows, self.candidates, self.fitted = rows, list(candidates), fitted
         self._noise, self._prior = noise, prior
         self._n_v = rows.model.layout.n_v
@@ -102,7 +90,7 @@ class Tracing:
         self.path: list[tuple[int, list[int]]] = []
         self._own = np.zeros_like(rows.std)  # variance of the effects chosen
         self._taken: dict[int, float] = {}  # gains of the effects chosen
-        self._weigh()
+        self.weigh()
 
     def settle(self, chosen: Sequence[int]) -> None:
         """Weigh the rows with what noise makes of the effects chosen too: of a rate's sign near a reversal, say."""
@@ -116,9 +104,10 @@ class Tracing:
             at += c
         if np.any(np.abs(own - self._own) > SMALL_CHANGE * (self.rows.std**2 + self._own)):
             self._own = own
-            self._weigh()
+            self.weigh()
 
-    def _weigh(self) -> None:
+    def weigh(self) -> None:
+        """Weigh the rows, and whiten them, with what is left open by the effects settled last."""
         rows = self.rows
         self.std = np.sqrt(rows.std**2 + self._own)
         self._plain_model = self._model / self.std[..., None]
@@ -220,6 +209,7 @@ class Tracing:
         self.path = []
         self._taken = {}
         refused: set[str] = set()
+        held: set[int] = set()
         seen: set[frozenset[int]] = {frozenset()}
         while len(chosen) < MOST_EFFECTS:
             gains, eligible = self.gains(chosen), self._eligible(chosen, refused)
@@ -231,12 +221,14 @@ class Tracing:
             if law is None and self.improvement(chosen, best) < LEAST_IMPROVEMENT:
                 refused.add(self.candidates[best].key)
                 continue
-            best = best if law is None else law
+            if law is not None:
+                best = law
+                held.add(law)
             refine([*chosen, best], best)
             # Its own noise may be what others were taken for, at a standstill say.
             self.settle([*chosen, best])
             self._take([*chosen, best])
-            chosen = self._revised([*chosen, best], refused)
+            chosen = self._revised([*chosen, best], refused, held)
             self.settle(chosen)
             # What the laws found are uncertain by is told in the rows' new weights.
             self._take(chosen)
@@ -270,11 +262,12 @@ class Tracing:
         if not laws:
             return None
         law = max(laws, key=lambda k: gains[k].gain)
-        others = [self._surprise(each) for each in ([*chosen, best], chosen) if law not in each]
-        surprise = self._surprise([*chosen, law])
+        others = [self._deviance(each) for each in ([*chosen, best], chosen) if law not in each]
+        deviance = self._deviance([*chosen, law])
         # Its shape is told by all rows, those too in which it may take any value.
         self.settle(chosen)
-        return law if surprise < min(others) else None
+        # Rows that overlap count the same evidence once for each.
+        return law if deviance < min(others) - DECISIVE * HOPS else None
 
     @property
     def sticks(self) -> bool:
@@ -285,8 +278,11 @@ class Tracing:
         candidate = self.candidates[k]
         return self._noise is not None and candidate.effect.name in DRY and self._noise.at_rest(candidate) > MUCH_REST
 
-    def _surprise(self, chosen: Sequence[int]) -> float:
-        """Minus twice the log of the likelihood of held-out rows, as if they were independent, up to a constant."""
+    def _deviance(self, chosen: Sequence[int]) -> float:
+        """Minus twice the log of the likelihood of held-out rows, as if they were independent, up to a constant.
+
+        Fitted to the other windows; what is left open goes with the coefficients from all of them.
+        """
         self.settle(chosen)
         left = self.residual(chosen, self.solution(chosen, self.fitted))
         return float(np.sum((left**2 + 2.0 * np.log(self.std))[~self.fitted]))
@@ -309,11 +305,12 @@ class Tracing:
             if candidate.key not in taken | refused and (candidate.extends is None or candidate.extends in held)
         ]
 
-    def _revised(self, chosen: list[int], refused: set[str]) -> list[int]:
+    def _revised(self, chosen: list[int], refused: set[str], held: set[int]) -> list[int]:
         """The same effects without those that the last one has made superfluous, each in its best form beside them.
 
-        What takes an effect's place has to lower the residual of held-out rows, as every effect has. The last one stays
-        though its own noise, which the rows bear by now, may leave little of its gain: that of an axis that stuck.
+        What takes an effect's place has to lower the residual of held-out rows. The last one stays though its own
+        noise, which the rows bear by now, may leave little of its gain: that of an axis that stuck; and so do those
+        held, which their likelihood has chosen.
         """
         last = chosen[-1]
         for k in list(chosen):
@@ -323,7 +320,7 @@ class Tracing:
             simple = [j for j in self._eligible(others, refused) if j == k or self.candidates[j].extends is None]
             best = self._preferred(gains, [*simple, k] if k not in simple else simple)
             if best is None or self._excess(k, gains[k]) <= 0.0:
-                chosen = chosen if k == last else others
+                chosen = chosen if k == last or k in held else others
             elif (
                 best != k
                 and not self._near(gains[k].gain, gains[best].gain)

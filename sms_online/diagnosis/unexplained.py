@@ -18,6 +18,8 @@ from sms_online.stream import Array
 INTERVALS = 8
 # A residual takes its course from something that was found where this explains more of its squares than not.
 SAME_COURSE = 0.5
+# Windows for a column at least, for that to be no chance.
+LEAST_WINDOWS = 20
 # Points at which a spline is reported.
 POINTS = 25
 
@@ -86,7 +88,7 @@ def _taken_aside(rows: SessionRows, columns: Array, left: Array, speed: int) -> 
     main = np.argmax(np.sum((columns / rows.std[..., None]) ** 2, axis=0), axis=0)
     scaled = columns[:, main, np.arange(main.size)] / rows.std[:, [speed]]
     sizes = np.linalg.norm(scaled, axis=0)
-    if not np.any(sizes):
+    if not np.any(sizes) or left.size < LEAST_WINDOWS * sizes.size:
         return None
     coefficients = least_squares(scaled, left)
     if 1.0 - np.sum((left - scaled @ coefficients) ** 2) / np.sum(left**2) < SAME_COURSE:

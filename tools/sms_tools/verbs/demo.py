@@ -13,6 +13,7 @@ from time import perf_counter
 
 from rich.console import Console, Group
 from rich.live import Live
+from rich.text import Text
 
 from sms_adapters.session_log import SESSION
 from sms_adapters.system_file import load_system
@@ -66,7 +67,7 @@ def _watch(args: argparse.Namespace, arm: SimulatedArm, file: Path, directory: P
         return document_of(estimator, throughput, warnings, truth, discrepancies=online.discrepancies)
 
     console = report_console(args.json)
-    console.print("solving the arm's motion ahead …", style="dim")
+    show(console, Text("solving the arm's motion ahead …", style="dim"))
     with Interruption() as interruption, termination_interrupts(), ExitStack() as stack:
         stack.enter_context(closing(searches))
         if console.is_terminal:
