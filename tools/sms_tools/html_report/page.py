@@ -44,7 +44,7 @@ stroke-width: 3px } .grid { stroke: #e8edf2 } .span { fill: #f1f4f7 } .mark { st
 .warning { background: #fff4e0; border-left: 4px solid #e0a030; padding: 0.3em 0.8em; margin: 0.4em 0 }
 .verdict { font-size: 1.1em; border-left: 6px solid #b4005a; background: #f8f1f5; padding: 0.5em 0.9em }
 .verdict.clean { border-color: #009e73; background: #eff8f5 }
-.pair { display: flex; gap: 1.5em; align-items: center }
+.pair { display: flex; flex-wrap: wrap; gap: 1.5em; align-items: center }
 svg .badge { fill: #fff; text-anchor: middle; font-weight: bold }
 th.over { text-align: center } .dense { font-size: 13px }
 td.beyond { color: #c04000; font-weight: bold }
