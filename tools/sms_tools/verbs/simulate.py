@@ -9,7 +9,6 @@ from pathlib import Path
 
 from rich.console import Console
 from rich.progress import Progress, TextColumn, TimeElapsedColumn
-from rich.text import Text
 
 from sms_adapters.capture import CaptureWriter
 from sms_adapters.truth import truth_path, write_truth
@@ -27,9 +26,8 @@ from sms_tools.session import described_system
 
 @contextmanager
 def _solving(console: Console) -> Iterator[Callable[[float], None]]:
-    """Tells how far the motion is solved, or at least that it is: that may take longer than the motion lasts."""
+    """Tells a person at a terminal how far the motion is solved, which may take longer than it lasts."""
     if not console.is_terminal:
-        show(console, Text("solving the motion …", style="dim"))
         yield lambda t: None
         return
     told = Progress(TextColumn("{task.description}"), TimeElapsedColumn(), console=console, transient=True)
