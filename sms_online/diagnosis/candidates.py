@@ -54,7 +54,7 @@ class CandidateColumns:
         self._since = since
         self._weak = rows.weak if weak is None else weak
         self._noisy: list[CandidateColumns] = []
-        self._held: dict[int, Standstill] = {}
+        self._held: dict[str, Standstill] = {}
         self._turned: dict[str, Reversals] = {}
         self._own = {p.name for p in rows.model.parameters}
 
@@ -203,7 +203,7 @@ class CandidateColumns:
 
             out = np.maximum(out, self._weak.variance(off))
         if effect.name in DRY:
-            held = self._standstill(int(effect.where.removeprefix("joint_")) - 1)
+            held = self._standstill(effect.where)
             out += np.square(self._force(model, held) @ coefficients)
         return out
 
@@ -245,15 +245,15 @@ class CandidateColumns:
 
     def at_rest(self, candidate: Candidate) -> float:
         """Share of the session in which the axis of a law of dry friction stands still."""
-        return self._standstill(int(candidate.effect.where.removeprefix("joint_")) - 1).share
+        return self._standstill(candidate.effect.where).share
 
-    def _standstill(self, joint: int) -> Standstill:
-        """Of a joint's motor, by number from 0."""
-        rows = self.rows
-        if joint not in self._held:
+    def _standstill(self, where: str) -> Standstill:
+        """Of a joint's motor."""
+        if where not in self._held:
+            rows, joint = self.rows, int(where.removeprefix("joint_")) - 1
             noise = self._noise_of(joint)
-            self._held[joint] = Standstill(rows.sensing, rows.segments, joint, noise, self.system.sample_rate)
-        return self._held[joint]
+            self._held[where] = Standstill(rows.sensing, rows.segments, joint, noise, self.system.sample_rate)
+        return self._held[where]
 
     def _reversals(self, where: str) -> Reversals:
         """Of a joint's motor, in the windows' own samples."""
