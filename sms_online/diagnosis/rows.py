@@ -20,8 +20,17 @@ from sms_online.model.model import Model
 from sms_online.pipeline.joint_balance import EXPONENT as JOINT_EXPONENT
 from sms_online.pipeline.joint_balance import JointBalance
 from sms_online.pipeline.latency import clock_groups
-from sms_online.pipeline.momentum_balance import COPIES, EXPONENT, HOPS, INSTANTS, Instants, MomentumBalance, Window
-from sms_online.pipeline.row_noise import STEPS, RowNoise, factored
+from sms_online.pipeline.momentum_balance import (
+    COPIES,
+    EXPONENT,
+    HOPS,
+    INSTANTS,
+    STEPS,
+    Instants,
+    MomentumBalance,
+    Window,
+)
+from sms_online.pipeline.row_noise import RowNoise, factored
 from sms_online.pipeline.sensing import Sensing
 from sms_online.pipeline.sensitivity import Sensitivities
 from sms_online.pipeline.sensor_noise import FINEST, SensorNoise
@@ -152,6 +161,7 @@ class SessionRows:
     def weigh(self, beta: Array) -> None:
         """Tell the noise of the rows for parameters beta (n,), and make them independent of each other."""
         n_v, noise, span = self.model.layout.n_v, self.noise, self._balance.span
+        rough, pi = self._balance.rough, self.base.physical_values(beta)
         self.beta = beta
         self.bends = self._bends()
         self._covariances: list[list[Array]] = []
@@ -165,12 +175,13 @@ class SessionRows:
             for window, variance, added in zip(told.windows, beyond, told.displacements, strict=True):
                 sensitivity = sensitivities.window(window.start)
                 age = window.end / self._rate
-                covariances = row_noise.covariance(sensitivity, noise.sensors, noise.torque, age)
+                kernel = row_noise.kernel(sensitivity) + rough.kernel(window.rough, pi, sensitivity.displacements)
+                covariances = row_noise.covariance(kernel, sensitivity.rates, noise.sensors, noise.torque, age)
                 covariances[-1][np.diag_indices(n_v)] += variance
                 self._covariances.append(covariances)
                 # Sums over the steps, sensor by sensor.
-                kernel = row_noise.kernel(sensitivity).transpose(2, 1, 0) * (span / STEPS)
-                responses.append((kernel @ added.transpose(2, 1, 0)).transpose(2, 1, 0))
+                by_sensor = kernel.transpose(2, 1, 0) * (span / STEPS)
+                responses.append((by_sensor @ added.transpose(2, 1, 0)).transpose(2, 1, 0))
         self.std = np.sqrt([np.diag(covariances[-1]) for covariances in self._covariances]).reshape(-1, n_v)
         stacked = np.array(responses).reshape(self.count, len(DISPLACEMENTS), n_v, -1)
         self.responses = dict(zip(DISPLACEMENTS, np.moveaxis(stacked, 1, 0), strict=True))
@@ -215,7 +226,7 @@ class SessionRows:
 
     def _sensitivities(self, instants: list[Instants], span: float) -> Sensitivities:
         out = Sensitivities(self.model, self.sensing.displacements, span / INSTANTS)
-        pi = self.base.physical_values(self.beta)
+        pi = self._balance.rough.without(self.base.physical_values(self.beta))
         x, v, signals = (np.concatenate([getattr(p, part) for p in instants]) for part in ("x", "v", "signals"))
         for start in range(0, len(x), TOLD):
             some = slice(start, start + TOLD)

@@ -6,7 +6,7 @@ of it (windows side by side cost fifteen times the error).
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import groupby
 from operator import itemgetter
@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from sms_online.model.base_parameters import RANDOM_SEED, RANK_TOLERANCE, BaseParameters, random_inputs, random_states
 from sms_online.model.model import Model
+from sms_online.pipeline.rough_forces import RoughForces, responses
 from sms_online.pipeline.smoothing import HALF_WIDTHS, WidthChoice, smooth, stride
 from sms_online.pipeline.weak_form import test_function
 from sms_online.stream import Array
@@ -27,6 +28,8 @@ EXPONENT = 6
 HOPS = 10  # a window begins every tenth of a window
 # Instants of a window at which the sensitivity to noise is told, two a hop: it changes as slowly as the motion.
 INSTANTS = 2 * HOPS
+# Steps of a window at which it is known what noise adds to its rows: two for each instant.
+STEPS = 2 * INSTANTS
 # Random states that tell which entries of a row are zero by structure.
 PATTERN_STATES = 8
 # A hop compares the widths of the filter at so many instants.
@@ -74,7 +77,7 @@ class Window:
     start: its first instant, in half hops since the segment began. end: grid index of its last sample. Y (copies,
     nonzero): columns of the base parameters where the model has any (`MomentumBalance.rows`, `.columns`); b (copies,
     n_v). The first copy is that of the samples as measured, the others those of the samples with noise added.
-    half_width: M of the filter.
+    half_width: M of the filter. rough (STEPS + 1, E): what noise does by way of rough forces, see `RoughForces.kernel`.
     """
 
     start: int
@@ -82,6 +85,7 @@ class Window:
     Y: Array
     b: Array
     half_width: int
+    rough: Array
 
 
 def windows_state(name: str, windows: list[Window]) -> dict[str, Any]:
@@ -90,15 +94,16 @@ def windows_state(name: str, windows: list[Window]) -> dict[str, Any]:
         f"{name}_place": np.array([(w.start, w.end, w.half_width) for w in windows], dtype=np.int64).reshape(-1, 3),
         f"{name}_Y": np.array([w.Y for w in windows]),
         f"{name}_b": np.array([w.b for w in windows]),
+        f"{name}_rough": np.array([w.rough for w in windows]),
     }
 
 
 def windows_from_state(name: str, state: Mapping[str, NDArray[Any]]) -> list[Window]:
     """The windows that `windows_state` saved."""
-    places, columns, right = (state[f"{name}_{part}"] for part in ("place", "Y", "b"))
+    places, *parts = (state[f"{name}_{part}"] for part in ("place", "Y", "b", "rough"))
     return [
-        Window(int(start), int(end), np.array(Y), np.array(b), int(half_width))
-        for (start, end, half_width), Y, b in zip(places, columns, right, strict=True)
+        Window(int(start), int(end), np.array(Y), np.array(b), int(half_width), np.array(rough))
+        for (start, end, half_width), Y, b, rough in zip(places, *parts, strict=True)
     ]
 
 
@@ -128,13 +133,18 @@ def prompt_margin(width: int) -> int:
 
 @dataclass
 class _Smoothed:
-    """Momenta and forces at the thinned samples of one half width, as far as windows have asked for them.
+    """Momenta and forces at every `step` th sample, of one half width, as far as windows have asked for them.
 
     first: number of the sample in the segment. columns (K, entries).
     """
 
+    step: int
     first: int
     columns: Array
+
+
+# Evaluates x (copies, K, n_x), v (copies, K, n_v) and signals (copies, K, joints + n_states): (K, entries).
+_Evaluation = Callable[[Array, Array, Array], Array]
 
 
 class MomentumBalance:
@@ -142,7 +152,8 @@ class MomentumBalance:
 
     prompt: windows end at multiples of a hop on the grid, whenever the segment began, and come after `margin` samples
     behind them, with a narrower filter at their end; else they begin with the segment and wait for the widest filter.
-    rows, columns (nonzero,): places of the entries of Y that are not zero by the structure of the model.
+    rows, columns (nonzero,): places of the entries of Y that are not zero by the structure of the model. rough: forces
+    that are summed from every sample, where all else is from a thinned motion.
     """
 
     def __init__(
@@ -157,13 +168,15 @@ class MomentumBalance:
         self.span = self.width / sample_rate
         self.rows, self.columns = np.nonzero(momentum_pattern(model)[:, list(base.independent)])
         self._physical = np.array(base.independent)[self.columns]
+        self.rough = RoughForces(model)
+        self._rough = np.flatnonzero(np.isin(self._physical, self.rough.columns))
         self._widths = half_widths(self.width)
         # Samples before and after a window that its filter needs.
         self.lead = self._widths[-1]
         self.margin = prompt_margin(self.width) if prompt else self.lead
         self._prompt = prompt
         self._choice = WidthChoice(self._widths)
-        self._phi = {s: self._weights(s) for s in {stride(M, self.hop) for M in self._widths}}
+        self._phi = {s: self._weights(s) for s in {1, *(stride(M, self.hop) for M in self._widths)}}
         self.begin_segment()
 
     def _weights(self, s: int) -> tuple[Array, Array]:
@@ -179,7 +192,9 @@ class MomentumBalance:
         self._window = 0  # number of the next window's first sample
         self._told = 0  # number of the next instant, in half hops
         self._compared: list[Array] = []  # squares of the hops from the next window on
-        self._smoothed: dict[int, _Smoothed] = {}
+        # By the filter's half width, of all that is thinned and of the rough forces.
+        self._thinned: dict[int, _Smoothed] = {}
+        self._dense: dict[int, _Smoothed] = {}
 
     def push(
         self, index: NDArray[np.int64], copies: list[Array], sigma: Array, probes: Probes | None = None
@@ -255,33 +270,67 @@ class MomentumBalance:
     def _rows(
         self, half_width: int, windows: list[int], grid: int, further: tuple[Array, Array, Array] | None
     ) -> tuple[list[Window], Columns | None]:
-        s = stride(half_width, self.hop)
-        smoothed = self._smoothed.get(half_width)
-        if smoothed is None or smoothed.first + smoothed.columns.shape[0] * s < windows[0]:
-            smoothed = self._smoothed[half_width] = _Smoothed(windows[0], np.empty((0, self._entries)))
-        known = smoothed.first + smoothed.columns.shape[0] * s
-        # Samples that the filter ends too late for, by their distance from the window's end.
-        tail = np.arange((half_width - self.margin - 1) // s, -1, -1) * s
-        fresh = np.arange(known, windows[-1] + self.width + s - tail.size * s, s)
-        ends = np.array(windows) + self.width
-        skip = max(0, (windows[0] - smoothed.first) // s)
-        smoothed.columns = smoothed.columns[skip:]
-        smoothed.first += skip * s
-        states = self._states([(fresh, half_width), *((ends - d, self.margin + d) for d in tail.tolist())])
-        columns, probed = self._columns(*states, further)
-        smoothed.columns = np.concatenate((smoothed.columns, columns[: fresh.size]))
-        tails = columns[fresh.size :].reshape(tail.size, len(windows), columns.shape[1])
+        s, n_v, entries = stride(half_width, self.hop), self.model.layout.n_v, self.rows.size
+        probed: Columns | None = None
+
+        def thinned(x: Array, v: Array, signals: Array) -> Array:
+            nonlocal probed
+            columns, probed = self._columns(x, v, signals, further)
+            return columns
+
+        kept = self._kept(self._thinned, half_width, s, windows[0], self._entries)
         phi, phi_dot = self._phi[s]
-        width = COPIES * (self.rows.size + self.model.layout.n_v)
+        width = COPIES * (entries + n_v)
         out = []
-        for k, window in enumerate(windows):
-            begin = (window - smoothed.first) // s
-            values = np.concatenate((smoothed.columns[begin : begin + phi.size - tail.size], tails[:, k]))
+        for window, values in zip(windows, self._seen(kept, half_width, windows, thinned), strict=True):
             weak = -(phi_dot @ values[:, :width] + phi @ values[:, width : 2 * width]).reshape(COPIES, -1)
-            b = (phi @ values[:, 2 * width :]).reshape(COPIES, -1) - weak[:, self.rows.size :]
+            b = (phi @ values[:, 2 * width :]).reshape(COPIES, -1) - weak[:, entries:]
             last = grid + window + self.width + self.lead
-            out.append(Window(window // self.half_hop, last, weak[:, : self.rows.size], b, half_width))
-        return out, probed
+            no_rough = np.empty((STEPS + 1, 0))
+            out.append(Window(window // self.half_hop, last, weak[:, :entries], b, half_width, no_rough))
+        return self._with_rough(half_width, windows, out) if self.rough.columns.size else out, probed
+
+    def _with_rough(self, half_width: int, windows: list[int], rows: list[Window]) -> list[Window]:
+        """Rows with the columns of rough forces."""
+        phi, _ = self._phi[1]
+        width = COPIES * (self._rough.size + self.model.layout.n_v)
+        kept = self._kept(self._dense, half_width, 1, windows[0], width + 2 * self.rough.rows.size)
+        out = []
+        for row, values in zip(rows, self._seen(kept, half_width, windows, self._rough_columns), strict=True):
+            weak = -(phi @ values[:, :width]).reshape(COPIES, -1)
+            Y = row.Y.copy()
+            Y[:, self._rough] = weak[:, : self._rough.size]
+            told = responses(values[:, width:], phi * self.sample_rate, half_width, self.sample_rate, STEPS)
+            out.append(replace(row, Y=Y, b=row.b - weak[:, self._rough.size :], rough=told))
+        return out
+
+    def _kept(self, kept: dict[int, _Smoothed], half_width: int, step: int, first: int, entries: int) -> _Smoothed:
+        """What windows of this half width have asked for that windows from sample `first` on may ask for too."""
+        smoothed = kept.get(half_width)
+        if smoothed is None or smoothed.first + len(smoothed.columns) * step < first:
+            smoothed = kept[half_width] = _Smoothed(step, first, np.empty((0, entries)))
+        skip = max(0, (first - smoothed.first) // step)
+        smoothed.columns = smoothed.columns[skip:]
+        smoothed.first += skip * step
+        return smoothed
+
+    def _seen(self, kept: _Smoothed, half_width: int, windows: list[int], evaluate: _Evaluation) -> Iterator[Array]:
+        """For each window the columns at all its samples of a step (width / step + 1, entries)."""
+        step, known = kept.step, kept.first + len(kept.columns) * kept.step
+        s = stride(half_width, self.hop)
+        # Samples that the filter ends too late for, by their distance from the window's end: s of them share a width.
+        tail = np.arange((half_width - self.margin - 1) // s, -1, -1) * s
+        within = np.arange(s - step, -1, -step)
+        ends = np.array(windows) + self.width
+        fresh = np.arange(known, ends[-1] + step - tail.size * s, step)
+        late = [((ends - d - within[:, None]).ravel(), self.margin + d) for d in tail.tolist()]
+        columns = evaluate(*self._states([(fresh, half_width), *late]))
+        kept.columns = np.concatenate((kept.columns, columns[: fresh.size]))
+        tails = columns[fresh.size :].reshape(tail.size * within.size, len(windows), columns.shape[1])
+        count = self.width // step + 1 - len(tails)
+        for k, window in enumerate(windows):
+            begin = (window - kept.first) // step
+            yield np.concatenate((kept.columns[begin : begin + count], tails[:, k]))
 
     @property
     def _entries(self) -> int:
@@ -293,33 +342,47 @@ class MomentumBalance:
     ) -> tuple[Array, Columns | None]:
         """P and G, each of the base parameters, packed, and of what is known, and Q, for every copy: (K, entries).
 
-        And all columns at further states.
+        Rough forces are zero there. And all columns at further states.
         """
-        K = signals.shape[1]
-        # Without noise all copies are one.
-        distinct = COPIES if np.any(x[1] != x[0]) else 1
-        packed = []
-        own = [part[:distinct].reshape(distinct * K, part.shape[2]) for part in (x, v, signals)]
+        own, K = self._distinct(x, v, signals)
         at = own if further is None else [np.concatenate(pair) for pair in zip(own, further, strict=True)]
         P, G = self.model.momentum_columns(at[0], at[1], inputs=self.model.inputs(at[2]))
-        for part in (P[: distinct * K], G[: distinct * K]):
-            both = np.concatenate((part[:, self.rows, self._physical], self.base.known_part(part)), axis=1)
-            both = both.reshape(distinct, K, -1).swapaxes(0, 1)
-            packed.append(np.broadcast_to(both, (K, COPIES, both.shape[2])).reshape(K, -1))
+        seen = slice(0, len(own[0]))
+        G[seen, :, self.rough.columns] = 0.0
+        everywhere = np.arange(self.rows.size)
+        packed = [self._packed(part[seen], everywhere, K) for part in (P, G)]
         torque = signals[..., : len(self.model.layout.q)]
         force = self.model.generalized_force(torque.swapaxes(0, 1).reshape(-1, torque.shape[2]))
-        probed = None if further is None else (P[distinct * K :], G[distinct * K :])
+        probed = None if further is None else (P[seen.stop :], G[seen.stop :])
         return np.concatenate((*packed, force.reshape(K, -1)), axis=1), probed
+
+    def _rough_columns(self, x: Array, v: Array, signals: Array) -> Array:
+        """G of rough forces alone, likewise, and their slopes: (K, entries)."""
+        own, K = self._distinct(x, v, signals)
+        return np.concatenate(
+            (self._packed(self.rough.force(*own), self._rough, K), self.rough.slopes(x[0], v[0], signals[0])), axis=1
+        )
+
+    def _distinct(self, x: Array, v: Array, signals: Array) -> tuple[list[Array], int]:
+        """States of the copies one below the other, and how many a copy has: without noise all copies are one."""
+        copies = COPIES if np.any(x[1] != x[0]) else 1
+        return [part[:copies].reshape(-1, part.shape[2]) for part in (x, v, signals)], x.shape[1]
+
+    def _packed(self, part: Array, entries: NDArray[np.int64], K: int) -> Array:
+        """Entries of columns at the states of `_distinct`, and what is known of them, for every copy: (K, entries)."""
+        own = part[:, self.rows[entries], self._physical[entries]]
+        both = np.concatenate((own, self.base.known_part(part)), axis=1)
+        both = both.reshape(-1, K, both.shape[1]).swapaxes(0, 1)
+        return np.broadcast_to(both, (K, COPIES, both.shape[2])).reshape(K, -1)
 
     def state(self) -> dict[str, Any]:
         """What `restore` needs to continue."""
-        smoothed = {f"columns_{M}": kept.columns for M, kept in self._smoothed.items()}
         return {
             "samples": self._samples,
             "position": np.array([self._first, self._window, self._told, -1 if self._skip is None else self._skip]),
             "compared": np.array(self._compared),
-            "widths": np.array([(M, kept.first) for M, kept in self._smoothed.items()], dtype=np.int64).reshape(-1, 2),
-            **smoothed,
+            **_smoothed_state("thinned", self._thinned),
+            **_smoothed_state("dense", self._dense),
         }
 
     def restore(self, state: Mapping[str, NDArray[Any]]) -> None:
@@ -328,6 +391,19 @@ class MomentumBalance:
         self._first, self._window, self._told, skip = (int(k) for k in state["position"])
         self._skip = None if skip < 0 else skip
         self._compared = list(np.array(state["compared"]))
-        self._smoothed = {
-            int(M): _Smoothed(int(first), np.array(state[f"columns_{M}"])) for M, first in state["widths"]
-        }
+        self._thinned, self._dense = (_smoothed_from_state(name, state) for name in ("thinned", "dense"))
+
+
+def _smoothed_state(name: str, smoothed: dict[int, _Smoothed]) -> dict[str, Any]:
+    places = [(M, kept.step, kept.first) for M, kept in smoothed.items()]
+    return {
+        f"{name}_place": np.array(places, dtype=np.int64).reshape(-1, 3),
+        **{f"{name}_{M}": kept.columns for M, kept in smoothed.items()},
+    }
+
+
+def _smoothed_from_state(name: str, state: Mapping[str, NDArray[Any]]) -> dict[int, _Smoothed]:
+    return {
+        int(M): _Smoothed(int(step), int(first), np.array(state[f"{name}_{M}"]))
+        for M, step, first in state[f"{name}_place"]
+    }

@@ -21,13 +21,11 @@ from numpy.typing import NDArray
 from scipy.linalg.lapack import dtrtrs
 
 from sms_online.pipeline.latency import SourceGroup
-from sms_online.pipeline.momentum_balance import EXPONENT, HOPS, INSTANTS
+from sms_online.pipeline.momentum_balance import EXPONENT, HOPS, INSTANTS, STEPS
 from sms_online.pipeline.sensitivity import SPARSE, Sensitivity, nodes
 from sms_online.pipeline.weak_form import test_function
 from sms_online.stream import Array
 
-# Steps of the integrals over c(t): two for each instant that the sensitivity is told at.
-STEPS = 2 * INSTANTS
 STEPS_A_HOP = STEPS // HOPS
 # Share of a row's variance that is added to it alone, for the rounding of the factorisation.
 OWN_SHARE = 1e-7
@@ -75,26 +73,29 @@ class RowNoise:
         self._late_before.clear()
 
     def kernel(self, window: Sensitivity) -> Array:
-        """c (STEPS + 1, n_v, sensors): what a displacement n(t) of each sensor adds to the rows is ∫ c(t) n(t) dt."""
+        """c (STEPS + 1, n_v, sensors): what a displacement n(t) of each sensor adds to the rows is ∫ c(t) n(t) dt.
+
+        But for rough forces, which see the motion through the filter: `RoughForces.kernel`.
+        """
         parts = (window.H, window.H_dot, window.P_x, window.G_v, window.G_x)
         n_v, sensors = window.H.shape[1:]
         stacked = np.concatenate(parts).reshape(-1, n_v * sensors)
         return np.asarray((self._weights[window.offset] @ stacked).reshape(STEPS + 1, n_v, sensors))
 
     def covariance(
-        self, window: Sensitivity, sensor_density: Array, torque_density: Array, age: float = np.inf
+        self, kernel: Array, rates: Array, sensor_density: Array, torque_density: Array, age: float = np.inf
     ) -> list[Array]:
         """Covariances (n_v, n_v) with the windows before, oldest first, then the window's own; (N s)² and so on.
 
+        kernel (STEPS + 1, n_v, sensors): c. rates (INSTANTS + 1, sensors): of the readings in the window.
         sensor_density (sensors,): σ² T_s of each position sensor. torque_density (joints,): of n τ, (N m)² s.
         age: of the clocks at the window's end, s.
         """
-        kernel = self.kernel(window)
         n_v, sensors = kernel.shape[1:]
         # By time, so that what two windows have in common lies in one piece.
         c = np.multiply(kernel.swapaxes(1, 2), np.sqrt(self._step * sensor_density)[:, None], order="C")
         c = c.reshape(-1, n_v)
-        self.late = self._lateness(kernel, window.rates)
+        self.late = self._lateness(kernel, rates)
         late = (CLOCK_ERROR if age >= CLOCK_KNOWN else YOUNG_CLOCK_ERROR) * self._by_clock(self.late)
         self._before.append(c)
         self._torque_before.append(torque_density)

@@ -28,7 +28,7 @@ class Sensitivity:
 
     H, H_dot (INSTANTS + 1, n_v, sensors): ∂Pπ/∂v and Ḣ. P_x, G_v, G_x (nodes, n_v, sensors): ∂Pπ/∂x, ∂Gπ/∂v, ∂Gπ/∂x at
     every other instant, the first of which is `offset` instants into the window. rates (INSTANTS + 1, sensors): of the
-    readings.
+    readings. displacements (n_v, sensors): that unit noise makes in the middle of the window.
     """
 
     H: Array
@@ -38,6 +38,7 @@ class Sensitivity:
     G_x: Array
     offset: int
     rates: Array
+    displacements: Array
 
 
 def derivatives(dynamics: Dynamics, x: Array, v: Array, signals: Array | None = None) -> Array:
@@ -147,7 +148,8 @@ class Sensitivities:
         first = int(np.searchsorted(self._numbers, start))
         told = self._derivatives[first : first + nodes(offset).size]
         P_x, G_v, G_x = (told[:, :, k * n_v : (k + 1) * n_v] @ readings[nodes(offset)] for k in range(3))
-        return Sensitivity(H @ readings, H_dot @ readings, P_x, G_v, G_x, offset, self._rates[inside])
+        middle = readings[INSTANTS // 2]
+        return Sensitivity(H @ readings, H_dot @ readings, P_x, G_v, G_x, offset, self._rates[inside], middle)
 
     def drop(self, before: int) -> None:
         """Forget instants with smaller numbers."""

@@ -56,7 +56,7 @@ class Weighing:
         clocks: Sequence[SourceGroup] = (),
     ) -> None:
         n_v = model.layout.n_v
-        self._base = base
+        self._base, self._rough = base, balance.rough
         self._sample_rate = balance.sample_rate
         self._sensitivities = Sensitivities(model, readings, balance.span / INSTANTS)
         self._noise = RowNoise(model.layout.theta_m, balance.span, clocks)
@@ -93,7 +93,7 @@ class Weighing:
         needed = self._sensitivities.next_instant
         fresh = needed - first
         assert self.beta is not None
-        pi = self._base.physical_values(self.beta)
+        pi = self._rough.without(self._base.physical_values(self.beta))
         probed = next((piece.probed for piece in instants if piece.number == needed), None)
         self._sensitivities.tell(pi, x[fresh:], v[fresh:], signals[fresh:], probed)
 
@@ -104,19 +104,23 @@ class Weighing:
     def push(self, window: Window, rows: Array, errors: Array) -> Weighed:
         """The next window's rows (n_v, width); errors (n_v,): variance of each that nothing propagates."""
         assert self.sensor_noise is not None
+        assert self.beta is not None
+        pi = self._base.physical_values(self.beta)
         sensitivity = self._sensitivities.window(window.start)
         age = window.end / self._sample_rate
-        covariances = self._noise.covariance(sensitivity, self.sensor_noise.sensors, self.sensor_noise.torque, age)
+        kernel = self._noise.kernel(sensitivity) + self._rough.kernel(window.rough, pi, sensitivity.displacements)
+        noise = self.sensor_noise
+        covariances = self._noise.covariance(kernel, sensitivity.rates, noise.sensors, noise.torque, age)
         own = covariances[-1]
         diagonal = np.einsum("ii->i", own)
         diagonal += errors
-        noise = own.copy()
+        of_noise = own.copy()
         diagonal += self.misfit * diagonal
         width = rows.shape[1]
         if len(self._late):
             rows = np.concatenate((rows, self._late.of(self._noise.late)), axis=1)
         white = self._whitener.push(covariances, rows)
-        return Weighed(white[:, :width], white[:, width:], noise, own)
+        return Weighed(white[:, :width], white[:, width:], of_noise, own)
 
     def state(self) -> dict[str, Any]:
         """What `restore` needs to continue."""

@@ -1,0 +1,119 @@
+"""Forces that jump with the motion or turn fast with it, and what noise does to them: both from every sample.
+
+A thinned motion folds what such a force does between its samples back into the rows: the phase of a cogging behind a
+gear turns through a radian in a few milliseconds. And noise reaches such a force through the filter: what a row takes
+in of it in one instant cancels what it takes in a quarter of a turn later, within the filter's reach.
+"""
+
+from __future__ import annotations
+
+from functools import cache
+from itertools import product
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sms_online.model.model import Model
+from sms_online.pipeline.smoothing import kernel
+from sms_online.stream import Array
+
+# Step of the differences that give slopes, rad and rad/s (m, m/s): 1e-9 of a force is lost to curvature where a phase
+# turns 300 times as fast as its joint, and as much to rounding.
+DIFFERENCE = 1e-6
+
+
+class RoughForces:
+    """The forces of a model that are not `smooth`.
+
+    columns (c,): their places in π. rows, coefficients, coordinates (E,): of the entries of `slopes`: generalized
+    speed whose row a force is in, place in π of its coefficient, speed along which a position or rate changes; of
+    joints' forces without internal states, which depend on that joint's positions and rates.
+    """
+
+    def __init__(self, model: Model) -> None:
+        self._model = model
+        layout = model.layout
+        rough = [k for k, effect in enumerate(model.effects) if not effect.smooth]
+        self.columns = np.concatenate([np.empty(0, dtype=np.int64), *(self._places(k) for k in rough)])
+        self._joints = {
+            k: sorted({layout.theta_m[i], layout.q[i]})
+            for k in rough
+            if model.effects[k].where.startswith("joint_") and not model.effects[k].n_states
+            for i in [int(model.effects[k].where.removeprefix("joint_")) - 1]
+        }
+        entries = [
+            entry for k, speeds in self._joints.items() for entry in product(speeds, speeds, self._places(k).tolist())
+        ]
+        self.coordinates, self.rows, self.coefficients = np.array(entries, dtype=np.int64).reshape(-1, 3).T
+
+    def _places(self, k: int) -> NDArray[np.int64]:
+        columns = self._model.effect_slices[k]
+        return np.arange(columns.start, columns.stop, dtype=np.int64)
+
+    def force(self, x: Array, v: Array, signals: Array) -> Array:
+        """Columns (K, n_v, n_pi), zero but for these forces, at x (K, n_x), v (K, n_v), signals as in `Instants`."""
+        out = np.zeros((*v.shape, self._model.n_pi))
+        for effect, columns, own in self._model.acting(self._model.inputs(signals)):
+            if not effect.smooth:
+                out[..., columns] = effect.force(self._model.layout, x, v, own)
+        return out
+
+    def slopes(self, x: Array, v: Array, signals: Array) -> Array:
+        """(K, 2 E): of one unit of each coefficient by position, then by rate, at states as in `force`."""
+        layout, K = self._model.layout, len(x)
+        offset = layout.n_base_positions - layout.n_base_speeds
+        by_position, by_rate = [np.empty((K, 0))], [np.empty((K, 0))]
+        acting = list(self._model.acting(self._model.inputs(np.tile(signals, (4, 1)))))
+        for k, speeds in self._joints.items():
+            effect, _, own = acting[k]
+            for speed in speeds:
+                # Each position there and back, then each rate.
+                x_n, v_n = np.tile(x, (4, 1)), np.tile(v, (4, 1))
+                x_n[:K, speed + offset] += DIFFERENCE
+                x_n[K : 2 * K, speed + offset] -= DIFFERENCE
+                v_n[2 * K : 3 * K, speed] += DIFFERENCE
+                v_n[3 * K :, speed] -= DIFFERENCE
+                moved = effect.force(layout, x_n, v_n, own)[:, speeds].reshape(4, K, -1)
+                by_position.append((moved[0] - moved[1]) / (2.0 * DIFFERENCE))
+                by_rate.append((moved[2] - moved[3]) / (2.0 * DIFFERENCE))
+        return np.concatenate((*by_position, *by_rate), axis=1)
+
+    def without(self, pi: Array) -> Array:
+        """π (n_pi,) without the forces that `slopes` tells."""
+        out = pi.copy()
+        out[self.coefficients] = 0.0
+        return out
+
+    def kernel(self, told: Array, pi: Array, readings: Array) -> Array:
+        """What these forces add to `RowNoise.kernel` (steps, n_v, sensors), for parameters π (n_pi,).
+
+        told (steps, E): a window's `responses`. readings (n_v, sensors): displacements by each sensor's reading.
+        """
+        n_v, sensors = readings.shape
+        out = np.zeros((len(told), n_v, sensors))
+        for row in np.unique(self.rows):
+            own = self.rows == row
+            out[:, row] = (told[:, own] * pi[self.coefficients[own]]) @ readings[self.coordinates[own]]
+        return out
+
+
+@cache
+def _through_filter(half_width: int, width: int, steps: int) -> Array:
+    """(2, steps + 1, width + 1): from slopes by value and by change a sample, at the samples of a window, to what
+    readings do at `steps` even steps of it, by way of the filter."""
+    at = np.arange(width + 1.0)
+    interpolation = np.stack([np.interp(np.linspace(0.0, width, steps + 1), at, unit) for unit in np.eye(width + 1)], 1)
+    apart = np.arange(width + 1)[:, None] - np.arange(width + 1) + half_width
+    inside = (apart >= 0) & (apart <= 2 * half_width)
+    passed = np.where(inside, kernel(half_width)[np.where(inside, apart, 0)].transpose(2, 0, 1), 0.0)
+    return np.asarray(interpolation @ passed)
+
+
+def responses(slopes: Array, phi: Array, half_width: int, sample_rate: float, steps: int) -> Array:
+    """c (steps + 1, E): what a displacement n(t) of a reading adds to a row is ∫ c(t) n(t) dt, for unit coefficients.
+
+    slopes (width + 1, 2 E): `RoughForces.slopes` along the window. phi (width + 1,): test function at the samples.
+    """
+    by_value, by_change = _through_filter(half_width, phi.size - 1, steps)
+    by_position, by_rate = np.split(phi[:, None] * slopes, 2, axis=1)
+    return np.asarray(-(by_value @ by_position + sample_rate * (by_change @ by_rate)))
