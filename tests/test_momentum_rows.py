@@ -10,12 +10,13 @@ from prescribed_motion import prescribed
 
 from sms_adapters.system_file import load_system
 from sms_online.description.parse import parse_system
-from sms_online.description.schema import System
+from sms_online.description.schema import Effect, System
 from sms_online.model.base_parameters import find_base_parameters
 from sms_online.model.model import Model
 from sms_online.pipeline import momentum_fit
 from sms_online.pipeline.estimator import Estimator
 from sms_online.pipeline.momentum_balance import COPIES, EXPONENT, MomentumBalance, Window
+from sms_online.pipeline.smoothing import stride
 from sms_online.pipeline.weak_form import test_function as weak_test_function
 from sms_online.results import results_document
 from sms_online.stream import Array, Block
@@ -108,6 +109,27 @@ def test_what_is_stored_of_a_row_is_all_that_is_not_zero(system: System) -> None
     stored = np.zeros(full.shape, dtype=bool)
     stored[balance.rows, balance.columns] = True
     assert (np.abs(full) <= np.where(stored, np.inf, 1e-15) * size).all()
+
+
+def test_a_force_that_turns_with_the_thinned_samples_is_summed_from_every_one() -> None:
+    """A cogging of 450 periods a turn, at 1.4 rad/s: one period for each thinned sample."""
+    cogging = Effect(name="cogging", where="joint_2", coefficients={"amplitude": 6.0, "order": 9.0})
+    model = Model(paper(effects=(cogging,)))
+    balance = MomentumBalance(model, find_base_parameters(model), 1000.0, SPAN)
+    motion = prescribed(model, balance.width + balance.lead + balance.margin + 1, seed=1)
+    (window,) = windows_of(balance, motion.x, motion.Q[:, list(model.layout.theta_m)], sigma=1e-4)
+    thinned = stride(window.half_width, balance.hop)
+    rate = motion.v[:, model.layout.theta_m[1]]
+    assert rate.min() < 2.0 * np.pi / (450.0 * thinned * 1e-3) < rate.max()
+    phi, _, _ = weak_test_function(balance.width, balance.span, EXPONENT)
+    first = first_sample(balance, window)
+    force = model.momentum_columns(motion.x, motion.v)[1][first : first + balance.width + 1]
+    every = -balance.base.columns(np.tensordot(phi, force, 1)) / 1000.0
+    folded = -balance.base.columns(np.tensordot(phi[::thinned], force[::thinned], 1)) * thinned / 1000.0
+    own = [k for k, p in enumerate(balance.base.parameters) if p.name.startswith("cogging")]
+    found = dense(balance, window)[:, own]
+    assert np.abs(folded[:, own] - every[:, own]).max() > 0.01
+    np.testing.assert_allclose(found, every[:, own], rtol=0.0, atol=1e-6)
 
 
 def test_rows_of_a_free_base_hold_no_spring_damper_or_rotor() -> None:

@@ -12,7 +12,7 @@ from prescribed_motion import prescribed
 
 from sms_adapters.system_file import load_system
 from sms_online.description.parse import parse_system
-from sms_online.description.schema import System
+from sms_online.description.schema import Effect, System
 from sms_online.model.base_parameters import find_base_parameters
 from sms_online.model.model import Model
 from sms_online.pipeline.latency import SourceGroup
@@ -30,9 +30,17 @@ POSITION_NOISE, TORQUE_NOISE = 1e-6, 1e-3
 # Windows after the first.
 HOPS_FOLLOWED = 3
 AXIS_SYSTEM = parse_system(AXIS.replace("sample_rate = 200.0", "sample_rate = 1000.0"), "axis.toml")
+# A phase of 25 Hz, where the filter of the motion passes half the noise, friction and a hard spring:
+# they multiply the variance of their joints' rows.
+ROUGH = (
+    Effect(name="cogging", where="joint_2", coefficients={"amplitude": 150.0, "phase": 0.4, "order": 2.0}),
+    Effect(name="viscous_friction", where="joint_1", coefficients={"damping": 500.0}),
+    Effect(name="cubic_stiffness", where="joint_1", coefficients={"stiffness": 5e6}),
+)
 # With the number of draws: fewer where rows are dear.
 SYSTEMS = {
     "planar": (paper(), 120),
+    "planar, rough forces": (paper(effects=ROUGH), 240),
     "planar, exact links": (paper("exact"), 30),
     "spatial": (load_system("spatial-two-link"), 60),
     "spatial, prismatic joint, gravity, effects": (spatial(free=False), 60),
@@ -84,7 +92,7 @@ def scatter(system: System, draws: int, seed: int) -> Scatter:
         found, instants = balance.push(np.arange(len(values)), [sensing.motion(values)] * COPIES, coordinates)
         told = Sensitivities(model, sensing.displacements, balance.span / INSTANTS)
         for piece in instants if values is exact else []:
-            told.tell(model.nominal, piece.x, piece.v, piece.signals)
+            told.tell(balance.rough.without(model.nominal), piece.x, piece.v, piece.signals)
         return found, told
 
     def residual(found: list[Window]) -> Array:
@@ -96,14 +104,13 @@ def scatter(system: System, draws: int, seed: int) -> Scatter:
     found, told = windows(exact)
     noise, whitener = RowNoise(model.layout.theta_m, probe.span), Whitener(model.layout.n_v, draws)
     density = POSITION_NOISE**2 / system.sample_rate, TORQUE_NOISE**2 / system.sample_rate
-    covariances = [
-        noise.covariance(
-            told.window(window.start),
-            np.full(model.layout.n_x, density[0]),
-            np.full(len(model.layout.q), density[1]),
-        )
-        for window in found
-    ]
+    covariances = []
+    for window in found:
+        sensitivity = told.window(window.start)
+        kernel = noise.kernel(sensitivity)
+        kernel += probe.rough.kernel(window.rough, model.nominal, sensitivity.displacements)
+        densities = np.full(model.layout.n_x, density[0]), np.full(len(model.layout.q), density[1])
+        covariances.append(noise.covariance(kernel, sensitivity.rates, *densities))
     rest = residual(found)
     errors = np.stack(
         [residual(windows(exact + sigma * rng.standard_normal(exact.shape))[0]) - rest for _ in range(draws)]
@@ -166,13 +173,15 @@ def test_a_clock_that_is_off_moves_rows_by_the_rates_of_its_readings() -> None:
     clock = SourceGroup("encoders", sensors, (), ())
     noise = RowNoise(model.layout.theta_m, balance.span, (clock,))
     nothing = np.zeros(model.layout.n_x), np.zeros(len(model.layout.q))
-    found = [noise.covariance(told.window(start), *nothing) for start in starts]
+    seen = [told.window(start) for start in starts]
+    kernels = [noise.kernel(sensitivity) for sensitivity in seen]
+    found = [noise.covariance(c, each.rates, *nothing) for c, each in zip(kernels, seen, strict=True)]
     assert len(found) > 2
     for k in range(2):  # a window with itself and with the one before
         expected = (1.0 - k / HOPS) * CLOCK_ERROR**2 * np.outer(slopes[-1], slopes[-1 - k])
         np.testing.assert_allclose(found[-1][-1 - k], expected, atol=0.02 * np.abs(expected).max())
     young = RowNoise(model.layout.theta_m, balance.span, (clock,))
-    own = young.covariance(told.window(starts[-1]), *nothing, 0.5 * CLOCK_KNOWN)[-1]
+    own = young.covariance(kernels[-1], seen[-1].rates, *nothing, 0.5 * CLOCK_KNOWN)[-1]
     np.testing.assert_allclose(own, 4.0 * found[-1][-1], rtol=1e-12)
 
 

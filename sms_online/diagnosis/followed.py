@@ -11,37 +11,18 @@ from scipy.interpolate import CubicSpline
 from sms_online.description.schema import System
 from sms_online.diagnosis.record import Segment
 from sms_online.model.model import Model
-from sms_online.pipeline.internal_states import InternalStates
+from sms_online.pipeline.internal_states import InternalStates, half_width, smooth_from_the_start
 from sms_online.pipeline.sensing import Sensing
-from sms_online.pipeline.smoothing import HALF_WIDTHS, smooth
+from sms_online.pipeline.smoothing import HALF_WIDTHS
 from sms_online.stream import Array
 
 # States are advanced once in so many samples: at 1 kHz what changes at 3 Hz is told 80 times a period.
 STEP = 4
-# Half width of the filter of the motion behind them, s, which passes 50 Hz: a hysteresis forgets with every way that
-# its spring goes, noise's too. Of short windows it is this multiple at most.
-HALF_WIDTH, OF_WINDOW = 0.040, 1.4
 
 
 def least_samples(system: System) -> int:
     """Samples of a segment that give any window, and a motion that internal states can follow."""
     return round(1.5 * system.windows.momentum * system.sample_rate) + 2 * half_width(system)
-
-
-def half_width(system: System) -> int:
-    """Half width of the filter of the motion that internal states follow, in samples."""
-    return max(HALF_WIDTHS[0], round(min(HALF_WIDTH, OF_WINDOW * system.windows.momentum) * system.sample_rate))
-
-
-def _smooth_from_the_start(x: Array, samples: NDArray[np.int64], M: int, sample_rate: float) -> tuple[Array, Array]:
-    """As `smooth` with half width M, but near the beginning with as much of the ladder of widths as it allows.
-
-    A mass that rings keeps for good what it has missed of a motion's beginning.
-    """
-    widths = [m for m in HALF_WIDTHS if m < M]
-    own = np.append(widths, M)[np.searchsorted([*widths[1:], M], samples, side="right")]
-    parts = [smooth(x, samples[own == m], m, sample_rate) for m in np.unique(own).tolist()]
-    return np.concatenate([part[0] for part in parts]), np.concatenate([part[1] for part in parts])
 
 
 class FollowedMotion:
@@ -57,7 +38,7 @@ class FollowedMotion:
         for segment in segments:
             x = sensing.coordinates(segment.values)
             samples = np.arange(M - STEP * ((M - HALF_WIDTHS[0]) // STEP), len(x) - M, STEP)
-            smoothed, rates = _smooth_from_the_start(x, samples, M, sample_rate)
+            smoothed, rates = smooth_from_the_start(x, 0, samples, M, sample_rate)
             self._motions.append((samples, smoothed, layout.speeds(smoothed, rates)))
 
     def states(self, model: Model, number: int, at: NDArray[np.int64] | None = None) -> Array:

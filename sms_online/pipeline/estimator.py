@@ -89,7 +89,7 @@ class Estimator:
         # Positions choose the filter's width; torques pass the same filter for the sake of the lag.
         self._rates = RatesStage(system.sample_rate, range(layout.n_x), self.sensing.noise)
         self._unbalanced: list[GridSamples] = []  # coordinates and torques that wait for the energy balance
-        self._followed = FollowedStates(model, system.sample_rate, len(self.sensing.channels))
+        self._followed = FollowedStates(model, self.sensing, system.sample_rate)
         self._energy = EnergyBalance(model, base, system.sample_rate)
         # A balance of forces does not hold in a shape that is not the link's; energies bear it best.
         by_energy = system.balance == "energy" or self.sensing.missing
@@ -224,7 +224,6 @@ class Estimator:
         self._balance_waiting()
         for rates in self._rates.flush():
             self._balance(rates)
-        self._fit()
         if self.momentum is not None:
             events = len(self.events)
             self.momentum.finish(self.periods)
@@ -261,13 +260,14 @@ class Estimator:
             self._differentiate(corrected)
 
     def _differentiate(self, piece: GridSamples) -> None:
-        self._followed.wait(piece)
-        self._unbalanced.append(GridSamples(piece.index, self.sensing.motion(piece.values), piece.segment))
-        waiting = sum(each.index.size for each in self._unbalanced)
-        # Beside momentum rows nobody waits for those of the energy, but for the internal states that come with them.
-        if self.momentum is None or self._model.n_states or waiting >= ENERGY_BLOCK:
-            self._balance_waiting()
-        self._fit()
+        for followed in self._followed.push(piece):
+            motion = self.sensing.motion(followed.values[:, : len(self.sensing.channels)])
+            self._unbalanced.append(GridSamples(followed.index, motion, followed.segment))
+            waiting = sum(each.index.size for each in self._unbalanced)
+            # Beside momentum rows nobody waits for those of the energy.
+            if self.momentum is None or waiting >= ENERGY_BLOCK:
+                self._balance_waiting()
+            self._fit(followed)
 
     def _balance_waiting(self) -> None:
         waiting, self._unbalanced = self._unbalanced, []
@@ -277,14 +277,13 @@ class Estimator:
             for rates in self._rates.push(GridSamples(index, values, segment)):
                 self._balance(rates)
 
-    def _fit(self) -> None:
-        """Hand on to the momentum balance the samples whose internal states are known."""
-        for piece in self._followed.met():
-            if self.momentum is not None:
-                events = len(self.events)
-                self.momentum.push(piece, self._synchroniser.start_time, self.periods)
-                if len(self.events) > events:
-                    self._begin_joints()
+    def _fit(self, piece: GridSamples) -> None:
+        """Hand samples, with their internal states, on to the momentum balance."""
+        if self.momentum is not None:
+            events = len(self.events)
+            self.momentum.push(piece, self._synchroniser.start_time, self.periods)
+            if len(self.events) > events:
+                self._begin_joints()
 
     def _balance(self, rates: RateSamples) -> None:
         if rates.segment != self._segment:
@@ -298,7 +297,7 @@ class Estimator:
             self.smoother.move(rates.index, x, v)
         if self.on_motion is not None:
             self.on_motion(rates.index, rates.segment, x, v)
-        signals = np.concatenate((torque, self._followed.push(rates, x, v)), axis=1)
+        signals = np.concatenate((torque, self._followed.beside(rates)), axis=1)
         rows = self._energy.push(rates.index, x, v, signals, self._rates.sigma[n_x:])
         finite = np.isfinite(rows.Y).all(axis=1) & np.isfinite(rows.b)
         self.dropped_rows += int(np.sum(~finite))

@@ -13,11 +13,37 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from sms_online.description.schema import System
 from sms_online.model.model import Model
 from sms_online.pipeline.rates import RateSamples
+from sms_online.pipeline.sensing import Sensing
+from sms_online.pipeline.smoothing import HALF_WIDTHS, smooth
 from sms_online.pipeline.synchronise import GridSamples
 from sms_online.pipeline.waiting import waiting_from_state, waiting_state
 from sms_online.stream import Array
+
+# Half width of the filter of the motion behind the states, s, which passes 50 Hz: a hysteresis forgets with every way
+# that its spring goes, noise's too. Of short windows it is this multiple at most.
+HALF_WIDTH, OF_WINDOW = 0.040, 1.4
+
+
+def half_width(system: System) -> int:
+    """Half width of the filter of the motion that internal states follow, in samples."""
+    return max(HALF_WIDTHS[0], round(min(HALF_WIDTH, OF_WINDOW * system.windows.momentum) * system.sample_rate))
+
+
+def smooth_from_the_start(
+    x: Array, first: int, samples: NDArray[np.int64], M: int, sample_rate: float
+) -> tuple[Array, Array]:
+    """As `smooth` with half width M, but near the beginning with as much of the ladder of widths as it allows.
+
+    A mass that rings keeps for good what it has missed of a motion's beginning. first: number of the first of x (B, ·)
+    in the segment; samples (n,): numbers too.
+    """
+    widths = [m for m in HALF_WIDTHS if m < M]
+    own = np.append(widths, M)[np.searchsorted([*widths[1:], M], samples, side="right")]
+    parts = [smooth(x, samples[own == m] - first, m, sample_rate) for m in np.unique(own).tolist()]
+    return np.concatenate([part[0] for part in parts]), np.concatenate([part[1] for part in parts])
 
 
 class InternalStates:
@@ -93,63 +119,74 @@ def _along(step: Array, push: Array, z: Array) -> Array:
 
 
 class FollowedStates:
-    """Internal states beside the grid samples: these wait until the smoothed motion, and so the states, are known.
+    """Internal states beside the grid samples: these wait until the motion behind the states is known.
 
     A model without internal states lets its samples pass at once.
     """
 
-    def __init__(self, model: Model, sample_rate: float, channels: int) -> None:
+    def __init__(self, model: Model, sensing: Sensing, sample_rate: float) -> None:
         self._states = InternalStates(model, sample_rate)
-        self._n = model.n_states
-        self._segment = -1  # of the states
-        self._known: list[GridSamples] = []  # states that have met no sample yet
-        self._waiting: list[GridSamples] = []
-        self._channels = channels
+        self._sensing, self._rate = sensing, sample_rate
+        self._n, self._half_width = model.n_states, half_width(model.system)
+        self._segment = -1
+        self._begin_segment()
+        self._unasked: list[GridSamples] = []  # states that nobody has asked for
 
-    def wait(self, piece: GridSamples) -> None:
-        """Take grid samples of the channels (B, channels)."""
-        self._waiting.append(piece)
+    def _begin_segment(self) -> None:
+        self._states.begin_segment()
+        self._values = np.empty((0, len(self._sensing.channels)))
+        self._first = 0  # number in the segment of the first of these
+        self._next = HALF_WIDTHS[0]  # of the first sample whose states are not known yet
 
-    def push(self, rates: RateSamples, x: Array, v: Array) -> Array:
-        """States (B, n_states) at smoothed samples, which those that wait may meet."""
-        if rates.segment != self._segment:
-            self._segment = rates.segment
-            self._states.begin_segment()
-        z = self._states.push(x, v)
-        if self._n:
-            self._known.append(GridSamples(rates.index, z, rates.segment))
-        return z
+    def push(self, piece: GridSamples) -> list[GridSamples]:
+        """Take samples of the channels (B, channels); return those whose states are known (·, channels + n_states).
 
-    def met(self) -> list[GridSamples]:
-        """Samples (B, channels + n_states) whose states are known by now; those at a gap have none and are left out."""
+        Those at a gap have no states and are left out.
+        """
         if self._n == 0:
-            ready, self._waiting = self._waiting, []
-            return ready
-        # One piece for each of states, however the samples came: what follows depends on where pieces end.
-        out = [self._joined(known) for known in self._known]
-        if self._known:
-            newest = self._known[-1]
-            done = newest.segment, int(newest.index[-1])
-            self._waiting = [piece for piece in self._waiting if (piece.segment, int(piece.index[-1])) > done]
-            self._known = []
-        return out
+            return [piece]
+        if piece.segment != self._segment:
+            self._segment = piece.segment
+            self._begin_segment()
+        self._values = np.concatenate((self._values, piece.values))
+        end = self._first + len(self._values)
+        samples = np.arange(self._next, end - self._half_width)
+        if not samples.size:
+            return []
+        x = self._sensing.coordinates(self._values)
+        smoothed, rates = smooth_from_the_start(x, self._first, samples, self._half_width, self._rate)
+        z = self._states.push(smoothed, self._sensing.model.layout.speeds(smoothed, rates))
+        index = samples + (int(piece.index[-1]) - (end - 1))
+        self._unasked.append(GridSamples(index, z, self._segment))
+        joined = np.concatenate((self._values[samples - self._first], z), axis=1)
+        self._next = int(samples[-1]) + 1
+        drop = max(0, self._next - self._half_width - self._first)
+        self._values, self._first = self._values[drop:], self._first + drop
+        return [GridSamples(index, joined, self._segment)]
 
-    def _joined(self, known: GridSamples) -> GridSamples:
-        """The samples that wait for `known` states, and these beside them."""
-        values = [
-            piece.values[(piece.index >= known.index[0]) & (piece.index <= known.index[-1])]
-            for piece in self._waiting
-            if piece.segment == known.segment
+    def beside(self, rates: RateSamples) -> Array:
+        """States (B, n_states) at samples that have been known for as long as a filter takes."""
+        if self._n == 0:
+            return np.empty((len(rates.index), 0))
+        own = [piece for piece in self._unasked if piece.segment == rates.segment]
+        index, z = (np.concatenate([getattr(piece, part) for piece in own]) for part in ("index", "values"))
+        self._unasked = [
+            piece
+            for piece in self._unasked
+            if (piece.segment, int(piece.index[-1])) > (rates.segment, int(rates.index[-1]))
         ]
-        return GridSamples(known.index, np.concatenate((np.concatenate(values), known.values), axis=1), known.segment)
+        return np.asarray(z[np.searchsorted(index, rates.index)])
 
     def state(self) -> dict[str, Any]:
-        """What `restore` needs to continue, between pushes."""
-        waiting = waiting_state("waiting", self._waiting, self._channels)
-        return {"segment": self._segment, **waiting, **self._states.state()}
+        """What `restore` needs to continue."""
+        return {
+            "position": np.array([self._segment, self._first, self._next]), "values": self._values,
+            **waiting_state("unasked", self._unasked, self._n), **self._states.state(),
+        }  # fmt: skip
 
     def restore(self, state: Mapping[str, NDArray[Any]]) -> None:
         """Continue from a saved state."""
-        self._segment = int(state["segment"])
-        self._waiting = waiting_from_state("waiting", state)
+        self._segment, self._first, self._next = (int(number) for number in state["position"])
+        self._values = np.array(state["values"])
+        self._unasked = waiting_from_state("unasked", state)
         self._states.restore(state)

@@ -7,6 +7,7 @@ in of it in one instant cancels what it takes in a quarter of a turn later, with
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import cache
 from itertools import product
 
@@ -27,7 +28,7 @@ class RoughForces:
 
     columns (c,): their places in π. rows, coefficients, coordinates (E,): of the entries of `slopes`: generalized
     speed whose row a force is in, place in π of its coefficient, speed along which a position or rate changes; of
-    joints' forces without internal states, which depend on that joint's positions and rates.
+    joints' forces, which depend on that joint's positions and rates.
     """
 
     def __init__(self, model: Model) -> None:
@@ -38,7 +39,7 @@ class RoughForces:
         self._joints = {
             k: sorted({layout.theta_m[i], layout.q[i]})
             for k in rough
-            if model.effects[k].where.startswith("joint_") and not model.effects[k].n_states
+            if model.effects[k].where.startswith("joint_")
             for i in [int(model.effects[k].where.removeprefix("joint_")) - 1]
         }
         entries = [
@@ -59,23 +60,31 @@ class RoughForces:
         return out
 
     def slopes(self, x: Array, v: Array, signals: Array) -> Array:
-        """(K, 2 E): of one unit of each coefficient by position, then by rate, at states as in `force`."""
-        layout, K = self._model.layout, len(x)
+        """(K, 2 E): of one unit of each coefficient by position, then by rate, at states as in `force`.
+
+        Noise is faster than internal states forget: a state moves with a position as its rate does with that speed.
+        """
+        layout, K, h = self._model.layout, len(x), DIFFERENCE
         offset = layout.n_base_positions - layout.n_base_speeds
         by_position, by_rate = [np.empty((K, 0))], [np.empty((K, 0))]
         acting = list(self._model.acting(self._model.inputs(np.tile(signals, (4, 1)))))
         for k, speeds in self._joints.items():
             effect, _, own = acting[k]
+            assert own is not None
             for speed in speeds:
                 # Each position there and back, then each rate.
-                x_n, v_n = np.tile(x, (4, 1)), np.tile(v, (4, 1))
-                x_n[:K, speed + offset] += DIFFERENCE
-                x_n[K : 2 * K, speed + offset] -= DIFFERENCE
-                v_n[2 * K : 3 * K, speed] += DIFFERENCE
-                v_n[3 * K :, speed] -= DIFFERENCE
-                moved = effect.force(layout, x_n, v_n, own)[:, speeds].reshape(4, K, -1)
-                by_position.append((moved[0] - moved[1]) / (2.0 * DIFFERENCE))
-                by_rate.append((moved[2] - moved[3]) / (2.0 * DIFFERENCE))
+                x_n, v_n, z_n = np.tile(x, (4, 1)), np.tile(v, (4, 1)), own.states.copy()
+                x_n[:K, speed + offset] += h
+                x_n[K : 2 * K, speed + offset] -= h
+                v_n[2 * K : 3 * K, speed] += h
+                v_n[3 * K :, speed] -= h
+                if effect.n_states:
+                    there, back = np.split(effect.state_rate(layout, x_n[2 * K :], v_n[2 * K :], z_n[2 * K :]), 2)
+                    z_n[:K] += 0.5 * (there - back)
+                    z_n[K : 2 * K] -= 0.5 * (there - back)
+                moved = effect.force(layout, x_n, v_n, replace(own, states=z_n))[:, speeds].reshape(4, K, -1)
+                by_position.append((moved[0] - moved[1]) / (2.0 * h))
+                by_rate.append((moved[2] - moved[3]) / (2.0 * h))
         return np.concatenate((*by_position, *by_rate), axis=1)
 
     def without(self, pi: Array) -> Array:
