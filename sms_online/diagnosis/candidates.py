@@ -23,11 +23,10 @@ from sms_online.effects.catalogue import ENTRIES, candidates
 from sms_online.model.model import Model
 from sms_online.model.parameters import Parameter
 from sms_online.pipeline.momentum_balance import HOPS
+from sms_online.pipeline.rough_forces import RoughForces
 from sms_online.stream import Array
 
 TORQUE_RATE = "torque rate"
-# Step of a force's derivative along a sensor's noise, of its deviation: no phase turns within it.
-SMALL = 0.01
 # Forces whose law is another for either sign of a motor's rate.
 REVERSING = (*DRY, "direction_friction")
 # Linear coefficients of effects on channels: quantity, unit, what a unit of it adds to a reading, with its sign. A lag
@@ -208,38 +207,25 @@ class CandidateColumns:
         return out
 
     def _spread(self, model: Model, coefficients: Array) -> Array:
-        """Variance (W, n_v) of the rows for a model's last effect, of a joint, to first order in the sensors' noise."""
-        force, layout, noise, sensing = model.effects[-1], model.layout, self.rows.noise, self.rows.sensing
-        joint = int(force.where.removeprefix("joint_")) - 1
-        offset = layout.n_base_positions - layout.n_base_speeds
-        readings = np.zeros((1, len(sensing.channels)))
-        readings[0, sensing.torque_columns[joint]] = noise.grid[len(sensing.position_columns) + joint]
-        torque = sensing.joint_torque(readings)[0]
+        """Variance (W, n_v) of the rows for a model's last effect, of a joint, to first order in encoders' noise."""
+        rough, noise, sensing = RoughForces(model), self.rows.noise, self.rows.sensing
+        columns = model.effect_slices[-1]
+        own = (rough.coefficients >= columns.start) & (rough.coefficients < columns.stop)
+        factor = coefficients[rough.coefficients[own] - columns.start]
+        to_row = np.eye(model.layout.n_v)[rough.rows[own]]
 
         def slopes(motion: Motion) -> tuple[Array, Array]:
             inputs = self._inputs(model, motion)
-
-            def change(x: Array | float, v: Array | float, torque: Array | float) -> Array:
-                ends = [
-                    force.force(
-                        layout,
-                        motion.x + part * x,
-                        motion.v + part * v,
-                        replace(inputs, torque=inputs.torque + part * torque),
-                    )
-                    for part in (0.5 * SMALL, -0.5 * SMALL)
-                ]
-                return np.asarray((ends[0] - ends[1]) @ coefficients / SMALL)
-
-            by_value, by_rate = [change(0.0, 0.0, torque)], [np.zeros_like(motion.v)]
+            signals = np.concatenate((inputs.torque, inputs.states), axis=1)
+            by_position, by_rate = np.split(rough.slopes(motion.x, motion.v, signals), 2, axis=1)
             # A reading of the motor moves the joint too where that is read as an angle beyond it.
-            along = sensing.displacements(motion.x[:1])[0]
-            for sensor in {layout.q[joint] + offset, layout.theta_m[joint] + offset}:
-                v = along[:, sensor] * noise.grid[sensor]
-                x = np.concatenate((np.zeros(layout.n_base_positions), v[layout.n_base_speeds :]))
-                by_value.append(change(x, 0.0, 0.0))
-                by_rate.append(change(0.0, v * self.system.sample_rate, 0.0))
-            return np.array(by_value), np.array(by_rate)
+            along = sensing.displacements(motion.x[:1])[0][rough.coordinates[own]] * noise.grid[: motion.x.shape[1]]
+            sensors = np.flatnonzero(np.any(along, axis=0))
+            by_value, by_change = (
+                np.stack([(part[:, own] * factor * along[:, sensor]) @ to_row for sensor in sensors])
+                for part in (by_position, by_rate)
+            )
+            return by_value, by_change * self.system.sample_rate
 
         return self._weak.spread(slopes)
 

@@ -103,7 +103,7 @@ def _curve(diagnosis: Diagnosis, where: str, name: str, own: list[int]) -> Force
         left = left + candidates[k].columns @ _coefficients(diagnosis, k)
     values = np.concatenate([variable(motion) for motion, _ in rows.weak.motions()])
     knots, at = _knots(values, jumps=name == SPEED)
-    white = rows.white(spline_columns(rows, variable, knots, direction))
+    white = rows.white(spline_columns(rows, variable, knots, direction, dense=True))
     found = gain(np.empty((len(white), 0)), rows.white(left[..., None])[:, 0], white)
     B = design(at, knots)
     std = np.sqrt(np.einsum("pi,ij,pj->p", B, found.covariance, B))

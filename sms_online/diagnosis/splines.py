@@ -24,10 +24,13 @@ def design(values: Array, knots: Array) -> Array:
     return np.asarray(BSpline.design_matrix(inside, knots, DEGREE).toarray())
 
 
-def spline_columns(rows: SessionRows, variable: Variable, knots: Array, direction: Array) -> Array:
-    """Columns (W, n_v, c) of one unit of each B-spline of a variable as a force along a direction (n_v,)."""
+def spline_columns(rows: SessionRows, variable: Variable, knots: Array, direction: Array, dense: bool = False) -> Array:
+    """Columns (W, n_v, c) of one unit of each B-spline of a variable as a force along a direction (n_v,).
+
+    dense: see `WeakWindows.columns`.
+    """
 
     def weak(motion: Motion) -> tuple[None, Array]:
         return None, direction[:, None] * design(variable(motion), knots)[:, None, :]
 
-    return rows.weak.columns(weak)
+    return rows.weak.columns(weak, dense)

@@ -41,7 +41,8 @@ class ForceEffect(Protocol):
 
     parameters: the linear coefficients as they enter π. shapes: shape constants. relative_to: names of the model's
     parameters that reported coefficients are divided by. n_states: number of internal states. smooth: whether it is as
-    smooth as the motion. A joint's force without internal states depends on that joint's positions, rates and torque.
+    smooth as the motion, which is thinned then. A joint's force and internal states depend on that joint's positions,
+    rates and torque.
     """
 
     name: str
