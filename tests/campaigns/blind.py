@@ -41,6 +41,7 @@ from sms_online.effects.spacecraft import TableTilt
 from sms_online.model.base_parameters import find_base_parameters
 from sms_online.model.model import Model
 from sms_online.pipeline.estimator import Estimator
+from sms_online.results import residuals
 from sms_online.stream import Array, Block
 from tests.campaigns.accuracy import flagged, read
 from tests.campaigns.sessions import disguised, exact_session, noisy_session, true_parameters
@@ -56,6 +57,8 @@ TOLERANCE = 1e-8
 
 # Asked of the residual on data not fitted, over what noise alone leaves.
 MOST_OVER_FLOOR = 1.2
+# A session of 20 s that leaves more than this multiple of the predicted noise leaves more than noise.
+MOST_IN_A_SESSION = 1.25
 # Asked of the median error of every parameter, over that of sessions whose description declares the effect.
 MOST_OVER_DECLARED = 1.5
 
@@ -236,6 +239,7 @@ def _case(system: System, block: Block, effect: Effect) -> Record:
         "before": {row: test.whitened for row, test in found.before.test.items()},
         "after": {row: test.whitened for row, test in found.after.test.items()},
         "holdout": found.after.holdout.whitened,
+        "session": _left(found.estimator_after),
         "errors": _errors(system, found.estimator_after),
         "declared": _declared(system, block, effect),
         "seconds": seconds,
@@ -250,6 +254,12 @@ def _declared(system: System, block: Block, effect: Effect) -> dict[str, float]:
     told.push(block)
     told.finish()
     return _errors(system, told)
+
+
+def _left(session: Estimator) -> dict[str, float]:
+    """What the rows of a session leave, over the noise predicted for them, by kind of row."""
+    rows = residuals(session, session.estimate().pi)
+    return {name: told["whitened"] for name, told in rows.items() if told["whitened"] is not None}
 
 
 def _errors(system: System, session: Estimator) -> dict[str, float]:
@@ -323,6 +333,7 @@ def summary(records: list[Record]) -> str:
         within = sum(times <= MOST_OVER_FLOOR for times in held)
         told = f"median {np.median(held):.2f}, worst {max(held):.2f} times predicted noise, {within} of {n} within"
         lines.append(f"held-out residual: {told} {MOST_OVER_FLOOR:g}")
+        lines += _in_sessions(singles)
         lines += _over_floor(singles, [r for r in records if r["kind"] == "clean" and r["name"] == GRADE])
         lines.append(f"seconds: median {np.median([r['seconds'] for r in singles]):.1f}")
         lines += _against_declared(singles)
@@ -341,6 +352,14 @@ def summary(records: list[Record]) -> str:
     if cleans:
         lines.append(f"{len(cleans)} clean: {sum(r['verdict'] != 'clean' for r in cleans)} more than noise")
     return "\n".join(lines)
+
+
+def _in_sessions(singles: list[Record]) -> list[str]:
+    """What sessions leave that declare what was found, and which of them more than noise."""
+    left = {f"{r['name']} {r['seed']}": max(r["session"].values()) for r in singles}
+    more = {name: round(worst, 2) for name, worst in left.items() if worst > MOST_IN_A_SESSION}
+    told = f"median {np.median(list(left.values())):.2f}, worst {max(left.values()):.2f} times predicted noise"
+    return [f"residual of a session that declares what was found: {told}, above {MOST_IN_A_SESSION:g}: {more}"]
 
 
 def _over_floor(singles: list[Record], cleans: list[Record]) -> list[str]:
