@@ -40,6 +40,8 @@ FITTED = 2.0 / 3.0
 # A verdict names effects that take away all but this share of what is beyond noise: a wrong one that is 10° from the
 # right one leaves sin² 10°.
 LARGEST_SHARE_LEFT = 0.03
+# No right effect leaves a row type more than this multiple of its noise, unless that is what its law is uncertain by.
+MOST_LEFT = 2.0
 # Windows that a session is judged by at most: of a longer one stretches are taken.
 MOST_WINDOWS = 2500
 # Stretches of a session that is used in part, in window lengths.
@@ -236,9 +238,9 @@ class Attempt:
         """Another search where an axis sticks and much was left, unless it leaves more than the first."""
         first = self.tracing
         beyond = any(row.beyond for row in self.test([]).values())
-        first.settle(chosen)
+        loud = any(row.whitened > MOST_LEFT for row in self.test(chosen).values())
         left = self.excess(chosen)
-        if not beyond or left <= LARGEST_SHARE_LEFT * self.excess([]):
+        if not beyond or not (loud or left > LARGEST_SHARE_LEFT * self.excess([])):
             return chosen
         again = self._search_again(sticking=True)
         if self.excess(again) < left:

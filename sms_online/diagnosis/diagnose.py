@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from sms_online.description.schema import Effect, System
-from sms_online.diagnosis.attempt import LARGEST_SHARE_LEFT, Attempt, Case, PriorOf, State, Step
+from sms_online.diagnosis.attempt import LARGEST_SHARE_LEFT, MOST_LEFT, Attempt, Case, PriorOf, State, Step
 from sms_online.diagnosis.candidate import DRY, Finding, Ranked
 from sms_online.diagnosis.constants import stands
 from sms_online.diagnosis.late_sensors import LateSensor, find_late
@@ -26,8 +26,6 @@ from sms_online.stream import Block
 CORRECTIONS = 3
 # Exact links have to take this share of what straight ones leave beyond noise.
 STIFFENING_TAKES = 0.1
-# No right effect leaves a row type more than this multiple of its noise, unless that is what its law is uncertain by.
-MOST_LEFT = 2.0
 
 
 @dataclass(frozen=True)
