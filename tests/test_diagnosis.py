@@ -21,7 +21,7 @@ from sms_online.diagnosis.diagnose import Diagnosis, diagnose
 from sms_online.diagnosis.document import coefficients, diagnosis_document
 from sms_online.effects.catalogue import parse_effect
 from sms_online.errors import InputError
-from sms_online.pipeline.momentum_balance import HOPS
+from sms_online.pipeline.momentum_windows import HOPS
 from sms_online.stream import Block
 from sms_sim.simulate import sampled_blocks, simulate
 from sms_tools.adopted_system import adopted_text

@@ -17,7 +17,8 @@ from sms_online.model.model import Model
 from sms_online.pipeline.estimator import Estimator
 from sms_online.pipeline.event_hypotheses import opened
 from sms_online.pipeline.events import Event
-from sms_online.pipeline.momentum_balance import HOPS, MARGIN
+from sms_online.pipeline.momentum_balance import MARGIN
+from sms_online.pipeline.momentum_windows import HOPS
 from sms_online.results import judged, results_document, standard_deviation
 from sms_online.stream import Array, Block
 from sms_online.trackers.factor import solve, triangular_factor

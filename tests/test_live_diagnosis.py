@@ -24,7 +24,7 @@ from sms_online.diagnosis.online import Immediate, OnlineDiagnosis, Searcher
 from sms_online.diagnosis.online_search import Outcome, Request, search
 from sms_online.errors import InputError
 from sms_online.pipeline.estimator import Estimator
-from sms_online.pipeline.momentum_balance import HOPS
+from sms_online.pipeline.momentum_windows import HOPS
 from sms_online.results import results_document
 from sms_online.stream import Array
 from sms_tools.cli import main

@@ -15,7 +15,8 @@ from sms_online.model.base_parameters import find_base_parameters
 from sms_online.model.model import Model
 from sms_online.pipeline import momentum_fit
 from sms_online.pipeline.estimator import Estimator
-from sms_online.pipeline.momentum_balance import COPIES, EXPONENT, MomentumBalance, Window
+from sms_online.pipeline.momentum_balance import MomentumBalance
+from sms_online.pipeline.momentum_windows import COPIES, EXPONENT, Window
 from sms_online.pipeline.smoothing import stride
 from sms_online.pipeline.weak_form import test_function as weak_test_function
 from sms_online.results import results_document

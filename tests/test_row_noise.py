@@ -16,7 +16,8 @@ from sms_online.description.schema import Effect, System
 from sms_online.model.base_parameters import find_base_parameters
 from sms_online.model.model import Model
 from sms_online.pipeline.latency import SourceGroup
-from sms_online.pipeline.momentum_balance import COPIES, HOPS, INSTANTS, MomentumBalance, Window
+from sms_online.pipeline.momentum_balance import MomentumBalance
+from sms_online.pipeline.momentum_windows import COPIES, HOPS, INSTANTS, Window
 from sms_online.pipeline.row_noise import CLOCK_ERROR, CLOCK_KNOWN, OWN_SHARE, RowNoise, Whitener
 from sms_online.pipeline.sensing import Sensing
 from sms_online.pipeline.sensitivity import Sensitivities

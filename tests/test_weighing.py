@@ -8,8 +8,9 @@ from prescribed_motion import prescribed
 
 from sms_online.model.base_parameters import find_base_parameters
 from sms_online.model.model import Model
-from sms_online.pipeline.momentum_balance import COPIES, HOPS, MomentumBalance
+from sms_online.pipeline.momentum_balance import MomentumBalance
 from sms_online.pipeline.momentum_fit import WARM_UP
+from sms_online.pipeline.momentum_windows import COPIES, HOPS
 from sms_online.pipeline.sensing import Sensing
 from sms_online.pipeline.sensor_noise import SensorNoise
 from sms_online.pipeline.weighing import Weighing

@@ -26,7 +26,7 @@ from sms_online.errors import InputError
 from sms_online.model.model import Model
 from sms_online.pipeline.conditioning import noise_gains
 from sms_online.pipeline.estimator import Estimator
-from sms_online.pipeline.momentum_balance import HOPS
+from sms_online.pipeline.momentum_windows import HOPS
 from sms_online.pipeline.sensor_noise import SensorNoise
 from sms_online.stream import Array
 from sms_online.trackers.interface import Prior

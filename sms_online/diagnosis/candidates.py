@@ -22,7 +22,7 @@ from sms_online.effects.base import Inputs, Ranges, position
 from sms_online.effects.catalogue import ENTRIES, candidates
 from sms_online.model.model import Model
 from sms_online.model.parameters import Parameter
-from sms_online.pipeline.momentum_balance import HOPS
+from sms_online.pipeline.momentum_windows import HOPS
 from sms_online.pipeline.rough_forces import RoughForces
 from sms_online.stream import Array
 

@@ -19,7 +19,7 @@ from sms_online.diagnosis.unexplained import Unexplained, describe_residual
 from sms_online.effects.catalogue import GEOMETRIC_STIFFENING, places
 from sms_online.errors import InputError
 from sms_online.pipeline.estimator import Estimator
-from sms_online.pipeline.momentum_balance import HOPS
+from sms_online.pipeline.momentum_windows import HOPS
 from sms_online.stream import Block
 
 # Times that the constants of channels' effects are improved, each with samples corrected by those found before.

@@ -25,7 +25,7 @@ from sms_online.diagnosis.record import Segment
 from sms_online.diagnosis.rows import SessionRows
 from sms_online.diagnosis.weak_windows import Motion, WeakWindows
 from sms_online.effects.catalogue import candidates
-from sms_online.pipeline.momentum_balance import HOPS
+from sms_online.pipeline.momentum_windows import HOPS
 from sms_online.stream import Array
 
 # Corners that are tried first, Hz, from that of the longest delay on; quicker lags are found to first order in their

@@ -29,7 +29,7 @@ from sms_online.effects.catalogue import ENTRIES, declarable
 from sms_online.effects.spacecraft import TableTilt
 from sms_online.model.base_parameters import BaseParameters
 from sms_online.model.model import Model
-from sms_online.pipeline.momentum_balance import HOPS
+from sms_online.pipeline.momentum_windows import HOPS
 from sms_online.pipeline.sensing import Sensing
 from sms_online.pipeline.sensor_noise import SensorNoise
 from sms_online.stream import Array

@@ -20,16 +20,8 @@ from sms_online.model.model import Model
 from sms_online.pipeline.joint_balance import EXPONENT as JOINT_EXPONENT
 from sms_online.pipeline.joint_balance import JointBalance
 from sms_online.pipeline.latency import clock_groups
-from sms_online.pipeline.momentum_balance import (
-    COPIES,
-    EXPONENT,
-    HOPS,
-    INSTANTS,
-    STEPS,
-    Instants,
-    MomentumBalance,
-    Window,
-)
+from sms_online.pipeline.momentum_balance import MomentumBalance
+from sms_online.pipeline.momentum_windows import COPIES, EXPONENT, HOPS, INSTANTS, STEPS, Instants, Window
 from sms_online.pipeline.row_noise import RowNoise, factored
 from sms_online.pipeline.sensing import Sensing
 from sms_online.pipeline.sensitivity import Sensitivities

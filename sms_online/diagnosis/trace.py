@@ -21,7 +21,7 @@ from sms_online.diagnosis.candidate import DRY, Candidate, Finding, Ranked
 from sms_online.diagnosis.evidence import Gain, basis, free_of, gain, least_squares, threshold, together
 from sms_online.diagnosis.plausible import plausible
 from sms_online.diagnosis.rows import SessionRows
-from sms_online.pipeline.momentum_balance import HOPS
+from sms_online.pipeline.momentum_windows import HOPS
 from sms_online.stream import Array
 from sms_online.trackers.factor import prior_factor, solve
 from sms_online.trackers.interface import Prior

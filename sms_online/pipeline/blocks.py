@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from sms_online.description.schema import System
-from sms_online.pipeline.momentum_balance import HOPS, half_hop, prompt_margin
+from sms_online.pipeline.momentum_balance import half_hop, prompt_margin
+from sms_online.pipeline.momentum_windows import HOPS
 from sms_online.pipeline.synchronise import SIDE
 
 # Samples that pass through the pipeline together are those of some time. Everything behind sees the same blocks however

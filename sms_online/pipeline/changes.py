@@ -27,8 +27,9 @@ from sms_online.pipeline.event_hypotheses import (
 )
 from sms_online.pipeline.event_instant import event_instant
 from sms_online.pipeline.events import REMEMBERED, ChangeDetector, Event, Seen
-from sms_online.pipeline.momentum_balance import COPIES, INSTANTS, MARGIN, MomentumBalance
+from sms_online.pipeline.momentum_balance import MARGIN, MomentumBalance
 from sms_online.pipeline.momentum_fit import MomentumFit
+from sms_online.pipeline.momentum_windows import COPIES, INSTANTS
 from sms_online.pipeline.sensing import Sensing
 from sms_online.pipeline.sensor_noise import SensorNoise
 from sms_online.pipeline.synchronise import GridSamples

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from sms_online.model.model import Model
 from sms_online.pipeline.events import Seen
-from sms_online.pipeline.momentum_balance import EXPONENT, INSTANTS
+from sms_online.pipeline.momentum_windows import EXPONENT, INSTANTS
 from sms_online.pipeline.smoothing import smooth
 from sms_online.pipeline.weak_form import test_function
 from sms_online.stream import Array

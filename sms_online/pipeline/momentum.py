@@ -17,8 +17,9 @@ from sms_online.pipeline.changes import Adoption, Changes
 from sms_online.pipeline.errors_in_variables import NoiseBias
 from sms_online.pipeline.events import Event
 from sms_online.pipeline.latency import Latencies, clock_groups, source_groups
-from sms_online.pipeline.momentum_balance import COPIES, HOPS, MomentumBalance
+from sms_online.pipeline.momentum_balance import MomentumBalance
 from sms_online.pipeline.momentum_fit import FIRST_MOTION, MomentumFit, WhiteRows
+from sms_online.pipeline.momentum_windows import COPIES, HOPS
 from sms_online.pipeline.residual_test import SequentialTest
 from sms_online.pipeline.sensing import Sensing
 from sms_online.pipeline.sensor_noise import NoiseEstimate, SensorNoise, noise_from_state, noise_state

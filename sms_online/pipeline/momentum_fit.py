@@ -22,12 +22,12 @@ from numpy.typing import NDArray
 
 from sms_online.model.base_parameters import BaseParameters
 from sms_online.model.model import Model
-from sms_online.pipeline.momentum_balance import (
+from sms_online.pipeline.momentum_balance import MomentumBalance
+from sms_online.pipeline.momentum_windows import (
     COPIES,
     HOPS,
     INSTANTS,
     Instants,
-    MomentumBalance,
     Probes,
     Window,
     windows_from_state,

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from scipy.linalg.lapack import dtrtrs
 
 from sms_online.pipeline.latency import SourceGroup
-from sms_online.pipeline.momentum_balance import EXPONENT, HOPS, INSTANTS, STEPS
+from sms_online.pipeline.momentum_windows import EXPONENT, HOPS, INSTANTS, STEPS
 from sms_online.pipeline.sensitivity import SPARSE, Sensitivity, nodes
 from sms_online.pipeline.weak_form import test_function
 from sms_online.stream import Array

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from sms_online.model.dynamics import Dynamics
 from sms_online.model.model import Model
-from sms_online.pipeline.momentum_balance import INSTANTS, Columns, Instants
+from sms_online.pipeline.momentum_windows import INSTANTS, Columns, Instants
 from sms_online.stream import Array
 
 # Step of the differences that give derivatives: 1e-8 of their size is lost to curvature, as much to rounding.

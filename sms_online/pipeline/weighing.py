@@ -18,7 +18,8 @@ from numpy.typing import NDArray
 from sms_online.model.base_parameters import BaseParameters
 from sms_online.model.model import Model
 from sms_online.pipeline.latency import LatencyColumns, SourceGroup
-from sms_online.pipeline.momentum_balance import COPIES, INSTANTS, Instants, MomentumBalance, Probes, Window
+from sms_online.pipeline.momentum_balance import MomentumBalance
+from sms_online.pipeline.momentum_windows import COPIES, INSTANTS, Instants, Probes, Window
 from sms_online.pipeline.row_noise import RowNoise, Whitener
 from sms_online.pipeline.sensitivity import Sensitivities
 from sms_online.pipeline.sensor_noise import SensorNoise, noise_from_state, noise_state

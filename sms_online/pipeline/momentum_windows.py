@@ -1,0 +1,82 @@
+"""Windows of the momentum balance: where they are, and what the balance makes of each."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sms_online.stream import Array
+
+# Exponent of φ = (1 - z²)⁶: smooth enough that sums over samples are integrals and that two derivatives of φ, which
+# multiply position noise, stay calm.
+EXPONENT = 6
+HOPS = 10  # a window begins every tenth of a window
+# Instants of a window at which the sensitivity to noise is told, two a hop: it changes as slowly as the motion.
+INSTANTS = 2 * HOPS
+# Steps of a window at which it is known what noise adds to its rows: two for each instant.
+STEPS = 2 * INSTANTS
+# Copies of motion and torques: as measured, and with synthetic noise added and subtracted.
+COPIES = 3
+
+
+@dataclass(frozen=True)
+class Instants:
+    """States at `number`, `number` + 1, …, in half hops since the segment began: x (K, n_x), v (K, n_v).
+
+    signals (K, joints + n_states): n τ, then internal states of effects. probed: columns of momentum and force at the
+    states that `Probes` adds, where there are any.
+    """
+
+    number: int
+    x: Array
+    v: Array
+    signals: Array
+    probed: Columns | None = None
+
+
+# Columns P and G (E, n_v, n_pi) of `Model.momentum_columns`.
+Columns = tuple[Array, Array]
+# Further states x (E, n_x), v (E, n_v), signals (E, joints + n_states) at which somebody wants them, of new instants:
+# with those of the rows in one call, for of few states a call costs more than these.
+Probes = Callable[[Instants], tuple[Array, Array, Array]]
+
+
+@dataclass(frozen=True)
+class Window:
+    """Weak-form rows of one window, one for each generalized speed, in N s (N m s).
+
+    start: its first instant, in half hops since the segment began. end: grid index of its last sample. Y (copies,
+    nonzero): columns of the base parameters where the model has any (`MomentumBalance.rows`, `.columns`); b (copies,
+    n_v). The first copy is that of the samples as measured, the others those of the samples with noise added.
+    half_width: M of the filter. rough (STEPS + 1, E): what noise does by way of rough forces, see `RoughForces.kernel`.
+    """
+
+    start: int
+    end: int
+    Y: Array
+    b: Array
+    half_width: int
+    rough: Array
+
+
+def windows_state(name: str, windows: list[Window]) -> dict[str, Any]:
+    """Windows as arrays, to be saved under names that begin with `name`."""
+    return {
+        f"{name}_place": np.array([(w.start, w.end, w.half_width) for w in windows], dtype=np.int64).reshape(-1, 3),
+        f"{name}_Y": np.array([w.Y for w in windows]),
+        f"{name}_b": np.array([w.b for w in windows]),
+        f"{name}_rough": np.array([w.rough for w in windows]),
+    }
+
+
+def windows_from_state(name: str, state: Mapping[str, NDArray[Any]]) -> list[Window]:
+    """The windows that `windows_state` saved."""
+    places, *parts = (state[f"{name}_{part}"] for part in ("place", "Y", "b", "rough"))
+    return [
+        Window(int(start), int(end), np.array(Y), np.array(b), int(half_width), np.array(rough))
+        for (start, end, half_width), Y, b, rough in zip(places, *parts, strict=True)
+    ]
