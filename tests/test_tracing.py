@@ -11,8 +11,9 @@ import pytest
 from numpy.typing import NDArray
 
 from sms_online.description.schema import Effect
-from sms_online.diagnosis.candidate import DRY, Candidate
+from sms_online.diagnosis.candidate import Candidate
 from sms_online.diagnosis.trace import Tracing
+from sms_online.effects.friction import DRY
 from sms_online.model.parameters import Parameter
 from sms_online.stream import Array
 

@@ -10,8 +10,6 @@ from sms_online.diagnosis.evidence import Gain
 from sms_online.model.parameters import Parameter
 from sms_online.stream import Array
 
-# Laws of dry friction: what they give at a standstill is any value up to that of the law.
-DRY = ("coulomb_friction", "stribeck_friction", "load_friction")
 # Effects that contain a simpler one, which is to be tried first, as is everything else: they refine a law.
 EXTENDS = {"direction_friction": "viscous_friction"}
 

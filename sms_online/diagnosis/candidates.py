@@ -11,7 +11,7 @@ from itertools import product
 import numpy as np
 
 from sms_online.description.schema import Effect, System
-from sms_online.diagnosis.candidate import DRY, Candidate
+from sms_online.diagnosis.candidate import Candidate
 from sms_online.diagnosis.constants import is_constant
 from sms_online.diagnosis.followed import FollowedMotion
 from sms_online.diagnosis.reversals import Reversals
@@ -20,6 +20,7 @@ from sms_online.diagnosis.standstill import Standstill
 from sms_online.diagnosis.weak_windows import Motion, WeakWindows
 from sms_online.effects.base import Inputs, Ranges, position
 from sms_online.effects.catalogue import ENTRIES, candidates
+from sms_online.effects.friction import DRY
 from sms_online.model.model import Model
 from sms_online.model.parameters import Parameter
 from sms_online.pipeline.momentum_windows import HOPS

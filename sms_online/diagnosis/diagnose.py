@@ -9,7 +9,7 @@ import numpy as np
 
 from sms_online.description.schema import Effect, System
 from sms_online.diagnosis.attempt import LARGEST_SHARE_LEFT, MOST_LEFT, Attempt, Case, PriorOf, State, Step
-from sms_online.diagnosis.candidate import DRY, Finding, Ranked
+from sms_online.diagnosis.candidate import Finding, Ranked
 from sms_online.diagnosis.constants import stands
 from sms_online.diagnosis.late_sensors import LateSensor, find_late
 from sms_online.diagnosis.record import SampleRecord
@@ -17,6 +17,7 @@ from sms_online.diagnosis.residuals import RowResidual
 from sms_online.diagnosis.trace import DECISIVE, INEXACT, INEXACT_DRY
 from sms_online.diagnosis.unexplained import Unexplained, describe_residual
 from sms_online.effects.catalogue import GEOMETRIC_STIFFENING, places
+from sms_online.effects.friction import DRY
 from sms_online.errors import InputError
 from sms_online.pipeline.estimator import Estimator
 from sms_online.pipeline.momentum_windows import HOPS

@@ -169,7 +169,7 @@ class SessionRows:
                 age = window.end / self._rate
                 kernel = row_noise.kernel(sensitivity) + rough.kernel(window.rough, pi, sensitivity.displacements)
                 covariances = row_noise.covariance(kernel, sensitivity.rates, noise.sensors, noise.torque, age)
-                covariances[-1][np.diag_indices(n_v)] += variance
+                covariances[-1][np.diag_indices(n_v)] += variance + rough.at_rest(window.rest, pi)
                 self._covariances.append(covariances)
                 # Sums over the steps, sensor by sensor.
                 by_sensor = kernel.transpose(2, 1, 0) * (span / STEPS)

@@ -17,10 +17,11 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from sms_online.diagnosis.candidate import DRY, Candidate, Finding, Ranked
+from sms_online.diagnosis.candidate import Candidate, Finding, Ranked
 from sms_online.diagnosis.evidence import Gain, basis, free_of, gain, least_squares, threshold, together
 from sms_online.diagnosis.plausible import plausible
 from sms_online.diagnosis.rows import SessionRows
+from sms_online.effects.friction import DRY
 from sms_online.pipeline.momentum_windows import HOPS
 from sms_online.stream import Array
 from sms_online.trackers.factor import prior_factor, solve

@@ -14,6 +14,8 @@ from sms_online.effects.base import Entry, Force, Inputs, Ranges, Shape, Site, p
 from sms_online.model.layout import Layout
 from sms_online.stream import Array
 
+# Laws of dry friction: what they give at a standstill is any value up to that of the law.
+DRY = ("coulomb_friction", "stribeck_friction", "load_friction")
 # Speed below which an axis stands still, rad/s (m/s): an integrator cannot follow a jump, and encoders resolve no less.
 STANDSTILL = 1e-4
 

@@ -30,6 +30,7 @@ from sms_online.pipeline.momentum_windows import (
 )
 from sms_online.pipeline.rough_forces import RoughForces, responses
 from sms_online.pipeline.smoothing import HALF_WIDTHS, WidthChoice, smooth, stride
+from sms_online.pipeline.standstill import lasting, rate_filter, slowest
 from sms_online.pipeline.weak_form import test_function
 from sms_online.stream import Array
 
@@ -163,6 +164,8 @@ class MomentumBalance:
             fresh = instants[0] if probes is not None and len(instants) == 1 and not windows else None
             further = None if fresh is None or probes is None else probes(fresh)
             rows, probed = self._rows(half_width, [window for window, _ in run], grid, further)
+            if self.rough.columns.size:
+                rows = self._with_rough(half_width, rows, sigma)
             windows += rows
             if fresh is not None:
                 instants = [replace(fresh, probed=probed)]
@@ -228,23 +231,40 @@ class MomentumBalance:
             weak = -(phi_dot @ values[:, :width] + phi @ values[:, width : 2 * width]).reshape(COPIES, -1)
             b = (phi @ values[:, 2 * width :]).reshape(COPIES, -1) - weak[:, entries:]
             last = grid + window + self.width + self.lead
-            no_rough = np.empty((STEPS + 1, 0))
-            out.append(Window(window // self.half_hop, last, weak[:, :entries], b, half_width, no_rough))
-        return self._with_rough(half_width, windows, out) if self.rough.columns.size else out, probed
+            none = np.empty((STEPS + 1, 0)), np.empty(0)
+            out.append(Window(window // self.half_hop, last, weak[:, :entries], b, half_width, *none))
+        return out, probed
 
-    def _with_rough(self, half_width: int, windows: list[int], rows: list[Window]) -> list[Window]:
-        """Rows with the columns of rough forces."""
+    def _with_rough(self, half_width: int, rows: list[Window], sigma: Array) -> list[Window]:
+        """Rows with the columns of rough forces, and what these leave open."""
         phi, _ = self._phi[1]
-        width = COPIES * (self._rough.size + self.model.layout.n_v)
-        kept = self._kept(self._dense, half_width, 1, windows[0], width + 2 * self.rough.rows.size)
+        windows = [row.start * self.half_hop for row in rows]
+        parts = np.cumsum([COPIES * (self._rough.size + self.model.layout.n_v), 2 * self.rough.rows.size])
+        kept = self._kept(self._dense, half_width, 1, windows[0], int(parts[-1]) + self.rough.dry.size)
         out = []
-        for row, values in zip(rows, self._seen(kept, half_width, windows, self._rough_columns), strict=True):
-            weak = -(phi @ values[:, :width]).reshape(COPIES, -1)
+        seen = self._seen(kept, half_width, windows, self._rough_columns)
+        for window, row, values in zip(windows, rows, seen, strict=True):
+            columns, slopes, breaking = np.split(values, parts, axis=1)
+            weak = -(phi @ columns).reshape(COPIES, -1)
             Y = row.Y.copy()
             Y[:, self._rough] = weak[:, : self._rough.size]
-            told = responses(values[:, width:], phi * self.sample_rate, half_width, self.sample_rate, STEPS)
-            out.append(replace(row, Y=Y, b=row.b - weak[:, self._rough.size :], rough=told))
+            told = responses(slopes, phi * self.sample_rate, half_width, self.sample_rate, STEPS)
+            rest = phi @ (breaking * self._resting(window, sigma))
+            out.append(replace(row, Y=Y, b=row.b - weak[:, self._rough.size :], rough=told, rest=rest))
         return out
+
+    def _resting(self, window: int, sigma: Array) -> NDArray[np.bool_]:
+        """At which samples of a window the axes of dry friction stand still (width + 1, D); sigma as in `push`."""
+        layout, rate = self.model.layout, self.sample_rate
+        M = min(rate_filter(rate), self.lead, self.margin)
+        centres = np.arange(window, window + self.width + 1) + self.lead - self._first
+        still = np.empty((centres.size, self.rough.motors.size), dtype=bool)
+        for motor in np.unique(self.rough.motors).tolist():
+            angle = motor + layout.n_base_positions - layout.n_base_speeds
+            rates = smooth(self._samples[:, angle : angle + 1], centres, M, rate)[1]
+            slow = np.abs(rates[:, 0]) < slowest(float(sigma[angle]), M, rate)
+            still[:, self.rough.motors == motor] = lasting(slow, rate)[:, None]
+        return still
 
     def _kept(self, kept: dict[int, _Smoothed], half_width: int, step: int, first: int, entries: int) -> _Smoothed:
         """What windows of this half width have asked for that windows from sample `first` on may ask for too."""
@@ -299,11 +319,11 @@ class MomentumBalance:
         return np.concatenate((*packed, force.reshape(K, -1)), axis=1), probed
 
     def _rough_columns(self, x: Array, v: Array, signals: Array) -> Array:
-        """G of rough forces alone, likewise, and their slopes: (K, entries)."""
+        """G of rough forces alone, likewise, their slopes, and what breaks them loose: (K, entries)."""
         own, K = self._distinct(x, v, signals)
-        return np.concatenate(
-            (self._packed(self.rough.force(*own), self._rough, K), self.rough.slopes(x[0], v[0], signals[0])), axis=1
-        )
+        measured = x[0], v[0], signals[0]
+        packed = self._packed(self.rough.force(*own), self._rough, K)
+        return np.concatenate((packed, self.rough.slopes(*measured), self.rough.breaking(*measured)), axis=1)
 
     def _distinct(self, x: Array, v: Array, signals: Array) -> tuple[list[Array], int]:
         """States of the copies one below the other, and how many a copy has: without noise all copies are one."""

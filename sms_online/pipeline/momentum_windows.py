@@ -53,6 +53,7 @@ class Window:
     nonzero): columns of the base parameters where the model has any (`MomentumBalance.rows`, `.columns`); b (copies,
     n_v). The first copy is that of the samples as measured, the others those of the samples with noise added.
     half_width: M of the filter. rough (STEPS + 1, E): what noise does by way of rough forces, see `RoughForces.kernel`.
+    rest (D,): see `RoughForces.at_rest`.
     """
 
     start: int
@@ -61,6 +62,7 @@ class Window:
     b: Array
     half_width: int
     rough: Array
+    rest: Array
 
 
 def windows_state(name: str, windows: list[Window]) -> dict[str, Any]:
@@ -70,13 +72,14 @@ def windows_state(name: str, windows: list[Window]) -> dict[str, Any]:
         f"{name}_Y": np.array([w.Y for w in windows]),
         f"{name}_b": np.array([w.b for w in windows]),
         f"{name}_rough": np.array([w.rough for w in windows]),
+        f"{name}_rest": np.array([w.rest for w in windows]),
     }
 
 
 def windows_from_state(name: str, state: Mapping[str, NDArray[Any]]) -> list[Window]:
     """The windows that `windows_state` saved."""
-    places, *parts = (state[f"{name}_{part}"] for part in ("place", "Y", "b", "rough"))
+    places, *parts = (state[f"{name}_{part}"] for part in ("place", "Y", "b", "rough", "rest"))
     return [
-        Window(int(start), int(end), np.array(Y), np.array(b), int(half_width), np.array(rough))
-        for (start, end, half_width), Y, b, rough in zip(places, *parts, strict=True)
+        Window(int(start), int(end), np.array(Y), np.array(b), int(half_width), np.array(rough), np.array(rest))
+        for (start, end, half_width), Y, b, rough, rest in zip(places, *parts, strict=True)
     ]

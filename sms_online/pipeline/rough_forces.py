@@ -14,6 +14,7 @@ from itertools import product
 import numpy as np
 from numpy.typing import NDArray
 
+from sms_online.effects.friction import DRY, STANDSTILL
 from sms_online.model.model import Model
 from sms_online.pipeline.smoothing import kernel
 from sms_online.stream import Array
@@ -21,6 +22,8 @@ from sms_online.stream import Array
 # Step of the differences that give slopes, rad and rad/s (m, m/s): 1e-9 of a force is lost to curvature where a phase
 # turns 300 times as fast as its joint, and as much to rounding.
 DIFFERENCE = 1e-6
+# Rate of an axis that moves off, rad/s (m/s): beyond what a sign is smoothed by, within what friction falls by.
+MOVING_OFF = 10.0 * STANDSTILL
 
 
 class RoughForces:
@@ -28,7 +31,8 @@ class RoughForces:
 
     columns (c,): their places in π. rows, coefficients, coordinates (E,): of the entries of `slopes`: generalized
     speed whose row a force is in, place in π of its coefficient, speed along which a position or rate changes; of
-    joints' forces, which depend on that joint's positions and rates.
+    joints' forces, which depend on that joint's positions and rates. motors, dry (D,): of laws of dry friction, speed
+    of the motor, place in π of the coefficient.
     """
 
     def __init__(self, model: Model) -> None:
@@ -40,12 +44,21 @@ class RoughForces:
             k: sorted({layout.theta_m[i], layout.q[i]})
             for k in rough
             if model.effects[k].where.startswith("joint_")
-            for i in [int(model.effects[k].where.removeprefix("joint_")) - 1]
+            for i in [self._joint(k)]
         }
         entries = [
             entry for k, speeds in self._joints.items() for entry in product(speeds, speeds, self._places(k).tolist())
         ]
         self.coordinates, self.rows, self.coefficients = np.array(entries, dtype=np.int64).reshape(-1, 3).T
+        self._dry = [(k, self._motor(k)) for k in rough if model.effects[k].name in DRY]
+        dry = [(motor, place) for k, motor in self._dry for place in self._places(k).tolist()]
+        self.motors, self.dry = np.array(dry, dtype=np.int64).reshape(-1, 2).T
+
+    def _joint(self, k: int) -> int:
+        return int(self._model.effects[k].where.removeprefix("joint_")) - 1
+
+    def _motor(self, k: int) -> int:
+        return self._model.layout.theta_m[self._joint(k)]
 
     def _places(self, k: int) -> NDArray[np.int64]:
         columns = self._model.effect_slices[k]
@@ -86,6 +99,25 @@ class RoughForces:
                 by_position.append((moved[0] - moved[1]) / (2.0 * h))
                 by_rate.append((moved[2] - moved[3]) / (2.0 * h))
         return np.concatenate((*by_position, *by_rate), axis=1)
+
+    def breaking(self, x: Array, v: Array, signals: Array) -> Array:
+        """What breaks an axis of dry friction loose (K, D): force of one unit of each coefficient as it moves off."""
+        out = np.empty((len(x), self.dry.size))
+        acting = list(self._model.acting(self._model.inputs(signals)))
+        for k, motor in self._dry:
+            effect, _, own = acting[k]
+            slow = v.copy()
+            slow[:, motor] = MOVING_OFF
+            out[:, np.isin(self.dry, self._places(k))] = effect.force(self._model.layout, x, slow, own)[:, motor]
+        return out
+
+    def at_rest(self, rest: Array, pi: Array) -> Array:
+        """Variance (n_v,) of rows for what dry friction may be at a standstill: any value up to what breaks it loose.
+
+        rest (D,): integral of `breaking` over the window where its axis rests. pi (n_pi,).
+        """
+        by_motor = np.eye(self._model.layout.n_v)[:, self.motors]
+        return np.asarray((by_motor @ (rest * pi[self.dry])) ** 2)
 
     def without(self, pi: Array) -> Array:
         """π (n_pi,) without the forces that `slopes` tells."""

@@ -114,7 +114,7 @@ class Weighing:
         covariances = self._noise.covariance(kernel, sensitivity.rates, noise.sensors, noise.torque, age)
         own = covariances[-1]
         diagonal = np.einsum("ii->i", own)
-        diagonal += errors
+        diagonal += errors + self._rough.at_rest(window.rest, pi)
         of_noise = own.copy()
         diagonal += self.misfit * diagonal
         width = rows.shape[1]
