@@ -73,11 +73,12 @@ class RoughForces:
         return out
 
     def slopes(self, x: Array, v: Array, signals: Array) -> Array:
-        """(K, 2 E): of one unit of each coefficient by position, then by rate, at states as in `force`.
+        """(K, 2 E): of one unit of each coefficient by position, then by rate, at states as in `force`, in time order.
 
-        Noise is faster than internal states forget: a state moves with a position as its rate does with that speed.
+        By rate of the force averaged over a sample, which is what a sum over samples can tell of one that jumps. Noise
+        is faster than internal states forget: a state moves with a position as its rate does with that speed.
         """
-        layout, K, h = self._model.layout, len(x), DIFFERENCE
+        layout, K = self._model.layout, len(x)
         offset = layout.n_base_positions - layout.n_base_speeds
         by_position, by_rate = [np.empty((K, 0))], [np.empty((K, 0))]
         acting = list(self._model.acting(self._model.inputs(np.tile(signals, (4, 1)))))
@@ -85,19 +86,20 @@ class RoughForces:
             effect, _, own = acting[k]
             assert own is not None
             for speed in speeds:
+                within = np.maximum(DIFFERENCE, 0.5 * np.abs(np.gradient(v[:, speed])))
                 # Each position there and back, then each rate.
                 x_n, v_n, z_n = np.tile(x, (4, 1)), np.tile(v, (4, 1)), own.states.copy()
-                x_n[:K, speed + offset] += h
-                x_n[K : 2 * K, speed + offset] -= h
-                v_n[2 * K : 3 * K, speed] += h
-                v_n[3 * K :, speed] -= h
+                x_n[: 2 * K, speed + offset] += np.repeat((DIFFERENCE, -DIFFERENCE), K)
+                v_n[2 * K :, speed] += np.concatenate((within, -within))
                 if effect.n_states:
-                    there, back = np.split(effect.state_rate(layout, x_n[2 * K :], v_n[2 * K :], z_n[2 * K :]), 2)
-                    z_n[:K] += 0.5 * (there - back)
-                    z_n[K : 2 * K] -= 0.5 * (there - back)
-                moved = effect.force(layout, x_n, v_n, replace(own, states=z_n))[:, speeds].reshape(4, K, -1)
-                by_position.append((moved[0] - moved[1]) / (2.0 * h))
-                by_rate.append((moved[2] - moved[3]) / (2.0 * h))
+                    rates = effect.state_rate(layout, x_n[2 * K :], v_n[2 * K :], z_n[2 * K :])
+                    moved = DIFFERENCE * (rates[:K] - rates[K:]) / (2.0 * within[:, None])
+                    z_n[: 2 * K] += np.concatenate((moved, -moved))
+                there, back, up, down = effect.force(layout, x_n, v_n, replace(own, states=z_n))[:, speeds].reshape(
+                    4, K, -1
+                )
+                by_position.append((there - back) / (2.0 * DIFFERENCE))
+                by_rate.append((up - down) / (2.0 * within[:, None]))
         return np.concatenate((*by_position, *by_rate), axis=1)
 
     def breaking(self, x: Array, v: Array, signals: Array) -> Array:
