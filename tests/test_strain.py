@@ -54,5 +54,5 @@ def test_gauges_may_lag_alone_and_together(strips: Model) -> None:
 
 
 def test_a_flexible_joint_needs_one_of_both(strips: Model) -> None:
-    with pytest.raises(InputError, match=r"no channel 'q_1'; expected q_1 or link_1\.strain_angle"):
+    with pytest.raises(InputError, match=r"no channel 'q_1'; expected a column q_1 or link_1\.strain_angle"):
         Sensing(strips, DRIVES, "test")

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from sms_online.description.channels import sensed_channels, strain_channel
+from sms_online.description.explain import hint, nearest
 from sms_online.description.schema import System
 from sms_online.errors import InputError
 from sms_online.model.beam import LinearLink
@@ -55,7 +56,8 @@ class Sensing:
                     if name not in channels:
                         channels.append(name)
                     return channels.index(name)
-            raise InputError(source, "header", f"no channel {alternatives[0]!r}", f"{' or '.join(alternatives)}")
+            expected = f"a column {' or '.join(alternatives)}{hint(nearest(alternatives[0], available))}"
+            raise InputError(source, "header", f"no channel {alternatives[0]!r}", expected)
 
         base = layout.position_names[: layout.n_base_positions]
         self._base = [need(name) for name in base]

@@ -20,7 +20,7 @@ ONLINE_NAME = "adopted.toml"
 def adopted_text(described: str, before: System, after: System, remarks: Mapping[str, str]) -> str:
     """TOML of the system `after`: the text of `described`, file or name of the system `before`, and what is new.
 
-    remarks: what to say of an effect without coefficients, by name@where, for people: a session estimates them anew.
+    remarks: what to say of an effect, by name@where, for people: a session estimates what is no shape constant anew.
     """
     lines = _text(described).rstrip().splitlines()
     if after.gravity != before.gravity:
@@ -39,7 +39,7 @@ def adopted_text(described: str, before: System, after: System, remarks: Mapping
             if effect.coefficients:
                 inside = ", ".join(f"{name} = {value:.9g}" for name, value in effect.coefficients.items())
                 lines.append(f"coefficients = {{ {inside} }}")
-            elif remark := remarks.get(f"{effect.name}@{effect.where}"):
+            if remark := remarks.get(f"{effect.name}@{effect.where}"):
                 lines.append(f"# found: {remark}")
     return "\n".join(lines) + "\n"
 

@@ -73,7 +73,10 @@ def run(args: argparse.Namespace) -> int:
     lines: list[Table | str | Text] = ["", document["summary"], ""]
     if document["effects"]:
         lines += [_effects(document), ""]
-    lines += [_residuals(document), "", parameter_table(document["after"], console.width, title="after"), ""]
+    # See `diagnosis_document`.
+    origin = "by a replay with it" if diagnosis.attempt.prior is None else "from the rows of the diagnosis"
+    title = f"parameters with what was found, {origin}"
+    lines += [_residuals(document), "", parameter_table(document["after"], console.width, title=title), ""]
     lines += [f"warning: {warning}" for warning in document["warnings"]]
     path = write_document(directory / NAME, document)
     added: list[str] = []
@@ -161,7 +164,13 @@ def _samples(
 
 
 def _effects(document: Document) -> Table:
-    table = Table(title="effects", title_justify="left", box=None, header_style="bold", pad_edge=False)
+    table = Table(
+        title="effects, from the rows of the diagnosis",
+        title_justify="left",
+        box=None,
+        header_style="bold",
+        pad_edge=False,
+    )
     for heading in ("effect", "coefficient", "estimate", "± std", "unit", "cannot be told from"):
         table.add_column(heading, justify="right" if heading in ("estimate", "± std") else "left", overflow="fold")
     for effect in document["effects"]:
