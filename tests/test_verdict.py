@@ -14,7 +14,7 @@ from sms_online.diagnosis import diagnose
 from sms_online.diagnosis.record import Segment
 from sms_online.diagnosis.residuals import RowResidual
 from sms_online.diagnosis.reversals import Reversals
-from sms_online.diagnosis.standstill import Standstill
+from sms_online.diagnosis.standstill import SessionStandstill
 from sms_online.diagnosis.weak_windows import Motion
 from sms_online.pipeline.smoothing import smooth
 
@@ -107,7 +107,7 @@ def test_an_axis_stands_still_where_its_rate_is_noise_for_longer_than_a_reversal
     position = np.cumsum(rate)[:, None] / 1000.0 + noise * np.random.default_rng(5).standard_normal((t.size, 1))
     layout = SimpleNamespace(theta_m=(0,), n_base_positions=3, n_base_speeds=3)
     sensing: Any = SimpleNamespace(model=SimpleNamespace(layout=layout), coordinates=lambda values: values)
-    held = Standstill(sensing, [Segment(np.arange(t.size), position)], 0, noise, 1000.0)
+    held = SessionStandstill(sensing, [Segment(np.arange(t.size), position)], 0, noise, 1000.0)
     rested = smooth(position, np.arange(1150, 1550, 4), 28, 1000.0)[1]
     assert held.slow == pytest.approx(4.0 * rested.std(), rel=0.35)
     seen = np.arange(100, 2900)

@@ -16,7 +16,7 @@ from sms_online.diagnosis.constants import is_constant
 from sms_online.diagnosis.followed import FollowedMotion
 from sms_online.diagnosis.reversals import Reversals
 from sms_online.diagnosis.rows import SessionRows
-from sms_online.diagnosis.standstill import Standstill
+from sms_online.diagnosis.standstill import SessionStandstill
 from sms_online.diagnosis.weak_windows import Motion, WeakWindows
 from sms_online.effects.base import Inputs, Ranges, position
 from sms_online.effects.catalogue import ENTRIES, candidates
@@ -54,7 +54,7 @@ class CandidateColumns:
         self._since = since
         self._weak = rows.weak if weak is None else weak
         self._noisy: list[CandidateColumns] = []
-        self._held: dict[str, Standstill] = {}
+        self._held: dict[str, SessionStandstill] = {}
         self._turned: dict[str, Reversals] = {}
         self._own = {p.name for p in rows.model.parameters}
 
@@ -151,7 +151,7 @@ class CandidateColumns:
             return Candidate(effect, parameters, self._weak.columns(inertia))
         return Candidate(effect, parameters, self._force(model))
 
-    def _force(self, model: Model, held: Standstill | None = None) -> Array:
+    def _force(self, model: Model, held: SessionStandstill | None = None) -> Array:
         """Columns (W, n_v, c) of a model's last effect; held: breaking loose where its axis stands still, alone."""
         force = model.effects[-1]
 
@@ -175,10 +175,11 @@ class CandidateColumns:
     def variance(self, candidate: Candidate, coefficients: Array) -> Array:
         """Variance (W, n_v) of the rows for what the sensors' noise makes of a force with coefficients (c,).
 
-        To first order where a joint's positions, rates and torque tell the force. Else by a few draws of it in every
-        window, averaged over the windows that a window overlaps: the noise of a force that jumps with a rate's sign is
-        that of its reversals, and no derivative tells it. Where its axis stands still dry friction takes any value up
-        to that of its law.
+        To first order where a joint's positions and rates tell the force; the noise of a torque that a gain or a ripple
+        takes in is left out beside the torque's own. Else by a few draws of it in every window, averaged over the
+        windows that a window overlaps. Of a force that jumps with a rate's sign it is that of its reversals, which a
+        whole session tells better than a derivative does while one runs. Where its axis stands still dry friction takes
+        any value up to that of its law.
         """
         effect = candidate.effect
         if ENTRIES[effect.name].kind != "force" or is_constant(effect) or self.rows.noise.exact:
@@ -218,7 +219,8 @@ class CandidateColumns:
         def slopes(motion: Motion) -> tuple[Array, Array]:
             inputs = self._inputs(model, motion)
             signals = np.concatenate((inputs.torque, inputs.states), axis=1)
-            by_position, by_rate = np.split(rough.slopes(motion.x, motion.v, signals), 2, axis=1)
+            told = rough.slopes(motion.x, motion.v, signals, np.zeros_like(motion.v))
+            by_position, by_rate = np.split(told, 2, axis=1)
             # A reading of the motor moves the joint too where that is read as an angle beyond it.
             along = sensing.displacements(motion.x[:1])[0][rough.coordinates[own]] * noise.grid[: motion.x.shape[1]]
             sensors = np.flatnonzero(np.any(along, axis=0))
@@ -234,12 +236,12 @@ class CandidateColumns:
         """Share of the session in which the axis of a law of dry friction stands still."""
         return self._standstill(candidate.effect.where).share
 
-    def _standstill(self, where: str) -> Standstill:
+    def _standstill(self, where: str) -> SessionStandstill:
         """Of a joint's motor."""
         if where not in self._held:
             rows, joint = self.rows, int(where.removeprefix("joint_")) - 1
             noise = self._noise_of(joint)
-            self._held[where] = Standstill(rows.sensing, rows.segments, joint, noise, self.system.sample_rate)
+            self._held[where] = SessionStandstill(rows.sensing, rows.segments, joint, noise, self.system.sample_rate)
         return self._held[where]
 
     def _reversals(self, where: str) -> Reversals:

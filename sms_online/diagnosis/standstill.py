@@ -11,11 +11,10 @@ from numpy.typing import NDArray
 from sms_online.diagnosis.record import Segment
 from sms_online.effects.base import position
 from sms_online.pipeline.sensing import Sensing
-from sms_online.pipeline.smoothing import smooth_all
-from sms_online.pipeline.standstill import lasting, rate_filter, slowest
+from sms_online.pipeline.standstill import Standstill, rate_filter, slowest
 
 
-class Standstill:
+class SessionStandstill:
     """Where one motor stands still in a session.
 
     joint: of the motor, by number from 0. noise: σ of its position, rad. slow: the rate below which it stands still,
@@ -27,11 +26,12 @@ class Standstill:
     ) -> None:
         layout = sensing.model.layout
         self.motor = layout.theta_m[joint]
-        self._half_width = M = rate_filter(sample_rate)
-        self.slow = slowest(noise, M, sample_rate)
-        angles = [position(layout, sensing.coordinates(each.values), self.motor)[:, None] for each in segments]
-        rates = [smooth_all(angle, M, sample_rate)[1][:, 0] for angle in angles]
-        self._still = [lasting(np.abs(rate) < self.slow, sample_rate) for rate in rates]
+        self.slow = slowest(noise, rate_filter(sample_rate), sample_rate)
+        self._still = []
+        for segment in segments:
+            still = Standstill(1, sample_rate)
+            still.push(position(layout, sensing.coordinates(segment.values), self.motor)[:, None], np.array([noise]))
+            self._still.append(still.at(np.arange(segment.index.size))[:, 0])
 
     @cached_property
     def share(self) -> float:
@@ -40,5 +40,4 @@ class Standstill:
 
     def at(self, number: int, samples: NDArray[np.int64]) -> NDArray[np.bool_]:
         """At which samples (K,) of a segment it does."""
-        still = self._still[number]
-        return still[np.clip(samples - self._half_width, 0, still.size - 1)]
+        return self._still[number][samples]

@@ -40,8 +40,8 @@ def smooth_from_the_start(
     A mass that rings keeps for good what it has missed of a motion's beginning. first: number of the first of x (B, ·)
     in the segment; samples (n,): numbers too.
     """
-    widths = [m for m in HALF_WIDTHS if m < M]
-    own = np.append(widths, M)[np.searchsorted([*widths[1:], M], samples, side="right")]
+    widths = [*(m for m in HALF_WIDTHS if m < M), M]
+    own = np.array(widths)[np.searchsorted(widths[1:], samples, side="right")]
     parts = [smooth(x, samples[own == m] - first, m, sample_rate) for m in np.unique(own).tolist()]
     return np.concatenate([part[0] for part in parts]), np.concatenate([part[1] for part in parts])
 

@@ -30,7 +30,7 @@ from sms_online.pipeline.momentum_windows import (
 )
 from sms_online.pipeline.rough_forces import RoughForces, responses
 from sms_online.pipeline.smoothing import HALF_WIDTHS, WidthChoice, smooth, stride
-from sms_online.pipeline.standstill import lasting, rate_filter, slowest
+from sms_online.pipeline.standstill import Standstill
 from sms_online.pipeline.weak_form import test_function
 from sms_online.stream import Array
 
@@ -46,6 +46,8 @@ WIDEST_SHARE = 5
 # another than that of the rows before, from which a row is subtracted. The test function is below 0.3 % of its height
 # there, and passes the windows that follow on to the wide filter.
 PROMPT_SHARE = HOPS
+# So many samples at once are smoothed and have their columns evaluated: of a long segment they would fill the memory.
+PIECE = 2000
 # Samples before and after a window that its filter needs at most.
 MARGIN = HALF_WIDTHS[-1]
 
@@ -86,8 +88,10 @@ class _Smoothed:
     columns: Array
 
 
-# Evaluates x (copies, K, n_x), v (copies, K, n_v) and signals (copies, K, joints + n_states): (K, entries).
-_Evaluation = Callable[[Array, Array, Array], Array]
+# Numbers of samples (K,) and half width of the filter that they pass.
+_Samples = Sequence[tuple[NDArray[np.int64], int]]
+# Evaluates columns at some samples: (K, entries).
+_Evaluation = Callable[[_Samples], Array]
 
 
 class MomentumBalance:
@@ -113,6 +117,8 @@ class MomentumBalance:
         self._physical = np.array(base.independent)[self.columns]
         self.rough = RoughForces(model)
         self._rough = np.flatnonzero(np.isin(self._physical, self.rough.columns))
+        offset = model.layout.n_base_positions - model.layout.n_base_speeds
+        self._motors = np.unique(self.rough.motors) + offset  # coordinates of those with dry friction
         self._widths = half_widths(self.width)
         # Samples before and after a window that its filter needs.
         self.lead = self._widths[-1]
@@ -138,6 +144,7 @@ class MomentumBalance:
         # By the filter's half width, of all that is thinned and of the rough forces.
         self._thinned: dict[int, _Smoothed] = {}
         self._dense: dict[int, _Smoothed] = {}
+        self._standstill = Standstill(self._motors.size, self.sample_rate)
 
     def push(
         self, index: NDArray[np.int64], copies: list[Array], sigma: Array, probes: Probes | None = None
@@ -151,6 +158,8 @@ class MomentumBalance:
             self._skip = -(int(index[0]) + self.lead) % self.hop if self._prompt else 0
         skipped, self._skip = min(self._skip, index.size), max(0, self._skip - index.size)
         self._samples = np.concatenate((self._samples, np.concatenate(copies, axis=1)[skipped:]))
+        if self._motors.size:
+            self._standstill.push(copies[0][skipped:, self._motors], sigma[self._motors])
         grid = int(index[-1]) - (self._first + self._samples.shape[0] - 1)
         chosen: list[tuple[int, int]] = []  # first sample and half width of each window
         while self._window + self.width + self.lead + self.margin < self._first + self._samples.shape[0]:
@@ -165,13 +174,14 @@ class MomentumBalance:
             further = None if fresh is None or probes is None else probes(fresh)
             rows, probed = self._rows(half_width, [window for window, _ in run], grid, further)
             if self.rough.columns.size:
-                rows = self._with_rough(half_width, rows, sigma)
+                rows = self._with_rough(half_width, rows)
             windows += rows
             if fresh is not None:
                 instants = [replace(fresh, probed=probed)]
         drop = self._window - self._first
         if drop > 0:
             self._samples, self._first = self._samples[drop:], self._window
+            self._standstill.drop(self._window + self.lead)
         return windows, instants
 
     def _choose(self, sigma: Array) -> int:
@@ -198,7 +208,7 @@ class MomentumBalance:
         self._told = last + 1
         return [Instants(int(numbers[0]), x[0], v[0], signals[0])]
 
-    def _states(self, samples: Sequence[tuple[NDArray[np.int64], int]]) -> tuple[Array, Array, Array]:
+    def _states(self, samples: _Samples) -> tuple[Array, Array, Array]:
         """x (copies, K, n_x), v (copies, K, n_v) and signals (copies, K, joints + n_states) at K samples.
 
         samples: their numbers, K in all, and half width M of their filter.
@@ -218,9 +228,9 @@ class MomentumBalance:
         s, n_v, entries = stride(half_width, self.hop), self.model.layout.n_v, self.rows.size
         probed: Columns | None = None
 
-        def thinned(x: Array, v: Array, signals: Array) -> Array:
+        def thinned(samples: _Samples) -> Array:
             nonlocal probed
-            columns, probed = self._columns(x, v, signals, further)
+            columns, probed = self._columns(*self._states(samples), further)
             return columns
 
         kept = self._kept(self._thinned, half_width, s, windows[0], self._entries)
@@ -235,12 +245,14 @@ class MomentumBalance:
             out.append(Window(window // self.half_hop, last, weak[:, :entries], b, half_width, *none))
         return out, probed
 
-    def _with_rough(self, half_width: int, rows: list[Window], sigma: Array) -> list[Window]:
+    def _with_rough(self, half_width: int, rows: list[Window]) -> list[Window]:
         """Rows with the columns of rough forces, and what these leave open."""
         phi, _ = self._phi[1]
         windows = [row.start * self.half_hop for row in rows]
         parts = np.cumsum([COPIES * (self._rough.size + self.model.layout.n_v), 2 * self.rough.rows.size])
         kept = self._kept(self._dense, half_width, 1, windows[0], int(parts[-1]) + self.rough.dry.size)
+        offset = self.model.layout.n_base_positions - self.model.layout.n_base_speeds
+        motor_of = np.searchsorted(self._motors, self.rough.motors + offset)
         out = []
         seen = self._seen(kept, half_width, windows, self._rough_columns)
         for window, row, values in zip(windows, rows, seen, strict=True):
@@ -249,22 +261,10 @@ class MomentumBalance:
             Y = row.Y.copy()
             Y[:, self._rough] = weak[:, : self._rough.size]
             told = responses(slopes, phi * self.sample_rate, half_width, self.sample_rate, STEPS)
-            rest = phi @ (breaking * self._resting(window, sigma))
+            still = self._standstill.at(np.arange(window, window + self.width + 1) + self.lead)
+            rest = phi @ (breaking * still[:, motor_of])
             out.append(replace(row, Y=Y, b=row.b - weak[:, self._rough.size :], rough=told, rest=rest))
         return out
-
-    def _resting(self, window: int, sigma: Array) -> NDArray[np.bool_]:
-        """At which samples of a window the axes of dry friction stand still (width + 1, D); sigma as in `push`."""
-        layout, rate = self.model.layout, self.sample_rate
-        M = min(rate_filter(rate), self.lead, self.margin)
-        centres = np.arange(window, window + self.width + 1) + self.lead - self._first
-        still = np.empty((centres.size, self.rough.motors.size), dtype=bool)
-        for motor in np.unique(self.rough.motors).tolist():
-            angle = motor + layout.n_base_positions - layout.n_base_speeds
-            rates = smooth(self._samples[:, angle : angle + 1], centres, M, rate)[1]
-            slow = np.abs(rates[:, 0]) < slowest(float(sigma[angle]), M, rate)
-            still[:, self.rough.motors == motor] = lasting(slow, rate)[:, None]
-        return still
 
     def _kept(self, kept: dict[int, _Smoothed], half_width: int, step: int, first: int, entries: int) -> _Smoothed:
         """What windows of this half width have asked for that windows from sample `first` on may ask for too."""
@@ -286,7 +286,9 @@ class MomentumBalance:
         ends = np.array(windows) + self.width
         fresh = np.arange(known, ends[-1] + step - tail.size * s, step)
         late = [((ends - d - within[:, None]).ravel(), self.margin + d) for d in tail.tolist()]
-        columns = evaluate(*self._states([(fresh, half_width), *late]))
+        *before, last = np.split(fresh, np.arange(PIECE, fresh.size, PIECE))
+        pieces = [*([(piece, half_width)] for piece in before), [(last, half_width), *late]]
+        columns = np.concatenate([evaluate(piece) for piece in pieces])
         kept.columns = np.concatenate((kept.columns, columns[: fresh.size]))
         tails = columns[fresh.size :].reshape(tail.size * within.size, len(windows), columns.shape[1])
         count = self.width // step + 1 - len(tails)
@@ -318,12 +320,27 @@ class MomentumBalance:
         probed = None if further is None else (P[seen.stop :], G[seen.stop :])
         return np.concatenate((*packed, force.reshape(K, -1)), axis=1), probed
 
-    def _rough_columns(self, x: Array, v: Array, signals: Array) -> Array:
+    def _rough_columns(self, samples: _Samples) -> Array:
         """G of rough forces alone, likewise, their slopes, and what breaks them loose: (K, entries)."""
+        x, v, signals = self._states(samples)
         own, K = self._distinct(x, v, signals)
-        measured = x[0], v[0], signals[0]
         packed = self._packed(self.rough.force(*own), self._rough, K)
-        return np.concatenate((packed, self.rough.slopes(*measured), self.rough.breaking(*measured)), axis=1)
+        measured = x[0], v[0], signals[0]
+        slopes = self.rough.slopes(*measured, self._change(samples, v[0]))
+        return np.concatenate((packed, slopes, self.rough.breaking(*measured)), axis=1)
+
+    def _change(self, samples: _Samples, v: Array) -> Array:
+        """What the rates of joints with rough forces change by from the sample before (K, n_v), of the motion v."""
+        layout, before = self.model.layout, self.lead - self._first
+        speeds = np.unique(self.rough.coordinates)
+        angles = self._samples[:, speeds + layout.n_base_positions - layout.n_base_speeds]
+        out = np.zeros_like(v)
+        if speeds.size:
+            # The first sample of all has none before it.
+            at = [(np.maximum(numbers - 1 + before, M), M) for numbers, M in samples]
+            earlier = np.concatenate([smooth(angles, centres, M, self.sample_rate)[1] for centres, M in at])
+            out[:, speeds] = v[:, speeds] - earlier
+        return out
 
     def _distinct(self, x: Array, v: Array, signals: Array) -> tuple[list[Array], int]:
         """States of the copies one below the other, and how many a copy has: without noise all copies are one."""
@@ -345,6 +362,7 @@ class MomentumBalance:
             "compared": np.array(self._compared),
             **_smoothed_state("thinned", self._thinned),
             **_smoothed_state("dense", self._dense),
+            **self._standstill.state(),
         }
 
     def restore(self, state: Mapping[str, NDArray[Any]]) -> None:
@@ -353,6 +371,7 @@ class MomentumBalance:
         self._first, self._window, self._told, skip = (int(k) for k in state["position"])
         self._skip = None if skip < 0 else skip
         self._compared = list(np.array(state["compared"]))
+        self._standstill.restore(state)
         self._thinned, self._dense = (_smoothed_from_state(name, state) for name in ("thinned", "dense"))
 
 

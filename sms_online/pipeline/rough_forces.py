@@ -1,4 +1,4 @@
-"""Forces that jump with the motion or turn fast with it, and what noise does to them: both from every sample.
+"""Forces of effects that may jump with the motion or turn fast with it, and what noise does to them, from every sample.
 
 A thinned motion folds what such a force does between its samples back into the rows: the phase of a cogging behind a
 gear turns through a radian in a few milliseconds. And noise reaches such a force through the filter: what a row takes
@@ -72,11 +72,12 @@ class RoughForces:
                 out[..., columns] = effect.force(self._model.layout, x, v, own)
         return out
 
-    def slopes(self, x: Array, v: Array, signals: Array) -> Array:
-        """(K, 2 E): of one unit of each coefficient by position, then by rate, at states as in `force`, in time order.
+    def slopes(self, x: Array, v: Array, signals: Array, change: Array) -> Array:
+        """(K, 2 E): of one unit of each coefficient by position, then by rate, at states as in `force`.
 
-        By rate of the force averaged over a sample, which is what a sum over samples can tell of one that jumps. Noise
-        is faster than internal states forget: a state moves with a position as its rate does with that speed.
+        By rate of the force averaged over a sample, which is what a sum over samples can tell of one that jumps: change
+        (K, n_v) is what the speeds change by in one. Noise is faster than internal states forget: a state moves with a
+        position as its rate does with that speed.
         """
         layout, K = self._model.layout, len(x)
         offset = layout.n_base_positions - layout.n_base_speeds
@@ -86,7 +87,7 @@ class RoughForces:
             effect, _, own = acting[k]
             assert own is not None
             for speed in speeds:
-                within = np.maximum(DIFFERENCE, 0.5 * np.abs(np.gradient(v[:, speed])))
+                within = np.maximum(DIFFERENCE, 0.5 * np.abs(change[:, speed]))
                 # Each position there and back, then each rate.
                 x_n, v_n, z_n = np.tile(x, (4, 1)), np.tile(v, (4, 1)), own.states.copy()
                 x_n[: 2 * K, speed + offset] += np.repeat((DIFFERENCE, -DIFFERENCE), K)
@@ -116,7 +117,8 @@ class RoughForces:
     def at_rest(self, rest: Array, pi: Array) -> Array:
         """Variance (n_v,) of rows for what dry friction may be at a standstill: any value up to what breaks it loose.
 
-        rest (D,): integral of `breaking` over the window where its axis rests. pi (n_pi,).
+        That much counts as one deviation, which is more than it can be; windows that overlap share it, and it counts
+        once in each. rest (D,): integral of `breaking` over the window where its axis rests. pi (n_pi,).
         """
         by_motor = np.eye(self._model.layout.n_v)[:, self.motors]
         return np.asarray((by_motor @ (rest * pi[self.dry])) ** 2)
@@ -142,8 +144,10 @@ class RoughForces:
 
 @cache
 def _through_filter(half_width: int, width: int, steps: int) -> Array:
-    """(2, steps + 1, width + 1): from slopes by value and by change a sample, at the samples of a window, to what
-    readings do at `steps` even steps of it, by way of the filter."""
+    """(2, steps + 1, width + 1): what a reading at even steps of a window does to its samples by way of the filter.
+
+    To the values, and to their changes from sample to sample.
+    """
     at = np.arange(width + 1.0)
     interpolation = np.stack([np.interp(np.linspace(0.0, width, steps + 1), at, unit) for unit in np.eye(width + 1)], 1)
     apart = np.arange(width + 1)[:, None] - np.arange(width + 1) + half_width

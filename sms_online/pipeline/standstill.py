@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
-from sms_online.pipeline.smoothing import HALF_WIDTHS, kernel
+from sms_online.pipeline.smoothing import HALF_WIDTHS, kernel, smooth_all
+from sms_online.stream import Array
 
 # An axis stands still where its rate is below this multiple of the rate's noise for so long, s. At a reversal it is for
 # less, unless it sticks there, or is turned round by less than 1 rad/s² (noise of 1e-4 rad at 1 kHz).
@@ -25,9 +29,52 @@ def slowest(noise: float, half_width: int, sample_rate: float) -> float:
 
 
 def lasting(slow: NDArray[np.bool_], sample_rate: float) -> NDArray[np.bool_]:
-    """Of samples (K,) at which an axis is slow, those at which it is for long, beyond the ends too as far as known."""
-    least = round(LASTING * sample_rate)
-    padded = np.pad(slow, least, mode="edge")
-    for begin, end in np.flatnonzero(np.diff(padded, prepend=False, append=False)).reshape(-1, 2).tolist():
-        padded[begin:end] = end - begin > least
-    return padded[least : least + slow.size]
+    """Of samples (K,) at which an axis is slow, those at which it is for long."""
+    still = np.zeros_like(slow)
+    for begin, end in np.flatnonzero(np.diff(slow, prepend=False, append=False)).reshape(-1, 2).tolist():
+        still[begin:end] = end - 1 - begin >= LASTING * sample_rate
+    return still
+
+
+class Standstill:
+    """Where motors (D,) stand still along one gap-free motion, as far as its samples tell by now.
+
+    samples are numbered from 0.
+    """
+
+    def __init__(self, motors: int, sample_rate: float) -> None:
+        self._rate, self._half_width = sample_rate, rate_filter(sample_rate)
+        self._first = 0  # number of the first angle kept
+        self._angles = np.empty((0, motors))
+        self._still = np.empty((0, motors), dtype=bool)  # from `_half_width` samples after that on
+
+    def push(self, angles: Array, noise: Array) -> None:
+        """Take the next angles (B, D); noise (D,): of each, 1σ per sample."""
+        M = self._half_width
+        self._angles = np.concatenate((self._angles, angles))
+        if len(self._angles) <= 2 * M:
+            return
+        rates = smooth_all(self._angles, M, self._rate)[1]
+        limits = [slowest(sigma, M, self._rate) for sigma in noise.tolist()]
+        self._still = np.stack([lasting(slow, self._rate) for slow in (np.abs(rates) < limits).T], axis=1)
+
+    def at(self, samples: NDArray[np.int64]) -> NDArray[np.bool_]:
+        """Whether they do at samples (K,), (K, D); what is not known yet is as what is known last."""
+        if not len(self._still):
+            return np.zeros((samples.size, self._still.shape[1]), dtype=bool)
+        return np.asarray(self._still[np.clip(samples - self._first - self._half_width, 0, len(self._still) - 1)])
+
+    def drop(self, before: int) -> None:
+        """Forget what nobody asks for who asks for samples from number `before` on."""
+        reach = self._half_width + round(LASTING * self._rate) + 1
+        drop = max(0, before - reach - self._first)
+        self._angles, self._still, self._first = self._angles[drop:], self._still[drop:], self._first + drop
+
+    def state(self) -> dict[str, Any]:
+        """What `restore` needs to continue."""
+        return {"rest_first": self._first, "rest_angles": self._angles, "rest_still": self._still}
+
+    def restore(self, state: Mapping[str, NDArray[Any]]) -> None:
+        """Continue from a saved state."""
+        self._first = int(state["rest_first"])
+        self._angles, self._still = np.array(state["rest_angles"]), np.array(state["rest_still"])
