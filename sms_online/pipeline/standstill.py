@@ -66,7 +66,8 @@ class Standstill:
 
     def drop(self, before: int) -> None:
         """Forget what nobody asks for who asks for samples from number `before` on."""
-        reach = self._half_width + round(LASTING * self._rate) + 1
+        # The newest rates are as far behind as the filter reaches, and with them what they have lasted is told.
+        reach = 2 * self._half_width + round(LASTING * self._rate) + 1
         drop = max(0, before - reach - self._first)
         self._angles, self._still, self._first = self._angles[drop:], self._still[drop:], self._first + drop
 
