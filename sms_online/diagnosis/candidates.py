@@ -20,7 +20,7 @@ from sms_online.diagnosis.standstill import SessionStandstill
 from sms_online.diagnosis.weak_windows import Motion, WeakWindows
 from sms_online.effects.base import Inputs, Ranges, position
 from sms_online.effects.catalogue import ENTRIES, candidates
-from sms_online.effects.friction import DRY
+from sms_online.effects.friction import DRY, REVERSING
 from sms_online.model.model import Model
 from sms_online.model.parameters import Parameter
 from sms_online.pipeline.momentum_windows import HOPS
@@ -28,8 +28,6 @@ from sms_online.pipeline.rough_forces import RoughForces
 from sms_online.stream import Array
 
 TORQUE_RATE = "torque rate"
-# Forces whose law is another for either sign of a motor's rate.
-REVERSING = (*DRY, "direction_friction")
 # Linear coefficients of effects on channels: quantity, unit, what a unit of it adds to a reading, with its sign. A lag
 # of a delay T reads x - T ẋ, a late torque τ - T τ̇, an eccentric disc x + a sin x + b cos x.
 LINEAR = {

@@ -20,12 +20,11 @@ from sms_online.diagnosis.record import Segment
 from sms_online.diagnosis.weak_windows import Motion
 from sms_online.effects.base import position
 from sms_online.effects.friction import STANDSTILL
+from sms_online.pipeline.rough_forces import WITHIN
 from sms_online.pipeline.sensing import Sensing
 from sms_online.pipeline.smoothing import HALF_WIDTHS, kernel, smooth_all
 from sms_online.stream import Array
 
-# Instants of a sample, in samples from its middle, that a force is averaged over.
-WITHIN = (-0.4, -0.2, 0.0, 0.2, 0.4)
 # What these leave of a jump's place, samples: they are a fifth apart.
 RESOLVED = 0.2 / np.sqrt(12.0)
 # A reversal is off by no more than this, s: an axis that turns round more slowly stands still.

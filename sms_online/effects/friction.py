@@ -16,6 +16,8 @@ from sms_online.stream import Array
 
 # Laws of dry friction: what they give at a standstill is any value up to that of the law.
 DRY = ("coulomb_friction", "stribeck_friction", "load_friction")
+# Laws that are others for either sign of the rate.
+REVERSING = (*DRY, "direction_friction")
 # Speed below which an axis stands still, rad/s (m/s): an integrator cannot follow a jump, and encoders resolve no less.
 STANDSTILL = 1e-4
 

@@ -324,10 +324,11 @@ class MomentumBalance:
         """G of rough forces alone, likewise, their slopes, and what breaks them loose: (K, entries)."""
         x, v, signals = self._states(samples)
         own, K = self._distinct(x, v, signals)
-        packed = self._packed(self.rough.force(*own), self._rough, K)
+        change = self._change(samples, v[0])
+        force = self.rough.force(own[0], own[1], own[2], np.tile(change, (len(own[0]) // K, 1)))
         measured = x[0], v[0], signals[0]
-        slopes = self.rough.slopes(*measured, self._change(samples, v[0]))
-        return np.concatenate((packed, slopes, self.rough.breaking(*measured)), axis=1)
+        told = self.rough.slopes(*measured, change), self.rough.breaking(*measured)
+        return np.concatenate((self._packed(force, self._rough, K), *told), axis=1)
 
     def _change(self, samples: _Samples, v: Array) -> Array:
         """What the rates of joints with rough forces change by from the sample before (K, n_v), of the motion v."""

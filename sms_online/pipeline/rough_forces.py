@@ -14,7 +14,7 @@ from itertools import product
 import numpy as np
 from numpy.typing import NDArray
 
-from sms_online.effects.friction import DRY, STANDSTILL
+from sms_online.effects.friction import DRY, REVERSING, STANDSTILL
 from sms_online.model.model import Model
 from sms_online.pipeline.smoothing import kernel
 from sms_online.stream import Array
@@ -22,6 +22,8 @@ from sms_online.stream import Array
 # Step of the differences that give slopes, rad and rad/s (m, m/s): 1e-9 of a force is lost to curvature where a phase
 # turns 300 times as fast as its joint, and as much to rounding.
 DIFFERENCE = 1e-6
+# Instants of a sample, in samples from its middle, that a force is averaged over which jumps with a rate's sign.
+WITHIN = (-0.4, -0.2, 0.0, 0.2, 0.4)
 # Rate of an axis that moves off, rad/s (m/s): beyond what a sign is smoothed by, within what friction falls by.
 MOVING_OFF = 10.0 * STANDSTILL
 
@@ -64,19 +66,23 @@ class RoughForces:
         columns = self._model.effect_slices[k]
         return np.arange(columns.start, columns.stop, dtype=np.int64)
 
-    def force(self, x: Array, v: Array, signals: Array) -> Array:
-        """Columns (K, n_v, n_pi), zero but for these forces, at x (K, n_x), v (K, n_v), signals as in `Instants`."""
+    def force(self, x: Array, v: Array, signals: Array, change: Array) -> Array:
+        """Columns (K, n_v, n_pi), zero but for these forces, at x (K, n_x), v (K, n_v), signals as in `Instants`.
+
+        change (K, n_v): what the speeds change by in a sample, over which forces are averaged that jump with a rate.
+        """
         out = np.zeros((*v.shape, self._model.n_pi))
         for effect, columns, own in self._model.acting(self._model.inputs(signals)):
             if not effect.smooth:
-                out[..., columns] = effect.force(self._model.layout, x, v, own)
+                instants = WITHIN if effect.name in REVERSING else (0.0,)
+                parts = [effect.force(self._model.layout, x, v + part * change, own) for part in instants]
+                out[..., columns] = sum(parts) / len(parts)
         return out
 
     def slopes(self, x: Array, v: Array, signals: Array, change: Array) -> Array:
         """(K, 2 E): of one unit of each coefficient by position, then by rate, at states as in `force`.
 
-        By rate of the force averaged over a sample, which is what a sum over samples can tell of one that jumps: change
-        (K, n_v) is what the speeds change by in one. Noise is faster than internal states forget: a state moves with a
+        By rate of the force averaged over a sample. Noise is faster than internal states forget: a state moves with a
         position as its rate does with that speed.
         """
         layout, K = self._model.layout, len(x)
