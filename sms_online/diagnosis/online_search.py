@@ -24,6 +24,7 @@ from sms_online.diagnosis.residuals import ResidualTest
 from sms_online.diagnosis.rows import SessionRows
 from sms_online.diagnosis.shape import refine
 from sms_online.diagnosis.trace import Tracing
+from sms_online.diagnosis.weak_windows import WeakWindows
 from sms_online.effects.base import report
 from sms_online.effects.catalogue import ENTRIES, declarable
 from sms_online.effects.spacecraft import TableTilt
@@ -115,9 +116,14 @@ class Outcome:
 class LateColumns(CandidateColumns):
     """Candidates that act from a segment on."""
 
-    def __init__(self, rows: SessionRows, system: System, late: int) -> None:
-        super().__init__(rows, system)
-        self._before = rows.weak.windows.segment < late
+    def __init__(self, rows: SessionRows, system: System, late: int, weak: WeakWindows | None = None) -> None:
+        super().__init__(rows, system, weak)
+        self._late = late
+        self._before = self._weak.windows.segment < late
+
+    def within(self, weak: WeakWindows) -> LateColumns:
+        """The same for other windows of the session."""
+        return LateColumns(self.rows, self.system, self._late, weak)
 
     def of(self, effect: Effect) -> Candidate:
         """The candidate of one declaration."""
@@ -126,6 +132,10 @@ class LateColumns(CandidateColumns):
     def limited(self, candidate: Candidate) -> Candidate:
         """The same without the windows before."""
         return replace(candidate, columns=np.where(self._before[:, None, None], 0.0, candidate.columns))
+
+    def variance(self, candidate: Candidate, coefficients: Array) -> Array:
+        """Of the windows that it acts in."""
+        return np.where(self._before[:, None], 0.0, super().variance(candidate, coefficients))
 
 
 def search(request: Request) -> Outcome | None:
@@ -187,9 +197,9 @@ def _trace(request: Request, rows: SessionRows, everything: Sequence[Candidate],
     make = LateColumns(rows, system, late)
     limited = [make.limited(candidate) for candidate in everything]
     fitted = _fitted(rows, late)
-    tracing = Tracing(rows, [c for c in limited if np.any(c.columns)], fitted, request.prior)
-    chosen = tracing.run(lambda found, k: refine(tracing, make, found, k))
+    tracing = Tracing(rows, [c for c in limited if np.any(c.columns)], fitted, request.prior, (), make)
     ranking = tracing.ranking()[:TOLD]
+    chosen = tracing.run(lambda found, k: refine(tracing, make, found, k), tracing.sticks)
     findings = [tracing.finding(chosen, k) for k in chosen]
     gains = {k: finding.gain.gain for k, finding in zip(chosen, findings, strict=True)}
     kept = [k for k in chosen if gains[k] >= LEAST_SHARE * max(gains.values())]
@@ -198,6 +208,7 @@ def _trace(request: Request, rows: SessionRows, everything: Sequence[Candidate],
         best = max(channels, key=lambda k: gains[k])
         kept = [*(k for k in kept if k not in channels), best]
     if kept != chosen:
+        tracing.settle(kept)
         chosen, findings = kept, [tracing.finding(kept, k) for k in kept]
     before = _excess(tracing, [])
     final, used, constant = tracing, list(chosen), None
@@ -271,7 +282,8 @@ def _corrected(
         rows = _rows(request, solution[:n], late, [constant])
         make = LateColumns(rows, applied(system, [constant]), late)
         candidates = [make.of(force) for force in forces]
-        tracing = Tracing(rows, candidates, _fitted(rows, late), request.prior, [make.of(constant)])
+        tracing = Tracing(rows, candidates, _fitted(rows, late), request.prior, [make.of(constant)], make)
+        tracing.settle(used)
         solution = _solution(tracing, used)
         constant = improved(constant, solution[n : n + len(last.parameters)])
     return tracing, used, constant
