@@ -148,6 +148,8 @@ class OnlineDiagnosis:
         """After the session's end, which may have decided on a change."""
         if self._estimator.momentum is not None and self._record:
             self._follow_events()
+        if self._adopt and self._onset is not None and self.episodes[-1].verdict == "named":
+            self.episodes[-1].refused = "the session ended before a second search could name the same"
 
     def _keep(self, piece: GridSamples) -> None:
         self._record.append(piece)
@@ -354,5 +356,5 @@ def refusal(model: Model, named: tuple[Named, ...]) -> str | None:
             return f"{each.key} is a constant of the description"
         with_it = model.of(model.system.model_copy(update={"effects": (*model.system.effects, each.effect)}))
         if with_it.n_states:
-            return f"{each.key} has an internal state, which begins at rest"
+            return f"{each.key} has an internal state, which is followed from a session's start alone"
     return None
