@@ -30,11 +30,11 @@ MOST_CANDIDATES = 6
 STYLE = """
 body { font: 15px/1.45 system-ui, sans-serif; color: #1c2733; max-width: 1160px; margin: 2em auto; padding: 0 1em }
 h1 { font-size: 1.5em; margin-bottom: 0.1em } h2 { font-size: 1.15em; margin-top: 1.8em }
-table { border-collapse: collapse }
+table { border-collapse: collapse; display: block; overflow-x: auto }
 td, th { padding: 0.15em 0.6em; text-align: right; white-space: nowrap; border-bottom: 1px solid #e4e9ee }
 td:first-child, th:first-child, .left { text-align: left } tr.unknown { color: #8895a3 }
 figure { display: inline-block; margin: 0.3em; text-align: center } figcaption { font-size: 0.85em; color: #5a6875 }
-svg { background: #fff } svg text { font: 11px system-ui, sans-serif; fill: #5a6875 }
+svg { background: #fff; max-width: 100%; height: auto } svg text { font: 11px system-ui, sans-serif; fill: #5a6875 }
 svg .title { font-size: 13px; fill: #1c2733 } svg .legend { text-anchor: end; paint-order: stroke; stroke: #fff;
 stroke-width: 3px } .grid { stroke: #e8edf2 } .span { fill: #f1f4f7 } .mark { stroke: #d04040; stroke-dasharray: 3 3 }
 .judgement { color: #fff; border-radius: 6px; padding: 0.7em 1.1em; margin-bottom: 1.2em }
