@@ -184,6 +184,15 @@ def test_hysteresis_saturates_and_turns_back_with_the_spring_s_slope() -> None:
     assert model.state_rate(x, v, np.zeros((1, 1)))[0, 0] == pytest.approx(0.3)
 
 
+def test_a_gap_is_told_by_what_it_takes_off_beyond() -> None:
+    """A spring that loses 4 % too much inside a gap 4 % too narrow is that of the gap, unless what it loses is stated."""
+    (own,) = with_effect("backlash@joint_1:gap=0.0096").effects
+    assert own.relative_to == ("joint_1.stiffness",)
+    assert own.reported(np.array([1040.0, 998.4]))["gap"] == pytest.approx(0.01)
+    (stated,) = with_effect("backlash@joint_1:gap=0.01,stiffness=500").effects
+    assert stated.reported(np.array([520.0])) == {"gap": 0.01}
+
+
 def test_slosh_swings_about_the_base_at_its_frequency() -> None:
     model = with_effect("slosh@base:mass=2,stiffness=50")
     s = Motion(model)

@@ -230,6 +230,17 @@ class CandidateColumns:
 
         return self._weak.spread(slopes)
 
+    def reported(self, effect: Effect, beta: Array, coefficients: Array) -> dict[str, float]:
+        """A force's coefficients as a person reads them, for parameters β (n,) and its own coefficients (c,).
+
+        Empty where β does not hold what they are relative to.
+        """
+        force = Model(self._declaring(effect)).effects[-1]
+        known = dict(zip((p.name for p in self.rows.base.parameters), beta.tolist(), strict=True))
+        if not known.keys() >= set(force.relative_to):
+            return {}
+        return force.reported(np.append(coefficients, [known[name] for name in force.relative_to]))
+
     def at_rest(self, candidate: Candidate) -> float:
         """Share of the session in which the axis of a law of dry friction stands still."""
         return self._standstill(candidate.effect.where).share

@@ -16,6 +16,8 @@ from sms_online.effects.catalogue import ENTRIES
 # a phase that is off moves the parameters. And evaluations at most.
 TOLERANCE = 1e-7
 EVALUATIONS = 40
+# Times that a shape constant follows from coefficients, which follow from it: the second is off by the first's square.
+SETTLED = 2
 # Constants that count something (of a cogging's period, say) are not refined.
 COUNTED = ("order",)
 
@@ -28,6 +30,29 @@ def refine(tracing: Tracing, make: CandidateColumns, chosen: Sequence[int], k: i
     for shape in ENTRIES[tracing.candidates[k].effect.name].shapes:
         if shape in tracing.candidates[k].effect.coefficients and shape not in COUNTED:
             _refine_one(tracing, make, chosen, k, shape)
+    _settle(tracing, make, chosen, k)
+
+
+def _settle(tracing: Tracing, make: CandidateColumns, chosen: Sequence[int], k: int) -> None:
+    """Give shape constants the values that a person reads, where these follow from coefficients beside them.
+
+    A gap where the spring is soft is as much as it takes off beyond, over the joint's stiffness: rows beyond tell that
+    to 1e-4, and the gap itself, with a stiffness of its own inside, to percents where the spring is seldom in it.
+    """
+    entry = ENTRIES[tracing.candidates[k].effect.name]
+    if entry.kind != "force" or not set(entry.shapes) - set(COUNTED):
+        return
+    for _ in range(SETTLED):
+        effect = tracing.candidates[k].effect
+        solution = tracing.solution(chosen, np.ones(tracing.rows.count, dtype=bool))
+        sizes = [len(tracing.candidates[other].parameters) for other in chosen]
+        first = len(solution) - sum(sizes[chosen.index(k) :])
+        own = solution[first : first + sizes[chosen.index(k)]]
+        told = make.reported(effect, solution[: tracing.rows.base.n], own)
+        moved = effect.coefficients | {name: told[name] for name in effect.coefficients.keys() & told.keys()}
+        if moved == effect.coefficients or min(moved.values()) <= 0.0:
+            return
+        tracing.put(k, make.of(effect.model_copy(update={"coefficients": moved})))
 
 
 def _refine_one(tracing: Tracing, make: CandidateColumns, chosen: Sequence[int], k: int, shape: str) -> None:

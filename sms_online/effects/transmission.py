@@ -103,6 +103,8 @@ class Backlash(Transmission):
     def __init__(self, site: Site, given: Mapping[str, float]) -> None:
         nominal = given.get("stiffness", site.system.joints[site.index - 1].stiffness)
         super().__init__(site, {"stiffness": (f"k_g{site.index}", "N m/rad", nominal)}, {"gap": given["gap"]})
+        if "stiffness" not in given:
+            self.relative_to = (f"joint_{site.index}.stiffness",)
 
     def along(self, layout: Layout, x: Array, v: Array, inputs: Inputs | None) -> Array:
         """clip(δ, -gap, gap)."""
@@ -110,8 +112,12 @@ class Backlash(Transmission):
         return np.clip(self.deflection(layout, x), -gap, gap)[:, None]
 
     def reported(self, values: Array) -> dict[str, float]:
-        """The gap."""
-        return dict(self.shapes)
+        """The gap where all of the joint's stiffness k is lost inside: that spring gives k gap less beyond it.
+
+        Where another stiffness is stated, the one that it is for.
+        """
+        lost = values[0] / values[1] if self.relative_to else 1.0
+        return {"gap": float(self.shapes["gap"] * lost)}
 
 
 class KinematicError(Transmission):
