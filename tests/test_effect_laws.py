@@ -185,7 +185,7 @@ def test_hysteresis_saturates_and_turns_back_with_the_spring_s_slope() -> None:
 
 
 def test_a_gap_is_told_by_what_it_takes_off_beyond() -> None:
-    """A spring that loses 4 % too much inside a gap 4 % too narrow is that of the gap, unless what it loses is stated."""
+    """A spring that loses 4 % too much in a gap 4 % too narrow is that of the gap, unless what it loses is stated."""
     (own,) = with_effect("backlash@joint_1:gap=0.0096").effects
     assert own.relative_to == ("joint_1.stiffness",)
     assert own.reported(np.array([1040.0, 998.4]))["gap"] == pytest.approx(0.01)
