@@ -117,7 +117,7 @@ def test_what_friction_may_be_at_a_standstill_is_open() -> None:
     rough = MomentumBalance(MODEL, BASE, RATE, SPAN).rough
     phi = (1.0 - np.linspace(-1.0, 1.0, 401) ** 2) ** 6
     for window in windows:
-        std = np.sqrt(rough.at_rest(window.rest, pi))
+        std = np.linalg.norm(rough.at_rest(window.rest, pi), axis=0)
         assert not np.any(np.delete(std, MOTOR))
         if window.end / RATE < 0.7 or window.end / RATE - SPAN > 1.5:
             assert std[MOTOR] == 0.0

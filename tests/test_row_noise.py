@@ -17,17 +17,20 @@ from sms_online.model.base_parameters import find_base_parameters
 from sms_online.model.model import Model
 from sms_online.pipeline.latency import SourceGroup
 from sms_online.pipeline.momentum_balance import MomentumBalance
-from sms_online.pipeline.momentum_windows import COPIES, HOPS, INSTANTS, Window
-from sms_online.pipeline.row_noise import CLOCK_ERROR, CLOCK_KNOWN, OWN_SHARE, RowNoise, Whitener
+from sms_online.pipeline.momentum_windows import COPIES, EXPONENT, HOPS, INSTANTS, STEPS, Window
+from sms_online.pipeline.rough_forces import open_at_rest
+from sms_online.pipeline.row_noise import CLOCK_ERROR, CLOCK_KNOWN, ROUNDING, RowNoise, Whitener
 from sms_online.pipeline.sensing import Sensing
 from sms_online.pipeline.sensitivity import Sensitivities
 from sms_online.pipeline.sensor_noise import NoiseEstimate
+from sms_online.pipeline.weak_form import test_function as weak_test_function
 from sms_online.stream import Array
 from sms_sim.plant import Plant
 
 SPAN = 0.4  # s
 # Small enough that rows are linear in it, large against rounding. rad and m; N m of the joint torque.
 POSITION_NOISE, TORQUE_NOISE = 1e-6, 1e-3
+NO_FREE_FORCES = np.empty((0, 0))
 # Windows after the first.
 HOPS_FOLLOWED = 3
 AXIS_SYSTEM = parse_system(AXIS.replace("sample_rate = 200.0", "sample_rate = 1000.0"), "axis.toml")
@@ -111,7 +114,7 @@ def scatter(system: System, draws: int, seed: int) -> Scatter:
         kernel = noise.kernel(sensitivity)
         kernel += probe.rough.kernel(window.rough, model.nominal, sensitivity.displacements)
         densities = np.full(model.layout.n_x, density[0]), np.full(len(model.layout.q), density[1])
-        covariances.append(noise.covariance(kernel, sensitivity.rates, *densities))
+        covariances.append(noise.covariance(kernel, sensitivity.rates, *densities, NO_FREE_FORCES))
     rest = residual(found)
     errors = np.stack(
         [residual(windows(exact + sigma * rng.standard_normal(exact.shape))[0]) - rest for _ in range(draws)]
@@ -176,13 +179,13 @@ def test_a_clock_that_is_off_moves_rows_by_the_rates_of_its_readings() -> None:
     nothing = np.zeros(model.layout.n_x), np.zeros(len(model.layout.q))
     seen = [told.window(start) for start in starts]
     kernels = [noise.kernel(sensitivity) for sensitivity in seen]
-    found = [noise.covariance(c, each.rates, *nothing) for c, each in zip(kernels, seen, strict=True)]
+    found = [noise.covariance(c, each.rates, *nothing, NO_FREE_FORCES) for c, each in zip(kernels, seen, strict=True)]
     assert len(found) > 2
     for k in range(2):  # a window with itself and with the one before
         expected = (1.0 - k / HOPS) * CLOCK_ERROR**2 * np.outer(slopes[-1], slopes[-1 - k])
         np.testing.assert_allclose(found[-1][-1 - k], expected, atol=0.02 * np.abs(expected).max())
     young = RowNoise(model.layout.theta_m, balance.span, (clock,))
-    own = young.covariance(kernels[-1], seen[-1].rates, *nothing, 0.5 * CLOCK_KNOWN)[-1]
+    own = young.covariance(kernels[-1], seen[-1].rates, *nothing, NO_FREE_FORCES, 0.5 * CLOCK_KNOWN)[-1]
     np.testing.assert_allclose(own, 4.0 * found[-1][-1], rtol=1e-12)
 
 
@@ -206,6 +209,37 @@ def test_sensitivities_of_columns_told_with_the_rows_are_those_of_the_dynamics()
         np.testing.assert_allclose(getattr(ours, part), expected, atol=1e-8 * np.abs(expected).max())
 
 
+def test_what_windows_hold_beside_a_force_that_nobody_knows_is_still_told() -> None:
+    """A constant force of 2 N m, beside any force from 1 to 1.3 s: by windows together, though all of them see that.
+
+    Ten times as well as if it were another error in each window.
+    """
+    rng = np.random.default_rng(8)
+    half_hop, dt, sigma = 20, 1e-3, 0.01
+    width = INSTANTS * half_hop
+    phi = weak_test_function(width, SPAN, EXPONENT)[0] * dt
+    time = np.arange(1600)
+    resting = (time >= 1000) & (time < 1300)
+    windows = [slice(start, start + width + 1) for start in range(640, 1000, 2 * half_hop)]
+    assert all(np.any(resting[inside]) for inside in windows)
+    nothing = np.zeros((STEPS + 1, 1, 1)), np.zeros((INSTANTS + 1, 1)), np.zeros(1), np.array([sigma**2 * dt])
+    errors, alone = [], 0.0
+    for draw in range(50):
+        force = 2.0 + sigma * rng.standard_normal(time.size)
+        force[resting] += 20.0 * rng.standard_normal() + np.cumsum(rng.standard_normal(300))
+        noise, whitener = RowNoise((0,), SPAN), Whitener(1, 2)
+        white = []
+        for inside in windows:
+            free = open_at_rest(np.full((width + 1, 1), 20.0), resting[inside, None], phi)
+            covariances = noise.covariance(*nothing, free)
+            white.append(whitener.push(covariances, np.array([[phi.sum(), phi @ force[inside]]])))
+            alone += float(phi.sum() ** 2 / covariances[-1][0, 0]) if draw == 0 else 0.0
+        column, rows = np.concatenate(white).T
+        errors.append((column @ rows - 2.0 * (column @ column)) / np.linalg.norm(column))
+    assert column @ column > 10.0**2 * alone
+    assert np.sqrt(np.mean(np.square(errors))) < 1.5
+
+
 def random_banded(n_v: int, windows: int, seed: int) -> list[list[Array]]:
     """Covariances of windows that share noise with HOPS - 1 windows before: moving averages of white noise."""
     rng = np.random.default_rng(seed)
@@ -225,7 +259,7 @@ def test_whitening_is_the_dense_cholesky_factor_solved_for() -> None:
     whitener = Whitener(n_v, width)
     found = np.concatenate([whitener.push(c, row) for c, row in zip(covariances, rows, strict=True)])
     full = block_matrix(covariances)
-    full[np.diag_indices_from(full)] *= 1.0 + OWN_SHARE
+    full[np.diag_indices_from(full)] *= 1.0 + ROUNDING
     np.testing.assert_allclose(found, np.linalg.solve(np.linalg.cholesky(full), np.concatenate(rows)), rtol=1e-8)
 
 

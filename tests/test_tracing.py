@@ -11,10 +11,11 @@ import pytest
 from numpy.typing import NDArray
 
 from sms_online.description.schema import Effect
-from sms_online.diagnosis.candidate import Candidate
+from sms_online.diagnosis.candidate import Candidate, LeftOpen
 from sms_online.diagnosis.trace import Tracing
 from sms_online.effects.friction import DRY
 from sms_online.model.parameters import Parameter
+from sms_online.pipeline.momentum_windows import HOPS
 from sms_online.stream import Array
 
 WINDOWS, SPEEDS = 300, 2
@@ -27,7 +28,7 @@ class MadeUpRows:
 
     Y: Array
     b: Array
-    floor: Array = field(default_factory=lambda: np.zeros((WINDOWS, SPEEDS)))
+    errors: Array = field(default_factory=lambda: np.zeros((WINDOWS, SPEEDS)))
     model: Any = field(
         default_factory=lambda: SimpleNamespace(
             layout=SimpleNamespace(n_v=SPEEDS), system=SimpleNamespace(effects=(), sample_rate=1000.0)
@@ -46,25 +47,30 @@ class MadeUpRows:
     def std(self) -> Array:
         return np.ones_like(self.b)
 
-    def whiten(self, floor: Array) -> None:
-        self.floor = floor
+    @property
+    def white_std(self) -> Array:
+        return np.sqrt(1.0 + self.errors)
+
+    def whiten(self, own: Array, free: Array | None = None) -> None:
+        self.errors = own if free is None else own + free[:, 0]
 
     def white(self, columns: Array) -> Array:
-        return np.asarray((columns / np.sqrt(1.0 + self.floor)[..., None]).reshape(WINDOWS * SPEEDS, -1))
+        return np.asarray((columns / self.white_std[..., None]).reshape(WINDOWS * SPEEDS, -1))
 
 
 @dataclass
 class Sticking:
-    """What friction leaves open: any value up to its law's where its axis is stuck, in a share of the session."""
+    """What friction leaves open where its axis is stuck, in a share of the session: so many times its law."""
 
     stuck: NDArray[np.bool_]
     share: float
+    times: float
 
-    def variance(self, candidate: Candidate, coefficients: Array) -> Array:
-        out = np.zeros((WINDOWS, SPEEDS))
+    def left_open(self, candidate: Candidate, coefficients: Array) -> LeftOpen:
+        free = np.zeros((WINDOWS, HOPS, SPEEDS))
         if candidate.effect.name in DRY:
-            out[:, 0] = np.where(self.stuck, 10.0 * coefficients[0], 0.0) ** 2
-        return out
+            free[:, 0, 0] = np.where(self.stuck, self.times * coefficients[0], 0.0) ** 2
+        return LeftOpen(np.zeros((WINDOWS, SPEEDS)), free)
 
     def at_rest(self, candidate: Candidate) -> float:
         return self.share
@@ -121,7 +127,7 @@ def test_an_effect_whose_own_noise_hides_what_it_takes_stays_and_what_stood_for_
     b[:, 0] += held
 
     rows: Any = MadeUpRows(Y, b)
-    tracing = Tracing(rows, [friction, ripple], FITTED, noise=Sticking(stuck, 0.0))
+    tracing = Tracing(rows, [friction, ripple], FITTED, laws=Sticking(stuck, 0.0, 10.0))
     found = tracing.run(lambda chosen, k: None)
     assert [taken for taken, _ in tracing.path] == [1, 0]
     assert found == [0]
@@ -136,7 +142,7 @@ def test_friction_that_holds_an_axis_much_of_the_time_is_found_beside_what_fits_
     offset = rng.standard_normal(WINDOWS)
     b = rng.standard_normal((WINDOWS, SPEEDS))
     b[:, 0] += held + 2.0 * offset
-    other = held if ripples else held + np.where(stuck, 3.0 * rng.standard_normal(WINDOWS), 0.0)
+    other = held if ripples else held + np.where(stuck, 5.0 * rng.standard_normal(WINDOWS), 0.0)
     candidates = [
         _candidate("stribeck_friction", np.sign(held)),
         _candidate("cogging", other),
@@ -144,10 +150,10 @@ def test_friction_that_holds_an_axis_much_of_the_time_is_found_beside_what_fits_
     ]
     rows: Any = MadeUpRows(rng.standard_normal((WINDOWS, SPEEDS, 3)), b)
 
-    def steps(sticking: bool) -> list[list[int]]:
-        tracing = Tracing(rows, candidates, FITTED, noise=Sticking(stuck, 0.6))
-        tracing.run(lambda chosen, k: None, sticking)
+    def steps(share: float) -> list[list[int]]:
+        tracing = Tracing(rows, candidates, FITTED, laws=Sticking(stuck, share, 2.0))
+        tracing.run(lambda chosen, k: None)
         return [chosen for _, chosen in tracing.path]
 
-    assert steps(sticking=False)[0] == [1]
-    assert steps(sticking=True) == ([[1], [1, 2]] if ripples else [[0], [0, 2]])
+    assert steps(0.0)[0] == [1]
+    assert steps(0.6) == ([[1], [1, 2]] if ripples else [[0], [0, 2]])

@@ -114,6 +114,11 @@ def test_an_axis_stands_still_where_its_rate_is_noise_for_longer_than_a_reversal
     still = held.at(0, seen)
     edges = t[seen[np.flatnonzero(np.diff(still, prepend=False, append=False)[: still.size])]]
     assert edges == pytest.approx([1.0, 1.6, 2.5, 2.6], abs=0.03)
+    # It moves off forwards from both.
+    leaving = held.leaving(0, seen)
+    assert leaving[(seen > edges[1] * 1000.0 - 20) & still & (seen < 2000)] == pytest.approx(1.0)
+    assert np.sum(leaving) == 50
+    assert not np.any(leaving[~still])
 
 
 @pytest.mark.parametrize("noise", [1e-6, 1e-5, 1e-4])
@@ -126,7 +131,7 @@ def test_the_integral_of_a_sign_is_known_as_well_as_it_is_told(noise: float) -> 
     turns = random.uniform(0.19, 0.21, 60)
     angles = [np.where(t < turn, -3.0, -1.0) * (t - turn) ** 2 for turn in turns]
     segments = [Segment(np.arange(t.size), (a + noise * random.standard_normal(t.size))[:, None]) for a in angles]
-    reversals = Reversals(sensing, segments, 0, noise, 1000.0)
+    reversals = Reversals(sensing, segments, 0, noise, 1000.0, SessionStandstill(sensing, segments, 0, noise, 1000.0))
     samples = np.arange(100, 300)
     off, told = [], []
     for k, turn in enumerate(turns):

@@ -232,29 +232,14 @@ class Attempt:
                 break
             self.rows.weigh(beta)
             chosen = self._search_again()
-        return self._search_sticking(chosen) if self.tracing.sticks else chosen
-
-    def _search_sticking(self, chosen: list[int]) -> list[int]:
-        """Another search where an axis sticks and much was left, unless it leaves more than the first."""
-        first = self.tracing
-        beyond = any(row.beyond for row in self.test([]).values())
-        loud = any(row.whitened > MOST_LEFT for row in self.test(chosen).values())
-        left = self.excess(chosen)
-        if not beyond or not (loud or left > LARGEST_SHARE_LEFT * self.excess([])):
-            return chosen
-        again = self._search_again(sticking=True)
-        if self.excess(again) < left:
-            return again
-        self.tracing = first
-        first.weigh()
         return chosen
 
-    def _search_again(self, sticking: bool = False) -> list[int]:
+    def _search_again(self) -> list[int]:
         self._trace([candidate for candidate in self.tracing.candidates if not candidate.constant])
-        return self._search(sticking)
+        return self._search()
 
-    def _search(self, sticking: bool = False) -> list[int]:
-        return self.tracing.run(lambda chosen, k: refine(self.tracing, self.make, chosen, k), sticking)
+    def _search(self) -> list[int]:
+        return self.tracing.run(lambda chosen, k: refine(self.tracing, self.make, chosen, k))
 
     def _same_weights(self, beta: Array) -> bool:
         """Whether rows would be weighed alike with beta (n,): their noise goes with the size of their terms."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Protocol
 
 from sms_online.description.schema import Effect
 from sms_online.diagnosis.constants import is_constant
@@ -41,6 +42,28 @@ class Candidate:
     def constant(self) -> bool:
         """Whether its coefficients become constants of the description, no unknowns of π: see `constants`."""
         return is_constant(self.effect)
+
+
+@dataclass(frozen=True)
+class LeftOpen:
+    """What the law of a candidate leaves open of the rows.
+
+    own (W, n_v): variance by noise. free (W, HOPS, n_v): covariances by forces that it does not tell, where the rate's
+    sign changes, and at a standstill. See `WeakWindows.free`.
+    """
+
+    own: Array
+    free: Array
+
+
+class Laws(Protocol):
+    """Tells what candidates' laws leave open."""
+
+    def left_open(self, candidate: Candidate, coefficients: Array) -> LeftOpen:
+        """Of the rows, for a candidate with coefficients (c,)."""
+
+    def at_rest(self, candidate: Candidate) -> float:
+        """Share of the session in which the axis of a law of dry friction stands still."""
 
 
 @dataclass(frozen=True)

@@ -11,12 +11,12 @@ from itertools import product
 import numpy as np
 
 from sms_online.description.schema import Effect, System
-from sms_online.diagnosis.candidate import Candidate
+from sms_online.diagnosis.candidate import Candidate, LeftOpen
 from sms_online.diagnosis.constants import is_constant
 from sms_online.diagnosis.followed import FollowedMotion
 from sms_online.diagnosis.reversals import Reversals
 from sms_online.diagnosis.rows import SessionRows
-from sms_online.diagnosis.standstill import SessionStandstill
+from sms_online.diagnosis.standstill import LEAVING, SessionStandstill
 from sms_online.diagnosis.weak_windows import Motion, WeakWindows
 from sms_online.effects.base import Inputs, Ranges, position
 from sms_online.effects.catalogue import ENTRIES, candidates
@@ -28,6 +28,8 @@ from sms_online.pipeline.rough_forces import RoughForces
 from sms_online.stream import Array
 
 TORQUE_RATE = "torque rate"
+# Share of its law that friction may lack just before it gives way, 1σ: the spring winds up meanwhile.
+WINDING = 0.2
 # Linear coefficients of effects on channels: quantity, unit, what a unit of it adds to a reading, with its sign. A lag
 # of a delay T reads x - T ẋ, a late torque τ - T τ̇, an eccentric disc x + a sin x + b cos x.
 LINEAR = {
@@ -149,8 +151,8 @@ class CandidateColumns:
             return Candidate(effect, parameters, self._weak.columns(inertia))
         return Candidate(effect, parameters, self._force(model))
 
-    def _force(self, model: Model, held: SessionStandstill | None = None) -> Array:
-        """Columns (W, n_v, c) of a model's last effect; held: breaking loose where its axis stands still, alone."""
+    def _force(self, model: Model) -> Array:
+        """Columns (W, n_v, c) of a model's last effect."""
         force = model.effects[-1]
 
         def columns(motion: Motion) -> tuple[Array | None, Array]:
@@ -160,31 +162,35 @@ class CandidateColumns:
             def along(v: Array) -> Array:
                 return force.force(model.layout, motion.x, v, inputs)
 
-            if held is None and force.name in REVERSING:
-                return None, self._reversals(force.where).mean(along, motion)
-            if held is None:
+            if force.name not in REVERSING:
                 return None, along(motion.v)
-            v = motion.v.copy()
-            v[:, held.motor] = held.slow
-            return None, np.where(held.at(motion.segment, motion.samples)[:, None, None], along(v), 0.0)
+            G = self._reversals(force.where).mean(along, motion)
+            if force.name in DRY:
+                # What holds the axis is no matter of the law but just before it gives way.
+                held = self._standstill(force.where)
+                still, leaving = (told(motion.segment, motion.samples) for told in (held.at, held.leaving))
+                v = motion.v.copy()
+                v[:, held.motor] = leaving * held.slow
+                G = np.where(still[:, None, None], along(v), G)
+            return None, G
 
         return self._weak.columns(columns, dense=not force.smooth)
 
-    def variance(self, candidate: Candidate, coefficients: Array) -> Array:
-        """Variance (W, n_v) of the rows for what the sensors' noise makes of a force with coefficients (c,).
+    def left_open(self, candidate: Candidate, coefficients: Array) -> LeftOpen:
+        """What the sensors' noise makes of a force with coefficients (c,), and what its law does not tell.
 
-        To first order where a joint's positions and rates tell the force; the noise of a torque that a gain or a ripple
-        takes in is left out beside the torque's own. Else by a few draws of it in every window, averaged over the
-        windows that a window overlaps. Of a force that jumps with a rate's sign it is that of its reversals, which a
-        whole session tells better than a derivative does while one runs. Where its axis stands still dry friction takes
-        any value up to that of its law.
+        Noise to first order where a joint's positions and rates tell the force; that of a torque which a gain or a
+        ripple takes in is left out beside the torque's own. Else by a few draws of it in every window, averaged over
+        the windows that a window overlaps. What a law that jumps with a rate's sign does not tell is where it jumps,
+        and at a standstill any value up to that of its law: with as much of it as they hold, draws tell no more.
         """
         effect = candidate.effect
+        nothing = np.zeros((len(self.rows.b), HOPS, self.rows.b.shape[1]))
         if ENTRIES[effect.name].kind != "force" or is_constant(effect) or self.rows.noise.exact:
-            return np.zeros_like(self.rows.b)
+            return LeftOpen(nothing[:, 0], nothing)
         model = Model(self._declaring(effect))
         if effect.where.startswith("joint_") and effect.name not in REVERSING and not model.effects[-1].n_states:
-            return self._spread(model, coefficients)
+            return LeftOpen(self._spread(model, coefficients), nothing)
         if not self._noisy:
             self._noisy = [self.within(weak) for weak in self.rows.noisy()]
         noisy = [make.of(effect).columns for make in self._noisy]
@@ -192,19 +198,35 @@ class CandidateColumns:
         squares = np.mean(np.square(changes), axis=0)
         near = slice(HOPS - 1, HOPS - 1 + len(squares))
         sums = [np.convolve(column, np.ones(2 * HOPS - 1))[near] for column in (np.ones(len(squares)), *squares.T)]
-        out = np.stack(sums[1:], axis=1) / sums[0][:, None]
-        if effect.name in REVERSING:
-            force, turned = model.effects[-1], self._reversals(effect.where)
+        own = np.stack(sums[1:], axis=1) / sums[0][:, None]
+        free = self._untold(model, coefficients) if effect.name in REVERSING else nothing
+        return LeftOpen(np.maximum(own - free[:, 0], 0.0), free)
 
-            def off(motion: Motion) -> Array:
-                inputs = self._inputs(model, motion)
-                return turned.squares(lambda v: force.force(model.layout, motion.x, v, inputs) @ coefficients, motion)
+    def _untold(self, model: Model, coefficients: Array) -> Array:
+        """Covariances (W, HOPS, n_v) of the rows by what a model's last effect, a law of a rate's sign, does not tell.
 
-            out = np.maximum(out, self._weak.variance(off))
-        if effect.name in DRY:
-            held = self._standstill(effect.where)
-            out += np.square(self._force(model, held) @ coefficients)
-        return out
+        Where the sign changes, and at a standstill.
+        """
+        force = model.effects[-1]
+        turned, held = self._reversals(force.where), self._standstill(force.where)
+        leaving_for = round(LEAVING * self.system.sample_rate)
+
+        def squares(motion: Motion) -> Array:
+            inputs = self._inputs(model, motion)
+
+            def along(v: Array) -> Array:
+                return force.force(model.layout, motion.x, v, inputs) @ coefficients
+
+            jumps = turned.squares(along, motion)
+            if force.name not in DRY:
+                return jumps
+            v = motion.v.copy()
+            v[:, held.motor] = held.slow
+            still, leaving = (told(motion.segment, motion.samples)[:, None] for told in (held.at, held.leaving))
+            times = np.where(leaving != 0.0, leaving_for * WINDING**2, self._weak.alike)
+            return np.where(still, times * along(v) ** 2, jumps)
+
+        return self._weak.free(squares)
 
     def _spread(self, model: Model, coefficients: Array) -> Array:
         """Variance (W, n_v) of the rows for a model's last effect, of a joint, to first order in encoders' noise."""
@@ -257,8 +279,8 @@ class CandidateColumns:
         """Of a joint's motor, in the windows' own samples."""
         if where not in self._turned:
             rows, joint = self.rows, int(where.removeprefix("joint_")) - 1
-            noise = self._noise_of(joint)
-            self._turned[where] = Reversals(rows.sensing, self._weak.segments, joint, noise, self.system.sample_rate)
+            parts = self._noise_of(joint), self.system.sample_rate, self._standstill(where)
+            self._turned[where] = Reversals(rows.sensing, self._weak.segments, joint, *parts)
         return self._turned[where]
 
     def _noise_of(self, joint: int) -> float:

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from sms_online.description.schema import Effect, System
 from sms_online.diagnosis.attempt import FITTED, LARGEST_SHARE_LEFT, MOST_WINDOWS, REWEIGHED, STRETCH
-from sms_online.diagnosis.candidate import Candidate
+from sms_online.diagnosis.candidate import Candidate, LeftOpen
 from sms_online.diagnosis.candidates import LINEAR, CandidateColumns
 from sms_online.diagnosis.constants import applied, corrected, deviations, improved, stands
 from sms_online.diagnosis.diagnose import CORRECTIONS
@@ -133,9 +133,11 @@ class LateColumns(CandidateColumns):
         """The same without the windows before."""
         return replace(candidate, columns=np.where(self._before[:, None, None], 0.0, candidate.columns))
 
-    def variance(self, candidate: Candidate, coefficients: Array) -> Array:
+    def left_open(self, candidate: Candidate, coefficients: Array) -> LeftOpen:
         """Of the windows that it acts in."""
-        return np.where(self._before[:, None], 0.0, super().variance(candidate, coefficients))
+        told = super().left_open(candidate, coefficients)
+        acts = ~self._before[:, None, None]
+        return LeftOpen(told.own * acts[..., 0], told.free * acts)
 
 
 def search(request: Request) -> Outcome | None:
@@ -199,7 +201,7 @@ def _trace(request: Request, rows: SessionRows, everything: Sequence[Candidate],
     fitted = _fitted(rows, late)
     tracing = Tracing(rows, [c for c in limited if np.any(c.columns)], fitted, request.prior, (), make)
     ranking = tracing.ranking()[:TOLD]
-    chosen = tracing.run(lambda found, k: refine(tracing, make, found, k), tracing.sticks)
+    chosen = tracing.run(lambda found, k: refine(tracing, make, found, k))
     findings = [tracing.finding(chosen, k) for k in chosen]
     gains = {k: finding.gain.gain for k, finding in zip(chosen, findings, strict=True)}
     kept = [k for k in chosen if gains[k] >= LEAST_SHARE * max(gains.values())]

@@ -15,8 +15,10 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import uniform_filter1d
 
 from sms_online.diagnosis.record import Segment
+from sms_online.diagnosis.standstill import SessionStandstill
 from sms_online.diagnosis.weak_windows import Motion
 from sms_online.effects.base import position
 from sms_online.effects.friction import STANDSTILL
@@ -36,24 +38,24 @@ BESIDE = 10.0
 class Reversals:
     """Rates of one motor.
 
-    joint: of the motor, by number from 0. noise: σ of its position, rad.
+    joint: of the motor, by number from 0. noise: σ of its position, rad. standstill: of the same.
     """
 
     def __init__(
-        self, sensing: Sensing, segments: Sequence[Segment], joint: int, noise: float, sample_rate: float
-    ) -> None:
+        self, sensing: Sensing, segments: Sequence[Segment], joint: int, noise: float, sample_rate: float,
+        standstill: SessionStandstill,
+    ) -> None:  # fmt: skip
         layout = sensing.model.layout
         self._motor = layout.theta_m[joint]
         self._angles = [position(layout, sensing.coordinates(each.values), self._motor)[:, None] for each in segments]
-        self._noise, self._rate = noise, sample_rate
+        self._noise, self._rate, self._standstill = noise, sample_rate, standstill
         self._known: dict[tuple[int, int], Array] = {}
 
     @cached_property
     def _half_width(self) -> int:
         """Of the filter that tells all changes of sign best, which are the more the narrower it is.
 
-        Where an axis rests those of noise count too: then it is narrower than need be, and rows near reversals count
-        for less.
+        Where the motor stands still noise alone changes it.
         """
         # Twice the width has to lie within the segments.
         shortest = min(len(angle) for angle in self._angles)
@@ -61,6 +63,7 @@ class Reversals:
 
         def off(M: int) -> float:
             inner = [np.arange(2 * M, len(angle) - 2 * M) for angle in self._angles]
+            inner = [samples[~self._standstill.at(k, samples)] for k, samples in enumerate(inner)]
             return float(sum(np.sum(self._turns(k, samples, M)[1] ** 2) for k, samples in enumerate(inner)))
 
         return min(widths, key=off)
@@ -81,12 +84,17 @@ class Reversals:
         """
         rate = self._rates(segment, M, samples)
         turns = np.flatnonzero((np.diff(np.sign(rate)) != 0.0) & (np.diff(samples) == 1))
-        own, wide = kernel(M)[:, 1], kernel(2 * M)[:, 1]
-        alone, between = (self._noise * float(np.linalg.norm(w)) * self._rate for w in (own, wide - np.pad(own, M)))
+        alone, between = self._noise_of(M)
         more = self._rates(segment, 2 * M, samples[turns]) - rate[turns]
         deviation = np.sqrt(alone**2 + np.maximum(0.0, more**2 - between**2))
         off = np.hypot(deviation / np.abs(rate[turns + 1] - rate[turns]), RESOLVED)
         return turns, np.minimum(off, LARGEST * self._rate)
+
+    def _noise_of(self, M: int) -> tuple[float, float]:
+        """Deviation of the rate by noise, and of what it differs by from that of a filter twice as wide, rad/s."""
+        own, wide = kernel(M)[:, 1], kernel(2 * M)[:, 1]
+        alone, between = (self._noise * float(np.linalg.norm(w)) * self._rate for w in (own, wide - np.pad(own, M)))
+        return alone, between
 
     def mean(self, force: Callable[[Array], Array], motion: Motion) -> Array:
         """Forces (K, n_v, c) of speeds (K, n_v), averaged over each sample of a motion."""
@@ -99,13 +107,28 @@ class Reversals:
         return np.asarray(total / len(WITHIN))
 
     def squares(self, force: Callable[[Array], Array], motion: Motion) -> Array:
-        """Squares (K, n_v) of what a force (K, n_v) of speeds is off by at the samples before a reversal."""
-        turns, off = self._turns(motion.segment, motion.samples, min(motion.half_width, self._half_width))
-        sides = []
-        for side in (BESIDE * STANDSTILL, -BESIDE * STANDSTILL):
+        """Squares (K, n_v) of what a force (K, n_v) of speeds is off by, as of one that is off anew at each sample.
+
+        At the samples before a reversal by the jump's place. Elsewhere by what the filter rounds off of the rate, which
+        stays for as many samples as it is wide.
+        """
+        M = min(motion.half_width, self._half_width)
+        rate, blur = self._rates(motion.segment, M, motion.samples), self._blur(motion.segment, M)[motion.samples]
+
+        def at(speed: Array | float) -> Array:
             v = motion.v.copy()
-            v[:, self._motor] = side
-            sides.append(force(v))
-        out = np.zeros_like(motion.v)
-        out[turns] = ((sides[0] - sides[1])[turns] * off[:, None]) ** 2
-        return out
+            v[:, self._motor] = speed
+            return force(v)
+
+        slowest = BESIDE * STANDSTILL
+        faster, slower = (np.sign(rate) * np.maximum(np.abs(rate) + off, slowest) for off in (blur, -blur))
+        out = (2 * M + 1) * (0.5 * (at(faster) - at(slower))) ** 2
+        turns, off = self._turns(motion.segment, motion.samples, M)
+        out[turns] += ((at(slowest) - at(-slowest))[turns] * off[:, None]) ** 2
+        return np.asarray(out)
+
+    def _blur(self, segment: int, M: int) -> Array:
+        """What the filter rounds off of the rate around each sample of a segment (B,), rad/s: see `_turns`."""
+        every = np.arange(len(self._angles[segment]))
+        more = self._rates(segment, 2 * M, every) - self._rates(segment, M, every)
+        return np.sqrt(np.maximum(0.0, uniform_filter1d(more**2, 2 * M + 1) - self._noise_of(M)[1] ** 2))

@@ -65,14 +65,16 @@ class SessionRows:
 
     Y (W, n_v, n), b (W, n_v): rows as they are. time (W,): the windows' middles, s since grid index 0. weak: evaluates
     further columns. Once they are weighed: beta (n,), values behind their noise; std (W, n_v), their own predicted
-    deviation; bends, half width of the filter to (n_v,): variance of what noise does beyond first order; responses,
-    name to (W, n_v, sensors): of the rows to so much added to each position sensor's reading.
+    deviation; white_std (W, n_v), that of what a row tells beside those before it; bends, half width of the filter to
+    (n_v,): variance of what noise does beyond first order; responses, name to (W, n_v, sensors): of the rows to so much
+    added to each position sensor's reading.
     """
 
     beta: Array
     std: Array
     bends: Mapping[int, Array]
     responses: dict[str, Array]
+    white_std: Array
 
     def __init__(
         self,
@@ -168,8 +170,9 @@ class SessionRows:
                 sensitivity = sensitivities.window(window.start)
                 age = window.end / self._rate
                 kernel = row_noise.kernel(sensitivity) + rough.kernel(window.rough, pi, sensitivity.displacements)
-                covariances = row_noise.covariance(kernel, sensitivity.rates, noise.sensors, noise.torque, age)
-                covariances[-1][np.diag_indices(n_v)] += variance + rough.at_rest(window.rest, pi)
+                free = rough.at_rest(window.rest, pi)
+                covariances = row_noise.covariance(kernel, sensitivity.rates, noise.sensors, noise.torque, free, age)
+                covariances[-1][np.diag_indices(n_v)] += variance
                 self._covariances.append(covariances)
                 # Sums over the steps, sensor by sensor.
                 by_sensor = kernel.transpose(2, 1, 0) * (span / STEPS)
@@ -241,15 +244,23 @@ class SessionRows:
         """Number of windows W."""
         return len(self.b)
 
-    def whiten(self, own: Array) -> None:
-        """Make the windows' rows independent; own (W, n_v): share of a row's variance that is an error of its own."""
+    def whiten(self, own: Array, free: Array | None = None) -> None:
+        """Make the windows' rows independent; own (W, n_v): further variance of each row, an error of its own.
+
+        free (W, HOPS, n_v): further covariances, see `WeakWindows.free`.
+        """
         n_v = self.model.layout.n_v
         self._operators: list[tuple[Array, Array]] = []
+        self.white_std = np.empty_like(self.std)
         L = np.empty((0, 0))
-        for covariances, share in zip(self._covariances, own, strict=True):
-            L = factored(L, covariances, share)
+        for k, (covariances, errors) in enumerate(zip(self._covariances, own, strict=True)):
+            if free is not None:
+                more = free[k, : len(covariances)][::-1]
+                covariances = [one + np.diag(other) for one, other in zip(covariances, more, strict=True)]
+            L = factored(L, covariances, errors)
             inverse = scipy.linalg.solve_triangular(L[-n_v:, -n_v:], np.eye(n_v), lower=True, check_finite=False)
             self._operators.append((inverse @ L[-n_v:, :-n_v], inverse))
+            self.white_std[k] = np.diag(L)[-n_v:]
 
     def white(self, columns: Array) -> Array:
         """Columns (W, n_v, c) in the whitened rows, (W n_v, c)."""

@@ -12,6 +12,10 @@ from sms_online.diagnosis.record import Segment
 from sms_online.effects.base import position
 from sms_online.pipeline.sensing import Sensing
 from sms_online.pipeline.standstill import Standstill, rate_filter, slowest
+from sms_online.stream import Array
+
+# An axis that breaks loose is held by what its law gives so long before its motion shows, s.
+LEAVING = 0.025
 
 
 class SessionStandstill:
@@ -27,11 +31,13 @@ class SessionStandstill:
         layout = sensing.model.layout
         self.motor = layout.theta_m[joint]
         self.slow = slowest(noise, rate_filter(sample_rate), sample_rate)
-        self._still = []
+        self._still, self._leaving = [], []
         for segment in segments:
+            angle = position(layout, sensing.coordinates(segment.values), self.motor)
             still = Standstill(1, sample_rate)
-            still.push(position(layout, sensing.coordinates(segment.values), self.motor)[:, None], np.array([noise]))
-            self._still.append(still.at(np.arange(segment.index.size))[:, 0])
+            still.push(angle[:, None], np.array([noise]))
+            self._still.append(still.at(np.arange(angle.size))[:, 0])
+            self._leaving.append(_leaving(self._still[-1], angle, sample_rate))
 
     @cached_property
     def share(self) -> float:
@@ -41,3 +47,18 @@ class SessionStandstill:
     def at(self, number: int, samples: NDArray[np.int64]) -> NDArray[np.bool_]:
         """At which samples (K,) of a segment it does."""
         return self._still[number][samples]
+
+    def leaving(self, number: int, samples: NDArray[np.int64]) -> Array:
+        """Sign (K,) of the motion that it breaks loose into at samples (K,) just before it does, zero elsewhere."""
+        return self._leaving[number][samples]
+
+
+def _leaving(still: NDArray[np.bool_], angle: Array, sample_rate: float) -> Array:
+    """See `SessionStandstill.leaving`, for all samples of a segment."""
+    out = np.zeros(still.size)
+    beyond = rate_filter(sample_rate)
+    for end in (np.flatnonzero(np.diff(still.astype(np.int8)) < 0) + 1).tolist():
+        if end + beyond < still.size:
+            begin = end - round(LEAVING * sample_rate)
+            out[begin:end] = np.sign(angle[end + beyond] - angle[end]) * still[begin:end]
+    return out

@@ -12,12 +12,11 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from sms_online.diagnosis.candidate import Candidate, Finding, Ranked
+from sms_online.diagnosis.candidate import Candidate, Finding, Laws, Ranked
 from sms_online.diagnosis.evidence import Gain, basis, free_of, gain, least_squares, threshold, together
 from sms_online.diagnosis.plausible import plausible
 from sms_online.diagnosis.rows import SessionRows
@@ -49,18 +48,10 @@ INEXACT_DRY = 1e-3
 SMALL_CHANGE = 0.1
 # Dry friction is told by what it leaves open where its axis stands still for at least this share of a session.
 MUCH_REST = 0.05
+# Times at most that shape constants are refined, for the weights follow them, and they the weights.
+SETTLED = 3
 # At most so many effects are looked for in turn.
 MOST_EFFECTS = 8
-
-
-class LeftOpen(Protocol):
-    """What a candidate's law leaves open: the sensors' noise in it, and any value of friction at a standstill."""
-
-    def variance(self, candidate: Candidate, coefficients: Array) -> Array:
-        """Variance (W, n_v) of the rows for what noise makes of a candidate with coefficients (c,)."""
-
-    def at_rest(self, candidate: Candidate) -> float:
-        """Share of the session in which the axis of a law of dry friction stands still."""
 
 
 class Tracing:
@@ -76,47 +67,54 @@ class Tracing:
         fitted: NDArray[np.bool_],
         prior: Prior | None = None,
         fixed: Sequence[Candidate] = (),
-        noise: LeftOpen | None = None,
+        laws: Laws | None = None,
     ) -> None:
         """fixed: effects that belong to the model already, whose columns come right after its parameters'.
 
-        noise: without it candidates leave nothing open.
+        laws: without them candidates leave nothing open.
         """
         self.rows, self.candidates, self.fitted = rows, list(candidates), fitted
-        self._noise, self._prior = noise, prior
+        self._laws, self._prior = laws, prior
         self._n_v = rows.model.layout.n_v
         self._model = np.concatenate([rows.Y, *(candidate.columns for candidate in fixed)], axis=2)
         self.trials = len(self.candidates)
         # Which candidate each step of the search took, and all that were chosen then.
         self.path: list[tuple[int, list[int]]] = []
-        self._own = np.zeros_like(rows.std)  # variance of the effects chosen
+        # What the effects chosen leave open.
+        self._own = np.zeros_like(rows.std)
+        self._free = np.zeros((len(rows.b), HOPS, self._n_v))
         self._taken: dict[int, float] = {}  # gains of the effects chosen
         self.weigh()
 
-    def settle(self, chosen: Sequence[int]) -> None:
-        """Weigh the rows with what noise makes of the effects chosen too: of a rate's sign near a reversal, say."""
-        if self._noise is None:
-            return
-        own = np.zeros_like(self.rows.std)
+    def settle(self, chosen: Sequence[int]) -> bool:
+        """Weigh the rows with what the laws of the effects chosen leave open too; whether that changes the weights."""
+        if self._laws is None:
+            return False
+        own, free = np.zeros_like(self._own), np.zeros_like(self._free)
         at, solution = self._model.shape[2], self.solution(chosen, np.ones(self.rows.count, dtype=bool))
         for k in chosen:
             c = len(self.candidates[k].parameters)
-            own += self._noise.variance(self.candidates[k], solution[at : at + c])
+            told = self._laws.left_open(self.candidates[k], solution[at : at + c])
+            own += told.own
+            free += told.free
             at += c
-        if np.any(np.abs(own - self._own) > SMALL_CHANGE * (self.rows.std**2 + self._own)):
-            self._own = own
-            self.weigh()
+        used, wanted = self._own + self._free[:, 0], own + free[:, 0]
+        if not np.any(np.abs(wanted - used) > SMALL_CHANGE * (self.rows.std**2 + used)):
+            return False
+        self._own, self._free = own, free
+        self.weigh()
+        return True
 
     def weigh(self) -> None:
         """Weigh the rows, and whiten them, with what is left open by the effects settled last."""
         rows = self.rows
-        self.std = np.sqrt(rows.std**2 + self._own)
+        self.std = np.sqrt(rows.std**2 + self._own + self._free[:, 0])
         self._plain_model = self._model / self.std[..., None]
         self._plain = [candidate.columns / self.std[..., None] for candidate in self.candidates]
         self.floor = self._floor()
         # Windows that overlap share the noise of the effects chosen: as errors of their own they count it once.
-        weighed = (1.0 + self.floor) * self.std**2 + (HOPS - 1) * self._own
-        rows.whiten(weighed / rows.std**2 - 1.0)
+        own = self.floor * self.std**2 + HOPS * self._own
+        rows.whiten(own, self._free if np.any(self._free) else None)
         # What is known beforehand are rows too, of parameters alone.
         known = prior_factor(self._prior, rows.base.n)
         self._known = len(known)
@@ -200,11 +198,10 @@ class Tracing:
         candidate = self.candidates[k]
         return max(len(candidate.parameters), len(candidate.effect.coefficients))
 
-    def run(self, refine: Callable[[Sequence[int], int], None], sticking: bool = False) -> list[int]:
+    def run(self, refine: Callable[[Sequence[int], int], None]) -> list[int]:
         """Numbers of the candidates found, in the order of what they explain.
 
-        refine: improves the shape constants of one of those chosen, before what it leaves is given to others. sticking:
-        whether dry friction that holds its axis comes before what explains more, see `_holding`.
+        refine: improves the shape constants of one of those chosen, before what it leaves is given to others.
         """
         chosen: list[int] = []
         self.path = []
@@ -218,16 +215,19 @@ class Tracing:
             best = self._preferred(gains, eligible) if best is None else best
             if best is None:
                 break
-            law = self._holding(chosen, best, gains, eligible) if sticking else None
+            law = self._holding(chosen, best, gains, eligible)
             if law is None and self.improvement(chosen, best) < LEAST_IMPROVEMENT:
                 refused.add(self.candidates[best].key)
                 continue
             if law is not None:
                 best = law
                 held.add(law)
-            refine([*chosen, best], best)
-            # Its own noise may be what others were taken for, at a standstill say.
+            # What it leaves open may be what others were taken for, at a standstill say.
             self.settle([*chosen, best])
+            for _ in range(SETTLED):
+                refine([*chosen, best], best)
+                if not self.settle([*chosen, best]):
+                    break
             self._take([*chosen, best])
             chosen = self._revised([*chosen, best], refused, held)
             self.settle(chosen)
@@ -239,7 +239,9 @@ class Tracing:
                 chosen = [k for k in chosen if k not in impossible]
                 self.settle(chosen)
                 self._take(chosen)
-            if self.candidates[best].key in refused:
+            if self.candidates[best].key not in {self.candidates[k].key for k in chosen}:
+                # Nothing is left of it once the rows bear what it leaves open.
+                refused.add(self.candidates[best].key)
                 continue
             if frozenset(chosen) in seen:
                 break  # effects that replace each other in turn
@@ -262,31 +264,27 @@ class Tracing:
         ]
         if not laws:
             return None
-        law = max(laws, key=lambda k: gains[k].gain)
+        told = {k: self._deviance([*chosen, k]) for k in laws}
+        law = min(laws, key=lambda k: told[k])
         others = [self._deviance(each) for each in ([*chosen, best], chosen) if law not in each]
-        deviance = self._deviance([*chosen, law])
-        # Its shape is told by all rows, those too in which it may take any value.
         self.settle(chosen)
-        # Rows that overlap count the same evidence once for each.
-        return law if deviance < min(others) - DECISIVE * HOPS else None
-
-    @property
-    def sticks(self) -> bool:
-        """Whether any candidate is dry friction that holds its axis much of the time."""
-        return any(self._holds(k) for k in range(len(self.candidates)))
+        return law if told[law] < min(others, default=np.inf) - DECISIVE else None
 
     def _holds(self, k: int) -> bool:
         candidate = self.candidates[k]
-        return self._noise is not None and candidate.effect.name in DRY and self._noise.at_rest(candidate) > MUCH_REST
+        return self._laws is not None and candidate.effect.name in DRY and self._laws.at_rest(candidate) > MUCH_REST
 
     def _deviance(self, chosen: Sequence[int]) -> float:
-        """Minus twice the log of the likelihood of held-out rows, as if they were independent, up to a constant.
+        """Minus twice the log of the likelihood of held-out rows beside those before them, up to a constant.
 
         Fitted to the other windows; what is left open goes with the coefficients from all of them.
         """
-        self.settle(chosen)
-        left = self.residual(chosen, self.solution(chosen, self.fitted))
-        return float(np.sum((left**2 + 2.0 * np.log(self.std))[~self.fitted]))
+        for _ in range(SETTLED):
+            if not self.settle(chosen):
+                break
+        left = self._b - self._columns(chosen) @ self.solution(chosen, self.fitted)
+        squares = left[: self.std.size].reshape(self.std.shape) ** 2
+        return float(np.sum((squares + 2.0 * np.log(self.rows.white_std))[~self.fitted]))
 
     def _take(self, chosen: Sequence[int]) -> None:
         """Remember what each of the effects chosen takes beside the others."""
@@ -309,9 +307,9 @@ class Tracing:
     def _revised(self, chosen: list[int], refused: set[str], held: set[int]) -> list[int]:
         """The same effects without those that the last one has made superfluous, each in its best form beside them.
 
-        What takes an effect's place has to lower the residual of held-out rows. The last one stays though its own
-        noise, which the rows bear by now, may leave little of its gain: that of an axis that stuck; and so do those
-        held, which their likelihood has chosen.
+        What takes an effect's place has to lower the residual of held-out rows. Dry friction that came last stays
+        though what it leaves open, which the rows bear by now, may leave little of its gain; and so do those held,
+        which their likelihood has chosen.
         """
         last = chosen[-1]
         for k in list(chosen):
@@ -321,9 +319,11 @@ class Tracing:
             simple = [j for j in self._eligible(others, refused) if j == k or self.candidates[j].extends is None]
             best = self._preferred(gains, [*simple, k] if k not in simple else simple)
             if best is None or self._excess(k, gains[k]) <= 0.0:
-                chosen = chosen if k == last or k in held else others
+                stays = k in held or (k == last and self.candidates[k].effect.name in DRY)
+                chosen = chosen if stays else others
             elif (
                 best != k
+                and k not in held
                 and not self._near(gains[k].gain, gains[best].gain)
                 and self.improvement(others, best) >= LEAST_IMPROVEMENT
             ):

@@ -12,9 +12,11 @@ from scipy.signal import oaconvolve
 
 from sms_online.diagnosis.record import Segment
 from sms_online.model.layout import Layout
+from sms_online.pipeline.momentum_windows import HOPS, INSTANTS
+from sms_online.pipeline.row_noise import common
 from sms_online.pipeline.sensing import Sensing
 from sms_online.pipeline.smoothing import kernel, smooth, smooth_all
-from sms_online.pipeline.weak_form import test_function
+from sms_online.pipeline.weak_form import alike, test_function
 from sms_online.stream import Array
 
 
@@ -101,6 +103,11 @@ class WeakWindows:
         v = self._layout.speeds(x, rates[:, :n_x])
         return Motion(number, M, seen, x, v, smoothed[:, n_x:]), which
 
+    @property
+    def alike(self) -> float:
+        """Samples that a window averages over, see `weak_form.alike`."""
+        return alike(test_function(self.windows.width, 1.0, self.windows.exponent)[0])
+
     def columns(self, weak: WeakColumns, dense: bool = False) -> Array:
         """Rows (W, n_v, c).
 
@@ -122,11 +129,23 @@ class WeakWindows:
         assert out is not None
         return out
 
-    def variance(self, squares: Callable[[Motion], Array]) -> Array:
-        """Variance of the rows (W, n_v) for squares (K, n_v) of what a force is off by at single samples."""
-        out = np.zeros((self.count, self._layout.n_v))
+    def free(self, squares: Callable[[Motion], Array]) -> Array:
+        """Covariances (W, HOPS, n_v) of each speed's row with its own, then with those of the windows before.
+
+        By a force that is off by something else at every sample; squares: gives those of that, (K, n_v).
+        """
+        parts = np.zeros((self.count, INSTANTS, self._layout.n_v))
         for (motion, which), (by_force, _) in zip(self.motions(dense=True), self._sums(dense=True), strict=True):
-            out[which] = by_force.power(2) @ squares(motion)
+            # The last sample, where the test function is zero, is the first of the next half hop.
+            seen, weights = (part.reshape(which.size, -1)[:, :-1] for part in (by_force.indices, by_force.data))
+            told = squares(motion)
+            for row in np.flatnonzero(np.any(told, axis=0)):
+                inside = weights**2 * told[seen, row]
+                parts[which, :, row] = np.sqrt(inside.reshape(which.size, INSTANTS, -1).sum(axis=2))
+        out = np.zeros((self.count, HOPS, self._layout.n_v))
+        for k in np.flatnonzero(np.any(parts, axis=(1, 2))).tolist():
+            first = max(k + 1 - HOPS, int(np.searchsorted(self.windows.segment, self.windows.segment[k])))
+            out[k, : k + 1 - first] = common(parts[k], parts[first : k + 1])[::-1]
         return out
 
     def spread(self, slopes: Callable[[Motion], tuple[Array, Array]]) -> Array:

@@ -28,7 +28,7 @@ from sms_online.pipeline.momentum_windows import (
     Probes,
     Window,
 )
-from sms_online.pipeline.rough_forces import RoughForces, responses
+from sms_online.pipeline.rough_forces import RoughForces, open_at_rest, responses
 from sms_online.pipeline.smoothing import HALF_WIDTHS, WidthChoice, smooth, stride
 from sms_online.pipeline.standstill import Standstill
 from sms_online.pipeline.weak_form import test_function
@@ -241,7 +241,7 @@ class MomentumBalance:
             weak = -(phi_dot @ values[:, :width] + phi @ values[:, width : 2 * width]).reshape(COPIES, -1)
             b = (phi @ values[:, 2 * width :]).reshape(COPIES, -1) - weak[:, entries:]
             last = grid + window + self.width + self.lead
-            none = np.empty((STEPS + 1, 0)), np.empty(0)
+            none = np.empty((STEPS + 1, 0)), np.empty((INSTANTS, 0))
             out.append(Window(window // self.half_hop, last, weak[:, :entries], b, half_width, *none))
         return out, probed
 
@@ -262,7 +262,7 @@ class MomentumBalance:
             Y[:, self._rough] = weak[:, : self._rough.size]
             told = responses(slopes, phi * self.sample_rate, half_width, self.sample_rate, STEPS)
             still = self._standstill.at(np.arange(window, window + self.width + 1) + self.lead)
-            rest = phi @ (breaking * still[:, motor_of])
+            rest = open_at_rest(breaking, still[:, motor_of], phi)
             out.append(replace(row, Y=Y, b=row.b - weak[:, self._rough.size :], rough=told, rest=rest))
         return out
 

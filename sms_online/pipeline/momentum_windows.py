@@ -53,7 +53,7 @@ class Window:
     nonzero): columns of the base parameters where the model has any (`MomentumBalance.rows`, `.columns`); b (copies,
     n_v). The first copy is that of the samples as measured, the others those of the samples with noise added.
     half_width: M of the filter. rough (STEPS + 1, E): what noise does by way of rough forces, see `RoughForces.kernel`.
-    rest (D,): see `RoughForces.at_rest`.
+    rest (INSTANTS, D): see `RoughForces.at_rest`.
     """
 
     start: int

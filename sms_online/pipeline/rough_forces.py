@@ -16,7 +16,9 @@ from numpy.typing import NDArray
 
 from sms_online.effects.friction import DRY, REVERSING, STANDSTILL
 from sms_online.model.model import Model
+from sms_online.pipeline.momentum_windows import INSTANTS
 from sms_online.pipeline.smoothing import kernel
+from sms_online.pipeline.weak_form import alike
 from sms_online.stream import Array
 
 # Step of the differences that give slopes, rad and rad/s (m, m/s): 1e-9 of a force is lost to curvature where a phase
@@ -121,13 +123,13 @@ class RoughForces:
         return out
 
     def at_rest(self, rest: Array, pi: Array) -> Array:
-        """Variance (n_v,) of rows for what dry friction may be at a standstill: any value up to what breaks it loose.
+        """What dry friction may add to rows at a standstill, any value up to what breaks it loose, in each half hop.
 
-        That much counts as one deviation, which is more than it can be; windows that overlap share it, and it counts
-        once in each. rest (D,): integral of `breaking` over the window where its axis rests. pi (n_pi,).
+        (INSTANTS, n_v), one deviation, of parameters π (n_pi,); no half hops for a model without dry friction. rest
+        (INSTANTS, D): see `open_at_rest`.
         """
-        by_motor = np.eye(self._model.layout.n_v)[:, self.motors]
-        return np.asarray((by_motor @ (rest * pi[self.dry])) ** 2)
+        by_motor = np.eye(self._model.layout.n_v)[self.motors]
+        return np.abs((rest * pi[self.dry]) @ by_motor) if self.dry.size else np.empty((0, by_motor.shape[1]))
 
     def without(self, pi: Array) -> Array:
         """π (n_pi,) without the forces that `slopes` tells."""
@@ -146,6 +148,19 @@ class RoughForces:
             own = self.rows == row
             out[:, row] = (told[:, own] * pi[self.coefficients[own]]) @ readings[self.coordinates[own]]
         return out
+
+
+def open_at_rest(breaking: Array, still: NDArray[np.bool_], phi: Array) -> Array:
+    """(INSTANTS, D): one deviation of the integrals of forces where their axes rest, a half hop at a time.
+
+    As of a force that is another at each sample, so that nothing is foreseen of its course; over a window, all of which
+    its axis rests in, as large as what breaks it loose, which is more than it can be. breaking (width + 1, D):
+    `RoughForces.breaking` along the window. still (width + 1, D): whether the axis rests. phi (width + 1,): weights of
+    the integral.
+    """
+    inside = alike(phi) * (phi[:, None] * breaking * still) ** 2
+    half_hops = np.arange(0, phi.size - 1, (phi.size - 1) // INSTANTS)
+    return np.asarray(np.sqrt(np.add.reduceat(inside[:-1], half_hops)))
 
 
 @cache

@@ -6,6 +6,9 @@ balance; and ∫ φ n_τ dt from the noise of the torque. White noise of 1σ per
 windows that overlap share noise, so their covariance is block-banded, and so is its Cholesky factor L: L⁻¹ [Y b] are
 rows with independent errors of standard deviation one.
 
+A force that nobody knows, as dry friction's at a standstill, is an error of all windows that see it: what it adds to
+one says what it adds to the others, and what they hold beside it is still told.
+
 Devices with clocks of their own are all a little early or late against each other, by the same for seconds. Over a
 window that is an error of the row in proportion to the rates of that device's readings.
 """
@@ -13,7 +16,7 @@ window that is an error of the row in proportion to the rates of that device's r
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -27,8 +30,9 @@ from sms_online.pipeline.weak_form import test_function
 from sms_online.stream import Array
 
 STEPS_A_HOP = STEPS // HOPS
-# Share of a row's variance that is added to it alone, for the rounding of the factorisation.
-OWN_SHARE = 1e-7
+# Shares of a row's variance that are added to it alone, for the rounding of the factorisation: of what is noise of
+# sensors, and of all of it, which unknown forces may be beyond by far.
+OWN_SHARE, ROUNDING = 1e-7, 1e-13
 # What the clock of a device is off by, 1σ, s, when it has been watched for CLOCK_KNOWN, s, and before. The line behind
 # it is told by the least delayed samples, which reach the loop some 100 µs late, give or take 50; few tell less.
 CLOCK_ERROR, YOUNG_CLOCK_ERROR, CLOCK_KNOWN = 5e-5, 1e-4, 10.0
@@ -54,6 +58,7 @@ class RowNoise:
         self._before: deque[Array] = deque(maxlen=HOPS)
         self._torque_before: deque[Array] = deque(maxlen=HOPS)
         self._late_before: deque[Array] = deque(maxlen=HOPS)
+        self._free_before: deque[Array] = deque(maxlen=HOPS)
         self.late = np.empty((0, 0))
 
     def _told(self, offset: int, span: float) -> Array:
@@ -71,6 +76,7 @@ class RowNoise:
         self._before.clear()
         self._torque_before.clear()
         self._late_before.clear()
+        self._free_before.clear()
 
     def kernel(self, window: Sensitivity) -> Array:
         """c (STEPS + 1, n_v, sensors): what a displacement n(t) of each sensor adds to the rows is ∫ c(t) n(t) dt.
@@ -83,13 +89,15 @@ class RowNoise:
         return np.asarray((self._weights[window.offset] @ stacked).reshape(STEPS + 1, n_v, sensors))
 
     def covariance(
-        self, kernel: Array, rates: Array, sensor_density: Array, torque_density: Array, age: float = np.inf
-    ) -> list[Array]:
+        self, kernel: Array, rates: Array, sensor_density: Array, torque_density: Array, free: Array,
+        age: float = np.inf,
+    ) -> list[Array]:  # fmt: skip
         """Covariances (n_v, n_v) with the windows before, oldest first, then the window's own; (N s)² and so on.
 
         kernel (STEPS + 1, n_v, sensors): c. rates (INSTANTS + 1, sensors): of the readings in the window.
         sensor_density (sensors,): σ² T_s of each position sensor. torque_density (joints,): of n τ, (N m)² s.
-        age: of the clocks at the window's end, s.
+        free (INSTANTS, n_v): deviation of what unknown forces add to each row in a half hop; no half hops where there
+        are none in any window. age: of the clocks at the window's end, s.
         """
         n_v, sensors = kernel.shape[1:]
         # By time, so that what two windows have in common lies in one piece.
@@ -109,6 +117,11 @@ class RowNoise:
         if self._clocks:
             # What windows share fades out where they no longer overlap, for the covariance to stay banded.
             out += ((1.0 - hops / HOPS)[:, None, None] * late) @ np.array(self._late_before).swapaxes(1, 2)
+        own = np.einsum("ii->i", out[-1])
+        own += OWN_SHARE * own
+        if len(free):
+            self._free_before.append(free)
+            np.einsum("hii->hi", out)[:] += common(free, self._free_before)
         return list(out)
 
     def _lateness(self, kernel: Array, rates: Array) -> Array:
@@ -134,6 +147,7 @@ class RowNoise:
             "before": np.array(self._before),
             "torque_before": np.array(self._torque_before),
             "late_before": np.array(self._late_before),
+            "free_before": np.array(self._free_before),
         }
 
     def restore(self, state: Mapping[str, NDArray[Any]]) -> None:
@@ -141,6 +155,18 @@ class RowNoise:
         self._before = deque(np.array(state["before"]), maxlen=HOPS)
         self._torque_before = deque(np.array(state["torque_before"]), maxlen=HOPS)
         self._late_before = deque(np.array(state["late_before"]), maxlen=HOPS)
+        self._free_before = deque(np.array(state["free_before"]), maxlen=HOPS)
+
+
+def common(free: Array, before: Iterable[Array]) -> Array:
+    """Covariances (windows, n_v) of a window with each of `before`, it being the last, by forces that nobody knows.
+
+    free (INSTANTS, n_v): see `RowNoise.covariance`.
+    """
+    others = list(before)[::-1]
+    instants = range(0, len(others) * (INSTANTS // HOPS), INSTANTS // HOPS)  # by which this one begins later
+    found = [np.sum(free[: INSTANTS - k] * other[k:], axis=0) for k, other in zip(instants, others, strict=True)]
+    return np.array(found[::-1])
 
 
 def _interpolation(at: Array, nodes: Array) -> Array:
@@ -148,15 +174,16 @@ def _interpolation(at: Array, nodes: Array) -> Array:
     return np.stack([np.interp(at, nodes, unit) for unit in np.eye(nodes.size)], axis=1)
 
 
-def factored(L: Array, covariances: list[Array], floor: Array | float = 0.0) -> Array:
+def factored(L: Array, covariances: list[Array], errors: Array | float = 0.0) -> Array:
     """Cholesky factor of the windows that the last one overlaps, and of itself, its rows below the others'.
 
-    L: the same as of the window before. covariances: see `RowNoise.covariance`. floor (n_v,): share of a row's variance
-    that is an error of its own. Raises numpy.linalg.LinAlgError where the covariance is not positive definite.
+    L: the same as of the window before. covariances: see `RowNoise.covariance`. errors (n_v,): further variance of each
+    row, of its own. Raises numpy.linalg.LinAlgError where the covariance is not positive definite.
     """
     own = covariances[-1].copy()
     n_v = len(own)
-    own[np.diag_indices(n_v)] *= 1.0 + OWN_SHARE + floor
+    diagonal = np.einsum("ii->i", own)
+    diagonal += ROUNDING * diagonal + errors
     size = n_v * (len(covariances) - 1)
     L = L[len(L) - size :, len(L) - size :]
     cross = np.concatenate([np.empty((n_v, 0)), *covariances[:-1]], axis=1).T  # (size, n_v)

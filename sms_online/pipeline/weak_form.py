@@ -10,6 +10,14 @@ import numpy as np
 from sms_online.stream import Array
 
 
+def alike(phi: Array) -> float:
+    """Samples of φ (K,) that an integral with it averages over, (Σ φ)² / Σ φ².
+
+    Of a force that is another at each sample with so many times the variance it is as large as of one that stays.
+    """
+    return float(phi.sum() ** 2 / (phi @ phi))
+
+
 def test_function(steps: int, span: float, exponent: int) -> tuple[Array, Array, Array]:
     """φ = (1 - z²)^exponent with φ̇ (1/s) and φ̈ (1/s²) at steps + 1 instants of a window of `span` seconds."""
     z = np.linspace(-1.0, 1.0, steps + 1)

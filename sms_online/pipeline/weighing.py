@@ -111,10 +111,11 @@ class Weighing:
         age = window.end / self._sample_rate
         kernel = self._noise.kernel(sensitivity) + self._rough.kernel(window.rough, pi, sensitivity.displacements)
         noise = self.sensor_noise
-        covariances = self._noise.covariance(kernel, sensitivity.rates, noise.sensors, noise.torque, age)
+        free = self._rough.at_rest(window.rest, pi)
+        covariances = self._noise.covariance(kernel, sensitivity.rates, noise.sensors, noise.torque, free, age)
         own = covariances[-1]
         diagonal = np.einsum("ii->i", own)
-        diagonal += errors + self._rough.at_rest(window.rest, pi)
+        diagonal += errors
         of_noise = own.copy()
         diagonal += self.misfit * diagonal
         width = rows.shape[1]
