@@ -138,11 +138,11 @@ def test_friction_that_holds_an_axis_much_of_the_time_is_found_beside_what_fits_
     """It takes any value there, and moves nothing elsewhere; where a ripple explains all of it, there is none."""
     rng = np.random.default_rng(8)
     stuck = rng.random(WINDOWS) < 0.6
-    held = np.where(stuck, rng.uniform(-30.0, 30.0, WINDOWS), 0.0)
+    held = np.where(stuck, rng.uniform(-3e3, 3e3, WINDOWS), 0.0)
     offset = rng.standard_normal(WINDOWS)
     b = rng.standard_normal((WINDOWS, SPEEDS))
     b[:, 0] += held + 2.0 * offset
-    other = held if ripples else held + np.where(stuck, 5.0 * rng.standard_normal(WINDOWS), 0.0)
+    other = held if ripples else held + np.where(stuck, 800.0 * rng.standard_normal(WINDOWS), 0.0)
     candidates = [
         _candidate("stribeck_friction", np.sign(held)),
         _candidate("cogging", other),
@@ -156,4 +156,4 @@ def test_friction_that_holds_an_axis_much_of_the_time_is_found_beside_what_fits_
         return [chosen for _, chosen in tracing.path]
 
     assert steps(0.0)[0] == [1]
-    assert steps(0.6) == ([[1], [1, 2]] if ripples else [[0], [0, 2]])
+    assert steps(0.6) == ([[1]] if ripples else [[0], [0, 2]])
