@@ -161,7 +161,7 @@ def test_noise_of_a_phase_is_told_to_first_order(
     _, rows = session()
     make = CandidateColumns(rows, rows.model.system)
     candidate = make.of(Effect(name=name, where="joint_1", coefficients=shape))
-    told = make.variance(candidate, np.array(coefficients))
+    told = make.left_open(candidate, np.array(coefficients)).own
     monkeypatch.setattr("sms_online.diagnosis.rows.NOISES", 60)
     drawn = [make.within(weak).of(candidate.effect).columns - candidate.columns for weak in rows.noisy()]
     acts = [rows.model.layout.q[0], rows.model.layout.theta_m[0]] if both else [rows.model.layout.theta_m[0]]
