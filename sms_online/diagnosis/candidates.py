@@ -46,21 +46,23 @@ class CandidateColumns:
     Columns of those that become constants hold the parameters behind the noise of the rows, and follow them.
     """
 
-    def __init__(self, rows: SessionRows, system: System, weak: WeakWindows | None = None, since: int = 0) -> None:
+    def __init__(
+        self, rows: SessionRows, system: System, weak: WeakWindows | None = None, since: int = 0, resting: bool = False
+    ) -> None:
         """weak: windows that columns are wanted in, in place of the rows'. since: number of the first segment whose
-        length tells frequencies apart.
+        length tells frequencies apart. resting: whether dry friction has its law at a standstill too.
         """
         self.rows, self.system = rows, system
-        self._since = since
+        self._since, self._resting = since, resting
         self._weak = rows.weak if weak is None else weak
         self._noisy: list[CandidateColumns] = []
         self._held: dict[str, SessionStandstill] = {}
         self._turned: dict[str, Reversals] = {}
         self._own = {p.name for p in rows.model.parameters}
 
-    def within(self, weak: WeakWindows) -> CandidateColumns:
+    def within(self, weak: WeakWindows, resting: bool = False) -> CandidateColumns:
         """The same for other windows of the session."""
-        return CandidateColumns(self.rows, self.system, weak)
+        return CandidateColumns(self.rows, self.system, weak, resting=resting)
 
     def inputs(self, motion: Motion) -> Inputs:
         """What the effects that the system declares need beside the motion."""
@@ -165,7 +167,7 @@ class CandidateColumns:
             if force.name not in REVERSING:
                 return None, along(motion.v)
             G = self._reversals(force.where).mean(along, motion)
-            if force.name in DRY:
+            if force.name in DRY and not self._resting:
                 # What holds the axis is no matter of the law but just before it gives way.
                 held = self._standstill(force.where)
                 still, leaving = (told(motion.segment, motion.samples) for told in (held.at, held.leaving))

@@ -116,14 +116,16 @@ class Outcome:
 class LateColumns(CandidateColumns):
     """Candidates that act from a segment on."""
 
-    def __init__(self, rows: SessionRows, system: System, late: int, weak: WeakWindows | None = None) -> None:
-        super().__init__(rows, system, weak)
+    def __init__(
+        self, rows: SessionRows, system: System, late: int, weak: WeakWindows | None = None, resting: bool = False
+    ) -> None:
+        super().__init__(rows, system, weak, resting=resting)
         self._late = late
         self._before = self._weak.windows.segment < late
 
-    def within(self, weak: WeakWindows) -> LateColumns:
+    def within(self, weak: WeakWindows, resting: bool = False) -> LateColumns:
         """The same for other windows of the session."""
-        return LateColumns(self.rows, self.system, self._late, weak)
+        return LateColumns(self.rows, self.system, self._late, weak, resting)
 
     def of(self, effect: Effect) -> Candidate:
         """The candidate of one declaration."""

@@ -25,7 +25,8 @@ class RelativeResiduals:
         layout = rows.model.layout
         self._joints = list(layout.theta_m)
         self._windows = weak = joint_windows(rows)
-        self._make = make.within(weak)
+        # Sessions, too, foretell friction at a standstill by its law.
+        self._make = make.within(weak, resting=True)
         starts, segments = weak.windows.start, weak.windows.segment
         firsts = np.array([segment.index[0] for segment in rows.segments])
         self.times = (firsts[segments] + starts + weak.windows.width / 2) / rows.model.system.sample_rate

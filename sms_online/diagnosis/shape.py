@@ -62,9 +62,10 @@ def _refine_one(tracing: Tracing, make: CandidateColumns, chosen: Sequence[int],
     if len(tried) < 2 or tried[0] <= 0.0:
         return
     here = tried.index(effect.coefficients[shape])
-    # Beyond the ends of the grid by as much as to the next value inside.
-    low = tried[here - 1] if here > 0 else tried[0] ** 2 / tried[1]
-    high = tried[here + 1] if here < len(tried) - 1 else tried[-1] ** 2 / tried[-2]
+    # Beyond the ends of the grid by as much as to the next value inside: further off it is another effect.
+    grid = ENTRIES[effect.name].shapes[shape].grid(make.ranges(effect.where))
+    low = tried[here - 1] if here > 0 else grid[0] ** 2 / grid[1]
+    high = tried[here + 1] if here < len(tried) - 1 else grid[-1] ** 2 / grid[-2]
     best: dict[float, Candidate] = {}
 
     def loss(log_value: float) -> float:

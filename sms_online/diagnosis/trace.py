@@ -233,10 +233,10 @@ class Tracing:
             self.settle(chosen)
             # What the laws found are uncertain by is told in the rows' new weights.
             self._take(chosen)
-            # In those weights, beside the others, an effect may have to be what it cannot be.
-            while impossible := [k for k in chosen if self._taken[k] == 0.0]:
-                refused |= {self.candidates[k].key for k in impossible}
-                chosen = [k for k in chosen if k not in impossible]
+            # In those weights, beside the others, an effect may have to be what it cannot be, or be none.
+            while gone := [k for k in chosen if self._taken[k] <= self._least(k, held)]:
+                refused |= {self.candidates[k].key for k in gone}
+                chosen = [k for k in chosen if k not in gone]
                 self.settle(chosen)
                 self._take(chosen)
             if self.candidates[best].key not in {self.candidates[k].key for k in chosen}:
@@ -294,6 +294,11 @@ class Tracing:
             found = gain(Q, free_of(Q, self._b[:, None])[:, 0], self._Z[k])
             self._taken[k] = self._plausible(self.candidates[k], found).gain
 
+    def _least(self, k: int, held: set[int]) -> float:
+        """Gain that one of those chosen must have in the end: of dry friction what it leaves open may leave little."""
+        dry = k in held or self.candidates[k].effect.name in DRY
+        return 0.0 if dry else threshold(FALSE_ALARM, self.trials, self._Z[k].shape[1])
+
     def _eligible(self, chosen: Sequence[int], refused: set[str]) -> list[int]:
         """Candidates that may come to those chosen; one that extends another comes after it, and then replaces it."""
         taken = {self.candidates[k].key for k in chosen}
@@ -307,9 +312,9 @@ class Tracing:
     def _revised(self, chosen: list[int], refused: set[str], held: set[int]) -> list[int]:
         """The same effects without those that the last one has made superfluous, each in its best form beside them.
 
-        What takes an effect's place has to lower the residual of held-out rows. Dry friction that came last stays
-        though what it leaves open, which the rows bear by now, may leave little of its gain; and so do those held,
-        which their likelihood has chosen.
+        What takes an effect's place has to lower the residual of held-out rows. The last one stays though what it
+        leaves open, which the rows bear by now, may leave little of its gain; and so do those held, which their
+        likelihood has chosen.
         """
         last = chosen[-1]
         for k in list(chosen):
@@ -319,8 +324,7 @@ class Tracing:
             simple = [j for j in self._eligible(others, refused) if j == k or self.candidates[j].extends is None]
             best = self._preferred(gains, [*simple, k] if k not in simple else simple)
             if best is None or self._excess(k, gains[k]) <= 0.0:
-                stays = k in held or (k == last and self.candidates[k].effect.name in DRY)
-                chosen = chosen if stays else others
+                chosen = chosen if k == last or k in held else others
             elif (
                 best != k
                 and k not in held
