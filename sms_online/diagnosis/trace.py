@@ -48,6 +48,8 @@ INEXACT_DRY = 1e-3
 SMALL_CHANGE = 0.1
 # Dry friction is told by what it leaves open where its axis stands still for at least this share of a session.
 MUCH_REST = 0.05
+# Laws of it that are compared, with their shape constants, those that explain most.
+RIVALS = 3
 # Times at most that shape constants are refined, for the weights follow them, and they the weights.
 SETTLED = 3
 # At most so many effects are looked for in turn.
@@ -240,8 +242,7 @@ class Tracing:
                 self.settle(chosen)
                 self._take(chosen)
             if self.candidates[best].key not in {self.candidates[k].key for k in chosen}:
-                # Nothing is left of it once the rows bear what it leaves open.
-                refused.add(self.candidates[best].key)
+                refused.add(self.candidates[best].key)  # nothing is left of it beside the others
                 continue
             if frozenset(chosen) in seen:
                 break  # effects that replace each other in turn
@@ -259,9 +260,8 @@ class Tracing:
         compared by their likelihoods, with what each leaves open.
         """
         acts = self._acts(best)
-        laws = [
-            k for k in allowed if self._excess(k, gains[k]) > 0.0 and np.any(acts & self._acts(k)) and self._holds(k)
-        ]
+        beside = [k for k in allowed if self._excess(k, gains[k]) > 0.0 and np.any(acts & self._acts(k))]
+        laws = sorted((k for k in beside if self._holds(k)), key=lambda k: -gains[k].gain)[:RIVALS]
         if not laws:
             return None
         told = {k: self._deviance([*chosen, k]) for k in laws}
