@@ -137,6 +137,9 @@ def test_the_adopted_system_file_holds_what_was_found() -> None:
     (effect,) = parse_system(adopted_text("paper-planar", system, adopted, {}), "adopted").effects
     assert (effect.name, effect.where) == ("torsional_hysteresis", "joint_1")
     assert effect.coefficients["width"] == pytest.approx(0.02, rel=0.02)
+    value, std = coefficients(diagnosis, diagnosis.findings[0])["width"]
+    assert std is not None
+    assert abs(value - 0.02) < 3.0 * std < 0.06 * value
 
 
 def test_the_document_holds_residuals_and_parameters_before_and_after() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -11,6 +12,7 @@ from sms_online.diagnosis.attempt import LARGEST_SHARE_LEFT, Attempt, Part
 from sms_online.diagnosis.candidate import Finding
 from sms_online.diagnosis.constants import deviations
 from sms_online.diagnosis.diagnose import Diagnosis
+from sms_online.diagnosis.shape import slopes
 from sms_online.effects.base import report
 from sms_online.effects.catalogue import ENTRIES, declarable
 from sms_online.judgement import Facts, Judgement, judge, judge_diagnosis
@@ -215,14 +217,19 @@ def coefficients(diagnosis: Diagnosis, finding: Finding) -> Coefficients:
             stds = deviations(constant, covariance)
             return {name: (value, stds.get(name)) for name, value in constant.coefficients.items()}
     session = diagnosis.estimator_after
-    names, values, covariance = _estimate(diagnosis)
+    batch = _batch(attempt, diagnosis.chosen)
+    names, values = [p.name for p in batch.parameters], batch.values
+    covariance = np.where(np.isfinite(batch.covariance), batch.covariance, 0.0)
     for force in session.model.effects:
         if (force.name, force.where) == (effect.name, effect.where):
             # What only a combination of parameters is known of counts as zero in the others' favour.
             absent = [p.name for p in force.parameters if p.name not in names]
             grown = np.pad(covariance, (0, len(absent)))
             told = report(force, [*names, *absent], np.pad(values, (0, len(absent))), grown)
-            return {name: (value, None if name in force.shapes else std) for name, (value, std) in told.items()}
+            return {
+                name: (value, batch.shapes.get((finding.candidate.key, name)) if name in force.shapes else std)
+                for name, (value, std) in told.items()
+            }
     own_names = [p.name for p in finding.candidate.parameters]
     return {
         name.rsplit(".", 1)[1]: (float(values[k]), float(np.sqrt(covariance[k, k])))
@@ -236,8 +243,8 @@ def _posterior(attempt: Attempt, chosen: Sequence[int]) -> list[dict[str, Any]]:
 
     A session weighs rows by the sensors' noise alone until it knows better, and against that no prior counts.
     """
-    parameters, values, covariance = _batch(attempt, chosen)
-    stds = np.sqrt(np.diag(covariance))
+    batch = _batch(attempt, chosen)
+    parameters, values, stds = batch.parameters, batch.values, np.sqrt(np.diag(batch.covariance))
     return [
         {
             "name": p.name,
@@ -254,20 +261,27 @@ def _posterior(attempt: Attempt, chosen: Sequence[int]) -> list[dict[str, Any]]:
     ]
 
 
-def _batch(attempt: Attempt, chosen: Sequence[int]) -> tuple[list[Parameter], Array, Array]:
-    """Parameters of the model and of the effects chosen, with values and covariance from all rows."""
+@dataclass(frozen=True)
+class _Batch:
+    """Parameters of the model and of the effects chosen (k,), with values and covariance (k, k) from all rows.
+
+    shapes: deviations of shape constants, by key of the effect and name; the others' bear what these leave open.
+    """
+
+    parameters: list[Parameter]
+    values: Array
+    covariance: Array
+    shapes: dict[tuple[str, str], float]
+
+
+def _batch(attempt: Attempt, chosen: Sequence[int]) -> _Batch:
     columns = [*attempt.fixed, *(attempt.tracing.candidates[k] for k in chosen)]
     parameters = [*attempt.rows.base.parameters, *(p for candidate in columns for p in candidate.parameters)]
     constants = {p.name for candidate in attempt.fixed for p in candidate.parameters}
     kept = [k for k, p in enumerate(parameters) if p.name not in constants]
-    covariance = attempt.tracing.covariance(chosen)[np.ix_(kept, kept)]
-    return [parameters[k] for k in kept], attempt.solution(chosen)[kept], covariance
-
-
-def _estimate(diagnosis: Diagnosis) -> tuple[list[str], Array, Array]:
-    """Names, values and covariance of the parameters after, from the rows of the diagnosis.
-
-    A session thins the motion to what the arm's own columns need; a cogging's phase turns faster than that.
-    """
-    parameters, values, covariance = _batch(diagnosis.attempt, diagnosis.chosen)
-    return [p.name for p in parameters], values, np.where(np.isfinite(covariance), covariance, 0.0)
+    shapes, moved = slopes(attempt.tracing, attempt.make, chosen)
+    covariance = attempt.tracing.covariance(chosen, moved)
+    stds = np.sqrt(np.diag(covariance)[len(parameters) :]).tolist()
+    told = {shape: std for shape, std in zip(shapes, stds, strict=True) if np.isfinite(std)}
+    values = attempt.solution(chosen)[kept]
+    return _Batch([parameters[k] for k in kept], values, covariance[np.ix_(kept, kept)], told)

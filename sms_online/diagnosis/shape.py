@@ -7,15 +7,19 @@ from collections.abc import Sequence
 import numpy as np
 from scipy.optimize import minimize_scalar
 
+from sms_online.description.schema import Effect
 from sms_online.diagnosis.candidate import Candidate
 from sms_online.diagnosis.candidates import CandidateColumns
 from sms_online.diagnosis.trace import Tracing
 from sms_online.effects.catalogue import ENTRIES
+from sms_online.stream import Array
 
 # Relative accuracy of a shape constant: twenty seconds tell the frequency of a mass that rings with 100 N to 1e-7, and
 # a phase that is off moves the parameters. And evaluations at most.
 TOLERANCE = 1e-7
 EVALUATIONS = 40
+# Relative step of slopes by a shape constant: twenty seconds of a slow ringing turn on by a milliradian.
+STEP = 1e-5
 # Times that a shape constant follows from coefficients, which follow from it: the second is off by the first's square.
 SETTLED = 2
 # Constants that count something (of a cogging's period, say) are not refined.
@@ -31,6 +35,36 @@ def refine(tracing: Tracing, make: CandidateColumns, chosen: Sequence[int], k: i
         if shape in tracing.candidates[k].effect.coefficients and shape not in COUNTED:
             _refine_one(tracing, make, chosen, k, shape)
     _settle(tracing, make, chosen, k)
+
+
+def slopes(tracing: Tracing, make: CandidateColumns, chosen: Sequence[int]) -> tuple[list[tuple[str, str]], Array]:
+    """Shape constants of those chosen that the rows tell, key of the effect and name, and slopes of the rows by them.
+
+    (W, n_v, shapes). What follows from coefficients is none of them.
+    """
+    names, found = [], [np.empty((*tracing.rows.b.shape, 0))]
+    solution = tracing.solution(chosen, np.ones(tracing.rows.count, dtype=bool))
+    at = len(solution) - sum(len(tracing.candidates[k].parameters) for k in chosen)
+    for candidate in (tracing.candidates[k] for k in chosen):
+        effect, own = candidate.effect, solution[at : at + len(candidate.parameters)]
+        at += own.size
+        for shape in _told_by_rows(effect):
+            value = effect.coefficients[shape]
+            there, back = (
+                make.of(effect.model_copy(update={"coefficients": effect.coefficients | {shape: moved}})).columns @ own
+                for moved in (value * (1.0 + STEP), value * (1.0 - STEP))
+            )
+            names.append((candidate.key, shape))
+            found.append(((there - back) / (2.0 * STEP * value))[..., None])
+    return names, np.concatenate(found, axis=2)
+
+
+def _told_by_rows(effect: Effect) -> list[str]:
+    """Shape constants of an effect that are refined for themselves."""
+    shapes = ENTRIES[effect.name].shapes
+    told = [s for s in shapes if effect.coefficients.get(s, 0.0) > 0.0 and s not in COUNTED]
+    # A gap is reported for itself, where others have a coefficient too.
+    return told if set(ENTRIES[effect.name].coefficients) - set(shapes) else []
 
 
 def _settle(tracing: Tracing, make: CandidateColumns, chosen: Sequence[int], k: int) -> None:

@@ -71,9 +71,8 @@ class Tracing:
         fixed: Sequence[Candidate] = (),
         laws: Laws | None = None,
     ) -> None:
-        """fixed: effects that belong to the model already, whose columns come right after its parameters'.
-
-        laws: without them candidates leave nothing open.
+        """fixed: effects of the model already, whose columns come right after its parameters'. laws: without them
+        candidates leave nothing open.
         """
         self.rows, self.candidates, self.fitted = rows, list(candidates), fitted
         self._laws, self._prior = laws, prior
@@ -122,7 +121,7 @@ class Tracing:
         self._known = len(known)
         n, width = rows.base.n, self._model.shape[2]
         parts = [self._model, rows.b[..., None], *(candidate.columns for candidate in self.candidates)]
-        white = self._padded(rows.white(np.concatenate(parts, axis=2)))
+        white = self._whitened(np.concatenate(parts, axis=2))
         if self._known:
             white[-self._known :, :n], white[-self._known :, width] = known[:, :-1], known[:, -1]
         ends = np.cumsum([part.shape[2] for part in parts])
@@ -154,18 +153,17 @@ class Tracing:
     def gain_of(self, candidate: Candidate, chosen: Sequence[int]) -> Gain:
         """What any candidate would take beside those chosen."""
         Q = basis(self._columns(chosen))
-        return self._plausible(candidate, gain(Q, free_of(Q, self._b[:, None])[:, 0], self._whitened(candidate)))
+        r = free_of(Q, self._b[:, None])[:, 0]
+        return self._plausible(candidate, gain(Q, r, self._whitened(candidate.columns)))
 
     def put(self, k: int, candidate: Candidate) -> None:
         """Put another form of an effect in the place of a candidate."""
         self.candidates[k] = candidate
         self._plain[k] = candidate.columns / self.std[..., None]
-        self._Z[k] = self._whitened(candidate)
+        self._Z[k] = self._whitened(candidate.columns)
 
-    def _whitened(self, candidate: Candidate) -> Array:
-        return self._padded(self.rows.white(candidate.columns))
-
-    def _padded(self, white: Array) -> Array:
+    def _whitened(self, columns: Array) -> Array:
+        white = self.rows.white(columns)
         return np.concatenate((white, np.zeros((self._known, white.shape[1]))))
 
     def _excess(self, k: int, g: Gain) -> float:
@@ -233,9 +231,8 @@ class Tracing:
             self._take([*chosen, best])
             chosen = self._revised([*chosen, best], refused, held)
             self.settle(chosen)
-            # What the laws found are uncertain by is told in the rows' new weights.
             self._take(chosen)
-            # In those weights, beside the others, an effect may have to be what it cannot be, or be none.
+            # In the new weights, beside the others, an effect may have to be what it cannot be, or be none.
             while gone := [k for k in chosen if self._taken[k] <= self._least(k, held)]:
                 refused |= {self.candidates[k].key for k in gone}
                 chosen = [k for k in chosen if k not in gone]
@@ -389,10 +386,13 @@ class Tracing:
         use[: windows.size * self._n_v] = np.repeat(windows, self._n_v)
         return least_squares(self._columns(chosen)[use], self._b[use])
 
-    def covariance(self, chosen: Sequence[int]) -> Array:
-        """Of the solution (n + c, n + c) from all windows, infinite where they tell nothing."""
-        columns = self._columns(chosen)
-        return solve(np.column_stack((columns, self._b))).covariance()
+    def covariance(self, chosen: Sequence[int], further: Array | None = None) -> Array:
+        """Of the solution (n + c, n + c) from all windows, infinite where they tell nothing.
+
+        further (W, n_v, s): columns of unknowns beside it, which come last.
+        """
+        beside = np.empty((self._b.size, 0)) if further is None else self._whitened(further)
+        return solve(np.column_stack((self._columns(chosen), beside, self._b))).covariance()
 
     def residual(self, chosen: Sequence[int], solution: Array) -> Array:
         """What is left of every row (W, n_v) over its own deviation, see `settle`."""
