@@ -253,16 +253,24 @@ class MomentumBalance:
         kept = self._kept(self._dense, half_width, 1, windows[0], int(parts[-1]) + self.rough.dry.size)
         offset = self.model.layout.n_base_positions - self.model.layout.n_base_speeds
         motor_of = np.searchsorted(self._motors, self.rough.motors + offset)
+        # Entries of columns and slopes by laws of dry friction: at a standstill they tell noise's sign for friction's.
+        by_law = [
+            places[:, None] == self.rough.dry for places in (self._physical[self._rough], self.rough.coefficients)
+        ]
         out = []
         seen = self._seen(kept, half_width, windows, self._rough_columns)
         for window, row, values in zip(windows, rows, seen, strict=True):
             columns, slopes, breaking = np.split(values, parts, axis=1)
-            weak = -(phi @ columns).reshape(COPIES, -1)
+            still = self._standstill.at(np.arange(window, window + self.width + 1) + self.lead)[:, motor_of]
+            moving, both = (~(still @ law.T) for law in by_law)
+            columns = columns.reshape(len(columns), COPIES, -1).copy()
+            columns[..., : self._rough.size] *= moving[:, None]
+            slopes = slopes * np.tile(both, 2)
+            weak = -np.tensordot(phi, columns, 1)
             Y = row.Y.copy()
             Y[:, self._rough] = weak[:, : self._rough.size]
             told = responses(slopes, phi * self.sample_rate, half_width, self.sample_rate, STEPS)
-            still = self._standstill.at(np.arange(window, window + self.width + 1) + self.lead)
-            rest = open_at_rest(breaking, still[:, motor_of], phi)
+            rest = open_at_rest(breaking, still, phi)
             out.append(replace(row, Y=Y, b=row.b - weak[:, self._rough.size :], rough=told, rest=rest))
         return out
 
