@@ -112,7 +112,7 @@ def summary(diagnosis: Diagnosis) -> str:
         return "Nothing but noise is left: the model explains the capture."
     keys = [f"{effect['name']} at {effect['where']}" for effect in _named(diagnosis)]
     before, after = diagnosis.before.holdout.whitened, diagnosis.after.holdout.whitened
-    row = max(before, key=lambda name: before[name])
+    row = max(before, key=lambda name: before[name] ** 2 - after[name] ** 2)
     fall = f"from {_times(before[row])} to {_times(after[row])} times noise"
     falls = f"the residual of {row} falls {fall} on data not fitted"
     if diagnosis.verdict == "named":
