@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from functools import cache
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -19,10 +21,12 @@ from sms_online.diagnosis.record import SampleRecord, Segment, excerpts
 from sms_online.diagnosis.residuals import RowResidual
 from sms_online.diagnosis.rows import SessionRows
 from sms_online.diagnosis.unexplained import describe_residual
+from sms_online.diagnosis.weak_windows import WeakWindows, Windows
 from sms_online.effects.base import Inputs
 from sms_online.model.layout import row_types
 from sms_online.model.model import Model
 from sms_online.pipeline.estimator import Estimator
+from sms_online.pipeline.momentum_windows import EXPONENT, HOPS, INSTANTS
 from sms_online.results import standard_deviation
 from sms_online.stream import Array
 from sms_online.trackers.factor import solve
@@ -239,3 +243,25 @@ def test_only_plausible_coefficients_are_taken() -> None:
     # What a held command does is no sensor's lag.
     assert not plausible("sensor_lag", np.array([4e-4]), 1000.0)
     assert plausible("sensor_lag", np.array([4e-4]), 2000.0)
+
+
+@pytest.mark.parametrize("half_hop", [1, 3])
+def test_rows_share_a_force_that_is_off_at_every_sample(half_hop: int) -> None:
+    """Against sums over samples: windows of two segments, seen through filters of two widths."""
+    width, rate = INSTANTS * half_hop, 100.0
+    segment = np.array([0] * 14 + [1] * 5)
+    start = np.concatenate([np.arange(count) * 2 * half_hop + 10 for count in (14, 5)])
+    half_width = np.array([4, 4, 7, 7, 7, 4, 4, 4, 7, 7, 4, 4, 4, 4, 4, 4, 7, 7, 4])
+    windows = Windows(segment, start, half_width, width, EXPONENT, lambda M: 1)
+    sensing: Any = SimpleNamespace(coordinates=lambda values: values[:, :2], joint_torque=lambda values: values[:, 2:])
+    layout: Any = SimpleNamespace(n_v=2, n_x=2, speeds=lambda x, x_dot: x_dot)
+    samples = [Segment(np.arange(200), np.zeros((200, 3))) for _ in range(2)]
+    squares = np.random.default_rng(1).random((2, 200, 2))
+    found = WeakWindows(windows, layout, sensing, samples, rate).free(lambda m: squares[m.segment, m.samples])
+    phi = np.zeros((segment.size, 200))
+    for row, first in zip(phi, start.tolist(), strict=True):
+        row[first : first + width + 1] = (1.0 - np.linspace(-1.0, 1.0, width + 1) ** 2) ** EXPONENT / rate
+    for k, lag in np.ndindex(segment.size, HOPS):
+        same = lag <= k and segment[k - lag] == segment[k]
+        expected = (phi[k] * phi[k - lag]) @ squares[segment[k]] if same else np.zeros(2)
+        assert_allclose(found[k, lag], expected, rtol=0.0, atol=0.01 * np.sum(phi[k] ** 2))

@@ -157,3 +157,17 @@ def test_friction_that_holds_an_axis_much_of_the_time_is_found_beside_what_fits_
 
     assert steps(0.0)[0] == [1]
     assert steps(0.6) == ([[1]] if ripples else [[0], [0, 2]])
+
+
+@pytest.mark.parametrize("times", [0.5, 1.0, 2.0])
+def test_what_another_effect_has_replaced_comes_back_for_what_that_leaves(times: float) -> None:
+    rng = np.random.default_rng(3)
+    stuck = rng.random(WINDOWS) < 0.2
+    friction = np.where(stuck, np.sign(rng.standard_normal(WINDOWS)), 0.0)
+    ripple = np.where(stuck, 0.0, rng.standard_normal(WINDOWS))
+    b = rng.standard_normal((WINDOWS, SPEEDS))
+    b[:, 0] += 50.0 * friction + 5.0 * ripple
+    candidates = [_candidate("coulomb_friction", friction), _candidate("cogging", ripple)]
+    rows: Any = MadeUpRows(rng.standard_normal((WINDOWS, SPEEDS, 3)), b)
+    found = Tracing(rows, candidates, FITTED, laws=Sticking(stuck, 0.0, times)).run(lambda chosen, k: None)
+    assert sorted(found) == [0, 1]

@@ -100,10 +100,10 @@ def test_links_stiffen_that_take_something_away(
 
 @pytest.mark.parametrize("noise", [1e-5, 1e-4])
 def test_an_axis_stands_still_where_its_rate_is_noise_for_longer_than_a_reversal(noise: float) -> None:
-    """A position that reverses at 0.25 and 0.75 s, rests from 1 to 1.6 s and sticks for 0.1 s at 2.5 s."""
+    """A position that reverses at 0.25 and 0.75 s, rests from 1 to 1.6 s, sticks for 0.1 s at 2.5 s and goes back."""
     t = np.arange(3000) / 1000.0
     rest = ((t >= 1.0) & (t < 1.6)) | ((t >= 2.5) & (t < 2.6))
-    rate = np.where(t < 1.0, np.cos(2.0 * np.pi * t), np.where(rest, 0.0, 1.0))
+    rate = np.where(t < 1.0, np.cos(2.0 * np.pi * t), np.where(rest, 0.0, np.where(t < 2.5, 1.0, -1.0)))
     position = np.cumsum(rate)[:, None] / 1000.0 + noise * np.random.default_rng(5).standard_normal((t.size, 1))
     layout = SimpleNamespace(theta_m=(0,), n_base_positions=3, n_base_speeds=3)
     sensing: Any = SimpleNamespace(model=SimpleNamespace(layout=layout), coordinates=lambda values: values)
@@ -114,10 +114,11 @@ def test_an_axis_stands_still_where_its_rate_is_noise_for_longer_than_a_reversal
     still = held.at(0, seen)
     edges = t[seen[np.flatnonzero(np.diff(still, prepend=False, append=False)[: still.size])]]
     assert edges == pytest.approx([1.0, 1.6, 2.5, 2.6], abs=0.03)
-    # It moves off forwards from both.
+    # It moves off forwards, then back.
     leaving = held.leaving(0, seen)
     assert leaving[(seen > edges[1] * 1000.0 - 20) & still & (seen < 2000)] == pytest.approx(1.0)
-    assert np.sum(leaving) == 50
+    assert leaving[(seen > edges[3] * 1000.0 - 20) & still & (seen > 2000)] == pytest.approx(-1.0)
+    assert np.sum(np.abs(leaving)) == 50
     assert not np.any(leaving[~still])
 
 

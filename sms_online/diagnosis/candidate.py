@@ -49,7 +49,7 @@ class LeftOpen:
     """What the law of a candidate leaves open of the rows.
 
     own (W, n_v): variance by noise. free (W, HOPS, n_v): covariances by forces that it does not tell, where the rate's
-    sign changes, and at a standstill. See `WeakWindows.free`.
+    sign changes, at a standstill, and where the rate is blurred. See `WeakWindows.free`.
     """
 
     own: Array

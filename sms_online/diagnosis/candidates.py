@@ -24,7 +24,7 @@ from sms_online.effects.friction import DRY, REVERSING
 from sms_online.model.model import Model
 from sms_online.model.parameters import Parameter
 from sms_online.pipeline.momentum_windows import HOPS
-from sms_online.pipeline.rough_forces import RoughForces
+from sms_online.pipeline.rough_forces import MOVING_OFF, RoughForces
 from sms_online.stream import Array
 
 TORQUE_RATE = "torque rate"
@@ -172,7 +172,7 @@ class CandidateColumns:
                 held = self._standstill(force.where)
                 still, leaving = (told(motion.segment, motion.samples) for told in (held.at, held.leaving))
                 v = motion.v.copy()
-                v[:, held.motor] = leaving * held.slow
+                v[:, held.motor] = leaving * MOVING_OFF
                 G = np.where(still[:, None, None], along(v), G)
             return None, G
 
@@ -207,7 +207,7 @@ class CandidateColumns:
     def _untold(self, model: Model, coefficients: Array) -> Array:
         """Covariances (W, HOPS, n_v) of the rows by what a model's last effect, a law of a rate's sign, does not tell.
 
-        Where the sign changes, and at a standstill.
+        Where the sign changes, at a standstill, and by what the filter rounds off of the rate.
         """
         force = model.effects[-1]
         turned, held = self._reversals(force.where), self._standstill(force.where)
@@ -223,7 +223,7 @@ class CandidateColumns:
             if force.name not in DRY:
                 return jumps
             v = motion.v.copy()
-            v[:, held.motor] = held.slow
+            v[:, held.motor] = MOVING_OFF
             still, leaving = (told(motion.segment, motion.samples)[:, None] for told in (held.at, held.leaving))
             times = np.where(leaving != 0.0, leaving_for * WINDING**2, self._weak.alike)
             return np.where(still, times * along(v) ** 2, jumps)

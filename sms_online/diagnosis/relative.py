@@ -25,7 +25,7 @@ class RelativeResiduals:
         layout = rows.model.layout
         self._joints = list(layout.theta_m)
         self._windows = weak = joint_windows(rows)
-        # Sessions, too, foretell friction at a standstill by its law.
+        # The relative residual of a session (`JointBalance`), too, foretells friction at a standstill by its law.
         self._make = make.within(weak, resting=True)
         starts, segments = weak.windows.start, weak.windows.segment
         firsts = np.array([segment.index[0] for segment in rows.segments])

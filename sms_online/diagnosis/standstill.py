@@ -58,7 +58,6 @@ def _leaving(still: NDArray[np.bool_], angle: Array, sample_rate: float) -> Arra
     out = np.zeros(still.size)
     beyond = rate_filter(sample_rate)
     for end in (np.flatnonzero(np.diff(still.astype(np.int8)) < 0) + 1).tolist():
-        if end + beyond < still.size:
-            begin = end - round(LEAVING * sample_rate)
-            out[begin:end] = np.sign(angle[end + beyond] - angle[end]) * still[begin:end]
+        # Standstill is told by a filter that reaches so far, and lasts for longer than this.
+        out[end - round(LEAVING * sample_rate) : end] = np.sign(angle[end + beyond] - angle[end])
     return out

@@ -50,8 +50,8 @@ SMALL_CHANGE = 0.1
 MUCH_REST = 0.05
 # Laws of it that are compared, with their shape constants, those that explain most.
 RIVALS = 3
-# Times at most that shape constants are refined, for the weights follow them, and they the weights.
-SETTLED = 3
+# Times at most that rows are weighed anew for a set of effects: weights follow coefficients, and these the weights.
+ROUNDS = 3
 # At most so many effects are looked for in turn.
 MOST_EFFECTS = 8
 
@@ -224,7 +224,7 @@ class Tracing:
                 held.add(law)
             # What it leaves open may be what others were taken for, at a standstill say.
             self.settle([*chosen, best])
-            for _ in range(SETTLED):
+            for _ in range(ROUNDS):
                 refine([*chosen, best], best)
                 if not self.settle([*chosen, best]):
                     break
@@ -233,13 +233,12 @@ class Tracing:
             self.settle(chosen)
             self._take(chosen)
             # In the new weights, beside the others, an effect may have to be what it cannot be, or be none.
-            while gone := [k for k in chosen if self._taken[k] <= self._least(k, held)]:
+            while gone := [k for k in chosen if self._taken[k] <= self._least(k)]:
                 refused |= {self.candidates[k].key for k in gone}
                 chosen = [k for k in chosen if k not in gone]
                 self.settle(chosen)
                 self._take(chosen)
-            if self.candidates[best].key not in {self.candidates[k].key for k in chosen}:
-                refused.add(self.candidates[best].key)  # nothing is left of it beside the others
+            if self.candidates[best].key in refused:
                 continue
             if frozenset(chosen) in seen:
                 break  # effects that replace each other in turn
@@ -265,7 +264,7 @@ class Tracing:
         law = min(laws, key=lambda k: told[k])
         others = [self._deviance(each) for each in ([*chosen, best], chosen) if law not in each]
         self.settle(chosen)
-        return law if told[law] < min(others, default=np.inf) - DECISIVE else None
+        return law if told[law] < min(others) - DECISIVE else None
 
     def _holds(self, k: int) -> bool:
         candidate = self.candidates[k]
@@ -276,7 +275,7 @@ class Tracing:
 
         Fitted to the other windows; what is left open goes with the coefficients from all of them.
         """
-        for _ in range(SETTLED):
+        for _ in range(ROUNDS):
             if not self.settle(chosen):
                 break
         left = self._b - self._columns(chosen) @ self.solution(chosen, self.fitted)
@@ -291,9 +290,9 @@ class Tracing:
             found = gain(Q, free_of(Q, self._b[:, None])[:, 0], self._Z[k])
             self._taken[k] = self._plausible(self.candidates[k], found).gain
 
-    def _least(self, k: int, held: set[int]) -> float:
+    def _least(self, k: int) -> float:
         """Gain that one of those chosen must have in the end: of dry friction what it leaves open may leave little."""
-        dry = k in held or self.candidates[k].effect.name in DRY
+        dry = self.candidates[k].effect.name in DRY
         return 0.0 if dry else threshold(FALSE_ALARM, self.trials, self._Z[k].shape[1])
 
     def _eligible(self, chosen: Sequence[int], refused: set[str]) -> list[int]:

@@ -161,6 +161,7 @@ class RowNoise:
 def common(free: Array, before: Iterable[Array]) -> Array:
     """Covariances (windows, n_v) of a window with each of `before`, it being the last, by forces that nobody knows.
 
+    As if these stayed for a half hop, in which the test functions of either change little.
     free (INSTANTS, n_v): see `RowNoise.covariance`.
     """
     others = list(before)[::-1]
