@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 from model_systems import SYSTEMS, paper, random_states, rigid_chain, spatial
 
-from sms_online.description.schema import System
+from sms_adapters.system_file import load_system
+from sms_online.description.schema import Joint, Motor, RigidLink, System
 from sms_online.model.base_parameters import BaseParameters, find_base_parameters
 from sms_online.model.model import Model
 from sms_online.stream import Array
@@ -146,3 +147,49 @@ def test_finding_them_is_deterministic() -> None:
     first, second = (find_base_parameters(Model(SYSTEMS["spatial exact"])) for _ in range(2))
     assert first.parameters == second.parameters
     assert (first.mixture == second.mixture).all()
+
+
+# Mounts, rad in units of π/2 about x, and tips, m, of two six-axis arms: one with a spherical wrist, one with three
+# parallel axes and an offset wrist.
+RIGHT_ANGLES = {
+    "spherical wrist": ((2, 1, 0, -1, 1, -1), ((0.35, 0, -0.675), (1.15, 0, 0), (0.04, 0, 0.2), (0, 0, -1.2))),
+    "three parallel axes": ((0, 1, 0, 0, 1, -1), ((0, 0, 0.18), (-0.61, 0, 0), (-0.57, 0, 0.17), (0, -0.12, 0))),
+}
+
+
+def right_angled(name: str) -> System:
+    """A rigid arm on a fixed base whose mounts are turned by right angles about x; motors on all axes."""
+    turns, tips = RIGHT_ANGLES[name]
+    chain = rigid_chain(6, free=False, motors=True)
+    return chain.model_copy(
+        update={
+            "gravity": (0.0, 0.0, -9.81),
+            "payload": None,
+            "motors": tuple(Motor(mass=1.5, rotor_inertia=0.002) for _ in turns),
+            "joints": tuple(
+                Joint(mount_rotation=(turn * np.pi / 2, 0.0, 0.0), gear_ratio=100.0, transmission="rigid")
+                for turn in turns
+            ),
+            "links": tuple(
+                RigidLink(**{**link.model_dump(), "tip": tip})
+                for link, tip in zip(chain.links, (*tips, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)), strict=True)
+            ),
+        }
+    )
+
+
+@pytest.mark.parametrize("decimals", [4, 6, 9, 11])
+@pytest.mark.parametrize("arm", ["seven-joint", "spatial-two-link", *RIGHT_ANGLES])
+def test_mounts_rounded_to_decimals_change_no_base_parameter(arm: str, decimals: int) -> None:
+    """Axes that are parallel or cross in the drawing do so in the model, however many digits somebody wrote down."""
+    system = right_angled(arm) if arm in RIGHT_ANGLES else load_system(arm)
+    mounts = (tuple(round(angle, decimals) for angle in joint.mount_rotation) for joint in system.joints)
+    joints = tuple(
+        joint.model_copy(update={"mount_rotation": mount}) for joint, mount in zip(system.joints, mounts, strict=True)
+    )
+    exact, rounded = (find_base_parameters(Model(s)) for s in (system, system.model_copy(update={"joints": joints})))
+    assert [p.name for p in rounded.parameters] == [p.name for p in exact.parameters]
+    nominal = [p.nominal for p in exact.parameters]
+    # An angle that is off by half of its last decimal moves a combination by that share of what is lumped into it.
+    slack = 20.0 * 10.0**-decimals * max(np.abs(nominal))
+    np.testing.assert_allclose([p.nominal for p in rounded.parameters], nominal, rtol=0.0, atol=slack)

@@ -1,27 +1,35 @@
 """Base parameters: the combinations of physical parameters that the motion of a system can determine at all.
 
-Found numerically on the system itself: columns of energy and dissipated power at random states, rank by QR with column
-pivoting, then independent columns chosen in the order of preference. Source: Gautier, J. Robotic Systems 8 (1991) 485.
+Found numerically on the system itself: columns of energy and dissipated power at random states, orthogonalised in the
+order of preference. A column is independent of those before it where its remainder exceeds what the tolerances of the
+geometry could make of zero: axes that are parallel, or cross, are so to a fraction of a milliradian at best.
+Source of the numerical search: Gautier, J. Robotic Systems 8 (1991) 485.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-import scipy.linalg
 
 from sms_online.description.explain import hint, nearest
 from sms_online.effects.base import Inputs
 from sms_online.errors import InputError
 from sms_online.model.model import Model
 from sms_online.model.parameters import Parameter
+from sms_online.model.tolerance import perturbed
 from sms_online.stream import Array
 
 # States per parameter: enough that the rank is that of the columns and not of the sample.
 STATES_PER_PARAMETER = 4
-# Relative size below which a scaled column's remainder is zero: rounding leaves 1e-14, real combinations above 1e-6.
+# Relative size below which a scaled column's remainder is zero whatever the tolerances: rounding leaves 1e-14.
 RANK_TOLERANCE = 1e-9
+# Geometries drawn from the tolerances, and the multiple of the rms remainder they make of a dependent column that an
+# independent one exceeds. On every shipped system real combinations exceed ten times that multiple; mounts written to
+# four decimals stay below a hundredth of it.
+DRAWS = 3
+BEYOND_TOLERANCE = 3.0
 # Coefficients of combinations within this of zero or of one are that number: they come from a least-squares solve.
 COEFFICIENT_ROUNDING = 1e-8
 RANDOM_SEED = 1965
@@ -105,46 +113,92 @@ def find_base_parameters(model: Model) -> BaseParameters:
     known = tuple((names.index(name), value) for name, value in model.system.known.items())
     rng = np.random.default_rng(RANDOM_SEED)
     x, v = random_states(model, STATES_PER_PARAMETER * model.n_pi, rng)
-    energy = model.energy_columns(x, v)
-    power = model.power_columns(x, v, random_inputs(model, len(x), rng))
-    Y = np.concatenate((energy[1:] - energy[0], power))
+    inputs = random_inputs(model, len(x), rng)
+    Y = _columns(model, x, v, inputs)
     scale = np.linalg.norm(Y, axis=0)
     known_indices = {index for index, _ in known}
     largest = float(scale.max())
     absent = tuple(k for k in range(model.n_pi) if scale[k] <= RANK_TOLERANCE * largest or k in known_indices)
     candidates = [k for k in range(model.n_pi) if k not in absent]
-    scaled = Y[:, candidates] / scale[candidates]
-    pivoted = np.abs(np.diag(scipy.linalg.qr(scaled, mode="r", pivoting=True)[0]))
-    rank = int(np.sum(pivoted > RANK_TOLERANCE * pivoted[0]))
-    # Without pivoting a column that depends on earlier ones leaves nothing on the diagonal of R.
-    remainder = np.abs(np.diag(np.linalg.qr(scaled, mode="r")))
-    chosen = sorted(np.argsort(-remainder, kind="stable")[:rank])
-    independent = tuple(candidates[k] for k in chosen)
+    drawn = [_columns(model.of(perturbed(model.system, rng)), x, v, inputs) for _ in range(DRAWS)]
+    changes = [(other - Y)[:, candidates] / scale[candidates] for other in drawn]
+    kept = _independent(Y[:, candidates] / scale[candidates], changes)
+    independent = tuple(candidates[k] for k in kept)
     dependent = tuple(k for k in candidates if k not in independent)
-    mixture = np.linalg.lstsq(Y[:, independent] / scale[list(independent)], Y[:, dependent], rcond=None)[0]
-    mixture /= scale[list(independent)][:, None]
-    mixture[np.abs(mixture) < COEFFICIENT_ROUNDING] = 0.0
-    ones = np.abs(np.abs(mixture) - 1.0) < COEFFICIENT_ROUNDING
-    mixture[ones] = np.sign(mixture[ones])
+    mixture = _snapped(_mixture(Y, independent, dependent, scale), np.full((len(independent), 1), COEFFICIENT_ROUNDING))
+    spread = np.sqrt(
+        np.mean([(_mixture(other, independent, dependent, scale) - mixture) ** 2 for other in drawn], axis=0)
+    )
+    tolerance = np.maximum(COEFFICIENT_ROUNDING, BEYOND_TOLERANCE * spread)
+    printed = _snapped(mixture, tolerance)
+    lumped = [model.parameters[d] for d in dependent]
     parameters = tuple(
-        _combine(
-            model.parameters[k], [(mixture[row, column], model.parameters[d]) for column, d in enumerate(dependent)]
-        )
-        for row, k in enumerate(independent)
+        _combine(model.parameters[k], list(zip(exact.tolist(), shown.tolist(), lumped, strict=True)))
+        for k, exact, shown in zip(independent, mixture, printed, strict=True)
     )
     return BaseParameters(model.parameters, parameters, independent, dependent, absent, mixture, known)
 
 
-def _combine(leading: Parameter, others: list[tuple[float, Parameter]]) -> Parameter:
-    """Leading parameter with what is lumped into it: the symbol is the combination, masses say so in the name."""
-    lumped = [(c, p) for c, p in others if c != 0.0]
+def _columns(model: Model, x: Array, v: Array, inputs: Inputs) -> Array:
+    """Columns (rows, n_pi) of differences of energy, then of dissipated power, at states x, v."""
+    energy = model.energy_columns(x, v)
+    return np.concatenate((energy[1:] - energy[0], model.power_columns(x, v, inputs)))
+
+
+def _independent(columns: Array, changes: Sequence[Array]) -> list[int]:
+    """Numbers of the columns (rows, c), of unit length, that are independent of those kept before them.
+
+    changes: of the columns, each by a geometry drawn from its tolerances. A column that depends on others leaves of
+    them what its own change leaves of theirs; an independent one leaves more than BEYOND_TOLERANCE times that.
+    """
+    kept: list[int] = []
+    Q = np.empty((len(columns), 0))
+
+    def remainder(column: Array) -> Array:
+        once = column - Q @ (Q.T @ column)
+        return np.asarray(once - Q @ (Q.T @ once))
+
+    for k, column in enumerate(columns.T):
+        rest = remainder(column)
+        length = float(np.linalg.norm(rest))
+        if length <= RANK_TOLERANCE:
+            continue
+        mixture = np.linalg.lstsq(columns[:, kept], column, rcond=None)[0] if kept else np.empty(0)
+        made = [np.sum(remainder(change[:, k] - change[:, kept] @ mixture) ** 2) for change in changes]
+        if length > BEYOND_TOLERANCE * np.sqrt(np.mean(made)):
+            kept.append(k)
+            Q = np.column_stack((Q, rest / length))
+    return kept
+
+
+def _mixture(Y: Array, independent: Sequence[int], dependent: Sequence[int], scale: Array) -> Array:
+    """Coefficients (n, dependent) of the dependent columns of Y in the independent ones, by least squares.
+
+    scale (n_pi,): sizes of the columns.
+    """
+    size = scale[list(independent)]
+    return np.asarray(np.linalg.lstsq(Y[:, independent] / size, Y[:, dependent], rcond=None)[0] / size[:, None])
+
+
+def _snapped(mixture: Array, tolerance: Array) -> Array:
+    """Coefficients with those within a tolerance of 0, 1 or -1 set to that number."""
+    out = np.where(np.abs(mixture) < tolerance, 0.0, mixture)
+    return np.where(np.abs(np.abs(out) - 1.0) < tolerance, np.sign(out), out)
+
+
+def _combine(leading: Parameter, others: list[tuple[float, float, Parameter]]) -> Parameter:
+    """Leading parameter with what is lumped into it, each with its coefficient and that as people read it.
+
+    The symbol is the combination; masses say so in the name.
+    """
+    lumped = [(c, p) for _, c, p in others if c != 0.0]
     symbol = leading.symbol + "".join(f"{'+' if c > 0 else '-'}{_factor(abs(c))}{p.symbol}" for c, p in lumped)
     name = leading.name
     if leading.quantity == "mass" and lumped and all(c == 1.0 and p.quantity == "mass" for c, p in lumped):
         name += "_with_" + "_and_".join(p.owner for _, p in lumped)
-    nominal = leading.nominal + sum(c * p.nominal for c, p in lumped)
+    nominal = leading.nominal + sum(c * p.nominal for c, _, p in others if c != 0.0)
     return replace(leading, name=name, symbol=symbol, nominal=nominal)
 
 
 def _factor(c: float) -> str:
-    return "" if c == 1.0 else f"{c:.4g} "
+    return "" if c == 1.0 else f"{c:.5g} "
