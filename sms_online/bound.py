@@ -26,6 +26,7 @@ from sms_online.model.dynamics import Dynamics
 from sms_online.model.model import Model
 from sms_online.sensor_set import Readings, SensorSet, session_sensors
 from sms_online.stream import Array
+from sms_online.threads import one_blas_thread
 from sms_online.trackers.factor import raw_triangle
 
 if TYPE_CHECKING:
@@ -78,6 +79,7 @@ class MotionRecord:
         return [motion for motion in joined if motion.t.size > 1]
 
 
+@one_blas_thread()
 def session_bound(estimator: Estimator, record: MotionRecord) -> Array | None:
     """Bound (n,) of a finished session at its own estimate, with the noise that it has used of its sensors.
 
@@ -101,6 +103,7 @@ def session_bound(estimator: Estimator, record: MotionRecord) -> Array | None:
     return cramer_rao_bound(dynamics, estimator.base, motions, session_sensors(estimator.sensing, noise))
 
 
+@one_blas_thread()
 def cramer_rao_bound(dynamics: Dynamics, base: BaseParameters, motions: Sequence[Motion], sensors: SensorSet) -> Array:
     """Least standard deviation (n,) of every base parameter, in its unit; inf where the motion does not determine it.
 

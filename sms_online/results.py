@@ -14,6 +14,7 @@ from sms_online.physical import PhysicalSet, Projection
 from sms_online.pipeline.estimator import Estimator
 from sms_online.pipeline.events import Event
 from sms_online.stream import Array
+from sms_online.threads import one_blas_thread
 from sms_online.trackers.interface import Estimate
 
 SCHEMA = "sms-online/results/1"
@@ -31,6 +32,7 @@ LARGEST_PULL = 1.0
 POSITIVE = ("mass", "mass_per_length", "stiffness", "damping", "rotor_inertia", "rigidity", "rigidity_y", "rigidity_z")
 
 
+@one_blas_thread()
 def standard_deviation(estimator: Estimator, estimate: Estimate | None = None) -> Array:
     """1σ of each parameter (n,) as known now, inf where the data determine nothing.
 
@@ -103,6 +105,7 @@ def pulled(estimator: Estimator, estimate: Estimate, std: Array) -> list[str]:
     return [p.name for p, s, d in zip(estimator.base.parameters, shift, std, strict=True) if s > LARGEST_PULL * d]
 
 
+@one_blas_thread()
 def judged(
     estimator: Estimator,
     estimate: Estimate | None = None,
@@ -247,6 +250,7 @@ def event_document(event: Event) -> dict[str, Any]:
     }
 
 
+@one_blas_thread()
 def results_document(
     estimator: Estimator,
     throughput: float,

@@ -36,6 +36,7 @@ from sms_online.description.channels import drive_channel
 from sms_online.description.schema import CanBus, CanSource, SerialPort, Signal, System
 from sms_online.errors import InputError
 from sms_online.stream import Array, Block
+from sms_online.threads import one_blas_thread
 from sms_sim.bus_encode import CanDevice, DeviceClock, SerialDevice, devices
 from sms_sim.bus_layout import commands
 from sms_sim.bus_motion import HeldTorque, MovingArm
@@ -303,8 +304,9 @@ def _solve(arm: MovingArm, pipe: Connection, others: Connection) -> None:
     os.nice(NICENESS)
     try:
         pipe.recv()
-        for block in arm:
-            pipe.send(block)
+        with one_blas_thread():
+            for block in arm:
+                pipe.send(block)
     except InputError as error:
         pipe.send(error)
     except (EOFError, ConnectionError, KeyboardInterrupt):

@@ -11,6 +11,7 @@ import numpy as np
 from sms_online.description.schema import System
 from sms_online.errors import InputError
 from sms_online.stream import Array, Block
+from sms_online.threads import one_blas_thread
 from sms_sim.distortion import Distortion
 from sms_sim.integrate import Dense, solve
 from sms_sim.plant import Plant
@@ -120,6 +121,7 @@ def _ratio(lost: Array, scale: Array) -> float:
     return float(np.abs(lost).max()) / largest if largest > 0.0 else 0.0
 
 
+@one_blas_thread()
 def simulate(
     system: System,
     duration: float | None = None,
@@ -151,6 +153,7 @@ def tolerance(plant: Plant, position: float = POSITION_TOLERANCE) -> Array:
     return np.concatenate((np.full(layout.n_x, position), np.full(speeds, SPEED_FACTOR * position)))
 
 
+@one_blas_thread()
 def exact_states(simulation: Simulation, t: Array) -> ExactStates:
     """Exact states, torques and energies at instants t (B,) within the session, s."""
     plant, solution = simulation.plant, simulation.solution
@@ -176,6 +179,7 @@ def sampled_blocks(simulation: Simulation, grade: str | None = None, seed: int =
     distortion = Distortion(plant.system, sensors.channels)
     many = distortion.oversampling
 
+    @one_blas_thread()
     def exact(t: Array) -> Array:
         """Exact values (B, C) at instants t (B,); before the start the system rests."""
         inside = np.clip(t, 0.0, duration)

@@ -22,6 +22,7 @@ from sms_online.errors import InputError
 from sms_online.pipeline.estimator import Estimator
 from sms_online.pipeline.momentum_windows import HOPS
 from sms_online.stream import Block
+from sms_online.threads import one_blas_thread
 
 # Times that the constants of channels' effects are improved, each with samples corrected by those found before.
 CORRECTIONS = 3
@@ -166,6 +167,7 @@ def _with_constants(
     return attempt, chosen, findings
 
 
+@one_blas_thread()
 def diagnose(
     system: System,
     blocks: Sequence[Block],

@@ -19,6 +19,7 @@ from sms_online.judgement import Facts, Judgement, judge, judge_diagnosis
 from sms_online.model.parameters import Parameter
 from sms_online.results import NORMAL_95, identifiable, judged, projected, results_document, standard_deviation
 from sms_online.stream import Array
+from sms_online.threads import one_blas_thread
 
 SCHEMA = "sms-online/diagnosis/1"
 
@@ -26,6 +27,7 @@ SCHEMA = "sms-online/diagnosis/1"
 Coefficients = dict[str, tuple[float, float | None]]
 
 
+@one_blas_thread()
 def diagnosis_document(diagnosis: Diagnosis, warnings: list[str], truth: dict[str, float] | None) -> dict[str, Any]:
     """diagnosis.json.
 

@@ -34,6 +34,7 @@ from sms_online.pipeline.momentum_windows import HOPS
 from sms_online.pipeline.sensing import Sensing
 from sms_online.pipeline.sensor_noise import SensorNoise
 from sms_online.stream import Array
+from sms_online.threads import one_blas_thread
 from sms_online.trackers.interface import Prior
 
 # Windows that the effect acts in, of which a third checks what the others say.
@@ -142,6 +143,7 @@ class LateColumns(CandidateColumns):
         return LeftOpen(told.own * acts[..., 0], told.free * acts)
 
 
+@one_blas_thread()
 def search(request: Request) -> Outcome | None:
     """Trace what the record holds beyond the model; None where it is too short to tell, or its rows are degenerate."""
     try:

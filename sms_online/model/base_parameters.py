@@ -20,6 +20,7 @@ from sms_online.model.model import Model
 from sms_online.model.parameters import Parameter
 from sms_online.model.tolerance import perturbed
 from sms_online.stream import Array
+from sms_online.threads import one_blas_thread
 
 # States per parameter: enough that the rank is that of the columns and not of the sample.
 STATES_PER_PARAMETER = 4
@@ -103,6 +104,7 @@ def random_inputs(model: Model, count: int, rng: np.random.Generator) -> Inputs:
     return Inputs(rng.normal(size=(count, len(model.layout.q))), rng.normal(size=(count, model.n_states)))
 
 
+@one_blas_thread()
 def find_base_parameters(model: Model) -> BaseParameters:
     """Base parameters of a system; parameters declared known leave the unknowns. InputError on an unknown name."""
     names = [p.name for p in model.parameters]

@@ -37,6 +37,7 @@ from sms_online.pipeline.synchronise import GridSamples, SyncCounters, Synchroni
 from sms_online.pipeline.waiting import waiting_from_state, waiting_state
 from sms_online.smoother.session import Smoother
 from sms_online.stream import Array, Block
+from sms_online.threads import one_blas_thread
 from sms_online.trackers.interface import Estimate, Prior, Rows, Tracker
 from sms_online.trackers.square_root import RecursiveLeastSquares
 
@@ -57,6 +58,7 @@ class Estimator:
     reference: π (n_pi,) of the system whose masses that tilt pulls at, from an estimate without it or from weighing.
     """
 
+    @one_blas_thread()
     def __init__(self, system: System, channels: tuple[str, ...], source: str, reference: Array | None = None) -> None:
         self.system = system
         self._model = model = Model(system, reference)
@@ -108,6 +110,7 @@ class Estimator:
             return energy_blocks(self.system)
         return momentum_blocks(self.system, stated_period(self.system, self.sensing.channels))
 
+    @one_blas_thread()
     def set_prior(self, prior: Prior) -> None:
         """Weigh the rows against what is known of the base parameters beforehand; before the first sample."""
         self.energy_tracker = RecursiveLeastSquares(self.base.n, prior=prior, scaled_by_residual=True)
@@ -209,11 +212,13 @@ class Estimator:
         self._pending = np.concatenate((self._pending, block.values[:, self._columns]))
         number = np.floor((self._pending_t - self._first_time - self._first_block) / self._block)
         ends = np.flatnonzero(np.diff(number)) + 1
-        for start, stop in pairwise([0, *ends.tolist()]):
-            self._synchronise(self._pending_t[start:stop], self._pending[start:stop])
         if ends.size:
+            with one_blas_thread():
+                for start, stop in pairwise([0, *ends.tolist()]):
+                    self._synchronise(self._pending_t[start:stop], self._pending[start:stop])
             self._pending_t, self._pending = self._pending_t[ends[-1] :], self._pending[ends[-1] :]
 
+    @one_blas_thread()
     def finish(self) -> None:
         """End of the session: process what is still pending."""
         if self._pending_t.size:
@@ -314,6 +319,7 @@ class Estimator:
         t = self._synchroniser.start_time + rows.index / self.system.sample_rate
         return Rows(rows.Y, rows.b, np.ones_like(rows.b), t)
 
+    @one_blas_thread()
     def estimate(self) -> Estimate:
         """The base parameters as they are known now."""
         if self.smoother is not None and self.by_smoother:
@@ -354,6 +360,7 @@ class Estimator:
             **({} if self.smoother is None else self.smoother.state()),
         }
 
+    @one_blas_thread()
     def restore(self, state: SessionState) -> None:
         """Continue from a saved state."""
         session = state["session"]

@@ -20,10 +20,6 @@ from sms_tools.exit_codes import BAD_INPUT, INTERRUPTED, OK
 from sms_tools.view.choice import parse_choice
 
 PROGRAM = "sms-online"
-# A sum that BLAS splits over threads is rounded differently for every number of threads, and the same samples must give
-# the same bits. The matrices are small; threads would not make them faster. Both are read when NumPy is imported.
-for _variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
-    os.environ[_variable] = "1"
 
 
 class Parser(argparse.ArgumentParser):

@@ -50,10 +50,12 @@ def _serve(start: Start, frames: Queue[Frame | None], messages: IO[str]) -> None
 
     try:
         # Here, so that a broken installation of rerun is told like any other trouble.
+        from sms_online.threads import one_blas_thread
         from sms_tools.view.recorder import Recorder
 
         recorder = Recorder(start, lambda text: say(place=text))
-        _record(recorder, frames, SAVE_INTERVAL if start.choice.kind == "save" else SHOW_INTERVAL)
+        with one_blas_thread():
+            _record(recorder, frames, SAVE_INTERVAL if start.choice.kind == "save" else SHOW_INTERVAL)
         say(done="")
     except TroubleError as error:
         say(trouble=str(error))

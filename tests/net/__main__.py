@@ -1,0 +1,58 @@
+"""Records the net's numbers, or compares those of now with the recorded ones.
+
+python -m tests.net record
+python -m tests.net compare [--tolerance 1e-10] [SESSION …]
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from pathlib import Path
+from time import perf_counter
+
+# As pytest has it, where the sessions come from.
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
+from net import RECORDED
+from net.numbers import differences, environment, numbers
+from net.sessions import SESSIONS
+
+
+def main() -> int:
+    """0 where nothing differs, 1 where something does."""
+    assert __doc__ is not None
+    parser = argparse.ArgumentParser(prog="python -m tests.net", description=__doc__.splitlines()[0])
+    parser.add_argument("verb", choices=("record", "compare"))
+    parser.add_argument("session", nargs="*", help="all by default")
+    parser.add_argument("--tolerance", type=float, default=0.0, help="relative; 0 by default: not a bit may differ")
+    args = parser.parse_args()
+    names = args.session or list(SESSIONS)
+    found = {}
+    for name in names:
+        begun = perf_counter()
+        session = SESSIONS[name]()
+        made = perf_counter()
+        found[name] = numbers(session)
+        print(
+            f"{name}: made in {made - begun:.1f} s, run in {perf_counter() - made:.1f} s", file=sys.stderr, flush=True
+        )
+    if args.verb == "record":
+        old = json.loads(RECORDED.read_text())["sessions"] if RECORDED.exists() and args.session else {}
+        RECORDED.write_text(json.dumps({"environment": environment(), "sessions": old | found}, indent=0) + "\n")
+        return 0
+    recorded = json.loads(RECORDED.read_text())
+    if recorded["environment"] != environment():
+        print(f"recorded elsewhere: {recorded['environment']}; here: {environment()}")
+    differing = 0
+    for name in names:
+        lines = sorted(differences(recorded["sessions"][name], found[name], args.tolerance))
+        differing += bool(lines)
+        print(f"{name}: {len(lines) or 'none'} of {len(found[name])} differ")
+        print("".join(f"  {line}\n" for line in lines), end="")
+    return 1 if differing else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
