@@ -29,28 +29,25 @@ def main() -> int:
     parser.add_argument("--tolerance", type=float, default=0.0, help="relative; 0 by default: not a bit may differ")
     args = parser.parse_args()
     names = args.session or list(SESSIONS)
-    found = {}
+    recorded = json.loads(RECORDED.read_text()) if RECORDED.exists() else {"sessions": {}}
+    if args.verb == "compare" and recorded["environment"] != environment():
+        print(f"recorded elsewhere: {recorded['environment']}; here: {environment()}")
+    differing = 0
     for name in names:
         begun = perf_counter()
         session = SESSIONS[name]()
         made = perf_counter()
-        found[name] = numbers(session)
-        print(
-            f"{name}: made in {made - begun:.1f} s, run in {perf_counter() - made:.1f} s", file=sys.stderr, flush=True
-        )
-    if args.verb == "record":
-        old = json.loads(RECORDED.read_text())["sessions"] if RECORDED.exists() and args.session else {}
-        RECORDED.write_text(json.dumps({"environment": environment(), "sessions": old | found}, indent=0) + "\n")
-        return 0
-    recorded = json.loads(RECORDED.read_text())
-    if recorded["environment"] != environment():
-        print(f"recorded elsewhere: {recorded['environment']}; here: {environment()}")
-    differing = 0
-    for name in names:
-        lines = sorted(differences(recorded["sessions"][name], found[name], args.tolerance))
+        found = numbers(session)
+        took = f"made in {made - begun:.1f} s, run in {perf_counter() - made:.1f} s"
+        if args.verb == "record":
+            recorded = {"environment": environment(), "sessions": recorded["sessions"] | {name: found}}
+            RECORDED.write_text(json.dumps(recorded, indent=0) + "\n")
+            print(f"{name}: {len(found)} recorded, {took}", flush=True)
+            continue
+        lines = sorted(differences(recorded["sessions"][name], found, args.tolerance))
         differing += bool(lines)
-        print(f"{name}: {len(lines) or 'none'} of {len(found[name])} differ")
-        print("".join(f"  {line}\n" for line in lines), end="")
+        print(f"{name}: {len(lines)} of {len(found)} differ, {took}", flush=True)
+        print("".join(f"  {line}\n" for line in lines), end="", flush=True)
     return 1 if differing else 0
 
 
