@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from sms_online.description.schema import System
+from sms_online.effects.build import build_model
 from sms_online.errors import InputError
 from sms_online.model.base_parameters import find_base_parameters
 from sms_online.model.model import Model
@@ -23,7 +24,7 @@ def reconstruct(document: dict[str, Any], source: str) -> tuple[Model, Array]:
     """
     if document.get("schema") != SCHEMA:
         raise InputError(source, "schema", repr(document.get("schema")), SCHEMA)
-    model = Model(System.model_validate(document["system"]))
+    model = build_model(System.model_validate(document["system"]))
     base = find_base_parameters(model)
     estimates = {entry["name"]: entry["estimate"] for entry in document["parameters"]}
     missing = [p.name for p in base.parameters if p.name not in estimates]

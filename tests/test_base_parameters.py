@@ -8,6 +8,7 @@ from model_systems import SYSTEMS, paper, random_states, rigid_chain, spatial
 
 from sms_adapters.system_file import load_system
 from sms_online.description.schema import Joint, Motor, RigidLink, System
+from sms_online.effects.build import build_model
 from sms_online.model.base_parameters import BaseParameters, find_base_parameters
 from sms_online.model.model import Model
 from sms_online.stream import Array
@@ -44,7 +45,7 @@ CASES: dict[str, System] = {
 
 @pytest.fixture(scope="module", params=CASES)
 def case(request: pytest.FixtureRequest) -> tuple[Model, BaseParameters]:
-    model = Model(CASES[request.param])
+    model = build_model(CASES[request.param])
     return model, find_base_parameters(model)
 
 
@@ -54,13 +55,13 @@ def close(found: Array, expected: Array, tolerance: float = RELATIVE) -> None:
 
 @pytest.mark.parametrize("kinematics", ["linear", "exact"])
 def test_the_example_has_the_sixteen_of_table_v(kinematics: str) -> None:
-    base = find_base_parameters(Model(paper(kinematics)))
+    base = find_base_parameters(build_model(paper(kinematics)))
     assert [p.name for p in base.parameters] == list(TABLE_V)
     np.testing.assert_allclose([p.nominal for p in base.parameters], list(TABLE_V.values()), rtol=1e-12)
 
 
 def test_combinations_are_printed_as_the_paper_prints_them() -> None:
-    base = find_base_parameters(Model(paper()))
+    base = find_base_parameters(build_model(paper()))
     symbols = {p.name: p.symbol for p in base.parameters}
     assert symbols["spacecraft.inertia_about_joint_1"] == "I_0+m_0 r_0²+I_s1"
     assert symbols["spacecraft.mass_with_motor_1"] == "m_0+m_m1"
@@ -71,7 +72,7 @@ def test_combinations_are_printed_as_the_paper_prints_them() -> None:
 
 def test_the_same_arm_on_a_fixed_base() -> None:
     """What the base carries moves no more: stator 1 and the mass of motor 1 are gone, all else stays."""
-    base = find_base_parameters(Model(paper(free=False)))
+    base = find_base_parameters(build_model(paper(free=False)))
     expected = [name for name in TABLE_V if not name.startswith("spacecraft")]
     assert [p.name for p in base.parameters] == expected
     gone = {base.physical[k].name for k in base.absent}
@@ -85,12 +86,12 @@ def test_number_of_base_parameters_of_a_rigid_arm() -> None:
     """
     for joints in (3, 5):
         system = rigid_chain(joints, free=True).model_copy(update={"payload": None})
-        assert find_base_parameters(Model(system)).n == 10 + 7 * joints
+        assert find_base_parameters(build_model(system)).n == 10 + 7 * joints
 
 
 def test_known_parameters_leave_the_unknowns() -> None:
     """With the mass of motor 1 known the spacecraft's mass stands alone, and the known masses enter as numbers."""
-    model = Model(CASES["some known"])
+    model = build_model(CASES["some known"])
     base = find_base_parameters(model)
     names = [p.name for p in base.parameters]
     assert "spacecraft.mass" in names
@@ -144,7 +145,7 @@ def test_columns_of_base_parameters_are_independent(case: tuple[Model, BaseParam
 
 
 def test_finding_them_is_deterministic() -> None:
-    first, second = (find_base_parameters(Model(SYSTEMS["spatial exact"])) for _ in range(2))
+    first, second = (find_base_parameters(build_model(SYSTEMS["spatial exact"])) for _ in range(2))
     assert first.parameters == second.parameters
     assert (first.mixture == second.mixture).all()
 
@@ -187,7 +188,9 @@ def test_mounts_rounded_to_decimals_change_no_base_parameter(arm: str, decimals:
     joints = tuple(
         joint.model_copy(update={"mount_rotation": mount}) for joint, mount in zip(system.joints, mounts, strict=True)
     )
-    exact, rounded = (find_base_parameters(Model(s)) for s in (system, system.model_copy(update={"joints": joints})))
+    exact, rounded = (
+        find_base_parameters(build_model(s)) for s in (system, system.model_copy(update={"joints": joints}))
+    )
     assert [p.name for p in rounded.parameters] == [p.name for p in exact.parameters]
     nominal = [p.nominal for p in exact.parameters]
     # An angle that is off by half of its last decimal moves a combination by that share of what is lumped into it.

@@ -8,6 +8,7 @@ from numpy.testing import assert_allclose
 
 from sms_online.bound import DERIVATIVES_INTERVAL, cramer_rao_bound, discretise
 from sms_online.description.parse import parse_system, shipped_text
+from sms_online.effects.build import build_model
 from sms_online.errors import InputError
 from sms_online.linearised import Motion, linearise
 from sms_online.model.base_parameters import BaseParameters, find_base_parameters, random_states
@@ -43,7 +44,7 @@ def turntable_motion(t: Array) -> Motion:
 
 
 def bound_of_turntable(motions: list[Motion]) -> float:
-    model = Model(parse_system(TURNTABLE, "turntable"))
+    model = build_model(parse_system(TURNTABLE, "turntable"))
     base = find_base_parameters(model)
     assert [p.name for p in base.parameters] == ["link_1.inertia"]
     sensors = sensor_set(model, ("force_1", "q_1"), np.array([SIGMA_TORQUE, SIGMA_ANGLE]), np.full(2, RATE))
@@ -183,7 +184,7 @@ def test_a_sensor_set_names_what_is_missing(planar: tuple[Model, BaseParameters,
 @pytest.fixture(scope="module")
 def spatial() -> tuple[Model, BaseParameters, Array, Array]:
     """Random states of the spatial arm."""
-    model = Model(parse_system(shipped_text("spatial-two-link"), "spatial-two-link"))
+    model = build_model(parse_system(shipped_text("spatial-two-link"), "spatial-two-link"))
     x, v = random_states(model, 4, np.random.default_rng(7))
     return model, find_base_parameters(model), x, v
 

@@ -20,8 +20,8 @@ from scipy.io import savemat
 from sms_adapters.system_file import load_system
 from sms_adapters.truth import truth_path, write_truth
 from sms_online.description.parse import parse_system, shipped_text
+from sms_online.effects.build import build_model
 from sms_online.model.base_parameters import find_base_parameters
-from sms_online.model.model import Model
 from sms_online.pipeline.estimator import Estimator
 from sms_online.stream import Block
 from sms_tools.cli import main
@@ -95,7 +95,7 @@ def test_results_go_to_a_new_directory_for_each_run(bench: Path) -> None:
 
 def test_the_truth_reaches_the_report_and_never_the_estimate(bench: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["replay", "run.csv", "--system", "axis.toml", "--out", "without"]) == 0
-    names = [parameter.name for parameter in Model(load_system("axis.toml")).parameters]
+    names = [parameter.name for parameter in build_model(load_system("axis.toml")).parameters]
     wrong = {name: 2.0 * TRUTH.get(name, 0.0) for name in names}
     write_truth(bench / "run.csv", wrong, {})
     capsys.readouterr()
@@ -187,7 +187,7 @@ def test_ctrl_c_finishes_with_what_has_been_read(
 
 def test_a_stated_prior_holds_without_being_asked_for_nominal_values_only_with() -> None:
     system = parse_system(AXIS + '[prior."link_1.inertia"]\nvalue = 0.5\nstd = 0.05\n', "axis.toml")
-    base = find_base_parameters(Model(system))
+    base = find_base_parameters(build_model(system))
     names = [parameter.name for parameter in base.parameters]
     inertia, damping = names.index("link_1.inertia"), names.index("viscous_friction@joint_1.damping")
     stated, nominal = base_prior(system, base, nominal=False), base_prior(system, base, nominal=True)
@@ -203,7 +203,7 @@ def test_a_combination_has_a_prior_when_all_of_it_has() -> None:
     whole = half + '"motor_1.mass" = { value = 3.0, std = 4.0 }\n'
     for description, std in ((half, math.nan), (whole, 5.0)):
         system = parse_system(description, "paper.toml")
-        base = find_base_parameters(Model(system))
+        base = find_base_parameters(build_model(system))
         prior = base_prior(system, base, nominal=False)
         k = [parameter.name for parameter in base.parameters].index("spacecraft.mass_with_motor_1")
         assert prior.std[k] == pytest.approx(std, nan_ok=True)

@@ -20,7 +20,7 @@ from sms_online.description.schema import Effect
 from sms_online.diagnosis.diagnose import Diagnosis, diagnose
 from sms_online.diagnosis.document import diagnosis_document
 from sms_online.diagnosis.force_curves import added_variables, force_curves
-from sms_online.model.model import Model
+from sms_online.effects.build import build_model
 from sms_tools.adopted_system import added_lines, adopted_text, remarks
 from sms_tools.cli import main
 from sms_tools.html_report.arm_drawing import MARK, marked_arm
@@ -100,7 +100,7 @@ def test_diagnose_writes_the_page_beside_its_document(tmp_path: Path) -> None:
 
 def test_every_place_of_an_effect_is_marked() -> None:
     system = load_system("paper-planar")
-    scene = Scene(Model(system))
+    scene = Scene(build_model(system))
     x = np.zeros((3, scene.model.layout.n_x))
     places = {"base": "1", "joint_1": "2", "joint_2": "3, 4", "link_1": "5", "link_2": "6", "tip": "?"}
     root = ElementTree.fromstring(marked_arm(scene, x, 1, places))

@@ -22,9 +22,9 @@ from sms_online.diagnosis.residuals import RowResidual
 from sms_online.diagnosis.rows import SessionRows
 from sms_online.diagnosis.unexplained import describe_residual
 from sms_online.diagnosis.weak_windows import WeakWindows, Windows
-from sms_online.effects.base import Inputs
+from sms_online.effects.build import build_model
+from sms_online.model.effect import Inputs
 from sms_online.model.layout import row_types
-from sms_online.model.model import Model
 from sms_online.pipeline.estimator import Estimator
 from sms_online.pipeline.momentum_windows import EXPONENT, HOPS, INSTANTS
 from sms_online.results import standard_deviation
@@ -102,7 +102,7 @@ def test_internal_states_follow_a_motion_from_its_first_sample() -> None:
     """
     estimator, rows = session()
     effect = Effect(name="slosh", where="base", coefficients={"mass": 1.0, "stiffness": 324.0})
-    model = Model(rows.model.system.model_copy(update={"effects": (effect,)}))
+    model = build_model(rows.model.system.model_copy(update={"effects": (effect,)}))
     index = np.arange(4000, dtype=np.int64)
     t, a = index / 1000.0, 0.1
     values = np.zeros((t.size, len(estimator.sensing.channels)))

@@ -13,10 +13,12 @@ from model_systems import paper, random_states, spatial
 from numpy.testing import assert_allclose
 
 from sms_online.description.schema import Effect, Inertia, RigidBody, System
-from sms_online.effects.base import Entry, Force, Inputs, Ranges, Site, report
+from sms_online.effects.base import Entry, Force, Ranges, Site, report
+from sms_online.effects.build import build_model
 from sms_online.effects.catalogue import ENTRIES, NAMES, candidates, parse_effect
 from sms_online.effects.friction import STANDSTILL, MotorSide
 from sms_online.errors import InputError
+from sms_online.model.effect import Inputs
 from sms_online.model.model import Model
 from sms_online.stream import Array
 
@@ -46,7 +48,7 @@ Law = Callable[[Motion], dict[int, Array]]
 
 def with_effect(text: str, system: System | None = None) -> Model:
     system = paper() if system is None else system
-    return Model(system.model_copy(update={"effects": (parse_effect(text, system),)}))
+    return build_model(system.model_copy(update={"effects": (parse_effect(text, system),)}))
 
 
 def spring(force: Array) -> dict[int, Array]:
@@ -108,13 +110,13 @@ def test_the_generalized_force_is_the_law(text: str) -> None:
     power = model.power_columns(s.x, s.v, s.inputs)[:, own] @ model.nominal[own]
     assert_allclose(power, -np.sum(expected * s.v, axis=1), rtol=1e-9, atol=1e-12)
     C = model.dynamics(model.nominal).mass_and_bias(s.x, s.v, s.inputs)[1]
-    C_without = Model(paper()).dynamics(Model(paper()).nominal).mass_and_bias(s.x, s.v)[1]
+    C_without = build_model(paper()).dynamics(build_model(paper()).nominal).mass_and_bias(s.x, s.v)[1]
     assert_allclose(C_without - C, expected, rtol=0, atol=1e-10 * np.abs(C).max())
 
 
 def test_link_damping_resists_bending_as_its_stiffness_would() -> None:
     """A rate of bending q̇_f meets η times the force of a bend q_f = q̇_f."""
-    model, clean = with_effect("link_damping@link_2:time=0.002"), Model(paper())
+    model, clean = with_effect("link_damping@link_2:time=0.002"), build_model(paper())
     s = Motion(model)
     own = model.effect_slices[0]
     bent = s.x.copy()
@@ -143,20 +145,20 @@ def test_mass_damping_takes_out_twice_the_rate_times_a_link_s_own_kinetic_energy
 def test_a_tilted_table_is_gravity() -> None:
     """Of the same masses: columns of a system with gravity, for which the model has code of its own."""
     tilted = with_effect("table_tilt@base:gravity_x=0.2,gravity_y=-0.3")
-    level, heavy = Model(paper()), Model(paper().model_copy(update={"gravity": (0.2, -0.3, 0.0)}))
+    level, heavy = build_model(paper()), build_model(paper().model_copy(update={"gravity": (0.2, -0.3, 0.0)}))
     x, v = random_states(tilted.layout, STATES, seed=4)
     own = tilted.effect_slices[0]
     force = tilted.momentum_columns(x, v)[1][..., own] @ tilted.nominal[own]
     weight = (heavy.momentum_columns(x, v)[1] - level.momentum_columns(x, v)[1]) @ level.nominal
     assert_allclose(force, weight, rtol=0, atol=1e-11 * np.abs(weight).max())
-    half = Model(tilted.system, reference=0.5 * tilted.nominal)
+    half = build_model(tilted.system, reference=0.5 * tilted.nominal)
     assert_allclose(half.momentum_columns(x, v)[1][..., own] @ tilted.nominal[own], 0.5 * force, atol=1e-9)
 
 
 def test_a_point_mass_at_the_tip_is_a_payload_of_no_size() -> None:
     system = paper()
     body = RigidBody(mass=2.0, inertia=Inertia(zz=0.3))
-    described = Model(system.model_copy(update={"payload": body}))
+    described = build_model(system.model_copy(update={"payload": body}))
     declared = with_effect("tip_payload@tip:mass=2,inertia=0.3", system)
     x, v = random_states(declared.layout, STATES, seed=5)
     for ours, theirs in zip(declared.momentum_columns(x, v), described.momentum_columns(x, v), strict=True):
@@ -244,7 +246,7 @@ def test_a_ratio_needs_what_it_is_relative_to() -> None:
 def test_every_candidate_of_a_system_can_be_declared_with_all_others() -> None:
     for system in (paper(), spatial("linear").model_copy(update={"effects": ()})):
         effects = candidates(system)
-        model = Model(system.model_copy(update={"effects": tuple(effects)}))
+        model = build_model(system.model_copy(update={"effects": tuple(effects)}))
         assert {effect.name for effect in effects} <= set(NAMES)
         assert {e.name for e in effects if ENTRIES[e.name].kind == "force"} == {e.name for e in model.effects}
         assert len({(effect.name, effect.where) for effect in effects}) == len(effects)
@@ -302,7 +304,7 @@ def test_a_wrong_effect_is_refused_in_one_line(text: str, words: str) -> None:
 
 def test_geometric_stiffening_is_no_effect_of_a_link_that_is_exact_already() -> None:
     assert (
-        Model(paper(effects=(Effect(name="geometric_stiffening", where="link_1"),))).system.links[0].kinematics
+        build_model(paper(effects=(Effect(name="geometric_stiffening", where="link_1"),))).system.links[0].kinematics
         == "exact"
     )
     with pytest.raises(InputError, match="linear link"):
@@ -325,7 +327,7 @@ def test_an_effect_as_the_guide_for_contributors_writes_it_is_one() -> None:
     code = guide.split("    class WindageFriction")[1].split("\n\nList the class")[0]
     names = {"np": np, "MotorSide": MotorSide, "Entry": Entry, "Mapping": Mapping}
     exec(textwrap.dedent(f"    from __future__ import annotations\n\n    class WindageFriction{code}"), names)
-    model = Model(paper())
+    model = build_model(paper())
     site = Site(model.system, model.chain, "joint_1", 1, model.weight)
     effect = cast(type[Force], names["WindageFriction"])(site, {"drag": 0.3})  # type: ignore[arg-type]
     s = Motion(model)

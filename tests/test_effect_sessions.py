@@ -18,12 +18,12 @@ from sms_online.description.schema import System
 from sms_online.diagnosis.constants import corrected
 from sms_online.diagnosis.record import Segment
 from sms_online.effects.base import report
+from sms_online.effects.build import build_model
 from sms_online.effects.catalogue import channel_effects, parse_effect
 from sms_online.effects.channel import EncoderEccentricity, SensorLag, TorqueDelay
 from sms_online.errors import InputError
 from sms_online.linearised import Motion
 from sms_online.model.base_parameters import find_base_parameters
-from sms_online.model.model import Model
 from sms_online.pipeline.conditioning import Conditioning
 from sms_online.pipeline.estimator import Estimator
 from sms_online.pipeline.synchronise import GridSamples
@@ -137,7 +137,7 @@ def test_geometric_stiffening_of_one_link_is_sampled_and_estimated() -> None:
     """The model's own system has that link exact already, where the effect could not be declared."""
     system = declaring("geometric_stiffening@link_1")
     blocks = list(sampled_blocks(simulate(system, 0.05), "A", seed=1))
-    estimator = Estimator(Model(system).system, blocks[0].channels, "one link")
+    estimator = Estimator(build_model(system).system, blocks[0].channels, "one link")
     for block in blocks:
         estimator.push(block)
     assert estimator.samples == sum(block.t.size for block in blocks)
@@ -162,7 +162,7 @@ def test_declared_effects_are_identified_together_with_the_arm(session: tuple[Sy
     """Within four deviations (seed 1, 26 parameters), and the effects within 1 %."""
     true, estimator = session
     estimate = estimator.estimate()
-    truth = estimator.base.values(Model(true).nominal)
+    truth = estimator.base.values(build_model(true).nominal)
     assert estimator.by_momentum
     assert estimate.determined.all()
     assert np.abs((estimate.pi - truth) / estimate.std).max() < 4.0
@@ -223,7 +223,7 @@ def test_a_tilt_is_found_with_masses_from_elsewhere() -> None:
     """Of 1 mm/s² within 1 % at grade A (seed 3), with every mass 0.1 % too large, by as much too small."""
     true = declaring("table_tilt@base:gravity_x=0.001,gravity_y=-0.002")
     blocks = list(sampled_blocks(simulate(true, 2.5), "A", seed=3))
-    reference = 1.001 * Model(true).nominal
+    reference = 1.001 * build_model(true).nominal
     estimator = Estimator(declaring("table_tilt@base"), blocks[0].channels, "session", reference)
     for block in blocks:
         estimator.push(block)

@@ -12,8 +12,8 @@ from changed_session import changed_session, noisy
 from sms_adapters.system_file import load_system
 from sms_online.description.parse import parse_system
 from sms_online.description.schema import Effect, Inertia, RigidBody, System
+from sms_online.effects.build import build_model
 from sms_online.model.base_parameters import find_base_parameters
-from sms_online.model.model import Model
 from sms_online.pipeline.estimator import Estimator
 from sms_online.pipeline.event_hypotheses import opened
 from sms_online.pipeline.events import Event
@@ -61,7 +61,7 @@ def only_event(estimator: Estimator) -> Event:
 
 
 def true_values() -> Array:
-    model = Model(PLANAR)
+    model = build_model(PLANAR)
     return find_base_parameters(model).values(model.nominal)
 
 

@@ -13,7 +13,7 @@ import pytest
 
 from sms_adapters.capture import CaptureWriter
 from sms_adapters.system_file import load_system
-from sms_online.model.model import Model
+from sms_online.effects.build import build_model
 from sms_online.pipeline.estimator import Estimator
 from sms_online.results import results_document
 from sms_online.stream import Array, Block
@@ -148,7 +148,7 @@ def test_ticks_are_round_and_inside(low: float, high: float) -> None:
 
 @pytest.mark.parametrize("name", ["paper-planar", "seven-joint", "emps"])
 def test_any_arm_can_be_drawn(name: str) -> None:
-    scene = Scene(Model(load_system(name)))
+    scene = Scene(build_model(load_system(name)))
     x = np.zeros((3, scene.model.layout.n_x))
     if name == "seven-joint":
         x[:, 6] = 1.0

@@ -8,8 +8,8 @@ import numpy as np
 from numpy.testing import assert_allclose
 
 from sms_adapters.system_file import load_system
+from sms_online.effects.build import build_model
 from sms_online.effects.catalogue import parse_effect
-from sms_online.model.model import Model
 from sms_online.pipeline.internal_states import InternalStates
 
 RATE = 250.0
@@ -19,7 +19,7 @@ def test_a_liquid_keeps_its_frequency_for_minutes() -> None:
     """In a base that moves off at 1 m/s: p - r_S = -sin(ω t) / ω on either axis, in pieces too."""
     system = load_system("paper-planar")
     effect = parse_effect("slosh@base:mass=1,stiffness=324", system)
-    model = Model(system.model_copy(update={"effects": (effect,)}))
+    model = build_model(system.model_copy(update={"effects": (effect,)}))
     t = np.arange(round(120.0 * RATE)) / RATE
     x, v = np.zeros((t.size, model.layout.n_x)), np.zeros((t.size, model.layout.n_v))
     x[:, :2], v[:, :2] = t[:, None], 1.0

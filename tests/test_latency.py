@@ -9,7 +9,7 @@ import pytest
 from bus_streams import AxisBus, axis_testbed, merged
 
 from sms_online.description.schema import System
-from sms_online.model.model import Model
+from sms_online.effects.build import build_model
 from sms_online.pipeline.estimator import Estimator
 from sms_online.pipeline.latency import Latencies, LatencyColumns, SourceGroup, source_groups
 from sms_online.pipeline.sensing import Sensing
@@ -85,7 +85,7 @@ def test_what_is_known_of_latencies_is_saved_with_the_session(tmp_path: Path) ->
 def test_one_source_has_nobody_to_be_late_against(tmp_path: Path) -> None:
     system = axis_testbed(tmp_path)
     alone = system.model_copy(update={"sources": system.sources[:1]})
-    assert source_groups(Sensing(Model(alone), ("force_1", "q_1"), "test")) == ()
+    assert source_groups(Sensing(build_model(alone), ("force_1", "q_1"), "test")) == ()
 
 
 def test_the_column_of_a_source_is_its_sensors_together() -> None:

@@ -10,6 +10,7 @@ from model_systems import SYSTEMS, difference, move, paper, random_states, spati
 from scipy.integrate import solve_ivp
 
 from sms_online.description.schema import System
+from sms_online.effects.build import build_model
 from sms_online.model.model import Model
 from sms_online.stream import Array
 
@@ -28,7 +29,7 @@ def close(found: Array, expected: Array, tolerance: float) -> None:
 
 @all_systems
 def test_energy_columns_give_kinetic_and_potential_energy(system: System) -> None:
-    model = Model(system)
+    model = build_model(system)
     x, v = random_states(model.layout, 20, seed=1)
     H = model.dynamics(model.nominal).mass_matrix(x)
     K = 0.5 * np.einsum("bi,bij,bj->b", v, H, v)
@@ -38,7 +39,7 @@ def test_energy_columns_give_kinetic_and_potential_energy(system: System) -> Non
 
 @all_systems
 def test_mass_matrix_is_symmetric_and_positive_definite(system: System) -> None:
-    model = Model(system)
+    model = build_model(system)
     x, v = random_states(model.layout, 20, seed=2)
     dynamics = model.dynamics(model.nominal)
     H = dynamics.mass_matrix(x)
@@ -49,7 +50,7 @@ def test_mass_matrix_is_symmetric_and_positive_definite(system: System) -> None:
 
 @all_systems
 def test_momentum_columns_are_mass_matrix_times_speeds(system: System) -> None:
-    model = Model(system)
+    model = build_model(system)
     x, v = random_states(model.layout, 20, seed=3)
     P, _ = model.momentum_columns(x, v)
     H = model.dynamics(model.nominal).mass_matrix(x)
@@ -59,7 +60,7 @@ def test_momentum_columns_are_mass_matrix_times_speeds(system: System) -> None:
 @all_systems
 def test_change_of_momentum_is_the_equation_of_motion(system: System) -> None:
     """d/dt(P π) - G π = H v̇ + C, row by row, whatever the acceleration."""
-    model = Model(system)
+    model = build_model(system)
     x, v = random_states(model.layout, 4, seed=4)
     a = np.random.default_rng(5).normal(size=v.shape)
     P_rate = along(model, x, v, a, lambda x, v: model.momentum_columns(x, v)[0] @ model.nominal)
@@ -70,7 +71,7 @@ def test_change_of_momentum_is_the_equation_of_motion(system: System) -> None:
 
 @all_systems
 def test_power_of_the_forces_is_the_change_of_energy_and_what_is_dissipated(system: System) -> None:
-    model = Model(system)
+    model = build_model(system)
     x, v = random_states(model.layout, 4, seed=6)
     a = np.random.default_rng(7).normal(size=v.shape)
     dynamics = model.dynamics(model.nominal)
@@ -82,7 +83,7 @@ def test_power_of_the_forces_is_the_change_of_energy_and_what_is_dissipated(syst
 
 @all_systems
 def test_acceleration_solves_the_equations_of_motion(system: System) -> None:
-    model = Model(system)
+    model = build_model(system)
     x, v = random_states(model.layout, 5, seed=8)
     Q = model.generalized_force(np.random.default_rng(9).normal(size=(5, len(system.joints))))
     dynamics = model.dynamics(model.nominal)
@@ -92,7 +93,7 @@ def test_acceleration_solves_the_equations_of_motion(system: System) -> None:
 
 @all_systems
 def test_some_rows_are_those_rows_of_all(system: System) -> None:
-    model = Model(system)
+    model = build_model(system)
     layout = model.layout
     x, v = random_states(layout, 6, seed=10)
     P, G = model.momentum_columns(x, v)
@@ -107,7 +108,7 @@ def test_some_rows_are_those_rows_of_all(system: System) -> None:
 
 @all_systems
 def test_each_sample_of_a_block_is_computed_alone(system: System) -> None:
-    model = Model(system)
+    model = build_model(system)
     x, v = random_states(model.layout, 9, seed=11)
     E, (P, G) = model.energy_columns(x, v), model.momentum_columns(x, v)
     for b in (0, 4, 8):
@@ -119,7 +120,7 @@ def test_each_sample_of_a_block_is_computed_alone(system: System) -> None:
 
 def test_internal_forces_leave_the_base_rows_clean() -> None:
     """Springs, dampers and friction act between the base's bodies: the base's momentum balance does not hold them."""
-    model = Model(SYSTEMS["planar linear"])
+    model = build_model(SYSTEMS["planar linear"])
     x, v = random_states(model.layout, 10, seed=12)
     P, G = model.momentum_columns(x, v, range(model.layout.n_base_speeds))
     internal = [
@@ -134,7 +135,7 @@ def test_internal_forces_leave_the_base_rows_clean() -> None:
 
 def test_rotor_row_holds_only_its_own_joint() -> None:
     """The row of θ_m of a flexible joint holds I_r, k, b and that joint's effects: nothing else."""
-    model = Model(SYSTEMS["planar exact"])
+    model = build_model(SYSTEMS["planar exact"])
     x, v = random_states(model.layout, 10, seed=13)
     P, G = model.momentum_columns(x, v, [model.layout.theta_m[1]])
     touched = (P != 0.0).any(axis=(0, 1)) | (G != 0.0).any(axis=(0, 1))
@@ -175,7 +176,7 @@ def free_motion(
 @pytest.mark.parametrize("kinematics", ["linear", "exact"])
 def test_work_of_the_motors_is_the_change_of_energy_along_a_motion(kinematics: str) -> None:
     """(43): work = change of K + U, plus what the dampers take."""
-    model = Model(paper(kinematics))
+    model = build_model(paper(kinematics))
     pi = soften(model)
     x, v, work, dissipated = free_motion(model, pi, lambda t: 40.0 * np.cos([9.0 * t, 7.0 * t]), 0.3)
     E = model.energy_columns(x, v) @ pi
@@ -189,7 +190,7 @@ FREE_FLOATERS = (paper("exact"), spatial("linear").model_copy(update={"gravity":
 @pytest.mark.parametrize("system", FREE_FLOATERS, ids=("planar", "spatial"))
 def test_momentum_of_a_free_floating_system_is_conserved(system: System) -> None:
     """Motors move the arm; linear momentum and angular momentum about the origin stay."""
-    model = Model(system)
+    model = build_model(system)
     pi = soften(model)
     torque = np.linspace(30.0, -20.0, len(system.joints))
     x, v, _, _ = free_motion(model, pi, lambda t: torque * np.cos(20.0 * t), 0.1)

@@ -9,8 +9,8 @@ import pytest
 from model_systems import paper, random_states
 
 from sms_online.description.schema import Effect
+from sms_online.effects.build import build_model
 from sms_online.errors import InputError
-from sms_online.model.model import Model
 from sms_online.stream import Array
 
 LAWS: dict[str, tuple[str, Callable[[Array, float], Array]]] = {
@@ -26,7 +26,7 @@ def test_an_effect_is_a_force_on_its_own_motor(name: str, joint: int) -> None:
     """Its law on θ_m of its joint, after the gear; no other row feels it."""
     coefficient, law = LAWS[name]
     effect = Effect(name=name, where=f"joint_{joint}", coefficients={coefficient: 0.4})
-    with_effect, without = Model(paper(effects=(effect,))), Model(paper())
+    with_effect, without = build_model(paper(effects=(effect,))), build_model(paper())
     layout = with_effect.layout
     x, v = random_states(layout, 20, seed=80)
     G = with_effect.momentum_columns(x, v)[1][..., -1]
@@ -43,13 +43,13 @@ def test_an_effect_is_a_force_on_its_own_motor(name: str, joint: int) -> None:
 
 def test_friction_takes_power_out_in_either_direction() -> None:
     effects = [Effect(name=name, where="joint_1") for name in ("viscous_friction", "coulomb_friction")]
-    model = Model(paper(effects=effects))
+    model = build_model(paper(effects=effects))
     x, v = random_states(model.layout, 50, seed=81)
     assert (model.power_columns(x, v)[:, -2:] > 0.0).all()
 
 
 def test_an_undeclared_coefficient_is_zero() -> None:
-    model = Model(paper(effects=(Effect(name="coulomb_friction", where="joint_2"),)))
+    model = build_model(paper(effects=(Effect(name="coulomb_friction", where="joint_2"),)))
     assert model.nominal[-1] == 0.0
 
 
@@ -63,4 +63,4 @@ def test_an_undeclared_coefficient_is_zero() -> None:
 )
 def test_a_wrong_effect_is_refused_with_what_was_expected(effect: Effect, words: str) -> None:
     with pytest.raises(InputError, match=words):
-        Model(paper(effects=(effect,)))
+        build_model(paper(effects=(effect,)))

@@ -15,8 +15,8 @@ from scipy.interpolate import CubicHermiteSpline
 from scipy.spatial.transform import Rotation
 
 from sms_online.description.schema import FlexibleLink, Inertia, RigidBody, RigidLink, System
+from sms_online.effects.build import build_model
 from sms_online.model.layout import Layout
-from sms_online.model.model import Model
 from sms_online.stream import Array
 
 # Instants of the differences, s. The step leaves 1e-16/STEP of rounding and STEP⁸ of truncation.
@@ -193,7 +193,7 @@ def energy(system: System, layout: Layout, x: Array, v: Array) -> tuple[float, f
 
 @pytest.mark.parametrize("system", SYSTEMS.values(), ids=SYSTEMS.keys())
 def test_energy_is_that_of_all_points_and_slices(system: System) -> None:
-    model = Model(system)
+    model = build_model(system)
     x, v = random_states(model.layout, 3, seed=30)
     moving = model.energy_columns(x, v) @ model.nominal
     at_rest = model.energy_columns(x, 0.0 * v) @ model.nominal

@@ -10,9 +10,9 @@ from scipy.linalg import expm
 from scipy.spatial.transform import Rotation
 
 from sms_online.description.schema import FlexibleLink, System
+from sms_online.effects.build import build_model
 from sms_online.model.beam import LinearLink
 from sms_online.model.flexible import LinkKinematics
-from sms_online.model.model import Model
 from sms_online.model.rod import ExactRod
 from sms_online.stream import Array
 
@@ -215,7 +215,7 @@ def test_first_order_tip_rotation_stretches_what_it_carries(angle: float, expect
     """(13) as printed: the next link's end is off by 1 - cos θ of its length, 4.5 % at 0.3 rad."""
     ends = []
     for tip_rotation in ("exponential", "first_order"):
-        model = Model(two_links(tip_rotation))
+        model = build_model(two_links(tip_rotation))
         x = np.zeros((1, model.layout.n_x))
         x[0, model.layout.position_names.index("link_1.marker_2.theta_z")] = angle
         ends.append(model.chain.configure(x).frames[-1].origin[0])

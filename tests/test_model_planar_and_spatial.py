@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from model_systems import paper, random_states
 
+from sms_online.effects.build import build_model
 from sms_online.model.model import Model
 from sms_online.stream import Array
 
@@ -17,8 +18,8 @@ both = pytest.mark.parametrize(("kinematics", "free"), CASES)
 def twins(kinematics: str, free: bool) -> tuple[Model, Model, list[int]]:
     """A planar model, its spatial twin, and the twin's indices of the planar speeds. Gravity lies in the plane."""
     gravity = {"gravity": (1.3, -2.0, 0.0)}
-    planar = Model(paper(kinematics, "planar", free).model_copy(update=gravity))
-    spatial = Model(paper(kinematics, "spatial", free).model_copy(update=gravity))
+    planar = build_model(paper(kinematics, "planar", free).model_copy(update=gravity))
+    spatial = build_model(paper(kinematics, "spatial", free).model_copy(update=gravity))
     return planar, spatial, [spatial.layout.speed_names.index(name) for name in planar.layout.speed_names]
 
 

@@ -9,6 +9,7 @@ import pytest
 from model_systems import random_states, rigid_chain
 
 from sms_online.description.schema import Inertia, RigidBody, RigidLink, System
+from sms_online.effects.build import build_model
 from sms_online.model.layout import Layout
 from sms_online.model.model import Model
 from sms_online.model.so3 import RotationVector
@@ -124,7 +125,7 @@ DRIVEN = {
 @pytest.mark.parametrize("system", DRIVEN.values(), ids=DRIVEN.keys())
 def test_dynamics_are_pinocchios(system: System) -> None:
     """M, nonlinear effects, inverse dynamics, kinetic energy and potential of gravity; rotors as bodies at n q̇."""
-    model, yardstick = Model(system), Yardstick(system)
+    model, yardstick = build_model(system), Yardstick(system)
     layout = model.layout
     x, v = random_states(layout, 5, seed=20)
     a = np.random.default_rng(21).normal(size=v.shape)
@@ -149,7 +150,7 @@ def test_dynamics_are_pinocchios(system: System) -> None:
 @all_chains
 def test_energy_columns_are_pinocchios_energy_regressors(system: System) -> None:
     """Contracted with the parameters; and for the links, whose frames and signs agree, column by column."""
-    model, yardstick = Model(system), Yardstick(system)
+    model, yardstick = build_model(system), Yardstick(system)
     layout = model.layout
     x, v = random_states(layout, 5, seed=22)
     Y = model.energy_columns(x, v)
@@ -164,7 +165,7 @@ def test_energy_columns_are_pinocchios_energy_regressors(system: System) -> None
 @all_chains
 def test_momentum_columns_are_pinocchios_joint_torque_regressor(system: System) -> None:
     """Column by column: H v̇ + C of one unit of each of a link's parameters."""
-    model, yardstick = Model(system), Yardstick(system)
+    model, yardstick = build_model(system), Yardstick(system)
     layout = model.layout
     x, v = random_states(layout, 1, seed=23)
     a = np.random.default_rng(24).normal(size=v.shape)

@@ -6,9 +6,9 @@ import numpy as np
 from model_systems import difference, random_states, spatial
 from scipy.spatial.transform import Rotation
 
+from sms_online.effects.build import build_model
 from sms_online.model import so3
 from sms_online.model.layout import build_layout
-from sms_online.model.model import Model
 
 
 def test_exponential_and_logarithm_up_to_half_a_turn() -> None:
@@ -71,7 +71,7 @@ def test_speeds_and_position_rates_are_inverse_maps() -> None:
 
 def test_turning_the_world_changes_no_inertia() -> None:
     """A rotation of everything, base and speeds alike, leaves the energy of a weightless system as it was."""
-    model = Model(spatial("exact").model_copy(update={"gravity": (0.0, 0.0, 0.0)}))
+    model = build_model(spatial("exact").model_copy(update={"gravity": (0.0, 0.0, 0.0)}))
     x, v = random_states(model.layout, 5, seed=75)
     world = Rotation.from_rotvec([0.4, -1.1, 0.7])
     turned_x, turned_v = x.copy(), v.copy()

@@ -11,8 +11,8 @@ import pytest
 import scipy.linalg
 
 from sms_online.description.schema import Deformation, FlexibleLink, Inertia, Joint, RigidBody, System
+from sms_online.effects.build import build_model
 from sms_online.model.eigenmodes import clamped_loaded_modes, tip_load
-from sms_online.model.model import Model
 from sms_online.stream import Array
 
 BETA_L = np.array([1.875104068711961, 4.694091132974175, 7.854757438237613])
@@ -40,7 +40,7 @@ def cantilever(elements: int, deformation: Deformation, kinematics: str, payload
 
 def natural_frequencies(system: System) -> Array:
     """ω, rad/s, with the joint held and the link straight."""
-    model = Model(system)
+    model = build_model(system)
     dynamics = model.dynamics(model.nominal)
     H = dynamics.mass_matrix(np.zeros((1, model.layout.n_x)))[0, 1:, 1:]
     return np.sqrt(scipy.linalg.eigvalsh(dynamics.stiffness[1:, 1:], H))

@@ -11,8 +11,8 @@ from prescribed_motion import prescribed
 from sms_adapters.system_file import load_system
 from sms_online.description.parse import parse_system
 from sms_online.description.schema import Effect, System
+from sms_online.effects.build import build_model
 from sms_online.model.base_parameters import find_base_parameters
-from sms_online.model.model import Model
 from sms_online.pipeline import momentum_fit
 from sms_online.pipeline.estimator import Estimator
 from sms_online.pipeline.momentum_balance import MomentumBalance
@@ -62,7 +62,7 @@ def dense(balance: MomentumBalance, window: Window) -> Array:
 @all_systems
 def test_rows_are_the_equations_of_motion_on_any_motion(system: System) -> None:
     """Y β = ∫ φ Q dt for the forces that H v̇ + C = Q asks for; the balance is told those of the motors."""
-    model = Model(system)
+    model = build_model(system)
     balance = MomentumBalance(model, find_base_parameters(model), system.sample_rate, SPAN)
     motion = prescribed(model, balance.width + balance.lead + balance.margin + 2 * balance.hop + 1, seed=1)
     torque = motion.Q[:, list(model.layout.theta_m)]
@@ -94,7 +94,7 @@ def test_rows_of_the_simulated_example_close_with_its_torque_alone(planar_sessio
 
 @all_systems
 def test_what_is_stored_of_a_row_is_all_that_is_not_zero(system: System) -> None:
-    model = Model(system)
+    model = build_model(system)
     balance = MomentumBalance(model, find_base_parameters(model), system.sample_rate, SPAN)
     motion = prescribed(model, balance.width + balance.lead + balance.margin + 1, seed=2)
     (window,) = windows_of(balance, motion.x, motion.Q[:, list(model.layout.theta_m)], sigma=0.0)
@@ -115,7 +115,7 @@ def test_what_is_stored_of_a_row_is_all_that_is_not_zero(system: System) -> None
 def test_a_force_that_turns_with_the_thinned_samples_is_summed_from_every_one() -> None:
     """A cogging of 450 periods a turn, at 1.4 rad/s: one period for each thinned sample."""
     cogging = Effect(name="cogging", where="joint_2", coefficients={"amplitude": 6.0, "order": 9.0})
-    model = Model(paper(effects=(cogging,)))
+    model = build_model(paper(effects=(cogging,)))
     balance = MomentumBalance(model, find_base_parameters(model), 1000.0, SPAN)
     motion = prescribed(model, balance.width + balance.lead + balance.margin + 1, seed=1)
     (window,) = windows_of(balance, motion.x, motion.Q[:, list(model.layout.theta_m)], sigma=1e-4)
@@ -135,7 +135,7 @@ def test_a_force_that_turns_with_the_thinned_samples_is_summed_from_every_one() 
 
 def test_rows_of_a_free_base_hold_no_spring_damper_or_rotor() -> None:
     """Internal forces do not change the momentum of the whole system; these rows cost nothing there."""
-    model = Model(paper())
+    model = build_model(paper())
     balance = MomentumBalance(model, find_base_parameters(model), 1000.0, SPAN)
     names = [p.name for p in balance.base.parameters]
     in_base_rows = {names[k] for k in balance.columns[balance.rows < model.layout.n_base_speeds]}
@@ -148,7 +148,7 @@ def test_rows_of_a_free_base_hold_no_spring_damper_or_rotor() -> None:
 
 def test_windows_follow_one_another_without_a_gap_and_stay_in_their_segment() -> None:
     system = paper()
-    model = Model(system)
+    model = build_model(system)
     balance = MomentumBalance(model, find_base_parameters(model), system.sample_rate, SPAN)
     motion = prescribed(model, 3 * balance.width, seed=3)
     torque = motion.Q[:, list(model.layout.theta_m)]
@@ -242,7 +242,7 @@ def test_a_session_restored_while_new_weights_are_told_windows_gives_the_same_bi
 def test_the_nominal_values_of_a_description_never_enter_the_estimate() -> None:
     block = axis_session(np.arange(800) / 200.0, noise=1e-4)
     other = parse_system(AXIS.replace(f"zz = {INERTIA}", "zz = 7.0").replace(f"= {DAMPING} }}", "= 5.0 }"), "axis.toml")
-    assert Model(other).nominal.tolist() != Model(parse_system(AXIS, "axis.toml")).nominal.tolist()
+    assert build_model(other).nominal.tolist() != build_model(parse_system(AXIS, "axis.toml")).nominal.tolist()
     estimator = Estimator(other, block.channels, "axis")
     estimator.push(block)
     estimator.finish()

@@ -14,8 +14,8 @@ from changed_session import changed_session, noisy
 from sms_adapters.system_file import load_system
 from sms_online.description.schema import Effect, System
 from sms_online.diagnosis.online import Immediate, OnlineDiagnosis, refusal
+from sms_online.effects.build import build_model
 from sms_online.model.base_parameters import find_base_parameters
-from sms_online.model.model import Model
 from sms_online.pipeline.estimator import Estimator
 from sms_online.results import results_document
 from sms_online.stream import Block
@@ -68,8 +68,8 @@ def test_an_effect_of_the_base_that_begins_in_mid_session_is_named_and_disturbs_
     (event,) = estimator.events
     assert (event.kind, event.parameters) == ("effect", ("air_drag@base.damping",))
     assert event.time == pytest.approx(BEGIN, abs=0.15)
-    base = find_base_parameters(Model(PLANAR))
-    true = np.append(base.values(Model(PLANAR).nominal), 60.0)
+    base = find_base_parameters(build_model(PLANAR))
+    true = np.append(base.values(build_model(PLANAR).nominal), 60.0)
     estimate = estimator.estimate()
     assert (np.abs(estimate.pi - true) < 4.0 * estimate.std).all()
     assert estimate.pi[-1] == pytest.approx(60.0, rel=1e-3)
@@ -192,7 +192,7 @@ def test_a_replica_follows_an_adoption() -> None:
 def test_what_acts_before_the_balance_is_not_taken_up_while_running() -> None:
     """A constant of a channel, and an effect with a state of its own, say why."""
     (named,) = cogged(True)[1].episodes[0].named
-    model = Model(PLANAR)
+    model = build_model(PLANAR)
 
     def as_if(name: str, where: str) -> str | None:
         effect = Effect(name=name, where=where)

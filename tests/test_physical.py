@@ -10,6 +10,7 @@ import scipy.optimize
 from numpy.testing import assert_allclose
 
 from sms_online.description.parse import parse_system, shipped_text
+from sms_online.effects.build import build_model
 from sms_online.model.base_parameters import BaseParameters, find_base_parameters
 from sms_online.model.model import Model
 from sms_online.physical import PhysicalSet
@@ -38,7 +39,7 @@ Case = tuple[Model, BaseParameters, PhysicalSet]
 
 
 def case(text: str, name: str) -> Case:
-    model = Model(parse_system(text, name))
+    model = build_model(parse_system(text, name))
     base = find_base_parameters(model)
     return model, base, PhysicalSet(model, base)
 

@@ -8,8 +8,8 @@ from model_systems import FRICTION, paper
 from prescribed_motion import prescribed
 
 from sms_online.description.schema import Effect
+from sms_online.effects.build import build_model
 from sms_online.model.base_parameters import find_base_parameters
-from sms_online.model.model import Model
 from sms_online.pipeline.estimator import Estimator
 from sms_online.pipeline.momentum_balance import MomentumBalance
 from sms_online.pipeline.momentum_windows import COPIES, STEPS, Window
@@ -20,7 +20,7 @@ from sms_sim.plant import Plant
 SPAN = 0.4  # s
 RATE = 1000.0
 COULOMB = Effect(name="coulomb_friction", where="joint_1", coefficients={"torque": 1.0})
-MODEL = Model(paper(effects=(COULOMB,)))
+MODEL = build_model(paper(effects=(COULOMB,)))
 BASE = find_base_parameters(MODEL)
 MOTOR = MODEL.layout.theta_m[0]
 ANGLE = MOTOR + MODEL.layout.n_base_positions - MODEL.layout.n_base_speeds
@@ -86,7 +86,7 @@ def test_a_reversal_of_friction_scatters_as_predicted(
 
 def test_rows_of_a_backlog_are_those_of_hop_after_hop() -> None:
     cogging = Effect(name="cogging", where="joint_2", coefficients={"amplitude": 6.0, "order": 9.0})
-    model = Model(paper(effects=(*FRICTION, cogging)))
+    model = build_model(paper(effects=(*FRICTION, cogging)))
     base = find_base_parameters(model)
     motion = prescribed(model, 1500, seed=1)
     samples = np.concatenate((motion.x, motion.Q[:, list(model.layout.theta_m)]), axis=1)

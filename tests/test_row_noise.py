@@ -13,8 +13,8 @@ from prescribed_motion import prescribed
 from sms_adapters.system_file import load_system
 from sms_online.description.parse import parse_system
 from sms_online.description.schema import Effect, System
+from sms_online.effects.build import build_model
 from sms_online.model.base_parameters import find_base_parameters
-from sms_online.model.model import Model
 from sms_online.pipeline.latency import SourceGroup
 from sms_online.pipeline.momentum_balance import MomentumBalance
 from sms_online.pipeline.momentum_windows import COPIES, EXPONENT, HOPS, INSTANTS, STEPS, Window
@@ -74,7 +74,7 @@ def block_matrix(covariances: list[list[Array]]) -> Array:
 
 def scatter(system: System, draws: int, seed: int) -> Scatter:
     """Rows of one stretch of motion, exact parameters, `draws` times with new noise on every sensor."""
-    model = Model(system)
+    model = build_model(system)
     plant = Plant(system)
     base = find_base_parameters(model)
     beta = base.values(model.nominal)
@@ -150,7 +150,7 @@ def test_rows_of_noisy_readings_scatter_as_predicted(system: System, draws: int)
 def test_a_clock_that_is_off_moves_rows_by_the_rates_of_its_readings() -> None:
     """Against rows of samples moved in time; windows that overlap share it, and a clock just found is off by more."""
     system = paper()
-    model = Model(system)
+    model = build_model(system)
     base = find_base_parameters(model)
     motion = prescribed(model, 800, seed=1)
     sensors, late = (model.layout.position_names.index("q_1"), model.layout.position_names.index("q_2")), 1e-6  # s
@@ -190,7 +190,7 @@ def test_a_clock_that_is_off_moves_rows_by_the_rates_of_its_readings() -> None:
 
 
 def test_sensitivities_of_columns_told_with_the_rows_are_those_of_the_dynamics() -> None:
-    model = Model(paper(effects=FRICTION))
+    model = build_model(paper(effects=FRICTION))
     balance = MomentumBalance(model, find_base_parameters(model), model.system.sample_rate, SPAN)
     motion = prescribed(model, balance.width + balance.lead + balance.margin + 1, seed=2)  # of one window
     samples = np.concatenate((motion.x, np.zeros((len(motion.x), len(model.layout.q)))), axis=1)
@@ -283,7 +283,7 @@ def test_noise_is_told_from_a_sensors_own_samples_however_slow_it_is(rate: float
 
     1000 samples tell σ to 5 % and so the density to 10 %; three times that is allowed.
     """
-    sensing = Sensing(Model(AXIS_SYSTEM), ("force_1", "q_1"), "test")
+    sensing = Sensing(build_model(AXIS_SYSTEM), ("force_1", "q_1"), "test")
     estimate = NoiseEstimate(sensing, AXIS_SYSTEM.sample_rate)
     sigma = 1e-4
     t = np.arange(round(10.0 * grid)) / grid

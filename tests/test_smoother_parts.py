@@ -9,6 +9,7 @@ from one_link import one_link
 
 from sms_online.description.channels import channels
 from sms_online.description.parse import parse_system, shipped_text
+from sms_online.effects.build import build_model
 from sms_online.errors import InputError
 from sms_online.linearised import Motion
 from sms_online.model.model import Model
@@ -24,7 +25,7 @@ DISPLACEMENTS = [0, 2]  # of the two markers' u_y, theta_z
 
 @pytest.fixture(scope="module", params=["linear", "exact"])
 def model(request: pytest.FixtureRequest) -> Model:
-    return Model(one_link(request.param))
+    return build_model(one_link(request.param))
 
 
 def test_a_static_shape_is_that_of_a_link_held_at_its_markers(model: Model) -> None:
@@ -42,7 +43,7 @@ def test_a_static_shape_is_that_of_a_link_held_at_its_markers(model: Model) -> N
 
 
 def test_slopes_of_a_cantilever_with_a_load_at_its_tip_follow_from_displacements() -> None:
-    kinematics = Model(one_link("linear")).chain.flexible[0]
+    kinematics = build_model(one_link("linear")).chain.flexible[0]
     assert kinematics is not None
     # u = a (3 L s² - s³) of a load at the tip, L = 1 m.
     s, a = np.array([0.5, 1.0]), 0.01
@@ -65,7 +66,7 @@ def test_a_link_without_any_marker_and_a_spatial_base_with_too_few_are_refused(m
     sensing = Sensing(model, (*drives, "link_1.marker_2.u_y"), "capture")
     assert "link_1.marker_2.theta_z" in sensing.missing
     assert "link_1.marker_2.u_y" not in sensing.missing
-    spatial = Model(parse_system(shipped_text("spatial-two-link"), "spatial-two-link"))
+    spatial = build_model(parse_system(shipped_text("spatial-two-link"), "spatial-two-link"))
     every = channels(spatial.system)
     with pytest.raises(InputError, match=r"'link_1\.marker_1\.theta_z'"):
         Sensing(spatial, [name for name in every if name != "link_1.marker_1.theta_z"], "capture")

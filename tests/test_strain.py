@@ -7,6 +7,7 @@ import pytest
 
 from sms_adapters.system_file import load_system
 from sms_online.description.channels import channels
+from sms_online.effects.build import build_model
 from sms_online.effects.catalogue import candidates
 from sms_online.errors import InputError
 from sms_online.model.model import Model
@@ -19,7 +20,7 @@ DRIVES = ("tau_1", "tau_2", "theta_m_1", "theta_m_2")
 
 @pytest.fixture(scope="module")
 def strips() -> Model:
-    return Model(load_system("quanser-2dsfl"))
+    return build_model(load_system("quanser-2dsfl"))
 
 
 def test_the_link_is_beyond_the_hub_by_the_strain(strips: Model) -> None:

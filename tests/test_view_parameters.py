@@ -11,8 +11,8 @@ import rerun as rr
 from recordings import columns
 
 from sms_adapters.system_file import load_system
+from sms_online.effects.build import build_model
 from sms_online.model.base_parameters import find_base_parameters
-from sms_online.model.model import Model
 from sms_online.model.parameters import Parameter
 from sms_online.pipeline.events import Event
 from sms_online.pipeline.joint_balance import SquaredResidual
@@ -34,7 +34,7 @@ def about(parameters: Sequence[Parameter]) -> Basis:
 @pytest.mark.parametrize("truth", [False, True])
 @pytest.mark.parametrize("name", ["paper-planar", "seven-joint", "quanser-2dsfl", "emps"])
 def test_every_parameter_is_in_one_plot_of_one_unit(name: str, truth: bool) -> None:
-    parameters = find_base_parameters(Model(load_system(name))).parameters
+    parameters = find_base_parameters(build_model(load_system(name))).parameters
     groups = parameter_groups(parameters, [Reference(p.nominal, truth) for p in parameters], about(parameters))
     members = np.concatenate([group.indices for group in groups])
     assert sorted(members.tolist()) == list(range(len(parameters)))

@@ -7,6 +7,7 @@ import pytest
 
 from sms_adapters.system_file import load_system
 from sms_online.description.schema import FlexibleLink
+from sms_online.effects.build import build_model
 from sms_online.model.base_parameters import random_states
 from sms_online.model.model import Model
 from sms_online.model.so3 import RotationVector
@@ -25,7 +26,7 @@ def states(model: Model, count: int = 20) -> Array:
 
 @pytest.mark.parametrize("name", SYSTEMS)
 def test_the_drawn_tip_is_the_forward_kinematics(name: str) -> None:
-    model = Model(load_system(name))
+    model = build_model(load_system(name))
     x = states(model)
     drawing = Scene(model).draw(x)
     end = model.chain.configure(x).frames[-1].origin
@@ -35,7 +36,7 @@ def test_the_drawn_tip_is_the_forward_kinematics(name: str) -> None:
 
 @pytest.mark.parametrize("name", SYSTEMS)
 def test_links_hang_together(name: str) -> None:
-    drawing = Scene(Model(load_system(name))).draw(states(Model(load_system(name))))
+    drawing = Scene(build_model(load_system(name))).draw(states(build_model(load_system(name))))
     for i, line in enumerate(drawing.links):
         np.testing.assert_allclose(line[:, 0], drawing.joints[:, i], rtol=0, atol=1e-12)
         if i + 1 < len(drawing.links):
@@ -65,7 +66,7 @@ def measured_marker(model: Model, readings: dict[str, float], i: int, j: int) ->
 
 
 def test_markers_are_where_they_were_measured(planar_block: Block) -> None:
-    model = Model(load_system("paper-planar"))
+    model = build_model(load_system("paper-planar"))
     scene = Scene(model)
     rows = slice(0, None, 997)
     values = planar_block.values[rows]
@@ -79,7 +80,7 @@ def test_markers_are_where_they_were_measured(planar_block: Block) -> None:
 
 
 def test_the_last_marker_of_each_link_is_its_end() -> None:
-    model = Model(load_system("spatial-two-link"))
+    model = build_model(load_system("spatial-two-link"))
     scene = Scene(model)
     drawing = scene.draw(states(model))
     for column, (i, j) in enumerate(scene.markers):
@@ -91,14 +92,14 @@ def test_the_last_marker_of_each_link_is_its_end() -> None:
 
 @pytest.mark.parametrize("name", ["paper-planar", "paper-planar-exact", "seven-joint"])
 def test_without_deflections_the_arm_is_its_ghost(name: str) -> None:
-    model = Model(load_system(name))
+    model = build_model(load_system(name))
     stiff = Scene(model, exaggeration=0.0).draw(states(model))
     np.testing.assert_allclose(stiff.joints, stiff.ghost[:, :-1], rtol=0, atol=1e-12)
     np.testing.assert_allclose(stiff.tip, stiff.ghost[:, -1], rtol=0, atol=1e-12)
 
 
 def test_exaggeration_multiplies_a_links_deflection() -> None:
-    model = Model(load_system("paper-planar"))
+    model = build_model(load_system("paper-planar"))
     x = np.zeros((1, model.layout.n_x))
     x[0, model.layout.position_names.index("link_1.marker_1.u_y")] = 0.01
     once, tenfold = (Scene(model, factor).draw(x).markers[0, 0] for factor in (1.0, 10.0))
@@ -110,7 +111,7 @@ def test_the_spacecraft_holds_joint_1_and_its_tracked_point() -> None:
     for name in ("paper-planar", "seven-joint"):
         system = load_system(name)
         assert system.spacecraft is not None
-        center, half = Scene(Model(system)).box
+        center, half = Scene(build_model(system)).box
         axes = slice(0, 2 if system.motion == "planar" else 3)
         for point in (np.zeros(3), np.array(system.spacecraft.tracked_point)):
             assert np.all(np.abs(point - center)[axes] <= half[axes])
@@ -129,7 +130,7 @@ def test_a_channel_keeps_its_last_reading() -> None:
 
 @pytest.mark.parametrize("size", [1, 7, 400])
 def test_pictures_come_at_their_rate_however_samples_are_split(planar_block: Block, size: int) -> None:
-    model = Model(load_system("paper-planar"))
+    model = build_model(load_system("paper-planar"))
     readings = Readings(Sensing(model, planar_block.channels, "test"), planar_block.channels)
     block = Block(planar_block.t[:2000], planar_block.channels, planar_block.values[:2000])
     t = [readings.push(piece)[0] for piece in block.pieces(size)]
@@ -137,7 +138,7 @@ def test_pictures_come_at_their_rate_however_samples_are_split(planar_block: Blo
 
 
 def test_nothing_is_drawn_before_every_channel_has_a_reading(planar_block: Block) -> None:
-    model = Model(load_system("paper-planar"))
+    model = build_model(load_system("paper-planar"))
     values = planar_block.values[:500].copy()
     values[:120, planar_block.channels.index("theta_0")] = np.nan
     readings = Readings(Sensing(model, planar_block.channels, "test"), planar_block.channels)

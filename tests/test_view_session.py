@@ -19,8 +19,8 @@ from recordings import columns, scalars
 from sms_adapters.capture import CaptureWriter
 from sms_adapters.system_file import load_system
 from sms_adapters.truth import write_truth
+from sms_online.effects.build import build_model
 from sms_online.model.base_parameters import find_base_parameters
-from sms_online.model.model import Model
 from sms_online.pipeline.estimator import Estimator
 from sms_online.results import results_document
 from sms_online.stream import Block
@@ -242,7 +242,7 @@ def test_references_are_the_truth_or_else_nominal_values() -> None:
 
 def test_a_parameter_without_a_nominal_value_has_no_reference() -> None:
     system = load_system("quanser-2dsfl")
-    base = find_base_parameters(Model(system))
+    base = find_base_parameters(build_model(system))
     channels = ("tau_1", "tau_2", "theta_m_1", "theta_m_2", "q_1", "q_2")
     found = references(Estimator(system, channels, "test"), None)
     assert [reference is None for reference in found] == [p.nominal == 0.0 for p in base.parameters]
@@ -250,5 +250,5 @@ def test_a_parameter_without_a_nominal_value_has_no_reference() -> None:
 
 
 def _channels() -> tuple[str, ...]:
-    layout = Model(load_system("paper-planar")).layout
+    layout = build_model(load_system("paper-planar")).layout
     return (*layout.position_names, "tau_1", "tau_2")

@@ -6,8 +6,8 @@ import numpy as np
 from model_systems import paper
 from prescribed_motion import prescribed
 
+from sms_online.effects.build import build_model
 from sms_online.model.base_parameters import find_base_parameters
-from sms_online.model.model import Model
 from sms_online.pipeline.momentum_balance import MomentumBalance
 from sms_online.pipeline.momentum_fit import WARM_UP
 from sms_online.pipeline.momentum_windows import COPIES, HOPS
@@ -29,7 +29,7 @@ def _information(rows: Array) -> Array:
 
 def test_a_chain_that_was_told_enough_windows_weighs_like_one_that_knows_them_all() -> None:
     system = paper()
-    model = Model(system)
+    model = build_model(system)
     base = find_base_parameters(model)
     plant = Plant(system)
     sensing = Sensing(model, plant.channels, "test")

@@ -8,8 +8,8 @@ import numpy as np
 
 from sms_online.description.channels import drive_channel, sensed_channels
 from sms_online.description.schema import System
-from sms_online.effects.base import Inputs
-from sms_online.model.model import Model
+from sms_online.effects.build import build_model
+from sms_online.model.effect import Inputs
 from sms_online.sensor_set import Readings, readable_channels
 from sms_online.stream import Array
 from sms_sim.controller import JointPD
@@ -26,7 +26,7 @@ class Plant:
     """
 
     def __init__(self, system: System, parameters: Array | None = None) -> None:
-        self.model = Model(system, parameters)
+        self.model = build_model(system, parameters)
         self.system = self.model.system
         self.parameters = self.model.nominal if parameters is None else parameters
         self.dynamics = self.model.dynamics(self.parameters)

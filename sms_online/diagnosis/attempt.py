@@ -22,8 +22,8 @@ from sms_online.diagnosis.residuals import ResidualTest, RowResidual, whitened
 from sms_online.diagnosis.rows import SessionRows
 from sms_online.diagnosis.shape import refine
 from sms_online.diagnosis.trace import Tracing
+from sms_online.effects.build import build_model
 from sms_online.errors import InputError
-from sms_online.model.model import Model
 from sms_online.pipeline.conditioning import noise_gains
 from sms_online.pipeline.estimator import Estimator
 from sms_online.pipeline.momentum_windows import HOPS
@@ -193,7 +193,7 @@ class Attempt:
         attempt's rows, whatever else becomes of them: the same measure for all that are compared.
         """
         forces = tuple(effect for effect in (*system.effects, *effects) if not is_constant(effect))
-        states = Model(system.model_copy(update={"effects": forces})).n_states
+        states = build_model(system.model_copy(update={"effects": forces})).n_states
         return Attempt(self.case, system, constants, beta, effects, LONGEST if states else SOME, self.rows.bends)
 
     def _start(self, candidates: Sequence[Candidate]) -> None:

@@ -18,9 +18,11 @@ from sms_online.diagnosis.reversals import Reversals
 from sms_online.diagnosis.rows import SessionRows
 from sms_online.diagnosis.standstill import LEAVING, SessionStandstill
 from sms_online.diagnosis.weak_windows import Motion, WeakWindows
-from sms_online.effects.base import Inputs, Ranges, position
+from sms_online.effects.base import Ranges, position
+from sms_online.effects.build import build_model
 from sms_online.effects.catalogue import ENTRIES, candidates
 from sms_online.effects.friction import DRY, REVERSING
+from sms_online.model.effect import Inputs
 from sms_online.model.model import Model
 from sms_online.model.parameters import Parameter
 from sms_online.pipeline.momentum_windows import HOPS
@@ -139,7 +141,7 @@ class CandidateColumns:
         if ENTRIES[effect.name].kind == "channel":
             return self._channel(effect)
         # What becomes a constant is linear only beside parameters that are known.
-        model = Model(
+        model = build_model(
             self._declaring(effect), self.rows.base.physical_values(self.rows.beta) if is_constant(effect) else None
         )
         added = [k for k, p in enumerate(model.parameters) if p.name not in self._own]
@@ -190,7 +192,7 @@ class CandidateColumns:
         nothing = np.zeros((len(self.rows.b), HOPS, self.rows.b.shape[1]))
         if ENTRIES[effect.name].kind != "force" or is_constant(effect) or self.rows.noise.exact:
             return LeftOpen(nothing[:, 0], nothing)
-        model = Model(self._declaring(effect))
+        model = build_model(self._declaring(effect))
         if effect.where.startswith("joint_") and effect.name not in REVERSING and not model.effects[-1].n_states:
             return LeftOpen(self._spread(model, coefficients), nothing)
         if not self._noisy:
@@ -259,7 +261,7 @@ class CandidateColumns:
 
         Empty where β does not hold what they are relative to.
         """
-        force = Model(self._declaring(effect)).effects[-1]
+        force = build_model(self._declaring(effect)).effects[-1]
         known = dict(zip((p.name for p in self.rows.base.parameters), beta.tolist(), strict=True))
         if not known.keys() >= set(force.relative_to):
             return {}

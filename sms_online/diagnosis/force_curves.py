@@ -19,7 +19,8 @@ from sms_online.diagnosis.diagnose import Diagnosis
 from sms_online.diagnosis.evidence import basis, free_of, gain
 from sms_online.diagnosis.splines import DEGREE, Variable, design, spline_columns
 from sms_online.diagnosis.weak_windows import Motion
-from sms_online.effects.base import Inputs, position
+from sms_online.effects.base import position
+from sms_online.model.effect import Inputs
 from sms_online.stream import Array
 
 # Effects whose force is a function of one variable, and acts along one direction.

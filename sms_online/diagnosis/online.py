@@ -21,6 +21,7 @@ from sms_online.diagnosis.episodes import Episode, Evidence, discrepancy, episod
 from sms_online.diagnosis.followed import least_samples
 from sms_online.diagnosis.online_search import Named, Outcome, Request, search
 from sms_online.diagnosis.record import Segment, joined
+from sms_online.effects.build import changed_model
 from sms_online.effects.catalogue import ENTRIES
 from sms_online.judgement import Discrepancy
 from sms_online.model.model import Model
@@ -354,7 +355,9 @@ def refusal(model: Model, named: tuple[Named, ...]) -> str | None:
     for each in named:
         if is_constant(each.effect):
             return f"{each.key} is a constant of the description"
-        with_it = model.of(model.system.model_copy(update={"effects": (*model.system.effects, each.effect)}))
+        with_it = changed_model(
+            model, model.system.model_copy(update={"effects": (*model.system.effects, each.effect)})
+        )
         if with_it.n_states:
             return f"{each.key} has an internal state, which is followed from a session's start alone"
     return None

@@ -26,6 +26,7 @@ from sms_online.diagnosis.shape import refine
 from sms_online.diagnosis.trace import Tracing
 from sms_online.diagnosis.weak_windows import WeakWindows
 from sms_online.effects.base import report
+from sms_online.effects.build import build_model
 from sms_online.effects.catalogue import ENTRIES, declarable
 from sms_online.effects.spacecraft import TableTilt
 from sms_online.model.base_parameters import BaseParameters
@@ -307,7 +308,7 @@ def _coefficients(
         return {name: (value, stds.get(name), units.get(name, "")) for name, value in effect.coefficients.items()}
     names = [p.name for p in base.parameters]
     declared = system.model_copy(update={"effects": (*system.effects, effect)})
-    model = Model(declared, base.physical_values(solution[: base.n]))
+    model = build_model(declared, base.physical_values(solution[: base.n]))
     known = [*range(base.n), *range(own.start, own.stop)]
     values, spread = solution[known], covariance[np.ix_(known, known)]
     spread = np.where(np.isfinite(spread), spread, 0.0)

@@ -8,12 +8,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import ClassVar, Literal, Protocol
+from typing import ClassVar, Literal
 
 import numpy as np
 
 from sms_online.description.schema import System
 from sms_online.model.chain import Chain
+from sms_online.model.effect import ForceEffect, Inputs
 from sms_online.model.layout import Layout
 from sms_online.model.parameters import Parameter
 from sms_online.stream import Array
@@ -22,55 +23,6 @@ Kind = Literal["force", "inertia", "channel", "kinematics"]
 Place = Literal["joint", "flexible joint", "later joint", "link", "linear link", "base", "tip", "angle", "position"]
 # Relative step of the differences that carry standard deviations over to reported coefficients.
 DIFFERENCE = 1e-6
-
-
-@dataclass(frozen=True)
-class Inputs:
-    """What an effect may need besides positions and speeds, at B instants.
-
-    torque (B, joints): n τ as measured, N m (N). states (B, n_z): internal states, to the model those of all effects in
-    their order, to an effect its own.
-    """
-
-    torque: Array
-    states: Array
-
-
-class ForceEffect(Protocol):
-    """An effect of kind `force`.
-
-    parameters: the linear coefficients as they enter π. shapes: shape constants. relative_to: names of the model's
-    parameters that reported coefficients are divided by. n_states: number of internal states. smooth: whether it is as
-    smooth as the motion, which is thinned then. A joint's force and internal states depend on that joint's positions,
-    rates and torque.
-    """
-
-    name: str
-    where: str
-    parameters: tuple[Parameter, ...]
-    shapes: Mapping[str, float]
-    relative_to: tuple[str, ...]
-    needs_torque: bool
-    n_states: int
-    smooth: bool
-
-    def force(self, layout: Layout, x: Array, v: Array, inputs: Inputs | None) -> Array:
-        """Columns f_j (B, n_v, coefficients): generalized force of one unit of each coefficient."""
-
-    def power(self, layout: Layout, x: Array, v: Array, inputs: Inputs | None) -> Array:
-        """Power (B, coefficients) that one unit of each coefficient takes out, W."""
-
-    def state_rate(self, layout: Layout, x: Array, v: Array, z: Array) -> Array:
-        """ż (B, n_states) of the internal states z (B, n_states)."""
-
-    def initial_state(self, layout: Layout, x_0: Array) -> Array:
-        """z (n_states,) at the start, at positions x_0 (n_x,) and rest."""
-
-    def reported(self, values: Array) -> dict[str, float]:
-        """The coefficients that a person reads, shape constants included, by name.
-
-        values: of `parameters`, then of the parameters that `relative_to` names.
-        """
 
 
 @dataclass(frozen=True)

@@ -6,14 +6,13 @@ A further effect is a class with an `entry`, listed in CLASSES.
 from __future__ import annotations
 
 import math
-import re
 from collections.abc import Callable, Iterable, Mapping
 from fnmatch import fnmatchcase
 
 from sms_online.description.channels import channels, drive_channel, strain_channel
 from sms_online.description.explain import hint, nearest
 from sms_online.description.schema import Effect, FlexibleLink, System
-from sms_online.effects.base import Entry, ForceEffect, Place, Site
+from sms_online.effects.base import Entry, Place, Site
 from sms_online.effects.channel import (
     LONGEST_DELAY,
     ChannelEffect,
@@ -35,8 +34,7 @@ from sms_online.effects.payload import TipPayload
 from sms_online.effects.spacecraft import AirDrag, CableSpring, ReactionWheel, Slosh, TableTilt, ThrusterLeak
 from sms_online.effects.transmission import Backlash, CubicStiffness, KinematicError, TorsionalHysteresis
 from sms_online.errors import InputError
-from sms_online.model.chain import Chain
-from sms_online.stream import Array
+from sms_online.model.effect import ForceEffect, InertiaEffect
 
 FORCES = (
     CoulombFriction, ViscousFriction, StribeckFriction, LoadFriction, DirectionFriction, TorsionalHysteresis,
@@ -48,11 +46,13 @@ CLASSES = (*FORCES, TipPayload, *CHANNELS)
 # The step from `linear` to `exact` kinematics of a link; it has no coefficients and no class.
 GEOMETRIC_STIFFENING = Entry("geometric_stiffening", "kinematics", "linear link", {}, SEPARATED_BY)
 
-NUMBERED = re.compile(r"(?:joint|link)_(\d+)")
 ENTRIES: dict[str, Entry] = {entry.name: entry for entry in (*(each.entry for each in CLASSES), GEOMETRIC_STIFFENING)}
 NAMES = tuple(ENTRIES)
 # Built from a site and the declared coefficients, or from a channel (or pattern) and these.
-_FORCES: dict[str, Callable[[Site, Mapping[str, float]], ForceEffect]] = {each.entry.name: each for each in FORCES}
+FORCE_CLASSES: dict[str, Callable[[Site, Mapping[str, float]], ForceEffect]] = {
+    each.entry.name: each for each in FORCES
+}
+INERTIA_CLASSES: dict[str, Callable[[Site, Mapping[str, float]], InertiaEffect]] = {TipPayload.entry.name: TipPayload}
 _CHANNELS: dict[str, Callable[[str, Mapping[str, float]], ChannelEffect]] = {
     EncoderOffset.entry.name: EncoderOffset,
     EncoderEccentricity.entry.name: EncoderEccentricity,
@@ -130,45 +130,6 @@ def with_shapes(effect: Effect, system: System) -> Effect:
     known = declarable(entry, system)
     shapes = {name: shape.default for name, shape in entry.shapes.items() if name in known}
     return effect.model_copy(update={"coefficients": shapes | effect.coefficients})
-
-
-def with_kinematics(system: System) -> System:
-    """The system with `exact` kinematics of the links that declare geometric_stiffening; InputError as `check_effect`.
-
-    What is exact already stays, so that the system that comes out may go in again.
-    """
-    links = list(system.links)
-    flexible = [(f"link_{i}", link) for i, link in enumerate(links, start=1) if isinstance(link, FlexibleLink)]
-    exact = {name for name, link in flexible if link.kinematics == "exact"}
-    for k, effect in enumerate(system.effects, start=1):
-        if effect.name == GEOMETRIC_STIFFENING.name and effect.where not in exact:
-            check_effect(system, effect, f"effect {k}", system.name)
-            i = int(effect.where.removeprefix("link_")) - 1
-            links[i] = links[i].model_copy(update={"kinematics": "exact"})
-    return system.model_copy(update={"links": tuple(links)}) if links != list(system.links) else system
-
-
-def build_effects(
-    system: System, chain: Chain, weight: Callable[[Array], Array]
-) -> tuple[tuple[ForceEffect, ...], tuple[TipPayload, ...]]:
-    """Effects of kind force, and of kind inertia, that a system declares, in its order; weight: see `Site`.
-
-    InputError on an unknown name, place or coefficient.
-    """
-    forces: list[ForceEffect] = []
-    inertias: list[TipPayload] = []
-    for k, effect in enumerate(system.effects, start=1):
-        if effect.name == GEOMETRIC_STIFFENING.name:
-            continue  # the links are exact already
-        check_effect(system, effect, f"effect {k}", system.name)
-        numbered = NUMBERED.fullmatch(effect.where)
-        site = Site(system, chain, effect.where, int(numbered[1]) if numbered else 0, weight)
-        given = with_shapes(effect, system).coefficients
-        if effect.name in _FORCES:
-            forces.append(_FORCES[effect.name](site, given))
-        elif effect.name == TipPayload.entry.name:
-            inertias.append(TipPayload(site, given))
-    return tuple(forces), tuple(inertias)
 
 
 def parse_effect(text: str, system: System) -> Effect:

@@ -9,9 +9,10 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from sms_online.effects.base import Entry, Inputs, Shape, Site, position
+from sms_online.effects.base import Entry, Shape, Site, position
 from sms_online.effects.friction import MotorSide
 from sms_online.effects.harmonic import amplitude_and_phase, nominal_parts, phase_columns
+from sms_online.model.effect import Inputs
 from sms_online.model.layout import Layout
 from sms_online.stream import Array
 

@@ -10,7 +10,8 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from sms_online.effects.base import Entry, Force, Inputs, Ranges, Shape, Site, position
+from sms_online.effects.base import Entry, Force, Ranges, Shape, Site, position
+from sms_online.model.effect import Inputs
 from sms_online.model.layout import Layout
 from sms_online.stream import Array
 

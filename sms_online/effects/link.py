@@ -6,7 +6,8 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from sms_online.effects.base import Entry, Force, Inputs, Site
+from sms_online.effects.base import Entry, Force, Site
+from sms_online.model.effect import Inputs
 from sms_online.model.flexible import LinkKinematics
 from sms_online.model.layout import Layout
 from sms_online.model.parameters import rigidity_parameter

@@ -10,8 +10,9 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from sms_online.effects.base import Entry, Force, Inputs, Ranges, Shape, Site, position
+from sms_online.effects.base import Entry, Force, Ranges, Shape, Site, position
 from sms_online.effects.harmonic import amplitude_and_phase, nominal_parts, phase_columns
+from sms_online.model.effect import Inputs
 from sms_online.model.layout import Layout
 from sms_online.stream import Array
 

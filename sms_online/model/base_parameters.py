@@ -14,8 +14,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from sms_online.description.explain import hint, nearest
-from sms_online.effects.base import Inputs
 from sms_online.errors import InputError
+from sms_online.model.effect import Inputs
 from sms_online.model.model import Model
 from sms_online.model.parameters import Parameter
 from sms_online.model.tolerance import perturbed
@@ -122,7 +122,7 @@ def find_base_parameters(model: Model) -> BaseParameters:
     largest = float(scale.max())
     absent = tuple(k for k in range(model.n_pi) if scale[k] <= RANK_TOLERANCE * largest or k in known_indices)
     candidates = [k for k in range(model.n_pi) if k not in absent]
-    drawn = [_columns(model.of(perturbed(model.system, rng)), x, v, inputs) for _ in range(DRAWS)]
+    drawn = [_columns(model.of_geometry(perturbed(model.system, rng)), x, v, inputs) for _ in range(DRAWS)]
     changes = [(other - Y)[:, candidates] / scale[candidates] for other in drawn]
     kept = _independent(Y[:, candidates] / scale[candidates], changes)
     independent = tuple(candidates[k] for k in kept)

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from sms_online.effects.base import Inputs
+from sms_online.model.effect import Inputs
 from sms_online.model.flexible import ShapeRate
 from sms_online.model.inertia import BodyTerm, LinkMotion, LinkTerm, convective
 from sms_online.model.projection import project

@@ -12,11 +12,9 @@ from dataclasses import replace
 import numpy as np
 
 from sms_online.description.schema import FlexibleLink, RigidLink, System
-from sms_online.effects.base import ForceEffect, Inputs
-from sms_online.effects.catalogue import build_effects, with_kinematics
-from sms_online.effects.payload import TipPayload
 from sms_online.model.chain import Chain, Configuration
 from sms_online.model.dynamics import Dynamics
+from sms_online.model.effect import EffectsOf, ForceEffect, InertiaEffect, Inputs
 from sms_online.model.flexible import ShapeRate
 from sms_online.model.inertia import BodyTerm, LinkMotion, LinkTerm, Term, convective
 from sms_online.model.layout import Layout, build_layout
@@ -33,13 +31,17 @@ class Model:
     take these as `inputs` and raise ValueError where they are missing.
     """
 
-    def __init__(self, system: System, reference: Array | None = None) -> None:
-        """reference: π whose masses the effect table_tilt weighs, the nominal ones unless given."""
-        self.system = system = with_kinematics(system)
+    def __init__(self, system: System, effects_of: EffectsOf, reference: Array | None = None) -> None:
+        """effects_of: makes the effects that the system declares; `sms_online.effects.build.build_model` states it.
+
+        reference: π whose masses `weight` weighs, the nominal ones unless given.
+        """
+        self.system = system
+        self._effects_of = effects_of
         self.layout: Layout = build_layout(system)
         self.chain = Chain(system, self.layout)
         self.gravity = np.array(system.gravity)
-        self.effects, inertias = build_effects(system, self.chain, self.weight)
+        self.effects, inertias = effects_of(system, self.chain, self.weight)
         parameters: list[Parameter] = []
         self.bodies: list[BodyTerm] = []
         self.links: list[LinkTerm] = []
@@ -106,7 +108,7 @@ class Model:
         for i, (_, stator) in motors.items():
             add(stator, 2 * i - 1, speeds[i])
 
-    def _add_inertia(self, parameters: list[Parameter], effect: TipPayload) -> None:
+    def _add_inertia(self, parameters: list[Parameter], effect: InertiaEffect) -> None:
         indices = tuple(range(len(parameters), len(parameters) + len(effect.parameters)))
         parameters += effect.parameters
         for k, body in enumerate(self.bodies):
@@ -153,12 +155,9 @@ class Model:
                 springs.append(Spring(len(parameters), ends, np.array([[1.0, -1.0], [-1.0, 1.0]])))
                 parameters.append(Parameter(f"joint_{i}.{kind}", f"{symbol}_{i}", unit, getattr(joint, kind)))
 
-    def of(self, system: System) -> Model:
-        """Model of a changed system, with the reference of this one by the parameters' names; what is new weighs 0."""
-        reference = dict(zip((p.name for p in self.parameters), self.reference, strict=True))
-        other = Model(system)
-        other.reference = np.array([reference.get(p.name, 0.0) for p in other.parameters])
-        return other
+    def of_geometry(self, system: System) -> Model:
+        """Model of a system that differs from this one's in lengths and directions alone: the same parameters."""
+        return Model(system, self._effects_of, self.reference)
 
     @property
     def dissipative(self) -> list[int]:

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sms_online.description.schema import Effect
+from sms_online.effects.build import changed_model
 from sms_online.model.base_parameters import BaseParameters
 from sms_online.model.model import Model
 from sms_online.pipeline.event_hypotheses import (
@@ -119,7 +120,7 @@ class Changes:
         alarm = self.detector.alarm
         if alarm is None or self.windows_after < (LEAST_DECISION if last else self._wanted):
             return None
-        whole = self.model.of(everything(self._system))
+        whole = changed_model(self.model, everything(self._system))
         names = additional(self._system, whole, self.base)
         base = extended(self._described, whole, [*self._added, *names])
         onset = self.detector.onset - MARGIN
@@ -253,7 +254,7 @@ class Changes:
     def _extend(self) -> None:
         """Model and base with the parameters that events have added."""
         if self._added:
-            self.model = self.model.of(restricted(self._system, self._added))
+            self.model = changed_model(self.model, restricted(self._system, self._added))
             self.base = extended(self._described, self.model, self._added)
 
     def state(self) -> dict[str, Any]:

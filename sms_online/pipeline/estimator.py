@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sms_online.description.schema import System
+from sms_online.effects.build import build_model
 from sms_online.effects.catalogue import channel_effects
 from sms_online.effects.spacecraft import TableTilt
 from sms_online.errors import InputError
@@ -61,7 +62,7 @@ class Estimator:
     @one_blas_thread()
     def __init__(self, system: System, channels: tuple[str, ...], source: str, reference: Array | None = None) -> None:
         self.system = system
-        self._model = model = Model(system, reference)
+        self._model = model = build_model(system, reference)
         if reference is None:
             _refuse_unknown_masses(model)
         self._base = base = find_base_parameters(model)

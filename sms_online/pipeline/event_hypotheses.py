@@ -14,6 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from sms_online.description.schema import Effect, RigidBody, System
+from sms_online.effects.build import build_model
 from sms_online.model.base_parameters import BaseParameters
 from sms_online.model.model import Model
 from sms_online.model.parameters import Parameter
@@ -90,7 +91,7 @@ def everything(system: System) -> System:
 
 def additional(system: System, model: Model, base: BaseParameters) -> list[str]:
     """Names of the parameters of `model`, of the system with everything, that neither the system nor `base` holds."""
-    held = {p.name for p in Model(system).parameters} | {p.name for p in base.parameters}
+    held = {p.name for p in build_model(system).parameters} | {p.name for p in base.parameters}
     return [p.name for p in model.parameters if p.name not in held]
 
 

@@ -14,7 +14,7 @@ from model_systems import random_states, rigid_chain
 from test_model_rigid import Yardstick
 
 from sms_online.description.parse import parse_system, shipped_text
-from sms_online.model.model import Model
+from sms_online.effects.build import build_model
 
 pin: Any = pytest.importorskip("pinocchio", reason="Pinocchio (pip package `pin`) is the yardstick of the rigid case")
 
@@ -32,7 +32,7 @@ def measure(benchmark: Any, samples: int, call: Callable[[], object]) -> None:
 @pytest.mark.benchmark(group="paper-planar")
 def test_columns_of_the_example(benchmark: Any, columns: str, B: int) -> None:
     """Energy columns, all momentum rows, and the rows of the motors alone."""
-    model = Model(parse_system(shipped_text("paper-planar"), "paper-planar"))
+    model = build_model(parse_system(shipped_text("paper-planar"), "paper-planar"))
     x, v = random_states(model.layout, B, seed=1)
     calls: dict[str, Callable[[], object]] = {
         "energy_columns": lambda: model.energy_columns(x, v),
@@ -46,7 +46,7 @@ def test_columns_of_the_example(benchmark: Any, columns: str, B: int) -> None:
 @pytest.mark.parametrize("columns", ["energy_columns", "momentum_columns"])
 @pytest.mark.benchmark(group="rigid free-floater, 7 joints")
 def test_columns_of_a_rigid_arm(benchmark: Any, columns: str, B: int) -> None:
-    model = Model(rigid_chain(7, free=True))
+    model = build_model(rigid_chain(7, free=True))
     x, v = random_states(model.layout, B, seed=1)
     measure(benchmark, B, lambda: getattr(model, columns)(x, v))
 
@@ -56,7 +56,7 @@ def test_columns_of_a_rigid_arm(benchmark: Any, columns: str, B: int) -> None:
 def test_pinocchio_on_the_same_arm(benchmark: Any, regressor: str) -> None:
     """One sample a call, as Pinocchio works; called from Python."""
     system = rigid_chain(7, free=True)
-    layout, yardstick = Model(system).layout, Yardstick(system)
+    layout, yardstick = build_model(system).layout, Yardstick(system)
     x, v = random_states(layout, 1, seed=1)
     q, v_pin = yardstick.positions(layout, x[0]), yardstick.speed_map(layout, x[0]) @ v[0]
     arm, data, a = yardstick.model, yardstick.data, np.ones(yardstick.model.nv)

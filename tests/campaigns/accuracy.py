@@ -19,9 +19,9 @@ from typing import Any
 import numpy as np
 
 from sms_adapters.system_file import load_system
+from sms_online.effects.build import build_model
 from sms_online.errors import InputError
 from sms_online.model.base_parameters import find_base_parameters
-from sms_online.model.model import Model
 from sms_online.pipeline.estimator import Estimator
 from sms_online.results import NORMAL_95, standard_deviation
 from sms_online.stream import Array, Block
@@ -97,7 +97,7 @@ def read(results: Path) -> list[Record]:
 def summary(records: list[Record]) -> str:
     """What the sessions show beside what is asked, grade by grade; an exclamation mark where it is not reached."""
     system = load_system(SYSTEM)
-    names = [p.name for p in find_base_parameters(Model(system)).parameters]
+    names = [p.name for p in find_base_parameters(build_model(system)).parameters]
     truth = true_parameters(system)
     parts = []
     for grade in GRADES:

@@ -36,10 +36,10 @@ from sms_online.diagnosis.document import coefficients
 from sms_online.diagnosis.evidence import angle, basis
 from sms_online.diagnosis.record import SampleRecord
 from sms_online.diagnosis.rows import SessionRows
+from sms_online.effects.build import build_model
 from sms_online.effects.catalogue import ENTRIES, candidates
 from sms_online.effects.spacecraft import TableTilt
 from sms_online.model.base_parameters import find_base_parameters
-from sms_online.model.model import Model
 from sms_online.pipeline.estimator import Estimator
 from sms_online.results import residuals
 from sms_online.stream import Array, Block
@@ -264,7 +264,7 @@ def _left(session: Estimator) -> dict[str, float]:
 
 def _errors(system: System, session: Estimator) -> dict[str, float]:
     """Relative errors of the parameters that the system has without effects."""
-    names = [p.name for p in find_base_parameters(Model(system)).parameters]
+    names = [p.name for p in find_base_parameters(build_model(system)).parameters]
     truth = dict(zip(names, true_parameters(system), strict=True))
     estimated = zip(session.base.parameters, session.estimate().pi, strict=True)
     return {p.name: float(value / truth[p.name] - 1.0) for p, value in estimated if p.name in truth}

@@ -20,8 +20,8 @@ from filterpy.kalman import KalmanFilter
 
 from sms_adapters.system_file import load_system
 from sms_online.description.schema import System
+from sms_online.effects.build import build_model
 from sms_online.model.base_parameters import find_base_parameters
-from sms_online.model.model import Model
 from sms_online.pipeline.estimator import Estimator
 from sms_online.pipeline.sensing import Sensing
 from sms_online.pipeline.smoothing import smooth
@@ -61,7 +61,7 @@ def _session(system: System, block: Block) -> Estimator:
 
 def paper(system: System, block: Block) -> Array:
     """(42)-(45) with central differences, the trapezoidal rule at sensor rate, and 100 measurements."""
-    model = Model(system)
+    model = build_model(system)
     sensing = Sensing(model, block.channels, "comparison")
     values = block.values[:, [block.channels.index(name) for name in sensing.channels]]
     x, torque = sensing.coordinates(values), sensing.joint_torque(values)
@@ -120,7 +120,7 @@ def rls(system: System, block: Block) -> Array:
 def output_error(system: System, block: Block) -> Array:
     """SciPy's least squares on simulated output, told the sensors' noise and the parameters to 10 %, as a prior too."""
     block = _first(block, SHORT)
-    model = Model(system)
+    model = build_model(system)
     base = find_base_parameters(model)
     sensing = Sensing(model, block.channels, "comparison")
     values = block.values[:, [block.channels.index(name) for name in sensing.channels]]
@@ -160,7 +160,7 @@ def table(seeds: int, cache: Path) -> str:
     """Markdown: errors over all parameters and sessions, and processor time of a session."""
     true_system = load_system(SYSTEM)
     truth, exact = true_parameters(true_system), exact_session(true_system, cache)
-    names = [p.name for p in find_base_parameters(Model(true_system)).parameters]
+    names = [p.name for p in find_base_parameters(build_model(true_system)).parameters]
     blocks = [noisy_session(true_system, exact, GRADE, seed) for seed in range(seeds)]
     lines = [
         f"| grade {GRADE}, {exact.t[-1]:g} s, {seeds} sessions | median error % | worst error % | of | time s |",

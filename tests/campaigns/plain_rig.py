@@ -20,8 +20,8 @@ from typing import Any
 import numpy as np
 
 from sms_online.description.schema import System
+from sms_online.effects.build import build_model
 from sms_online.model.base_parameters import find_base_parameters
-from sms_online.model.model import Model
 from sms_online.pipeline.estimator import Estimator
 from sms_online.results import NORMAL_95, standard_deviation
 from sms_online.stream import Block
@@ -78,7 +78,7 @@ def summary(results: Path) -> str:
     records: list[dict[str, Any]] = read(results)
     limit = np.array(json.loads(results.with_suffix(".bound.json").read_text(encoding="utf-8")))
     system = plain_rig()
-    truth, names = true_parameters(system), [p.name for p in find_base_parameters(Model(system)).parameters]
+    truth, names = true_parameters(system), [p.name for p in find_base_parameters(build_model(system)).parameters]
     estimate, std = (np.array([record[key] for record in records]) for key in ("estimate", "std"))
     error = np.abs(estimate - truth)
     ratio, normalised = error / limit, (estimate - truth) / std

@@ -10,8 +10,8 @@ import numpy as np
 
 from sms_online.description.parse import describe
 from sms_online.description.schema import System
+from sms_online.effects.build import build_model
 from sms_online.model.base_parameters import find_base_parameters
-from sms_online.model.model import Model
 from sms_online.stream import Array, Block
 from sms_sim.sensors import Sensors
 from sms_sim.simulate import POSITION_TOLERANCE, sampled_blocks, simulate
@@ -46,7 +46,7 @@ def noisy_session(system: System, exact: Block, grade: str, seed: int) -> Block:
 
 def true_parameters(system: System) -> Array:
     """Base parameters (n,) of the nominal values, in the order in which they are estimated."""
-    model = Model(system)
+    model = build_model(system)
     return find_base_parameters(model).values(model.nominal)
 
 

@@ -5,9 +5,9 @@ from __future__ import annotations
 from typing import Any
 
 from sms_online.description.schema import Effect, System
+from sms_online.effects.build import build_model
 from sms_online.effects.catalogue import check_effect
 from sms_online.errors import InputError
-from sms_online.model.model import Model
 
 
 def true_values(truth: dict[str, Any], described: System, adopted: System) -> dict[str, float]:
@@ -17,8 +17,8 @@ def true_values(truth: dict[str, Any], described: System, adopted: System) -> di
     """
     injected = tuple(e for e in map(Effect.model_validate, truth.get("effects", ())) if _fits(described, e))
     declared = described.model_copy(update={"effects": (*described.effects, *injected)})
-    stated = {p.name: p.nominal for p in Model(declared).parameters if "@" in p.name}
-    absent = {p.name: 0.0 for p in Model(adopted).parameters if "@" in p.name}
+    stated = {p.name: p.nominal for p in build_model(declared).parameters if "@" in p.name}
+    absent = {p.name: 0.0 for p in build_model(adopted).parameters if "@" in p.name}
     return absent | stated | dict(truth["parameters"])
 
 

@@ -12,9 +12,9 @@ from rich.progress import Progress, TextColumn, TimeElapsedColumn
 
 from sms_adapters.capture import CaptureWriter
 from sms_adapters.truth import truth_path, write_truth
+from sms_online.effects.build import build_model
 from sms_online.effects.catalogue import parse_effect
 from sms_online.errors import InputError
-from sms_online.model.model import Model
 from sms_sim.plant import Plant
 from sms_sim.sensors import Sensors
 from sms_sim.simulate import sampled_blocks, simulate
@@ -57,7 +57,7 @@ def run(args: argparse.Namespace) -> int:
             writer.write(block)
             samples += block.t.size
     drift = simulation.drift
-    model = Model(described)
+    model = build_model(described)
     truth = {p.name: p.nominal for p in model.parameters}
     injected = [effect.model_dump(mode="json") for effect in system.effects[len(described.effects) :]]
     provenance = {

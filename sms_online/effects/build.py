@@ -1,0 +1,74 @@
+"""From a description to a model with the effects that it declares."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+
+import numpy as np
+
+from sms_online.description.schema import FlexibleLink, System
+from sms_online.effects.base import Site
+from sms_online.effects.catalogue import FORCE_CLASSES, GEOMETRIC_STIFFENING, INERTIA_CLASSES, check_effect, with_shapes
+from sms_online.model.chain import Chain
+from sms_online.model.effect import ForceEffect, InertiaEffect
+from sms_online.model.model import Model
+from sms_online.stream import Array
+
+NUMBERED = re.compile(r"(?:joint|link)_(\d+)")
+
+
+def build_model(system: System, reference: Array | None = None) -> Model:
+    """Model of a system with the effects that it declares.
+
+    reference (n_pi,): π whose masses effects of gravity weigh, the nominal ones unless given. InputError on an unknown
+    name, place or coefficient of an effect.
+    """
+    return Model(with_kinematics(system), build_effects, reference)
+
+
+def changed_model(model: Model, system: System) -> Model:
+    """Model of a changed system, with the reference of `model` by the parameters' names; what is new weighs 0."""
+    reference = dict(zip((p.name for p in model.parameters), model.reference, strict=True))
+    other = build_model(system)
+    other.reference = np.array([reference.get(p.name, 0.0) for p in other.parameters])
+    return other
+
+
+def with_kinematics(system: System) -> System:
+    """The system with `exact` kinematics of the links that declare geometric_stiffening; InputError as `check_effect`.
+
+    What is exact already stays, so that the system that comes out may go in again.
+    """
+    links = list(system.links)
+    flexible = [(f"link_{i}", link) for i, link in enumerate(links, start=1) if isinstance(link, FlexibleLink)]
+    exact = {name for name, link in flexible if link.kinematics == "exact"}
+    for k, effect in enumerate(system.effects, start=1):
+        if effect.name == GEOMETRIC_STIFFENING.name and effect.where not in exact:
+            check_effect(system, effect, f"effect {k}", system.name)
+            i = int(effect.where.removeprefix("link_")) - 1
+            links[i] = links[i].model_copy(update={"kinematics": "exact"})
+    return system.model_copy(update={"links": tuple(links)}) if links != list(system.links) else system
+
+
+def build_effects(
+    system: System, chain: Chain, weight: Callable[[Array], Array]
+) -> tuple[tuple[ForceEffect, ...], tuple[InertiaEffect, ...]]:
+    """Effects of kind force, and of kind inertia, that a system declares, in its order; weight: see `Site`.
+
+    InputError on an unknown name, place or coefficient.
+    """
+    forces: list[ForceEffect] = []
+    inertias: list[InertiaEffect] = []
+    for k, effect in enumerate(system.effects, start=1):
+        if effect.name == GEOMETRIC_STIFFENING.name:
+            continue  # the links are exact already
+        check_effect(system, effect, f"effect {k}", system.name)
+        numbered = NUMBERED.fullmatch(effect.where)
+        site = Site(system, chain, effect.where, int(numbered[1]) if numbered else 0, weight)
+        given = with_shapes(effect, system).coefficients
+        if effect.name in FORCE_CLASSES:
+            forces.append(FORCE_CLASSES[effect.name](site, given))
+        elif effect.name in INERTIA_CLASSES:
+            inertias.append(INERTIA_CLASSES[effect.name](site, given))
+    return tuple(forces), tuple(inertias)

@@ -1,0 +1,84 @@
+"""What an effect has to be to enter a model: a generalized force linear in its coefficients, or inertia of a frame.
+
+f(x, v, t) = Σ c_j f_j on the right-hand side of the equations of motion, d/dt(P π) - G π = Q + f.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Protocol
+
+from sms_online.description.schema import System
+from sms_online.model.chain import Chain
+from sms_online.model.layout import Layout
+from sms_online.model.parameters import Parameter
+from sms_online.stream import Array
+
+
+@dataclass(frozen=True)
+class Inputs:
+    """What an effect may need besides positions and speeds, at B instants.
+
+    torque (B, joints): n τ as measured, N m (N). states (B, n_z): internal states, to the model those of all effects in
+    their order, to an effect its own.
+    """
+
+    torque: Array
+    states: Array
+
+
+class ForceEffect(Protocol):
+    """An effect of kind `force`.
+
+    parameters: the linear coefficients as they enter π. shapes: shape constants. relative_to: names of the model's
+    parameters that reported coefficients are divided by. n_states: number of internal states. smooth: whether it is as
+    smooth as the motion, which is thinned then. A joint's force and internal states depend on that joint's positions,
+    rates and torque.
+    """
+
+    name: str
+    where: str
+    parameters: tuple[Parameter, ...]
+    shapes: Mapping[str, float]
+    relative_to: tuple[str, ...]
+    needs_torque: bool
+    n_states: int
+    smooth: bool
+
+    def force(self, layout: Layout, x: Array, v: Array, inputs: Inputs | None) -> Array:
+        """Columns f_j (B, n_v, coefficients): generalized force of one unit of each coefficient."""
+
+    def power(self, layout: Layout, x: Array, v: Array, inputs: Inputs | None) -> Array:
+        """Power (B, coefficients) that one unit of each coefficient takes out, W."""
+
+    def state_rate(self, layout: Layout, x: Array, v: Array, z: Array) -> Array:
+        """ż (B, n_states) of the internal states z (B, n_states)."""
+
+    def initial_state(self, layout: Layout, x_0: Array) -> Array:
+        """z (n_states,) at the start, at positions x_0 (n_x,) and rest."""
+
+    def reported(self, values: Array) -> dict[str, float]:
+        """The coefficients that a person reads, shape constants included, by name.
+
+        values: of `parameters`, then of the parameters that `relative_to` names.
+        """
+
+
+class InertiaEffect(Protocol):
+    """An effect of kind `inertia`: a body in a frame of the chain.
+
+    frame: number of the frame. parameters: its coefficients as they enter π. matrices (c, 6, 6): inertia of one unit of
+    each in the frame's axes, linear over angular.
+    """
+
+    frame: int
+    parameters: tuple[Parameter, ...]
+    matrices: Array
+
+
+# Makes the effects that a system declares, of kinds force and inertia, for its chain and the weight of its masses:
+# x (B, n_x) to the generalized forces (B, n_v, 2) of 1 m/s² of gravity along inertial x and y.
+EffectsOf = Callable[
+    [System, Chain, Callable[[Array], Array]], tuple[tuple[ForceEffect, ...], tuple[InertiaEffect, ...]]
+]
