@@ -16,7 +16,6 @@ from sms_online.diagnosis.candidates import CandidateColumns
 from sms_online.diagnosis.constants import corrected, deviations, improved, stands
 from sms_online.diagnosis.evidence import angle, basis, free_of, gain, threshold
 from sms_online.diagnosis.followed import FollowedMotion
-from sms_online.diagnosis.plausible import plausible
 from sms_online.diagnosis.record import SampleRecord, Segment, excerpts
 from sms_online.diagnosis.residuals import RowResidual
 from sms_online.diagnosis.rows import SessionRows
@@ -230,19 +229,6 @@ def test_constants_are_improved_by_what_is_left_of_them() -> None:
     # σ of the two parts is σ of the radius, and of the angle over it.
     stds = deviations(disc, np.diag([1e-8, 1e-8]))
     assert stds == {"amplitude": pytest.approx(1e-4), "phase": pytest.approx(0.02)}
-
-
-def test_only_plausible_coefficients_are_taken() -> None:
-    assert plausible("coulomb_friction", np.array([0.1]), 1000.0)
-    assert not plausible("coulomb_friction", np.array([-0.1]), 1000.0)
-    assert not plausible("torque_gain", np.array([-1.0]), 1000.0)
-    assert plausible("torque_gain", np.array([-0.02]), 1000.0)
-    # No torque is known to this.
-    assert not plausible("torque_gain", np.array([2e-4]), 1000.0)
-    assert plausible("cubic_stiffness", np.array([-100.0]), 1000.0)
-    # What a held command does is no sensor's lag.
-    assert not plausible("sensor_lag", np.array([4e-4]), 1000.0)
-    assert plausible("sensor_lag", np.array([4e-4]), 2000.0)
 
 
 @pytest.mark.parametrize("half_hop", [1, 3])

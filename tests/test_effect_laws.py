@@ -2,21 +2,19 @@
 
 from __future__ import annotations
 
-import textwrap
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from pathlib import Path
-from typing import cast
 
 import numpy as np
 import pytest
+from guide import windage
 from model_systems import paper, random_states, spatial
 from numpy.testing import assert_allclose
 
 from sms_online.description.schema import Effect, Inertia, RigidBody, System
-from sms_online.effects.base import Entry, Force, Ranges, Site, report
+from sms_online.effects.base import STANDSTILL, Ranges, Site, report
 from sms_online.effects.build import build_model
 from sms_online.effects.catalogue import ENTRIES, NAMES, candidates, parse_effect
-from sms_online.effects.friction import STANDSTILL, MotorSide
 from sms_online.errors import InputError
 from sms_online.model.effect import Inputs
 from sms_online.model.model import Model
@@ -323,13 +321,9 @@ def test_the_guide_lists_every_effect_with_its_coefficients_and_defaults() -> No
 
 
 def test_an_effect_as_the_guide_for_contributors_writes_it_is_one() -> None:
-    guide = (Path(__file__).parent.parent / "CONTRIBUTING.md").read_text(encoding="utf-8")
-    code = guide.split("    class WindageFriction")[1].split("\n\nList the class")[0]
-    names = {"np": np, "MotorSide": MotorSide, "Entry": Entry, "Mapping": Mapping}
-    exec(textwrap.dedent(f"    from __future__ import annotations\n\n    class WindageFriction{code}"), names)
     model = build_model(paper())
     site = Site(model.system, model.chain, "joint_1", 1, model.weight)
-    effect = cast(type[Force], names["WindageFriction"])(site, {"drag": 0.3})  # type: ignore[arg-type]
+    effect = windage()(site, {"drag": 0.3})  # type: ignore[call-arg, arg-type]
     s = Motion(model)
     f = effect.force(model.layout, s.x, s.v, None)[..., 0] * effect.parameters[0].nominal
     assert_allclose(f[:, M_1], np.where(s.rate > 0.0, -0.3, 0.3) * s.rate**2)

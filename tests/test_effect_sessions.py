@@ -20,7 +20,8 @@ from sms_online.diagnosis.record import Segment
 from sms_online.effects.base import report
 from sms_online.effects.build import build_model
 from sms_online.effects.catalogue import channel_effects, parse_effect
-from sms_online.effects.channel import EncoderEccentricity, SensorLag, TorqueDelay
+from sms_online.effects.channel import EncoderEccentricity
+from sms_online.effects.delay import SensorLag, TorqueDelay
 from sms_online.errors import InputError
 from sms_online.linearised import Motion
 from sms_online.model.base_parameters import find_base_parameters

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from sms_online.description.schema import Effect
 from sms_online.diagnosis.candidate import Candidate, LeftOpen
 from sms_online.diagnosis.trace import Tracing
-from sms_online.effects.friction import DRY
+from sms_online.effects.catalogue import ENTRIES
 from sms_online.model.parameters import Parameter
 from sms_online.pipeline.momentum_windows import HOPS
 from sms_online.stream import Array
@@ -68,7 +68,7 @@ class Sticking:
 
     def left_open(self, candidate: Candidate, coefficients: Array) -> LeftOpen:
         free = np.zeros((WINDOWS, HOPS, SPEEDS))
-        if candidate.effect.name in DRY:
+        if ENTRIES[candidate.effect.name].traits.dry:
             free[:, 0, 0] = np.where(self.stuck, self.times * coefficients[0], 0.0) ** 2
         return LeftOpen(np.zeros((WINDOWS, SPEEDS)), free)
 

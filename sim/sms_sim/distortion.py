@@ -7,7 +7,7 @@ import scipy.signal
 
 from sms_online.description.schema import System
 from sms_online.effects.catalogue import channel_effects
-from sms_online.effects.channel import Convolved, SensorLag
+from sms_online.effects.channel import Convolved
 from sms_online.stream import Array
 
 # A lag is integrated on so many exact values a sample, joined by straight lines: at 1 kHz and 10 rad/s² they are off by
@@ -27,7 +27,7 @@ class Distortion:
     def __init__(self, system: System, channels: tuple[str, ...], single: bool = False) -> None:
         effects = [(k, e) for e in channel_effects(system) for k, channel in enumerate(channels) if e.acts_on(channel)]
         self._of_value = [(k, effect) for k, effect in effects if not isinstance(effect, Convolved)]
-        lags = [(k, effect) for k, effect in effects if isinstance(effect, SensorLag)]
+        lags = [(k, effect) for k, effect in effects if effect.filtered]
         self.oversampling = OVERSAMPLING if lags and not single else 1
         rate = self.oversampling * system.sample_rate
         self._sample_rate = system.sample_rate

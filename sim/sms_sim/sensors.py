@@ -9,7 +9,6 @@ import numpy as np
 from sms_online.description.channels import drive_channel, sensed_channels
 from sms_online.description.schema import Sensor, System
 from sms_online.effects.catalogue import channel_effects
-from sms_online.effects.channel import TorqueDelay
 from sms_online.errors import InputError
 from sms_online.stream import Array
 
@@ -54,7 +53,7 @@ class Sensors:
         else:
             used = [Sensor(channels=(c,), noise=_grade_noise(system, c, drives, GRADES[grade])) for c in self.channels]
         self.sample_rate = system.sample_rate
-        self.latency = np.array([sensor.latency for sensor in used]) + _torque_delays(system, self.channels)
+        self.latency = np.array([sensor.latency for sensor in used]) + _latencies(system, self.channels)
         self.rate = np.array([min(sensor.rate or self.sample_rate, self.sample_rate) for sensor in used])
         self.noise = np.array([sensor.noise for sensor in used])
         self.resolution = np.array([sensor.resolution for sensor in used])
@@ -75,12 +74,11 @@ class Sensors:
         return np.where(np.diff(interval, axis=0) > 0, values, np.nan)
 
 
-def _torque_delays(system: System, channels: tuple[str, ...]) -> Array:
-    """Delays (channels,) of drives that the effect torque_delay states, s."""
+def _latencies(system: System, channels: tuple[str, ...]) -> Array:
+    """Delays (channels,) that effects state, s."""
     out = np.zeros(len(channels))
     for effect in channel_effects(system):
-        if isinstance(effect, TorqueDelay):
-            out += [effect.coefficients["time"] * effect.acts_on(channel) for channel in channels]
+        out += [effect.latency * effect.acts_on(channel) for channel in channels]
     return out
 
 

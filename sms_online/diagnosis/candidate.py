@@ -8,11 +8,10 @@ from typing import Protocol
 from sms_online.description.schema import Effect
 from sms_online.diagnosis.constants import is_constant
 from sms_online.diagnosis.evidence import Gain
+from sms_online.effects.catalogue import ENTRIES
+from sms_online.effects.traits import Traits
 from sms_online.model.parameters import Parameter
 from sms_online.stream import Array
-
-# Effects that contain a simpler one, which is to be tried first, as is everything else: they refine a law.
-EXTENDS = {"direction_friction": "viscous_friction"}
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,9 +32,14 @@ class Candidate:
         return f"{self.effect.name}@{self.effect.where}"
 
     @property
+    def traits(self) -> Traits:
+        """Those of its effect."""
+        return ENTRIES[self.effect.name].traits
+
+    @property
     def extends(self) -> str | None:
-        """Key of a simpler effect that it contains."""
-        simpler = EXTENDS.get(self.effect.name)
+        """Key of a simpler effect that it contains: it refines a law."""
+        simpler = self.traits.extends
         return None if simpler is None else f"{simpler}@{self.effect.where}"
 
     @property

@@ -20,8 +20,7 @@ from sms_online.diagnosis.standstill import LEAVING, SessionStandstill
 from sms_online.diagnosis.weak_windows import Motion, WeakWindows
 from sms_online.effects.base import Ranges, position
 from sms_online.effects.build import build_model
-from sms_online.effects.catalogue import ENTRIES, candidates
-from sms_online.effects.friction import DRY, REVERSING
+from sms_online.effects.catalogue import ENTRIES, LINEAR, candidates, periods
 from sms_online.model.effect import Inputs
 from sms_online.model.model import Model
 from sms_online.model.parameters import Parameter
@@ -29,17 +28,8 @@ from sms_online.pipeline.momentum_windows import HOPS
 from sms_online.pipeline.rough_forces import MOVING_OFF, RoughForces
 from sms_online.stream import Array
 
-TORQUE_RATE = "torque rate"
 # Share of its law that friction may lack just before it gives way, 1σ: the spring winds up meanwhile.
 WINDING = 0.2
-# Linear coefficients of effects on channels: quantity, unit, what a unit of it adds to a reading, with its sign. A lag
-# of a delay T reads x - T ẋ, a late torque τ - T τ̇, an eccentric disc x + a sin x + b cos x.
-LINEAR = {
-    "encoder_offset": (("offset", "rad", "one", -1.0),),
-    "encoder_eccentricity": (("sine", "rad", "sine", -1.0), ("cosine", "rad", "cosine", -1.0)),
-    "sensor_lag": (("delay", "s", "rate", 1.0),),
-    "torque_delay": (("time", "s", TORQUE_RATE, -1.0),),
-}
 
 
 class CandidateColumns:
@@ -109,11 +99,13 @@ class CandidateColumns:
             grids = {s: values for s, values in grids.items() if s in effect.coefficients}
             for values in product(*grids.values()):
                 shapes = dict(zip(grids, values, strict=True))
-                if "order" in shapes and not self._turns(effect.where, shapes["order"]):
+                shaped = effect.model_copy(update={"coefficients": effect.coefficients | shapes})
+                order = periods(shaped)
+                if order is not None and not self._turns(effect.where, order):
                     continue
                 if any(value <= 0.0 < entry.shapes[s].default for s, value in shapes.items()):
                     continue  # a joint at rest has no range to take a share of
-                yield effect.model_copy(update={"coefficients": effect.coefficients | shapes})
+                yield shaped
 
     def _turns(self, where: str, order: float) -> bool:
         """Whether an effect of so many periods a motor turn goes through one: less of it is a constant or a gain."""
@@ -166,10 +158,10 @@ class CandidateColumns:
             def along(v: Array) -> Array:
                 return force.force(model.layout, motion.x, v, inputs)
 
-            if force.name not in REVERSING:
+            if not force.reversing:
                 return None, along(motion.v)
             G = self._reversals(force.where).mean(along, motion)
-            if force.name in DRY and not self._resting:
+            if force.dry and not self._resting:
                 # What holds the axis is no matter of the law but just before it gives way.
                 held = self._standstill(force.where)
                 still, leaving = (told(motion.segment, motion.samples) for told in (held.at, held.leaving))
@@ -193,7 +185,8 @@ class CandidateColumns:
         if ENTRIES[effect.name].kind != "force" or is_constant(effect) or self.rows.noise.exact:
             return LeftOpen(nothing[:, 0], nothing)
         model = build_model(self._declaring(effect))
-        if effect.where.startswith("joint_") and effect.name not in REVERSING and not model.effects[-1].n_states:
+        force = model.effects[-1]
+        if effect.where.startswith("joint_") and not force.reversing and not force.n_states:
             return LeftOpen(self._spread(model, coefficients), nothing)
         if not self._noisy:
             self._noisy = [self.within(weak) for weak in self.rows.noisy()]
@@ -203,7 +196,7 @@ class CandidateColumns:
         near = slice(HOPS - 1, HOPS - 1 + len(squares))
         sums = [np.convolve(column, np.ones(2 * HOPS - 1))[near] for column in (np.ones(len(squares)), *squares.T)]
         own = np.stack(sums[1:], axis=1) / sums[0][:, None]
-        free = self._untold(model, coefficients) if effect.name in REVERSING else nothing
+        free = self._untold(model, coefficients) if force.reversing else nothing
         return LeftOpen(np.maximum(own - free[:, 0], 0.0), free)
 
     def _untold(self, model: Model, coefficients: Array) -> Array:
@@ -222,7 +215,7 @@ class CandidateColumns:
                 return force.force(model.layout, motion.x, v, inputs) @ coefficients
 
             jumps = turned.squares(along, motion)
-            if force.name not in DRY:
+            if not force.dry:
                 return jumps
             v = motion.v.copy()
             v[:, held.motor] = MOVING_OFF
@@ -319,7 +312,7 @@ class CandidateColumns:
             names = [self.rows.sensing.channels[k] for k in self.rows.sensing.position_columns]
             acts = [k for k, name in enumerate(names) if fnmatchcase(name, effect.where)]
             response = np.zeros((self._weak.count, layout.n_v))
-            if displacement == TORQUE_RATE:
+            if displacement == "torque rate":
                 response = sign * self._torque_rate(effect.where)
             elif self._weak is self.rows.weak:
                 response = sign * self.rows.responses[displacement][:, :, acts].sum(axis=2)

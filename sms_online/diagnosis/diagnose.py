@@ -14,10 +14,10 @@ from sms_online.diagnosis.constants import stands
 from sms_online.diagnosis.late_sensors import LateSensor, find_late
 from sms_online.diagnosis.record import SampleRecord
 from sms_online.diagnosis.residuals import RowResidual
-from sms_online.diagnosis.trace import DECISIVE, INEXACT, INEXACT_DRY
+from sms_online.diagnosis.trace import DECISIVE
 from sms_online.diagnosis.unexplained import Unexplained, describe_residual
-from sms_online.effects.catalogue import GEOMETRIC_STIFFENING, places
-from sms_online.effects.friction import DRY
+from sms_online.effects.catalogue import kinematic_candidates
+from sms_online.effects.traits import INEXACT
 from sms_online.errors import InputError
 from sms_online.pipeline.estimator import Estimator
 from sms_online.pipeline.momentum_windows import HOPS
@@ -79,18 +79,17 @@ def _verdict(
     if not named or left > LARGEST_SHARE_LEFT:
         return "unexplained"
     # Friction of a joint acts on the rows of that joint.
-    dry = {finding.candidate.effect.where for finding in findings if finding.candidate.effect.name in DRY}
+    found = [finding.candidate for finding in findings]
     for name, row in after.items():
-        inexact = INEXACT_DRY if name in dry else INEXACT
+        inexact = max((each.traits.inexact for each in found if each.effect.where == name), default=INEXACT)
         if row.whitened > MOST_LEFT and row.whitened**2 > inexact * before[name].whitened ** 2:
             return "unexplained"
     return "named"
 
 
-def _exact(system: System, links: Sequence[str]) -> System:
-    """The system with these links exact, by effects that say so."""
-    effects = (Effect(name=GEOMETRIC_STIFFENING.name, where=where) for where in links)
-    return system.model_copy(update={"effects": (*system.effects, *effects)})
+def _exact(system: System, links: Sequence[Effect]) -> System:
+    """The system with links exact, by effects that say so."""
+    return system.model_copy(update={"effects": (*system.effects, *links)})
 
 
 def _stiffened(case: Case, attempt: Attempt, chosen: Sequence[int]) -> Attempt | None:
@@ -98,9 +97,7 @@ def _stiffened(case: Case, attempt: Attempt, chosen: Sequence[int]) -> Attempt |
 
     All links together first, for one may hide what another lacks; then without those that take no more than chance.
     """
-    declared = {(effect.name, effect.where) for effect in attempt.system.effects}
-    every = places(attempt.system, GEOMETRIC_STIFFENING.at)
-    links = [where for where in every if (GEOMETRIC_STIFFENING.name, where) not in declared]
+    links = kinematic_candidates(attempt.system)
     if not links:
         return None
 
@@ -108,7 +105,7 @@ def _stiffened(case: Case, attempt: Attempt, chosen: Sequence[int]) -> Attempt |
     # What was found may be there beside it, or may only have stood for it.
     effects = [attempt.tracing.candidates[k].effect for k in chosen]
 
-    def excess(links: Sequence[str]) -> float:
+    def excess(links: Sequence[Effect]) -> float:
         try:
             some = attempt.trial(_exact(attempt.system, links), attempt.constants, beta, effects)
         except np.linalg.LinAlgError:
@@ -119,11 +116,11 @@ def _stiffened(case: Case, attempt: Attempt, chosen: Sequence[int]) -> Attempt |
     chance = DECISIVE * HOPS
     least = excess(links)
     while len(links) > 1:
-        fewer = {where: excess([other for other in links if other != where]) for where in links}
-        dropped = min(fewer, key=lambda where: fewer[where])
-        if fewer[dropped] > least + chance:
+        fewer = [[*links[:k], *links[k + 1 :]] for k in range(len(links))]
+        left = [excess(some) for some in fewer]
+        if min(left) > least + chance:
             break
-        links, least = [where for where in links if where != dropped], fewer[dropped]
+        links, least = fewer[left.index(min(left))], min(left)
     straight = excess([])
     if straight - least <= max(chance, STIFFENING_TAKES * straight):
         return None
@@ -221,7 +218,7 @@ def diagnose(
     attempt.tracing.settle(chosen)
     attempt, chosen, constants = _with_constants(case, attempt, chosen, progress)
     beyond = any(row.beyond for row in attempt.test(chosen).values())
-    if beyond and places(attempt.system, GEOMETRIC_STIFFENING.at):
+    if beyond and kinematic_candidates(attempt.system):
         progress("comparing exact links")
         exact = _stiffened(case, attempt, chosen)
         if exact is not None:

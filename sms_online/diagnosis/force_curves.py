@@ -20,21 +20,11 @@ from sms_online.diagnosis.evidence import basis, free_of, gain
 from sms_online.diagnosis.splines import DEGREE, Variable, design, spline_columns
 from sms_online.diagnosis.weak_windows import Motion
 from sms_online.effects.base import position
+from sms_online.effects.catalogue import periods
+from sms_online.effects.traits import Curve
 from sms_online.model.effect import Inputs
 from sms_online.stream import Array
 
-# Effects whose force is a function of one variable, and acts along one direction.
-SPEED, DEFLECTION, PHASE, TORQUE = "motor speed", "deflection", "phase in the motor's turn", "torque"
-VARIABLES = {
-    **dict.fromkeys(
-        ("coulomb_friction", "viscous_friction", "stribeck_friction", "direction_friction", "torque_offset"), SPEED
-    ),
-    **dict.fromkeys(("cubic_stiffness", "backlash"), DEFLECTION),
-    **dict.fromkeys(("cogging", "kinematic_error"), PHASE),
-    "torque_gain": TORQUE,
-}
-# Of those, the ones between motor and link side; the others act on the motor's side alone.
-PAIRS = ("cubic_stiffness", "backlash", "kinematic_error")
 # Inner knots of a spline to each side of zero, where friction jumps and axes stick: shares of the time that the motion
 # spends between zero and them.
 KNOTS = (0.05, 0.25, 0.5, 0.75)
@@ -80,41 +70,42 @@ class AddedVariable:
 def force_curves(diagnosis: Diagnosis) -> list[ForceCurve]:
     """Curves of the effects found that have a variable of their own; those of the same joint and variable share one."""
     attempt = diagnosis.attempt
-    groups: dict[tuple[str, str, float | None], list[int]] = {}
+    groups: dict[tuple[str, Curve, float | None], list[int]] = {}
     for k in diagnosis.chosen:
-        effect = attempt.tracing.candidates[k].effect
-        if effect.name in VARIABLES:
-            key = effect.where, VARIABLES[effect.name], effect.coefficients.get("order")
+        candidate = attempt.tracing.candidates[k]
+        if candidate.traits.curve is not None:
+            key = candidate.effect.where, candidate.traits.curve, periods(candidate.effect)
             groups.setdefault(key, []).append(k)
-    return [_curve(diagnosis, where, variable, own) for (where, variable, _), own in groups.items()]
+    return [_curve(diagnosis, where, curve, order, own) for (where, curve, order), own in groups.items()]
 
 
-def _curve(diagnosis: Diagnosis, where: str, name: str, own: list[int]) -> ForceCurve:
+def _curve(diagnosis: Diagnosis, where: str, curve: Curve, order: float | None, own: list[int]) -> ForceCurve:
+    name, jumps = curve.over, curve.over == "motor speed"
     attempt, after = diagnosis.attempt, diagnosis.after
     rows, candidates = attempt.rows, attempt.tracing.candidates
     layout, i = rows.model.layout, int(where.removeprefix("joint_")) - 1
     effects = tuple(candidates[k].effect for k in own)
     direction = np.eye(layout.n_v)[layout.theta_m[i]]
-    if effects[0].name in PAIRS:
+    if curve.between:
         direction[layout.q[i]] = -1.0
-    variable = _variable(attempt, i, name, effects[0].coefficients.get("order", 1.0))
+    variable = _variable(attempt, i, name, 1.0 if order is None else order)
     # What is left once everything else has been subtracted.
     left = after.residual * attempt.tracing.std
     for k in own:
         left = left + candidates[k].columns @ _coefficients(diagnosis, k)
     values = np.concatenate([variable(motion) for motion, _ in rows.weak.motions()])
-    knots, at = _knots(values, jumps=name == SPEED)
+    knots, at = _knots(values, jumps)
     white = rows.white(spline_columns(rows, variable, knots, direction, dense=True))
     found = gain(np.empty((len(white), 0)), rows.white(left[..., None])[:, 0], white)
     B = design(at, knots)
     std = np.sqrt(np.einsum("pi,ij,pj->p", B, found.covariance, B))
     force, law = B @ found.coefficients, _law(diagnosis, own, variable, at)
-    if name == SPEED:
+    if jumps:
         for part in (force, std, law):
             part[at == 0.0] = np.nan
     prismatic = rows.model.system.joints[i].kind == "prismatic"
     angle, force_unit = ("m", "N") if prismatic else ("rad", "N m")
-    unit = {SPEED: f"{angle}/s", DEFLECTION: angle, PHASE: "rad", TORQUE: force_unit}[name]
+    unit = {"motor speed": f"{angle}/s", "deflection": angle, "torque": force_unit}.get(name, "rad")
     return ForceCurve(where, name, unit, force_unit, effects, at, force, std, law)
 
 
@@ -191,7 +182,7 @@ def added_variables(diagnosis: Diagnosis) -> list[AddedVariable]:
             # It has been taken off the samples of the last attempt.
             own = described.make.of(candidate.effect.model_copy(update={"coefficients": {}}))
             out.append(_added_variable(described, [described.make.of(each.effect) for each in chosen], own))
-        elif candidate.effect.name not in VARIABLES:
+        elif candidate.traits.curve is None:
             others = [*attempt.fixed, *(other for other in chosen if other is not candidate)]
             out.append(_added_variable(attempt, others, candidate))
     return out

@@ -19,18 +19,19 @@ from scipy.optimize import minimize_scalar
 
 from sms_online.description.schema import Effect
 from sms_online.diagnosis.candidates import CandidateColumns
-from sms_online.diagnosis.constants import LONGEST_DELAY, corrected, delay_of
+from sms_online.diagnosis.constants import corrected
 from sms_online.diagnosis.evidence import RANK_TOLERANCE, threshold
 from sms_online.diagnosis.record import Segment
 from sms_online.diagnosis.rows import SessionRows
 from sms_online.diagnosis.weak_windows import Motion, WeakWindows
-from sms_online.effects.catalogue import candidates
+from sms_online.effects.catalogue import lag_places
+from sms_online.effects.delay import LONGEST_FOUND, delay_of, lag, late_keys
 from sms_online.pipeline.momentum_windows import HOPS
 from sms_online.stream import Array
 
 # Corners that are tried first, Hz, from that of the longest delay on; quicker lags are found to first order in their
 # delay, beside the forces.
-CORNERS = (delay_of(LONGEST_DELAY), 2.0, 3.5, 6.0)
+CORNERS = (delay_of(LONGEST_FOUND), 2.0, 3.5, 6.0)
 # Where masses follow the springs to this share none of these corners is in any sensor: 6 Hz would leave 5 % at least.
 FOLLOWED = 0.02
 # A sensor is late where its lag leaves less than this share of what no masses can follow.
@@ -110,7 +111,7 @@ class Motions:
     def places(self) -> list[str]:
         """Groups of sensors that may be late together."""
         readings = [self._channels[k] for k in self._rows.sensing.position_columns]
-        lags = [effect.where for effect in candidates(self._rows.model.system) if effect.name == "sensor_lag"]
+        lags = lag_places(self._rows.model.system)
         return [where for where in lags if any(fnmatchcase(name, where) for name in readings)]
 
     def unfollowed(self, where: str | None = None, corner: float = np.inf) -> tuple[float, float]:
@@ -135,8 +136,8 @@ class Motions:
 
     def _without(self, where: str, corner: float, segment: Segment) -> Segment:
         """The samples of a segment with one lag more taken off."""
-        lag = Effect(name="sensor_lag", where=where, coefficients={"corner": corner})
-        return corrected(self._rows.model.system.model_copy(update={"effects": (lag,)}), self._channels, segment)
+        lagging = self._rows.model.system.model_copy(update={"effects": (lag(where, corner),)})
+        return corrected(lagging, self._channels, segment)
 
     def _share(self, Y: Array, spring: int) -> tuple[float, float]:
         """Of one spring's column in its rows (W, rows, n_pi)."""
@@ -180,13 +181,11 @@ def find_late(rows: SessionRows, make: CandidateColumns, fitted: NDArray[np.bool
     if after > LARGEST_LEFT * held:
         return None
     gain = motions.gain(fit, best)
-    ambiguous = dict.fromkeys(
-        f"sensor_lag@{other}"
-        for share, other, _ in tried
-        if other != where and motions.gain(fit, share) > (1.0 - SAME_SHARE) * gain
+    alike = dict.fromkeys(
+        other for share, other, _ in tried if other != where and motions.gain(fit, share) > (1.0 - SAME_SHARE) * gain
     )
-    effect = Effect(name="sensor_lag", where=where, coefficients={"corner": corner})
-    return LateSensor(effect, _std(motions, where, corner, best), gain, limit, held, after, tuple(ambiguous))
+    std = _std(motions, where, corner, best)
+    return LateSensor(lag(where, corner), std, gain, limit, held, after, tuple(late_keys((), alike)))
 
 
 def _refined(motions: Motions, where: str, corner: float) -> float:

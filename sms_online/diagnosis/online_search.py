@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 from sms_online.description.schema import Effect, System
 from sms_online.diagnosis.attempt import FITTED, LARGEST_SHARE_LEFT, MOST_WINDOWS, REWEIGHED, STRETCH
 from sms_online.diagnosis.candidate import Candidate, LeftOpen
-from sms_online.diagnosis.candidates import LINEAR, CandidateColumns
-from sms_online.diagnosis.constants import applied, corrected, deviations, improved, stands
+from sms_online.diagnosis.candidates import CandidateColumns
+from sms_online.diagnosis.constants import applied, corrected, deviations, improved, is_constant, stands
 from sms_online.diagnosis.diagnose import CORRECTIONS
 from sms_online.diagnosis.record import Segment, excerpts
 from sms_online.diagnosis.residuals import ResidualTest
@@ -27,8 +27,7 @@ from sms_online.diagnosis.trace import Tracing
 from sms_online.diagnosis.weak_windows import WeakWindows
 from sms_online.effects.base import report
 from sms_online.effects.build import build_model
-from sms_online.effects.catalogue import ENTRIES, declarable
-from sms_online.effects.spacecraft import TableTilt
+from sms_online.effects.catalogue import ENTRIES, LINEAR, declarable
 from sms_online.model.base_parameters import BaseParameters
 from sms_online.model.model import Model
 from sms_online.pipeline.momentum_windows import HOPS
@@ -232,7 +231,7 @@ def _trace(request: Request, rows: SessionRows, everything: Sequence[Candidate],
     solution, covariance = _solution(final, used), final.covariance(used)
     named = [
         Named(
-            effect=improved(effect, solution[own]) if effect.name == TableTilt.entry.name else effect,
+            effect=improved(effect, solution[own]) if is_constant(effect) and effect is not constant else effect,
             parameters=tuple(p.name for p in finding.candidate.parameters) if effect is not constant else (),
             units=tuple(p.unit for p in finding.candidate.parameters) if effect is not constant else (),
             values=solution[own] if effect is not constant else np.empty(0),

@@ -20,8 +20,7 @@ from scipy.ndimage import uniform_filter1d
 from sms_online.diagnosis.record import Segment
 from sms_online.diagnosis.standstill import SessionStandstill
 from sms_online.diagnosis.weak_windows import Motion
-from sms_online.effects.base import position
-from sms_online.effects.friction import STANDSTILL
+from sms_online.effects.base import STANDSTILL, position
 from sms_online.pipeline.rough_forces import WITHIN
 from sms_online.pipeline.sensing import Sensing
 from sms_online.pipeline.smoothing import HALF_WIDTHS, kernel, smooth_all

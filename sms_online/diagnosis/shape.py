@@ -22,8 +22,6 @@ EVALUATIONS = 40
 STEP = 1e-5
 # Times that a shape constant follows from coefficients, which follow from it: the second is off by the first's square.
 SETTLED = 2
-# Constants that count something (of a cogging's period, say) are not refined.
-COUNTED = ("order",)
 
 
 def refine(tracing: Tracing, make: CandidateColumns, chosen: Sequence[int], k: int) -> None:
@@ -31,8 +29,8 @@ def refine(tracing: Tracing, make: CandidateColumns, chosen: Sequence[int], k: i
 
     Source of the search: Brent, Algorithms for Minimization without Derivatives, 1973, chapter 5.
     """
-    for shape in ENTRIES[tracing.candidates[k].effect.name].shapes:
-        if shape in tracing.candidates[k].effect.coefficients and shape not in COUNTED:
+    for shape, constant in ENTRIES[tracing.candidates[k].effect.name].shapes.items():
+        if shape in tracing.candidates[k].effect.coefficients and not constant.counted:
             _refine_one(tracing, make, chosen, k, shape)
     _settle(tracing, make, chosen, k)
 
@@ -62,7 +60,7 @@ def slopes(tracing: Tracing, make: CandidateColumns, chosen: Sequence[int]) -> t
 def _told_by_rows(effect: Effect) -> list[str]:
     """Shape constants of an effect that are refined for themselves."""
     shapes = ENTRIES[effect.name].shapes
-    told = [s for s in shapes if effect.coefficients.get(s, 0.0) > 0.0 and s not in COUNTED]
+    told = [s for s, constant in shapes.items() if effect.coefficients.get(s, 0.0) > 0.0 and not constant.counted]
     # A gap is reported for itself, where others have a coefficient too.
     return told if set(ENTRIES[effect.name].coefficients) - set(shapes) else []
 
@@ -74,7 +72,7 @@ def _settle(tracing: Tracing, make: CandidateColumns, chosen: Sequence[int], k: 
     to 1e-4, and the gap itself, with a stiffness of its own inside, to percents where the spring is seldom in it.
     """
     entry = ENTRIES[tracing.candidates[k].effect.name]
-    if entry.kind != "force" or not set(entry.shapes) - set(COUNTED):
+    if entry.kind != "force" or all(constant.counted for constant in entry.shapes.values()):
         return
     for _ in range(SETTLED):
         effect = tracing.candidates[k].effect

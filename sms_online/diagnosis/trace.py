@@ -18,9 +18,7 @@ from numpy.typing import NDArray
 
 from sms_online.diagnosis.candidate import Candidate, Finding, Laws, Ranked
 from sms_online.diagnosis.evidence import Gain, basis, free_of, gain, least_squares, threshold, together
-from sms_online.diagnosis.plausible import plausible
 from sms_online.diagnosis.rows import SessionRows
-from sms_online.effects.friction import DRY
 from sms_online.pipeline.momentum_windows import HOPS
 from sms_online.stream import Array
 from sms_online.trackers.factor import prior_factor, solve
@@ -39,11 +37,6 @@ ACTS = 0.01
 # Rows whose mean square exceeds their variance by more than this although everything that is known of has been
 # subtracted have an error of their own: friction is never quite its model.
 LARGEST_RATIO = 1.5
-# No law of a force is true to better than 0.3 %, and what it leaves of its own gain is no other effect on its rows.
-INEXACT = 1e-5
-# Dry friction changes its sign by creeping, not in a step, and repeats to a few percent: Armstrong-Hélouvry, Dupont and
-# Canudas de Wit, Automatica 30 (1994) 1083.
-INEXACT_DRY = 1e-3
 # Share of a row's variance by which that of the effects chosen has to change for rows to be weighed anew.
 SMALL_CHANGE = 0.1
 # Dry friction is told by what it leaves open where its axis stands still for at least this share of a session.
@@ -147,7 +140,7 @@ class Tracing:
 
     def _plausible(self, candidate: Candidate, found: Gain) -> Gain:
         """The gain, none where the effect cannot have the coefficients."""
-        possible = plausible(candidate.effect.name, found.coefficients, self.rows.model.system.sample_rate)
+        possible = candidate.traits.plausible(found.coefficients, self.rows.model.system.sample_rate)
         return found if possible else replace(found, gain=0.0)
 
     def gain_of(self, candidate: Candidate, chosen: Sequence[int]) -> Gain:
@@ -172,8 +165,7 @@ class Tracing:
         limit = threshold(FALSE_ALARM, self.trials, self._Z[k].shape[1])
         for other, taken in self._taken.items():
             if other != k and np.any(acts & self._acts(other)):
-                inexact = INEXACT_DRY if self.candidates[other].effect.name in DRY else INEXACT
-                limit = max(limit, inexact * taken)
+                limit = max(limit, self.candidates[other].traits.inexact * taken)
         return g.gain - limit
 
     def _acts(self, k: int) -> NDArray[np.bool_]:
@@ -268,7 +260,7 @@ class Tracing:
 
     def _holds(self, k: int) -> bool:
         candidate = self.candidates[k]
-        return self._laws is not None and candidate.effect.name in DRY and self._laws.at_rest(candidate) > MUCH_REST
+        return self._laws is not None and candidate.traits.dry and self._laws.at_rest(candidate) > MUCH_REST
 
     def _deviance(self, chosen: Sequence[int]) -> float:
         """Minus twice the log of the likelihood of held-out rows beside those before them, up to a constant.
@@ -292,7 +284,7 @@ class Tracing:
 
     def _least(self, k: int) -> float:
         """Gain that one of those chosen must have in the end: of dry friction what it leaves open may leave little."""
-        dry = self.candidates[k].effect.name in DRY
+        dry = self.candidates[k].traits.dry
         return 0.0 if dry else threshold(FALSE_ALARM, self.trials, self._Z[k].shape[1])
 
     def _eligible(self, chosen: Sequence[int], refused: set[str]) -> list[int]:

@@ -12,7 +12,8 @@ from typing import ClassVar, Literal
 
 import numpy as np
 
-from sms_online.description.schema import System
+from sms_online.description.schema import Effect, System
+from sms_online.effects.traits import Traits
 from sms_online.model.chain import Chain
 from sms_online.model.effect import ForceEffect, Inputs
 from sms_online.model.layout import Layout
@@ -21,6 +22,10 @@ from sms_online.stream import Array
 
 Kind = Literal["force", "inertia", "channel", "kinematics"]
 Place = Literal["joint", "flexible joint", "later joint", "link", "linear link", "base", "tip", "angle", "position"]
+# Speed below which an axis stands still, rad/s (m/s): an integrator cannot follow a jump, and encoders resolve no less.
+STANDSTILL = 1e-4
+# Kinds of events that effects are named after.
+CHANGES = ("stiffness", "friction", "offset", "damping")
 # Relative step of the differences that carry standard deviations over to reported coefficients.
 DIFFERENCE = 1e-6
 
@@ -41,11 +46,16 @@ class Ranges:
 
 @dataclass(frozen=True)
 class Shape:
-    """A shape constant: unit, value where none is given, and the values to search for a motion's ranges."""
+    """A shape constant: unit, value where none is given, and the values to search for a motion's ranges.
+
+    counted: whether it is a number of periods in a motor's turn, which is one of those in the grid, and of which the
+    motion has to go through one.
+    """
 
     unit: str
     default: float
     grid: Callable[[Ranges], tuple[float, ...]]
+    counted: bool = False
 
 
 @dataclass(frozen=True)
@@ -64,6 +74,13 @@ class Entry:
     separated_by: str
     shapes: Mapping[str, Shape] = field(default_factory=dict)
     further: Mapping[str, str] = field(default_factory=dict)
+    traits: Traits = field(default_factory=Traits)
+
+    @property
+    def change(self) -> str:
+        """Kind of an event in which its coefficients jump, by the last word of its name."""
+        word = self.name.rsplit("_", 1)[-1]
+        return word if word in CHANGES else "inertia"
 
 
 @dataclass(frozen=True)
@@ -97,19 +114,51 @@ class Site:
         return unit.replace("N m", "N").replace("rad", "m")
 
 
+class Constant:
+    """What becomes a constant of the description where it is found, and no unknown of π.
+
+    Its linear coefficients are first approximations, by which constants are improved while what is left is fitted.
+    """
+
+    entry: ClassVar[Entry]
+
+    @classmethod
+    def improved(cls, given: Mapping[str, float], increments: Array) -> dict[str, float]:
+        """The constants changed by the linear coefficients (c,) of what is left when they are taken off."""
+        changes = zip(cls.entry.coefficients, increments, strict=True)
+        return {name: given.get(name, 0.0) + float(change) for name, change in changes}
+
+    @classmethod
+    def deviations(cls, given: Mapping[str, float], covariance: Array) -> dict[str, float]:
+        """1σ of the constants for the covariance (c, c) of the linear coefficients."""
+        return {name: float(std) for name, std in zip(given, np.sqrt(np.diag(covariance)), strict=True)}
+
+    @classmethod
+    def possible(cls, given: Mapping[str, float], sample_rate: float) -> bool:
+        """Whether constants that were improved are still of this effect, on samples at so many Hz."""
+        return True
+
+    @classmethod
+    def declared(cls, system: System, effect: Effect) -> System:
+        """The system with an effect of these constants."""
+        return system.model_copy(update={"effects": (*system.effects, effect)})
+
+
 class Force:
     """What most force effects share: no torque, no internal state, coefficients reported as they are."""
 
     entry: ClassVar[Entry]
     needs_torque = False
     n_states = 0
-    smooth = False
+    weighs = False
 
     def __init__(
         self, site: Site, linear: Mapping[str, tuple[str, str, float]], shapes: Mapping[str, float] | None = None
     ) -> None:
         """linear: quantity to symbol, unit and nominal value."""
         self.name, self.where, self.index = self.entry.name, site.where, site.index
+        traits = self.entry.traits
+        self.smooth, self.reversing, self.dry = traits.course == "smooth", traits.reversing, traits.dry
         self.shapes: Mapping[str, float] = {} if shapes is None else shapes
         self.relative_to: tuple[str, ...] = ()
         self.parameters = tuple(

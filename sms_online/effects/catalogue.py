@@ -12,15 +12,9 @@ from fnmatch import fnmatchcase
 from sms_online.description.channels import channels, drive_channel, strain_channel
 from sms_online.description.explain import hint, nearest
 from sms_online.description.schema import Effect, FlexibleLink, System
-from sms_online.effects.base import Entry, Place, Site
-from sms_online.effects.channel import (
-    LONGEST_DELAY,
-    ChannelEffect,
-    EncoderEccentricity,
-    EncoderOffset,
-    SensorLag,
-    TorqueDelay,
-)
+from sms_online.effects.base import Constant, Entry, Place, Site
+from sms_online.effects.channel import ChannelEffect, EncoderEccentricity, EncoderOffset, Linear
+from sms_online.effects.delay import LONGEST_DELAY, SensorLag, TorqueDelay
 from sms_online.effects.drive import Cogging, TorqueGain, TorqueOffset, TorqueRipple
 from sms_online.effects.friction import (
     CoulombFriction,
@@ -43,6 +37,7 @@ FORCES = (
 )  # fmt: skip
 CHANNELS = (EncoderOffset, EncoderEccentricity, SensorLag, TorqueDelay)
 CLASSES = (*FORCES, TipPayload, *CHANNELS)
+_CLASSES: tuple[type[object], ...] = CLASSES
 # The step from `linear` to `exact` kinematics of a link; it has no coefficients and no class.
 GEOMETRIC_STIFFENING = Entry("geometric_stiffening", "kinematics", "linear link", {}, SEPARATED_BY)
 
@@ -53,12 +48,12 @@ FORCE_CLASSES: dict[str, Callable[[Site, Mapping[str, float]], ForceEffect]] = {
     each.entry.name: each for each in FORCES
 }
 INERTIA_CLASSES: dict[str, Callable[[Site, Mapping[str, float]], InertiaEffect]] = {TipPayload.entry.name: TipPayload}
-_CHANNELS: dict[str, Callable[[str, Mapping[str, float]], ChannelEffect]] = {
-    EncoderOffset.entry.name: EncoderOffset,
-    EncoderEccentricity.entry.name: EncoderEccentricity,
-    SensorLag.entry.name: SensorLag,
-    TorqueDelay.entry.name: TorqueDelay,
-}
+_CHANNELS: dict[str, Callable[[str, Mapping[str, float]], ChannelEffect]] = {each.entry.name: each for each in CHANNELS}
+# Linear coefficients of those on channels, and what becomes a constant of the description.
+LINEAR: dict[str, tuple[Linear, ...]] = {each.entry.name: each.linear for each in CHANNELS}
+CONSTANTS: dict[str, type[Constant]] = {each.entry.name: each for each in _CLASSES if issubclass(each, Constant)}
+# Tried at any joint where something changes while a session runs.
+BEGINNING = tuple(sorted(entry.name for entry in ENTRIES.values() if entry.traits.begins))
 
 
 def places(system: System, at: Place) -> tuple[str, ...]:
@@ -183,6 +178,22 @@ def candidates(system: System) -> list[Effect]:
             if (entry.name, where) not in declared:
                 out.append(with_shapes(Effect(name=entry.name, where=where), system))
     return out
+
+
+def lag_places(system: System) -> list[str]:
+    """Channels, or patterns of channels, that may lag together; those that the system declares are left out."""
+    return [effect.where for effect in candidates(system) if effect.name == SensorLag.entry.name]
+
+
+def kinematic_candidates(system: System) -> list[Effect]:
+    """What may be declared that changes the links' kinematics."""
+    return [effect for effect in candidates(system) if ENTRIES[effect.name].kind == "kinematics"]
+
+
+def periods(effect: Effect) -> float | None:
+    """Periods that an effect has in a motor's turn, None where it has none."""
+    counted = (name for name, shape in ENTRIES[effect.name].shapes.items() if shape.counted)
+    return next((effect.coefficients[name] for name in counted if name in effect.coefficients), None)
 
 
 # Channels that come together, beside those of a link's markers.

@@ -12,10 +12,14 @@ import numpy as np
 from sms_online.effects.base import Entry, Shape, Site, position
 from sms_online.effects.friction import MotorSide
 from sms_online.effects.harmonic import amplitude_and_phase, nominal_parts, phase_columns
+from sms_online.effects.traits import Curve, Traits
 from sms_online.model.effect import Inputs
 from sms_online.model.layout import Layout
 from sms_online.stream import Array
 
+# Torque sensors, and models of what a torque moves, are right to a thousandth at best: a gain or ripple below that is
+# no fault of theirs. With a gain of -1 a measured torque explains itself and the arm weighs nothing.
+LEAST_RATIO, LARGEST_RATIO = 1e-3, 0.5
 # Orders that windings and poles of usual motors give, per motor turn.
 ORDERS = (1.0, 2.0, 3.0, 4.0, 6.0, 8.0, 12.0, 18.0, 24.0)
 
@@ -30,7 +34,8 @@ class Cogging(MotorSide):
     entry = Entry(
         "cogging", "force", "joint", {"amplitude": "N m", "phase": "rad"},
         "many motor turns, under little and much torque (ripple grows with it)",
-        {"order": Shape("", 6.0, lambda ranges: ORDERS)},
+        {"order": Shape("", 6.0, lambda ranges: ORDERS, counted=True)},
+        traits=Traits(signed=True, curve=Curve("phase in the motor's turn")),
     )  # fmt: skip
 
     def __init__(self, site: Site, given: Mapping[str, float]) -> None:
@@ -57,7 +62,8 @@ class TorqueRipple(MotorSide):
     entry = Entry(
         "torque_ripple", "force", "joint", {"amplitude": "", "phase": "rad"},
         "many motor turns, under little and much torque (cogging does not grow with it)",
-        {"order": Shape("", 6.0, lambda ranges: ORDERS)},
+        {"order": Shape("", 6.0, lambda ranges: ORDERS, counted=True)},
+        traits=Traits(signed=True, least=LEAST_RATIO, most=LARGEST_RATIO),
     )  # fmt: skip
     needs_torque = True
 
@@ -83,7 +89,10 @@ class TorqueOffset(MotorSide):
     Limitations: constant over the session; a drifting amplifier needs a slower model.
     """
 
-    entry = Entry("torque_offset", "force", "joint", {"torque": "N m"}, "standstill under a known torque")
+    entry = Entry(
+        "torque_offset", "force", "joint", {"torque": "N m"}, "standstill under a known torque",
+        traits=Traits(signed=True, curve=Curve("motor speed"), begins=True),
+    )  # fmt: skip
 
     def __init__(self, site: Site, given: Mapping[str, float]) -> None:
         super().__init__(site, {"torque": (f"o_{site.index}", "N m", given.get("torque", 0.0))})
@@ -100,7 +109,10 @@ class TorqueGain(MotorSide):
     Limitations: a gain common to all joints only rescales π, so it is relative to joint 1, which has none.
     """
 
-    entry = Entry("torque_gain", "force", "later joint", {"ratio": ""}, "motion of each joint alone, then of all")
+    entry = Entry(
+        "torque_gain", "force", "later joint", {"ratio": ""}, "motion of each joint alone, then of all",
+        traits=Traits(signed=True, least=LEAST_RATIO, most=LARGEST_RATIO, curve=Curve("torque")),
+    )  # fmt: skip
     needs_torque = True
 
     def __init__(self, site: Site, given: Mapping[str, float]) -> None:

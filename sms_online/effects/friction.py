@@ -10,17 +10,11 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from sms_online.effects.base import Entry, Force, Ranges, Shape, Site, position
+from sms_online.effects.base import STANDSTILL, Entry, Force, Ranges, Shape, Site, position
+from sms_online.effects.traits import Curve, Traits
 from sms_online.model.effect import Inputs
 from sms_online.model.layout import Layout
 from sms_online.stream import Array
-
-# Laws of dry friction: what they give at a standstill is any value up to that of the law.
-DRY = ("coulomb_friction", "stribeck_friction", "load_friction")
-# Laws that are others for either sign of the rate.
-REVERSING = (*DRY, "direction_friction")
-# Speed below which an axis stands still, rad/s (m/s): an integrator cannot follow a jump, and encoders resolve no less.
-STANDSTILL = 1e-4
 
 
 def sign(rate: Array) -> Array:
@@ -53,8 +47,9 @@ class ViscousFriction(MotorSide):
     """
 
     entry = Entry(
-        "viscous_friction", "force", "joint", {"damping": "N m s/rad"}, "two speeds, each held in both directions"
-    )
+        "viscous_friction", "force", "joint", {"damping": "N m s/rad"}, "two speeds, each held in both directions",
+        traits=Traits(curve=Curve("motor speed"), begins=True),
+    )  # fmt: skip
 
     def __init__(self, site: Site, given: Mapping[str, float]) -> None:
         super().__init__(site, {"damping": (f"d_{site.index}", "N m s/rad", given.get("damping", 0.0))})
@@ -70,7 +65,10 @@ class CoulombFriction(MotorSide):
     Limitations: no stiction and no presliding; around standstill the sign of a noisy rate is noise.
     """
 
-    entry = Entry("coulomb_friction", "force", "joint", {"torque": "N m"}, "two speeds, each held in both directions")
+    entry = Entry(
+        "coulomb_friction", "force", "joint", {"torque": "N m"}, "two speeds, each held in both directions",
+        traits=Traits(course="dry", curve=Curve("motor speed"), begins=True),
+    )  # fmt: skip
 
     def __init__(self, site: Site, given: Mapping[str, float]) -> None:
         super().__init__(site, {"torque": (f"c_{site.index}", "N m", given.get("torque", 0.0))})
@@ -94,6 +92,7 @@ class StribeckFriction(MotorSide):
     entry = Entry(
         "stribeck_friction", "force", "joint", {"torque": "N m"}, "slow motion through standstill, and fast motion",
         {"velocity": Shape("rad/s", 0.05, _stribeck_velocities)},
+        traits=Traits(course="dry", curve=Curve("motor speed")),
     )  # fmt: skip
 
     def __init__(self, site: Site, given: Mapping[str, float]) -> None:
@@ -114,8 +113,9 @@ class LoadFriction(MotorSide):
     """
 
     entry = Entry(
-        "load_friction", "force", "flexible joint", {"ratio": ""}, "the same speeds under little and much load"
-    )
+        "load_friction", "force", "flexible joint", {"ratio": ""}, "the same speeds under little and much load",
+        traits=Traits(course="dry"),
+    )  # fmt: skip
 
     def __init__(self, site: Site, given: Mapping[str, float]) -> None:
         nominal = given.get("ratio", 0.0) * site.system.joints[site.index - 1].stiffness
@@ -143,6 +143,8 @@ class DirectionFriction(MotorSide):
     entry = Entry(
         "direction_friction", "force", "joint", {"plus": "N m s/rad", "minus": "N m s/rad"},
         "two speeds in both directions",
+        # Beside the viscous friction that it refines a coefficient is a difference, of either sign.
+        traits=Traits(signed=True, course="reversing", curve=Curve("motor speed"), extends=ViscousFriction.entry.name),
     )  # fmt: skip
 
     def __init__(self, site: Site, given: Mapping[str, float]) -> None:

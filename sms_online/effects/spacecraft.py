@@ -10,7 +10,9 @@ from collections.abc import Mapping
 import numpy as np
 
 from sms_online.description.channels import AXES
-from sms_online.effects.base import Entry, Force, Ranges, Shape, Site
+from sms_online.description.schema import Effect, System
+from sms_online.effects.base import Constant, Entry, Force, Ranges, Shape, Site
+from sms_online.effects.traits import Traits
 from sms_online.model.effect import Inputs
 from sms_online.model.layout import Layout
 from sms_online.stream import Array
@@ -35,6 +37,7 @@ class ReactionWheel(Force):
         "reaction_wheel", "force", "base",
         {"torque": "N m", "torque_x": "N m", "torque_y": "N m", "torque_z": "N m"},
         "long motion in which the base turns and travels far: a force about S then differs from a torque",
+        traits=Traits(signed=True),
     )  # fmt: skip
 
     def __init__(self, site: Site, given: Mapping[str, float]) -> None:
@@ -60,6 +63,7 @@ class ThrusterLeak(Force):
     entry = Entry(
         "thruster_leak", "force", "base", {"force_x": "N", "force_y": "N", "force_z": "N"},
         "a base that turns by a quarter turn or more: a leak turns with it, a tilted table does not",
+        traits=Traits(signed=True),
     )  # fmt: skip
 
     def __init__(self, site: Site, given: Mapping[str, float]) -> None:
@@ -74,7 +78,7 @@ class ThrusterLeak(Force):
         return f
 
 
-class TableTilt(Force):
+class TableTilt(Constant, Force):
     """Uniform gravity in the plane on every mass, m/s²: `gravity_x`, `gravity_y`, in inertial axes.
 
     The product of gravity and masses is linear in one of them only: columns are those of 1 m/s² on the masses of the
@@ -85,8 +89,9 @@ class TableTilt(Force):
     entry = Entry(
         "table_tilt", "force", "base", {"gravity_x": "m/s²", "gravity_y": "m/s²"},
         "a base that turns by a quarter turn or more: gravity does not turn with it, a leak does",
+        traits=Traits(signed=True, course="smooth"),
     )  # fmt: skip
-    smooth = True
+    weighs = True
 
     def __init__(self, site: Site, given: Mapping[str, float]) -> None:
         names = ("gravity_x", "gravity_y")
@@ -96,6 +101,13 @@ class TableTilt(Force):
     def force(self, layout: Layout, x: Array, v: Array, inputs: Inputs | None) -> Array:
         """Weight of the reference masses under 1 m/s² along x and y."""
         return self._weight(x)
+
+    @classmethod
+    def declared(cls, system: System, effect: Effect) -> System:
+        """The system with more gravity."""
+        gravity = np.array(system.gravity)
+        gravity[:2] += effect.coefficients["gravity_x"], effect.coefficients["gravity_y"]
+        return system.model_copy(update={"gravity": tuple(gravity.tolist())})
 
 
 class AirDrag(Force):

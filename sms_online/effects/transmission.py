@@ -12,6 +12,7 @@ import numpy as np
 
 from sms_online.effects.base import Entry, Force, Ranges, Shape, Site, position
 from sms_online.effects.harmonic import amplitude_and_phase, nominal_parts, phase_columns
+from sms_online.effects.traits import Curve, Traits
 from sms_online.model.effect import Inputs
 from sms_online.model.layout import Layout
 from sms_online.stream import Array
@@ -77,8 +78,9 @@ class CubicStiffness(Transmission):
     """
 
     entry = Entry(
-        "cubic_stiffness", "force", "flexible joint", {"stiffness": "N m/rad³"}, "small and large deflections"
-    )
+        "cubic_stiffness", "force", "flexible joint", {"stiffness": "N m/rad³"}, "small and large deflections",
+        traits=Traits(signed=True, curve=Curve("deflection", between=True)),
+    )  # fmt: skip
 
     def __init__(self, site: Site, given: Mapping[str, float]) -> None:
         super().__init__(site, {"stiffness": (f"k_3{site.index}", "N m/rad³", given.get("stiffness", 0.0))})
@@ -99,6 +101,7 @@ class Backlash(Transmission):
     entry = Entry(
         "backlash", "force", "flexible joint", {"gap": "rad"}, "deflections within and far beyond the gap",
         {"gap": Shape("rad", 0.001, _widths)}, {"stiffness": "N m/rad"},
+        Traits(curve=Curve("deflection", between=True)),
     )  # fmt: skip
 
     def __init__(self, site: Site, given: Mapping[str, float]) -> None:
@@ -131,7 +134,8 @@ class KinematicError(Transmission):
     entry = Entry(
         "kinematic_error", "force", "flexible joint", {"amplitude": "rad", "phase": "rad"},
         "constant speeds that put the error's frequency below and above the joint's resonance",
-        {"order": Shape("", 2.0, lambda ranges: (1.0, 2.0, 4.0))},
+        {"order": Shape("", 2.0, lambda ranges: (1.0, 2.0, 4.0), counted=True)},
+        traits=Traits(signed=True, curve=Curve("phase in the motor's turn", between=True)),
     )  # fmt: skip
 
     def __init__(self, site: Site, given: Mapping[str, float]) -> None:

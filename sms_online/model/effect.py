@@ -33,8 +33,9 @@ class ForceEffect(Protocol):
 
     parameters: the linear coefficients as they enter π. shapes: shape constants. relative_to: names of the model's
     parameters that reported coefficients are divided by. n_states: number of internal states. smooth: whether it is as
-    smooth as the motion, which is thinned then. A joint's force and internal states depend on that joint's positions,
-    rates and torque.
+    smooth as the motion, which is thinned then. reversing: whether it jumps with the sign of its joint's motor's rate.
+    dry: whether at a standstill it is any value up to that of its law. weighs: whether its columns hold the reference
+    masses of the model. A joint's force and internal states depend on that joint's positions, rates and torque.
     """
 
     name: str
@@ -45,6 +46,9 @@ class ForceEffect(Protocol):
     needs_torque: bool
     n_states: int
     smooth: bool
+    reversing: bool
+    dry: bool
+    weighs: bool
 
     def force(self, layout: Layout, x: Array, v: Array, inputs: Inputs | None) -> Array:
         """Columns f_j (B, n_v, coefficients): generalized force of one unit of each coefficient."""

@@ -20,7 +20,6 @@ from numpy.typing import NDArray
 from sms_online.description.schema import System
 from sms_online.effects.build import build_model
 from sms_online.effects.catalogue import channel_effects
-from sms_online.effects.spacecraft import TableTilt
 from sms_online.errors import InputError
 from sms_online.model.base_parameters import BaseParameters, find_base_parameters
 from sms_online.model.model import Model
@@ -391,7 +390,7 @@ class Estimator:
 def _refuse_unknown_masses(model: Model) -> None:
     """InputError on a declared effect whose columns hold masses that are yet to be found."""
     for effect in model.effects:
-        if effect.name == TableTilt.entry.name:
+        if effect.weighs:
             place, found = f"effect {effect.name}@{effect.where}", "a product with masses, which are unknown"
             expected = "the system's gravity, or a tilt that is found from a whole capture"
             raise InputError(model.system.name, place, found, expected)

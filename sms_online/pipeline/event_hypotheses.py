@@ -15,6 +15,7 @@ import numpy as np
 
 from sms_online.description.schema import Effect, RigidBody, System
 from sms_online.effects.build import build_model
+from sms_online.effects.catalogue import BEGINNING, ENTRIES
 from sms_online.model.base_parameters import BaseParameters
 from sms_online.model.model import Model
 from sms_online.model.parameters import Parameter
@@ -39,15 +40,8 @@ SAME = 1e-3
 # A column of which the others leave less than this share cannot jump alone.
 FREE = 1e-6
 
-# Effects that may begin while a session runs, at any joint.
-EVENT_EFFECTS = ("coulomb_friction", "torque_offset", "viscous_friction")
-# Kinds of events by the ends of what jumped: an effect's name, or a parameter's quantity.
-KINDS = {
-    "stiffness": ("stiffness", "rigidity", "rigidity_y", "rigidity_z"),
-    "friction": ("friction",),
-    "offset": ("offset",),
-    "damping": ("damping",),
-}
+# Kinds of events by the ends of the parameter that jumped.
+KINDS = {"stiffness": ("stiffness", "rigidity", "rigidity_y", "rigidity_z"), "damping": ("damping",)}
 
 
 @dataclass(frozen=True)
@@ -83,7 +77,7 @@ def everything(system: System) -> System:
     declared = {(effect.name, effect.where) for effect in system.effects}
     joints = [f"joint_{i}" for i in range(1, len(system.joints) + 1)]
     missing = [
-        Effect(name=name, where=where) for where in joints for name in EVENT_EFFECTS if (name, where) not in declared
+        Effect(name=name, where=where) for where in joints for name in BEGINNING if (name, where) not in declared
     ]
     payload = RigidBody() if system.payload is None else system.payload
     return system.model_copy(update={"payload": payload, "effects": (*system.effects, *missing)})
@@ -155,8 +149,9 @@ def kind_of(names: list[str]) -> str:
     name = names[0]
     if name.startswith("payload."):
         return "payload"
-    what = name.split("@")[0] if "@" in name else name
-    return next((kind for kind, ends in KINDS.items() if what.endswith(ends)), "inertia")
+    if "@" in name:
+        return ENTRIES[name.split("@")[0]].change
+    return next((kind for kind, ends in KINDS.items() if name.endswith(ends)), "inertia")
 
 
 def explain(factor: Array, rows: Array, jumps: list[Jump]) -> Explanation:

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sms_online.description.schema import SerialFrames, SerialLines, Source
+from sms_online.effects.delay import late_keys
 from sms_online.pipeline.sensing import Sensing
 from sms_online.stream import Array
 from sms_online.trackers.factor import triangular_factor
@@ -130,9 +131,8 @@ class Latencies:
         best = np.flatnonzero(certain & (gain >= ALIKE * gain[certain].max()))
         k = int(best[np.argmax(size[best])])
         group = self.groups[k]
-        effects = [f"torque_delay@joint_{joint}" for joint in group.joints]
-        effects += [f"sensor_lag@{name}" for name in group.channels if not name.startswith(("tau_", "force_"))]
-        return Latency(group.name, float(size[k]), float(std[k]), tuple(effects))
+        positions = [name for name in group.channels if not name.startswith(("tau_", "force_"))]
+        return Latency(group.name, float(size[k]), float(std[k]), tuple(late_keys(group.joints, positions)))
 
     def state(self) -> dict[str, Any]:
         """What `restore` needs to continue."""

@@ -14,7 +14,7 @@ from itertools import product
 import numpy as np
 from numpy.typing import NDArray
 
-from sms_online.effects.friction import DRY, REVERSING, STANDSTILL
+from sms_online.effects.base import STANDSTILL
 from sms_online.model.model import Model
 from sms_online.pipeline.momentum_windows import INSTANTS
 from sms_online.pipeline.smoothing import kernel
@@ -54,7 +54,7 @@ class RoughForces:
             entry for k, speeds in self._joints.items() for entry in product(speeds, speeds, self._places(k).tolist())
         ]
         self.coordinates, self.rows, self.coefficients = np.array(entries, dtype=np.int64).reshape(-1, 3).T
-        self._dry = [(k, self._motor(k)) for k in rough if model.effects[k].name in DRY]
+        self._dry = [(k, self._motor(k)) for k in rough if model.effects[k].dry]
         dry = [(motor, place) for k, motor in self._dry for place in self._places(k).tolist()]
         self.motors, self.dry = np.array(dry, dtype=np.int64).reshape(-1, 2).T
 
@@ -76,7 +76,7 @@ class RoughForces:
         out = np.zeros((*v.shape, self._model.n_pi))
         for effect, columns, own in self._model.acting(self._model.inputs(signals)):
             if not effect.smooth:
-                instants = WITHIN if effect.name in REVERSING else (0.0,)
+                instants = WITHIN if effect.reversing else (0.0,)
                 parts = [effect.force(self._model.layout, x, v + part * change, own) for part in instants]
                 out[..., columns] = sum(parts) / len(parts)
         return out

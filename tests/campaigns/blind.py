@@ -30,7 +30,6 @@ import numpy as np
 from sms_adapters.system_file import load_system
 from sms_online.description.schema import Effect, System
 from sms_online.diagnosis.candidates import CandidateColumns
-from sms_online.diagnosis.constants import delay_of
 from sms_online.diagnosis.diagnose import Diagnosis, diagnose
 from sms_online.diagnosis.document import coefficients
 from sms_online.diagnosis.evidence import angle, basis
@@ -38,6 +37,7 @@ from sms_online.diagnosis.record import SampleRecord
 from sms_online.diagnosis.rows import SessionRows
 from sms_online.effects.build import build_model
 from sms_online.effects.catalogue import ENTRIES, candidates
+from sms_online.effects.delay import delay_of
 from sms_online.effects.spacecraft import TableTilt
 from sms_online.model.base_parameters import find_base_parameters
 from sms_online.pipeline.estimator import Estimator
