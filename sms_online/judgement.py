@@ -51,8 +51,8 @@ class Facts:
     determined: parameters that the data determine, and of how many. undetermined: names of the others. settling: why
     the estimate will still move by more than its error bars, empty where it will not. negative: names of estimates that
     are negative and must not be. pulled: names of those that noise in the columns pulls beyond their bars. alarm: type
-    of the rows that the sequential test finds more than noise in, of a session without diagnosis. unweighed: joint
-    (from 1) whose torque is explained so little that rows get no weights. undecided: times, s, of changes that the
+    of the rows that the sequential test finds more than noise in, of a session without diagnosis. unweighed: that of the
+    joint whose torque is explained so little that rows get no weights. undecided: times, s, of changes that the
     session ended too early to tell. distance: from the nearest real bodies, in standard deviations. lost: share of the
     samples. troubles: whatever else, a short sentence each, such as of the devices of a live session.
     """
@@ -64,7 +64,7 @@ class Facts:
     negative: tuple[str, ...] = ()
     pulled: tuple[str, ...] = ()
     alarm: str | None = None
-    unweighed: int | None = None
+    unweighed: str | None = None
     undecided: tuple[float, ...] = ()
     distance: float = 0.0
     lost: float = 0.0
@@ -135,7 +135,7 @@ def judge(facts: Facts) -> Judgement:
     if settled or facts.unweighed is not None:
         torques = _unexplained_torques(facts.residual)
         doubts += torques
-        if facts.unweighed is not None and f"joint_{facts.unweighed}" not in [reason.places[0] for reason in torques]:
+        if facts.unweighed is not None and facts.unweighed not in [reason.places[0] for reason in torques]:
             doubts.append(_unweighed(facts.unweighed))
     if settled:
         doubts += _loud_rows(facts.residual)
@@ -191,9 +191,9 @@ def _open(discrepancy: Discrepancy) -> bool:
     return not discrepancy.adopted and discrepancy.verdict != "change"
 
 
-def _unweighed(joint: int) -> Reason:
-    text = f"no weights: by a first fit, most of the torque or force of joint_{joint} is not explained"
-    return Reason(text, True, (f"joint_{joint}",), "not explained")
+def _unweighed(row: str) -> Reason:
+    text = f"no weights: by a first fit, most of the torque or force of {row} is not explained"
+    return Reason(text, True, (row,), "not explained")
 
 
 def _named(discrepancies: Iterable[Discrepancy]) -> list[Reason]:

@@ -13,6 +13,7 @@ from sms_online.judgement import Discrepancy, Facts, Judgement, judge
 from sms_online.physical import PhysicalSet, Projection
 from sms_online.pipeline.estimator import Estimator
 from sms_online.pipeline.events import Event
+from sms_online.row_types import ENERGY, joint_rows, row_types
 from sms_online.stream import Array
 from sms_online.threads import one_blas_thread
 from sms_online.trackers.interface import Estimate
@@ -78,19 +79,12 @@ def residuals(estimator: Estimator, beta: Array) -> dict[str, dict[str, float | 
     """By row type: `relative` to the measured torque or force, `whitened` over its predicted standard deviation."""
     layout, momentum = estimator.model.layout, estimator.momentum
 
-    def whitened(rows: list[int]) -> float | None:
+    relative = {joint_rows(i): joint.relative(beta) for i, joint in enumerate(estimator.joint_residuals)}
+    out: dict[str, dict[str, float | None]] = {ENERGY: {"relative": None, "whitened": None}}
+    for name, speeds in row_types(layout).items():
         # Where the smoother knows better, rows of the balance see shapes that are not the links'.
-        return momentum.whitened(rows, beta) if momentum is not None and rows and not estimator.by_smoother else None
-
-    out: dict[str, dict[str, float | None]] = {"energy": {"relative": None, "whitened": None}}
-    for i, joint in enumerate(estimator.joint_residuals, start=1):
-        out[f"joint_{i}"] = {"relative": joint.relative(beta), "whitened": whitened([layout.theta_m[i - 1]])}
-    for i, (q, theta_m, q_f) in enumerate(zip(layout.q, layout.theta_m, layout.q_f, strict=True), start=1):
-        rows = [*range(q_f.start, q_f.stop), *([q] if q != theta_m else [])]
-        if rows:
-            out[f"link_{i}"] = {"relative": None, "whitened": whitened(rows)}
-    if layout.n_base_speeds:
-        out["base"] = {"relative": None, "whitened": whitened(list(range(layout.n_base_speeds)))}
+        whitened = None if momentum is None or estimator.by_smoother else momentum.whitened(speeds, beta)
+        out[name] = {"relative": relative.get(name), "whitened": whitened}
     return out
 
 
@@ -129,7 +123,7 @@ def judged(
     alarm = unweighed = None
     if momentum is not None:
         alarm = None if momentum.test.alarm is None else momentum.test.alarm.row
-        unweighed = None if momentum.fit.unexplained is None else momentum.fit.unexplained + 1
+        unweighed = None if momentum.fit.unexplained is None else joint_rows(momentum.fit.unexplained)
     return judge(
         Facts(
             determined=(int(np.count_nonzero(flags)), flags.size),

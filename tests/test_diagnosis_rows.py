@@ -23,10 +23,10 @@ from sms_online.diagnosis.unexplained import describe_residual
 from sms_online.diagnosis.weak_windows import WeakWindows, Windows
 from sms_online.effects.build import build_model
 from sms_online.model.effect import Inputs
-from sms_online.model.layout import row_types
 from sms_online.pipeline.estimator import Estimator
 from sms_online.pipeline.momentum_windows import EXPONENT, HOPS, INSTANTS
 from sms_online.results import standard_deviation
+from sms_online.row_types import row_types
 from sms_online.stream import Array
 from sms_online.trackers.factor import solve
 from sms_sim.simulate import sampled_blocks, simulate

@@ -108,7 +108,7 @@ def test_residuals_of_an_estimate_that_is_settling_show_nothing() -> None:
     assert judge(loud).level == "not yet"
     assert judge(loud).sentence == "Not yet: too few rows"
     # Unless no fit explains the torques at all, or a test says so.
-    assert judge(replace(loud, unweighed=1)).grave
+    assert judge(replace(loud, unweighed="joint_1")).grave
     assert judge(replace(loud, alarm="joint_1")).grave
 
 
@@ -120,7 +120,7 @@ def test_an_alarm_is_that_of_what_the_diagnosis_looks_into_and_a_doubt_of_its_ow
 
 
 def test_a_torque_that_forbids_weights_is_a_grave_doubt_whatever_the_energy_balance_says_of_it() -> None:
-    judgement = judge(replace(GOOD, settling="no weights", unweighed=2))
+    judgement = judge(replace(GOOD, settling="no weights", unweighed="joint_2"))
     assert judgement.grave
     assert judgement.marks == {"joint_2": "not explained"}
 

@@ -30,6 +30,7 @@ from sms_online.pipeline.events import Event
 from sms_online.pipeline.momentum import Momentum
 from sms_online.pipeline.momentum_balance import MARGIN
 from sms_online.pipeline.synchronise import GridSamples
+from sms_online.row_types import joint_rows
 from sms_online.stream import Array
 from sms_online.trackers.factor import solve
 
@@ -216,7 +217,7 @@ class OnlineDiagnosis:
             last, first, row = test.alarm.since - width, test.alarm.end - width, test.alarm.row
         elif (joint := self._momentum.fit.unexplained) is not None:
             # Rows are not even weighed.
-            last, first, row = -1, 0, f"joint_{joint + 1}"
+            last, first, row = -1, 0, joint_rows(joint)
         else:
             return
         seen = detector.before(last) if last >= 0 else None

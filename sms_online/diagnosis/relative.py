@@ -11,6 +11,7 @@ from sms_online.description.schema import Effect
 from sms_online.diagnosis.candidates import CandidateColumns
 from sms_online.diagnosis.rows import SessionRows, joint_windows
 from sms_online.diagnosis.weak_windows import Motion
+from sms_online.row_types import joint_rows
 from sms_online.stream import Array
 
 
@@ -53,4 +54,4 @@ class RelativeResiduals:
         left = self._b[windows] - columns @ solution
         size = np.linalg.norm(self._measured[windows], axis=0)
         ratio = np.divide(np.linalg.norm(left, axis=0), size, out=np.zeros_like(size), where=size > 0.0)
-        return {f"joint_{i}": float(r) for i, r in enumerate(ratio, start=1)}
+        return {joint_rows(i): float(r) for i, r in enumerate(ratio)}

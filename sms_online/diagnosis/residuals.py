@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scipy.stats import chi2
 
 from sms_online.diagnosis.rows import SessionRows
-from sms_online.model.layout import row_types
+from sms_online.row_types import row_types
 from sms_online.stream import Array
 
 # Sensors' noise, and with it the predicted variance of rows, is known to a tenth where it is estimated from samples.

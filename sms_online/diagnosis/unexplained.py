@@ -11,7 +11,7 @@ from sms_online.diagnosis.evidence import basis, free_of, gain, least_squares
 from sms_online.diagnosis.residuals import RowResidual
 from sms_online.diagnosis.rows import SessionRows
 from sms_online.diagnosis.splines import DEGREE, Variable, design, spline_columns
-from sms_online.model.layout import row_types
+from sms_online.row_types import row_types
 from sms_online.stream import Array
 
 # Cubic splines on so many intervals of a variable's range.

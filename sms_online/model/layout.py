@@ -139,15 +139,3 @@ def build_layout(system: System) -> Layout:
         theta_m=tuple(theta_m),
         q_f=tuple(q_f),
     )
-
-
-def row_types(layout: Layout) -> dict[str, list[int]]:
-    """Generalized speeds by row type: `joint_i` holds the motor's torque, `link_i` what moves with link i, `base`."""
-    out = {f"joint_{i}": [theta_m] for i, theta_m in enumerate(layout.theta_m, start=1)}
-    for i, (q, theta_m, q_f) in enumerate(zip(layout.q, layout.theta_m, layout.q_f, strict=True), start=1):
-        rows = [*range(q_f.start, q_f.stop), *([q] if q != theta_m else [])]
-        if rows:
-            out[f"link_{i}"] = rows
-    if layout.n_base_speeds:
-        out["base"] = list(range(layout.n_base_speeds))
-    return out

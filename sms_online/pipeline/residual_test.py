@@ -21,9 +21,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sms_online.model.layout import Layout, row_types
+from sms_online.model.layout import Layout
 from sms_online.pipeline.momentum_fit import WhiteRows
 from sms_online.pipeline.momentum_windows import HOPS
+from sms_online.row_types import row_types
 from sms_online.stream import Array
 
 # False alarms an hour, at most: one in a hundred hours of motion.

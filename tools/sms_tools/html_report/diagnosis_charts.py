@@ -10,7 +10,7 @@ from sms_online.diagnosis.attempt import State
 from sms_online.diagnosis.diagnose import Diagnosis
 from sms_online.diagnosis.force_curves import AddedVariable, ForceCurve, added_variables, force_curves
 from sms_online.diagnosis.weak_windows import Windows
-from sms_online.model.layout import row_types
+from sms_online.row_types import row_types
 from sms_online.stream import Array
 from sms_tools.html_report.svg import Series, chart
 from sms_tools.view.known import BOUNDS
