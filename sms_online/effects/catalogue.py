@@ -1,6 +1,6 @@
 """All effects by name: what may be declared where, and from declarations to effects.
 
-A further effect is a class with an `entry`, listed in CLASSES.
+A further effect is a class with an `entry`, listed in FORCES, INERTIAS or CHANNELS.
 """
 
 from __future__ import annotations
@@ -36,8 +36,9 @@ FORCES = (
     ThrusterLeak, TableTilt, AirDrag, CableSpring, Slosh, TorqueGain, TorqueOffset,
 )  # fmt: skip
 CHANNELS = (EncoderOffset, EncoderEccentricity, SensorLag, TorqueDelay)
-CLASSES = (*FORCES, TipPayload, *CHANNELS)
-_CLASSES: tuple[type[object], ...] = CLASSES
+INERTIAS = (TipPayload,)
+CLASSES = (*FORCES, *INERTIAS, *CHANNELS)
+_CLASSES: tuple[type[object], ...] = CLASSES  # of one type, of which some are constants
 # The step from `linear` to `exact` kinematics of a link; it has no coefficients and no class.
 GEOMETRIC_STIFFENING = Entry("geometric_stiffening", "kinematics", "linear link", {}, SEPARATED_BY)
 
@@ -47,7 +48,9 @@ NAMES = tuple(ENTRIES)
 FORCE_CLASSES: dict[str, Callable[[Site, Mapping[str, float]], ForceEffect]] = {
     each.entry.name: each for each in FORCES
 }
-INERTIA_CLASSES: dict[str, Callable[[Site, Mapping[str, float]], InertiaEffect]] = {TipPayload.entry.name: TipPayload}
+INERTIA_CLASSES: dict[str, Callable[[Site, Mapping[str, float]], InertiaEffect]] = {
+    each.entry.name: each for each in INERTIAS
+}
 _CHANNELS: dict[str, Callable[[str, Mapping[str, float]], ChannelEffect]] = {each.entry.name: each for each in CHANNELS}
 # Linear coefficients of those on channels, and what becomes a constant of the description.
 LINEAR: dict[str, tuple[Linear, ...]] = {each.entry.name: each.linear for each in CHANNELS}
