@@ -51,8 +51,8 @@ class Facts:
     determined: parameters that the data determine, and of how many. undetermined: names of the others. settling: why
     the estimate will still move by more than its error bars, empty where it will not. negative: names of estimates that
     are negative and must not be. pulled: names of those that noise in the columns pulls beyond their bars. alarm: type
-    of the rows that the sequential test finds more than noise in, of a session without diagnosis. unweighed: that of the
-    joint whose torque is explained so little that rows get no weights. undecided: times, s, of changes that the
+    of the rows that the sequential test finds more than noise in, of a session without diagnosis. unweighed: that
+    of the joint whose torque is explained so little that rows get no weights. undecided: times, s, of changes that the
     session ended too early to tell. distance: from the nearest real bodies, in standard deviations. lost: share of the
     samples. troubles: whatever else, a short sentence each, such as of the devices of a live session.
     """

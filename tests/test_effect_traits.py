@@ -9,14 +9,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from guide import windage
 from model_systems import paper
 
 from sms_online.description.schema import Effect
-from sms_online.diagnosis.candidate import Candidate
 from sms_online.diagnosis.constants import is_constant
 from sms_online.effects import catalogue
-from sms_online.effects.base import Force
 from sms_online.effects.build import build_model
 from sms_online.effects.catalogue import BEGINNING, CLASSES, ENTRIES, NAMES, candidates
 
@@ -86,26 +83,6 @@ def test_what_an_effect_extends_is_one_at_the_same_place() -> None:
 def test_a_session_is_searched_for_what_may_begin_at_any_joint() -> None:
     assert BEGINNING == ("coulomb_friction", "torque_offset", "viscous_friction")
     assert {ENTRIES[name].at for name in BEGINNING} == {"joint"}
-
-
-# The guide's own effect
-
-
-@pytest.fixture
-def listed(monkeypatch: pytest.MonkeyPatch) -> type[Force]:
-    """The guide's effect in the catalogue, by nothing but its class."""
-    effect = windage()
-    monkeypatch.setitem(catalogue.ENTRIES, effect.entry.name, effect.entry)
-    monkeypatch.setitem(catalogue.FORCE_CLASSES, effect.entry.name, effect)
-    return effect
-
-
-def test_the_guide_s_drag_is_refused_where_it_is_negative(listed: type[Force]) -> None:
-    drag = next(effect for effect in candidates(paper()) if effect.name == listed.entry.name)
-    parameters = build_model(paper(effects=(drag,))).effects[0].parameters
-    candidate = Candidate(drag, parameters, np.ones((3, 2, 1)))
-    assert candidate.traits.plausible(np.array([0.3]), 1000.0)
-    assert not candidate.traits.plausible(np.array([-0.3]), 1000.0)
 
 
 # Who names whom

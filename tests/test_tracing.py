@@ -8,11 +8,15 @@ from typing import Any
 
 import numpy as np
 import pytest
+from guide import windage
+from model_systems import paper
 from numpy.typing import NDArray
 
 from sms_online.description.schema import Effect
 from sms_online.diagnosis.candidate import Candidate, LeftOpen
 from sms_online.diagnosis.trace import Tracing
+from sms_online.effects import catalogue
+from sms_online.effects.build import build_model
 from sms_online.effects.catalogue import ENTRIES
 from sms_online.model.parameters import Parameter
 from sms_online.pipeline.momentum_windows import HOPS
@@ -103,6 +107,23 @@ def test_what_does_not_hold_on_other_windows_takes_no_place(seed: int) -> None:
         [_candidate("torque_offset", column), _candidate("cogging", lasting)], 3.0 * passing + 1.5 * lasting, seed
     )
     assert found == ["cogging"]
+
+
+@pytest.mark.parametrize(("drag", "found"), [(0.3, ["windage_friction"]), (-0.3, [])])
+def test_the_guide_s_drag_is_named_unless_it_is_negative(
+    drag: float, found: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The effect of CONTRIBUTING.md in the catalogue, by its class alone, at rates of a swinging joint (seed 3)."""
+    effect = windage()
+    monkeypatch.setitem(catalogue.ENTRIES, effect.entry.name, effect.entry)
+    monkeypatch.setitem(catalogue.FORCE_CLASSES, effect.entry.name, effect)
+    declared = next(each for each in catalogue.candidates(paper()) if each.name == effect.entry.name)
+    model = build_model(paper(effects=(declared,)))
+    x, v = np.zeros((WINDOWS, model.layout.n_x)), np.zeros((WINDOWS, model.layout.n_v))
+    motor = model.layout.theta_m[0]
+    v[:, motor] = 10.0 * np.sin(np.linspace(0.0, 60.0, WINDOWS))
+    column = model.effects[0].force(model.layout, x, v, None)[:, motor, 0]
+    assert _found([_candidate(declared.name, column)], drag * column, seed=3) == found
 
 
 @pytest.mark.parametrize(("share", "second"), [(0.02, []), (0.1, ["cogging"])])
