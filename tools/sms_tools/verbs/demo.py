@@ -59,9 +59,6 @@ def _watch(args: argparse.Namespace, arm: SimulatedArm, file: Path, directory: P
     truth = {parameter.name: parameter.nominal for parameter in estimator.base.physical}
     write_truth(directory / SESSION, truth, {})
 
-    searches = SearchProcess(directory, adopt=False)
-    online = OnlineDiagnosis(estimator, searches, adopt=False)
-
     def document(throughput: float) -> Document:
         warnings = [*merger.warnings, *session.warnings]
         return document_of(estimator, throughput, warnings, truth, discrepancies=online.discrepancies)
@@ -69,15 +66,17 @@ def _watch(args: argparse.Namespace, arm: SimulatedArm, file: Path, directory: P
     console = report_console(args.json)
     show(console, Text("solving the arm's motion ahead …", style="dim"))
     with Interruption() as interruption, termination_interrupts(), ExitStack() as stack:
-        stack.enter_context(closing(searches))
+        # The view takes the estimator as it is, before anything listens to it.
+        shown = stack.enter_context(showing(args, estimator, merger.channels, directory, truth, live=session))
+        searches = stack.enter_context(closing(SearchProcess(directory, adopt=False)))
+        online = OnlineDiagnosis(estimator, searches, adopt=False)
+        shown.follow(online)
         if console.is_terminal:
             live = stack.enter_context(Live(console=console, auto_refresh=False, transient=True))
             assert system.trajectory is not None  # the arm moves
             tell = _draw(live, document, system.trajectory.duration)
         else:
             tell = _tell(console, estimator, document)
-        shown = stack.enter_context(showing(args, estimator, merger.channels, directory, truth, live=session))
-        shown.follow(online)
         for block in shown.watch(session.blocks(interruption, ended=arm.ended, ready=arm.start)):
             estimator.push(block)
             tell()
