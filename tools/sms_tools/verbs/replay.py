@@ -21,6 +21,7 @@ from sms_online.diagnosis.online import Immediate, OnlineDiagnosis
 from sms_online.stream import Block
 from sms_tools.interruption import Interruption
 from sms_tools.live.searches import searcher_of
+from sms_tools.live.signals import termination_interrupts
 from sms_tools.results_file import results_directory
 from sms_tools.session import (
     check_part,
@@ -50,7 +51,7 @@ def run(args: argparse.Namespace) -> int:
     capture: Path = args.capture
     opened = perf_counter()
     progress = _progress(capture, always=args.speed == "1")
-    with Interruption() as interruption:
+    with Interruption() as interruption, termination_interrupts():
         with progress or nullcontext():
             on_bytes = None
             if progress is not None:
