@@ -18,13 +18,21 @@ Deformation = Literal["traction", "torsion", "bending_y", "bending_z"]
 
 
 class Record(BaseModel):
-    """A frozen record: unknown keys, infinities and NaN are errors."""
+    """A frozen record: unknown keys, infinities and NaN are errors.
+
+    The docstring of each record has a line `field: meaning, unit.` for each of its fields. The site's reference of
+    system files is made of these lines, and its build fails where one is missing.
+    """
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
 
 class Inertia(Record):
-    """Moments and products of inertia about the centre of mass in body axes, kg m² (products: -∫xy dm)."""
+    """Moments and products of inertia about the centre of mass in body axes.
+
+    xx, yy, zz: moment of inertia about this axis, kg m².
+    xy, xz, yz: product of inertia, -∫xy dm and so on, kg m².
+    """
 
     xx: NonNegative = 0.0
     yy: NonNegative = 0.0
@@ -35,7 +43,12 @@ class Inertia(Record):
 
 
 class RigidBody(Record):
-    """Mass (kg), centre of mass in the body's frame (m), inertia about it (kg m²)."""
+    """A rigid body in a frame of its own.
+
+    mass: m, kg.
+    center_of_mass: its position in the body's frame, m.
+    inertia: about the centre of mass, in the body's axes.
+    """
 
     mass: NonNegative = 0.0
     center_of_mass: Vector3 = (0.0, 0.0, 0.0)
@@ -54,8 +67,10 @@ class Spacecraft(RigidBody):
 class Motor(Record):
     """Motor of a joint: stator on the link before it, rotor spinning about the joint's axis, (17).
 
-    mass: m_m, kg, rotor and stator. rotor_inertia: axial I_r before the gear, kg m². stator_inertia: I_s, kg m², with
-    the rotor's transverse inertia in it (for a rotor of revolution the two cannot be told apart).
+    mass: m_m of rotor and stator, kg.
+    rotor_inertia: I_r about the joint's axis, before the gear, kg m².
+    stator_inertia: I_s, with the rotor's transverse inertia in it: of a rotor of revolution only their sum is
+    identifiable.
     """
 
     mass: NonNegative = 0.0
@@ -64,10 +79,15 @@ class Motor(Record):
 
 
 class Joint(Record):
-    """A joint: its mount is turned by the rotation vector `mount_rotation` (rad) from the end of the link before.
+    """A joint; in brackets the units of a prismatic one.
 
-    axis: unit vector in the mount frame. gear_ratio: n (rad/m on a prismatic joint). transmission `rigid`: q = θ_m.
-    stiffness: k, N m/rad (N/m). damping: b, N m s/rad (N s/m).
+    kind: whether the joint turns or slides.
+    axis: unit vector of the joint's axis in the mount frame.
+    mount_rotation: rotation vector from the end of the link before to the mount frame, rad.
+    gear_ratio: n, turns of the motor to one of the joint (rad/m).
+    transmission: `flexible`, a spring and a damper between θ_m and q; or `rigid`, q = θ_m.
+    stiffness: k of the spring, N m/rad (N/m).
+    damping: b of the damper, N m s/rad (N s/m).
     """
 
     kind: Literal["revolute", "prismatic"] = "revolute"
@@ -80,7 +100,11 @@ class Joint(Record):
 
 
 class RigidLink(RigidBody):
-    """A rigid link; frame {i} has its origin in joint i. tip: where the next joint sits, m."""
+    """A rigid link; frame {i} has its origin in joint i.
+
+    kind: `rigid`.
+    tip: where the next joint, or the payload, is mounted, m.
+    """
 
     kind: Literal["rigid"]
     tip: Vector3 = (0.0, 0.0, 0.0)
@@ -89,11 +113,18 @@ class RigidLink(RigidBody):
 class FlexibleLink(Record):
     """A uniform flexible link along the x axis of its frame, with a marker at the end of each of its elements.
 
-    length: L, m. mass_per_length: ρA, kg/m. polar_inertia_per_length: ρI_p, kg m. axial_rigidity: EA, N.
-    flexural_rigidity_y, _z: EI_y, EI_z, N m². torsional_rigidity: GI_p, N m².
-    deformations: the active ones; bending_z bends in the x-y plane (u_y, θ_z; EI_z), bending_y in the x-z plane.
-    kinematics: `exact` (inextensible, geometrically exact) or `linear` (the paper's). tip_rotation, for `linear`:
-    exponential of the nodal rotation vector, or `first_order` as (13), (21) are printed.
+    kind: `flexible`.
+    length: L, m.
+    elements: number of elements, and of markers, equally spaced; the last one is at the tip.
+    mass_per_length: ρA, kg/m.
+    polar_inertia_per_length: ρI_p, kg m.
+    axial_rigidity: EA, N.
+    flexural_rigidity_y, flexural_rigidity_z: EI_y of bending in the x-z plane, EI_z of bending in the x-y plane, N m².
+    torsional_rigidity: GI_p, N m².
+    deformations: the active ones; bending_z bends in the x-y plane (u_y, θ_z), bending_y in the x-z plane (u_z, θ_y).
+    kinematics: `exact` (inextensible, geometrically exact) or `linear` (the paper's).
+    tip_rotation: of a `linear` link: exponential of the nodal rotation vector, or `first_order`, (13) and (21) as
+    printed.
     """
 
     kind: Literal["flexible"]
@@ -114,9 +145,13 @@ Link = Annotated[RigidLink | FlexibleLink, Field(discriminator="kind")]
 
 
 class Sensor(Record):
-    """One sensor: channels it fills (shell patterns allowed), rate Hz, latency s, resolution and noise in their unit.
+    """One sensor.
 
-    Noise is 1σ, white per sample. No rate means the system's sample_rate.
+    channels: the channels that it fills; shell patterns select several.
+    rate: samples a second, Hz; none means the system's sample_rate.
+    resolution: step of its readings, in the channel's unit.
+    noise: 1σ of its white noise per sample, in the channel's unit; 0 means that it is estimated from the samples.
+    latency: its delay behind the others, s; warned of, not corrected.
     """
 
     channels: Annotated[tuple[str, ...], Field(min_length=1)]
@@ -127,11 +162,15 @@ class Sensor(Record):
 
 
 class Signal(Record):
-    """Where a number of a device goes: channel value = scale number + offset, in the channel's unit.
+    """Where a number of a device goes: channel value = scale · number + offset.
 
-    A negative scale turns the sign. minimum, maximum: of the channel value before unwrapping; what lies outside cannot
-    be true and is dropped. wrap: an encoder counts modulo this, in the number's own unit; its turns are then counted,
-    the first sample lying in turn 0. In a system file a mere channel name is short for { channel = name }.
+    In a system file a mere channel name is short for { channel = name }.
+
+    channel: the channel that it becomes.
+    scale: the channel's unit for one count; a negative one turns the sign.
+    offset: in the channel's unit.
+    minimum, maximum: of the channel value before unwrapping, in its unit; what lies outside is dropped and counted.
+    wrap: an encoder counts modulo this, in the number's own unit; its turns are counted from the first sample on.
     """
 
     channel: str
@@ -148,14 +187,24 @@ class Signal(Record):
 
 
 class SourceRecord(Record):
-    """A device: its name in messages and recordings; latency: constant delay from the instant to the stamp, s."""
+    """A device.
+
+    name: of the device, in messages and recordings.
+    latency: constant delay from the instant of a measurement to its stamp, s; it is corrected.
+    """
 
     name: str
     latency: NonNegative = 0.0
 
 
 class CanBus(SourceRecord):
-    """A CAN bus by the names of python-can: interface, channel, bitrate in bit/s, further options of the interface."""
+    """A CAN bus by the names of python-can.
+
+    interface: python-can's name of the interface: socketcan, pcan, kvaser, slcan, gs_usb, udp_multicast, …
+    channel: python-can's name of the channel: can0, PCAN_USBBUS1, …
+    bitrate: bit/s, where the interface sets it.
+    options: further options, passed to python-can as they are.
+    """
 
     interface: str = "socketcan"
     channel: str = "can0"
@@ -164,9 +213,12 @@ class CanBus(SourceRecord):
 
 
 class CanSource(CanBus):
-    """Messages of a DBC: a file beside the system file, or a shipped one; signals: `MESSAGE.SIGNAL` to channel.
+    """Messages that a DBC describes.
 
-    counters: the signals, at most one a message, in which a sender counts its frames.
+    kind: `can`.
+    dbc: a file beside the system file, or a shipped one.
+    signals: `MESSAGE.SIGNAL` of the DBC to the channel that it becomes.
+    counters: the signals, at most one a message, in which a sender counts its frames; they show losses.
     """
 
     kind: Literal["can"]
@@ -176,10 +228,12 @@ class CanSource(CanBus):
 
 
 class CanopenSource(CanBus):
-    """Process data of CANopen nodes, as their EDS maps them; nodes: node id to EDS, a file beside the system file.
+    """Process data of CANopen nodes, as their EDS maps them.
 
-    signals: `NODE.INDEX` or `NODE.INDEX:SUBINDEX`, the index in hexadecimal as in the EDS, to channel: "1.6064" is the
-    position of the drive that is node 1.
+    kind: `canopen`.
+    nodes: node id to EDS, a file beside the system file.
+    signals: `NODE.INDEX` or `NODE.INDEX:SUBINDEX`, the index in hexadecimal as in the EDS, to the channel that it
+    becomes: "1.6064" is the position of the drive that is node 1.
     """
 
     kind: Literal["canopen"]
@@ -190,9 +244,14 @@ class CanopenSource(CanBus):
 class SerialField(Record):
     """One number of a serial frame or line: a channel, the device's time, a counter of frames, or nothing of interest.
 
-    channel … wrap: see Signal. tick: s a count, for the device's time, or for a counter of frames that are taken at a
-    constant rate. wrap: of tick or counter, where it starts again from 0; a word of a binary frame does so at its
-    width without saying.
+    channel: the channel that it becomes, if any.
+    scale: the channel's unit for one count; a negative one turns the sign.
+    offset: in the channel's unit.
+    minimum, maximum: of the channel value before unwrapping, in its unit; what lies outside is dropped and counted.
+    wrap: of an encoder as for CAN signals; of tick or counter, where it starts again from 0. A word of a binary frame
+    does so at its width without saying.
+    tick: s a count, of the device's time, or of a counter of frames that are taken at a constant rate.
+    counter: whether it counts frames; losses then show.
     """
 
     channel: str | None = None
@@ -206,13 +265,21 @@ class SerialField(Record):
 
 
 class FrameField(SerialField):
-    """A word of a binary frame, little-endian: its type is u (unsigned), i (signed) or f (IEEE float) and its bits."""
+    """A word of a binary frame, little-endian.
+
+    type: u (unsigned), i (signed) or f (IEEE float), and its bits.
+    """
 
     type: Literal["u8", "i8", "u16", "i16", "u32", "i32", "u64", "i64", "f32", "f64"]
 
 
 class SerialPort(SourceRecord):
-    """A serial port by the names of pyserial, a URL such as socket://host:port included; baudrate in bit/s."""
+    """A serial port.
+
+    kind: `serial`.
+    port: as pyserial names it, a URL such as socket://host:port included.
+    baudrate: bit/s.
+    """
 
     kind: Literal["serial"]
     port: str
@@ -224,6 +291,9 @@ class SerialFrames(SerialPort):
 
     The CRC-32 is that of Ethernet and zlib, little-endian. Source: Cheshire and Baker, IEEE/ACM Trans. Networking 7
     (1999) 159.
+
+    format: `frames`.
+    fields: the words of a frame, in order.
     """
 
     format: Literal["frames"]
@@ -231,8 +301,11 @@ class SerialFrames(SerialPort):
 
 
 class SerialLines(SerialPort):
-    """Lines of decimal numbers in ASCII, `separator` between them ("" for blanks).
+    """Lines of decimal numbers in ASCII.
 
+    format: `lines`.
+    fields: the numbers of a line, in order.
+    separator: between the numbers; "" means blanks.
     checksum: `xor` expects * and two hexadecimal digits at the end, the exclusive or of the bytes before, without a
     leading $, as NMEA 0183 has it.
     """
@@ -248,7 +321,12 @@ Source = Annotated[CanSource | CanopenSource | SerialSource, Field(discriminator
 
 
 class Effect(Record):
-    """An effect declared from the start and identified with π; its nominal coefficients serve the simulator alone."""
+    """An effect declared from the start and identified with π.
+
+    name: of the effect.
+    where: `joint_i`, `link_i`, `base`, `tip`, or a channel or shell pattern of channels.
+    coefficients: nominal values by name; the simulator alone uses them, except shape constants, which are fixed.
+    """
 
     name: str
     where: str
@@ -256,21 +334,33 @@ class Effect(Record):
 
 
 class Prior(Record):
-    """A weighed part: value ± std in the parameter's unit."""
+    """What is known of a parameter beforehand, from weighing a part for instance.
+
+    value: in the parameter's unit.
+    std: its standard deviation, in the same unit.
+    """
 
     value: float
     std: Positive
 
 
 class Controller(Record):
-    """Joint PD of the simulator, n τ = K_p (q_d - q) + K_D (q̇_d - q̇): gains per joint, N m/rad and N m s/rad."""
+    """Joint PD control of the simulator, n τ = K_p (q_d - q) + K_D (q̇_d - q̇).
+
+    stiffness: K_p of each joint, N m/rad (N/m).
+    damping: K_D of each joint, N m s/rad (N s/m).
+    """
 
     stiffness: tuple[NonNegative, ...]
     damping: tuple[NonNegative, ...]
 
 
 class Harmonic(Record):
-    """One term of a reference, sine sin(ω t) + cosine (cos(ω t) - 1): amplitudes rad (m), frequency ω rad/s."""
+    """One term of a reference, sine · sin(ω t) + cosine · (cos(ω t) - 1).
+
+    frequency: ω, rad/s.
+    sine, cosine: amplitudes, rad (m).
+    """
 
     frequency: Positive
     sine: float = 0.0
@@ -278,24 +368,51 @@ class Harmonic(Record):
 
 
 class Trajectory(Record):
-    """Reference of every joint: a Fourier series, (46) with one term; duration s."""
+    """Reference of every joint, a Fourier series; (46) has one term.
+
+    duration: of the motion, s.
+    joints: a list of harmonics for each joint; `joint_1`, `joint_2`, … in a system file.
+    """
 
     duration: Positive
     joints: tuple[tuple[Harmonic, ...], ...]
 
 
 class Windows(Record):
-    """Full widths of test functions, s. relative: of relative residuals. momentum: of the rows that are fitted."""
+    """Full widths of the test functions.
+
+    relative: of the relative residuals, s.
+    momentum: of the momentum balance's rows, which are fitted, s.
+    """
 
     relative: Positive = 0.1
     momentum: Positive = 0.4
 
 
 class System(Record):
-    """A whole testbed. No spacecraft means a fixed base. joints, motors, links are in order from the base outwards.
+    """A whole testbed; joints, motors and links are in order from the base outwards.
 
-    balance: which rows are fitted; `both` is the momentum balance, and the energy balance until its weights are known.
-    `smoother` is the smoother that knows the dynamics, which links with too few sensors get unless it says `energy`.
+    name: of the system.
+    title: a line for reports.
+    reference: where the values come from.
+    motion: `planar` (in the x-y plane) or `spatial`.
+    gravity: its vector in inertial axes, m/s².
+    sample_rate: of the estimator's grid, and of sensors that state no other, Hz.
+    spacecraft: the free-floating base; without it the base is fixed.
+    joints: `[joint_1]`, `[joint_2]`, … in a system file.
+    motors: `[motor_1]`, …; one without a table has neither mass nor inertia.
+    links: `[link_1]`, …, one for each joint.
+    payload: a rigid body at the tip of the last link, in that link's tip frame.
+    sensors: `[[sensor]]` tables.
+    sources: `[[source]]` tables, the devices of a live session.
+    effects: `[[effect]]` tables.
+    known: parameters that are known exactly, name to value in the parameter's unit; they leave the unknowns.
+    priors: parameters that are known with a standard deviation, a table `[prior]`.
+    controller: of the simulator.
+    trajectory: of the simulator.
+    windows: widths of the test functions.
+    balance: which rows are fitted. `both`: the momentum balance, and the energy balance until its weights are known.
+    `smoother`: state and parameters together, which links with too few sensors get unless it says `energy`.
     """
 
     name: str
