@@ -88,8 +88,12 @@ class Finding:
 
 @dataclass(frozen=True)
 class Ranked:
-    """A candidate in the first comparison: share of the residual's excess that it alone takes away, and its gain."""
+    """A candidate in the first comparison: its gain, and share of the residual's excess that it alone takes away.
+
+    explained: share of the whole residual, with its noise; 0 where the gain is no more than an absent candidate's.
+    """
 
     candidate: Candidate
     gain: float
     share: float
+    explained: float

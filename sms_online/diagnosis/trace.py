@@ -359,12 +359,18 @@ class Tracing:
         gains = self.gains([])
         r = free_of(basis(self._Y), self._b[:, None])[:, 0]
         # Where rows were given an error of their own, nothing may be beyond it: then shares are those of the best.
-        excess = max(float(r @ r) - r.size, *(g.gain for g in gains), float(np.finfo(np.float64).tiny))
+        whole = float(r @ r)
+        excess = max(whole - r.size, *(g.gain for g in gains), float(np.finfo(np.float64).tiny))
         best: dict[str, int] = {}
         for k, candidate in enumerate(self.candidates):
             if candidate.key not in best or gains[k].gain > gains[best[candidate.key]].gain:
                 best[candidate.key] = k
-        ranked = [Ranked(self.candidates[k], gains[k].gain, gains[k].gain / excess) for k in best.values()]
+        ranked = []
+        for k in best.values():
+            gained = gains[k].gain
+            chance = threshold(FALSE_ALARM, self.trials, self._Z[k].shape[1])
+            explained = gained / whole if gained > chance else 0.0
+            ranked.append(Ranked(self.candidates[k], gained, gained / excess, explained))
         return sorted(ranked, key=lambda entry: -entry.gain)
 
     def columns(self, chosen: Sequence[int]) -> Array:

@@ -13,12 +13,12 @@ from sms_online.diagnosis.online import OnlineDiagnosis
 from sms_online.pipeline.estimator import Estimator
 from sms_online.stream import Block
 from sms_tools.html_report.history import History
-from sms_tools.html_report.page import write_report
 from sms_tools.interruption import Interruption
 from sms_tools.live.loop import LiveSession
 from sms_tools.report import Document, report_console, show, verdict_text
 from sms_tools.view.frames import Circumstances
-from sms_tools.view.session import View, open_view, references
+from sms_tools.view.scene import Scene
+from sms_tools.view.session import View, open_view
 
 
 class Showing:
@@ -31,14 +31,12 @@ class Showing:
         view: View,
         channels: tuple[str, ...],
         directory: Path,
-        truth: Mapping[str, float] | None,
     ) -> None:
         self._args = args
         self._estimator = estimator
         self._view = view
         self._history = History(estimator, channels)
         self._directory = directory
-        self._truth = truth
 
     @property
     def notices(self) -> list[str]:
@@ -74,9 +72,13 @@ class Showing:
     def report(self, document: Document, interruption: Interruption) -> None:
         """Write the page of a finished session, say where it is and whether to trust the numbers, and keep serving the
         view while that is asked for."""
+        # Matplotlib takes a second to be imported, which nobody should wait for before a session.
+        from sms_tools.html_report.page import write_report
+
         self._history.finish()
-        compared = references(self._estimator, self._truth)
-        page = write_report(self._directory, document, self._estimator, self._history, compared, self._args.exaggerate)
+        nominal = {p.name: p.nominal for p in self._estimator.base.parameters if p.nominal}
+        scene = Scene(self._estimator.model, self._args.exaggerate)
+        page = write_report(self._directory, document, self._history.course, nominal, scene)
         show(report_console(self._args.json), f"report: {page}", "", verdict_text(document["verdict"]))
         self._view.linger(interruption)
 
@@ -103,4 +105,4 @@ def showing(
     ) as view:
         if live is not None:
             view.circumstances = lambda: Circumstances(troubles=tuple(live.troubles))
-        yield Showing(args, estimator, view, channels, directory, truth)
+        yield Showing(args, estimator, view, channels, directory)

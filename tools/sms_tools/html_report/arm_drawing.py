@@ -1,4 +1,4 @@
-"""The arm at chosen instants as SVG: seen from above in the plane, obliquely in space."""
+"""The arm at chosen instants: seen from above in the plane, obliquely in space."""
 
 from __future__ import annotations
 
@@ -6,122 +6,119 @@ import itertools
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from html import escape
 
 import numpy as np
+from markupsafe import Markup
+from matplotlib.axes import Axes
+from matplotlib.patches import Polygon
 from scipy.spatial import ConvexHull
 
 from sms_online.stream import Array
-from sms_tools.html_report.svg import path, svg
+from sms_tools.html_report.figures import Chart, drawn, ink
 from sms_tools.view.scene import Drawing, Scene
 
-SIZE = 208  # px, of one picture
-# A picture with places marked, px.
-MARKED_WIDTH, MARKED_HEIGHT = 520, 330
-MARGIN = 16.0  # px
+# Sizes, pt: of one of a row of pictures, and of a picture with places marked.
+SMALL = (180.0, 180.0)
+MARKED = (440.0, 300.0)
+MARGIN = 16.0  # pt
+# A mark's text is so far above its place, pt.
+ABOVE = 18.0
 # Directions to the right and up on the paper: of a planar arm its own axes, of a spatial one seen from above one side.
 PLANAR = np.array(((1.0, 0.0, 0.0), (0.0, 1.0, 0.0)))
 OBLIQUE = np.array(((0.92, 0.40, 0.0), (-0.20, 0.46, 0.87)))
-BASE, LINK, GHOST, JOINT, MARKER, WAY = "#c9d2dc", "#1c2733", "#9aa7b5", "#d55e00", "#009e73", "#8fc1e3"
-MARK = "#b4005a"
+# Places of the tip that are drawn, at most.
+WAY_POINTS = 200
 
 
 @dataclass(frozen=True)
 class Paper:
-    """A picture's projection.
-
-    axes (2, 3): directions to the right and up. middle (2,), m; scale, px/m; extent: of all that is drawn, m.
-    """
+    """A picture's projection onto axes (2, 3) about a middle (2,), m; size, pt; extent: of what is drawn, m."""
 
     axes: Array
     middle: Array
-    scale: float
+    size: tuple[float, float]
+    scale: float  # m/pt
     extent: float
-    width: float
-    height: float
 
     def __call__(self, points: Array) -> Array:
-        """Pixels (..., 2) of points (..., 3), m."""
-        center = np.array((self.width, self.height)) / 2.0
-        return np.asarray((points @ self.axes.T - self.middle) * self.scale * (1.0, -1.0) + center)
+        """Places (2, ...) of points (..., 3), m."""
+        return np.moveaxis(points @ self.axes.T, -1, 0)
 
 
-def arm_drawings(scene: Scene, x: Array, chosen: Sequence[int], captions: Sequence[str]) -> list[str]:
+def arm_drawings(scene: Scene, x: Array, chosen: Sequence[int], captions: Sequence[str]) -> list[Chart]:
     """Pictures of positions x (B, n_x) at chosen rows, all on one scale, with the tip's places in all rows behind."""
     drawing = scene.draw(x)
     corners = _corners(scene, drawing)
-    paper = _paper(scene, (corners[list(chosen)], *drawing.links, drawing.tip), SIZE, SIZE)
-    out = []
-    for row, caption in zip(chosen, captions, strict=True):
-        parts = _arm(paper, drawing, corners, row)
-        picture = svg(SIZE, SIZE, "".join([*parts, _scale_bar(paper)]))
-        out.append(f"<figure>{picture}<figcaption>{caption}</figcaption></figure>")
-    return out
+    paper = _paper(scene, (corners[list(chosen)], *drawing.links, drawing.tip), SMALL)
+    return [
+        Chart(caption, (), drawn(f"arm at {caption}", *SMALL, lambda axes, row=row: _arm(axes, paper, drawing, corners, row), bare=True))
+        for row, caption in zip(chosen, captions, strict=True)
+    ]
 
 
-def marked_arm(scene: Scene, x: Array, row: int, marks: Mapping[str, str]) -> str:
+def marked_arm(scene: Scene, x: Array, row: int, marks: Mapping[str, str]) -> Markup:
     """One picture of a row of x (B, n_x) with places marked: `joint_i`, `link_i`, `base`, `tip` to a mark's short text.
 
-    The tip's places in all rows stand behind.
+    The tip's places in all rows are behind.
     """
     drawing = scene.draw(x)
     corners = _corners(scene, drawing)
     shown = (corners[[row]], *(line[row] for line in drawing.links), drawing.tip)
-    paper = _paper(scene, shown, MARKED_WIDTH, MARKED_HEIGHT)
-    parts, badges = _arm(paper, drawing, corners, row), []
-    for place, text in marks.items():
-        kind, _, number = place.partition("_")
-        if kind == "link":
-            line = paper(drawing.links[int(number) - 1][row])
-            parts.append(f'<g opacity="0.35">{_line(line, MARK, 12.0)}</g>')
-            at = line[len(line) // 2]
-        elif kind == "base":
-            parts.append(
-                f'<polygon points="{_outline(paper(corners[row]))}" fill="none" stroke="{MARK}" stroke-width="3"/>'
-            )
-            at = paper(corners[row]).mean(axis=0)
-        else:
-            at = paper(drawing.tip[row] if kind == "tip" else drawing.joints[row, int(number) - 1])
-            parts.append(
-                f'<circle cx="{at[0]:.1f}" cy="{at[1]:.1f}" r="9" fill="none" stroke="{MARK}" stroke-width="3"/>'
-            )
-        badges.append(_badge(at, text, paper))
-    return svg(MARKED_WIDTH, MARKED_HEIGHT, "".join([*parts, *badges, _scale_bar(paper)]))
+    paper = _paper(scene, shown, MARKED)
+
+    def draw(axes: Axes) -> None:
+        _arm(axes, paper, drawing, corners, row)
+        for place, text in marks.items():
+            kind, _, number = place.partition("_")
+            if kind == "link":
+                line = paper(drawing.links[int(number) - 1][row])
+                axes.plot(*line, color=ink("mark"), linewidth=12.0, alpha=0.35)
+                at = line[:, line.shape[1] // 2] if line.shape[1] > 2 else line.mean(axis=1)
+            elif kind == "base":
+                axes.add_patch(_outline(paper(corners[row]), facecolor="none", edgecolor=ink("mark"), linewidth=3.0))
+                at = paper(corners[row]).mean(axis=1)
+            else:
+                at = paper(drawing.tip[row] if kind == "tip" else drawing.joints[row, int(number) - 1])
+                axes.plot(*at, "o", markersize=16.0, color="none", markeredgecolor=ink("mark"), markeredgewidth=3.0)
+            badge = {"boxstyle": "round,pad=0.35,rounding_size=0.8", "facecolor": ink("mark"), "edgecolor": "none"}
+            axes.annotate(
+                text, at, (0.0, ABOVE), textcoords="offset points", ha="center", va="center", color="white",
+                weight="bold", bbox=badge, gid="badge",
+            )  # fmt: skip
+
+    return drawn("where", *MARKED, draw, bare=True)
 
 
-def _paper(scene: Scene, shown: Sequence[Array], width: float, height: float) -> Paper:
+def _paper(scene: Scene, shown: Sequence[Array], size: tuple[float, float]) -> Paper:
     """A picture that holds all points shown, each (..., 3)."""
     axes = PLANAR if scene.model.layout.planar else OBLIQUE
     flat = np.concatenate([(points @ axes.T).reshape(-1, 2) for points in shown])
     low, high = flat.min(axis=0), flat.max(axis=0)
-    scale = float(np.min((np.array((width, height)) - 2 * MARGIN) / np.maximum(high - low, 1e-9)))
-    return Paper(axes, (low + high) / 2.0, scale, float((high - low).max()), width, height)
+    # Twice the margin above and below, for marks and the scale.
+    room = np.array(size) - MARGIN * np.array((2.0, 4.0))
+    scale = float(np.max(np.maximum(high - low, 1e-9) / room))
+    return Paper(axes, (low + high) / 2.0, size, scale, float((high - low).max()))
 
 
-def _arm(paper: Paper, drawing: Drawing, corners: Array, row: int) -> list[str]:
-    """Base, the tip's places, the rigid arm's ghost, links, joints and markers of a row."""
-    parts = [f'<polygon points="{_outline(paper(corners[row]))}" fill="{BASE}"/>']
-    parts += [_dot(point, WAY, 1.0) for point in paper(drawing.tip)]
-    parts.append(_line(paper(drawing.ghost[row]), GHOST, 1.0))
-    parts += [_line(paper(line[row]), LINK, 3.0) for line in drawing.links]
-    parts += [_dot(point, JOINT, 4.0) for point in paper(drawing.joints[row])]
-    return parts + [_dot(point, MARKER, 3.0) for point in paper(drawing.markers[row])]
+def _arm(axes: Axes, paper: Paper, drawing: Drawing, corners: Array, row: int) -> None:
+    """Base, the tip's places, the rigid arm's ghost, links, joints and markers of a row, and the scale."""
+    axes.add_patch(_outline(paper(corners[row]), color=ink("body")))
+    way = paper(drawing.tip)[:, :: -(-len(drawing.tip) // WAY_POINTS)]
+    axes.plot(*way, ".", color=ink("sky"), markersize=2.5)
+    axes.plot(*paper(drawing.ghost[row]), color=ink("grey"), linewidth=1.0)
+    for line in drawing.links:
+        axes.plot(*paper(line[row]), color=ink("ink"), linewidth=3.0, solid_capstyle="round")
+    axes.plot(*paper(drawing.joints[row]), "o", color=ink("orange"), markersize=7.0, markeredgewidth=0.0)
+    axes.plot(*paper(drawing.markers[row]), "o", color=ink("green"), markersize=5.0, markeredgewidth=0.0)
+    half = np.array(paper.size) * paper.scale / 2.0
+    axes.set_xlim(paper.middle[0] - half[0], paper.middle[0] + half[0])
+    axes.set_ylim(paper.middle[1] - half[1], paper.middle[1] + half[1])
+    _scale_bar(axes, paper)
 
 
-def _outline(box: Array) -> str:
-    """Points of the outline of a box's corners (8, 2), px."""
-    return " ".join(f"{a:.1f},{b:.1f}" for a, b in box[ConvexHull(box).vertices])
-
-
-def _badge(at: Array, text: str, paper: Paper) -> str:
-    """A text in a frame above a place, or below it where there is no room."""
-    width = 10.0 + 7.0 * len(text)
-    x = float(np.clip(at[0], width / 2.0, paper.width - width / 2.0))
-    y = at[1] + (-26.0 if at[1] > 44.0 else 26.0)
-    return (
-        f'<rect x="{x - width / 2.0:.1f}" y="{y - 9:.1f}" width="{width:.1f}" height="18" rx="9" fill="{MARK}"/>'
-        f'<text class="badge" x="{x:.1f}" y="{y + 4:.1f}">{escape(text)}</text>'
-    )
+def _outline(box: Array, **look: object) -> Polygon:
+    """The outline of a box's corners (2, 8)."""
+    return Polygon(box.T[ConvexHull(box.T).vertices], **look)
 
 
 def _corners(scene: Scene, drawing: Drawing) -> Array:
@@ -131,21 +128,10 @@ def _corners(scene: Scene, drawing: Drawing) -> Array:
     return np.asarray(drawing.base_origin[:, None] + np.einsum("bij,cj->bci", drawing.base_rotation, local))
 
 
-def _line(points: Array, color: str, width: float) -> str:
-    return path(points[:, 0], points[:, 1], color, width)
-
-
-def _dot(point: Array, color: str, radius: float) -> str:
-    return f'<circle cx="{point[0]:.1f}" cy="{point[1]:.1f}" r="{radius:g}" fill="{color}"/>'
-
-
-def _scale_bar(paper: Paper) -> str:
+def _scale_bar(axes: Axes, paper: Paper) -> None:
     """A bar of a round length, at most a third of what is drawn."""
     power = 10.0 ** math.floor(math.log10(paper.extent / 3.0))
     length = max(step * power for step in (1, 2, 5) if step * power <= paper.extent / 3.0)
-    end = MARGIN + length * paper.scale
-    y = paper.height - 6.0
-    return (
-        f'<line x1="{MARGIN:g}" x2="{end:.1f}" y1="{y:g}" y2="{y:g}" stroke="#444" stroke-width="2"/>'
-        f'<text class="tick" x="{end + 5:.1f}" y="{y + 3:g}">{length:g} m</text>'
-    )
+    left, bottom = axes.get_xlim()[0] + MARGIN * paper.scale, axes.get_ylim()[0] + MARGIN / 2.0 * paper.scale
+    axes.plot((left, left + length), (bottom, bottom), color=ink("muted"), linewidth=2.0)
+    axes.annotate(f"{length:g} m", (left + length, bottom), (5.0, 0.0), textcoords="offset points", va="center")

@@ -28,6 +28,21 @@ class Instant(Known):
     x: Array
 
 
+@dataclass(frozen=True)
+class Course:
+    """N instants t (N,), s, of a session.
+
+    estimate, std (N, n): of what was determined then, else NaN. residual (N, joints): share of the measured torque or
+    force over the last second. x (N, n_x): measured positions, NaN before every channel had a reading.
+    """
+
+    t: Array
+    estimate: Array
+    std: Array
+    residual: Array
+    x: Array
+
+
 class History:
     """Instants of one session, evenly spread over it."""
 
@@ -54,6 +69,24 @@ class History:
             self.instants.pop()
         if np.isfinite(self._t):
             self._add()
+
+    @property
+    def course(self) -> Course:
+        """What was seen, as arrays."""
+        estimator, instants = self._estimator, self.instants
+        estimate, std = np.full((2, len(instants), estimator.base.n), np.nan)
+        for k, instant in enumerate(instants):
+            # Fewer before an event has added some.
+            known = np.flatnonzero(instant.determined)
+            estimate[k, known], std[k, known] = instant.estimate[known], instant.std[known]
+        joints, n_x = len(estimator.system.joints), estimator.model.layout.n_x
+        return Course(
+            t=np.array([instant.t for instant in instants]),
+            estimate=estimate,
+            std=std,
+            residual=np.array([instant.residual for instant in instants]).reshape(-1, joints),
+            x=np.array([instant.x for instant in instants]).reshape(-1, n_x),
+        )
 
     def _look(self, block: Block) -> None:
         self._held.push(block)

@@ -22,7 +22,6 @@ from sms_online.stream import Block
 from sms_online.trackers.interface import Prior
 from sms_tools.adopted_system import added_lines, adopted_text, cells_of, remarks, write_adopted
 from sms_tools.exit_codes import NOTHING_DETERMINED, OK
-from sms_tools.html_report.diagnosis_page import write_diagnosis
 from sms_tools.interruption import Interruption
 from sms_tools.priors import base_prior
 from sms_tools.report import Document, parameter_table, report_console, show, verdict_text
@@ -84,6 +83,9 @@ def run(args: argparse.Namespace) -> int:
         text = adopted_text(args.system, system, diagnosis.after.system, remarks(document["effects"]))
         added = added_lines(args.system, text)
         lines.append(f"system file with what was found: {write_adopted(directory, text)}")
+    # Matplotlib takes a second to be imported, which nobody should wait for before the diagnosis.
+    from sms_tools.html_report.diagnosis_page import write_diagnosis
+
     page = write_diagnosis(directory, document, diagnosis, args.capture.name, added)
     show(console, *lines, f"diagnosis: {path}", f"page: {page}", "", verdict_text(document["judgement"]))
     if args.json:

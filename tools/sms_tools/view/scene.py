@@ -19,6 +19,8 @@ PLATE_DEPTH = 0.03
 UNKNOWN_REACH = 1.0
 # A fixed base is drawn as a cube with this share of the arm's reach as half its side.
 PEDESTAL = 0.06
+# A last link whose description states no point but its joint is drawn so long, as a share of the arm's reach.
+STUB = 0.15
 DISPLACEMENTS = ("u_x", "u_y", "u_z")
 
 
@@ -27,8 +29,9 @@ class Drawing:
     """B pictures of an arm, in m.
 
     S (B, 3); base_rotation (B, 3, 3); base_origin (B, 3): joint 1, the origin of {0}. joints (B, joints, 3). links:
-    for each link its line (B, P, 3), from joint to end. ghost (B, G, 3): the same arm if it were rigid. markers
-    (B, M, 3). tip (B, 3): the end of the last link.
+    for each link its line (B, P, 3), from joint to end, of a prismatic joint from where it is mounted. A rigid link
+    without a stated tip ends in its centre of mass. ghost (B, G, 3): the same arm if it were rigid. markers (B, M, 3).
+    tip (B, 3): the end of the last link's line.
     """
 
     S: Array
@@ -53,7 +56,8 @@ class Scene:
         self.model = model
         self.exaggeration = exaggeration
         system = model.system
-        self.reach = float(sum(_length(link) for link in system.links)) or UNKNOWN_REACH
+        self._ends = [_extent(link) for link in system.links]
+        self.reach = float(np.linalg.norm(self._ends, axis=1).sum()) or UNKNOWN_REACH
         if system.spacecraft is None:
             self.box = (np.zeros(3), np.full(3, PEDESTAL * self.reach))
         else:
@@ -63,6 +67,9 @@ class Scene:
             if model.layout.planar:
                 center[2], half[2] = -PLATE_DEPTH * self.reach, 0.0
             self.box = (center, half)
+        if not self._ends[-1].any() and system.joints[-1].kind == "revolute":
+            # Across the axis, so that its turning is seen.
+            self._ends[-1] = STUB * self.reach * np.eye(3)[np.argmin(np.abs(system.joints[-1].axis))]
         self.markers = tuple(
             (i, j)
             for i, link in enumerate(system.links, start=1)
@@ -81,16 +88,18 @@ class Scene:
         configuration = self.model.chain.configure(shown)
         frames = configuration.frames
         n = len(self.model.system.joints)
-        rigid = self.model.chain.configure(self._with_deflections(x, 0.0)).frames
+        rigid = self.model.chain.configure(self._with_deflections(x, 0.0))
+        links = tuple(self._line(configuration, i) for i in range(n))
+        ghost = [*(rigid.frames[2 * i + 2].origin for i in range(n)), self._line(rigid, n - 1)[:, -1]]
         return Drawing(
             S=configuration.r_S,
             base_origin=frames[0].origin,
             base_rotation=frames[0].rotation,
             joints=np.stack([frames[2 * i + 2].origin for i in range(n)], axis=1),
-            links=tuple(self._line(configuration, i) for i in range(n)),
-            ghost=np.stack([*(rigid[2 * i + 2].origin for i in range(n)), rigid[-1].origin], axis=1),
+            links=links,
+            ghost=np.stack(ghost, axis=1),
             markers=self._markers(configuration),
-            tip=frames[-1].origin,
+            tip=links[-1][:, -1],
         )
 
     def _with_deflections(self, x: Array, factor: float) -> Array:
@@ -102,12 +111,14 @@ class Scene:
 
     def _line(self, configuration: Configuration, i: int) -> Array:
         """Axis of link i (from 0): its ends, and between them the points at which the model integrates its shape."""
-        link, end = configuration.frames[2 * i + 2 : 2 * i + 4]
+        mount, link, end = configuration.frames[2 * i + 1 : 2 * i + 4]
+        start = [mount.origin] if self.model.system.joints[i].kind == "prismatic" else []
         shape = configuration.shape(i)
         if shape is None:
-            return np.stack((link.origin, end.origin), axis=1)
+            return np.stack((*start, link.origin, link.origin + link.rotation @ self._ends[i]), axis=1)
         inner = link.origin[:, None] + np.einsum("bij,bgj->bgi", link.rotation, shape.points)
-        return np.concatenate((link.origin[:, None], inner, end.origin[:, None]), axis=1)
+        ends = np.stack((*start, link.origin), axis=1)
+        return np.concatenate((ends, inner, end.origin[:, None]), axis=1)
 
     def _markers(self, configuration: Configuration) -> Array:
         """Markers (B, M, 3): their displacements from the straight link, turned to inertial axes."""
@@ -129,5 +140,8 @@ class Scene:
         return np.concatenate(points, axis=1)
 
 
-def _length(link: RigidLink | FlexibleLink) -> float:
-    return link.length if isinstance(link, FlexibleLink) else float(np.linalg.norm(link.tip))
+def _extent(link: RigidLink | FlexibleLink) -> Array:
+    """What a link is drawn to while it is straight, (3,) in its frame, m; the origin where nothing is stated."""
+    if isinstance(link, FlexibleLink):
+        return np.array((link.length, 0.0, 0.0))
+    return np.array(link.tip if any(link.tip) else link.center_of_mass)
