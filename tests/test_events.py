@@ -15,13 +15,13 @@ from sms_online.description.schema import Effect, Inertia, RigidBody, System
 from sms_online.effects.build import build_model
 from sms_online.model.base_parameters import find_base_parameters
 from sms_online.pipeline.estimator import Estimator
-from sms_online.pipeline.event_hypotheses import opened
 from sms_online.pipeline.events import Event
 from sms_online.pipeline.momentum_balance import MARGIN
 from sms_online.pipeline.momentum_windows import HOPS
 from sms_online.results import judged, results_document, standard_deviation
 from sms_online.stream import Array, Block
 from sms_online.trackers.factor import solve, triangular_factor
+from sms_online.trackers.information import Information
 from sms_sim.simulate import Simulation
 from sms_tools.report import trust_lines
 
@@ -239,12 +239,12 @@ def test_an_opened_parameter_takes_nothing_from_the_others() -> None:
     rng = np.random.default_rng(8)
     before, after = rng.standard_normal((2, 40, 4))
     jumped = 1
-    factor = triangular_factor(opened(triangular_factor(before), [jumped]), after)
+    found = Information.none(3).with_rows(before).without([jumped]).with_rows(after).solution()
     apart = np.zeros((40, 5))
     apart[:, [0, 3, 2, 4]] = before
     batch = triangular_factor(apart, np.insert(after, 3, 0.0, axis=1))
-    assert solve(factor).pi == pytest.approx(solve(batch).pi[:3], rel=1e-10)
-    assert solve(factor).covariance() == pytest.approx(solve(batch).covariance()[:3, :3], rel=1e-9, abs=1e-12)
+    assert found.pi == pytest.approx(solve(batch).pi[:3], rel=1e-10)
+    assert found.covariance() == pytest.approx(solve(batch).covariance()[:3, :3], rel=1e-9, abs=1e-12)
 
 
 def test_windows_are_only_smoothed_with_samples_of_their_own_side() -> None:

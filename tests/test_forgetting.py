@@ -6,6 +6,7 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
+from batch_solution import batch_least_squares
 from tracker_rows import ALL_FORGETTING, PI_TRUE, TRACKERS, N, exciting_rows, ill_conditioned_rows, kalman, rows_of
 
 from sms_online.stream import Array
@@ -18,7 +19,6 @@ from sms_online.trackers import (
     RecursiveLeastSquares,
     Rows,
     SlidingWindow,
-    batch_least_squares,
 )
 from sms_online.trackers.memory import BLOCK_ROWS
 

@@ -2,19 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 import pytest
+from batch_solution import batch_least_squares
 from scipy.signal import lfilter
-from tracker_rows import ALL_FORGETTING, PI_TRUE, TRACKERS, N, exciting_rows, ill_conditioned_rows, rows_of
+from tracker_rows import ALL_FORGETTING, PI_TRUE, TRACKERS, N, exciting_rows, ill_conditioned_rows, kalman, rows_of
 
 from sms_online.stream import Array
 from sms_online.trackers import (
     Directional,
     Exponential,
     Forgetting,
+    Information,
     KalmanTracker,
     NoForgetting,
     Prior,
@@ -22,7 +25,6 @@ from sms_online.trackers import (
     Rows,
     SlidingWindow,
     Tracker,
-    batch_least_squares,
 )
 from sms_online.trackers.memory import BLOCK_ROWS
 
@@ -145,6 +147,56 @@ def test_a_state_that_does_not_fit_is_refused_and_leaves_the_tracker_as_it_was()
     with pytest.raises(ValueError, match="saved tracker state"):
         tracker.restore(RecursiveLeastSquares(N, SlidingWindow(100)).state())
     assert np.array_equal(tracker.estimate().pi, before)
+
+
+@pytest.mark.parametrize("name", TRACKERS)
+def test_a_tracker_goes_on_from_what_others_know(name: str, tmp_path: Path) -> None:
+    """As when a session goes on with further parameters: what was known of the old ones is known to a new tracker."""
+    rows = exciting_rows(seed=18, count=640)
+    known = Information.none(N - 1).with_rows(rows.whitened(N)[:, 1:]).widened(1)
+    tracker = TRACKERS[name]()
+    tracker.update(exciting_rows(seed=19, count=100, pi=-PI_TRUE))
+    tracker.begin(known)
+    estimate, expected = tracker.estimate(), known.solution()
+    assert list(estimate.determined) == [True] * (N - 1) + [False]
+    np.testing.assert_allclose(estimate.pi[:-1], expected.pi[:-1], rtol=1e-4)
+    np.testing.assert_allclose(estimate.std[:-1], np.sqrt(np.diag(expected.covariance()))[:-1], rtol=1e-4)
+    assert estimate.rows == 640
+    restored = TRACKERS[name]()
+    np.savez(tmp_path / "state.npz", **tracker.state())  # type: ignore[arg-type]
+    with np.load(tmp_path / "state.npz") as file:
+        restored.restore(dict(file))
+    later = exciting_rows(seed=20, count=320)
+    for each in (tracker, restored):
+        each.update(later)
+    assert_same_bits(tracker, restored)
+    assert tracker.estimate().determined.all()
+    with pytest.raises(ValueError, match=f"information of {N - 1} parameters"):
+        tracker.begin(Information.none(N - 1))
+
+
+@pytest.mark.parametrize("build", [TRACKERS["NoForgetting"], partial(kalman, process_std=0.0)])
+def test_rows_known_beforehand_count_like_rows_taken_in(build: Callable[[], Tracker]) -> None:
+    before, after = exciting_rows(seed=21, count=96), exciting_rows(seed=22, count=64)
+    begun, taken = build(), build()
+    begun.begin(Information.none(N).with_rows(before.whitened(N)))
+    taken.update(before)
+    for each in (begun, taken):
+        each.update(after)
+    one, other = begun.estimate(), taken.estimate()
+    np.testing.assert_allclose(one.pi, other.pi, rtol=1e-10)
+    np.testing.assert_allclose(one.covariance, other.covariance, rtol=1e-9, atol=1e-15)
+    np.testing.assert_allclose(one.rss, other.rss, rtol=1e-9)
+    assert (one.rows, one.dof) == (other.rows, other.dof)
+
+
+def test_a_window_forgets_what_was_known_beforehand() -> None:
+    tracker, fresh = (RecursiveLeastSquares(N, SlidingWindow(100)) for _ in range(2))
+    tracker.begin(Information.none(N).with_rows(exciting_rows(seed=23, count=64, pi=-PI_TRUE).whitened(N)))
+    later = exciting_rows(seed=24, count=200)
+    for each in (tracker, fresh):
+        each.update(later)
+    assert_same_bits(tracker, fresh)
 
 
 @pytest.mark.parametrize("name", TRACKERS)

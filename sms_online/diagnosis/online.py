@@ -31,8 +31,7 @@ from sms_online.pipeline.momentum import Momentum
 from sms_online.pipeline.momentum_balance import MARGIN
 from sms_online.pipeline.synchronise import GridSamples
 from sms_online.row_types import joint_rows
-from sms_online.stream import Array
-from sms_online.trackers.factor import solve
+from sms_online.trackers.information import Information
 
 # Times are in units of the windows of the momentum balance, those of 0.4 s at least.
 SHORTEST_UNIT = 0.4
@@ -79,12 +78,11 @@ class Immediate:
 @dataclass(frozen=True)
 class _Onset:
     """Grid indices: the effect is absent up to `last`, None where it may always have been there, and present from
-    `first`. factor, windows: what is known from before."""
+    `first`. known: from before."""
 
     last: int | None
     first: int
-    factor: Array
-    windows: int
+    known: Information
 
 
 class OnlineDiagnosis:
@@ -222,10 +220,9 @@ class OnlineDiagnosis:
             return
         seen = detector.before(last) if last >= 0 else None
         if seen is None or last - self._valid < LEAST_BEFORE * self._unit:
-            n = self._estimator.base.n
-            self._onset = _Onset(None, self._valid, np.zeros((n + 1, n + 1)), 0)
+            self._onset = _Onset(None, self._valid, Information.none(self._estimator.base.n))
         else:
-            self._onset = _Onset(last, first, seen.factor, seen.windows)
+            self._onset = _Onset(last, first, seen.known)
         began = None if self._onset.last is None else self._time(0.5 * (last + first))
         self._due = 0
         self.episodes.append(Episode(self._now, row, began))
@@ -268,7 +265,7 @@ class OnlineDiagnosis:
             earliest = max(self._valid, onset.last - round(BEFORE * self._unit))
             before = self._segments(earliest, onset.last)
         after = self._segments(onset.first, None)
-        beta = solve(onset.factor).pi if before else estimator.estimate().pi
+        beta = onset.known.solution().pi if before else estimator.estimate().pi
         momentum = self._momentum
         assert momentum.sensor_noise is not None
         if not after:
@@ -322,10 +319,9 @@ class OnlineDiagnosis:
         episode.refused = refusal(estimator.model, outcome.named)
         if episode.refused is not None:
             return
-        n = estimator.base.n
-        first, known = onset.first, (onset.factor, onset.windows)
+        first, known = onset.first, onset.known
         if not outcome.began or onset.last is None:
-            first, known = self._valid, (np.zeros((n + 1, n + 1)), 0)
+            first, known = self._valid, Information.none(estimator.base.n)
         last = self._record[-1].segment
         newest = joined(self._record)[last]
         late = newest.index >= first

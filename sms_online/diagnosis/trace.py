@@ -21,8 +21,8 @@ from sms_online.diagnosis.evidence import Gain, basis, free_of, gain, least_squa
 from sms_online.diagnosis.rows import SessionRows
 from sms_online.pipeline.momentum_windows import HOPS
 from sms_online.stream import Array
-from sms_online.trackers.factor import prior_factor, solve
-from sms_online.trackers.interface import Prior
+from sms_online.trackers.factor import solve
+from sms_online.trackers.interface import Prior, prior_factor
 
 # Probability that a session without any effect beyond the model shows one.
 FALSE_ALARM = 0.01

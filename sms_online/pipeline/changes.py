@@ -22,9 +22,7 @@ from sms_online.pipeline.event_hypotheses import (
     explain,
     extended,
     hypotheses,
-    opened,
     restricted,
-    widened,
 )
 from sms_online.pipeline.event_instant import event_instant
 from sms_online.pipeline.events import REMEMBERED, ChangeDetector, Event, Seen
@@ -36,7 +34,7 @@ from sms_online.pipeline.sensor_noise import SensorNoise
 from sms_online.pipeline.synchronise import GridSamples
 from sms_online.pipeline.weighing import Weighing
 from sms_online.stream import Array
-from sms_online.trackers.factor import solve
+from sms_online.trackers.information import Information
 from sms_online.trackers.interface import Prior
 
 # Windows after the event that a decision takes, and where two hypotheses remain, or a gap comes.
@@ -53,14 +51,13 @@ PASSES = 2
 class Adoption:
     """What the session goes on with after an event.
 
-    base: its parameters, of `model`. factor (n + 1, n + 1): what is known of them, from so many `windows`. weights
-    (n,): values behind the weights of the rows to come. samples: those after the event.
+    base: its parameters, of `model`. known: what is known of them. weights (n,): values behind the weights of the rows
+    to come. samples: those after the event.
     """
 
     model: Model
     base: BaseParameters
-    factor: Array
-    windows: int
+    known: Information
     weights: Array
     samples: GridSamples
 
@@ -141,9 +138,9 @@ class Changes:
         time = start_time + 0.5 * (onset + self.detector.alarm) / self._system.sample_rate
         dropped = sum(seen.end > before.end for seen in self.detector.history)
         self.events.append(Event(time, "undecided", (), (), (), (), dropped))
-        weights = solve(before.factor).pi
+        weights = before.known.solution().pi
         nothing = GridSamples(self._index[:0], self._values[:0], self._segment)
-        return Adoption(self.model, self.base, before.factor, before.windows, weights, nothing)
+        return Adoption(self.model, self.base, before.known, weights, nothing)
 
     def _explain(self, model: Model, base: BaseParameters, before: Seen, start: int, noise: SensorNoise) -> Explanation:
         n = self.base.n
@@ -153,16 +150,16 @@ class Changes:
         balance = MomentumBalance(model, base, self._system.sample_rate, self._system.windows.momentum)
         windows, instants = balance.push(self._index[after], [self._sensing.motion(values)] * COPIES, noise.coordinates)
         weights = np.zeros(base.n)
-        weights[:n] = solve(before.factor).pi
+        weights[:n] = before.known.solution().pi
         # What the rows before left decides, where it is more than noise.
-        freedom = max(1, before.windows * model.layout.n_v - n)
-        left = max(1.0, abs(before.factor[-1, -1]) / np.sqrt(freedom))
+        factor = before.known.factor
+        left = max(1.0, abs(factor[-1, -1]) / np.sqrt(max(1, before.known.rows - n)))
         new_weighing = partial(Weighing, model, base, balance, self._sensing.displacements)
         for _ in range(PASSES):
             fit = MomentumFit(model, base, balance, new_weighing, weights.copy)
             fit.go_on(weights, noise)
             rows = np.concatenate([white.Y for white in fit.push(windows, instants, noise)])
-            explanation = explain(before.factor / left, rows / left, jumps)
+            explanation = explain(factor / left, rows / left, jumps)
             weights = np.zeros(base.n)
             weights[:n] = explanation.beta
             if explanation.jump is not None:
@@ -195,12 +192,13 @@ class Changes:
         names = [p.name for p in self.base.parameters]
         jumped = [names.index(base.parameters[k].name) for k in columns]
         weights = np.zeros(self.base.n)
-        weights[:n] = explanation.beta if jumped else solve(before.factor).pi
+        weights[:n] = explanation.beta if jumped else before.known.solution().pi
         weights[jumped] += explanation.sizes[: len(jumped)]
-        factor = widened(before.factor, len(fresh))
         reach = last + self.window_samples
         # What no hypothesis explains leaves nothing of what was known.
-        factor = np.zeros_like(factor) if jump is None else opened(factor, jumped)
+        known = Information.none(self.base.n)
+        if jump is not None:
+            known = before.known.widened(len(fresh)).without(jumped)
         event = Event(
             time=start_time + at / self._system.sample_rate,
             kind="unexplained" if jump is None else jump.kind,
@@ -214,27 +212,26 @@ class Changes:
         after = self._index >= max(last, self._clear)
         samples = GridSamples(self._index[after], self._values[after], self._segment)
         self.detector = self._new_detector()
-        self.detector.begin(factor, before.windows if jump is not None else 0)
-        return Adoption(self.model, self.base, factor, self.detector.windows, weights, samples)
+        self.detector.begin(known)
+        return Adoption(self.model, self.base, known, weights, samples)
 
     def adopt(
-        self, effects: Sequence[Effect], event: Event, known: tuple[Array, int], weights: Array, samples: GridSamples
+        self, effects: Sequence[Effect], event: Event, known: Information, weights: Array, samples: GridSamples
     ) -> Adoption:
         """Go on with effects that the model lacked: forces without internal states, or a payload.
 
-        event: what is to be told of it; its parameters are the effects' own. known: factor (n + 1, n + 1) of the rows
-        that they had no part in, and the number of windows behind it. weights (n + c,): of the parameters, then the
-        effects'. samples: those of the session's last segment that hold the effects.
+        event: what is to be told of it; its parameters are the effects' own. known: from rows that they had no part
+        in. weights (n + c,): of the parameters, then the effects'. samples: those of the session's last segment that
+        hold the effects.
         """
-        factor, windows = known
         self._added += event.parameters
         self._follow_adopted((*self.adopted, *effects))
-        factor = widened(factor, len(event.parameters))
+        known = known.widened(len(event.parameters))
         self.events.append(event)
         self._clear, self._wanted = int(samples.index[0]), DECISION
         self.detector = self._new_detector()
-        self.detector.begin(factor, windows)
-        return Adoption(self.model, self.base, factor, windows, weights, samples)
+        self.detector.begin(known)
+        return Adoption(self.model, self.base, known, weights, samples)
 
     def _follow_adopted(self, adopted: tuple[Effect, ...]) -> None:
         fresh = adopted[len(self.adopted) :]

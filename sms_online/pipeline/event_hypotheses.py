@@ -20,7 +20,7 @@ from sms_online.model.base_parameters import BaseParameters
 from sms_online.model.model import Model
 from sms_online.model.parameters import Parameter
 from sms_online.stream import Array
-from sms_online.trackers.factor import RANK_TOLERANCE, solve, triangular_factor
+from sms_online.trackers.factor import solve
 
 # What a further jump must take off the residual sum of squares: 1e-5 of all noise does; and this share of what the
 # event has put there, for the rows' own errors of second order.
@@ -193,24 +193,3 @@ def explain(factor: Array, rows: Array, jumps: list[Jump]) -> Explanation:
     noise = EXPLAINED * (freedom + SCATTER * np.sqrt(2.0 * freedom))
     explained = bool(rss <= noise) or beyond_noise <= UNEXPLAINED
     return Explanation(best, fitted.pi[n:], std[n:], fitted.pi[:n], explained, decisive)
-
-
-def opened(factor: Array, columns: Iterable[int]) -> Array:
-    """The information that is left of a factor when nothing is known of some parameters any more."""
-    columns = list(columns)
-    others = [k for k in range(len(factor)) if k not in columns]
-    norm = np.linalg.norm(factor[:, columns], axis=0)
-    U, s, _ = np.linalg.svd(factor[:, columns] / np.where(norm > 0.0, norm, 1.0))
-    # What the opened parameters do not reach is what the others know without them.
-    rank = int(np.count_nonzero(s > RANK_TOLERANCE))
-    out = np.zeros_like(factor)
-    out[: len(factor) - rank, others] = U[:, rank:].T @ factor[:, others]
-    return triangular_factor(out)
-
-
-def widened(factor: Array, more: int) -> Array:
-    """A factor (n + 1, n + 1) with `more` parameters appended, of which nothing is known."""
-    n = len(factor) - 1
-    out = np.zeros((n + more + 1, n + more + 1))
-    out[: n + 1, :n], out[: n + 1, -1] = factor[:, :n], factor[:, -1]
-    return triangular_factor(out)

@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 from sms_online.pipeline.momentum_fit import WhiteRows
 from sms_online.stream import Array
 from sms_online.trackers.factor import triangular_factor
+from sms_online.trackers.information import Information
 
 # Time before the first test, s, and after an event before the next: a motion must have shown what the model lacks.
 WARM_UP = 4.0
@@ -73,33 +74,32 @@ class Event:
 class Seen:
     """A window that the test has seen: its rows before whitening across windows, and the information after it.
 
-    end: grid index of its last sample. raw (n_v, n + 1), covariance (n_v, n_v): as in WhiteRows. factor
-    (n + 1, n + 1): of all rows taken in up to and with this window. windows: how many they are.
+    end: grid index of its last sample. raw (n_v, n + 1), covariance (n_v, n_v): as in WhiteRows. known: information of
+    all rows taken in up to and with this window.
     """
 
     end: int
     raw: Array
     covariance: Array
-    factor: Array
-    windows: int
+    known: Information
 
 
 class ChangeDetector:
     """Sequential test of windows against the estimate before them.
 
-    hop: from one window to the next, s. factor (n + 1, n + 1): square-root information of the rows taken in. history:
-    the last windows, oldest first. alarm: grid index that an event is surely before, None while nothing has changed.
-    onset: grid index of the last window that is surely undisturbed.
+    hop: from one window to the next, s. known: information of the rows taken in. history: the last windows, oldest
+    first. alarm: grid index that an event is surely before, None while nothing has changed. onset: grid index of the
+    last window that is surely undisturbed.
     """
 
     def __init__(self, n: int, n_v: int, hop: float) -> None:
         self._n_v = n_v
         self._warm_up = round(WARM_UP / hop)
-        self.begin(np.zeros((n + 1, n + 1)), 0)
+        self.begin(Information.none(n))
 
-    def begin(self, factor: Array, windows: int) -> None:
-        """Start, or continue after an event, with the information of so many windows."""
-        self.factor, self.windows = factor, windows
+    def begin(self, known: Information) -> None:
+        """Start, or continue after an event, with what is known by then."""
+        self.known = known
         self.history: deque[Seen] = deque(maxlen=REMEMBERED)
         self.alarm: int | None = None
         self.onset = -1
@@ -117,9 +117,8 @@ class ChangeDetector:
         if self.alarm is None:
             self._test(rows, misfit)
         if self.alarm is None:
-            self.factor = triangular_factor(self.factor, rows.Y)
-            self.windows += 1
-        self.history.append(Seen(rows.end, rows.raw, rows.covariance, self.factor, self.windows))
+            self.known = self.known.with_rows(rows.Y)
+        self.history.append(Seen(rows.end, rows.raw, rows.covariance, self.known))
         return self.alarm is None
 
     def _test(self, rows: WhiteRows, misfit: bool) -> None:
@@ -143,7 +142,7 @@ class ChangeDetector:
         own = scipy.linalg.solve_triangular(L, rows.raw, lower=True, check_finite=False)
         # What the rows add to the residual sum of squares is χ² of their innovations, with the estimate's own
         # uncertainty counted; directions that nothing is known of add nothing.
-        known = self.factor.copy()
+        known = self.known.factor.copy()
         known[-1, -1] = 0.0
         chi2 = float(triangular_factor(known, own)[-1, -1] ** 2)
         if self._sum == 0.0:
@@ -161,25 +160,28 @@ class ChangeDetector:
 
     def state(self) -> dict[str, Any]:
         """What `restore` needs to continue."""
-        n1, alarm = len(self.factor), -1 if self.alarm is None else self.alarm
+        n1, alarm = len(self.known.factor), -1 if self.alarm is None else self.alarm
         return {
-            "factor": self.factor,
-            "numbers": np.array([self.windows, alarm, self.onset, self._tested, self._loud]),
+            "factor": self.known.factor,
+            "numbers": np.array([self.known.rows, alarm, self.onset, self._tested, self._loud]),
             "sums": np.array([self._sum, self._level, self._levels]),
-            "seen_end": np.array([(seen.end, seen.windows) for seen in self.history], dtype=np.int64).reshape(-1, 2),
+            "seen_end": np.array([(seen.end, seen.known.rows) for seen in self.history], dtype=np.int64).reshape(-1, 2),
             "seen_raw": np.array([seen.raw for seen in self.history]).reshape(-1, self._n_v, n1),
             "seen_covariance": np.array([s.covariance for s in self.history]).reshape(-1, self._n_v, self._n_v),
-            "seen_factor": np.array([seen.factor for seen in self.history]).reshape(-1, n1, n1),
+            "seen_factor": np.array([seen.known.factor for seen in self.history]).reshape(-1, n1, n1),
         }
 
     def restore(self, state: Mapping[str, NDArray[Any]]) -> None:
         """Continue from a saved state."""
-        self.factor = np.array(state["factor"])
-        self.windows, alarm, self.onset, self._tested, self._loud = (int(number) for number in state["numbers"])
+        rows, alarm, self.onset, self._tested, self._loud = (int(number) for number in state["numbers"])
+        self.known = Information(np.array(state["factor"]), rows)
         self.alarm = None if alarm < 0 else alarm
         self._sum, self._level, self._levels = (float(number) for number in state["sums"])
         entries = zip(state["seen_end"], state["seen_raw"], state["seen_covariance"], state["seen_factor"], strict=True)
         self.history = deque(
-            (Seen(int(end), np.array(raw), np.array(C), np.array(F), int(w)) for (end, w), raw, C, F in entries),
+            (
+                Seen(int(end), np.array(raw), np.array(C), Information(np.array(factor), int(rows)))
+                for (end, rows), raw, C, factor in entries
+            ),
             maxlen=REMEMBERED,
         )

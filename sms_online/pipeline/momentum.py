@@ -41,7 +41,7 @@ NOISE_RENEWED = 1.0
 class Momentum:
     """Balance, weights and tracker of one session.
 
-    tracker: square-root RLS, fed with rows of unit variance. bias: what noise in the columns does to the estimate. fit:
+    tracker: fed with rows of unit variance. bias: what noise in the columns does to the estimate. fit:
     what makes rows independent, and its sums. windows: how many it took since the last event. latencies: of the
     sources, since then too. test: whether rows leave more than noise, likewise. changes: events, and the model and
     parameters that the session goes on with after them. prior: what is known of the described ones beforehand.
@@ -76,10 +76,10 @@ class Momentum:
         displacements, sources, clocks = self.sensing.displacements, self._sources, self._clocks
         new_weighing = partial(Weighing, model, base, self._balance, displacements, sources, clocks)
         self.fit = MomentumFit(model, base, self._balance, new_weighing, self._solved)
-        self.tracker: Tracker = self._new_tracker()
+        self.tracker = self._new_tracker()
         self.test = SequentialTest(model.layout, self._balance.span / HOPS)
 
-    def _new_tracker(self) -> RecursiveLeastSquares:
+    def _new_tracker(self) -> Tracker:
         prior = None if self.prior is None else self.changes.prior(self.prior)
         return RecursiveLeastSquares(self.changes.base.n, prior=prior, scaled_by_residual=prior is not None)
 
@@ -178,8 +178,7 @@ class Momentum:
         bias.widen(adoption.base.n - bias.parameters)
         self._build()
         self.bias = bias
-        rows = float(adoption.windows * adoption.model.layout.n_v)
-        self.tracker.restore({**self.tracker.state(), "factor": adoption.factor, "rows": rows})
+        self.tracker.begin(adoption.known)
         self.fit.go_on(adoption.weights, noise)
         if adoption.samples.index.size:
             self._process(adoption.samples, noise)
@@ -212,7 +211,7 @@ class Momentum:
                 continue
             detector = self.changes.detector
             if self.sensor_noise is not None and not self.sensor_noise.exact:
-                self.test.push(rows, detector.factor)
+                self.test.push(rows, detector.known.factor)
             if not detector.push(rows, self.misfit):
                 continue
             t = self._start_time + rows.end / self._sample_rate

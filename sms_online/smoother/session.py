@@ -19,8 +19,8 @@ from sms_online.sensor_set import Readings, readable_channels
 from sms_online.smoother.fit import DivergedError, SpanFit, SpanSmoother
 from sms_online.smoother.span import Span
 from sms_online.stream import Array, Block
-from sms_online.trackers.factor import prior_factor, solve, triangular_factor
-from sms_online.trackers.interface import Estimate, Prior
+from sms_online.trackers.factor import solve, triangular_factor
+from sms_online.trackers.interface import Estimate, Prior, prior_factor
 
 # Length of a span, s. Its first state is unknown, which costs some information; its arrays take some 10 MB a second.
 SPAN = 10.0

@@ -1,7 +1,7 @@
 """Trackers: recursive estimators of π from rows of the balances."""
 
-from sms_online.trackers.batch import batch_least_squares
 from sms_online.trackers.forgetting import Directional, Exponential, Forgetting, NoForgetting, SlidingWindow
+from sms_online.trackers.information import Information
 from sms_online.trackers.interface import Estimate, Prior, Rows, State, Tracker
 from sms_online.trackers.kalman import KalmanTracker
 from sms_online.trackers.square_root import RecursiveLeastSquares
@@ -11,6 +11,7 @@ __all__ = [
     "Estimate",
     "Exponential",
     "Forgetting",
+    "Information",
     "KalmanTracker",
     "NoForgetting",
     "Prior",
@@ -19,5 +20,4 @@ __all__ = [
     "SlidingWindow",
     "State",
     "Tracker",
-    "batch_least_squares",
 ]

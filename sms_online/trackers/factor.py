@@ -17,7 +17,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from sms_online.stream import Array
-from sms_online.trackers.interface import Prior
 
 # Scaled singular values below this times the largest are rounding: QR leaves a few 1e-15, and even a balance of scaled
 # condition 1e9 is four decades better than rounding.
@@ -39,19 +38,6 @@ def triangular_factor(*stacked: Array) -> Array:
 def raw_triangle(rows: Array) -> Array:
     """R with Rᵀ R = rowsᵀ rows in its upper triangle; below it there is what LAPACK leaves there."""
     return np.asarray(np.linalg.qr(rows, mode="raw")[0].T, dtype=np.float64)
-
-
-def prior_factor(prior: Prior | None, n: int) -> Array:
-    """The known priors as information rows (k, n + 1): π_j / std_j = value_j / std_j."""
-    if prior is None:
-        return np.zeros((0, n + 1))
-    if prior.std.size != n:
-        raise ValueError(f"prior of {prior.std.size} parameters; expected {n}")
-    known = np.flatnonzero(prior.known)
-    rows = np.zeros((known.size, n + 1))
-    rows[np.arange(known.size), known] = 1.0 / prior.std[known]
-    rows[:, n] = prior.value[known] / prior.std[known]
-    return rows
 
 
 @dataclass(frozen=True)

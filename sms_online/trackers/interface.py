@@ -9,6 +9,7 @@ from typing import Protocol
 import numpy as np
 
 from sms_online.stream import Array
+from sms_online.trackers.information import Information
 
 # What a tracker saves: arrays and numbers only, so that any array format can hold it.
 State = dict[str, Array | float]
@@ -77,6 +78,19 @@ class Prior:
         return ~np.isnan(self.std)
 
 
+def prior_factor(prior: Prior | None, n: int) -> Array:
+    """The known priors as information rows (k, n + 1): π_j / std_j = value_j / std_j."""
+    if prior is None:
+        return np.zeros((0, n + 1))
+    if prior.std.size != n:
+        raise ValueError(f"prior of {prior.std.size} parameters; expected {n}")
+    known = np.flatnonzero(prior.known)
+    rows = np.zeros((known.size, n + 1))
+    rows[np.arange(known.size), known] = 1.0 / prior.std[known]
+    rows[:, n] = prior.value[known] / prior.std[known]
+    return rows
+
+
 @dataclass(frozen=True)
 class Estimate:
     """π as far as the rows determine it.
@@ -126,11 +140,21 @@ class Tracker(Protocol):
     def reset(self) -> None:
         """Forget all rows; priors stay."""
 
+    def begin(self, known: Information) -> None:
+        """Forget all rows, and go on from what others say of π; priors stay. ValueError where it is not of n."""
+
     def state(self) -> State:
         """Everything needed to continue bit for bit, as copies."""
 
     def restore(self, state: Mapping[str, Array | float]) -> None:
         """Continue from a state saved by a tracker built with the same arguments; ValueError where it does not fit."""
+
+
+def checked(known: Information, n: int) -> Information:
+    """The same; ValueError where it is not of n parameters."""
+    if known.n != n:
+        raise ValueError(f"information of {known.n} parameters; expected {n}")
+    return known
 
 
 def saved_array(state: Mapping[str, Array | float], key: str, shape: tuple[int | None, ...]) -> Array:

@@ -8,8 +8,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from sms_online.stream import Array
-from sms_online.trackers.factor import RANK_TOLERANCE, masked_covariance
-from sms_online.trackers.interface import Estimate, Prior, Rows, State, saved_array, saved_number
+from sms_online.trackers.factor import RANK_TOLERANCE, masked_covariance, solve
+from sms_online.trackers.information import Information
+from sms_online.trackers.interface import Estimate, Prior, Rows, State, checked, saved_array, saved_number
 
 if TYPE_CHECKING:
     from filterpy.kalman import KalmanFilter
@@ -88,6 +89,20 @@ class KalmanTracker:
     def reset(self) -> None:
         """Forget all rows; start again from the initial value and std."""
         self._start()
+
+    def begin(self, known: Information) -> None:
+        """Forget all rows; start from the initial value and std together with what others say of π."""
+        checked(known, self._n)
+        self._start()
+        # In units of the initial std about the initial value, as the filter's own state.
+        Y, b = (
+            known.factor[:, :-1] * self._initial.std,
+            known.factor[:, -1] - known.factor[:, :-1] @ self._initial.value,
+        )
+        initial = np.eye(self._n, self._n + 1)
+        solution = solve(np.concatenate((initial, np.column_stack((Y, b)))))
+        self._filter.x, self._filter.P = solution.pi[:, None], solution.covariance()
+        self._rows, self._nis = known.rows, solution.rss
 
     def state(self) -> State:
         """Everything needed to continue bit for bit."""

@@ -12,6 +12,7 @@ import numpy as np
 from sms_online.stream import Array
 from sms_online.trackers.factor import triangular_factor
 from sms_online.trackers.forgetting import FadingForgetting, Forgetting, NoForgetting, SlidingWindow
+from sms_online.trackers.information import Information
 from sms_online.trackers.interface import State, saved_array, saved_number
 from sms_online.trackers.robust import MAX_CLUSTERS, ClusterFactors, merge_neighbours
 
@@ -31,6 +32,9 @@ class Content:
 
 class Memory(Protocol):
     """Store of absorbed blocks; a block is (M, n + 1) whitened rows."""
+
+    def begin(self, known: Information) -> None:
+        """Count what earlier rows say, before the first block."""
 
     def absorb(self, block: Array) -> None:
         """Take in a full block of BLOCK_ROWS rows."""
@@ -52,6 +56,10 @@ class FullMemory:
         self._factor = np.zeros((n + 1, n + 1))
         self._rows = 0
         self._clusters = ClusterFactors(n)
+
+    def begin(self, known: Information) -> None:
+        """See Memory; the rows behind it are in no cluster."""
+        self._factor, self._rows = known.factor, known.rows
 
     def absorb(self, block: Array) -> None:
         """See Memory."""
@@ -85,6 +93,11 @@ class FadingMemory:
         self._factor = np.zeros((n + 1, n + 1))
         self._peak = np.zeros(n)  # greatest square-root information that each parameter ever had
         self._rows = 0.0
+
+    def begin(self, known: Information) -> None:
+        """See Memory."""
+        self._factor, self._rows = known.factor, float(known.rows)
+        self._peak = np.linalg.norm(known.factor[:, :-1], axis=0)
 
     def absorb(self, block: Array) -> None:
         """See Memory."""
@@ -125,10 +138,19 @@ class WindowMemory:
     def __init__(self, n: int, rows: int) -> None:
         self._n = n
         self._blocks: deque[Array] = deque(maxlen=-(-rows // BLOCK_ROWS))
+        self._counts: deque[int] = deque(maxlen=self._blocks.maxlen)
+
+    def begin(self, known: Information) -> None:
+        """See Memory; it counts as one block, the first to leave."""
+        self._append(known.factor, known.rows)
+
+    def _append(self, factor: Array, rows: int) -> None:
+        self._blocks.append(factor)
+        self._counts.append(rows)
 
     def absorb(self, block: Array) -> None:
         """See Memory."""
-        self._blocks.append(triangular_factor(block))
+        self._append(triangular_factor(block), len(block))
 
     def with_pending(self, block: Array) -> Content:
         """See Memory."""
@@ -136,19 +158,22 @@ class WindowMemory:
         clusters = merge_neighbours(factors, -(-len(factors) // MAX_CLUSTERS))
         return Content(
             triangular_factor(clusters.reshape(-1, self._n + 1)),
-            len(self._blocks) * BLOCK_ROWS + len(block),
+            sum(self._counts) + len(block),
             clusters,
         )
 
     def state(self) -> State:
         """See Memory."""
         n1 = self._n + 1
-        return {"window": np.stack(self._blocks) if self._blocks else np.zeros((0, n1, n1))}
+        window = np.stack(self._blocks) if self._blocks else np.zeros((0, n1, n1))
+        return {"window": window, "window_rows": np.array(self._counts, dtype=np.float64)}
 
     def restore(self, state: Mapping[str, Array | float]) -> None:
         """See Memory."""
         window = saved_array(state, "window", (None, self._n + 1, self._n + 1))
+        counts = saved_array(state, "window_rows", (len(window),))
         self._blocks = deque(window, maxlen=self._blocks.maxlen)
+        self._counts = deque((int(count) for count in counts), maxlen=self._blocks.maxlen)
 
 
 def memory_for(forgetting: Forgetting, n: int) -> Memory:

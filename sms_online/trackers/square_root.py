@@ -7,9 +7,19 @@ from collections.abc import Mapping
 import numpy as np
 
 from sms_online.stream import Array
-from sms_online.trackers.factor import prior_factor, solve, triangular_factor
+from sms_online.trackers.factor import solve, triangular_factor
 from sms_online.trackers.forgetting import Forgetting, NoForgetting
-from sms_online.trackers.interface import Estimate, Prior, Rows, State, saved_array, saved_number
+from sms_online.trackers.information import Information
+from sms_online.trackers.interface import (
+    Estimate,
+    Prior,
+    Rows,
+    State,
+    checked,
+    prior_factor,
+    saved_array,
+    saved_number,
+)
 from sms_online.trackers.memory import BLOCK_ROWS, Content, memory_for
 from sms_online.trackers.robust import cluster_covariance
 
@@ -83,6 +93,12 @@ class RecursiveLeastSquares:
         """Forget all rows; the prior stays."""
         self._fill = 0
         self._memory = memory_for(self._forgetting, self._n)
+
+    def begin(self, known: Information) -> None:
+        """Forget all rows, and go on from what others say of π, which count as older ones; the prior stays."""
+        checked(known, self._n)
+        self.reset()
+        self._memory.begin(known)
 
     def state(self) -> State:
         """Everything needed to continue bit for bit, pending rows included."""

@@ -26,8 +26,8 @@ from sms_online.pipeline.estimator import Estimator
 from sms_online.pipeline.sensing import Sensing
 from sms_online.pipeline.smoothing import smooth
 from sms_online.stream import Array, Block
-from sms_online.trackers.batch import batch_least_squares
 from sms_sim.sensors import GRADES
+from tests.batch_solution import batch_least_squares
 from tests.campaigns.output_error import OutputError
 from tests.campaigns.sessions import disguised, exact_session, noisy_session, true_parameters
 from tests.keeping_tracker import KeepingTracker
