@@ -31,6 +31,7 @@ from sms_online.trackers.factor import raw_triangle
 
 if TYPE_CHECKING:
     from sms_online.pipeline.estimator import Estimator
+from sms_online.pipeline.observer import Observer
 
 # Step of a bound, s. Planar example, grade B, 20 s: all bounds within 2 % of those at 1 ms (the second stator's inertia
 # within 10 %), at a tenth of the cost.
@@ -55,7 +56,7 @@ RANK_TOLERANCE = 1e-8
 UNDETERMINED_SHARE = 1e-6
 
 
-class MotionRecord:
+class MotionRecord(Observer):
     """A session's motion at the step of a bound, segment by segment; some 250 n_v bytes a second at STEP."""
 
     def __init__(self, sample_rate: float) -> None:
@@ -63,8 +64,8 @@ class MotionRecord:
         self._every = max(1, round(STEP * sample_rate))
         self._segments: dict[int, list[Motion]] = {}
 
-    def add(self, index: NDArray[np.int64], segment: int, x: Array, v: Array) -> None:
-        """Take consecutive grid samples (B,) of one segment: grid index, x (B, n_x), v (B, n_v)."""
+    def motion(self, index: NDArray[np.int64], segment: int, x: Array, v: Array) -> None:
+        """See `Observer`."""
         kept = index % self._every == 0
         piece = Motion(index[kept] / self._sample_rate, x[kept], v[kept])
         self._segments.setdefault(segment, []).append(piece)

@@ -50,7 +50,7 @@ def record_of(exact: ExactStates, segments: Array) -> MotionRecord:
     index = np.arange(exact.t.size)
     cuts = np.unique(np.concatenate((segments, [7, 260, 1111]))).astype(int)
     for piece in np.split(index, cuts):
-        record.add(piece, int(np.searchsorted(segments, piece[0], side="right")), exact.x[piece], exact.v[piece])
+        record.motion(piece, int(np.searchsorted(segments, piece[0], side="right")), exact.x[piece], exact.v[piece])
     return record
 
 

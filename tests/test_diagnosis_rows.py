@@ -39,7 +39,7 @@ def session() -> tuple[Estimator, SessionRows]:
     blocks = list(sampled_blocks(simulate(system, 4.0, position_tolerance=1e-8), "B", seed=2))
     estimator = Estimator(system, blocks[0].channels, "test")
     record = SampleRecord(system.sample_rate)
-    estimator.on_samples = record.add
+    estimator.observers.append(record)
     for block in blocks:
         estimator.push(block)
     estimator.finish()

@@ -175,7 +175,7 @@ def test_a_session_with_an_adopted_effect_is_saved_and_goes_on_to_the_same_bits(
     assert [effect.name for effect in running.momentum.changes.adopted] == ["cogging"]
     continued = Estimator(SYSTEM, block.channels, "continued")
     continued.restore(running.state())
-    running.on_block = running.on_samples = None
+    running.observers.clear()
     for estimator in (running, continued):
         estimator.push(second)
         estimator.finish()

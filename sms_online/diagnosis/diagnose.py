@@ -256,7 +256,7 @@ def diagnose(
 def _session(system: System, blocks: Sequence[Block], source: str, prior: PriorOf) -> tuple[Estimator, SampleRecord]:
     estimator = Estimator(system, blocks[0].channels, source)
     record = SampleRecord(system.sample_rate)
-    estimator.on_samples = record.add
+    estimator.observers.append(record)
     known = prior(estimator)
     if known is not None:
         estimator.set_prior(known)

@@ -29,6 +29,7 @@ from sms_online.pipeline.estimator import Estimator
 from sms_online.pipeline.events import Event
 from sms_online.pipeline.momentum import Momentum
 from sms_online.pipeline.momentum_balance import MARGIN
+from sms_online.pipeline.observer import Observer
 from sms_online.pipeline.synchronise import GridSamples
 from sms_online.row_types import joint_rows
 from sms_online.trackers.information import Information
@@ -85,8 +86,8 @@ class _Onset:
     known: Information
 
 
-class OnlineDiagnosis:
-    """Watches one session, from before its first sample; takes the estimator's `on_samples` and `on_block`.
+class OnlineDiagnosis(Observer):
+    """Watches one session, from before its first sample.
 
     adopt: take up what is named. on_verdict (t, text), on_evidence (t, gain by candidate): are told what is new.
     """
@@ -107,8 +108,7 @@ class OnlineDiagnosis:
         self._due = 0  # searches of the open episode that were due so far
         self._begun = 0  # searches that were begun or left out
         self._pending: tuple[int, float] | None = None  # number of a search that runs, and time of its last sample, s
-        estimator.on_samples = self._keep
-        estimator.on_block = self._step
+        estimator.observers.append(self)
 
     @property
     def system(self) -> System:
@@ -151,14 +151,15 @@ class OnlineDiagnosis:
         if self._adopt and self._onset is not None and self.episodes[-1].verdict == "named":
             self.episodes[-1].refused = "the session ended before a second search could name the same"
 
-    def _keep(self, piece: GridSamples) -> None:
+    def samples(self, piece: GridSamples) -> None:
+        """See `Observer`."""
         self._record.append(piece)
         oldest = int(piece.index[-1]) - round(REMEMBERED * self._unit)
         while self._record[0].index[-1] < oldest:
             self._record.pop(0)
 
-    def _step(self) -> None:
-        """An internal block is through."""
+    def block_through(self) -> None:
+        """See `Observer`."""
         self._blocks += 1
         done = self._searcher.outcome(self._blocks)
         if self._estimator.momentum is None or not self._record:

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from sms_online.pipeline.observer import Observer
 from sms_online.pipeline.synchronise import GridSamples
 from sms_online.stream import Array
 
@@ -23,16 +24,16 @@ class Segment:
     values: Array
 
 
-class SampleRecord:
-    """Collects the grid samples of a session, up to LONGEST seconds of them; `add` is an Estimator's `on_samples`."""
+class SampleRecord(Observer):
+    """Collects the grid samples of a session, up to LONGEST seconds of them."""
 
     def __init__(self, sample_rate: float) -> None:
         self.sample_rate = sample_rate
         self._pieces: list[GridSamples] = []
         self._left = round(LONGEST * sample_rate)
 
-    def add(self, piece: GridSamples) -> None:
-        """Take consecutive samples."""
+    def samples(self, piece: GridSamples) -> None:
+        """See `Observer`."""
         kept = min(self._left, piece.index.size)
         if kept:
             self._pieces.append(GridSamples(piece.index[:kept], piece.values[:kept], piece.segment))

@@ -9,13 +9,11 @@ smoother that knows the dynamics; it gives the estimate as soon as its first spa
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from itertools import groupby, pairwise
 from operator import attrgetter
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sms_online.description.schema import System
 from sms_online.effects.build import build_model
@@ -31,6 +29,7 @@ from sms_online.pipeline.events import Event
 from sms_online.pipeline.internal_states import FollowedStates
 from sms_online.pipeline.joint_balance import JointBalance, SquaredResidual
 from sms_online.pipeline.momentum import Momentum
+from sms_online.pipeline.observer import Observer
 from sms_online.pipeline.rates import RateSamples, RatesStage
 from sms_online.pipeline.sensing import AttitudeContinuity, Sensing, stated_period
 from sms_online.pipeline.synchronise import GridSamples, SyncCounters, Synchroniser
@@ -44,11 +43,6 @@ from sms_online.trackers.square_root import RecursiveLeastSquares
 # What a session saves: arrays and numbers, by stage.
 SessionState = dict[str, dict[str, Any]]
 
-# Takes consecutive smoothed samples: grid index (B,), segment, x (B, n_x), v (B, n_v).
-MotionSink = Callable[[NDArray[np.int64], int, Array, Array], None]
-# Takes the grid samples of the channels that the model reads, as the synchroniser gives them.
-SampleSink = Callable[[GridSamples], None]
-
 
 class Estimator:
     """Streams one session of a described system.
@@ -56,6 +50,7 @@ class Estimator:
     channels: what the source's blocks hold. source: its name, for messages. Raises InputError when a channel is missing
     that the model needs, or where the system declares a tilt of the table and there is no reference.
     reference: π (n_pi,) of the system whose masses that tilt pulls at, from an estimate without it or from weighing.
+    observers: watch what passes, in this order.
     """
 
     @one_blas_thread()
@@ -70,9 +65,7 @@ class Estimator:
         self.dropped_rows = 0
         self.duration = 0.0
         self._newest_energy_row = -np.inf
-        self.on_motion: MotionSink | None = None
-        self.on_samples: SampleSink | None = None
-        self.on_block: Callable[[], None] | None = None  # when an internal block is through
+        self.observers: list[Observer] = []
         self.smoother: Smoother | None = None
         # It reads the channels as they come.
         distorted = channel_effects(system)
@@ -249,18 +242,18 @@ class Estimator:
             self._condition(piece)
         if self.smoother is not None:
             self.smoother.work(self._balanced)
-        if self.on_block is not None:
-            self.on_block()
+        for observer in self.observers:
+            observer.block_through()
 
     def adopt(self, adoption: Adoption) -> None:
-        """Go on with effects that the model lacked, see `Changes.adopt`; from within `on_block` alone."""
+        """Go on with effects that the model lacked, see `Changes.adopt`; from within `Observer.block_through` alone."""
         assert self.momentum is not None
         self.momentum.adopt(adoption)
         self._begin_joints()
 
     def _condition(self, piece: GridSamples) -> None:
-        if self.on_samples is not None:
-            self.on_samples(piece)
+        for observer in self.observers:
+            observer.samples(piece)
         for corrected in self._conditioning.push(piece):
             self._differentiate(corrected)
 
@@ -300,8 +293,8 @@ class Estimator:
         v = self.model.layout.speeds(x, rates.rates[:, :n_x])
         if self.smoother is not None:
             self.smoother.move(rates.index, x, v)
-        if self.on_motion is not None:
-            self.on_motion(rates.index, rates.segment, x, v)
+        for observer in self.observers:
+            observer.motion(rates.index, rates.segment, x, v)
         signals = np.concatenate((torque, self._followed.beside(rates)), axis=1)
         rows = self._energy.push(rates.index, x, v, signals, self._rates.sigma[n_x:])
         finite = np.isfinite(rows.Y).all(axis=1) & np.isfinite(rows.b)

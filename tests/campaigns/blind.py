@@ -74,7 +74,7 @@ class Draw:
         block = noisy_session(system, exact_session(system, cache / "clean.npz"), GRADE, 0)
         estimator = Estimator(system, block.channels, "clean")
         record = SampleRecord(system.sample_rate)
-        estimator.on_samples = record.add
+        estimator.observers.append(record)
         estimator.push(block)
         estimator.finish()
         assert estimator.momentum is not None

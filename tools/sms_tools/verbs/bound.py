@@ -100,7 +100,7 @@ def _of_capture(system: System, folder: Path | None, args: argparse.Namespace) -
     source = open_source(capture, system, None, None, None, folder)
     estimator = new_estimator(system, source.channels, str(capture))
     record = MotionRecord(system.sample_rate)
-    estimator.on_motion = record.add
+    estimator.observers.append(record)
     with Interruption() as interruption:
         stream(estimator, source, interruption)
     bound = session_bound(estimator, record)

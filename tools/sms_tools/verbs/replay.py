@@ -68,7 +68,7 @@ def run(args: argparse.Namespace) -> int:
                 load_checkpoint(source.checkpoint, estimator)
             record = MotionRecord(system.sample_rate) if args.bound else None
             if record is not None:
-                estimator.on_motion = record.add
+                estimator.observers.append(record)
             patient = args.speed == "max"
             rows = PIECE if patient else max(1, round(PACE * system.sample_rate))
             pieces = (piece for block in source for piece in block.pieces(rows))

@@ -1,0 +1,22 @@
+"""What can watch a session pass by."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sms_online.pipeline.synchronise import GridSamples
+from sms_online.stream import Array
+
+
+class Observer:
+    """Watches one session: put it into `Estimator.observers`. What it does not override it does not see."""
+
+    def samples(self, piece: GridSamples) -> None:
+        """Grid samples of the channels that the model reads, as the synchroniser gives them."""
+
+    def motion(self, index: NDArray[np.int64], segment: int, x: Array, v: Array) -> None:
+        """Consecutive smoothed samples: grid index (B,), number of the segment, x (B, n_x), v (B, n_v)."""
+
+    def block_through(self) -> None:
+        """An internal block has passed all stages: the one moment at which effects may be adopted."""
