@@ -19,11 +19,12 @@ from sms_online.pipeline.latency import SourceGroup
 from sms_online.pipeline.momentum_balance import MomentumBalance
 from sms_online.pipeline.momentum_windows import COPIES, EXPONENT, HOPS, INSTANTS, STEPS, Window
 from sms_online.pipeline.rough_forces import open_at_rest
-from sms_online.pipeline.row_noise import CLOCK_ERROR, CLOCK_KNOWN, ROUNDING, RowNoise, Whitener
+from sms_online.pipeline.row_noise import CLOCK_ERROR, CLOCK_KNOWN, RowNoise
 from sms_online.pipeline.sensing import Sensing
 from sms_online.pipeline.sensitivity import Sensitivities
 from sms_online.pipeline.sensor_noise import NoiseEstimate
 from sms_online.pipeline.weak_form import test_function as weak_test_function
+from sms_online.pipeline.whitening import ROUNDING, Whitener, Whitening
 from sms_online.stream import Array
 from sms_sim.plant import Plant
 
@@ -106,7 +107,7 @@ def scatter(system: System, draws: int, seed: int) -> Scatter:
         return np.concatenate([Y @ beta - window.b[0] for Y, window in zip(dense, found, strict=True)])
 
     found, told = windows(exact)
-    noise, whitener = RowNoise(model.layout.theta_m, probe.span), Whitener(model.layout.n_v, draws)
+    noise, whitener = RowNoise(model.layout.theta_m, probe.span), Whitener(draws)
     density = POSITION_NOISE**2 / system.sample_rate, TORQUE_NOISE**2 / system.sample_rate
     covariances = []
     for window in found:
@@ -227,7 +228,7 @@ def test_what_windows_hold_beside_a_force_that_nobody_knows_is_still_told() -> N
     for draw in range(50):
         force = 2.0 + sigma * rng.standard_normal(time.size)
         force[resting] += 20.0 * rng.standard_normal() + np.cumsum(rng.standard_normal(300))
-        noise, whitener = RowNoise((0,), SPAN), Whitener(1, 2)
+        noise, whitener = RowNoise((0,), SPAN), Whitener(2)
         white = []
         for inside in windows:
             free = open_at_rest(np.full((width + 1, 1), 20.0), resting[inside, None], phi)
@@ -256,17 +257,29 @@ def test_whitening_is_the_dense_cholesky_factor_solved_for() -> None:
     n_v, windows, width = 4, 25, 3
     covariances = random_banded(n_v, windows, seed=5)
     rows = np.random.default_rng(5).standard_normal((windows, n_v, width))
-    whitener = Whitener(n_v, width)
+    whitener = Whitener(width)
     found = np.concatenate([whitener.push(c, row) for c, row in zip(covariances, rows, strict=True)])
     full = block_matrix(covariances)
     full[np.diag_indices_from(full)] *= 1.0 + ROUNDING
     np.testing.assert_allclose(found, np.linalg.solve(np.linalg.cholesky(full), np.concatenate(rows)), rtol=1e-8)
 
 
+def test_a_capture_is_whitened_like_a_stream() -> None:
+    covariances = random_banded(4, 25, seed=9)
+    rows = np.random.default_rng(9).standard_normal((25, 4, 3))
+    whitener = Whitener(3)
+    streamed = [whitener.push(c, row) for c, row in zip(covariances, rows, strict=True)]
+    whole = Whitening(covariances, np.zeros((25, 4)))
+    np.testing.assert_allclose(whole.of(rows), np.concatenate(streamed), rtol=1e-9)
+    full = block_matrix(covariances)
+    full[np.diag_indices_from(full)] *= 1.0 + ROUNDING
+    np.testing.assert_allclose(whole.std.ravel(), np.diag(np.linalg.cholesky(full)), rtol=1e-8)
+
+
 def test_whitening_after_a_break_does_not_remember_what_was_before() -> None:
     covariances = random_banded(4, 12, seed=6)
     rows = np.random.default_rng(6).standard_normal((12, 4, 2))
-    whitener = Whitener(4, 2)
+    whitener = Whitener(2)
     first = [whitener.push(c, row) for c, row in zip(covariances, rows, strict=True)]
     whitener.begin_segment()
     second = [whitener.push(c, row) for c, row in zip(covariances, rows, strict=True)]

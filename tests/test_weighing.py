@@ -14,6 +14,7 @@ from sms_online.pipeline.momentum_windows import COPIES, HOPS
 from sms_online.pipeline.sensing import Sensing
 from sms_online.pipeline.sensor_noise import SensorNoise
 from sms_online.pipeline.weighing import Weighing
+from sms_online.pipeline.window_noise import WindowNoise
 from sms_online.stream import Array
 from sms_sim.plant import Plant
 
@@ -50,9 +51,9 @@ def test_a_chain_that_was_told_enough_windows_weighs_like_one_that_knows_them_al
 
     def told_from(first: int) -> Array:
         """Information about each parameter in the windows compared, by a chain that begins with window `first`."""
-        chain = Weighing(model, base, balance, sensing.displacements)
+        chain = Weighing(WindowNoise(model, base, balance, sensing.displacements), COPIES * (base.n + 1))
         chain.begin(base.values(model.nominal), noise, np.zeros(model.layout.n_v), windows[first].start)
-        chain.tell(0, x, v, signals)
+        chain.noise.tell(0, x, v, signals)
         white = []
         for window in windows[first : late + COMPARED]:
             rows = np.zeros((model.layout.n_v, COPIES * (base.n + 1)))

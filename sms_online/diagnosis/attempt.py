@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
@@ -27,6 +27,7 @@ from sms_online.errors import InputError
 from sms_online.pipeline.conditioning import noise_gains
 from sms_online.pipeline.estimator import Estimator
 from sms_online.pipeline.momentum_windows import HOPS
+from sms_online.pipeline.second_order import SecondOrderNoise
 from sms_online.pipeline.sensor_noise import SensorNoise
 from sms_online.stream import Array
 from sms_online.trackers.interface import Prior
@@ -138,10 +139,10 @@ class Attempt:
         beta: Array | None = None,
         candidates: Sequence[Effect] | None = None,
         most: float = LONGEST,
-        bends: Mapping[int, Array] | None = None,
+        second_order: SecondOrderNoise | None = None,
     ) -> None:
         """constants: see that module. beta (n,): behind the noise of rows, from the rows themselves unless given.
-        candidates: all by default. most: s of the session that are used. bends: see `SessionRows`.
+        candidates: all by default. most: s of the session that are used. second_order: see `SessionRows`.
         """
         self.case, self.system, self.constants = case, system, list(constants)
         session = case.session
@@ -161,7 +162,7 @@ class Attempt:
             [part for part in excerpts(each, length, longest) if part.index.size > least] for each in whole
         )
         self.rows = SessionRows(
-            estimator.model, estimator.base, estimator.sensing, noise, (*fitting, *held), bends=bends
+            estimator.model, estimator.base, estimator.sensing, noise, (*fitting, *held), second_order=second_order
         )
         self.make = CandidateColumns(self.rows, described)
         self._fitting = len(fitting)
@@ -194,7 +195,7 @@ class Attempt:
         """
         forces = tuple(effect for effect in (*system.effects, *effects) if not is_constant(effect))
         states = build_model(system.model_copy(update={"effects": forces})).n_states
-        return Attempt(self.case, system, constants, beta, effects, LONGEST if states else SOME, self.rows.bends)
+        return Attempt(self.case, system, constants, beta, effects, LONGEST if states else SOME, self.rows.second_order)
 
     def _start(self, candidates: Sequence[Candidate]) -> None:
         """Weigh the rows with what the model and all candidates together make of them.

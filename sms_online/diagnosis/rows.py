@@ -6,14 +6,14 @@ them is a column Z: Y β + Z c = b. Columns pass the same test functions and the
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import scipy.linalg
 
 from sms_online.diagnosis.followed import FollowedMotion
 from sms_online.diagnosis.record import Segment
+from sms_online.diagnosis.weak_rows import WeakRows
 from sms_online.diagnosis.weak_windows import WeakWindows, Windows
 from sms_online.model.base_parameters import BaseParameters
 from sms_online.model.model import Model
@@ -21,12 +21,12 @@ from sms_online.pipeline.joint_balance import EXPONENT as JOINT_EXPONENT
 from sms_online.pipeline.joint_balance import JointBalance
 from sms_online.pipeline.latency import clock_groups
 from sms_online.pipeline.momentum_balance import MomentumBalance
-from sms_online.pipeline.momentum_windows import COPIES, EXPONENT, HOPS, INSTANTS, STEPS, Instants, Window
-from sms_online.pipeline.row_noise import RowNoise, factored
+from sms_online.pipeline.momentum_windows import COPIES, EXPONENT, STEPS, Instants, Window
+from sms_online.pipeline.second_order import SecondOrderNoise, beyond_first_order, rounding, size
 from sms_online.pipeline.sensing import Sensing
-from sms_online.pipeline.sensitivity import Sensitivities
-from sms_online.pipeline.sensor_noise import FINEST, SensorNoise
+from sms_online.pipeline.sensor_noise import SensorNoise
 from sms_online.pipeline.smoothing import smooth_all, stride
+from sms_online.pipeline.window_noise import WindowNoise
 from sms_online.stream import Array
 
 # Instants that the sensitivity to noise is told at in one call.
@@ -60,21 +60,16 @@ class _Told:
     displacements: Array
 
 
-class SessionRows:
-    """Rows of the windows of a session, n_v a window.
+class SessionRows(WeakRows):
+    """Rows of the windows of a session.
 
-    Y (W, n_v, n), b (W, n_v): rows as they are. time (W,): the windows' middles, s since grid index 0. weak: evaluates
-    further columns. Once they are weighed: beta (n,), values behind their noise; std (W, n_v), their own predicted
-    deviation; white_std (W, n_v), that of what a row tells beside those before it; bends, half width of the filter to
-    (n_v,): variance of what noise does beyond first order; responses, name to (W, n_v, sensors): of the rows to so much
-    added to each position sensor's reading.
+    time (W,): the windows' middles, s since grid index 0. weak: evaluates further columns. Once they are weighed: beta
+    (n,), values behind their noise; second_order: variance of what noise does beyond first order; responses, name to
+    (W, n_v, sensors): of the rows to so much added to each position sensor's reading.
     """
 
     beta: Array
-    std: Array
-    bends: Mapping[int, Array]
     responses: dict[str, Array]
-    white_std: Array
 
     def __init__(
         self,
@@ -84,9 +79,9 @@ class SessionRows:
         noise: SensorNoise,
         segments: Sequence[Segment],
         beta: Array | None = None,
-        bends: Mapping[int, Array] | None = None,
+        second_order: SecondOrderNoise | None = None,
     ) -> None:
-        """beta (n,): to weigh the rows with at once. bends: as other rows of the session have told them, from synthetic
+        """beta (n,): to weigh the rows with at once. second_order: as of other rows of the session, from synthetic
         noise unless given, which takes three times as long. Raises numpy.linalg.LinAlgError on readings that no shape
         of the links gives, from which rows are no numbers.
         """
@@ -95,7 +90,9 @@ class SessionRows:
         self._rate = rate = model.system.sample_rate
         self._balance = balance = MomentumBalance(model, base, rate, model.system.windows.momentum, prompt=False)
         self.followed = FollowedMotion(sensing, self.segments, rate)
-        self._given = bends
+        self._given = second_order
+        if second_order is not None:
+            self.second_order = second_order
         added = self._noise_samples(np.random.default_rng(SEED))
         self._told = [self._of_segment(k, *part) for k, part in enumerate(zip(self.segments, added, strict=True))]
         if not all(np.all(np.abs(told.copies) < LARGEST) for told in self._told):
@@ -103,7 +100,7 @@ class SessionRows:
         windows = [(number, window) for number, told in enumerate(self._told) for window in told.windows]
         n_v = model.layout.n_v
         stacked = np.concatenate([np.empty((0, n_v, base.n + 1)), *(told.copies[:, 0] for told in self._told)])
-        self.Y, self.b = stacked[..., :-1], stacked[..., -1]
+        super().__init__(stacked[..., :-1], stacked[..., -1], rate)
         half = balance.width / 2
         self.time = np.array([window.end - half for _, window in windows]) / rate
         where = Windows(
@@ -139,10 +136,7 @@ class SessionRows:
                 for sign in (1.0, -1.0)
             ]
         windows, instants = balance.push(segment.index, copies, noise.coordinates)
-        dense = np.zeros((len(windows), COPIES, n_v, self.base.n + 1))
-        for rows, window in zip(dense, windows, strict=True):
-            rows[:, balance.rows, balance.columns] = window.Y
-            rows[:, :, -1] = window.b
+        dense = np.array([balance.dense(window) for window in windows]).reshape(-1, COPIES, n_v, self.base.n + 1)
         displacements = np.empty((0, len(DISPLACEMENTS), STEPS + 1, len(self.sensing.position_columns)))
         if windows:
             readings = self._readings(segment, _middle([window.half_width for window in windows]))
@@ -154,56 +148,41 @@ class SessionRows:
 
     def weigh(self, beta: Array) -> None:
         """Tell the noise of the rows for parameters beta (n,), and make them independent of each other."""
-        n_v, noise, span = self.model.layout.n_v, self.noise, self._balance.span
-        rough, pi = self._balance.rough, self.base.physical_values(beta)
+        model, balance = self.model, self._balance
         self.beta = beta
-        self.bends = self._bends()
-        self._covariances: list[list[Array]] = []
+        if self._given is None:
+            self.second_order = self._second_order()
+        noise = WindowNoise(model, self.base, balance, self.sensing.displacements, clock_groups(self.sensing))
+        covariances: list[list[Array]] = []
         responses: list[Array] = []
         for told in self._told:
-            if not told.windows:
-                continue
-            sensitivities = self._sensitivities(told.instants, span)
-            row_noise = RowNoise(self.model.layout.theta_m, span, clock_groups(self.sensing))
-            beyond = self._beyond_first_order(told)
-            for window, variance, added in zip(told.windows, beyond, told.displacements, strict=True):
-                sensitivity = sensitivities.window(window.start)
-                age = window.end / self._rate
-                kernel = row_noise.kernel(sensitivity) + rough.kernel(window.rough, pi, sensitivity.displacements)
-                free = rough.at_rest(window.rest, pi)
-                covariances = row_noise.covariance(kernel, sensitivity.rates, noise.sensors, noise.torque, free, age)
-                covariances[-1][np.diag_indices(n_v)] += variance
-                self._covariances.append(covariances)
+            noise.begin(beta, self.noise, 0)
+            self._tell(noise, told.instants)
+            largest = np.maximum.accumulate(size(told.copies[:, 0], beta), axis=0)
+            for window, own, added in zip(told.windows, rounding(largest), told.displacements, strict=True):
+                propagated = noise.push(window, self.second_order.variance(window.half_width) + own)
+                covariances.append(propagated.covariances)
                 # Sums over the steps, sensor by sensor.
-                by_sensor = kernel.transpose(2, 1, 0) * (span / STEPS)
+                by_sensor = propagated.kernel.transpose(2, 1, 0) * (balance.span / STEPS)
                 responses.append((by_sensor @ added.transpose(2, 1, 0)).transpose(2, 1, 0))
-        self.std = np.sqrt([np.diag(covariances[-1]) for covariances in self._covariances]).reshape(-1, n_v)
-        stacked = np.array(responses).reshape(self.count, len(DISPLACEMENTS), n_v, -1)
+        stacked = np.array(responses).reshape(self.count, len(DISPLACEMENTS), model.layout.n_v, -1)
         self.responses = dict(zip(DISPLACEMENTS, np.moveaxis(stacked, 1, 0), strict=True))
-        self.whiten(np.zeros_like(self.std))
+        self.have_noise(covariances)
 
-    def _bends(self) -> Mapping[int, Array]:
-        """See `bends`, as in the fit."""
-        if self._given is not None:
-            return self._given
-        squares = np.concatenate([self._bending(told.copies) for told in self._told if told.windows])
+    def _second_order(self) -> SecondOrderNoise:
+        """As in the fit."""
+        samples = [beyond_first_order(told.copies, self.beta) for told in self._told if told.windows]
+        squares = np.concatenate(samples) ** 2
         widths = self.weak.windows.half_width
-        means = {M: squares[widths == M].mean(axis=0) for M in np.unique(widths).tolist()}
-        # A narrow filter lets through no less than the wide ones do, however few windows it has been used for.
-        return {M: np.max([mean for wide, mean in means.items() if wide >= M], axis=0) for M in means}
+        return SecondOrderNoise({M: squares[widths == M].mean(axis=0) for M in np.unique(widths).tolist()})
 
-    def _bending(self, copies: Array) -> Array:
-        """Squares (W, n_v) of what is the same in the rows of noise and of its negative."""
-        residual = copies[..., -1] - copies[..., :-1] @ self.beta
-        return np.asarray((0.5 * (residual[:, 1] + residual[:, 2]) - residual[:, 0]) ** 2)
-
-    def _beyond_first_order(self, told: _Told) -> Array:
-        """Variance (W, n_v) of a segment's rows beyond first order, and of rounding."""
-        size = np.abs(told.copies[:, 0, :, :-1]) @ np.abs(self.beta) + np.abs(told.copies[:, 0, :, -1])
-        rounding = (FINEST * np.maximum.accumulate(size, axis=0)) ** 2 + np.finfo(np.float64).tiny
-        # A width that nobody has told of yet counts as the nearest one.
-        widths = [min(self.bends, key=lambda M: abs(M - window.half_width)) for window in told.windows]
-        return np.array([self.bends[M] for M in widths]) + rounding
+    @staticmethod
+    def _tell(noise: WindowNoise, instants: list[Instants]) -> None:
+        if instants:
+            x, v, signals = (np.concatenate([getattr(p, part) for p in instants]) for part in ("x", "v", "signals"))
+            for start in range(0, len(x), TOLD):
+                some = slice(start, start + TOLD)
+                noise.tell(start, x[some], v[some], signals[some])
 
     def _readings(self, segment: Segment, half_width: int) -> Callable[[Array], tuple[Array, Array]]:
         """Smoothed readings (T, sensors) of the position sensors, and their rates, at instants (T,) of a segment, s."""
@@ -219,15 +198,6 @@ class SessionRows:
 
         return at
 
-    def _sensitivities(self, instants: list[Instants], span: float) -> Sensitivities:
-        out = Sensitivities(self.model, self.sensing.displacements, span / INSTANTS)
-        pi = self._balance.rough.without(self.base.physical_values(self.beta))
-        x, v, signals = (np.concatenate([getattr(p, part) for p in instants]) for part in ("x", "v", "signals"))
-        for start in range(0, len(x), TOLD):
-            some = slice(start, start + TOLD)
-            out.tell(pi, x[some], v[some], signals[some])
-        return out
-
     def noisy(self) -> list[WeakWindows]:
         """The windows over the same session with synthetic noise of the sensors added, each time another one."""
         random, weak, out = np.random.default_rng(SEED), self.weak, []
@@ -238,53 +208,6 @@ class SessionRows:
             ]
             out.append(WeakWindows(weak.windows, self.model.layout, self.sensing, moved, self._rate))
         return out
-
-    @property
-    def count(self) -> int:
-        """Number of windows W."""
-        return len(self.b)
-
-    def whiten(self, own: Array, free: Array | None = None) -> None:
-        """Make the windows' rows independent; own (W, n_v): further variance of each row, an error of its own.
-
-        free (W, HOPS, n_v): further covariances, see `WeakWindows.free`.
-        """
-        n_v = self.model.layout.n_v
-        self._operators: list[tuple[Array, Array]] = []
-        self.white_std = np.empty_like(self.std)
-        L = np.empty((0, 0))
-        for k, (covariances, errors) in enumerate(zip(self._covariances, own, strict=True)):
-            if free is not None:
-                more = free[k, : len(covariances)][::-1]
-                covariances = [one + np.diag(other) for one, other in zip(covariances, more, strict=True)]
-            L = factored(L, covariances, errors)
-            inverse = scipy.linalg.solve_triangular(L[-n_v:, -n_v:], np.eye(n_v), lower=True, check_finite=False)
-            self._operators.append((inverse @ L[-n_v:, :-n_v], inverse))
-            self.white_std[k] = np.diag(L)[-n_v:]
-
-    def white(self, columns: Array) -> Array:
-        """Columns (W, n_v, c) in the whitened rows, (W n_v, c)."""
-        n_v, c = columns.shape[1:]
-        out = np.empty((self.count * n_v, c))
-        for k, (before, own) in enumerate(self._operators):
-            begin = k * n_v
-            out[begin : begin + n_v] = own @ columns[k] - before @ out[begin - before.shape[1] : begin]
-        return out
-
-    def freedom(self, speeds: Sequence[int]) -> float:
-        """Degrees of freedom of the mean square of some speeds' rows over their variance, which overlapping rows share.
-
-        2 / variance of the mean of squares of correlated normal numbers: (W S)² / Σ ρ².
-        """
-        total = 0.0
-        variance = self.std[:, speeds] ** 2
-        for lag in range(HOPS):
-            later = [k for k, covariances in enumerate(self._covariances) if len(covariances) > lag]
-            if later:
-                blocks = np.array([self._covariances[k][-1 - lag] for k in later])[:, speeds][..., speeds]
-                scale = variance[later, :, None] * variance[np.array(later) - lag, None, :]
-                total += (1.0 if lag == 0 else 2.0) * float(np.sum(blocks**2 / scale))
-        return (self.count * len(speeds)) ** 2 / total
 
 
 def _middle(half_widths: list[int]) -> int:

@@ -32,7 +32,7 @@ from sms_online.pipeline.momentum_windows import COPIES, INSTANTS
 from sms_online.pipeline.sensing import Sensing
 from sms_online.pipeline.sensor_noise import SensorNoise
 from sms_online.pipeline.synchronise import GridSamples
-from sms_online.pipeline.weighing import Weighing
+from sms_online.pipeline.window_noise import WindowNoise
 from sms_online.stream import Array
 from sms_online.trackers.information import Information
 from sms_online.trackers.interface import Prior
@@ -154,9 +154,9 @@ class Changes:
         # What the rows before left decides, where it is more than noise.
         factor = before.known.factor
         left = max(1.0, abs(factor[-1, -1]) / np.sqrt(max(1, before.known.rows - n)))
-        new_weighing = partial(Weighing, model, base, balance, self._sensing.displacements)
+        new_noise = partial(WindowNoise, model, base, balance, self._sensing.displacements)
         for _ in range(PASSES):
-            fit = MomentumFit(model, base, balance, new_weighing, weights.copy)
+            fit = MomentumFit(model, base, balance, new_noise, weights.copy)
             fit.go_on(weights, noise)
             rows = np.concatenate([white.Y for white in fit.push(windows, instants, noise)])
             explanation = explain(factor / left, rows / left, jumps)

@@ -25,7 +25,7 @@ from sms_online.pipeline.sensing import Sensing
 from sms_online.pipeline.sensor_noise import NoiseEstimate, SensorNoise, noise_from_state, noise_state
 from sms_online.pipeline.synchronise import GridSamples
 from sms_online.pipeline.waiting import waiting_from_state, waiting_state
-from sms_online.pipeline.weighing import Weighing
+from sms_online.pipeline.window_noise import WindowNoise
 from sms_online.stream import Array
 from sms_online.trackers.interface import Estimate, Prior, Rows, Tracker
 from sms_online.trackers.square_root import RecursiveLeastSquares
@@ -73,9 +73,8 @@ class Momentum:
         self.windows = 0
         self._balance = MomentumBalance(model, base, self._sample_rate, self._span)
         self.latencies = Latencies(self._sources, base.n)
-        displacements, sources, clocks = self.sensing.displacements, self._sources, self._clocks
-        new_weighing = partial(Weighing, model, base, self._balance, displacements, sources, clocks)
-        self.fit = MomentumFit(model, base, self._balance, new_weighing, self._solved)
+        new_noise = partial(WindowNoise, model, base, self._balance, self.sensing.displacements, self._clocks)
+        self.fit = MomentumFit(model, base, self._balance, new_noise, self._solved, self._sources)
         self.tracker = self._new_tracker()
         self.test = SequentialTest(model.layout, self._balance.span / HOPS)
 

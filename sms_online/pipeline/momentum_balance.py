@@ -363,6 +363,13 @@ class MomentumBalance:
         both = both.reshape(-1, K, both.shape[1]).swapaxes(0, 1)
         return np.broadcast_to(both, (K, COPIES, both.shape[2])).reshape(K, -1)
 
+    def dense(self, window: Window) -> Array:
+        """Rows [Y b] of a window's copies (copies, n_v, n + 1)."""
+        rows = np.zeros((COPIES, self.model.layout.n_v, self.base.n + 1))
+        rows[:, self.rows, self.columns] = window.Y
+        rows[:, :, -1] = window.b
+        return rows
+
     def state(self) -> dict[str, Any]:
         """What `restore` needs to continue."""
         return {

@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 
 from sms_online.model.base_parameters import BaseParameters
 from sms_online.model.model import Model
+from sms_online.pipeline.latency import SourceGroup
 from sms_online.pipeline.momentum_balance import MomentumBalance
 from sms_online.pipeline.momentum_windows import (
     COPIES,
@@ -34,9 +35,11 @@ from sms_online.pipeline.momentum_windows import (
     windows_state,
 )
 from sms_online.pipeline.plain_rows import PlainRows
-from sms_online.pipeline.sensor_noise import FINEST, SensorNoise
+from sms_online.pipeline.second_order import SecondOrderNoise, beyond_first_order, rounding, size
+from sms_online.pipeline.sensor_noise import SensorNoise
 from sms_online.pipeline.smoothing import HALF_WIDTHS
 from sms_online.pipeline.weighing import Weighed, Weighing
+from sms_online.pipeline.window_noise import WindowNoise
 from sms_online.stream import Array
 
 # Motion before weights are made, s: at the usual width, four windows side by side.
@@ -58,7 +61,7 @@ MOTION = 20.0
 UNSTEADY = 4.0
 # Windows of one filter's width over which the square of such a sample is averaged. The samples of windows that overlap
 # are nearly one, so a mean over few of them follows its own luck: rows in which it is low would be trusted too much.
-BENDS = 100
+MOST_SAMPLES = 100
 # Share of a joint's torque that a fit may leave for its weights to be used.
 LARGEST_UNEXPLAINED = 0.5
 # Time from one look at the weights to the next, s: it doubles from the first to the latest.
@@ -98,8 +101,8 @@ class WhiteRows:
 class MomentumFit:
     """Whitens the windows of a session, segment by segment.
 
-    new_weighing: makes who weighs, for the same model, base and balance. solve: gives the estimate of β so far (n,),
-    NaN where nothing is known of it. weighing: who weighs now.
+    new_noise: makes what propagates noise, for the same model, base and balance. solve: gives the estimate of β so far
+    (n,), NaN where nothing is known of it. sources: whose latencies are told. weighing: who weighs now.
     """
 
     def __init__(
@@ -107,27 +110,31 @@ class MomentumFit:
         model: Model,
         base: BaseParameters,
         balance: MomentumBalance,
-        new_weighing: Callable[[], Weighing],
+        new_noise: Callable[[], WindowNoise],
         solve: Callable[[], Array],
+        sources: Sequence[SourceGroup] = (),
     ) -> None:
         self.model = model
         self.base = base
         self._balance = balance
         self._solve = solve
-        self._new_weighing = new_weighing
-        self.weighing = new_weighing()
+        self._new_noise, self._sources = new_noise, sources
+        self.weighing = self._new_weighing()
         self._next: Weighing | None = None  # with new weights, that takes over when it has been told enough windows
         self._warm = 0  # windows that it has been told
         self.unexplained: int | None = None  # joint whose torque is least explained, where that forbids weights
         self._since = 0  # windows since they were looked at
         self._moving = 0
         self._renewal = 0  # windows from one look to the next
-        # Mean squares of what noise does beyond first order, by the filter's width, and of how many windows.
-        self._bends = {half_width: np.zeros(model.layout.n_v) for half_width in HALF_WIDTHS}
-        self._bent = dict.fromkeys(HALF_WIDTHS, 0)
+        # By the filter's width, and of how many windows.
+        self._second_order = SecondOrderNoise({half_width: np.zeros(model.layout.n_v) for half_width in HALF_WIDTHS})
+        self._sampled = dict.fromkeys(HALF_WIDTHS, 0)
         self._largest = np.zeros(model.layout.n_v)  # largest sum of a row's terms
         self.plain = PlainRows(model.layout.n_v, base.n)
         self._begin_segment()
+
+    def _new_weighing(self) -> Weighing:
+        return Weighing(self._new_noise(), COPIES * (self.base.n + 1), self._sources)
 
     def end_segment(self, noise: SensorNoise) -> list[WhiteRows]:
         """Rows of the windows held back, if they tell enough for weights; the next ones share no samples with them."""
@@ -178,7 +185,7 @@ class MomentumFit:
         π, would win, and weights that follow π would shrink it to zero. More motion is waited for.
         """
         self._moving = 0
-        unweighted, _ = _least_squares(np.concatenate([self._dense(window)[0] for window in self._held]))
+        unweighted, _ = _least_squares(np.concatenate([self._balance.dense(window)[0] for window in self._held]))
         weights = self._settled(unweighted, noise, PASSES, partly=False) if self._explains_torques(unweighted) else None
         if weights is None:
             self.weighing = self._new_weighing()
@@ -217,7 +224,7 @@ class MomentumFit:
     def _explains_torques(self, beta: Array) -> bool:
         """Whether β (n,) explains every joint's torque over the windows held back, by and large."""
         joints = list(self.model.layout.theta_m)
-        rows = np.stack([self._dense(window)[0, joints] for window in self._held])
+        rows = np.stack([self._balance.dense(window)[0, joints] for window in self._held])
         left = rows[..., -1] - rows[..., :-1] @ beta
         left_norm, torque = np.linalg.norm(left, axis=0), np.linalg.norm(rows[..., -1], axis=0)
         explained = bool(np.all(left_norm <= LARGEST_UNEXPLAINED * torque))
@@ -265,7 +272,7 @@ class MomentumFit:
 
     def _matters(self, beta: Array, noise: SensorNoise) -> bool:
         """Whether β (n,) and the noise of now would weigh rows otherwise."""
-        used = self.weighing
+        used = self.weighing.noise
         assert used.sensor_noise is not None
         squares = np.einsum("vii->vi", self.plain.gram)[:, :-1]
         changed, size = (np.sqrt(squares @ values**2) for values in (beta - self._known_weights, beta))
@@ -276,50 +283,37 @@ class MomentumFit:
     def _retell(self, weights: Array, noise: SensorNoise) -> None:
         """Work off the windows held back from the first one on, with weights β (n,)."""
         self.plain.clear()
-        self._bent = dict.fromkeys(HALF_WIDTHS, 0)
+        self._sampled = dict.fromkeys(HALF_WIDTHS, 0)
         self.weighing.begin(weights, noise, self.plain.misfit, self._first)
         self._tell()
 
     @property
     def probes(self) -> Probes | None:
         """At which states who weighs wants columns beside those of the rows, once weights are known."""
-        return None if self.weights is None else self.weighing.probes
+        return None if self.weights is None else self.weighing.noise.probes
 
     def _tell(self, instants: Sequence[Instants] = ()) -> None:
         """Have the states of the instants known to who weighs; instants: those that came last."""
         for weighing in self._weighings:
-            weighing.tell(self._first, self._x, self._v, self._signals, instants)
+            weighing.noise.tell(self._first, self._x, self._v, self._signals, instants)
 
     @property
     def _weighings(self) -> list[Weighing]:
         return [self.weighing] if self._next is None else [self.weighing, self._next]
 
-    def _dense(self, window: Window) -> Array:
-        """[Y b] (copies, n_v, n + 1)."""
-        rows = np.zeros((COPIES, self.model.layout.n_v, self.base.n + 1))
-        rows[:, self._balance.rows, self._balance.columns] = window.Y
-        rows[:, :, -1] = window.b
-        return rows
-
     def _white(self, window: Window) -> WhiteRows:
         n_v = self.model.layout.n_v
-        rows = self._dense(window)
-        residual = rows[..., -1] - rows[..., :-1] @ self._known_weights
-        # What noise does beyond first order, which nothing propagates: a sample of it for every row.
-        bend = 0.5 * (residual[1] + residual[2]) - residual[0]
-        M = window.half_width
-        self._bent[M] = min(self._bent[M] + 1, BENDS)
-        self._bends[M] = self._bends[M] + (bend**2 - self._bends[M]) / self._bent[M]
-        # A row whose coordinate has no noise, as far as the weights know, is exact to rounding only.
-        size = np.abs(rows[0, :, :-1]) @ np.abs(self._known_weights) + np.abs(rows[0, :, -1])
-        self._largest = np.maximum(self._largest, size)
-        rounding = (FINEST * self._largest) ** 2 + np.finfo(np.float64).tiny
-        # A narrow filter lets through no less than the wide ones do, however few windows it has been used for.
-        bent = np.max([mean for wide, mean in self._bends.items() if wide >= M], axis=0)
-        weighed = self._weigh(window, rows.swapaxes(0, 1).reshape(n_v, -1), bent + rounding)
+        rows = self._balance.dense(window)
+        sample = beyond_first_order(rows, self._known_weights)
+        M, means = window.half_width, self._second_order.means
+        self._sampled[M] = min(self._sampled[M] + 1, MOST_SAMPLES)
+        means[M] = means[M] + (sample**2 - means[M]) / self._sampled[M]
+        self._largest = np.maximum(self._largest, size(rows[0], self._known_weights))
+        errors = self._second_order.variance(M) + rounding(self._largest)
+        weighed = self._weigh(window, rows.swapaxes(0, 1).reshape(n_v, -1), errors)
         self.plain.add(rows[0], np.diag(weighed.noise))
         white = weighed.rows.reshape(n_v, COPIES, -1).swapaxes(0, 1)
-        unsteady = np.diag(UNSTEADY * bend**2)
+        unsteady = np.diag(UNSTEADY * sample**2)
         return WhiteRows(
             white[0], white[1:], rows[0], weighed.covariance + unsteady, weighed.noise + unsteady, window.end,
             weighed.late,
@@ -346,14 +340,15 @@ class MomentumFit:
         self._x, self._v, self._signals = self._x[drop:], self._v[drop:], self._signals[drop:]
         if self.weights is not None:
             for weighing in self._weighings:
-                weighing.drop(needed)
+                weighing.noise.drop(needed)
 
     def state(self) -> dict[str, Any]:
         """What `restore` needs to continue."""
         return {
             "since": self._since, "moving": self._moving, "first": self._first,
             "x": self._x, "v": self._v, "signals": self._signals,
-            "bends": np.array([*self._bends.values()]), "bent": np.array([*self._bent.values()]),
+            "second_order": np.array([*self._second_order.means.values()]),
+            "sampled": np.array([*self._sampled.values()]),
             "unexplained": -1 if self.unexplained is None else self.unexplained,
             "largest": self._largest, **self.plain.state(), "renewal": self._renewal, "last": self._last,
             "warm": -1 if self._next is None else self._warm, **self.weighing.state(),
@@ -366,8 +361,8 @@ class MomentumFit:
         self._since, self._moving, self._first = int(state["since"]), int(state["moving"]), int(state["first"])
         self._x, self._v, self._signals = (np.array(state[name]) for name in ("x", "v", "signals"))
         self._largest = np.array(state["largest"])
-        self._bends = dict(zip(HALF_WIDTHS, np.array(state["bends"]), strict=True))
-        self._bent = dict(zip(HALF_WIDTHS, state["bent"].tolist(), strict=True))
+        self._second_order.means = dict(zip(HALF_WIDTHS, np.array(state["second_order"]), strict=True))
+        self._sampled = dict(zip(HALF_WIDTHS, state["sampled"].tolist(), strict=True))
         self.plain.restore(state)
         self.unexplained = None if state["unexplained"] < 0 else int(state["unexplained"])
         self._held = windows_from_state("held", state)

@@ -1,10 +1,9 @@
-"""Noise of weak-form rows, propagated from the sensors, and the rows made independent of each other by it.
+"""Noise of weak-form rows, propagated from the sensors.
 
 A row's error is linear in the noise n(t) of the positions: ∫ c(t) n(t) dt with
 c = φ̈ H + φ̇ (Ḣ + ∂Gπ/∂v - ∂Pπ/∂x) + φ (d/dt ∂Gπ/∂v - ∂Gπ/∂x), P π = H v the momentum and G π the force of the
 balance; and ∫ φ n_τ dt from the noise of the torque. White noise of 1σ per sample has the density σ² T_s. Rows of
-windows that overlap share noise, so their covariance is block-banded, and so is its Cholesky factor L: L⁻¹ [Y b] are
-rows with independent errors of standard deviation one.
+windows that overlap share noise, so their covariance is block-banded; see `whitening`.
 
 A force that nobody knows, as dry friction's at a standstill, is an error of all windows that see it: what it adds to
 one says what it adds to the others, and what they hold beside it is still told.
@@ -21,7 +20,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg.lapack import dtrtrs
 
 from sms_online.pipeline.latency import SourceGroup
 from sms_online.pipeline.momentum_windows import EXPONENT, HOPS, INSTANTS, STEPS
@@ -30,9 +28,8 @@ from sms_online.pipeline.weak_form import test_function
 from sms_online.stream import Array
 
 STEPS_A_HOP = STEPS // HOPS
-# Shares of a row's variance that are added to it alone, for the rounding of the factorisation: of what is noise of
-# sensors, and of all of it, which unknown forces may be beyond by far.
-OWN_SHARE, ROUNDING = 1e-7, 1e-13
+# Share of the variance by sensors that is added to a row alone, for the rounding of the factorisation.
+OWN_SHARE = 1e-7
 # What the clock of a device is off by, 1σ, s, when it has been watched for CLOCK_KNOWN, s, and before. The line behind
 # it is told by the least delayed samples, which reach the loop some 100 µs late, give or take 50; few tell less.
 CLOCK_ERROR, YOUNG_CLOCK_ERROR, CLOCK_KNOWN = 5e-5, 1e-4, 10.0
@@ -173,64 +170,3 @@ def common(free: Array, before: Iterable[Array]) -> Array:
 def _interpolation(at: Array, nodes: Array) -> Array:
     """Weights (at, nodes) of linear interpolation, constant beyond the ends."""
     return np.stack([np.interp(at, nodes, unit) for unit in np.eye(nodes.size)], axis=1)
-
-
-def factored(L: Array, covariances: list[Array], errors: Array | float = 0.0) -> Array:
-    """Cholesky factor of the windows that the last one overlaps, and of itself, its rows below the others'.
-
-    L: the same as of the window before. covariances: see `RowNoise.covariance`. errors (n_v,): further variance of each
-    row, of its own. Raises numpy.linalg.LinAlgError where the covariance is not positive definite.
-    """
-    own = covariances[-1].copy()
-    n_v = len(own)
-    diagonal = np.einsum("ii->i", own)
-    diagonal += ROUNDING * diagonal + errors
-    size = n_v * (len(covariances) - 1)
-    L = L[len(L) - size :, len(L) - size :]
-    cross = np.concatenate([np.empty((n_v, 0)), *covariances[:-1]], axis=1).T  # (size, n_v)
-    X = _solved(L, cross) if size else cross
-    grown = np.zeros((size + n_v, size + n_v))
-    grown[:size, :size] = L
-    grown[size:, :size], grown[size:, size:] = X.T, np.linalg.cholesky(own - X.T @ X)
-    return grown
-
-
-def _solved(L: Array, right: Array) -> Array:
-    """L⁻¹ times right-hand sides, L lower triangular: by LAPACK itself, for SciPy's checks take longer than it."""
-    solution, _ = dtrtrs(L.T, right, lower=0, trans=1)
-    return np.asarray(solution)
-
-
-class Whitener:
-    """Rows of overlapping windows, one window after the other, turned into rows with independent unit errors."""
-
-    def __init__(self, n_v: int, width: int) -> None:
-        self._n_v, self._width = n_v, width
-        self.begin_segment()
-
-    def begin_segment(self) -> None:
-        """The next window shares no noise with those before."""
-        self._L = np.empty((0, 0))  # Cholesky factor of the windows that the next one overlaps
-        self._white = np.empty((0, self._width))  # and their whitened rows
-
-    def push(self, covariances: list[Array], rows: Array) -> Array:
-        """Whitened rows (n_v, width) of the next window's (n_v, width), from `RowNoise.covariance`.
-
-        Raises numpy.linalg.LinAlgError where the covariance is not positive definite.
-        """
-        n_v = self._n_v
-        self._L = factored(self._L, covariances)
-        white = self._white[len(self._white) + n_v - len(self._L) :]
-        below = self._L[-n_v:]
-        rows = rows - below[:, :-n_v] @ white
-        out = _solved(below[:, -n_v:], rows)
-        self._white = np.concatenate((white, out))
-        return out
-
-    def state(self) -> dict[str, Array]:
-        """What `restore` needs to continue."""
-        return {"L": self._L, "white": self._white}
-
-    def restore(self, state: Mapping[str, NDArray[Any]]) -> None:
-        """Continue from a saved state."""
-        self._L, self._white = np.array(state["L"]), np.array(state["white"])

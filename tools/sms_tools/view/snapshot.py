@@ -113,7 +113,7 @@ def apply(snapshot: Snapshot, replica: Estimator) -> None:
         momentum.tracker.restore(known.tracker)
         momentum.bias.restore(known.bias)
         fit = momentum.fit
-        fit.weighing.beta, fit.plain.misfit = known.weights, known.misfit
+        fit.weighing.noise.beta, fit.plain.misfit = known.weights, known.misfit
         fit.plain.gram, fit.plain.windows = known.plain_gram, known.plain_windows
         momentum.test.alarm, fit.unexplained = known.alarm, known.unexplained
         momentum.latencies.restore(known.latencies)

@@ -1,0 +1,110 @@
+"""Rows of overlapping windows made independent of each other: sequential whitening.
+
+Rows of windows that overlap share noise, so their covariance is block-banded, and so is its Cholesky factor L: those
+of L⁻¹ [Y b] have independent errors of standard deviation one. A window's whitened rows are its innovations: what its
+rows say beside all windows before it, in units of their deviation. The factor grows by one window at a time, of which
+it keeps those that the next one overlaps; the same rows of L whiten any further columns later.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg.lapack import dtrtrs
+
+from sms_online.stream import Array
+
+# Share of a row's variance that is added to it alone, for the rounding of the factorisation.
+ROUNDING = 1e-13
+
+
+class Factor:
+    """Cholesky factor of the windows' covariance, one window after the other."""
+
+    def __init__(self) -> None:
+        self.L = np.empty((0, 0))  # of the windows that the last one overlaps, and of itself
+
+    def push(self, covariances: Sequence[Array], errors: Array | float = 0.0) -> Array:
+        """The next window's rows of L (n_v, m n_v), its own block last.
+
+        covariances (m of (n_v, n_v)): with the windows before that it overlaps, oldest first, then its own. errors
+        (n_v,): further variance of each row, of its own. Raises numpy.linalg.LinAlgError where the covariance is not
+        positive definite.
+        """
+        own = covariances[-1].copy()
+        n_v = len(own)
+        diagonal = np.einsum("ii->i", own)
+        diagonal += ROUNDING * diagonal + errors
+        size = n_v * (len(covariances) - 1)
+        L = self.L[len(self.L) - size :, len(self.L) - size :]
+        cross = np.concatenate([np.empty((n_v, 0)), *covariances[:-1]], axis=1).T  # (size, n_v)
+        X = _solved(L, cross) if size else cross
+        self.L = np.zeros((size + n_v, size + n_v))
+        self.L[:size, :size] = L
+        self.L[size:, :size], self.L[size:, size:] = X.T, np.linalg.cholesky(own - X.T @ X)
+        return self.L[size:]
+
+
+def _solved(L: Array, right: Array) -> Array:
+    """L⁻¹ times right-hand sides, L lower triangular: by LAPACK itself, for SciPy's checks take longer than it."""
+    solution, _ = dtrtrs(L.T, right, lower=0, trans=1)
+    return np.asarray(solution)
+
+
+class Whitener:
+    """Whitens rows [Y b] as windows come."""
+
+    def __init__(self, width: int) -> None:
+        self._width = width
+        self.begin_segment()
+
+    def begin_segment(self) -> None:
+        """The next window shares no noise with those before."""
+        self._factor = Factor()
+        self._white = np.empty((0, self._width))  # of the windows that the next one may overlap
+
+    def push(self, covariances: Sequence[Array], rows: Array) -> Array:
+        """Whitened rows (n_v, width) of the next window's (n_v, width), with covariances as `Factor` takes them."""
+        own = self._factor.push(covariances)
+        seen = own.shape[1] - len(own)
+        white = self._white[len(self._white) - seen :]
+        out = _solved(own[:, seen:], rows - own[:, :seen] @ white)
+        self._white = np.concatenate((white, out))
+        return out
+
+    def state(self) -> dict[str, Array]:
+        """What `restore` needs to continue."""
+        return {"L": self._factor.L, "white": self._white}
+
+    def restore(self, state: Mapping[str, NDArray[Any]]) -> None:
+        """Continue from a saved state."""
+        self._factor.L, self._white = np.array(state["L"]), np.array(state["white"])
+
+
+class Whitening:
+    """Whitens any columns of the rows of W windows, all of which are there: many at once, so each by a product alone.
+
+    std (W, n_v): deviation of each row beside those before it.
+    """
+
+    def __init__(self, covariances: Sequence[Sequence[Array]], errors: Array) -> None:
+        """covariances, errors (W, n_v): of each window as `Factor` takes them."""
+        factor, n_v = Factor(), errors.shape[1]
+        self.std = np.empty_like(errors)
+        self._operators: list[tuple[Array, Array]] = []  # on the whitened rows before, and on a window's own
+        for std, some, error in zip(self.std, covariances, errors, strict=True):
+            before, own = np.split(factor.push(some, error), [-n_v], axis=1)
+            inverse = _solved(own, np.eye(n_v))
+            self._operators.append((inverse @ before, inverse))
+            std[:] = np.diag(own)
+
+    def of(self, columns: Array) -> Array:
+        """Columns (W, n_v, c) in the whitened rows, (W n_v, c)."""
+        W, n_v, c = columns.shape
+        out = np.empty((W * n_v, c))
+        for begin, rows, (before, own) in zip(range(0, W * n_v, n_v), columns, self._operators, strict=True):
+            out[begin : begin + n_v] = own @ rows - before @ out[begin - before.shape[1] : begin]
+        return out

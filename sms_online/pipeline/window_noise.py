@@ -1,0 +1,117 @@
+"""What the sensors' noise makes of the rows of a session's windows: for the stream as for whole captures."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sms_online.model.base_parameters import BaseParameters
+from sms_online.model.model import Model
+from sms_online.pipeline.latency import SourceGroup
+from sms_online.pipeline.momentum_balance import MomentumBalance
+from sms_online.pipeline.momentum_windows import INSTANTS, Instants, Probes, Window
+from sms_online.pipeline.row_noise import RowNoise
+from sms_online.pipeline.sensitivity import Sensitivities
+from sms_online.pipeline.sensor_noise import SensorNoise, noise_from_state, noise_state
+from sms_online.stream import Array
+
+
+@dataclass(frozen=True)
+class PropagatedNoise:
+    """Noise of one window's rows.
+
+    covariances: with those of the windows before, then their own; see `RowNoise.covariance`. kernel: see
+    `RowNoise.kernel`, rough forces included. late (n_v, sensors): see `RowNoise.late`.
+    """
+
+    covariances: list[Array]
+    kernel: Array
+    late: Array
+
+
+class WindowNoise:
+    """Propagates the sensors' noise to the rows of windows, one after the other, with parameters β (n,), see `begin`.
+
+    readings: x (K, n_x) to the displacements (K, n_v, sensors) that unit noise of each position sensor makes. clocks:
+    see `RowNoise`. beta: β, None before it has begun. n_v: rows of a window.
+    """
+
+    def __init__(
+        self,
+        model: Model,
+        base: BaseParameters,
+        balance: MomentumBalance,
+        readings: Callable[[Array], Array],
+        clocks: Sequence[SourceGroup] = (),
+    ) -> None:
+        self.n_v = model.layout.n_v
+        self._base, self._rough = base, balance.rough
+        self._sample_rate = balance.sample_rate
+        self._sensitivities = Sensitivities(model, readings, balance.span / INSTANTS)
+        self._noise = RowNoise(model.layout.theta_m, balance.span, clocks)
+        self.beta: Array | None = None
+        self.sensor_noise: SensorNoise | None = None
+
+    def begin(self, beta: Array, noise: SensorNoise, instant: int) -> None:
+        """Begin with the window that starts at an instant, as if no window before shared samples with it."""
+        self.beta, self.sensor_noise = beta, noise
+        self.begin_segment(instant)
+
+    def begin_segment(self, instant: int = 0) -> None:
+        """The window that starts at an instant is the next, and shares no samples with those before."""
+        self._sensitivities.forget(instant)
+        self._noise.begin_segment()
+
+    @property
+    def probes(self) -> Probes:
+        """At which states it wants columns of new instants."""
+        return self._sensitivities.probes
+
+    def tell(self, first: int, x: Array, v: Array, signals: Array, instants: Sequence[Instants] = ()) -> None:
+        """Take the states (K, ·) of the instants from number `first` on, of which it needs those not told yet.
+
+        instants: those that came last, with columns where they were probed.
+        """
+        needed = self._sensitivities.next_instant
+        fresh = needed - first
+        assert self.beta is not None
+        pi = self._rough.without(self._base.physical_values(self.beta))
+        probed = next((piece.probed for piece in instants if piece.number == needed), None)
+        self._sensitivities.tell(pi, x[fresh:], v[fresh:], signals[fresh:], probed)
+
+    def drop(self, instant: int) -> None:
+        """Forget what no window that starts at an instant or later asks for."""
+        self._sensitivities.drop(instant)
+
+    def push(self, window: Window, errors: Array) -> PropagatedNoise:
+        """Of the next window; errors (n_v,): variance of each row that nothing propagates."""
+        assert self.sensor_noise is not None
+        assert self.beta is not None
+        pi = self._base.physical_values(self.beta)
+        sensitivity = self._sensitivities.window(window.start)
+        age = window.end / self._sample_rate
+        kernel = self._noise.kernel(sensitivity) + self._rough.kernel(window.rough, pi, sensitivity.displacements)
+        noise = self.sensor_noise
+        free = self._rough.at_rest(window.rest, pi)
+        covariances = self._noise.covariance(kernel, sensitivity.rates, noise.sensors, noise.torque, free, age)
+        diagonal = np.einsum("ii->i", covariances[-1])
+        diagonal += errors
+        return PropagatedNoise(covariances, kernel, self._noise.late)
+
+    def state(self) -> dict[str, Any]:
+        """What `restore` needs to continue."""
+        return {
+            "weights": np.empty(0) if self.beta is None else self.beta, **self._noise.state(),
+            **self._sensitivities.state(), **noise_state("weighed", self.sensor_noise),
+        }  # fmt: skip
+
+    def restore(self, state: Mapping[str, NDArray[Any]]) -> None:
+        """Continue from a saved state."""
+        self.beta = np.array(state["weights"]) if state["weights"].size else None
+        self._sensitivities.restore(state)
+        self._noise.restore(state)
+        self.sensor_noise = noise_from_state("weighed", state)
