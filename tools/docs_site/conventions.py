@@ -10,6 +10,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from sms_online.description.parse import parse_system, shipped_text
+from sms_online.effects.build import build_model
 from sms_online.model.chain import Configuration, Frame
 from sms_online.model.model import Model
 from sms_online.stream import Array
@@ -24,7 +25,7 @@ VIEW = np.array([[0.55, 0.83, 0.0], [-0.38, 0.25, 0.89]])
 
 def spatial_frames() -> str:
     """SVG of the frames of the shipped system spatial-two-link, bent and turned so that none hides another."""
-    model = Model(parse_system(shipped_text("spatial-two-link"), "spatial-two-link"))
+    model = build_model(parse_system(shipped_text("spatial-two-link"), "spatial-two-link"))
     x = _position(
         model,
         {"r_S_x": 0.55, "r_S_y": 0.45, "r_S_z": 0.9, "eta": 1.0, "q_1": 0.6, "q_2": -1.0}
@@ -105,7 +106,7 @@ def _links(axes: Axes, model: Model, configuration: Configuration) -> None:
 def link_conventions() -> str:
     """SVG of one link bent in both planes of its frame, with the signs of what its markers read."""
     system = parse_system(shipped_text("spatial-two-link"), "spatial-two-link")
-    model = Model(system)
+    model = build_model(system)
     kinematics = model.chain.flexible[0]
     assert kinematics is not None
     figure = Figure(figsize=(8.0, 3.0), layout="constrained")
