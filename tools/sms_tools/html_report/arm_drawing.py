@@ -6,6 +6,8 @@ import itertools
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
+from typing import Any
 
 import numpy as np
 from markupsafe import Markup
@@ -18,7 +20,7 @@ from sms_tools.html_report.figures import Chart, drawn, ink
 from sms_tools.view.scene import Drawing, Scene
 
 # Sizes, pt: of one of a row of pictures, and of a picture with places marked.
-SMALL = (180.0, 180.0)
+SMALL = (180.0, 150.0)
 MARKED = (440.0, 300.0)
 MARGIN = 16.0  # pt
 # A mark's text is so far above its place, pt.
@@ -50,10 +52,11 @@ def arm_drawings(scene: Scene, x: Array, chosen: Sequence[int], captions: Sequen
     drawing = scene.draw(x)
     corners = _corners(scene, drawing)
     paper = _paper(scene, (corners[list(chosen)], *drawing.links, drawing.tip), SMALL)
-    return [
-        Chart(caption, (), drawn(f"arm at {caption}", *SMALL, lambda axes, row=row: _arm(axes, paper, drawing, corners, row), bare=True))
-        for row, caption in zip(chosen, captions, strict=True)
-    ]
+    pictures = []
+    for row, caption in zip(chosen, captions, strict=True):
+        draw = partial(_arm, paper=paper, drawing=drawing, corners=corners, row=row)
+        pictures.append(Chart(caption, (), drawn(f"arm at {caption}", *SMALL, draw, bare=True)))
+    return pictures
 
 
 def marked_arm(scene: Scene, x: Array, row: int, marks: Mapping[str, str]) -> Markup:
@@ -80,9 +83,9 @@ def marked_arm(scene: Scene, x: Array, row: int, marks: Mapping[str, str]) -> Ma
             else:
                 at = paper(drawing.tip[row] if kind == "tip" else drawing.joints[row, int(number) - 1])
                 axes.plot(*at, "o", markersize=16.0, color="none", markeredgecolor=ink("mark"), markeredgewidth=3.0)
-            badge = {"boxstyle": "round,pad=0.35,rounding_size=0.8", "facecolor": ink("mark"), "edgecolor": "none"}
+            badge = {"boxstyle": "round,pad=0.4,rounding_size=0.7", "facecolor": ink("mark"), "edgecolor": "none"}
             axes.annotate(
-                text, at, (0.0, ABOVE), textcoords="offset points", ha="center", va="center", color="white",
+                text, (at[0], at[1]), (0.0, ABOVE), textcoords="offset points", ha="center", va="center", color="white",
                 weight="bold", bbox=badge, gid="badge",
             )  # fmt: skip
 
@@ -116,7 +119,7 @@ def _arm(axes: Axes, paper: Paper, drawing: Drawing, corners: Array, row: int) -
     _scale_bar(axes, paper)
 
 
-def _outline(box: Array, **look: object) -> Polygon:
+def _outline(box: Array, **look: Any) -> Polygon:
     """The outline of a box's corners (2, 8)."""
     return Polygon(box.T[ConvexHull(box.T).vertices], **look)
 

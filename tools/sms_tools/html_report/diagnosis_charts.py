@@ -36,8 +36,9 @@ def residual_charts(diagnosis: Diagnosis) -> list[Chart]:
     for row, speeds in row_types(rows.model.layout).items():
         worst = _worst(before, speeds)
         name = names[worst]
-        noise, line = _noise(t), _residual(before, rows.weak.windows, t, worst, BEFORE)
-        if after.system == before.system:
+        changed = after.system != before.system
+        noise, line = _noise(t), _residual(before, rows.weak.windows, t, worst, BEFORE if changed else AFTER)
+        if not changed:
             out.append(chart(f"{row}, {name}", [noise, line], TIME, shaded=held))
             continue
         # Exact links have coordinates of their own.
@@ -99,10 +100,10 @@ def _curve_chart(curve: ForceCurve) -> Chart:
 
 
 def _added_chart(added: AddedVariable) -> Chart:
-    bound = BOUNDS * added.std
+    at, left, bound = added.expected, added.left, BOUNDS * added.std
     lines = [
-        Series("residual without it ± 2σ", added.expected, added.left, added.left - bound, added.left + bound, color=BEFORE),
-        Series("expected", added.expected, added.expected, dashed=True, color=LAW),
+        Series("residual without it ± 2σ", at, left, left - bound, left + bound, color=BEFORE),
+        Series("expected", at, at, dashed=True, color=LAW),
     ]
     caption = f"{added.effect.name} at {added.effect.where}: whitened rows without it"
     return chart(caption, lines, "what the effect adds to a row, over its deviation")

@@ -71,9 +71,10 @@ def _arm(document: Document, diagnosis: Diagnosis) -> Markup:
     """The arm in the middle of the session, with the effects' numbers at their places."""
     rows = diagnosis.attempt.rows
     # Windows of each filter's width hold another part of the motion.
-    first = [motion for motion, _ in rows.weak.motions() if motion.segment == 0]
-    order = np.argsort(np.concatenate([motion.samples for motion in first]), kind="stable")
-    x = np.concatenate([motion.x for motion in first])[order][:: max(1, order.size // WAY_POINTS)]
+    motions = [motion for motion, _ in rows.weak.motions()]
+    segment = np.repeat([motion.segment for motion in motions], [len(motion.x) for motion in motions])
+    order = np.lexsort((np.concatenate([motion.samples for motion in motions]), segment))
+    x = np.concatenate([motion.x for motion in motions])[order][:: max(1, order.size // WAY_POINTS)]
     channels = diagnosis.estimator_before.sensing.channels
     marks: dict[str, list[str]] = {}
     for number_, effect in enumerate(document["effects"], start=1):

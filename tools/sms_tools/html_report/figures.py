@@ -40,6 +40,8 @@ WIDTH, HEIGHT = 370.0, 190.0
 POINTS_PER_INCH = 72.0
 # A line with a band has at most so many points: bands are not simplified, and more cannot be seen.
 MOST_POINTS = 200
+# Opacity of a band: several overlap.
+BAND = 0.11
 # Intervals between the numbers of an axis, at most.
 TICKS = 6
 STYLE = {
@@ -109,7 +111,7 @@ def chart(
             rows = _thinned(line)
             if line.lower is not None and line.upper is not None:
                 bounds = line.lower[rows], line.upper[rows]
-                axes.fill_between(line.x[rows], *bounds, color=ink(name), alpha=0.14, linewidth=0)
+                axes.fill_between(line.x[rows], *bounds, color=ink(name), alpha=BAND, linewidth=0)
         for start, end in shaded:
             axes.axvspan(start, end, color=ink("panel"), zorder=0)
         for mark in marks:

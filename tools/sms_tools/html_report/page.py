@@ -56,7 +56,7 @@ def _facts(document: Document) -> dict[str, str]:
     return {
         "method": METHODS[document["method"]],
         "duration": f"{document['duration_s']:.6g} s",
-        "samples": f"{document['samples']:,}".replace(",", " "),
+        "samples": f"{document['samples']:,}",
         "lost samples": str(document["lost_samples"]),
         "condition number": "infinite" if condition is None else f"{condition:.3g}",
     }
@@ -125,9 +125,11 @@ def _convergence(document: Document, nominal: Mapping[str, float], course: Cours
         series = [
             Series(with_subscripts(label), course.t, y, y - bound, y + bound)
             for label, y, bound in zip(group.labels, drawn.T, width.T, strict=True)
+            if np.isfinite(y).any()
         ]
         y_range = None if group.half_range is None else (-limit, limit)
-        charts.append(chart(group.title, series, "time, s", y_range, marks))
+        if series:
+            charts.append(chart(group.title, series, "time, s", y_range, marks))
     return charts
 
 
@@ -146,7 +148,7 @@ def _evidence(episode: Document) -> list[Chart]:
     names = list(dict.fromkeys(name for each in searches for name in each["candidates"]))[:MOST_CANDIDATES]
     gains = np.array([[each["candidates"].get(name, np.nan) for name in names] for each in searches])
     series = [Series(name, t, column) for name, column in zip(names, np.maximum(gains, 1.0).T, strict=True)]
-    caption = f"Evidence for candidates at {t[-1]:g} s: gain of the log-likelihood, doubled"
+    caption = f"Evidence for candidates until {t[-1]:.4g} s: gain in the whitened sum of squares"
     return [chart(caption, series, "time of the newest sample, s", log=True)]
 
 

@@ -19,14 +19,14 @@ from sms_tools.report import NOT_DETERMINED, Document, formatter
 
 @dataclass(frozen=True)
 class Bar:
-    """An error bar, %: of its cell's width where it begins and ends and where the estimate is; its colour's name.
+    """An error bar: where it begins and ends and where the estimate is, % of its cell's width; its colour's name.
 
-    below, above: whether it goes on beyond the cell.
+    middle: none where the estimate is beyond the cell. below, above: whether the bar goes on beyond it.
     """
 
     start: float
     end: float
-    middle: float
+    middle: float | None
     color: str
     below: bool
     above: bool
@@ -38,12 +38,18 @@ def error_bar(deviation: float, bound: float, limit: float, color: str) -> Bar |
         return None
     ends = np.array((deviation - bound, deviation + bound, deviation)) / limit
     start, end, middle = (50.0 + 50.0 * np.clip(ends, -1.0, 1.0)).round(1).tolist()
-    return Bar(start, end, middle, color, bool(ends[0] < -1.0), bool(ends[1] > 1.0))
+    seen = abs(deviation) <= limit
+    return Bar(start, end, middle if seen else None, color, bool(ends[0] < -1.0), bool(ends[1] > 1.0))
 
 
 def with_subscripts(symbol: str) -> Markup:
     """A parameter's symbol with its indices set low."""
     return Markup(re.sub("_([0-9A-Za-z]+)", r"<sub>\1</sub>", str(escape(symbol))))
+
+
+def breakable(name: str) -> Markup:
+    """A parameter's name that may go on in the next line after its dot, its at, or a body that is lumped into it."""
+    return Markup(re.sub("([.@]|_and_)", r"\1<wbr>", str(escape(name))))
 
 
 def estimate_cells(p: Document) -> tuple[str, str, str]:
@@ -69,7 +75,7 @@ def _environment() -> Environment:
         lstrip_blocks=True,
     )
     environment.globals["palette"] = PALETTE
-    environment.filters |= {"with_subscripts": with_subscripts, "number": number}
+    environment.filters |= {"with_subscripts": with_subscripts, "breakable": breakable, "number": number}
     return environment
 
 

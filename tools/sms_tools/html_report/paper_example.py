@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Sequence
-from html import escape
 from pathlib import Path
 
 import numpy as np
@@ -15,8 +14,8 @@ import numpy as np
 from sms_adapters.system_file import load_system
 from sms_online.results import results_document
 from sms_sim.simulate import Simulation, exact_states, sampled_blocks, simulate
-from sms_tools.html_report.page import write_page
-from sms_tools.html_report.svg import Series, chart
+from sms_tools.html_report.figures import Chart, Series, chart
+from sms_tools.html_report.pages import write_page
 from sms_tools.session import new_estimator
 
 # Table V says EI_2 = 1768.8 N m², Table III 597.87; the figure's size of motion does not tell them apart.
@@ -51,11 +50,20 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("file", metavar="FILE.html", type=Path, help="the page to write")
     file: Path = parser.parse_args(arguments).file
     simulation = simulate(load_system(SYSTEM), DURATION)
-    body = f"<h1>The paper's example</h1>{figure_6(simulation)}{table_v(simulation)}"
-    write_page(file, "The paper's example", body)
+    samples, rows = table_v(simulation)
+    write_page(
+        file,
+        "paper_example.html",
+        title="The paper's example",
+        figures=figure_6(simulation),
+        rows=rows,
+        samples=samples,
+        duration=simulation.duration,
+        rate=simulation.plant.system.sample_rate,
+    )
 
 
-def figure_6(simulation: Simulation) -> str:
+def figure_6(simulation: Simulation) -> list[Chart]:
     """Joint angles, rates and motor torques over time, as in Figure 6."""
     t = np.linspace(0.0, simulation.duration, POINTS)
     exact = exact_states(simulation, t)
@@ -64,19 +72,19 @@ def figure_6(simulation: Simulation) -> str:
     angles, rates, torques = [], [], []
     for i, (q, theta_m) in enumerate(zip(layout.q, layout.theta_m, strict=True)):
         number = "₁₂"[i]
-        angles += [Series(f"q{number}", exact.x[:, q + offset]), Series(f"θ_m{number}", exact.x[:, theta_m + offset])]
-        rates += [Series(f"q̇{number}", exact.v[:, q]), Series(f"θ̇_m{number}", exact.v[:, theta_m])]
-        torques.append(Series(f"τ{number}", exact.torque[:, i] / system.joints[i].gear_ratio))
-    charts = [
-        chart("(a) joint angles q and θ_m, rad", t, angles, "time, s"),
-        chart("(b) rates of q and θ_m, rad/s", t, rates, "time, s"),
-        chart("(c) motor torques τ before the gear, N m", t, torques, "time, s"),
+        angles.append(Series(f"q{number}", t, exact.x[:, q + offset]))
+        angles.append(Series(f"θ_m{number}", t, exact.x[:, theta_m + offset]))
+        rates += [Series(f"q̇{number}", t, exact.v[:, q]), Series(f"θ̇_m{number}", t, exact.v[:, theta_m])]
+        torques.append(Series(f"τ{number}", t, exact.torque[:, i] / system.joints[i].gear_ratio))
+    return [
+        chart("(a) joint angles q and θ_m, rad", angles, "time, s"),
+        chart("(b) rates of q and θ_m, rad/s", rates, "time, s"),
+        chart("(c) motor torques τ before the gear, N m", torques, "time, s"),
     ]
-    return "<h2>Figure 6</h2>" + "".join(charts)
 
 
-def table_v(simulation: Simulation) -> str:
-    """Actual and estimated values and the relative error in %, printed and ours."""
+def table_v(simulation: Simulation) -> tuple[int, list[list[str]]]:
+    """Number of samples, and rows: symbol, unit, then actual and estimated value and error in %, printed and ours."""
     system = simulation.plant.system
     blocks = list(sampled_blocks(simulation, "0"))
     estimator = new_estimator(system, blocks[0].channels, system.name)
@@ -87,18 +95,8 @@ def table_v(simulation: Simulation) -> str:
     rows = []
     for p, printed in zip(results_document(estimator, 0.0, [], truth)["parameters"], TABLE_V, strict=True):
         error = 100.0 * (p["estimate"] / p["true"] - 1.0)
-        ours = (f"{p['true']:.6g}", f"{p['estimate']:.6g}", f"{error:+.2g}")
-        cells = "".join(f"<td>{cell}</td>" for cell in (*printed, *ours))
-        rows.append(f'<tr><td>{escape(p["symbol"])}</td><td class="left">{escape(p["unit"])}</td>{cells}</tr>')
-    heading = (
-        '<tr><th></th><th></th><th colspan="3">Table V as printed</th><th colspan="3">ours</th></tr>'
-        "<tr><th>π</th><th></th>" + 2 * "<th>actual</th><th>estimated</th><th>error %</th>" + "</tr>"
-    )
-    how = (
-        f"Ours: {estimator.samples} samples of {simulation.duration:g} s at {system.sample_rate:g} Hz without noise, "
-        "rates found from the positions."
-    )
-    return f"<h2>Table V</h2><p>{how}</p><table>{heading}{''.join(rows)}</table>"
+        rows.append([p["symbol"], p["unit"], *printed, f"{p['true']:.6g}", f"{p['estimate']:.6g}", f"{error:+.2g}"])
+    return estimator.samples, rows
 
 
 if __name__ == "__main__":
