@@ -1,8 +1,7 @@
-"""The effect that the guide for contributors adds, as it is written there."""
+"""The effect that the guide to effects adds, as it is written there."""
 
 from __future__ import annotations
 
-import textwrap
 from collections.abc import Mapping
 from pathlib import Path
 from typing import cast
@@ -12,11 +11,13 @@ import numpy as np
 from sms_online.effects.base import Entry, Force
 from sms_online.effects.friction import MotorSide
 
+GUIDE = Path(__file__).parents[1] / "docs" / "how-to" / "add-an-effect.md"
+
 
 def windage() -> type[Force]:
     """Its class."""
-    guide = (Path(__file__).parent.parent / "CONTRIBUTING.md").read_text(encoding="utf-8")
-    code = guide.split("    class WindageFriction")[1].split("\n\nList the class")[0]
+    blocks = GUIDE.read_text(encoding="utf-8").split("```python\n")
+    code = next(block for block in blocks if block.startswith("class WindageFriction")).split("```")[0]
     names = {"np": np, "MotorSide": MotorSide, "Entry": Entry, "Mapping": Mapping}
-    exec(textwrap.dedent(f"    from __future__ import annotations\n\n    class WindageFriction{code}"), names)
+    exec(f"from __future__ import annotations\n\n{code}", names)
     return cast(type[Force], names["WindageFriction"])

@@ -310,7 +310,7 @@ def test_geometric_stiffening_is_no_effect_of_a_link_that_is_exact_already() -> 
 
 
 def test_the_guide_lists_every_effect_with_its_coefficients_and_defaults() -> None:
-    guide = (Path(__file__).parent.parent / "docs" / "effects.md").read_text(encoding="utf-8")
+    guide = (Path(__file__).parent.parent / "docs" / "reference" / "effects.md").read_text(encoding="utf-8")
     rows = {line.split("`")[1]: line for line in guide.splitlines() if line.startswith("| `")}
     assert set(rows) == set(NAMES)
     for name, entry in ENTRIES.items():
@@ -320,7 +320,7 @@ def test_the_guide_lists_every_effect_with_its_coefficients_and_defaults() -> No
             assert f"{shape.default:.3g} {shape.unit}".strip() in rows[name], name
 
 
-def test_an_effect_as_the_guide_for_contributors_writes_it_is_one() -> None:
+def test_an_effect_as_the_guide_writes_it_is_one() -> None:
     model = build_model(paper())
     site = Site(model.system, model.chain, "joint_1", 1, model.weight)
     effect = windage()(site, {"drag": 0.3})  # type: ignore[call-arg, arg-type]

@@ -1,4 +1,4 @@
-"""What the guide to sources shows is what the program takes: its tables parse, its reader reads."""
+"""What the guides to benches and sources show is what the program takes: tables parse, the reader reads."""
 
 from __future__ import annotations
 
@@ -13,24 +13,31 @@ import pytest
 from sms_adapters.raw import LostDevice, SerialChunk
 from sms_online.description.parse import parse_system
 
-GUIDE = Path(__file__).parents[1] / "docs" / "sources.md"
+HOW_TO = Path(__file__).parents[1] / "docs" / "how-to"
 RIG = '[joint_1]\nstiffness = 100.0\n[motor_1]\nrotor_inertia = 0.001\n[link_1]\nkind = "rigid"\n'
 
 
-def shown(language: str) -> list[str]:
-    return re.findall(rf"```{language}\n(.*?)```", GUIDE.read_text(encoding="utf-8"), re.DOTALL)
+def shown(page: str, language: str) -> list[str]:
+    return re.findall(rf"```{language}\n(.*?)```", (HOW_TO / page).read_text(encoding="utf-8"), re.DOTALL)
 
 
-@pytest.mark.parametrize("table", shown("toml"))
-def test_the_tables_of_the_guide_are_accepted(table: str) -> None:
+@pytest.mark.parametrize("table", [*shown("can-bench.md", "toml"), *shown("serial-bench.md", "toml")])
+def test_the_tables_of_the_guides_are_accepted(table: str) -> None:
     assert parse_system(f'name = "rig"\n{RIG}{table}', "guide").sources
 
 
+def test_the_system_file_of_the_guide_is_accepted() -> None:
+    (text,) = shown("describe-a-system.md", "toml")
+    system = parse_system(text, "guide")
+    assert [effect.name for effect in system.effects] == ["viscous_friction"]
+    assert set(system.known) | set(system.priors) == {"joint_1.damping", "motor_1.rotor_inertia"}
+
+
 def test_the_guides_own_source_reads_and_decodes() -> None:
-    (code,) = shown("python")
+    (code,) = shown("add-a-source.md", "python")
     assert len(code.splitlines()) < 50
     scope: dict[str, Any] = {"__name__": "guide"}
-    exec(compile(code, str(GUIDE), "exec"), scope)
+    exec(compile(code, "add-a-source.md", "exec"), scope)
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as free:
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]

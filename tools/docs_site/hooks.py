@@ -5,12 +5,13 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
+from mkdocs.config.defaults import MkDocsConfig
+from mkdocs.structure.files import File, Files
+
 from api_page import api_page
 from channel_page import channel_tables
 from command_page import command_page
 from conventions import link_conventions, spatial_frames
-from mkdocs.config.defaults import MkDocsConfig
-from mkdocs.structure.files import File, Files
 from notebooks import page_of_notebook
 from schema_page import schema_tables
 
