@@ -10,6 +10,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from sms_online.description.parse import parse_system, shipped_text
+from sms_online.description.schema import FlexibleLink
 from sms_online.effects.build import build_model
 from sms_online.model.chain import Configuration, Frame
 from sms_online.model.model import Model
@@ -83,23 +84,23 @@ def _base(axes: Axes, model: Model, configuration: Configuration, frames: list[F
 def _links(axes: Axes, model: Model, configuration: Configuration) -> None:
     """The links' centre lines, straight and bent, and their markers."""
     for i, kinematics in enumerate(model.chain.flexible):
-        shape = configuration.shape(i)
+        shape, link = configuration.shape(i), model.system.links[i]
         assert kinematics is not None
         assert shape is not None
+        assert isinstance(link, FlexibleLink)
         frame = configuration.frames[2 * i + 2]
         origin, rotation = frame.origin[0], frame.rotation[0]
         points = np.vstack((np.zeros(3), shape.points[0], shape.tip[0]))
-        _line(axes, origin + np.outer((0.0, kinematics.length), rotation[:, 0]), color=GREY, linestyle="--")
+        _line(axes, origin + np.outer(np.array([0.0, link.length]), rotation[:, 0]), color=GREY, linestyle="--")
         _line(axes, origin + points @ rotation.T, color="black", linewidth=2.5)
-        elements = model.system.links[i].elements  # type: ignore[union-attr]  # all are flexible here
         readings = dict(
             zip(kinematics.marker_names, kinematics.markers(model.chain.elastic(configuration.x, i))[0], strict=True)
         )
-        for j in range(1, elements + 1):
-            straight = kinematics.length * j / elements
+        for j in range(1, link.elements + 1):
+            straight = link.length * j / link.elements
             at = origin + rotation @ np.array([straight, *(readings[f"marker_{j}.{u}"] for u in ("u_y", "u_z"))])
             axes.plot(*_seen(at), "o", color="#d68910", markersize=7, zorder=5)
-            if j < elements:
+            if j < link.elements:
                 _text(axes, at, f"marker_{j} of link_{i + 1}", color="#9c640c", offset=((-48, -14), (6, -14))[i])
 
 
@@ -107,8 +108,9 @@ def link_conventions() -> str:
     """SVG of one link bent in both planes of its frame, with the signs of what its markers read."""
     system = parse_system(shipped_text("spatial-two-link"), "spatial-two-link")
     model = build_model(system)
-    kinematics = model.chain.flexible[0]
+    kinematics, link = model.chain.flexible[0], system.links[0]
     assert kinematics is not None
+    assert isinstance(link, FlexibleLink)
     figure = Figure(figsize=(8.0, 3.0), layout="constrained")
     readings = {"u_y": 0.07, "theta_z": 0.13, "u_z": 0.07, "theta_y": -0.13}
     bent = {f"marker_{j}.{name}": value * (1.0, 2.9)[j - 1] for j in (1, 2) for name, value in readings.items()}
@@ -119,7 +121,7 @@ def link_conventions() -> str:
     ):
         _plane(
             axes,
-            kinematics.length,
+            link.length,
             shape.points[0][:, [0, up]],
             shape.tip[0][[0, up]],
             shape.tip_rotation[0][[0, up], 0],
@@ -127,7 +129,7 @@ def link_conventions() -> str:
         sign = "> 0" if plane == 0 else "< 0"
         axes.set_title(f"{deformation}: {u} > 0, {theta} {sign} as drawn", fontsize=10)
         axes.annotate("xyz"[up], (0.0, 0.33), color=COLORS[up], ha="center", va="bottom")
-        L, tip = kinematics.length, shape.tip[0][up]
+        L, tip = link.length, shape.tip[0][up]
         axes.annotate("", (L, tip), (L, 0.0), arrowprops={"arrowstyle": "->", "color": COLORS[up]})
         axes.annotate(u, (L + 0.03, 0.45 * tip), color=COLORS[up])
         out = "y into the paper" if plane == 1 else "z out of the paper"
@@ -169,9 +171,10 @@ def _paper(width: float, height: float) -> tuple[Figure, Axes]:
     return figure, axes
 
 
-def _seen(point: Array) -> Array:
-    """A point (3,) on the paper (2,), in parallel projection."""
-    return VIEW @ point
+def _seen(point: Array) -> tuple[float, float]:
+    """A point (3,) on the paper, in parallel projection."""
+    right, up = VIEW @ point
+    return float(right), float(up)
 
 
 def _line(axes: Axes, points: Array, **style: object) -> None:

@@ -14,9 +14,10 @@ def page_of_notebook(file: File) -> dict[str, str | bytes]:
 
     The notebook is not executed: its outputs are those of `pytest --nbmake --overwrite docs/tutorials`.
     """
-    notebook = nbformat.reads(file.content_string, as_version=4)
+    notebook = nbformat.reads(file.content_string, as_version=4)  # type: ignore[no-untyped-call]
     path = PurePosixPath(file.src_uri)
-    body, resources = MarkdownExporter().from_notebook_node(
+    exporter = MarkdownExporter()  # type: ignore[no-untyped-call]
+    body, resources = exporter.from_notebook_node(
         notebook, resources={"output_files_dir": f"{path.stem}-files", "unique_key": path.stem}
     )
     link = f"\nThis page is a notebook: [{path.name}]({path.name}).\n"

@@ -54,7 +54,8 @@ def described_fields(record: type[Record]) -> tuple[str, dict[str, str]]:
 
     Raises ValueError where a field is not described, or something that is no field.
     """
-    about, fields = "", {}
+    about = ""
+    fields: dict[str, str] = {}
     for kind in reversed(record.__mro__):
         if issubclass(kind, Record) and kind is not Record:
             about, own = _entries(kind)

@@ -8,14 +8,14 @@ from pathlib import Path
 from mkdocs.config.defaults import MkDocsConfig
 from mkdocs.structure.files import File, Files
 
-from api_page import api_page
-from channel_page import channel_tables
-from command_page import command_page
-from conventions import link_conventions, spatial_frames
-from notebooks import page_of_notebook
-from schema_page import schema_tables
+from docs_site.api_page import api_page
+from docs_site.channel_page import channel_tables
+from docs_site.command_page import command_page
+from docs_site.conventions import link_conventions, spatial_frames
+from docs_site.notebooks import page_of_notebook
+from docs_site.schema_page import schema_tables
 
-ROOT = Path(__file__).resolve().parents[2]
+ROOT = Path(__file__).resolve().parents[1]
 # Pages with a line `<!-- made: NAME -->`, which what is made replaces.
 MADE = re.compile(r"^<!-- made: ([\w-]+) -->$", re.MULTILINE)
 MAKERS = {
@@ -47,7 +47,7 @@ def on_page_markdown(markdown: str, **_: object) -> str:
 
 def _moved_into_docs(text: str) -> str:
     """Links of a page that lies beside docs/, as they are within it."""
-    text = re.sub(r"\]\(docs/", "](", text)
+    text = re.sub(r"\]\(docs/", "](", text).replace(".ipynb)", ".md)")
     return text.replace("](CONTRIBUTING.md", "](contributing.md").replace(
         "](LICENSE)", "](https://www.apache.org/licenses/LICENSE-2.0)"
     )

@@ -1,0 +1,1 @@
+"""What the docs site is made of beside its pages: parts that follow the code."""
