@@ -94,6 +94,8 @@ def test_a_closed_hand_over_ends_its_thread() -> None:
     [
         ("off", Choice("off")),
         ("save", Choice("save")),
+        ("serve", Choice("serve", "127.0.0.1")),
+        ("serve=0.0.0.0", Choice("serve", "0.0.0.0")),
         ("connect=lab-pc", Choice("connect", "lab-pc", 9876)),
         ("connect=127.0.0.1:80", Choice("connect", "127.0.0.1", 80)),
         ("connect=rerun+http://[::1]:9999/proxy", Choice("connect", "[::1]", 9999)),
@@ -103,7 +105,9 @@ def test_choices(text: str, choice: Choice) -> None:
     assert parse_choice(text) == choice
 
 
-@pytest.mark.parametrize("text", ["", "file", "connect", "connect=", "connect=host:0", "connect=host:99999", "save=x"])
+@pytest.mark.parametrize(
+    "text", ["", "file", "connect", "connect=", "connect=host:0", "connect=host:99999", "save=x", "serve=", "serve=all"]
+)
 def test_wrong_choices_say_what_was_expected(text: str) -> None:
-    with pytest.raises(ValueError, match="expected off, save, serve, spawn or connect=URL"):
+    with pytest.raises(ValueError, match="expected off, save, serve, serve=ADDRESS "):
         parse_choice(text)

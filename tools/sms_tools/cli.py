@@ -99,7 +99,7 @@ def _add_out(parser: Parser) -> None:
 
 def _add_view(parser: Parser) -> None:
     text = "view in rerun: a file in DIR, a page in the browser, a viewer started or running already; off by default"
-    names = "off|save|serve|spawn|connect=URL"
+    names = "off|save|serve[=ADDRESS]|spawn|connect=URL"
     parser.add_argument("--rerun", metavar=names, type=_rerun, default="off", help=text)
     text = "factor on the deflections that the view draws, 1 by default"
     parser.add_argument("--exaggerate", metavar="FACTOR", type=_factor, default=1.0, help=text)

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import json
+import os
 import pickle
+import signal
 import socket
 import subprocess
 import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import suppress
 from pathlib import Path
 from threading import Event as Flag
 from threading import Thread
@@ -187,7 +190,9 @@ class View:
 
     def _kill(self) -> None:
         if self._process is not None:
-            self._process.kill()
+            with suppress(ProcessLookupError):
+                # With a server that it has started, which outlives it where it was killed.
+                os.killpg(self._process.pid, signal.SIGKILL)
             self._process.wait()
 
 

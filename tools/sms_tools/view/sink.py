@@ -7,14 +7,17 @@ own log; a flush with a time limit after every batch finds out all of this.
 from __future__ import annotations
 
 import socket
-import sys
+import subprocess
+from ipaddress import ip_address
 from pathlib import Path
+from time import monotonic, sleep
 from urllib.parse import quote
 
 import rerun as rr
 import rerun.blueprint as rrb
+import rerun_cli
 
-from sms_tools.view.choice import Choice
+from sms_tools.view.choice import LOOPBACK, Choice
 from sms_tools.view.frames import TroubleError
 
 # One name for all sessions: the viewer keeps what a person changes in the layout by application.
@@ -24,6 +27,10 @@ FLUSH_TIMEOUT = 3.0
 # What a served session keeps for viewers that come late; the oldest goes first.
 SERVER_MEMORY = "512MiB"
 GRPC_PORT, WEB_PORT = 9876, 9090
+# The viewer and server itself; the script of that name starts it as a child, which would outlive its parent.
+RERUN = Path(rerun_cli.__file__).with_name("rerun")
+# A server listens within this time, s, also on a busy machine, and is tried so often, s.
+STARTING, TRY = 20.0, 0.05
 
 
 class Sink:
@@ -46,22 +53,42 @@ class Sink:
             self.stream.connect_grpc(self.choice.url, default_blueprint=blueprint)
             return f"showing in the viewer at {self.choice.url}"
         if kind == "spawn":
-            # The viewer stands beside the interpreter, whether or not that directory is in PATH.
-            viewer = Path(sys.executable).with_name("rerun")
             rr.spawn(
                 recording=self.stream,
-                port=_free_port(GRPC_PORT),
-                executable_path=str(viewer) if viewer.exists() else None,
+                port=_free_port(GRPC_PORT, LOOPBACK),
+                executable_path=str(RERUN),
                 default_blueprint=blueprint,
             )
             return "showing in a rerun viewer"
-        server = self.stream.serve_grpc(
-            grpc_port=_free_port(GRPC_PORT), default_blueprint=blueprint, server_memory_limit=SERVER_MEMORY
+        return self._serve(blueprint)
+
+    def _serve(self, blueprint: rrb.Blueprint) -> str:
+        """Start a server of pages and data, as a process of its own, for within this one it has no address to choose.
+
+        It stays in this process's group, with which the session ends it.
+        """
+        address = self.choice.host
+        port, page = _free_port(GRPC_PORT, address), _free_port(WEB_PORT, address)
+        command = [str(RERUN), "--serve-web", "--bind", address, "--server-memory-limit", SERVER_MEMORY]
+        command += ["--port", str(port), "--web-viewer-port", str(page)]
+        open_to_others = not ip_address(address).is_loopback
+        if open_to_others:
+            command += ["--cors-allow-origin", f"http://*:{page}"]  # pages that are asked for by this machine's name
+        server = subprocess.Popen(
+            command, stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
         )
-        port = _free_port(WEB_PORT)
-        rr.serve_web_viewer(web_port=port, open_browser=False, connect_to=server)
-        # rerun binds both servers to all interfaces and offers no other choice.
-        return f"in the browser: http://127.0.0.1:{port}/?url={quote(server, safe='')} (open to the whole network)"
+        reached = LOOPBACK if address == "0.0.0.0" else address
+        end = monotonic() + STARTING
+        while not _listens(reached, port):
+            if server.poll() is not None or monotonic() > end:
+                raise TroubleError(f"rerun's server does not start on {address}")
+            sleep(TRY)
+        data = f"rerun+http://{reached}:{port}/proxy"
+        self.stream.connect_grpc(data, default_blueprint=blueprint)
+        url = f"http://{reached}:{page}/?url={quote(data, safe='')}"
+        if address == "0.0.0.0":
+            return f"in the browser: {url} (open to the whole network: elsewhere this machine's name for {LOOPBACK})"
+        return f"in the browser: {url}"
 
     def arrange(self, blueprint: rrb.Blueprint) -> None:
         """Show in another layout from now on."""
@@ -85,13 +112,18 @@ class Sink:
             self.stream.disconnect()
 
 
-def _free_port(wanted: int) -> int:
-    """The wanted port, or any free one where that is taken."""
+def _listens(address: str, port: int) -> bool:
+    with socket.socket() as probe:
+        return probe.connect_ex((address, port)) == 0
+
+
+def _free_port(wanted: int, address: str) -> int:
+    """The wanted port at an address of this machine, or any free one where that is taken."""
     for port in (wanted, 0):
         with socket.socket() as probe:
             probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
             try:
-                probe.bind(("", port))
+                probe.bind((address, port))
             except OSError:
                 continue
             return int(probe.getsockname()[1])

@@ -9,6 +9,7 @@ from __future__ import annotations
 import json
 import os
 import pickle
+import signal
 import sys
 from queue import Empty, Queue
 from threading import Thread
@@ -40,7 +41,9 @@ def main() -> None:
     start = frames.get()
     if isinstance(start, Start):
         _serve(start, frames, messages)
-    # Rerun's own end waits for sinks that may never take their data.
+    # Rerun's own end waits for sinks that may never take their data; a server goes too, whoever has ended the session.
+    if os.getpgrp() == os.getpid():  # as it is started by a session
+        os.killpg(0, signal.SIGKILL)
     os._exit(0)
 
 
