@@ -10,6 +10,8 @@ from xml.etree import ElementTree
 
 import numpy as np
 import pytest
+from sms_tools.html_report.error_bars import Bar, error_bars
+from sms_tools.html_report.svg import Axis, Series, chart
 
 from sms_adapters.capture import CaptureWriter
 from sms_adapters.system_file import load_system
@@ -22,11 +24,9 @@ from sms_tools.cli import main
 from sms_tools.html_report import history as history_module
 from sms_tools.html_report import svg
 from sms_tools.html_report.arm_drawing import arm_drawings
-from sms_tools.html_report.error_bars import Bar, error_bars
 from sms_tools.html_report.history import History
 from sms_tools.html_report.page import write_report
 from sms_tools.html_report.paper_example import figure_6
-from sms_tools.html_report.svg import Axis, Series, chart
 from sms_tools.view.scene import Scene
 from sms_tools.view.session import references
 
