@@ -1,0 +1,97 @@
+"""Online parameter estimation for flexible space manipulators: `import sms_online as sms`.
+
+A name is loaded when it is first used, so that importing costs nothing. Whatever is not named here is private.
+"""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from sms_adapters.recorded import read_capture, write_capture
+    from sms_adapters.system_file import load_system
+    from sms_online.capture import Capture
+    from sms_online.description.parse import shipped_systems
+    from sms_online.description.schema import System
+    from sms_online.diagnosis.diagnosed import Diagnosis, diagnose
+    from sms_online.errors import InputError
+    from sms_online.judgement import Residual, Trust
+    from sms_online.pipeline.events import Event
+    from sms_online.result import Coefficient, Finding, Parameter, Parameters, Result
+    from sms_online.session import Session, estimate
+    from sms_online.stream import Block
+    from sms_sim.bound import Bounds, bound
+    from sms_sim.capture import simulate
+
+    __version__: str
+
+# Where each name lives.
+_HOMES = {
+    "Block": "sms_online.stream",
+    "Bounds": "sms_sim.bound",
+    "Capture": "sms_online.capture",
+    "Coefficient": "sms_online.result",
+    "Diagnosis": "sms_online.diagnosis.diagnosed",
+    "Event": "sms_online.pipeline.events",
+    "Finding": "sms_online.result",
+    "InputError": "sms_online.errors",
+    "Parameter": "sms_online.result",
+    "Parameters": "sms_online.result",
+    "Residual": "sms_online.judgement",
+    "Result": "sms_online.result",
+    "Session": "sms_online.session",
+    "System": "sms_online.description.schema",
+    "Trust": "sms_online.judgement",
+    "bound": "sms_sim.bound",
+    "diagnose": "sms_online.diagnosis.diagnosed",
+    "estimate": "sms_online.session",
+    "load_system": "sms_adapters.system_file",
+    "read_capture": "sms_adapters.recorded",
+    "shipped_systems": "sms_online.description.parse",
+    "simulate": "sms_sim.capture",
+    "write_capture": "sms_adapters.recorded",
+}
+
+__all__ = [
+    "Block",
+    "Bounds",
+    "Capture",
+    "Coefficient",
+    "Diagnosis",
+    "Event",
+    "Finding",
+    "InputError",
+    "Parameter",
+    "Parameters",
+    "Residual",
+    "Result",
+    "Session",
+    "System",
+    "Trust",
+    "__version__",
+    "bound",
+    "diagnose",
+    "estimate",
+    "load_system",
+    "read_capture",
+    "shipped_systems",
+    "simulate",
+    "write_capture",
+]
+
+
+def __getattr__(name: str) -> Any:
+    if name == "__version__":
+        from importlib.metadata import version
+
+        return version("sms-online")
+    if name not in _HOMES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    value = getattr(import_module(_HOMES[name]), name)
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return list(__all__)

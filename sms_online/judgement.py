@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 # A joint whose unexplained torque reaches this share of the measured one lacks an effect, whatever the error bars say.
 LARGEST_RESIDUAL = 0.5
@@ -26,8 +26,20 @@ LONGEST_SENTENCE = 100
 NAMED = 2
 
 Level = Literal["trust", "doubt", "not yet"]
-# By row type, `relative` and `whitened`, see `results.residuals`.
-Residual = Mapping[str, Mapping[str, float | None]]
+
+
+class Residual(NamedTuple):
+    """What one type of rows leaves, root mean square; None where it is not known.
+
+    relative: to the measured torque or force. whitened: over the standard deviation that the sensors' noise predicts,
+    so that 1 is noise alone.
+    """
+
+    relative: float | None
+    whitened: float | None
+
+
+Residuals = Mapping[str, Residual]  # by type of the rows
 
 
 @dataclass(frozen=True)
@@ -60,7 +72,7 @@ class Facts:
     determined: tuple[int, int]
     undetermined: tuple[str, ...] = ()
     settling: str = ""
-    residual: Residual = field(default_factory=dict)
+    residual: Residuals = field(default_factory=dict)
     negative: tuple[str, ...] = ()
     pulled: tuple[str, ...] = ()
     alarm: str | None = None
@@ -88,43 +100,58 @@ class Reason:
 
 
 @dataclass(frozen=True)
-class Judgement:
-    """May the numbers be trusted, and the reasons, the strongest first; of trust, what it rests on.
+class Trust:
+    """May the numbers be trusted?
 
-    grave: of a doubt, that the numbers may be wrong by more than any error bar says.
+    level: "trust", "doubt" or "not yet". grave: of a doubt, that the numbers may be wrong by more than any error bar
+    says. grounds: the strongest first; of trust, what it rests on.
     """
 
     level: Level
-    reasons: tuple[Reason, ...]
+    grounds: tuple[Reason, ...]
     grave: bool = False
 
     @property
-    def sentence(self) -> str:
-        """The level, by which a grave doubt is told from another, and the strongest reason, on a line."""
-        heading = "Do not trust" if self.grave else self.level.capitalize()
-        return _fitted(f"{heading}: {self.reasons[0].text}")
+    def reasons(self) -> tuple[str, ...]:
+        """The reasons, a short sentence each, the strongest first; of trust, what it rests on."""
+        return tuple(reason.text for reason in self.grounds)
 
     @property
-    def others(self) -> list[str]:
-        """The other reasons."""
-        return [reason.text for reason in self.reasons[1:]]
+    def sentence(self) -> str:
+        """The level, and whether a doubt is grave, with the strongest reason, on one line."""
+        heading = "Do not trust" if self.grave else self.level.capitalize()
+        return _fitted(f"{heading}: {self.grounds[0].text}")
+
+    @property
+    def others(self) -> tuple[str, ...]:
+        """The reasons but for the strongest."""
+        return self.reasons[1:]
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """Reasons with what they mean, where nothing else in results.json says it."""
+        return tuple(reason.full for reason in self.grounds if reason.full)
 
     @property
     def marks(self) -> dict[str, str]:
         """Where on the arm reasons to doubt sit, and a word or two for there: the strongest of each place."""
         marks: dict[str, str] = {}
-        for reason in self.reasons:
+        for reason in self.grounds:
             for place in reason.places:
                 marks.setdefault(place, reason.mark)
         return marks
 
     def document(self) -> dict[str, Any]:
         """As results.json holds it."""
-        reasons = [reason.text for reason in self.reasons]
-        return {"level": self.level, "grave": self.grave, "sentence": self.sentence, "reasons": reasons}
+        return {
+            "level": self.level, "grave": self.grave, "sentence": self.sentence, "reasons": list(self.reasons),
+        }  # fmt: skip
+
+    def __str__(self) -> str:
+        return "\n".join([self.sentence, *(f"  {other}" for other in self.others)])
 
 
-def judge(facts: Facts) -> Judgement:
+def judge(facts: Facts) -> Trust:
     """The judgement of a session.
 
     What has been shown to be wrong counts from when it is shown. Residuals of an estimate that is still settling show
@@ -149,16 +176,14 @@ def judge(facts: Facts) -> Judgement:
     # What befell the samples comes before what that may have done to the estimate.
     losses = _losses(facts.lost)
     if doubts:
-        return Judgement("doubt", (*losses, *doubts, *_cautions(facts)), grave=True)
+        return Trust("doubt", (*losses, *doubts, *_cautions(facts)), grave=True)
     if facts.settling:
-        return Judgement("not yet", (Reason(facts.settling, False), *losses, *_cautions(facts)))
+        return Trust("not yet", (Reason(facts.settling, False), *losses, *_cautions(facts)))
     cautions = (*losses, *_cautions(facts))
-    return Judgement("doubt", cautions) if cautions else Judgement("trust", tuple(_grounds(facts)))
+    return Trust("doubt", cautions) if cautions else Trust("trust", tuple(_grounds(facts)))
 
 
-def judge_diagnosis(
-    verdict: str, effects: Sequence[str], row: str | None, after: Judgement, near: bool = False
-) -> Judgement:
+def judge_diagnosis(verdict: str, effects: Sequence[str], row: str | None, after: Trust, near: bool = False) -> Trust:
     """The judgement of a diagnosed capture.
 
     verdict: `clean`, `named` or `unexplained`. effects: what was named, `name@where`. row: type of the rows that
@@ -182,8 +207,8 @@ def judge_diagnosis(
         trusted = f"; trust the parameters with {them}" + (" but for what follows" if after.level == "doubt" else "")
         told = f"the system file lacks {what}" + ("" if after.grave or after.level == "not yet" else trusted)
         found = [replace(each[0], text=told)] if len(each) == 1 else [Reason(told, after.grave), *each]
-    rest = after.reasons if after.level != "trust" else ()
-    return Judgement("doubt", (*found, *rest), grave=found[0].grave)
+    rest = after.grounds if after.level != "trust" else ()
+    return Trust("doubt", (*found, *rest), grave=found[0].grave)
 
 
 def _open(discrepancy: Discrepancy) -> bool:
@@ -218,8 +243,8 @@ def _unnamed(discrepancies: Iterable[Discrepancy]) -> list[Reason]:
     return out
 
 
-def _unexplained_torques(residual: Residual) -> list[Reason]:
-    shares = {name: share for name, rows in residual.items() if (share := rows["relative"]) is not None}
+def _unexplained_torques(residual: Residuals) -> list[Reason]:
+    shares = {name: share for name, rows in residual.items() if (share := rows.relative) is not None}
     out = []
     for name, share in sorted(shares.items(), key=lambda item: -item[1]):
         if share > LARGEST_RESIDUAL:
@@ -229,7 +254,7 @@ def _unexplained_torques(residual: Residual) -> list[Reason]:
     return out
 
 
-def _loud_rows(residual: Residual) -> list[Reason]:
+def _loud_rows(residual: Residuals) -> list[Reason]:
     """The rows that are furthest beyond their noise."""
     worst, noise = _loudest(residual)
     if worst is None or noise <= LARGEST_WHITENED:
@@ -241,8 +266,8 @@ def _loud_rows(residual: Residual) -> list[Reason]:
     return [Reason(f"the residual of {worst} is {noise:.0f} × noise", True, (worst,), f"{noise:.0f} × noise", full)]
 
 
-def _loudest(residual: Residual) -> tuple[str | None, float]:
-    noise = {name: value for name, rows in residual.items() if (value := rows["whitened"]) is not None}
+def _loudest(residual: Residuals) -> tuple[str | None, float]:
+    noise = {name: value for name, rows in residual.items() if (value := rows.whitened) is not None}
     worst = max(noise, key=lambda name: noise[name], default=None)
     return worst, noise[worst] if worst is not None else 0.0
 
@@ -289,7 +314,7 @@ def _grounds(facts: Facts) -> list[Reason]:
     """What trust rests on, and what it does not reach to."""
     known, of = facts.determined
     worst, noise = _loudest(facts.residual)
-    shares = [share for rows in facts.residual.values() if (share := rows["relative"]) is not None]
+    shares = [share for rows in facts.residual.values() if (share := rows.relative) is not None]
     rests = ""
     if worst is not None:
         rests = ", residual " + ("no more than noise" if noise < JUST_NOISE else f"at most {noise:.2g} × noise")

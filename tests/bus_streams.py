@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 from axis import AXIS, DAMPING, INERTIA
+from evaluated import standard_deviation
 
 from sms_adapters.clock_lanes import merger
 from sms_adapters.clock_merge import Merger
@@ -19,7 +20,6 @@ from sms_adapters.serial_decoder import encode_frames, frame_layout
 from sms_adapters.system_file import load_system
 from sms_online.description.schema import SerialFrames, System
 from sms_online.pipeline.estimator import Estimator
-from sms_online.results import standard_deviation
 from sms_online.stream import Array, Block
 
 RATE = 200.0  # Hz

@@ -7,7 +7,7 @@ import math
 import numpy as np
 
 from sms_adapters.system_file import load_system
-from sms_online.bound import STEP, cramer_rao_bound
+from sms_online.cramer_rao import STEP, cramer_rao_bound
 from sms_online.description.schema import Sensor, System
 from sms_online.linearised import Motion
 from sms_online.model.base_parameters import find_base_parameters

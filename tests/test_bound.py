@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from sms_online.bound import DERIVATIVES_INTERVAL, cramer_rao_bound, discretise
+from sms_online.cramer_rao import DERIVATIVES_INTERVAL, cramer_rao_bound, discretise
 from sms_online.description.parse import parse_system, shipped_text
 from sms_online.effects.build import build_model
 from sms_online.errors import InputError

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from evaluated import results_document
 from numpy.testing import assert_allclose, assert_array_equal
 
 from sms_adapters.system_file import load_system
-from sms_online.bound import STEP, MotionRecord, cramer_rao_bound, session_bound
+from sms_online.cramer_rao import STEP, MotionRecord, cramer_rao_bound, session_bound
 from sms_online.linearised import Motion
 from sms_online.pipeline.estimator import Estimator
-from sms_online.results import results_document
 from sms_online.sensor_set import sensor_set
 from sms_online.stream import Array
 from sms_online.trackers.interface import Prior

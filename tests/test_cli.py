@@ -23,9 +23,9 @@ from sms_online.description.parse import parse_system, shipped_text
 from sms_online.effects.build import build_model
 from sms_online.model.base_parameters import find_base_parameters
 from sms_online.pipeline.estimator import Estimator
+from sms_online.priors import base_prior
 from sms_online.stream import Block
 from sms_tools.cli import main
-from sms_tools.priors import base_prior
 
 MOVED = AXIS + MOTION
 TRUTH = {"link_1.inertia": INERTIA, "viscous_friction@joint_1.damping": DAMPING}

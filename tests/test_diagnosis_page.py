@@ -21,12 +21,12 @@ from sms_online.diagnosis.diagnose import Diagnosis, diagnose
 from sms_online.diagnosis.document import diagnosis_document
 from sms_online.diagnosis.force_curves import added_variables, force_curves
 from sms_online.effects.build import build_model
+from sms_online.truth import true_values
 from sms_tools.adopted_system import added_lines, adopted_text, remarks
 from sms_tools.cli import main
 from sms_tools.html_report.arm_drawing import MARK, marked_arm
 from sms_tools.html_report.diagnosis_page import write_diagnosis
 from sms_tools.report import Document
-from sms_tools.true_values import true_values
 from sms_tools.view.places import places_of
 from sms_tools.view.scene import Scene
 

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from evaluated import standard_deviation
 from numpy.testing import assert_allclose
 
 from sms_adapters.system_file import load_system
@@ -25,7 +26,6 @@ from sms_online.effects.build import build_model
 from sms_online.model.effect import Inputs
 from sms_online.pipeline.estimator import Estimator
 from sms_online.pipeline.momentum_windows import EXPONENT, HOPS, INSTANTS
-from sms_online.results import standard_deviation
 from sms_online.row_types import row_types
 from sms_online.stream import Array
 from sms_online.trackers.factor import solve

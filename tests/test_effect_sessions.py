@@ -12,7 +12,7 @@ from numpy.testing import assert_allclose
 from scipy.integrate import solve_ivp
 
 from sms_adapters.truth import read_truth
-from sms_online.bound import cramer_rao_bound
+from sms_online.cramer_rao import cramer_rao_bound
 from sms_online.description.parse import parse_system, shipped_text
 from sms_online.description.schema import System
 from sms_online.diagnosis.constants import corrected
@@ -363,7 +363,7 @@ def test_a_stated_delay_of_a_torque_is_taken_off(clean_motion: Simulation) -> No
             estimator.push(block)
         estimator.finish()
         assert estimator.momentum is not None
-        whitened = estimator.momentum.whitened([estimator.model.layout.theta_m[1]], estimator.estimate().pi)
+        whitened = estimator.momentum.fit.plain.whitened([estimator.model.layout.theta_m[1]], estimator.estimate().pi)
         assert whitened is not None
         return whitened
 

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from axis import AXIS, DAMPING, INERTIA
+from evaluated import standard_deviation
 
 from sms_online.description.parse import parse_system
 from sms_online.pipeline.estimator import Estimator
-from sms_online.results import standard_deviation
 from sms_online.stream import Array, Block
 
 SEEDS = 40

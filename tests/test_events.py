@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from axis import AXIS, DAMPING, INERTIA
 from changed_session import changed_session, noisy
+from evaluated import judged, results_document, standard_deviation
 
 from sms_adapters.system_file import load_system
 from sms_online.description.parse import parse_system
@@ -18,7 +19,6 @@ from sms_online.pipeline.estimator import Estimator
 from sms_online.pipeline.events import Event
 from sms_online.pipeline.momentum_balance import MARGIN
 from sms_online.pipeline.momentum_windows import HOPS
-from sms_online.results import judged, results_document, standard_deviation
 from sms_online.stream import Array, Block
 from sms_online.trackers.factor import solve, triangular_factor
 from sms_online.trackers.information import Information

@@ -10,6 +10,7 @@ from xml.etree import ElementTree
 
 import numpy as np
 import pytest
+from evaluated import results_document
 from sms_tools.html_report.error_bars import Bar, error_bars
 from sms_tools.html_report.svg import Axis, Series, chart
 
@@ -17,7 +18,6 @@ from sms_adapters.capture import CaptureWriter
 from sms_adapters.system_file import load_system
 from sms_online.effects.build import build_model
 from sms_online.pipeline.estimator import Estimator
-from sms_online.results import results_document
 from sms_online.stream import Array, Block
 from sms_sim.simulate import Simulation
 from sms_tools.cli import main

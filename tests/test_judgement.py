@@ -6,30 +6,26 @@ from dataclasses import replace
 
 import pytest
 from axis import AXIS, axis_block
+from evaluated import judged, results_document
 
 from sms_online.description.parse import parse_system
 from sms_online.judgement import LONGEST_SENTENCE, Discrepancy, Facts, Residual, judge, judge_diagnosis, place_of
 from sms_online.pipeline.estimator import Estimator
-from sms_online.results import judged, results_document
 
-QUIET: Residual = {
-    "energy": {"relative": None, "whitened": None},
-    "joint_1": {"relative": 0.01, "whitened": 1.1},
-    "joint_2": {"relative": 0.02, "whitened": 0.9},
-}
+QUIET = {"energy": Residual(None, None), "joint_1": Residual(0.01, 1.1), "joint_2": Residual(0.02, 0.9)}
 GOOD = Facts(determined=(15, 16), undetermined=("motor_2.stator_inertia",), residual=QUIET)
 LACKING = Discrepancy("joint_2", 2.7, "named", ("coulomb_friction@joint_2",))
 
 
 def with_row(row: str, **values: float) -> Facts:
-    return replace(GOOD, residual={**QUIET, row: {**QUIET[row], **values}})
+    return replace(GOOD, residual={**QUIET, row: QUIET[row]._replace(**values)})
 
 
 def test_what_nothing_speaks_against_is_trusted_and_its_reach_is_told() -> None:
     judgement = judge(GOOD)
     assert (judgement.level, judgement.grave, judgement.marks) == ("trust", False, {})
     assert judgement.sentence == "Trust: 15 of 16 parameters determined, residual at most 1.1 × noise"
-    assert judgement.others == ["not determined: motor_2.stator_inertia"]
+    assert judgement.others == ("not determined: motor_2.stator_inertia",)
 
 
 @pytest.mark.parametrize(
@@ -100,7 +96,7 @@ def test_the_named_effect_comes_before_the_residual_that_it_leaves() -> None:
 def test_lost_samples_come_before_the_residual_that_they_may_have_made() -> None:
     judgement = judge(replace(with_row("joint_2", whitened=19.0), lost=0.02))
     assert judgement.sentence == "Do not trust: 2 % of the samples are lost"
-    assert judgement.others == ["the residual of joint_2 is 19 × noise"]
+    assert judgement.others == ("the residual of joint_2 is 19 × noise",)
 
 
 def test_residuals_of_an_estimate_that_is_settling_show_nothing() -> None:
@@ -190,7 +186,7 @@ def test_what_nothing_explains_is_marked_where_it_acts() -> None:
 
 def test_an_effect_that_does_not_explain_all_is_called_near() -> None:
     judgement = judge_diagnosis("unexplained", ["cogging@joint_1"], "joint_1", TRUSTED)
-    assert judgement.reasons[1].text == "some of it looks like cogging@joint_1"
+    assert judgement.reasons[1] == "some of it looks like cogging@joint_1"
     judgement = judge_diagnosis("unexplained", ["cogging@joint_1"], "joint_1", TRUSTED, near=True)
     assert judgement.grave
     assert "is near cogging@joint_1, but is more or something else" in judgement.sentence

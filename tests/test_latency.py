@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from bus_streams import AxisBus, axis_testbed, merged
+from evaluated import results_document
 
 from sms_online.description.schema import System
 from sms_online.effects.build import build_model
@@ -14,7 +15,6 @@ from sms_online.pipeline.estimator import Estimator
 from sms_online.pipeline.latency import Latencies, LatencyColumns, SourceGroup, source_groups
 from sms_online.pipeline.sensing import Sensing
 from sms_online.stream import Block
-from sms_tools.session import document_of
 
 
 def session(folder: Path, drive: float, encoder: float) -> tuple[System, list[Block]]:
@@ -52,7 +52,7 @@ def test_a_latency_that_is_not_stated_is_reported(
     assert (found.source, found.effects) == (source, (effect,))
     assert found.size == pytest.approx(drive + encoder, abs=4.0 * found.std)
     assert found.std < 1e-4
-    (warning,) = (w for w in document_of(estimator, 0.0, [], None)["warnings"] if "stated latency" in w)
+    (warning,) = (w for w in results_document(estimator)["warnings"] if "stated latency" in w)
     assert warning.startswith(f"{source}: ")
     assert warning.endswith(f"later than its stated latency ({effect})")
 

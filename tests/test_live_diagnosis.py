@@ -14,10 +14,12 @@ import pytest
 from axis import AXIS
 from axis_effects import COGGING, SYSTEM, axis_block, cogging
 from bus_streams import axis_testbed
+from evaluated import results_document
 from rerun.chunk import RrdReader
 from test_live_session import Bench, patience
 
 from sms_adapters.capture import CaptureWriter
+from sms_adapters.searches import NAME, Repeated, searcher_of
 from sms_adapters.sources import open_source
 from sms_adapters.system_file import load_system
 from sms_online.diagnosis.online import Immediate, OnlineDiagnosis, Searcher
@@ -25,10 +27,9 @@ from sms_online.diagnosis.online_search import Outcome, Request, search
 from sms_online.errors import InputError
 from sms_online.pipeline.estimator import Estimator
 from sms_online.pipeline.momentum_windows import HOPS
-from sms_online.results import results_document
 from sms_online.stream import Array
 from sms_tools.cli import main
-from sms_tools.live.searches import NAME, Repeated, SearchProcess, searcher_of
+from sms_tools.live.searches import SearchProcess
 
 BEGIN = 8.0  # s
 # Waiting for another process, s: rather a failure than a suite that hangs.

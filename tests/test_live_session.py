@@ -14,8 +14,9 @@ from typing import Any
 import pytest
 from axis import DAMPING, INERTIA
 from bus_streams import AxisBus, axis_testbed
+from evaluated import results_document, standard_deviation
 
-from sms_adapters.checkpoint import load_checkpoint
+from sms_adapters.checkpoint import read_checkpoint
 from sms_adapters.clock_lanes import merger
 from sms_adapters.clock_merge import PATIENCE
 from sms_adapters.raw import LostDevice, Raw, SerialChunk
@@ -26,7 +27,7 @@ from sms_adapters.sources import open_source
 from sms_online.description.schema import System
 from sms_online.judgement import Facts, judge
 from sms_online.pipeline.estimator import Estimator
-from sms_online.results import results_document, standard_deviation
+from sms_online.session import Session
 from sms_tools.interruption import Interruption
 from sms_tools.live import feed as feed_module
 from sms_tools.live.feed import Feed, Interpreter, SessionClock
@@ -98,9 +99,10 @@ class Bench:
         ]
         self.feeds = [Feed(reader, self.recorder) for reader in self.readers]
         self.merger = merger(system, folder)
-        self.estimator = Estimator(system, self.merger.channels, "live")
+        session = Session(system, self.merger.channels, source="live")
+        self.estimator = session.estimator
         self.session = LiveSession(
-            self.clock, self.feeds, self.merger, self.estimator, 0.0, self.directory, self.recorder, **options
+            self.clock, self.feeds, self.merger, session, 0.0, self.directory, self.recorder, **options
         )
 
     def run(self, seconds: float, after: Callable[[], None] = lambda: None) -> dict[str, Any]:
@@ -236,7 +238,7 @@ def test_a_checkpoint_is_there_while_the_session_runs_and_goes_on_to_the_same_bi
     bench.run(21.0, look)
     (tmp_path / "killed.npz").write_bytes(states[0][0])
     resumed = Estimator(system, bench.merger.channels, "resumed")
-    load_checkpoint(tmp_path / "killed.npz", resumed)
+    read_checkpoint(tmp_path / "killed.npz").put_into(resumed)
     assert 0 < resumed.samples <= states[0][1]
     skip = resumed.samples
     for block in open_source(bench.directory, system, directory=tmp_path):

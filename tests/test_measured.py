@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from evaluated import results_document, standard_deviation
 
 from sms_adapters.importers import import_emps, import_quanser
 from sms_adapters.sources import open_source
@@ -13,7 +14,6 @@ from sms_adapters.system_file import load_system
 from sms_online.description.schema import Windows
 from sms_online.pipeline.estimator import Estimator
 from sms_online.pipeline.rates import smooth_and_differentiate
-from sms_online.results import results_document, standard_deviation
 from sms_online.stream import Array
 from sms_online.trackers.interface import Prior
 

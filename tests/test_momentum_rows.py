@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from axis import AXIS, DAMPING, INERTIA
+from evaluated import results_document
 from model_systems import FRICTION, paper, spatial
 from prescribed_motion import prescribed
 
@@ -19,7 +20,6 @@ from sms_online.pipeline.momentum_balance import MomentumBalance
 from sms_online.pipeline.momentum_windows import COPIES, EXPONENT, Window
 from sms_online.pipeline.smoothing import stride
 from sms_online.pipeline.weak_form import test_function as weak_test_function
-from sms_online.results import results_document
 from sms_online.stream import Array, Block
 from sms_sim.simulate import Simulation, exact_states
 

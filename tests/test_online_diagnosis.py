@@ -10,6 +10,7 @@ import pytest
 from axis import DAMPING, INERTIA
 from axis_effects import BARE, COGGING, PHASE, SYSTEM, axis_block, cogging, nothing
 from changed_session import changed_session, noisy
+from evaluated import elsewhere, results_document
 
 from sms_adapters.system_file import load_system
 from sms_online.description.schema import Effect, System
@@ -17,10 +18,9 @@ from sms_online.diagnosis.online import Immediate, OnlineDiagnosis, refusal
 from sms_online.effects.build import build_model
 from sms_online.model.base_parameters import find_base_parameters
 from sms_online.pipeline.estimator import Estimator
-from sms_online.results import results_document
+from sms_online.pipeline.statistics import Statistics
 from sms_online.stream import Block
 from sms_sim.simulate import Simulation
-from sms_tools.view import snapshot
 
 PLANAR = load_system("paper-planar")
 BEGIN = 8.0  # s
@@ -89,7 +89,7 @@ def test_an_effect_that_begins_is_dated_sized_and_taken_up() -> None:
     found = estimated(estimator)
     for name, true in (("link_1.inertia", INERTIA), ("cogging@joint_1.cosine", COGGING * np.cos(PHASE))):
         assert found[name][0] == pytest.approx(true, abs=4.0 * found[name][1])
-    assert not estimator.misfit
+    assert not estimator.momentum.misfit
 
 
 def test_without_adopt_it_is_only_told() -> None:
@@ -182,11 +182,9 @@ def test_a_session_with_an_adopted_effect_is_saved_and_goes_on_to_the_same_bits(
     assert results_document(continued, 0.0, []) == results_document(running, 0.0, [])
 
 
-def test_a_replica_follows_an_adoption() -> None:
+def test_pickled_statistics_say_the_same_after_an_adoption() -> None:
     estimator, _ = cogged(True)
-    replica = Estimator(SYSTEM, ("force_1", "q_1"), "replica")
-    snapshot.apply(snapshot.take(estimator), replica)
-    assert results_document(replica, 0.0, []) == results_document(estimator, 0.0, [])
+    assert elsewhere(Statistics.of(estimator)) == results_document(estimator, 0.0, [])
 
 
 def test_what_acts_before_the_balance_is_not_taken_up_while_running() -> None:

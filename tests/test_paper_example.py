@@ -7,15 +7,16 @@ import json
 import numpy as np
 import pytest
 from batch_solution import batch_least_squares
+from evaluated import results_document, standard_deviation
 from keeping_tracker import KeepingTracker
 
-from sms_adapters.checkpoint import load_checkpoint, snapshot, write_checkpoint
+from sms_adapters.checkpoint import read_checkpoint, write_checkpoint
 from sms_adapters.system_file import load_system
+from sms_online.checkpoint import Checkpoint
 from sms_online.description.schema import Harmonic, System, Trajectory
 from sms_online.model.base_parameters import find_base_parameters
 from sms_online.model.model import Model
 from sms_online.pipeline.estimator import Estimator
-from sms_online.results import results_document, standard_deviation
 from sms_online.stream import Array, Block
 from sms_sim.simulate import Simulation, exact_states, simulate
 
@@ -112,9 +113,9 @@ def test_result_does_not_depend_on_how_samples_arrive(
         parts.push(Block(block.t[start:stop], block.channels, block.values[start:stop]))
         if start < 9000 <= stop:
             # A session that goes on from a file is the same session.
-            write_checkpoint(checkpoint, snapshot(parts))
+            write_checkpoint(checkpoint, Checkpoint.of(parts))
             parts = Estimator(load_system("paper-planar"), block.channels, "simulation")
-            load_checkpoint(checkpoint, parts)
+            read_checkpoint(checkpoint).put_into(parts)
         start = stop
     parts.finish()
     first, second = results_document(whole, 0.0, []), results_document(parts, 0.0, [])

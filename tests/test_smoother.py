@@ -9,20 +9,22 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from evaluated import elsewhere, results_document, standard_deviation
 from numpy.testing import assert_array_equal
 from one_link import TEXT, one_link
 
-from sms_adapters import checkpoint
 from sms_adapters.capture import CaptureWriter
+from sms_adapters.checkpoint import read_checkpoint, write_checkpoint
 from sms_adapters.system_file import load_system
-from sms_online.bound import STEP, MotionRecord, cramer_rao_bound, session_bound
+from sms_online.checkpoint import Checkpoint
+from sms_online.cramer_rao import STEP, MotionRecord, cramer_rao_bound, session_bound
 from sms_online.description.channels import channels
 from sms_online.description.parse import describe
 from sms_online.description.schema import Effect, Sensor, System
 from sms_online.errors import InputError
 from sms_online.linearised import Motion
 from sms_online.pipeline.estimator import Estimator
-from sms_online.results import results_document, standard_deviation
+from sms_online.pipeline.statistics import Statistics
 from sms_online.sensor_set import sensor_set
 from sms_online.stream import Array, Block
 from sms_online.trackers.interface import Prior
@@ -30,7 +32,6 @@ from sms_sim.plant import Plant
 from sms_sim.sensors import Sensors
 from sms_sim.simulate import Simulation, exact_states, sampled_blocks, simulate
 from sms_tools.cli import main
-from sms_tools.view import snapshot
 
 SEEDS = 6
 MISSING = ("link_1.marker_1.theta_z", "link_1.marker_2.theta_z")
@@ -93,10 +94,8 @@ def test_results_say_what_gave_the_numbers(first: Estimator) -> None:
     assert any(", ".join(MISSING) in warning for warning in document["warnings"])
     assert all(p["identifiable"] for p in document["parameters"])
     assert_array_equal(session_bound(first, MotionRecord(500.0)), first.estimate().std)
-    # A view's replica knows the same.
-    replica = Estimator(first.system, first.channels, "replica")
-    snapshot.apply(snapshot.take(first), replica)
-    assert results_document(replica, 1.0, [])["parameters"] == document["parameters"]
+    # A view's process says the same.
+    assert elsewhere(Statistics.of(first))["parameters"] == document["parameters"]
 
 
 def test_a_weighed_part_sharpens_what_hangs_on_it(simulation: Simulation, first: Estimator) -> None:
@@ -142,8 +141,8 @@ def test_the_same_samples_give_the_same_bits_however_they_come(
     whole.finish()
     for piece in pieces(cuts[:4]):
         stopped.push(piece)
-    checkpoint.write_checkpoint(tmp_path / "half.npz", checkpoint.snapshot(stopped))
-    checkpoint.load_checkpoint(tmp_path / "half.npz", resumed)
+    write_checkpoint(tmp_path / "half.npz", Checkpoint.of(stopped))
+    read_checkpoint(tmp_path / "half.npz").put_into(resumed)
     for piece in pieces(cuts[3:]):
         resumed.push(piece)
     resumed.finish()

@@ -9,12 +9,13 @@ import numpy as np
 import pytest
 from campaigns.sessions import disguised, true_parameters
 from conftest import noise_free_block
+from evaluated import standard_deviation
 
 from sms_adapters.system_file import load_system
-from sms_online.bound import cramer_rao_bound
+from sms_online.cramer_rao import cramer_rao_bound
+from sms_online.evaluation import identifiable
 from sms_online.linearised import Motion
 from sms_online.pipeline.estimator import Estimator
-from sms_online.results import identifiable, standard_deviation
 from sms_online.sensor_set import sensor_set
 from sms_online.stream import Array
 from sms_sim.sensors import Sensors

@@ -27,7 +27,7 @@ import json, sys
 import numpy as np
 from sms_adapters.system_file import load_system
 from sms_online.pipeline.estimator import Estimator
-from sms_online.results import results_document
+from evaluated import results_document
 from sms_online.stream import Block
 
 with np.load(sys.argv[1]) as saved:

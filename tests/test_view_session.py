@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from evaluated import elsewhere, results_document
 from recordings import columns, scalars
 
 from sms_adapters.capture import CaptureWriter
@@ -22,12 +23,11 @@ from sms_adapters.truth import write_truth
 from sms_online.effects.build import build_model
 from sms_online.model.base_parameters import find_base_parameters
 from sms_online.pipeline.estimator import Estimator
-from sms_online.results import results_document
+from sms_online.pipeline.statistics import Statistics
 from sms_online.stream import Block
 from sms_sim.sensors import Sensors
 from sms_sim.simulate import Simulation, sampled_blocks
 from sms_tools.cli import main
-from sms_tools.view import snapshot
 from sms_tools.view.session import open_view, references
 
 # Of the example's motion: enough for its first weights, every marker moving, and a recording of a few batches' size.
@@ -115,17 +115,15 @@ def test_watching_changes_no_bit(recorded: Path, capture: Path, tmp_path: Path) 
     assert unseen["residual"] == seen["residual"]
 
 
-def test_a_replica_knows_what_the_estimator_knew(samples: Block) -> None:
+def test_statistics_stay_those_of_when_they_were_taken(samples: Block) -> None:
     system = load_system("paper-planar")
     estimator = Estimator(system, samples.channels, "test")
-    replica = Estimator(system, samples.channels, "test")
     half = samples.t.size // 2
     estimator.push(Block(samples.t[:half], samples.channels, samples.values[:half]))
-    taken = snapshot.take(estimator)
+    taken = Statistics.of(estimator)
     then = results_document(estimator, 0.0, [])
     estimator.push(Block(samples.t[half:], samples.channels, samples.values[half:]))
-    snapshot.apply(taken, replica)
-    assert results_document(replica, 0.0, []) == then
+    assert elsewhere(taken) == then
     assert results_document(estimator, 0.0, []) != then
 
 

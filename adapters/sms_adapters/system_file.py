@@ -1,17 +1,25 @@
-"""System descriptions by name or by path."""
+"""System descriptions by name, by path, or as tables."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 from sms_online.description.explain import hint, nearest
-from sms_online.description.parse import parse_system, shipped_systems, shipped_text
+from sms_online.description.parse import parse_system, shipped_systems, shipped_text, system_of
 from sms_online.description.schema import System
 from sms_online.errors import InputError
 
 
-def load_system(path_or_name: str) -> System:
-    """System of a shipped name or of a `.toml` file; InputError where it is neither, or where its text is wrong."""
+def load_system(described: str | Path | Mapping[str, Any]) -> System:
+    """Load a system: a shipped one by name, a `.toml` file by path, or the tables of one as a mapping.
+
+    InputError, one line with file and key, where it is neither, or where what it says is wrong.
+    """
+    if isinstance(described, Mapping):
+        return system_of(described, str(described.get("name", "system")))
+    path_or_name = str(described)
     if path_or_name in shipped_systems():
         return parse_system(shipped_text(path_or_name), path_or_name)
     path = Path(path_or_name)

@@ -39,6 +39,11 @@ def parse_system(text: str, source: str) -> System:
         parts = SYNTAX_ERROR_PLACE.fullmatch(str(error))
         what, place = (parts["what"], parts["place"]) if parts else (str(error), "")
         raise InputError(source, place, " ".join(what.split()), "valid TOML") from None
+    return system_of(document, source)
+
+
+def system_of(document: Mapping[str, Any], source: str) -> System:
+    """System of a system file's tables; InputError as `parse_system`."""
     record = _arrange(document, source)
     try:
         # Strict, so that "5" and true are no numbers; by way of JSON, for in Python's strict mode lists are no tuples.

@@ -435,3 +435,11 @@ class System(Record):
     trajectory: Trajectory | None = None
     windows: Windows = Windows()
     balance: Literal["both", "energy", "momentum", "smoother"] = "both"
+
+    @property
+    def nominal(self) -> dict[str, float]:
+        """Nominal values of the physical parameters by name, SI units; 0 where the description states none."""
+        # What parameters there are follows from the model, which is made of a description.
+        from sms_online.effects.build import build_model
+
+        return {parameter.name: parameter.nominal for parameter in build_model(self).parameters}

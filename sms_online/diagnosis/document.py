@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -15,9 +15,12 @@ from sms_online.diagnosis.diagnose import Diagnosis
 from sms_online.diagnosis.shape import slopes
 from sms_online.effects.base import report
 from sms_online.effects.catalogue import ENTRIES, declarable
-from sms_online.judgement import Facts, Judgement, judge, judge_diagnosis
+from sms_online.evaluation import NORMAL_95, Evaluation, identifiable
+from sms_online.judgement import Facts, Residual, Trust, judge, judge_diagnosis
 from sms_online.model.parameters import Parameter
-from sms_online.results import NORMAL_95, identifiable, judged, projected, results_document, standard_deviation
+from sms_online.pipeline.estimator import Estimator
+from sms_online.pipeline.statistics import Statistics
+from sms_online.result import residual_document, result_of
 from sms_online.stream import Array
 from sms_online.threads import one_blas_thread
 
@@ -28,28 +31,30 @@ Coefficients = dict[str, tuple[float, float | None]]
 
 
 @one_blas_thread()
-def diagnosis_document(diagnosis: Diagnosis, warnings: list[str], truth: dict[str, float] | None) -> dict[str, Any]:
+def diagnosis_document(
+    diagnosis: Diagnosis, warnings: Sequence[str] = (), truth: Mapping[str, float] | None = None
+) -> dict[str, Any]:
     """diagnosis.json.
 
     truth: true values of physical parameters by name, of a simulated capture; they enter this report alone.
     """
     before, after = diagnosis.before, diagnosis.after
-    sessions = {"before": diagnosis.estimator_before, "after": diagnosis.estimator_after}
-    results = {name: results_document(session, 0.0, [], truth) for name, session in sessions.items()}
-    unexplained = diagnosis.unexplained
+    sessions = {"before": evaluation(diagnosis.estimator_before), "after": evaluation(diagnosis.estimator_after)}
+    results = {name: result_of(session, truth).document() for name, session in sessions.items()}
+    unexplained, given = diagnosis.unexplained, diagnosis.attempt.prior is not None
     return {
         "schema": SCHEMA,
         "verdict": diagnosis.verdict,
         "summary": summary(diagnosis),
-        "judgement": judgement(diagnosis).document(),
+        "judgement": trust_of(diagnosis, sessions["after"]).document(),
         "effects": [_effect(diagnosis, finding) for finding in diagnosis.findings] + _by_comparison(diagnosis),
         "steps": [
             {"taken": step.taken, "effects": list(step.effects), "holdout": step.relative} for step in diagnosis.steps
         ],
         **{
             name: {
-                "fit": _part(state.fit),
-                "holdout": _part(state.holdout),
+                "fit": residual_document(_part(state.fit)),
+                "holdout": residual_document(_part(state.holdout)),
                 "limit": {row: test.limit for row, test in state.test.items()},
                 "parameters": results[name]["parameters"] if attempt.prior is None else _posterior(attempt, chosen),
             }
@@ -80,32 +85,34 @@ def diagnosis_document(diagnosis: Diagnosis, warnings: list[str], truth: dict[st
         "warnings": [
             *warnings,
             # Those of a session are of the session's parameters, which with a prior are not what is told.
-            *(results["after"]["warnings"] if diagnosis.attempt.prior is None else _fully(_after(diagnosis))),
+            *(_after(diagnosis, sessions["after"]).warnings if given else sessions["after"].warnings),
         ],
     }
 
 
-def _fully(judged: Judgement) -> list[str]:
-    return [reason.full for reason in judged.reasons if reason.full]
+def evaluation(session: Estimator) -> Evaluation:
+    """What a session of a diagnosis says."""
+    return Evaluation(Statistics.of(session), session.estimate())
 
 
-def _after(diagnosis: Diagnosis) -> Judgement:
+def _after(diagnosis: Diagnosis, session: Evaluation) -> Trust:
     """May the parameters after be trusted?"""
     if diagnosis.attempt.prior is None:
-        session = diagnosis.estimator_after
-        estimate = session.estimate()
-        projection = projected(session, estimate, standard_deviation(session, estimate))
-        return judged(session, estimate, projection=projection)
+        return session.trust
     # Parameters come from the rows of the diagnosis then, see `_posterior`.
     known = [p["identifiable"] for p in _posterior(diagnosis.attempt, diagnosis.chosen)]
     return judge(Facts((sum(known), len(known)), residual=_part(diagnosis.after.fit)))
 
 
-def judgement(diagnosis: Diagnosis) -> Judgement:
-    """May the parameters after be trusted, and the system file?"""
+def trust_of(diagnosis: Diagnosis, after: Evaluation | None = None) -> Trust:
+    """May the parameters after be trusted, and the system file?
+
+    after: the evaluation of the session with what was found, where it is at hand.
+    """
+    after = evaluation(diagnosis.estimator_after) if after is None else after
     effects = [f"{effect['name']}@{effect['where']}" for effect in _named(diagnosis)]
     row = None if diagnosis.unexplained is None else diagnosis.unexplained.row
-    return judge_diagnosis(diagnosis.verdict, effects, row, _after(diagnosis), _near(diagnosis))
+    return judge_diagnosis(diagnosis.verdict, effects, row, _after(diagnosis, after), _near(diagnosis))
 
 
 def summary(diagnosis: Diagnosis) -> str:
@@ -148,8 +155,8 @@ def _named(diagnosis: Diagnosis) -> list[dict[str, str]]:
     return [{"name": each["name"], "where": each["where"]} for each in _by_comparison(diagnosis)] + found
 
 
-def _part(part: Part) -> dict[str, dict[str, float | None]]:
-    return {row: {"relative": part.relative.get(row), "whitened": whitened} for row, whitened in part.whitened.items()}
+def _part(part: Part) -> dict[str, Residual]:
+    return {row: Residual(part.relative.get(row), whitened) for row, whitened in part.whitened.items()}
 
 
 def _effect(diagnosis: Diagnosis, finding: Finding) -> dict[str, Any]:
@@ -256,6 +263,7 @@ def _posterior(attempt: Attempt, chosen: Sequence[int]) -> list[dict[str, Any]]:
             "std": float(std) if np.isfinite(std) else None,
             "lower95": float(value - NORMAL_95 * std) if np.isfinite(std) else None,
             "upper95": float(value + NORMAL_95 * std) if np.isfinite(std) else None,
+            "nominal": p.nominal or None,
             "true": None,
             "identifiable": bool(known),
         }

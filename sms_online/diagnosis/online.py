@@ -89,14 +89,15 @@ class _Onset:
 class OnlineDiagnosis(Observer):
     """Watches one session, from before its first sample.
 
-    adopt: take up what is named. on_verdict (t, text), on_evidence (t, gain by candidate): are told what is new.
+    searcher: may be replaced until then. adopt: take up what is named. on_verdict (t, text), on_evidence (t, gain by
+    candidate): are told what is new.
     """
 
     def __init__(self, estimator: Estimator, searcher: Searcher, adopt: bool) -> None:
         self.episodes: list[Episode] = []
         self.on_verdict: Callable[[float, str], None] = lambda t, text: None
         self.on_evidence: Callable[[float, Mapping[str, float]], None] = lambda t, scores: None
-        self._estimator, self._searcher, self._adopt = estimator, searcher, adopt
+        self._estimator, self.searcher, self._adopt = estimator, searcher, adopt
         system = estimator.system
         self._unit = round(max(SHORTEST_UNIT, system.windows.momentum) * system.sample_rate)
         self._record: list[GridSamples] = []
@@ -161,7 +162,7 @@ class OnlineDiagnosis(Observer):
     def block_through(self) -> None:
         """See `Observer`."""
         self._blocks += 1
-        done = self._searcher.outcome(self._blocks)
+        done = self.searcher.outcome(self._blocks)
         if self._estimator.momentum is None or not self._record:
             return
         self._follow_events()
@@ -244,7 +245,7 @@ class OnlineDiagnosis(Observer):
             self._due = due
             self._begun += 1
             request = self._request(onset)
-            if request is not None and self._searcher.submit(self._begun, request):
+            if request is not None and self.searcher.submit(self._begun, request):
                 self._pending = self._begun, self._now
         elif self._due == len(schedule):
             self._give_up()

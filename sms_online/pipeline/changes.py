@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from functools import partial
 from typing import Any
@@ -271,16 +271,12 @@ class Changes:
         """Names of the parameters that events have added, in their order."""
         return tuple(self._added)
 
-    def follow(self, events: Iterable[Event], added: Iterable[str], adopted: Iterable[Effect] = ()) -> None:
-        """Know of these events, which have added these parameters, and these effects."""
-        self.events, self._added = list(events), list(added)
-        self._follow_adopted(tuple(adopted))
-
     def restore(self, state: Mapping[str, NDArray[Any]]) -> None:
         """Continue from a saved state."""
         events = [Event.from_saved(entry) for entry in json.loads(str(state["events"]))]
         adopted = [Effect.model_validate(entry) for entry in json.loads(str(state["adopted"]))]
-        self.follow(events, json.loads(str(state["added"])), adopted)
+        self.events, self._added = events, json.loads(str(state["added"]))
+        self._follow_adopted(tuple(adopted))
         self._segment, self._clear, self._wanted = (int(number) for number in state["place"])
         self._index, self._values = np.array(state["index"]), np.array(state["values"])
         self.detector = self._new_detector()

@@ -11,12 +11,14 @@ efficient one as an alarm: Hausman, Econometrica 46 (1978) 1251.
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from sms_online.stream import Array
+from sms_online.trackers.interface import Estimate
 
 # Windows that share samples answer for noise together; a cluster is of windows side by side.
 CLUSTER = 20
@@ -55,6 +57,8 @@ class NoiseBias:
         self._last = self._last + (0.5 * (noisy[0].T @ noisy[0] + noisy[1].T @ noisy[1]) - gram)
         self._open = (self._open + 1) % self._length
         if self._open == 0:
+            if self._count == len(self._whole):
+                self._whole = np.concatenate((self._whole, np.zeros((MOST_CLUSTERS - self._count, *gram.shape))))
             self._whole[self._count] = self._last
             self._count += 1
             self._last = np.zeros_like(self._last)
@@ -125,9 +129,16 @@ class NoiseBias:
         }  # fmt: skip
 
     def restore(self, state: Mapping[str, NDArray[Any]]) -> None:
-        """Continue from a saved state."""
-        self._gram, self._last = np.array(state["bias_gram"]), np.array(state["bias_last"])
-        self._count = len(state["bias_clusters"])
-        self._whole = np.zeros((MOST_CLUSTERS, *self._last.shape))
-        self._whole[: self._count] = state["bias_clusters"]
+        """Continue from a saved state, whose arrays are shared."""
+        self._gram, self._last = np.asarray(state["bias_gram"]), np.asarray(state["bias_last"])
+        self._whole = np.asarray(state["bias_clusters"])
+        self._count = len(self._whole)
         self._length, self._open = int(state["bias_length"]), int(state["bias_open"])
+
+
+def unbiased(estimate: Estimate, bias: NoiseBias) -> Estimate:
+    """An estimate free of what noise in the columns does; one that was weighed against a prior stays as it is."""
+    if estimate.scale is not None:
+        return estimate
+    shift, covariance = bias.correction(estimate.determined)
+    return replace(estimate, pi=estimate.pi + shift, covariance=estimate.covariance + covariance)

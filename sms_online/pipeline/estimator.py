@@ -32,13 +32,14 @@ from sms_online.pipeline.momentum import Momentum
 from sms_online.pipeline.observer import Observer
 from sms_online.pipeline.rates import RateSamples, RatesStage
 from sms_online.pipeline.sensing import AttitudeContinuity, Sensing, stated_period
+from sms_online.pipeline.statistics import Method, Setup
 from sms_online.pipeline.synchronise import GridSamples, SyncCounters, Synchroniser
 from sms_online.pipeline.waiting import waiting_from_state, waiting_state
 from sms_online.smoother.session import Smoother
 from sms_online.stream import Array, Block
 from sms_online.threads import one_blas_thread
 from sms_online.trackers.interface import Estimate, Prior, Rows, Tracker
-from sms_online.trackers.square_root import RecursiveLeastSquares
+from sms_online.trackers.square_root import session_tracker
 
 # What a session saves: arrays and numbers, by stage.
 SessionState = dict[str, dict[str, Any]]
@@ -89,11 +90,14 @@ class Estimator:
         # A balance of forces does not hold in a shape that is not the link's; energies bear it best.
         by_energy = system.balance == "energy" or self.sensing.missing
         self.momentum = None if by_energy else Momentum(model, base, self.sensing)
-        self.energy_tracker: Tracker = RecursiveLeastSquares(base.n)
+        self.energy_tracker: Tracker = session_tracker(base.n, None)
         self._begin_joints()
         self._first_block, self._block = self._blocks()
         self._segment = -1
         self._first_time = np.nan
+        self.finished = False  # no more samples come
+        self.prior: Prior | None = None
+        self._setup: tuple[int, Setup] | None = None  # and the number of events that it is since
         self._pending_t = np.empty(0)
         self._pending = np.empty((0, len(self._columns)))
 
@@ -106,7 +110,8 @@ class Estimator:
     @one_blas_thread()
     def set_prior(self, prior: Prior) -> None:
         """Weigh the rows against what is known of the base parameters beforehand; before the first sample."""
-        self.energy_tracker = RecursiveLeastSquares(self.base.n, prior=prior, scaled_by_residual=True)
+        self.prior, self._setup = prior, None
+        self.energy_tracker = session_tracker(self.base.n, prior)
         if self.momentum is not None:
             self.momentum.set_prior(prior)
         if self.smoother is not None:
@@ -143,6 +148,11 @@ class Estimator:
         self.joint_residuals = [SquaredResidual(np.zeros((n + 1, n + 1))) for _ in self.model.layout.q]
 
     @property
+    def end(self) -> float:
+        """Time of the newest sample, s; NaN before the first."""
+        return self._first_time + self.duration
+
+    @property
     def newest_row(self) -> float:
         """Time of the newest sample behind the estimate, s; -inf where there is none."""
         if self.smoother is not None and self.by_smoother:
@@ -164,9 +174,20 @@ class Estimator:
         return self.momentum.started or self.system.balance == "momentum"
 
     @property
-    def misfit(self) -> bool:
-        """Whether rows of the momentum balance leave clearly more than the sensors' noise."""
-        return self.momentum is not None and self.momentum.misfit
+    def method(self) -> Method:
+        """What the estimate comes from."""
+        if self.by_smoother:
+            return "smoother"
+        return "momentum" if self.by_momentum else "energy"
+
+    @property
+    def setup(self) -> Setup:
+        """What is estimated now: one object from one event to the next."""
+        if self._setup is None or self._setup[0] != len(self.events):
+            current = None if self.momentum is None else self.momentum.current_prior
+            now = self.model, self.base, self._base
+            self._setup = len(self.events), Setup(self.system, *now, self.sensing, self.unused, self.prior, current)
+        return self._setup[1]
 
     @property
     def half_width(self) -> int:
@@ -214,6 +235,7 @@ class Estimator:
     @one_blas_thread()
     def finish(self) -> None:
         """End of the session: process what is still pending."""
+        self.finished = True
         if self._pending_t.size:
             self._synchronise(self._pending_t, self._pending)
         self._pending_t, self._pending = self._pending_t[:0], self._pending[:0]
@@ -356,6 +378,7 @@ class Estimator:
     @one_blas_thread()
     def restore(self, state: SessionState) -> None:
         """Continue from a saved state."""
+        self._setup = None
         session = state["session"]
         if self.momentum is not None:
             self.momentum.restore(state)

@@ -2,20 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Mapping
+from copy import copy
 from functools import partial
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from sms_online.description.schema import Effect
 from sms_online.model.base_parameters import BaseParameters
 from sms_online.model.model import Model
 from sms_online.pipeline.changes import Adoption, Changes
-from sms_online.pipeline.errors_in_variables import NoiseBias
-from sms_online.pipeline.events import Event
+from sms_online.pipeline.errors_in_variables import NoiseBias, unbiased
 from sms_online.pipeline.latency import Latencies, clock_groups, source_groups
 from sms_online.pipeline.momentum_balance import MomentumBalance
 from sms_online.pipeline.momentum_fit import FIRST_MOTION, MomentumFit, WhiteRows
@@ -23,12 +21,13 @@ from sms_online.pipeline.momentum_windows import COPIES, HOPS
 from sms_online.pipeline.residual_test import SequentialTest
 from sms_online.pipeline.sensing import Sensing
 from sms_online.pipeline.sensor_noise import NoiseEstimate, SensorNoise, noise_from_state, noise_state
+from sms_online.pipeline.statistics import MomentumStatistics
 from sms_online.pipeline.synchronise import GridSamples
 from sms_online.pipeline.waiting import waiting_from_state, waiting_state
 from sms_online.pipeline.window_noise import WindowNoise
 from sms_online.stream import Array
 from sms_online.trackers.interface import Estimate, Prior, Rows, Tracker
-from sms_online.trackers.square_root import RecursiveLeastSquares
+from sms_online.trackers.square_root import session_tracker
 
 # The synthetic noise is the same in every session, so that the same samples give the same bits.
 SEED = 6
@@ -78,22 +77,18 @@ class Momentum:
         self.tracker = self._new_tracker()
         self.test = SequentialTest(model.layout, self._balance.span / HOPS)
 
+    @property
+    def current_prior(self) -> Prior | None:
+        """What is known beforehand of the current parameters."""
+        return None if self.prior is None else self.changes.prior(self.prior)
+
     def _new_tracker(self) -> Tracker:
-        prior = None if self.prior is None else self.changes.prior(self.prior)
-        return RecursiveLeastSquares(self.changes.base.n, prior=prior, scaled_by_residual=prior is not None)
+        return session_tracker(self.changes.base.n, self.current_prior)
 
     def set_prior(self, prior: Prior) -> None:
         """Weigh the rows against what is known of the base parameters beforehand; before the first sample."""
         self.prior = prior
         self.tracker = self._new_tracker()
-
-    def follow(self, events: Sequence[Event], added: Sequence[str], adopted: Sequence[Effect] = ()) -> None:
-        """Have the parameters of a session of the same system with these events and effects, knowing nothing of them
-        yet."""
-        new = tuple(added) != self.changes.added
-        self.changes.follow(events, added, adopted)
-        if new:
-            self._build()
 
     @property
     def started(self) -> bool:
@@ -112,11 +107,7 @@ class Momentum:
 
     def estimate(self) -> Estimate:
         """The base parameters as known now, free of what noise in the columns does; with a prior, as the rows say."""
-        estimate = self.tracker.estimate()
-        if estimate.scale is not None:
-            return estimate
-        shift, covariance = self.bias.correction(estimate.determined)
-        return replace(estimate, pi=estimate.pi + shift, covariance=estimate.covariance + covariance)
+        return unbiased(self.tracker.estimate(), self.bias)
 
     def _solved(self) -> Array:
         """β where the rows determine it, else NaN."""
@@ -221,9 +212,19 @@ class Momentum:
             self.latencies.add(rows.Y, rows.late)
             self.windows += 1
 
-    def whitened(self, rows: list[int], beta: Array) -> float | None:
-        """rms of the residual of some generalized speeds' rows over its predicted standard deviation, for β (n,)."""
-        return self.fit.plain.whitened(rows, beta)
+    def statistics(self) -> MomentumStatistics:
+        """What is known now; nothing in it changes as the session goes on."""
+        alarm = self.test.alarm
+        return MomentumStatistics(
+            tracker=self.tracker.state(),
+            bias=self.bias.state(),
+            rows=copy(self.fit.plain),
+            started=self.started,
+            tested=self.settled,
+            alarm=None if alarm is None else alarm.row,
+            unexplained=self.fit.unexplained,
+            latency=self.latencies.found,
+        )
 
     def state(self) -> dict[str, dict[str, Any]]:
         """Everything that `restore` needs to continue to the same bits."""

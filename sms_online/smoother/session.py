@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,6 +28,43 @@ SPAN = 10.0
 LEAST_SPAN = 0.5
 # No channel is better than this share of its largest reading: the collocation errs by as much.
 FINEST = 1e-6
+
+
+class SmootherStatistics(NamedTuple):
+    """What the spans so far have determined; nothing in it changes as the session goes on.
+
+    failures: spans that were left out and why, a sentence each. spans, rows: how many were taken. mean_square: of the
+    last span, see `SpanFit`; level: the largest of all. factor (n + 1, n + 1): square-root information about beta (n,).
+    last_step: of the last fit. end: time of the newest sample, s.
+    """
+
+    failures: tuple[str, ...]
+    spans: int
+    level: float
+    mean_square: float
+    factor: Array
+    beta: Array
+    rows: int
+    rss: float
+    last_step: float
+    end: float
+
+    def estimate(self, prior: Prior | None) -> Estimate:
+        """The base parameters, with what is known of them beforehand; only after the first span."""
+        n = self.beta.size
+        problem = triangular_factor(prior_factor(prior, n), self.factor)
+        problem[:, n] -= problem[:, :n] @ self.beta
+        solution = solve(problem)
+        return Estimate(
+            pi=self.beta.copy(),
+            covariance=solution.covariance(),
+            covariance_robust=None,
+            determined=solution.determined,
+            condition_number=solution.condition_number,
+            rows=float(self.rows),
+            rss=self.rss,
+            dof=max(float(self.rows - solution.rank), 0.0),
+        )
 
 
 class Smoother:
@@ -180,43 +217,22 @@ class Smoother:
         return values, sigma, drives**2 * periods
 
     def estimate(self) -> Estimate:
-        """The base parameters as the spans so far tell them, with the prior; only after the first span."""
-        n = self._base.n
-        problem = triangular_factor(prior_factor(self.prior, n), self._factor)
-        problem[:, n] -= problem[:, :n] @ self._beta
-        solution = solve(problem)
-        return Estimate(
-            pi=self._beta.copy(),
-            covariance=solution.covariance(),
-            covariance_robust=None,
-            determined=solution.determined,
-            condition_number=solution.condition_number,
-            rows=float(self._rows),
-            rss=self._rss,
-            dof=max(float(self._rows - solution.rank), 0.0),
-        )
+        """The base parameters as known now, with the prior; only after the first span."""
+        return self.statistics().estimate(self.prior)
 
-    def told(self) -> dict[str, Any]:
-        """What the spans so far have told; nothing in it changes when the session goes on."""
-        return {
-            "failures": np.array(self.failures, dtype=np.str_), "spans": self.spans, "level": self.level,
-            "mean_square": self.mean_square, "factor": self._factor, "beta": self._beta, "rows": self._rows,
-            "rss": self._rss, "last_step": self._last_step, "end": self._end,
-        }  # fmt: skip
-
-    def learn(self, told: Mapping[str, Any]) -> None:
-        """Take over what another smoother of the same session told."""
-        self.failures, self.spans = [str(text) for text in told["failures"]], int(told["spans"])
-        self.mean_square, self.level = float(told["mean_square"]), float(told["level"])
-        self._factor, self._beta = np.array(told["factor"]), np.array(told["beta"])
-        self._rows, self._rss = int(told["rows"]), float(told["rss"])
-        self._last_step, self._end = float(told["last_step"]), float(told["end"])
+    def statistics(self) -> SmootherStatistics:
+        """What is known now."""
+        return SmootherStatistics(
+            tuple(self.failures), self.spans, self.level, self.mean_square, self._factor, self._beta, self._rows,
+            self._rss, self._last_step, self._end,
+        )  # fmt: skip
 
     def state(self) -> dict[str, dict[str, Any]]:
         """Everything that `restore` needs to continue to the same bits."""
         return {
             "smoother": {
-                **self.told(), "t": self._t, "values": self._values, "index": self._index, "torque": self._torque,
+                **self.statistics()._asdict(), "failures": np.array(self.failures, dtype=np.str_),
+                "t": self._t, "values": self._values, "index": self._index, "torque": self._torque,
                 "moved": self._moved, "motion": self._motion,
             },
             "smoother_torques": dict(self._synchroniser.state()),
@@ -225,7 +241,11 @@ class Smoother:
     def restore(self, saved: Mapping[str, Mapping[str, NDArray[Any]]]) -> None:
         """Continue from a saved state."""
         state = saved["smoother"]
-        self.learn(state)
+        self.failures, self.spans = [str(text) for text in state["failures"]], int(state["spans"])
+        self.mean_square, self.level = float(state["mean_square"]), float(state["level"])
+        self._factor, self._beta = np.array(state["factor"]), np.array(state["beta"])
+        self._rows, self._rss = int(state["rows"]), float(state["rss"])
+        self._last_step, self._end = float(state["last_step"]), float(state["end"])
         self._t, self._values = np.array(state["t"]), np.array(state["values"])
         self._index, self._torque = np.array(state["index"]), np.array(state["torque"])
         self._moved, self._motion = np.array(state["moved"]), np.array(state["motion"])

@@ -122,6 +122,11 @@ class RecursiveLeastSquares:
         self.enabled = enabled
 
 
+def session_tracker(n: int, prior: Prior | None) -> RecursiveLeastSquares:
+    """The tracker of a balance's rows; beside a prior, the rows' std are right up to a common factor."""
+    return RecursiveLeastSquares(n, prior=prior, scaled_by_residual=prior is not None)
+
+
 def _residual_std(content: Content) -> float:
     """Standard deviation of the whitened rows about their own solution; 1 where there are too few to tell."""
     alone = solve(content.factor)

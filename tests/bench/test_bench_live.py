@@ -23,19 +23,20 @@ import numpy as np
 import pytest
 from axis import AXIS, DAMPING, INERTIA
 from changed_session import changed_session
+from evaluated import standard_deviation
 
 from sms_adapters.capture import CaptureWriter
-from sms_adapters.checkpoint import snapshot, write_checkpoint
+from sms_adapters.checkpoint import write_checkpoint
 from sms_adapters.clock_lanes import merger
 from sms_adapters.clock_merge import TICK
 from sms_adapters.raw import CanFrames, Raw, SerialChunk, concatenate_frames
 from sms_adapters.recording import tick_time
 from sms_adapters.system_file import load_system
+from sms_online.checkpoint import Checkpoint
 from sms_online.description.parse import shipped_text
 from sms_online.description.schema import System
 from sms_online.effects.catalogue import parse_effect
 from sms_online.pipeline.estimator import Estimator
-from sms_online.results import standard_deviation
 from sms_online.stream import Array, Block
 from sms_sim.bus_encode import DeviceClock, devices
 from sms_sim.bus_layout import messages
@@ -294,7 +295,7 @@ def test_a_day_at_full_speed(tmp_path: Path, balance: str) -> None:
             block = ours.advance(tick_time(tick), [[now[int(edges[-1]) :]]])
             if block is not None:
                 yield block
-            write_checkpoint(tmp_path / "checkpoint.npz", snapshot(estimator))
+            write_checkpoint(tmp_path / "checkpoint.npz", Checkpoint.of(estimator))
             if k % max(1, rounds // 24) == 0 or k == rounds - 1:
                 hours, pi, std = (k + 1) * ROUND / 3.6e6, estimator.estimate().pi, standard_deviation(estimator)
                 shown = ", ".join(f"{p:.6f} ± {2 * s:.6f}" for p, s in zip(pi, std, strict=True))

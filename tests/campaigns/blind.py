@@ -39,9 +39,10 @@ from sms_online.effects.build import build_model
 from sms_online.effects.catalogue import ENTRIES, candidates
 from sms_online.effects.delay import delay_of
 from sms_online.effects.spacecraft import TableTilt
+from sms_online.evaluation import Evaluation
 from sms_online.model.base_parameters import find_base_parameters
 from sms_online.pipeline.estimator import Estimator
-from sms_online.results import residuals
+from sms_online.pipeline.statistics import Statistics
 from sms_online.stream import Array, Block
 from tests.campaigns.accuracy import flagged, read
 from tests.campaigns.sessions import disguised, exact_session, noisy_session, true_parameters
@@ -258,8 +259,8 @@ def _declared(system: System, block: Block, effect: Effect) -> dict[str, float]:
 
 def _left(session: Estimator) -> dict[str, float]:
     """What the rows of a session leave, over the noise predicted for them, by kind of row."""
-    rows = residuals(session, session.estimate().pi)
-    return {name: told["whitened"] for name, told in rows.items() if told["whitened"] is not None}
+    rows = Evaluation(Statistics.of(session)).residuals
+    return {name: told.whitened for name, told in rows.items() if told.whitened is not None}
 
 
 def _errors(system: System, session: Estimator) -> dict[str, float]:

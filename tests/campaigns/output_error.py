@@ -13,7 +13,7 @@ from functools import cached_property
 import numpy as np
 from scipy.optimize import least_squares
 
-from sms_online.bound import discretise
+from sms_online.cramer_rao import discretise
 from sms_online.linearised import linearise
 from sms_online.model.base_parameters import BaseParameters
 from sms_online.model.model import Model

@@ -18,12 +18,13 @@ from time import process_time
 from typing import Any
 
 import numpy as np
+from evaluated import standard_deviation
 
 from sms_online.description.schema import System
 from sms_online.effects.build import build_model
+from sms_online.evaluation import NORMAL_95
 from sms_online.model.base_parameters import find_base_parameters
 from sms_online.pipeline.estimator import Estimator
-from sms_online.results import NORMAL_95, standard_deviation
 from sms_online.stream import Block
 from sms_sim.sensors import Sensors
 from sms_sim.simulate import simulate

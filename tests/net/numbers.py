@@ -16,14 +16,17 @@ import scipy.linalg
 from threadpoolctl import threadpool_info
 
 from net.sessions import Session
-from sms_adapters.checkpoint import load_checkpoint, snapshot, write_checkpoint
+from sms_adapters.checkpoint import read_checkpoint, write_checkpoint
+from sms_online.checkpoint import Checkpoint
 from sms_online.diagnosis.diagnose import diagnose
 from sms_online.diagnosis.document import diagnosis_document
 from sms_online.diagnosis.online import Immediate, OnlineDiagnosis
+from sms_online.evaluation import Evaluation
 from sms_online.pipeline.estimator import Estimator
-from sms_online.results import results_document
+from sms_online.pipeline.statistics import Statistics
+from sms_online.priors import base_prior
+from sms_online.result import result_of
 from sms_online.stream import Block
-from sms_tools.priors import base_prior
 
 # Number, name, or None where there is none, by its path in the documents.
 Value = float | int | bool | str | None
@@ -45,8 +48,8 @@ def numbers(session: Session) -> Numbers:
     continued, online_continued = _begun(session)
     with TemporaryDirectory() as folder:
         path = Path(folder) / "checkpoint.npz"
-        write_checkpoint(path, snapshot(estimator))
-        load_checkpoint(path, continued)
+        write_checkpoint(path, Checkpoint.of(estimator))
+        read_checkpoint(path).put_into(continued)
     out |= _results("whole", estimator, online, pieces[half:])
     out |= _results("continued", continued, online_continued, pieces[half:])
     if session.diagnosed:
@@ -67,8 +70,8 @@ def _results(name: str, estimator: Estimator, online: OnlineDiagnosis, pieces: l
         estimator.push(piece)
     estimator.finish()
     online.finish()
-    document = results_document(estimator, 0.0, [], discrepancies=online.discrepancies)
-    return leaves(name, document | {"diagnosis": online.document()})
+    evaluation = Evaluation(Statistics.of(estimator), estimator.estimate(), online.discrepancies)
+    return leaves(name, result_of(evaluation, episodes=online.document()).document())
 
 
 def leaves(path: str, value: Any) -> Numbers:

@@ -4,21 +4,18 @@ from __future__ import annotations
 
 import math
 import sys
-from collections.abc import Callable
 from typing import Any
 
 from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
+from sms_online.tables import formatter
+
 # Width of a table that goes to a file or a pipe, where there is no terminal to ask.
 FILE_WIDTH = 140
 # A terminal narrower than this has no room for what the intervals and errors tell too: ± std, the true values.
 WIDTH_WITH_ALL = 112
-# Significant digits of an estimate: as many as show two of its standard deviation, within these bounds.
-LEAST_DIGITS, MOST_DIGITS = 2, 7
-# Powers of ten below this one are written as such.
-SMALLEST_PLAIN = -4
 NOT_DETERMINED = "not determined"
 # Of a verdict, by its level; what is grave is red.
 LEVEL_STYLES = {"trust": "bold green", "doubt": "bold yellow", "not yet": "bold bright_black"}
@@ -78,16 +75,6 @@ def parameter_table(document: Document, width: int, title: str | Text | None = N
             cells.append(_error(p))
         table.add_row(*cells, style=None if p["identifiable"] else "dim")
     return table
-
-
-def formatter(estimate: float, std: float) -> Callable[[float], str]:
-    """Formats an estimate and its interval down to the second digit of the standard deviation."""
-    magnitude = math.floor(math.log10(abs(estimate))) if estimate else 0
-    second = math.floor(math.log10(std)) - 1 if std else -math.inf
-    digits = int(min(MOST_DIGITS, max(LEAST_DIGITS, magnitude - second + 1)))
-    if magnitude < SMALLEST_PLAIN:
-        return lambda value: f"{value:.{digits - 1}e}"
-    return lambda value: f"{value:.{max(0, digits - 1 - magnitude)}f}"
 
 
 def _in_doubt(p: Document) -> str:

@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-import json
-import math
 from datetime import datetime
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any
 
 from sms_online.errors import InputError
 
@@ -43,30 +40,17 @@ def _new_run() -> Path:
     return run
 
 
-def to_json(document: dict[str, Any]) -> str:
-    """The document as text. JSON knows no infinity (a condition number without full rank): it becomes null."""
-    return json.dumps(_finite(document), indent=2, ensure_ascii=False, allow_nan=False)
-
-
-def _finite(value: Any) -> Any:
-    if isinstance(value, dict):
-        return {key: _finite(item) for key, item in value.items()}
-    if isinstance(value, list):
-        return [_finite(item) for item in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value
-
-
-def write_results(directory: Path, document: dict[str, Any]) -> Path:
+def write_results(directory: Path, text: str) -> Path:
     """Write results.json into the directory, which is made; InputError where that fails."""
-    return write_document(directory / NAME, document)
+    return write_document(directory / NAME, text)
 
 
-def write_document(path: Path, document: dict[str, Any]) -> Path:
-    """Write a document as a whole or not at all; its directory is made. InputError where that fails."""
+def write_document(path: Path, text: str) -> Path:
+    """Write the text of a document as a whole or not at all; its directory is made. InputError where that fails."""
     part = path.with_name(path.name + ".part")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        part.write_text(to_json(document) + "\n", encoding="utf-8")
+        part.write_text(text + "\n", encoding="utf-8")
         part.replace(path)
     except OSError as error:
         raise InputError(str(path), "", error.strerror or str(error), "a file that can be written") from None

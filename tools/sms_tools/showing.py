@@ -8,34 +8,35 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
-from sms_online.diagnosis.online import OnlineDiagnosis
-from sms_online.pipeline.estimator import Estimator
+from sms_online.result import Result
+from sms_online.session import Session
 from sms_online.stream import Block
+from sms_online.truth import true_values
 from sms_tools.html_report.history import History
 from sms_tools.interruption import Interruption
 from sms_tools.live.loop import LiveSession
-from sms_tools.report import Document, report_console, show, verdict_text
+from sms_tools.report import report_console, show, verdict_text
 from sms_tools.view.frames import Circumstances
 from sms_tools.view.scene import Scene
 from sms_tools.view.session import View, open_view
 
 
 class Showing:
-    """View and history of one session. Blocks have to be pushed into the estimator as they come out of `watch`."""
+    """View and history of one session, which has to be updated with the blocks as they come out of `watch`."""
 
     def __init__(
         self,
         args: argparse.Namespace,
-        estimator: Estimator,
+        session: Session,
         view: View,
-        channels: tuple[str, ...],
         directory: Path,
     ) -> None:
         self._args = args
-        self._estimator = estimator
+        self._session = session
         self._view = view
-        self._history = History(estimator, channels)
+        self._history = History(session.estimator, session.channels)
         self._directory = directory
 
     @property
@@ -52,11 +53,12 @@ class Showing:
         """The same blocks, looked at on their way."""
         return iter(self._history.watch(self._view.watch(blocks)))
 
-    def follow(self, online: OnlineDiagnosis, say: Callable[[str], None] = lambda text: None) -> None:
-        """Show what a diagnosis finds meanwhile: evidence as a plot, verdicts in the log and in the judgement.
+    def follow(self, say: Callable[[str], None] = lambda text: None) -> None:
+        """Show what the session's diagnosis finds: evidence as a plot, verdicts in the log and in the trust.
 
-        say: is told the verdicts too.
+        say: is called with the verdicts too.
         """
+        online = self._session.diagnosis
         before = self._view.circumstances
         self._view.circumstances = lambda: replace(before(), discrepancies=online.discrepancies)
 
@@ -69,15 +71,16 @@ class Showing:
 
         online.on_evidence, online.on_verdict = evidence, verdict
 
-    def report(self, document: Document, interruption: Interruption) -> None:
+    def report(self, result: Result, interruption: Interruption) -> None:
         """Write the page of a finished session, say where it is and whether to trust the numbers, and keep serving the
         view while that is asked for."""
         # Matplotlib takes a second to be imported, which nobody should wait for before a session.
         from sms_tools.html_report.page import write_report
 
         self._history.finish()
-        nominal = {p.name: p.nominal for p in self._estimator.base.parameters if p.nominal}
-        scene = Scene(self._estimator.model, self._args.exaggerate)
+        document = result.document()
+        nominal = {p.name: p.nominal for p in result.parameters.values() if p.nominal is not None}
+        scene = Scene(self._session.estimator.model, self._args.exaggerate)
         page = write_report(self._directory, document, self._history.course, nominal, scene)
         show(report_console(self._args.json), f"report: {page}", "", verdict_text(document["verdict"]))
         self._view.linger(interruption)
@@ -86,23 +89,28 @@ class Showing:
 @contextmanager
 def showing(
     args: argparse.Namespace,
-    estimator: Estimator,
-    channels: tuple[str, ...],
+    session: Session,
     directory: Path,
-    truth: Mapping[str, float] | None,
+    truth: Mapping[str, Any] | None,
     patient: bool = False,
     live: LiveSession | None = None,
 ) -> Iterator[Showing]:
-    """What `--rerun` asks for, while the context lasts; the estimator has to be finished within it.
+    """What `--rerun` asks for, while the context lasts; the session has to be finished within it.
 
-    patient: the session may wait for the view, as a replay as fast as it goes does. live: it comes from devices, whose
-    health and troubles are shown with it.
+    truth: of a simulated session, see `Capture`. patient: the session may wait for the view, as a replay as fast as it
+    goes does. live: it comes from devices, whose health and troubles are shown with it.
     """
-    exaggeration = args.exaggerate
-    health = None if live is None else lambda: live.health
+    true = None if truth is None else true_values(truth, session.system, session.system)
     with open_view(
-        args.rerun, estimator, channels, directory, truth, patient=patient, exaggeration=exaggeration, health=health
+        args.rerun,
+        session.estimator,
+        session.channels,
+        directory,
+        true,
+        patient=patient,
+        exaggeration=args.exaggerate,
+        health=None if live is None else lambda: live.health,
     ) as view:
         if live is not None:
             view.circumstances = lambda: Circumstances(troubles=tuple(live.troubles))
-        yield Showing(args, estimator, view, channels, directory)
+        yield Showing(args, session, view, directory)

@@ -7,8 +7,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from sms_online.evaluation import Evaluation
 from sms_online.pipeline.estimator import Estimator
-from sms_online.results import standard_deviation
+from sms_online.pipeline.statistics import Statistics
 from sms_online.stream import Array, Block
 from sms_tools.view.known import Known
 from sms_tools.view.readings import SampleAndHold
@@ -101,9 +102,10 @@ class History:
 
     def _add(self) -> None:
         estimator = self._estimator
-        now = estimator.estimate()
-        residual = self._recent.push(self._t, estimator, now.pi)
+        now = Evaluation(Statistics.of(estimator), estimator.estimate())
+        estimate = now.estimate.pi
+        residual = self._recent.push(self._t, now.statistics, estimate)
         x = np.full(estimator.model.layout.n_x, np.nan)
         if np.isfinite(self._held.last).all():
             x = estimator.sensing.coordinates(self._held.last[None])[0]
-        self.instants.append(Instant(self._t, now.pi, standard_deviation(estimator, now), residual, x))
+        self.instants.append(Instant(self._t, estimate, now.std, residual, x))

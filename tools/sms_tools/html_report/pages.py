@@ -13,8 +13,9 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup, escape
 
 from sms_online.errors import InputError
+from sms_online.tables import formatter
 from sms_tools.html_report.figures import PALETTE
-from sms_tools.report import NOT_DETERMINED, Document, formatter
+from sms_tools.report import NOT_DETERMINED, Document
 
 
 @dataclass(frozen=True)

@@ -12,11 +12,10 @@ from pathlib import Path
 import numpy as np
 
 from sms_adapters.system_file import load_system
-from sms_online.results import results_document
+from sms_online.session import Session
 from sms_sim.simulate import Simulation, exact_states, sampled_blocks, simulate
 from sms_tools.html_report.figures import Chart, Series, chart
 from sms_tools.html_report.pages import write_page
-from sms_tools.session import new_estimator
 
 # Table V says EI_2 = 1768.8 N m², Table III 597.87; the figure's size of motion does not tell them apart.
 SYSTEM = "paper-planar-table-v"
@@ -87,16 +86,17 @@ def table_v(simulation: Simulation) -> tuple[int, list[list[str]]]:
     """Number of samples, and rows: symbol, unit, then actual and estimated value and error in %, printed and ours."""
     system = simulation.plant.system
     blocks = list(sampled_blocks(simulation, "0"))
-    estimator = new_estimator(system, blocks[0].channels, system.name)
+    session = Session(system, blocks[0].channels)
     for block in blocks:
-        estimator.push(block)
-    estimator.finish()
-    truth = {parameter.name: parameter.nominal for parameter in estimator.base.physical}
+        session.update(block)
+    session.finish()
+    result = session.evaluate(truth={"parameters": system.nominal})
     rows = []
-    for p, printed in zip(results_document(estimator, 0.0, [], truth)["parameters"], TABLE_V, strict=True):
-        error = 100.0 * (p["estimate"] / p["true"] - 1.0)
-        rows.append([p["symbol"], p["unit"], *printed, f"{p['true']:.6g}", f"{p['estimate']:.6g}", f"{error:+.2g}"])
-    return estimator.samples, rows
+    for p, printed in zip(result.parameters.values(), TABLE_V, strict=True):
+        assert p.true is not None
+        error = 100.0 * (p.value / p.true - 1.0)
+        rows.append([p.symbol, p.unit, *printed, f"{p.true:.6g}", f"{p.value:.6g}", f"{error:+.2g}"])
+    return result.samples, rows
 
 
 if __name__ == "__main__":

@@ -7,24 +7,21 @@ import threading
 import time
 from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from sms_adapters.checkpoint import snapshot, write_checkpoint
+from sms_adapters.checkpoint import write_checkpoint
 from sms_adapters.clock_merge import Merger
 from sms_adapters.recorder import Recorder
 from sms_adapters.recording import tick_time
-from sms_online.judgement import LARGEST_LOSS, Discrepancy
-from sms_online.pipeline.estimator import Estimator
-from sms_online.results import identifiable, judged, standard_deviation
+from sms_online.checkpoint import Checkpoint
+from sms_online.judgement import LARGEST_LOSS
+from sms_online.session import Session
 from sms_online.stream import Block
 from sms_tools.interruption import Interruption
 from sms_tools.live.feed import READ_TIMEOUT, Feed, Interpreter, SessionClock
 from sms_tools.live.latency import Latencies
 from sms_tools.live.status import Leading, News, StatusWriter
-from sms_tools.session import unstated_latency
 
 # A session that is killed loses no more of the estimate than this, s; its raw items are on disk all the same.
 CHECKPOINT_INTERVAL = 5.0
@@ -53,7 +50,7 @@ class LiveSession:
         clock: SessionClock,
         feeds: Sequence[Feed],
         merger: Merger,
-        estimator: Estimator,
+        session: Session,
         start: float,
         directory: Path,
         recorder: Recorder | None = None,
@@ -62,13 +59,13 @@ class LiveSession:
     ) -> None:
         self.latencies = Latencies()
         self.notices: Callable[[], Sequence[str]] = tuple  # further lines of the status
-        self.discrepancies: Callable[[], Sequence[Discrepancy]] = tuple  # of a diagnosis beside the session
         self.busy = 0.0  # s spent on samples
         self.health: Mapping[str, Mapping[str, float]] = {}  # latency and clock offsets, ms, by name; replaced when new
         self._clock = clock
         self._feeds = feeds
         self._merger = merger
-        self._estimator = estimator
+        self._session = session
+        self._estimator = session.estimator
         self._start = start
         self._directory = directory
         self._recorder = recorder
@@ -157,11 +154,11 @@ class LiveSession:
         if now - self._saved >= CHECKPOINT_INTERVAL and not self._saving.is_alive():
             self._saved = now
             # Writing takes as long as two blocks may, so it is not the loop's.
-            state = snapshot(self._estimator)
+            state = self._session.checkpoint()
             self._saving = threading.Thread(target=self._write, args=(state,), name="checkpoint")
             self._saving.start()
 
-    def _write(self, state: Mapping[str, NDArray[Any]]) -> None:
+    def _write(self, state: Checkpoint) -> None:
         """Write a checkpoint; no disk is worth the session, which goes on and ends without."""
         try:
             write_checkpoint(self._directory / CHECKPOINT, state)
@@ -178,7 +175,7 @@ class LiveSession:
         """Write a checkpoint, now."""
         if self._saving.ident is not None:
             self._saving.join()
-        self._write(snapshot(self._estimator))
+        self._write(self._session.checkpoint())
 
     @property
     def warnings(self) -> list[str]:
@@ -212,31 +209,29 @@ class LiveSession:
         if self._status is None:
             return
         now = self._clock()
-        estimate = self._estimator.estimate()
-        std = standard_deviation(self._estimator, estimate)
-        relative = std / np.maximum(np.abs(estimate.pi), np.finfo(float).tiny)
-        best = [k for k in np.argsort(relative)[:LEADING].tolist() if np.isfinite(std[k])]
-        parameters = self._estimator.base.parameters
-        residuals = [joint.relative(estimate.pi) for joint in self._estimator.joint_residuals]
         troubles = self.troubles
+        known = self._session.evaluation(troubles)
+        pi, std = known.estimate.pi, known.std
+        relative = std / np.maximum(np.abs(pi), np.finfo(float).tiny)
+        best = [k for k in np.argsort(relative)[:LEADING].tolist() if np.isfinite(std[k])]
+        parameters = known.parameters
+        shares = [residual.relative for residual in known.residuals.values()]
         news = News(
             time=now,
             rate=(self._estimator.samples - self._said_samples) / max(now - self._said, 1e-9),
             latency=self.latencies.quantile(0.99),
             lost=self._estimator.counters.lost_samples,
-            residual=max((r for r in residuals if r is not None), default=None),
-            determined=(int(np.count_nonzero(identifiable(estimate.pi, std))), len(parameters)),
-            leading=[
-                Leading(parameters[k].name, parameters[k].unit, float(estimate.pi[k]), float(std[k])) for k in best
-            ],
+            residual=max((share for share in shares if share is not None), default=None),
+            determined=(int(np.count_nonzero(known.determined)), len(parameters)),
+            leading=[Leading(parameters[k].name, parameters[k].unit, float(pi[k]), float(std[k])) for k in best],
             troubles=[
                 *self.notices(),
                 *troubles,
                 *self._merger.warnings,
                 *self.warnings,
-                *unstated_latency(self._estimator),
+                *known.unstated_latency,
             ],
-            judgement=judged(self._estimator, estimate, self.discrepancies(), troubles),
+            trust=known.trust,
         )
         self._said, self._said_samples = now, self._estimator.samples
         self._status.publish(news)

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from rich.console import Console
 from rich.table import Table
 
-from sms_online.judgement import Judgement
+from sms_online.judgement import Trust
 from sms_tools.report import verdict_text
 
 # News a second: more than anybody reads; where there is no terminal, a line every so many seconds.
@@ -34,7 +34,7 @@ class Leading:
 class News:
     """What there is to say. rate: samples/s; latency: p99, s, or None; lost: samples; residual: largest share of a
     joint's torque or force that is not explained, or None; leading: the best known parameters; troubles: what is wrong;
-    judgement: of all of it.
+    trust: in the numbers, of all of it.
     """
 
     time: float
@@ -45,7 +45,7 @@ class News:
     determined: tuple[int, int]
     leading: Sequence[Leading]
     troubles: Sequence[str]
-    judgement: Judgement
+    trust: Trust
 
 
 def summary(news: News) -> str:
@@ -62,7 +62,7 @@ def summary(news: News) -> str:
 def line(news: News) -> str:
     """All of it on one line, for a log."""
     shown = [f"{p.name} {p.estimate:.6g} ± {2.0 * p.std:.2g} {p.unit}" for p in news.leading]
-    return "; ".join([summary(news), news.judgement.sentence, *shown, *news.troubles])
+    return "; ".join([summary(news), news.trust.sentence, *shown, *news.troubles])
 
 
 def screen(news: News, width: int) -> str:
@@ -77,7 +77,7 @@ def screen(news: News, width: int) -> str:
             console.print(table)
         for trouble in news.troubles:
             console.print(trouble, style="yellow", markup=False)
-        console.print(verdict_text(news.judgement.document()))
+        console.print(verdict_text(news.trust.document()))
     return capture.get()
 
 

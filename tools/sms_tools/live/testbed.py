@@ -7,7 +7,7 @@ import sys
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
-from sms_adapters.checkpoint import load_checkpoint
+from sms_adapters.checkpoint import read_checkpoint
 from sms_adapters.clock_lanes import merger
 from sms_adapters.clock_merge import Merger
 from sms_adapters.devices import make_reader
@@ -17,11 +17,10 @@ from sms_adapters.session_log import MICROSECOND, SYSTEM, SessionHeader, read_he
 from sms_online.description.parse import shipped_systems, shipped_text
 from sms_online.description.schema import System
 from sms_online.errors import InputError
-from sms_online.pipeline.estimator import Estimator
+from sms_online.session import Session
 from sms_tools.live.feed import Feed, Interpreter, SessionClock, kind_of
 from sms_tools.live.loop import CHECKPOINT, LiveSession
 from sms_tools.live.status import StatusWriter
-from sms_tools.session import new_estimator
 
 PROGRAMS = ("sms-online", "numpy", "python-can", "pyserial", "cantools")
 # After the last sample before a resumption, s: longer than any hole that the synchroniser bridges.
@@ -55,8 +54,14 @@ def system_files(name: str, system: System) -> dict[str, bytes]:
 
 
 def open_testbed(
-    name: str, system: System, folder: Path | None, directory: Path, resume: Path | None, status: StatusWriter | None
-) -> tuple[LiveSession, Estimator, Merger]:
+    name: str,
+    system: System,
+    folder: Path | None,
+    directory: Path,
+    resume: Path | None = None,
+    status: StatusWriter | None = None,
+    adopt: bool = False,
+) -> tuple[LiveSession, Session, Merger]:
     """The session of a system, its devices not yet opened; it records into `directory`.
 
     name: of the system, as given. folder: where its file stands. resume: directory of an earlier session, from whose
@@ -65,9 +70,10 @@ def open_testbed(
     another system.
     """
     channels = merger(system, folder).channels
-    estimator = new_estimator(system, channels, name)
+    checkpoint = None if resume is None else read_checkpoint(resumable(resume))
+    session = Session(system, channels, adopt=adopt, source=name, checkpoint=checkpoint)
     clock = SessionClock()
-    start = 0.0 if resume is None else resumed_start(resume, estimator, clock.epoch)
+    start = 0.0 if resume is None else resumed_start(resume, session, clock.epoch)
     header = SessionHeader(clock.epoch, {source.name: kind_of(source) for source in system.sources}, start, versions())
     recorder = Recorder(directory, header, system_files(name, system))
     if resume is not None:
@@ -76,16 +82,19 @@ def open_testbed(
     sys.setswitchinterval(SWITCH_INTERVAL)
     feeds = [Feed(make_reader(source, clock, interpreter.await_free), recorder) for source in system.sources]
     merged = merger(system, folder, start)
-    session = LiveSession(clock, feeds, merged, estimator, start, directory, recorder, status, interpreter)
-    return session, estimator, merged
+    live = LiveSession(clock, feeds, merged, session, start, directory, recorder, status, interpreter)
+    return live, session, merged
 
 
-def resumed_start(resume: Path, estimator: Estimator, epoch: int) -> float:
-    """Load the checkpoint of an earlier session; time of the new session's clock zero in its time, s."""
+def resumable(resume: Path) -> Path:
+    """The checkpoint of an earlier session; InputError where there is none."""
     checkpoint = resume / CHECKPOINT
     if not checkpoint.is_file():
         raise InputError(str(resume), "", f"no {CHECKPOINT}", "the directory of a live session of five seconds or more")
+    return checkpoint
+
+
+def resumed_start(resume: Path, session: Session, epoch: int) -> float:
+    """Time of a new session's clock zero in the time of the earlier one that it goes on from, s."""
     header, _ = read_header(resume)
-    load_checkpoint(checkpoint, estimator)
-    last = float(estimator.state()["session"]["first_time"]) + estimator.duration
-    return max(header.start + (epoch - header.epoch) * MICROSECOND, last + PAUSE)
+    return max(header.start + (epoch - header.epoch) * MICROSECOND, session.estimator.end + PAUSE)

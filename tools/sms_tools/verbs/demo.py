@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import argparse
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from contextlib import ExitStack, closing
 from pathlib import Path
 from statistics import median
 from tempfile import TemporaryDirectory
 from time import perf_counter
+from typing import Any
 
 from rich.console import Console, Group
 from rich.live import Live
@@ -18,16 +19,15 @@ from rich.text import Text
 from sms_adapters.session_log import SESSION
 from sms_adapters.system_file import load_system
 from sms_adapters.truth import write_truth
-from sms_online.diagnosis.online import OnlineDiagnosis
-from sms_online.pipeline.estimator import Estimator
+from sms_online.session import Session
 from sms_tools.interruption import Interruption
 from sms_tools.live.searches import SearchProcess
 from sms_tools.live.signals import termination_interrupts
 from sms_tools.live.simulated import SimulatedArm, write_testbed
 from sms_tools.live.testbed import open_testbed
-from sms_tools.report import Document, parameter_table, report_console, show, verdict_text
+from sms_tools.report import parameter_table, report_console, show, verdict_text
 from sms_tools.results_file import results_directory
-from sms_tools.session import conclude, described_system, document_of
+from sms_tools.session import conclude, described_system
 from sms_tools.showing import showing
 
 # More tables than this nobody reads, s between two.
@@ -54,53 +54,45 @@ def run(args: argparse.Namespace) -> int:
 def _watch(args: argparse.Namespace, arm: SimulatedArm, file: Path, directory: Path) -> int:
     """Estimate while the arm moves."""
     system = load_system(str(file))
-    session, estimator, merger = open_testbed(str(file), system, file.parent, directory, None, None)
+    live, session, merger = open_testbed(str(file), system, file.parent, directory)
     # The simulated arm has the nominal values.
-    truth = {parameter.name: parameter.nominal for parameter in estimator.base.physical}
-    write_truth(directory / SESSION, truth, {})
-
-    def document(throughput: float) -> Document:
-        warnings = [*merger.warnings, *session.warnings]
-        return document_of(estimator, throughput, warnings, truth, discrepancies=online.discrepancies)
-
+    truth = {"parameters": {parameter.name: parameter.nominal for parameter in session.estimator.base.physical}}
+    write_truth(directory / SESSION, truth["parameters"], {})
     console = report_console(args.json)
     show(console, Text("solving the arm's motion ahead …", style="dim"))
     with Interruption() as interruption, termination_interrupts(), ExitStack() as stack:
-        # The view takes the estimator as it is, before anything listens to it.
-        shown = stack.enter_context(showing(args, estimator, merger.channels, directory, truth, live=session))
+        shown = stack.enter_context(showing(args, session, directory, truth, live=live))
         searches = stack.enter_context(closing(SearchProcess(directory, adopt=False)))
-        online = OnlineDiagnosis(estimator, searches, adopt=False)
-        shown.follow(online)
+        session.diagnosis.searcher = searches
+        shown.follow()
         if console.is_terminal:
-            live = stack.enter_context(Live(console=console, auto_refresh=False, transient=True))
+            drawn = stack.enter_context(Live(console=console, auto_refresh=False, transient=True))
             assert system.trajectory is not None  # the arm moves
-            tell = _draw(live, document, system.trajectory.duration)
+            tell = _draw(drawn, session, truth, system.trajectory.duration)
         else:
-            tell = _tell(console, estimator, document)
-        for block in shown.watch(session.blocks(interruption, ended=arm.ended, ready=arm.start)):
-            estimator.push(block)
+            tell = _tell(console, session, truth)
+        for block in shown.watch(live.blocks(interruption, ended=arm.ended, ready=arm.start)):
+            session.update(block)
             tell()
-        estimator.finish()
-        online.finish()
-        session.close()
+        session.finish()
+        live.close()
         stack.close()
-        result = document(estimator.samples / session.busy)
-        result["warnings"] += shown.warnings
-        result["warnings"] += [] if searches.problem is None else [searches.problem]
-        result["diagnosis"] = online.document()
+        warnings = [*merger.warnings, *live.warnings, *shown.warnings]
+        warnings += [] if searches.problem is None else [searches.problem]
+        result = session.evaluate(truth, None, warnings, session.estimator.samples / live.busy)
         code = conclude(args, result, directory, interruption.requested)
         shown.report(result, interruption)
     return code
 
 
-def _draw(live: Live, document: Callable[[float], Document], duration: float) -> Callable[[], None]:
+def _draw(live: Live, session: Session, truth: Mapping[str, Any], duration: float) -> Callable[[], None]:
     """Keeps a table up to date."""
     drawn = -math.inf
 
     def draw() -> None:
         nonlocal drawn
         if perf_counter() - drawn >= TABLE_INTERVAL:
-            now = document(0.0)
+            now = session.evaluate(truth).document()
             title = f"{now['system']['title']}: {now['duration_s']:.1f} of {duration:g} s"
             table = parameter_table(now, live.console.width, title)
             # Before it has settled an estimate may be off by any number of its bars.
@@ -111,21 +103,20 @@ def _draw(live: Live, document: Callable[[float], Document], duration: float) ->
     return draw
 
 
-def _tell(console: Console, estimator: Estimator, document: Callable[[float], Document]) -> Callable[[], None]:
+def _tell(console: Console, session: Session, truth: Mapping[str, Any]) -> Callable[[], None]:
     """Says now and then how far it has come."""
     told = 0.0
 
     def tell() -> None:
         nonlocal told
-        if estimator.duration >= told + LINE_INTERVAL:
-            told = estimator.duration
-            now = document(0.0)
-            parameters = now["parameters"]
-            determined = [p for p in parameters if p["identifiable"]]
-            line = f"{told:5.1f} s: {len(determined)} of {len(parameters)} parameters determined"
-            errors = [abs(p["estimate"] / p["true"] - 1.0) for p in determined if p["true"]]
+        if session.estimator.duration >= told + LINE_INTERVAL:
+            told = session.estimator.duration
+            now = session.evaluate(truth)
+            determined = [p for p in now.parameters.values() if p.determined]
+            line = f"{told:5.1f} s: {len(determined)} of {len(now.parameters)} parameters determined"
+            errors = [abs(p.value / p.true - 1.0) for p in determined if p.true]
             if errors:
                 line += f", errors {100.0 * median(errors):.2g} % (median), {100.0 * max(errors):.2g} % (largest)"
-            show(console, f"{line}; {now['verdict']['sentence']}")
+            show(console, f"{line}; {now.trust.sentence}")
 
     return tell

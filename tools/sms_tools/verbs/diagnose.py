@@ -4,30 +4,26 @@ from __future__ import annotations
 
 import argparse
 import math
-from collections.abc import Mapping
 from pathlib import Path
 
 from rich.table import Table
 from rich.text import Text
 
-from sms_adapters.sources import open_source
-from sms_adapters.truth import read_truth
+from sms_adapters.recorded import captured, open_recorded
+from sms_online.capture import Capture
 from sms_online.description.schema import System
-from sms_online.diagnosis.attempt import PriorOf
-from sms_online.diagnosis.diagnose import Diagnosis, diagnose
-from sms_online.diagnosis.document import diagnosis_document, judgement
+from sms_online.diagnosis.diagnosed import Diagnosis, diagnose
 from sms_online.errors import InputError
 from sms_online.pipeline.estimator import Estimator
-from sms_online.stream import Block
-from sms_online.trackers.interface import Prior
+from sms_online.priors import base_prior
+from sms_online.result import json_text
+from sms_online.truth import true_values
 from sms_tools.adopted_system import added_lines, adopted_text, cells_of, remarks, write_adopted
 from sms_tools.exit_codes import NOTHING_DETERMINED, OK
 from sms_tools.interruption import Interruption
-from sms_tools.priors import base_prior
 from sms_tools.report import Document, parameter_table, report_console, show, verdict_text
-from sms_tools.results_file import results_directory, to_json, write_document
-from sms_tools.session import check_part, described_system, stream
-from sms_tools.true_values import true_values
+from sms_tools.results_file import results_directory, write_document
+from sms_tools.session import check_part, described_system
 from sms_tools.view.frames import Diagnosed
 from sms_tools.view.parameter_groups import MOST_LINES
 from sms_tools.view.session import View, open_view
@@ -43,8 +39,8 @@ def run(args: argparse.Namespace) -> int:
     system, folder = described_system(args)
     directory = results_directory(args.out)
     console = report_console(args.json)
-    blocks, warnings = _samples(args.capture, system, args.start, args.stop, folder)
-    holdout: list[Block] = []
+    capture = _samples(args.capture, system, args.start, args.stop, folder)
+    holdout: Capture | None = None
     if args.holdout is not None:
         start = None
         if args.holdout == args.capture:
@@ -52,93 +48,81 @@ def run(args: argparse.Namespace) -> int:
                 expected = "-to SECONDS beside it: what comes after is held out then"
                 raise InputError("--holdout", "", "the capture itself", expected)
             start = args.stop
-        holdout, more = _samples(args.holdout, system, start, None, folder)
-        warnings += more
-        if holdout[0].channels != blocks[0].channels:
-            raise InputError(str(args.holdout), "header", ", ".join(holdout[0].channels), ", ".join(blocks[0].channels))
-    truth = read_truth(args.capture)
-
-    def prior(estimator: Estimator) -> Prior | None:
-        return base_prior(system, estimator.base, args.prior) if args.prior or system.priors else None
+        holdout = _samples(args.holdout, system, start, None, folder)
 
     def progress(message: str) -> None:
         console.print(f"{message} …", markup=False, style="dim")
 
-    diagnosis = diagnose(system, blocks, str(args.capture), prior, holdout, progress)
-    true = None if truth is None else true_values(truth, system, diagnosis.after.system)
-    document = diagnosis_document(diagnosis, warnings, true)
-    view = None if args.rerun == "off" else _watched(args, diagnosis, document, blocks, directory, prior, true)
-    document["warnings"] += [] if view is None else view.warnings
-    lines: list[Table | str | Text] = ["", document["summary"], ""]
+    found = diagnose(system, capture, holdout=holdout, prior=args.prior, progress=progress)
+    document = found.document()
+    view = None if args.rerun == "off" else _watched(args, system, found, capture, directory)
+    if view is not None:
+        document["warnings"] = [*document["warnings"], *view.warnings]
+    lines: list[Table | str | Text] = ["", found.summary, ""]
     if document["effects"]:
         lines += [_effects(document), ""]
     # See `diagnosis_document`.
-    origin = "by a replay with it" if diagnosis.attempt.prior is None else "from the rows of the diagnosis"
+    origin = "from the rows of the diagnosis" if found.search.attempt.prior is not None else "by a replay with it"
     title = f"parameters with what was found, {origin}"
     lines += [_residuals(document), "", parameter_table(document["after"], console.width, title=title), ""]
     lines += [f"warning: {warning}" for warning in document["warnings"]]
-    path = write_document(directory / NAME, document)
+    text = json_text(document)
+    path = write_document(directory / NAME, text)
     added: list[str] = []
-    if diagnosis.after.system != system:
-        text = adopted_text(args.system, system, diagnosis.after.system, remarks(document["effects"]))
-        added = added_lines(args.system, text)
-        lines.append(f"system file with what was found: {write_adopted(directory, text)}")
+    if found.system != system:
+        adopted = adopted_text(args.system, system, found.system, remarks(document["effects"]))
+        added = added_lines(args.system, adopted)
+        lines.append(f"system file with what was found: {write_adopted(directory, adopted)}")
     # Matplotlib takes a second to be imported, which nobody should wait for before the diagnosis.
     from sms_tools.html_report.diagnosis_page import write_diagnosis
 
-    page = write_diagnosis(directory, document, diagnosis, args.capture.name, added)
+    page = write_diagnosis(directory, document, found.search, args.capture.name, added)
     show(console, *lines, f"diagnosis: {path}", f"page: {page}", "", verdict_text(document["judgement"]))
     if args.json:
-        print(to_json(document))
+        print(text)
     if view is not None:
         with Interruption() as interruption:
             view.linger(interruption)
-    return OK if any(p["identifiable"] for p in document["after"]["parameters"]) else NOTHING_DETERMINED
+    return OK if any(p.determined for p in found.after.parameters.values()) else NOTHING_DETERMINED
 
 
-def _watched(
-    args: argparse.Namespace,
-    diagnosis: Diagnosis,
-    document: Document,
-    blocks: list[Block],
-    directory: Path,
-    prior: PriorOf,
-    true: Mapping[str, float] | None,
-) -> View:
+def _watched(args: argparse.Namespace, system: System, found: Diagnosis, capture: Capture, directory: Path) -> View:
     """The session once more in view, with what was found; with it the first candidates' evidence, and the verdict."""
-    channels = blocks[0].channels
-    estimator = Estimator(diagnosis.after.system, channels, str(args.capture))
-    known = prior(estimator)
+    document = found.document()
+    # What is to be seen has been found already: no diagnosis runs beside it.
+    estimator = Estimator(found.system, capture.channels, str(args.capture))
     told: dict[str, tuple[float, float]] = {}
-    if known is not None:
-        estimator.set_prior(known)
+    if found.search.attempt.prior is not None:
+        estimator.set_prior(base_prior(found.system, estimator.base, args.prior))
         # These come from the diagnosis's rows, not from a session; see `diagnosis_document`.
-        after = document["after"]["parameters"]
-        told = {p["name"]: (p["estimate"], math.inf if p["std"] is None else p["std"]) for p in after}
+        told = {p.name: (p.value, p.std) for p in found.after.parameters.values()}
     with (
         Interruption() as interruption,
         open_view(
             args.rerun,
             estimator,
-            channels,
+            capture.channels,
             directory,
-            true,
+            None if capture.truth is None else true_values(capture.truth, system, found.system),
             patient=True,
             exaggeration=args.exaggerate,
-            diagnosed=Diagnosed(told, judgement(diagnosis)),
+            diagnosed=Diagnosed(told, found.trust),
         ) as view,
     ):
-        stream(estimator, view.watch(blocks), interruption)
+        for block in view.watch(capture):
+            estimator.push(block)
+            if interruption.requested:
+                break
+        estimator.finish()
         scores = _evidence(document)
         # Judged by all of the capture, so it holds from beginning to end.
-        begin, end = float(blocks[0].t[0]), float(blocks[-1].t[-1])
+        begin, end = float(capture.t[0]), float(capture.t[-1])
         for t in (begin, end):
             view.evidence(t, scores)
-        view.event(end, document["summary"])
+        view.event(end, found.summary)
         told_of = remarks(document["effects"])
-        for effect in document["effects"]:
-            key = f"{effect['name']}@{effect['where']}"
-            view.event(end, ", ".join(filter(None, (key, told_of[key]))))
+        for finding in found.effects:
+            view.event(end, ", ".join(filter(None, (finding.effect, told_of[finding.effect]))))
     return view
 
 
@@ -155,14 +139,8 @@ def _evidence(document: Document) -> dict[str, float]:
     return {name: math.log10(max(1.0, gain)) for name, gain in gains}
 
 
-def _samples(
-    capture: Path, system: System, start: float | None, stop: float | None, folder: Path | None
-) -> tuple[list[Block], list[str]]:
-    source = open_source(capture, system, start, stop, None, folder)
-    blocks = list(source)
-    if not blocks:
-        raise InputError(str(capture), "", "no samples", "a capture with samples in the time asked for")
-    return blocks, list(source.warnings)
+def _samples(capture: Path, system: System, start: float | None, stop: float | None, folder: Path | None) -> Capture:
+    return captured(open_recorded(capture, system, start, stop, None, folder))
 
 
 def _effects(document: Document) -> Table:

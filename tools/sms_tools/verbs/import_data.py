@@ -6,9 +6,9 @@ import argparse
 
 from sms_adapters.importers import import_emps, import_quanser
 from sms_adapters.truth import truth_path
+from sms_online.result import json_text
 from sms_tools.exit_codes import OK
 from sms_tools.report import report_console, show
-from sms_tools.results_file import to_json
 
 IMPORTERS = {"emps": import_emps, "quanser": import_quanser}
 
@@ -20,5 +20,5 @@ def run(args: argparse.Namespace) -> int:
     truth_path(args.capture).unlink(missing_ok=True)
     show(report_console(args.json), f"capture: {args.capture}, {samples} samples")
     if args.json:
-        print(to_json({"schema": "sms-online/import/1", "capture": str(args.capture), "samples": samples}))
+        print(json_text({"schema": "sms-online/import/1", "capture": str(args.capture), "samples": samples}))
     return OK

@@ -6,7 +6,6 @@ import argparse
 import math
 from contextlib import closing
 
-from sms_online.diagnosis.online import OnlineDiagnosis
 from sms_tools.exit_codes import INTERRUPTED
 from sms_tools.interruption import Interruption
 from sms_tools.live.searches import SearchProcess
@@ -15,7 +14,7 @@ from sms_tools.live.status import StatusWriter
 from sms_tools.live.testbed import open_testbed
 from sms_tools.report import report_console, show
 from sms_tools.results_file import results_directory
-from sms_tools.session import conclude, described_system, document_of, write_named
+from sms_tools.session import conclude, described_system, write_named
 from sms_tools.showing import showing
 
 
@@ -24,34 +23,31 @@ def run(args: argparse.Namespace) -> int:
     system, folder = described_system(args)
     directory = results_directory(args.out)
     status = StatusWriter()
-    session, estimator, merger = open_testbed(args.system, system, folder, directory, args.resume, status)
+    live, session, merger = open_testbed(args.system, system, folder, directory, args.resume, status, args.adopt)
     with Interruption() as interruption, termination_interrupts():
         with (
-            showing(args, estimator, merger.channels, directory, None, live=session) as shown,
+            showing(args, session, directory, None, live=live) as shown,
             closing(SearchProcess(directory, args.adopt)) as searches,
         ):
-            online = OnlineDiagnosis(estimator, searches, args.adopt)
-            session.discrepancies = lambda: online.discrepancies
-            session.notices = lambda: [*online.notices, *shown.notices]
-            shown.follow(online)
-            blocks = session.blocks(interruption, math.inf if args.duration is None else args.duration)
+            session.diagnosis.searcher = searches
+            live.notices = lambda: [*session.diagnosis.notices, *shown.notices]
+            shown.follow()
+            blocks = live.blocks(interruption, math.inf if args.duration is None else args.duration)
             for block in shown.watch(blocks):
-                estimator.push(block)
-            estimator.finish()
-            online.finish()
-        session.close()
+                session.update(block)
+            session.finish()
+        live.close()
         status.close()
-        throughput = estimator.samples / session.busy if session.busy else 0.0
-        warnings = [*merger.warnings, *session.warnings, *shown.warnings]
+        throughput = session.estimator.samples / live.busy if live.busy else 0.0
+        warnings = [*merger.warnings, *live.warnings, *shown.warnings]
         warnings += [] if searches.problem is None else [searches.problem]
-        document = document_of(estimator, throughput, warnings, None, discrepancies=online.discrepancies)
-        document["diagnosis"] = online.document()
-        write_named(args, online, directory)
-        code = conclude(args, document, directory, interrupted=False)
-        half, nearly_all = session.latencies.quantile(0.5), session.latencies.quantile(0.99)
+        result = session.evaluate(None, None, warnings, throughput)
+        write_named(args, session, directory)
+        code = conclude(args, result, directory, interrupted=False)
+        half, nearly_all = live.latencies.quantile(0.5), live.latencies.quantile(0.99)
         if half is not None and nearly_all is not None:
             latency = f"median {1e3 * half:.0f} ms, p99 {1e3 * nearly_all:.0f} ms, over the last seconds"
             show(report_console(args.json), f"latency, arrival to estimate: {latency}")
-        shown.report(document, interruption)
+        shown.report(result, interruption)
     # That is how a session without an end ends, and no reason to doubt its results.
     return INTERRUPTED if interruption.requested else code

@@ -10,9 +10,9 @@ from rich.table import Table
 
 from sms_online.description.schema import FlexibleLink, System
 from sms_online.model.eigenmodes import LinkMarkers, markers
+from sms_online.result import json_text
 from sms_tools.exit_codes import OK
 from sms_tools.report import report_console, show
-from sms_tools.results_file import to_json
 from sms_tools.session import described_system
 
 
@@ -26,7 +26,7 @@ def run(args: argparse.Namespace) -> int:
     else:
         show(console, f"{system.name}: no flexible link that bends")
     if args.json:
-        print(to_json({"schema": "sms-online/markers/1", "system": system.name, "links": links}))
+        print(json_text({"schema": "sms-online/markers/1", "system": system.name, "links": links}))
     return OK
 
 

@@ -12,13 +12,14 @@ from sms_adapters.recorder import Recorder
 from sms_adapters.session_log import SessionHeader
 from sms_online.description.schema import CanSource, SerialField, SerialLines, Source
 from sms_online.errors import InputError
+from sms_online.result import json_text
 from sms_tools.exit_codes import INTERRUPTED, OK
 from sms_tools.interruption import Interruption
 from sms_tools.live.feed import Feed, SessionClock, kind_of
 from sms_tools.live.signals import termination_interrupts
 from sms_tools.live.testbed import versions
 from sms_tools.report import Document, report_console, show
-from sms_tools.results_file import results_directory, to_json
+from sms_tools.results_file import results_directory
 
 BAUDRATE = 115200
 # A look at the devices, s.
@@ -65,7 +66,7 @@ def run(args: argparse.Namespace) -> int:
     parts = [f"{name}: {count} items" for name, count in document["sources"].items()]
     show(console, *parts, *(f"warning: {warning}" for warning in warnings), f"recording: {directory}")
     if args.json:
-        print(to_json(document))
+        print(json_text(document))
     return INTERRUPTED if interruption.requested else OK
 
 

@@ -11,34 +11,19 @@ from time import perf_counter
 from rich.console import Console
 from rich.progress import BarColumn, DownloadColumn, Progress, TextColumn, TimeRemainingColumn
 
-from sms_adapters.checkpoint import load_checkpoint
-from sms_adapters.recording import Recording
-from sms_adapters.session_log import SESSION
-from sms_adapters.sources import open_source
-from sms_adapters.truth import read_truth
-from sms_online.bound import MotionRecord, session_bound
-from sms_online.diagnosis.online import Immediate, OnlineDiagnosis
+from sms_adapters.recorded import open_recorded
+from sms_online.capture import PIECE
+from sms_online.cramer_rao import MotionRecord, session_bound
+from sms_online.session import Session
 from sms_online.stream import Block
 from sms_tools.interruption import Interruption
-from sms_tools.live.searches import searcher_of
 from sms_tools.live.signals import termination_interrupts
 from sms_tools.results_file import results_directory
-from sms_tools.session import (
-    check_part,
-    conclude,
-    described_system,
-    document_of,
-    new_estimator,
-    stream,
-    write_named,
-)
+from sms_tools.session import check_part, conclude, described_system, feed, write_named
 from sms_tools.showing import showing
-from sms_tools.true_values import true_values
 
 # A progress bar appears from this size on, bytes: a second of work.
 LONG_FILE = 20_000_000
-# Samples pushed at a time: few enough to answer Ctrl-C soon, many enough that a push costs nothing beside its samples.
-PIECE = 1024
 # In step with the clock, a push holds so much of the session, s.
 PACE = 0.05
 
@@ -60,37 +45,36 @@ def run(args: argparse.Namespace) -> int:
                 def on_bytes(consumed: int) -> None:
                     progress.update(task, completed=consumed)
 
-            source = open_source(capture, system, args.start, args.stop, on_bytes, folder)
-            truth = read_truth(capture / SESSION if capture.is_dir() else capture)
-            true = None if truth is None else true_values(truth, system, system)
-            estimator = new_estimator(system, source.channels, str(capture), args.prior)
-            if isinstance(source, Recording) and source.checkpoint is not None:
-                load_checkpoint(source.checkpoint, estimator)
+            recorded = open_recorded(capture, system, args.start, args.stop, on_bytes, folder)
+            source = recorded.source
+            session = Session(
+                system,
+                source.channels,
+                prior=args.prior,
+                adopt=args.adopt,
+                source=recorded.name,
+                searcher=recorded.searcher(args.adopt),
+                checkpoint=recorded.checkpoint,
+            )
             record = MotionRecord(system.sample_rate) if args.bound else None
             if record is not None:
-                estimator.observers.append(record)
+                session.estimator.observers.append(record)
             patient = args.speed == "max"
             rows = PIECE if patient else max(1, round(PACE * system.sample_rate))
             pieces = (piece for block in source for piece in block.pieces(rows))
             blocks = pieces if patient else _paced(pieces, interruption)
-            with showing(args, estimator, source.channels, directory, true, patient) as shown:
-                searcher = searcher_of(capture, args.adopt) if args.start is args.stop is None else Immediate()
-                online = OnlineDiagnosis(estimator, searcher, args.adopt)
-                # A bar of progress stays below what is told.
-                console = Console(stderr=True, highlight=False) if progress is None else progress.console
-                shown.follow(online, lambda text: console.print(text, markup=False, soft_wrap=True))
-                stream(estimator, shown.watch(blocks), interruption)
-                online.finish()
+            # A bar of progress stays below what is told.
+            console = Console(stderr=True, highlight=False) if progress is None else progress.console
+            with showing(args, session, directory, recorded.truth, patient) as shown:
+                shown.follow(lambda text: console.print(text, markup=False, soft_wrap=True))
+                feed(session, shown.watch(blocks), interruption)
                 wall = perf_counter() - opened
-        bound = None if record is None else session_bound(estimator, record)
+        bound = None if record is None else session_bound(session.estimator, record)
         warnings = [*source.warnings, *shown.warnings]
-        # Of effects that were taken up, too.
-        true = None if truth is None else true_values(truth, system, online.system)
-        document = document_of(estimator, estimator.samples / wall, warnings, true, bound, online.discrepancies)
-        document["diagnosis"] = online.document()
-        write_named(args, online, directory)
-        code = conclude(args, document, directory, interruption.requested)
-        shown.report(document, interruption)
+        result = session.evaluate(recorded.truth, bound, warnings, session.estimator.samples / wall)
+        write_named(args, session, directory)
+        code = conclude(args, result, directory, interruption.requested)
+        shown.report(result, interruption)
     return code
 
 

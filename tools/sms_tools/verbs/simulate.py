@@ -13,14 +13,10 @@ from rich.progress import Progress, TextColumn, TimeElapsedColumn
 from sms_adapters.capture import CaptureWriter
 from sms_adapters.truth import truth_path, write_truth
 from sms_online.effects.build import build_model
-from sms_online.effects.catalogue import parse_effect
-from sms_online.errors import InputError
-from sms_sim.plant import Plant
-from sms_sim.sensors import Sensors
-from sms_sim.simulate import sampled_blocks, simulate
+from sms_online.result import json_text
+from sms_sim.capture import Simulated
 from sms_tools.exit_codes import OK
 from sms_tools.report import report_console, show
-from sms_tools.results_file import to_json
 from sms_tools.session import described_system
 
 
@@ -39,32 +35,19 @@ def _solving(console: Console) -> Iterator[Callable[[float], None]]:
 def run(args: argparse.Namespace) -> int:
     """Simulate a session and write FILE.csv and FILE.csv.truth.json."""
     described, _ = described_system(args)
-    system = described
-    for text in args.effect:
-        system = system.model_copy(update={"effects": (*system.effects, parse_effect(text, system))})
+    session = Simulated.of(described, args.effect, args.duration, args.grade, args.seed)
     capture: Path = args.capture
-    channels = Sensors(system, Plant(system).recordable, args.grade, args.seed).channels
     # The writer comes first: a name that cannot be written is known before a long simulation.
-    with CaptureWriter(capture, channels) as writer:
-        try:
-            with _solving(report_console(args.json)) as progress:
-                simulation = simulate(system, args.duration, progress=progress)
-        except ArithmeticError as error:
-            expected = "a motion that the integrator can follow"
-            raise InputError(args.system, "trajectory and controller", str(error), expected) from None
+    with CaptureWriter(capture, session.channels) as writer:
+        with _solving(report_console(args.json)) as progress:
+            simulation = session.solve(progress)
         samples = 0
-        for block in sampled_blocks(simulation, args.grade, args.seed):
+        for block in session.blocks(simulation):
             writer.write(block)
             samples += block.t.size
     drift = simulation.drift
-    model = build_model(described)
-    truth = {p.name: p.nominal for p in model.parameters}
-    injected = [effect.model_dump(mode="json") for effect in system.effects[len(described.effects) :]]
-    provenance = {
-        "system": system.name, "grade": args.grade, "seed": args.seed, "duration_s": simulation.duration,
-        "effects": injected,
-    }  # fmt: skip
-    write_truth(capture, truth, provenance)
+    truth = session.truth(simulation)
+    write_truth(capture, truth.pop("parameters"), truth)
     document = {
         "schema": "sms-online/simulation/1",
         "capture": str(capture),
@@ -84,9 +67,9 @@ def run(args: argparse.Namespace) -> int:
         text = conserved if value is None else f"{value:.1e} of what base and arm exchange"
         lines.append(f"{what} momentum drift: {text}")
     # As in what a diagnosis writes: the values of its effects are for the estimator to find.
-    idle = [e for e in model.effects if e.parameters and all(p.nominal == 0.0 for p in e.parameters)]
+    idle = [e for e in build_model(described).effects if e.parameters and all(p.nominal == 0.0 for p in e.parameters)]
     lines += [f"warning: {e.name}@{e.where} does nothing, for {args.system} states no size of it" for e in idle]
     show(report_console(args.json), *lines)
     if args.json:
-        print(to_json(document))
+        print(json_text(document))
     return OK

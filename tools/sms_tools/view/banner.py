@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import rerun as rr
 
-from sms_online.judgement import Judgement
+from sms_online.judgement import Trust
 from sms_tools.view import style
 from sms_tools.view.arm_log import times
 
@@ -24,10 +24,10 @@ class Banner:
         self._stream = stream
         self._shown: tuple[str, style.Color] | None = None
 
-    def show(self, t: float, judgement: Judgement) -> None:
+    def show(self, t: float, trust: Trust) -> None:
         """The judgement at t, s."""
-        color = style.verdict_color(judgement)
-        text = markdown(judgement)
+        color = style.verdict_color(trust)
+        text = markdown(trust)
         if self._shown == (text, color):
             return
         index = times(np.array([t]))
@@ -38,10 +38,10 @@ class Banner:
         self._shown = text, color
 
 
-def markdown(judgement: Judgement) -> str:
+def markdown(trust: Trust) -> str:
     """The sentence as a heading, the other reasons on a line below."""
-    level, _, reason = judgement.sentence.partition(": ")
-    others = " · ".join(judgement.others)
+    level, _, reason = trust.sentence.partition(": ")
+    others = " · ".join(trust.others)
     return f"# {level.upper()}: {_plain(reason)}\n\n{_plain(others)}"
 
 

@@ -6,10 +6,10 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
-from sms_online.judgement import Discrepancy, Judgement
+from sms_online.judgement import Discrepancy, Trust
+from sms_online.pipeline.statistics import Statistics
 from sms_online.stream import Block
 from sms_tools.view.choice import Choice
-from sms_tools.view.snapshot import Snapshot
 
 
 class TroubleError(Exception):
@@ -29,16 +29,16 @@ class Diagnosed:
     """That the session has been diagnosed before it is shown: verdict and evidence are in front.
 
     parameters: estimate and standard deviation by name, to be shown instead of what the session tells; empty where that
-    tells the same. judgement: of the diagnosis.
+    tells the same. trust: of the diagnosis.
     """
 
     parameters: Mapping[str, tuple[float, float]]
-    judgement: Judgement
+    trust: Trust
 
 
 @dataclass(frozen=True)
 class Circumstances:
-    """What the judgement of a session takes from beside its estimator: see `judgement.Facts`."""
+    """What the trust in a session takes from beside its estimator: see `judgement.Facts`."""
 
     discrepancies: tuple[Discrepancy, ...] = ()
     troubles: tuple[str, ...] = ()
@@ -46,14 +46,13 @@ class Circumstances:
 
 @dataclass(frozen=True)
 class Start:
-    """The session: its estimator before any sample, the channels of its blocks, a reference for each parameter.
+    """The session before any sample, the channels of its blocks, a reference for each parameter.
 
-    estimator: pickled when the session began, for it goes on working while this waits to be sent. recording: file that
-    `save` writes. exaggeration: factor on every deflection drawn. live: the source tells its latency and clocks.
-    diagnosed: of a session that is shown once more.
+    recording: file that `save` writes. exaggeration: factor on every deflection drawn. live: the source tells its
+    latency and clocks. diagnosed: of a session that is shown once more.
     """
 
-    estimator: bytes
+    statistics: Statistics
     channels: tuple[str, ...]
     choice: Choice
     recording: Path
@@ -71,7 +70,7 @@ class Picture:
     """
 
     blocks: tuple[Block, ...]
-    state: Snapshot | None
+    state: Statistics | None
     health: Mapping[str, Mapping[str, float]]
     circumstances: Circumstances
     wall: float
@@ -99,7 +98,7 @@ class End:
     """No more frames; state: the session's last."""
 
     t: float
-    state: Snapshot
+    state: Statistics
     circumstances: Circumstances
 
 

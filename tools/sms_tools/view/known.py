@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from sms_online.results import identifiable
+from sms_online.evaluation import identifiable
 from sms_online.stream import Array
 
 # Error bars and bands are drawn so far to either side, in standard deviations.

@@ -1,8 +1,7 @@
-"""Draws a session from its frames: a replica of the estimator takes on each state, and what it says is logged."""
+"""Draws a session from its frames: the statistics of each state are evaluated, and what they say is logged."""
 
 from __future__ import annotations
 
-import pickle
 from collections import deque
 from collections.abc import Callable
 from itertools import groupby
@@ -12,16 +11,10 @@ import numpy as np
 import rerun.blueprint as rrb
 from numpy.typing import NDArray
 
-from sms_online.judgement import LARGEST_RESIDUAL, LARGEST_WHITENED, Judgement
-from sms_online.pipeline.estimator import Estimator
-from sms_online.results import (
-    event_document,
-    judged,
-    projected,
-    residuals,
-    results_document,
-    standard_deviation,
-)
+from sms_online.evaluation import Evaluation
+from sms_online.judgement import LARGEST_RESIDUAL, LARGEST_WHITENED, Trust
+from sms_online.pipeline.statistics import Statistics
+from sms_online.result import event_document
 from sms_online.stream import Array
 from sms_tools.report import event_line
 from sms_tools.view import style
@@ -46,7 +39,6 @@ from sms_tools.view.readings import Readings
 from sms_tools.view.residuals import RecentResidual
 from sms_tools.view.scene import Scene
 from sms_tools.view.sink import Sink
-from sms_tools.view.snapshot import Snapshot, apply
 from sms_tools.view.table import markdown_table
 
 # The table, and residuals of all rows so far, which move slowly: s of the session.
@@ -66,25 +58,25 @@ class Recorder:
 
     def __init__(self, start: Start, opened: Callable[[str], None]) -> None:
         self.waiting = 0  # pictures in the batch
-        estimator: Estimator = pickle.loads(start.estimator)
-        self._estimator = estimator
+        self._now = now = Evaluation(start.statistics)
         self._references = start.references
         self._live, self._diagnosed = start.live, start.diagnosed
         self._opened: Callable[[str], None] | None = opened
-        self._scene = Scene(estimator.model, start.exaggeration)
-        self._readings = Readings(estimator.sensing, start.channels)
+        self._scene = Scene(now.model, start.exaggeration)
+        self._sensing = now.statistics.setup.sensing
+        self._readings = Readings(self._sensing, start.channels)
         self._scale = OwnScale(start.references)
-        system = estimator.system
+        system = now.statistics.setup.system
         self._sink = Sink(start.choice, start.recording, system.title or system.name)
         # t, x, relative residual of each link's rows, marks and their colour.
         self._arm: list[tuple[Array, Array, Array, dict[str, str], style.Color]] = []
         self._marks: dict[str, str] = {}
-        self._judgement: Judgement | None = None
+        self._trust: Trust | None = None
         self._circumstances = Circumstances()
         self._residual = np.full(len(system.joints), np.nan)
         self._recent = RecentResidual()
         self._events = 0  # marked and told so far
-        self._determined: NDArray[np.bool_] = np.zeros(estimator.base.n, dtype=bool)
+        self._determined: NDArray[np.bool_] = np.zeros(now.base.n, dtype=bool)
         self._gaps = 0
         self._beyond: set[str] = set()  # plots of residuals in which something was too much
         self._slow_due = -np.inf
@@ -102,7 +94,7 @@ class Recorder:
         self._opened(self._sink.open(self._layout()))
         self._opened = None
         self._arm_log, self._banner = ArmLog(stream, self._scene), Banner(stream)
-        joints = [f"joint {i}" for i in range(1, len(self._estimator.system.joints) + 1)]
+        joints = [f"joint {i}" for i in range(1, self._residual.size + 1)]
         self._numbers.describe(f"{RESIDUAL}/relative", joints)
         self._numbers.describe(f"{RESIDUAL}/energy", ["energy"])
         self._numbers.describe(f"{RESIDUAL}/noise", ["noise"], [style.REFERENCE], width=1.0)
@@ -114,7 +106,7 @@ class Recorder:
         self._numbers.describe(f"{HEALTH}/counts/all", counts)
 
     def _groups(self) -> list[Group]:
-        return parameter_groups(self._estimator.base.parameters, self._references, self._scale.basis)
+        return parameter_groups(self._now.parameters, self._references, self._scale.basis)
 
     def _layout(self) -> rrb.Blueprint:
         diagnosed = self._diagnosed is not None
@@ -132,14 +124,14 @@ class Recorder:
         if picture.state is not None and self._opened is None:
             t_state = float(picture.blocks[-1].t[-1])
             self._take(t_state, picture.state, picture.circumstances)
-            samples = self._estimator.samples
+            samples = picture.state.samples
             self._clock.append((samples, picture.wall))
             took = picture.wall - self._clock[0][1]
             if took > 0.0:
                 rate = (samples - self._clock[0][0]) / took
                 self._numbers.add(f"{HEALTH}/rates/samples", t_state, np.array([rate]))
-            counters = self._estimator.counters
-            counts = [counters.lost_samples, self._estimator.dropped_rows, counters.gaps, counters.interpolated_cells]
+            counters, dropped = picture.state.counters, picture.state.dropped_rows
+            counts = [counters.lost_samples, dropped, counters.gaps, counters.interpolated_cells]
             self._numbers.add(f"{HEALTH}/counts/all", t_state, np.array([*counts, picture.dropped], dtype=np.float64))
             for plot, values in picture.health.items():
                 self._numbers.add_named(f"{HEALTH}/{plot}", t_state, values)
@@ -171,31 +163,29 @@ class Recorder:
         """The session's last state, with what its results warn of; None where it was cut off."""
         if end is not None and self._opened is None:
             self._take(end.t, end.state, end.circumstances, last=True)
-            for warning in results_document(self._estimator, 0.0, [])["warnings"]:
+            for warning in self._now.warnings:
                 self._numbers.tell(end.t, warning, warning=True)
         self.write()
         if self._opened is None:
             self._sink.close()
 
-    def _take(self, t: float, state: Snapshot, circumstances: Circumstances, last: bool = False) -> None:
-        estimator = self._estimator
-        apply(state, estimator)
+    def _take(self, t: float, state: Statistics, circumstances: Circumstances, last: bool = False) -> None:
+        self._now = now = Evaluation(state, None, circumstances.discrepancies, circumstances.troubles)
         more = self._follow_events()
         known = self._known(t)
         slow = t >= self._slow_due or last
         if slow or circumstances != self._circumstances:
             self._circumstances = circumstances
             self._judge(t, last)
-        settled = self._judgement is not None and self._judgement.level != "not yet"
+        settled = self._trust is not None and self._trust.level != "not yet"
         self._arrange(t, more, self._scale.follow(known, settled, last))
         self._parameters.add(known)
-        self._residual = self._recent.push(t, estimator, known.estimate)
+        self._residual = self._recent.push(t, state, known.estimate)
         self._numbers.add(f"{RESIDUAL}/relative", t, self._residual)
         self._tell_changes(known)
         if slow:
-            parameters = estimator.base.parameters
-            self._numbers.table(t, markdown_table(parameters, self._references, known))
-            self._whole_residuals(t, known.estimate)
+            self._numbers.table(t, markdown_table(now.parameters, self._references, known))
+            self._whole_residuals(t)
             self._slow_due = t + SLOW_INTERVAL
 
     def _arrange(self, t: float, more: bool, rescaled: bool) -> None:
@@ -210,33 +200,22 @@ class Recorder:
 
     def _judge(self, t: float, last: bool) -> None:
         """May the numbers be trusted? Shown on top, marked on the arm, and told where the answer is another one."""
-        before = self._judgement
-        if self._diagnosed is not None:
-            now = self._diagnosed.judgement
-        else:
-            estimate, circumstances = self._estimator.estimate(), self._circumstances
-            projection = None
-            if last:
-                # It takes too long to be made at every step.
-                std = standard_deviation(self._estimator, estimate)
-                projection = projected(self._estimator, estimate, std)
-            now = judged(self._estimator, estimate, circumstances.discrepancies, circumstances.troubles, projection)
-        self._judgement = now
+        before, now = self._trust, self._now.trust if self._diagnosed is None else self._diagnosed.trust
+        self._trust = now
         self._banner.show(t, now)
-        self._marks = drawn_marks(now.marks, self._estimator.sensing.channels)
+        self._marks = drawn_marks(now.marks, self._sensing.channels)
         if last or before is None or (before.level, before.grave, before.marks) != (now.level, now.grave, now.marks):
             self._numbers.tell(t, now.sentence, warning=now.level == "doubt")
 
     def _known(self, t: float) -> Known:
         """What is known of the base parameters at t, s: by the session, or by a diagnosis."""
-        estimator = self._estimator
+        now = self._now
         if self._diagnosed is not None and self._diagnosed.parameters:
             unknown = np.nan, np.inf
-            told = [self._diagnosed.parameters.get(p.name, unknown) for p in estimator.base.parameters]
+            told = [self._diagnosed.parameters.get(p.name, unknown) for p in now.parameters]
             estimate, std = np.array(told).T
             return Known(t, estimate, std)
-        now = estimator.estimate()
-        return Known(t, now.pi, standard_deviation(estimator, now))
+        return Known(t, now.estimate.pi, now.std)
 
     def _mark(self, t: float) -> None:
         """A vertical line in all plots of parameters and residuals."""
@@ -246,29 +225,28 @@ class Recorder:
 
     @property
     def _color(self) -> style.Color:
-        return style.NOT_YET if self._judgement is None else style.verdict_color(self._judgement)
+        return style.NOT_YET if self._trust is None else style.verdict_color(self._trust)
 
     def _follow_events(self) -> bool:
         """Mark and tell new events; whether they have added parameters."""
-        base = self._estimator.base
-        more = base.n - len(self._references)
+        more = self._now.base.n - len(self._references)
         if more > 0:
             self._references = (*self._references, *[None] * more)
             self._determined = np.append(self._determined, np.zeros(more, dtype=bool))
-        events = self._estimator.events
+        events = self._now.statistics.events
         for event in events[self._events :]:
             self._mark(event.time)
             self._numbers.tell(event.time, event_line(event_document(event)), warning=True)
         self._events = len(events)
         return more > 0
 
-    def _whole_residuals(self, t: float, estimate: Array) -> None:
+    def _whole_residuals(self, t: float) -> None:
         """Residuals of all rows so far: over their predicted deviation, in decades, and of the energy balance."""
-        whole = residuals(self._estimator, estimate)
-        known = {rows: np.log10(value) for rows, r in whole.items() if (value := r["whitened"])}
+        whole = self._now.residuals
+        known = {rows: np.log10(value) for rows, r in whole.items() if (value := r.whitened)}
         self._numbers.add_named(f"{RESIDUAL}/whitened", t, known)
         self._numbers.add(f"{RESIDUAL}/noise", t, np.zeros(1))
-        shares = [share for r in whole.values() if (share := r["relative"]) is not None]
+        shares = [share for r in whole.values() if (share := r.relative) is not None]
         for plot, values in (("relative", shares), ("whitened", [*known.values()])):
             limit, (_, top) = LIMITS[plot], RANGES[plot]
             worst = max(values, default=-np.inf)
@@ -280,7 +258,7 @@ class Recorder:
             if plot in self._beyond:
                 beyond = min(worst, top) if worst > limit else np.nan
                 self._numbers.add(f"{RESIDUAL}/{plot}_beyond", t, np.array([beyond]))
-        energy = self._estimator.energy_tracker.estimate()
+        energy = self._now.statistics.energy_estimate()
         rms = np.sqrt(energy.rss / energy.dof) if energy.dof > 0.0 else np.nan
         self._numbers.add(f"{RESIDUAL}/energy", t, np.array([rms]))
 
@@ -288,13 +266,13 @@ class Recorder:
         """What has become known or has been lost since the last state."""
         t, determined = now.t, now.determined
         for k in np.flatnonzero(determined != self._determined):
-            p = self._estimator.base.parameters[k]
+            p = self._now.parameters[k]
             if determined[k]:
                 self._numbers.tell(t, f"{p.name} is determined: {now.estimate[k]:.4g} ± {now.std[k]:.2g} {p.unit}")
             else:
                 self._numbers.tell(t, f"{p.name} is not determined any more", warning=True)
         self._determined = determined
-        gaps = self._estimator.counters.gaps
+        gaps = self._now.statistics.counters.gaps
         if gaps > self._gaps:
             self._mark(t)
             self._numbers.tell(t, "a gap too long to bridge: a new window of the balance begins", warning=True)

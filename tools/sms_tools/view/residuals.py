@@ -6,8 +6,8 @@ from collections import deque
 
 import numpy as np
 
-from sms_online.pipeline.estimator import Estimator
 from sms_online.pipeline.joint_balance import SquaredResidual
+from sms_online.pipeline.statistics import Statistics
 from sms_online.stream import Array
 
 # A residual is stated over the last so many seconds: some windows of the balance.
@@ -18,20 +18,20 @@ class RecentResidual:
     """Relative residual of every joint's rows over the last second, with the estimate of now."""
 
     def __init__(self) -> None:
-        self._past: deque[tuple[float, list[SquaredResidual]]] = deque()
+        self._past: deque[tuple[float, tuple[SquaredResidual, ...]]] = deque()
         self._events = 0
 
-    def push(self, t: float, estimator: Estimator, beta: Array) -> Array:
+    def push(self, t: float, known: Statistics, beta: Array) -> Array:
         """Shares (joints,) of the measured torque or force that are not explained; NaN where nothing was measured."""
-        now = estimator.joint_residuals
-        if len(estimator.events) > self._events:
+        now = known.joints
+        if len(known.events) > self._events:
             # The sums begin anew, with what the event has added.
-            self._events = len(estimator.events)
+            self._events = len(known.events)
             self._past.clear()
-        self._past.append((t, [SquaredResidual(r.gram, r.signal) for r in now]))
+        self._past.append((t, now))
         while len(self._past) > 1 and self._past[1][0] <= t - SPAN:
             self._past.popleft()
-        then = self._past[0][1] if len(self._past) > 1 else [SquaredResidual(0.0 * r.gram, 0.0) for r in now]
+        then = self._past[0][1] if len(self._past) > 1 else tuple(SquaredResidual(0.0 * r.gram, 0.0) for r in now)
         recent = [SquaredResidual(a.gram - b.gram, a.signal - b.signal) for a, b in zip(now, then, strict=True)]
         shares = [residual.relative(beta) for residual in recent]
         return np.array([np.nan if share is None else share for share in shares])

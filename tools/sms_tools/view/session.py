@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import pickle
 import signal
 import socket
 import subprocess
@@ -22,12 +21,12 @@ import numpy as np
 
 from sms_online.errors import InputError
 from sms_online.pipeline.estimator import Estimator
+from sms_online.pipeline.statistics import Statistics
 from sms_online.stream import Block
 from sms_tools.interruption import Interruption
 from sms_tools.view.choice import EXPECTED, Choice, parse_choice
 from sms_tools.view.frames import Circumstances, Diagnosed, End, Event, Evidence, Frame, Picture, Reference, Start
 from sms_tools.view.handover import Handover
-from sms_tools.view.snapshot import take
 
 RECORDING = "session.rrd"
 # Hand-overs a second of the session: samples as often as they are drawn; with every fifth the estimator's state, for it
@@ -136,7 +135,7 @@ class View:
         if self._handover is None:
             return
         if kind is None:
-            self._put(End(self._t, take(self._estimator), self.circumstances()))
+            self._put(End(self._t, Statistics.of(self._estimator), self.circumstances()))
             self._close(self._handover)
         self._handover.close()
         if self._handover.dropped:
@@ -156,7 +155,7 @@ class View:
     def _show(self, blocks: tuple[Block, ...], with_state: bool) -> None:
         assert self._handover is not None
         health = self._health() if with_state and self._health is not None else {}
-        state = take(self._estimator) if with_state else None
+        state = Statistics.of(self._estimator) if with_state else None
         circumstances = self.circumstances() if with_state else Circumstances()
         self._put(Picture(blocks, state, health, circumstances, perf_counter(), self._handover.dropped))
 
@@ -228,7 +227,7 @@ def open_view(
         except OSError as error:
             raise InputError(str(directory), "", error.strerror or str(error), "a directory that can be made") from None
     start = Start(
-        estimator=pickle.dumps(estimator),
+        statistics=Statistics.of(estimator),
         channels=channels,
         choice=parsed,
         recording=recording,

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from sms_online.judgement import LARGEST_RESIDUAL, Judgement
+from sms_online.judgement import LARGEST_RESIDUAL, Trust
 from sms_online.stream import Array
 
 Color = tuple[int, int, int]
@@ -38,11 +38,11 @@ NOT_YET: Color = (110, 115, 125)
 GOOD, BAD = np.array((60.0, 190.0, 120.0)), np.array((235.0, 60.0, 60.0))
 
 
-def verdict_color(judgement: Judgement) -> Color:
+def verdict_color(trust: Trust) -> Color:
     """Green, amber, red, or grey while it is too early."""
-    if judgement.level == "doubt":
-        return GRAVE if judgement.grave else CAUTION
-    return TRUST if judgement.level == "trust" else NOT_YET
+    if trust.level == "doubt":
+        return GRAVE if trust.grave else CAUTION
+    return TRUST if trust.level == "trust" else NOT_YET
 
 
 def translucent(color: Color) -> tuple[int, int, int, int]:

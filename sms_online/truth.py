@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 from sms_online.description.schema import Effect, System
@@ -10,7 +11,7 @@ from sms_online.effects.catalogue import check_effect
 from sms_online.errors import InputError
 
 
-def true_values(truth: dict[str, Any], described: System, adopted: System) -> dict[str, float]:
+def true_values(truth: Mapping[str, Any], described: System, adopted: System) -> dict[str, float]:
     """By name, of `truth` as read beside a capture; the effects of `adopted` that were not injected are truly zero.
 
     Effects that were injected into a system of another kind are left out.

@@ -1,0 +1,93 @@
+"""A recorded session and what lies beside it: truth of a simulation, checkpoint and searches of a live session."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+
+from sms_adapters.capture import CaptureReader, CaptureWriter
+from sms_adapters.checkpoint import read_checkpoint
+from sms_adapters.recording import Recording
+from sms_adapters.searches import searcher_of
+from sms_adapters.session_log import SESSION
+from sms_adapters.sources import open_source
+from sms_adapters.system_file import load_system
+from sms_adapters.truth import read_truth, write_truth
+from sms_online.capture import Capture
+from sms_online.description.schema import System
+from sms_online.diagnosis.online import Immediate
+from sms_online.errors import InputError
+from sms_online.session import Recorded
+
+
+def open_recorded(
+    path: Path,
+    system: System,
+    start: float | None = None,
+    stop: float | None = None,
+    on_bytes: Callable[[int], None] | None = None,
+    directory: Path | None = None,
+) -> Recorded:
+    """The recorded session at a path; see `open_source`, which says what is read and when InputError is raised."""
+    source = open_source(path, system, start, stop, on_bytes, directory)
+    checkpoint = source.checkpoint if isinstance(source, Recording) else None
+    return Recorded(
+        source,
+        str(path),
+        truth_beside(path),
+        None if checkpoint is None else read_checkpoint(checkpoint),
+        partial(searcher_of, path) if start is stop is None else lambda adopt: Immediate(),
+    )
+
+
+def truth_beside(path: Path) -> dict[str, object] | None:
+    """The truth of a simulated capture or recording, None where there is none."""
+    return read_truth(path / SESSION if path.is_dir() else path)
+
+
+def read_capture(
+    path: str | Path,
+    system: System | str | Path | None = None,
+    start: float | None = None,
+    stop: float | None = None,
+) -> Capture:
+    """Read a capture (.csv), a CAN log or a live session's recording into memory.
+
+    system: described, or its name or file; a log or recording needs it, and finds a DBC of its own beside the system's
+    file where that is given. start, stop: s after the first sample. InputError where it cannot be read, line and place
+    named.
+    """
+    path, folder = Path(path), None
+    if isinstance(system, str | Path):
+        folder = Path(system).parent if Path(system).suffix == ".toml" else None
+        system = load_system(system)
+    if system is not None:
+        return captured(open_recorded(path, system, start, stop, None, folder))
+    if not path.name.removesuffix(".gz").endswith(".csv"):
+        raise InputError(str(path), "", "no system", "the system, to know which signals are which channels")
+    return captured(Recorded(CaptureReader(path, start, stop), str(path), truth_beside(path)))
+
+
+def captured(recorded: Recorded) -> Capture:
+    """A recorded session in memory; InputError where it cannot be read or holds no sample."""
+    blocks = list(recorded.source)
+    if not blocks:
+        raise InputError(recorded.name, "", "no samples", "a capture with samples in the time asked for")
+    t, values = (np.concatenate([getattr(block, part) for block in blocks]) for part in ("t", "values"))
+    source = recorded.source
+    return Capture(t, tuple(source.channels), values, recorded.name, tuple(source.warnings), recorded.truth)
+
+
+def write_capture(capture: Capture, path: str | Path) -> Path:
+    """Write a capture as .csv, to the same bits, and the truth of a simulation beside it. InputError where it fails."""
+    path = Path(path)
+    with CaptureWriter(path, capture.channels) as writer:
+        for block in capture:
+            writer.write(block)
+    if capture.truth is not None:
+        further = {key: value for key, value in capture.truth.items() if key not in ("schema", "parameters")}
+        write_truth(path, dict(capture.truth["parameters"]), further)
+    return path

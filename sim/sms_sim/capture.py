@@ -1,0 +1,111 @@
+"""A simulated session as a capture with its truth."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from sms_online.capture import Capture
+from sms_online.description.schema import Effect, System
+from sms_online.effects.build import build_model
+from sms_online.effects.catalogue import check_effect, parse_effect
+from sms_online.errors import InputError
+from sms_online.stream import Block
+from sms_sim.plant import Plant
+from sms_sim.sensors import Sensors
+from sms_sim.simulate import Simulation, sampled_blocks
+from sms_sim.simulate import simulate as solve
+
+
+@dataclass(frozen=True)
+class Simulated:
+    """A session to be simulated: the described system with effects that its file does not declare, and its sensors.
+
+    grade: noise in place of the described one. seed: of the noise. duration: s, None for the trajectory's own.
+    """
+
+    described: System
+    effects: tuple[Effect, ...] = ()
+    duration: float | None = None
+    grade: str | None = None
+    seed: int = 0
+
+    @staticmethod
+    def of(
+        system: System,
+        effects: Sequence[str | Effect] = (),
+        duration: float | None = None,
+        grade: str | None = None,
+        seed: int = 0,
+    ) -> Simulated:
+        """Effects as texts or records; InputError where one cannot act on the system."""
+        if isinstance(effects, str):
+            raise InputError("effects", "", repr(effects), f"a list of effects, [{effects!r}]")
+        injected: list[Effect] = []
+        for effect in effects:
+            whole = system.model_copy(update={"effects": (*system.effects, *injected)})
+            if isinstance(effect, Effect):
+                check_effect(whole, effect, "effects", f"{effect.name}@{effect.where}")
+                injected.append(effect)
+            else:
+                injected.append(parse_effect(effect, whole))
+        return Simulated(system, tuple(injected), duration, grade, seed)
+
+    @cached_property
+    def system(self) -> System:
+        """The system that moves."""
+        return self.described.model_copy(update={"effects": (*self.described.effects, *self.effects)})
+
+    @cached_property
+    def channels(self) -> tuple[str, ...]:
+        """What the sensors record; InputError on an unknown grade."""
+        return Sensors(self.system, Plant(self.system).recordable, self.grade, self.seed).channels
+
+    def solve(self, progress: Callable[[float], None] = lambda t: None) -> Simulation:
+        """The motion; InputError where nothing states how long it is, or where it cannot be followed."""
+        try:
+            return solve(self.system, self.duration, progress=progress)
+        except ArithmeticError as error:
+            expected = "a motion that the integrator can follow"
+            raise InputError(self.described.name, "trajectory and controller", str(error), expected) from None
+
+    def blocks(self, simulation: Simulation) -> Iterator[Block]:
+        """What the sensors record of it."""
+        return sampled_blocks(simulation, self.grade, self.seed)
+
+    def truth(self, simulation: Simulation) -> dict[str, Any]:
+        """True parameters of the described system, and how they came about."""
+        return {
+            "parameters": {p.name: p.nominal for p in build_model(self.described).parameters},
+            "system": self.system.name,
+            "grade": self.grade,
+            "seed": self.seed,
+            "duration_s": simulation.duration,
+            "effects": [effect.model_dump(mode="json") for effect in self.effects],
+        }
+
+
+def simulate(
+    system: System,
+    duration: float | None = None,
+    grade: str | None = None,
+    seed: int = 0,
+    effects: Sequence[str | Effect] = (),
+) -> Capture:
+    """Simulate a described system in closed loop, and record what its sensors see.
+
+    duration: s, the described trajectory's by default. grade: noise of all sensors in place of the described one, "0"
+    none, "A", "B", "C" ever more. seed: of the noise. effects: what the system file does not describe, as texts
+    "name@where:coefficient=value,…". The capture holds the truth, which no estimate uses.
+    InputError for an effect or a grade that there is not, or a motion that cannot be followed.
+    """
+    session = Simulated.of(system, effects, duration, grade, seed)
+    channels = session.channels
+    simulation = session.solve()
+    blocks = list(session.blocks(simulation))
+    t, values = (np.concatenate([getattr(block, part) for block in blocks]) for part in ("t", "values"))
+    return Capture(t, channels, values, f"simulation of {system.name}", (), session.truth(simulation))

@@ -1,0 +1,175 @@
+"""A diagnosis as one frozen record: verdict, effects, residuals before and after, the system with what was found."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, field
+from html import escape
+from typing import Any
+
+from sms_online.capture import check_channels
+from sms_online.description.channels import channels as known_channels
+from sms_online.description.schema import System
+from sms_online.diagnosis.diagnose import Diagnosis as Search
+from sms_online.diagnosis.diagnose import diagnose as search_for_effects
+from sms_online.diagnosis.document import diagnosis_document, trust_of
+from sms_online.errors import InputError
+from sms_online.judgement import Residual, Residuals, Trust
+from sms_online.pipeline.estimator import Estimator
+from sms_online.priors import base_prior
+from sms_online.result import Finding, Parameter, Parameters, json_text
+from sms_online.session import Data, recorded_session
+from sms_online.stream import Block
+from sms_online.tables import html_table, text_table
+from sms_online.trackers.interface import Prior
+from sms_online.truth import true_values
+
+
+@dataclass(frozen=True)
+class Fit:
+    """A description fitted to the capture.
+
+    parameters: by name. residuals: by type of the rows, of the samples that were fitted; held_out: of those that were
+    not. limits: what a whitened residual of noise alone stays below.
+    """
+
+    parameters: Parameters
+    residuals: Residuals
+    held_out: Residuals
+    limits: Mapping[str, float]
+
+    @staticmethod
+    def _of(document: Mapping[str, Any]) -> Fit:
+        parameters = Parameters(
+            Parameter(
+                name=p["name"],
+                symbol=p["symbol"],
+                unit=p["unit"],
+                value=p["estimate"],
+                std=math.inf if p["std"] is None else p["std"],
+                determined=p["identifiable"],
+                nominal=p["nominal"],
+                true=p["true"],
+                projected=p.get("projected"),
+            )
+            for p in document["parameters"]
+        )
+        fit, held_out = ({row: Residual(**r) for row, r in document[part].items()} for part in ("fit", "holdout"))
+        return Fit(parameters, fit, held_out, dict(document["limit"]))
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """An effect that was tried. gain: evidence, twice the log likelihood ratio, of the effect alone. share: of what is
+    beyond noise, that it takes."""
+
+    name: str
+    where: str
+    gain: float
+    share: float
+
+
+@dataclass(frozen=True)
+class Diagnosis:
+    """What a capture holds that its system file does not describe.
+
+    verdict: "clean", "named" or "unexplained". summary: the same in a sentence. effects: what was found. before, after:
+    fits of the system as described and with what was found. candidates: effects that were tried, the best first.
+    system: with what was found, to estimate with. trust: may the parameters after, and the system file, be trusted.
+    warnings: a sentence each.
+    """
+
+    verdict: str
+    summary: str
+    effects: tuple[Finding, ...]
+    before: Fit
+    after: Fit
+    candidates: tuple[Candidate, ...]
+    system: System
+    trust: Trust
+    warnings: tuple[str, ...]
+    search: Search = field(repr=False, compare=False)
+    _document: Mapping[str, Any] = field(repr=False, compare=False)
+
+    def document(self) -> dict[str, Any]:
+        """diagnosis.json as plain lists, dictionaries and numbers."""
+        return dict(self._document)
+
+    def to_json(self) -> str:
+        """The text of diagnosis.json; numbers that do not exist are null."""
+        return json_text(self.document())
+
+    def _rows(self) -> tuple[list[str], list[list[str]]]:
+        rows = []
+        for finding in self.effects:
+            named = [
+                [name, f"{c.value:.5g}", "" if c.std is None else f"{c.std:.2g}", c.unit]
+                for name, c in finding.coefficients.items()
+            ]
+            for k, cells in enumerate(named or [["", "", "", ""]]):
+                rows.append([finding.effect if k == 0 else "", *cells])
+        return ["effect", "coefficient", "estimate", "± std", "unit"], rows
+
+    def __str__(self) -> str:
+        table = f"{text_table(*self._rows(), left=2)}\n\n" if self.effects else ""
+        return f"{self.summary}\n\n{table}{self.trust}"
+
+    def _repr_html_(self) -> str:
+        table = html_table(*self._rows()) if self.effects else ""
+        return f"<p><b>{escape(self.summary)}</b></p>{table}<p>{escape(self.trust.sentence)}</p>"
+
+
+def diagnose(
+    system: System,
+    data: Data,
+    *,
+    holdout: Data | None = None,
+    prior: bool = False,
+    progress: Callable[[str], None] | None = None,
+) -> Diagnosis:
+    """Find what recorded data hold that a system file does not describe, and describe it.
+
+    data: as for `estimate`. holdout: another capture of the same rig, to check on; without it the last third of the
+    data. prior: start from nominal values, each ± 10 %. progress: is called with what is being done, a few words.
+    Raises InputError where the data cannot be read or do not fit the system, a coordinate is not measured, parameters
+    jump within the capture, or there is too little motion.
+    """
+    recorded = recorded_session(system, data)
+    check_channels(tuple(recorded.source.channels), known_channels(system), recorded.name)
+    blocks = _samples(recorded.source, recorded.name)
+    warnings = [*recorded.source.warnings]
+    held: list[Block] = []
+    if holdout is not None:
+        other = recorded_session(system, holdout)
+        held = _samples(other.source, other.name)
+        warnings += other.source.warnings
+        if held[0].channels != blocks[0].channels:
+            raise InputError(other.name, "header", ", ".join(held[0].channels), ", ".join(blocks[0].channels))
+
+    def known(estimator: Estimator) -> Prior | None:
+        return base_prior(system, estimator.base, prior) if prior or system.priors else None
+
+    found = search_for_effects(system, blocks, recorded.name, known, held, progress or (lambda message: None))
+    true = None if recorded.truth is None else true_values(recorded.truth, system, found.after.system)
+    document = diagnosis_document(found, warnings, true)
+    return Diagnosis(
+        verdict=found.verdict,
+        summary=document["summary"],
+        effects=tuple(map(Finding.of, document["effects"])),
+        before=Fit._of(document["before"]),
+        after=Fit._of(document["after"]),
+        candidates=tuple(Candidate(**candidate) for candidate in document["candidates"]),
+        system=found.after.system,
+        trust=trust_of(found),
+        warnings=tuple(document["warnings"]),
+        search=found,
+        _document=document,
+    )
+
+
+def _samples(source: Iterable[Block], name: str) -> list[Block]:
+    blocks = [block for block in source if block.t.size]
+    if not blocks:
+        raise InputError(name, "", "no samples", "a capture with samples in the time asked for")
+    return blocks

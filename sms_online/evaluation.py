@@ -1,0 +1,302 @@
+"""What the statistics of a session say: estimate, error bars, residuals, trust, each when it is asked for.
+
+A pure function of `Statistics`, so that the estimator's process, the view's and a reader of saved statistics say the
+same. `result_of` makes one record of all of it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sms_online.judgement import Discrepancy, Facts, Residual, Trust, judge
+from sms_online.model.parameters import Parameter
+from sms_online.physical import PhysicalSet, Projection
+from sms_online.pipeline.statistics import Statistics
+from sms_online.row_types import ENERGY, joint_rows, row_types
+from sms_online.stream import Array
+from sms_online.threads import one_blas_thread
+from sms_online.trackers.interface import Estimate
+
+# Half width of a 95 % interval in standard deviations.
+NORMAL_95 = 1.959963984540054
+# An estimate within three standard deviations of zero is not determined by the data: not even its sign is certain.
+LARGEST_RELATIVE_STD = 1.0 / 3.0
+# Mean square of rows over their predicted variance that noise alone may leave: that of the noise is estimated to 7 %.
+LARGEST_ROW_VARIANCE = 1.2
+# Rows of the energy balance, for each parameter, from which on its first transient is forgotten.
+ROWS_A_PARAMETER = 10
+# Noise in the columns matters where it pulls an estimate by more than this many standard deviations.
+LARGEST_PULL = 1.0
+# Quantities that cannot be negative, as the ends of names.
+POSITIVE = ("mass", "mass_per_length", "stiffness", "damping", "rotor_inertia", "rigidity", "rigidity_y", "rigidity_z")
+# Effects of one cause that a warning names.
+NAMED = 4
+
+
+def identifiable(beta: Array, std: Array) -> NDArray[np.bool_]:
+    """Which parameters β (n,) the data determine: std (n,) is finite, and β three of it from zero."""
+    return np.asarray(std <= LARGEST_RELATIVE_STD * np.abs(beta))
+
+
+class Evaluation:
+    """The statistics of an instant, evaluated.
+
+    estimate: the one that follows from them, where it is at hand: to make it costs milliseconds. discrepancies: of the
+    running diagnosis. troubles: whatever else speaks against the numbers, see `judgement.Facts`.
+    """
+
+    def __init__(
+        self,
+        statistics: Statistics,
+        estimate: Estimate | None = None,
+        discrepancies: Sequence[Discrepancy] = (),
+        troubles: Sequence[str] = (),
+    ) -> None:
+        self.statistics = statistics
+        self.model, self.base = statistics.setup.model, statistics.setup.base
+        self._estimate = estimate
+        self._discrepancies, self._troubles = tuple(discrepancies), tuple(troubles)
+
+    @property
+    def parameters(self) -> tuple[Parameter, ...]:
+        """What is estimated, (n,)."""
+        return self.base.parameters
+
+    @cached_property
+    def estimate(self) -> Estimate:
+        """The base parameters as the rows determine them."""
+        return self.statistics.estimate() if self._estimate is None else self._estimate
+
+    @cached_property
+    @one_blas_thread()
+    def std(self) -> Array:
+        """1σ of each parameter (n,) as it is reported, inf where the data determine nothing.
+
+        The smoother's covariance follows from the noise of sensors and torques, and of forces where it had to allow
+        some. Rows of the momentum balance have a predicted variance. While the residual agrees with it, the estimate's
+        covariance follows from it; where rows leave more, the model lacks something and the residual decides, as it
+        does for rows of the energy balance.
+        From the residual: the larger of two answers. One takes the rows' errors as independent with the residual's
+        variance, the other allows errors that last within clusters of rows. To it comes what errors add that rows of an
+        energy window share, which least squares absorbs and no residual shows; it is known while no row is forgotten.
+        Where rows have been weighed against a prior, the posterior's own covariance holds.
+        """
+        now, estimate = self.statistics, self.estimate
+        std = np.full(estimate.pi.shape, np.inf)
+        if estimate.dof <= 0.0:
+            return std
+        known = estimate.determined
+        if estimate.scale is not None or now.method == "smoother":
+            std[known] = estimate.std[known]
+            return std
+        row_variance = estimate.rss / estimate.dof
+        misfit = now.momentum is not None and now.momentum.rows.misfit.any()
+        if now.method == "momentum" and row_variance <= LARGEST_ROW_VARIANCE and not misfit:
+            std[known] = estimate.std[known]
+            return std
+        variance = np.diag(estimate.covariance)[known] * row_variance
+        if estimate.covariance_robust is not None:
+            variance = np.maximum(variance, np.diag(estimate.covariance_robust)[known])
+        if now.method == "energy" and estimate.rows == now.shared.rows:
+            inverse = np.where(np.outer(known, known), estimate.covariance, 0.0)
+            variance = variance + now.shared.variance(inverse, row_variance)[known]
+        std[known] = np.sqrt(variance)
+        return std
+
+    @cached_property
+    def determined(self) -> NDArray[np.bool_]:
+        """Which parameters the data determine (n,), see `identifiable`."""
+        return identifiable(self.estimate.pi, self.std)
+
+    @cached_property
+    @one_blas_thread()
+    def residuals(self) -> dict[str, Residual]:
+        """By type of the rows."""
+        now, beta = self.statistics, self.estimate.pi
+        relative = {joint_rows(i): joint.relative(beta) for i, joint in enumerate(now.joints)}
+        out = {ENERGY: Residual(None, None)}
+        for name, speeds in row_types(self.model.layout).items():
+            # Where the smoother knows better, rows of the balance see shapes that are not the links'.
+            momentum = None if now.method == "smoother" else now.momentum
+            whitened = None if momentum is None else momentum.rows.whitened(speeds, beta)
+            out[name] = Residual(relative.get(name), whitened)
+        return out
+
+    @cached_property
+    @one_blas_thread()
+    def pulled(self) -> list[str]:
+        """Names of parameters that noise in the columns pulls by more than their std: errors in variables.
+
+        The comparison is Hausman's, of least squares with an estimate that is free of this bias.
+        """
+        if self.statistics.method != "momentum":
+            return []
+        shift = np.abs(self.statistics.shift(self.estimate))
+        return [p.name for p, s, d in zip(self.parameters, shift, self.std, strict=True) if s > LARGEST_PULL * d]
+
+    @cached_property
+    @one_blas_thread()
+    def projection(self) -> Projection | None:
+        """The parameters of real bodies that are nearest to the estimate; None where they are not found.
+
+        A finished session is not lost for it. It takes too long to be made of a session that runs, and is None then.
+        """
+        if not self.statistics.finished:
+            return None
+        std, estimate = self.std, self.estimate
+        known = np.flatnonzero(np.isfinite(std))
+        stated = estimate.std[known]
+        scale = np.divide(std[known], stated, out=np.ones_like(stated), where=stated > 0.0)
+        covariance = np.diag(np.full(std.size, np.inf))
+        covariance[np.ix_(known, known)] = estimate.covariance[np.ix_(known, known)] * np.outer(scale, scale)
+        try:
+            return PhysicalSet(self.model, self.base).project(estimate.pi, covariance)
+        except ArithmeticError:
+            return None
+
+    @cached_property
+    def trust(self) -> Trust:
+        """May the estimate be trusted? The answer changes while a session runs."""
+        now, estimate, flags = self.statistics, self.estimate, self.determined
+        names = [p.name for p in self.parameters]
+        lost = now.counters.lost_samples
+        below = flags & (estimate.pi + NORMAL_95 * np.where(flags, self.std, 0.0) < 0.0)
+        momentum, projection = now.momentum, self.projection
+        unweighed = None if momentum is None or momentum.unexplained is None else joint_rows(momentum.unexplained)
+        return judge(
+            Facts(
+                determined=(int(np.count_nonzero(flags)), flags.size),
+                undetermined=tuple(name for name, known in zip(names, flags, strict=True) if not known),
+                settling=self._settling(),
+                residual=self.residuals,
+                negative=tuple(
+                    name for name, negative in zip(names, below, strict=True) if negative and name.endswith(POSITIVE)
+                ),
+                pulled=tuple(self.pulled),
+                alarm=None if momentum is None else momentum.alarm,
+                unweighed=unweighed,
+                undecided=tuple(event.time for event in now.events if event.kind == "undecided"),
+                distance=0.0 if projection is None else projection.distance,
+                lost=lost / max(1, lost + now.samples),
+                discrepancies=self._discrepancies,
+                troubles=(*self._troubles, *self._weaknesses()),
+            )
+        )
+
+    def _settling(self) -> str:
+        """Why the estimate will still move by more than its error bars."""
+        now, estimate = self.statistics, self.estimate
+        if not self.determined.any():
+            return "no parameter is determined, for want of motion"
+        smoother, momentum = now.smoother, now.momentum
+        if smoother is not None and smoother.spans == 0 and not smoother.failures:
+            return "the smoother has not worked off its first span"
+        if now.method == "smoother":
+            return ""
+        if momentum is None:
+            few = estimate.dof < ROWS_A_PARAMETER * estimate.pi.size
+            return "the energy balance has few rows yet" if few else ""
+        if not momentum.started:
+            return "the first fit has no weights yet, for want of motion"
+        if momentum.tested or (now.events and now.events[-1].kind == "undecided"):
+            return ""
+        after = f" since the change at {now.events[-1].time:.1f} s" if now.events else ""
+        return f"the test for more than noise has seen too few rows{after}"
+
+    def _weaknesses(self) -> list[str]:
+        """What weakens an estimate by the way it is made."""
+        out = []
+        now, missing = self.statistics, self.statistics.setup.sensing.missing
+        by_smoother = now.method == "smoother"
+        if now.smoother is not None and now.smoother.level > 0.0 and by_smoother:
+            out.append("samples do not agree with the equations of motion")
+        if now.momentum is None and not by_smoother:
+            out.append("by the energy balance alone, nothing tests whether the model lacks something")
+        if now.smoother is not None and not by_smoother and missing:
+            out.append("links are taken as bent statically: estimates are off by percents")
+        late = None if now.momentum is None else now.momentum.latency
+        if late is not None:
+            whose = late.source if late.size > 0.0 else f"all sources but {late.source}"
+            out.append(f"{whose}: {1e3 * abs(late.size):.2g} ms later than stated")
+        return out
+
+    @cached_property
+    def warnings(self) -> list[str]:
+        """What the trust rests on or lacks, in full sentences."""
+        return [*self.trust.warnings, *self._projection_warning(), *self._smoother_warnings()]
+
+    def _smoother_warnings(self) -> list[str]:
+        """What the smoother replaced, and where it failed."""
+        now, setup = self.statistics, self.statistics.setup
+        smoother = now.smoother
+        if smoother is None:
+            asked = setup.system.balance == "smoother"
+            return ["no smoother: it does not know of the effects on channels that are declared"] if asked else []
+        out = [f"the smoother left out {failure}" for failure in smoother.failures]
+        missing = ", ".join(setup.sensing.missing)
+        if now.method == "smoother":
+            if missing:
+                out.append(f"not measured, and told by the equations of motion: {missing}")
+            if smoother.level > 0.0:
+                share = f"{100.0 * smoother.level:.2g} % of the usual ones"
+                out.append(
+                    f"samples do not agree with the equations of motion: unknown forces of {share} are allowed for"
+                )
+        elif missing:
+            out.append(
+                f"links are taken as bent statically, for {missing} are not measured: estimates are off by percents"
+            )
+        return out
+
+    def _projection_warning(self) -> list[str]:
+        projection = self.projection
+        if not self.statistics.finished:
+            return []
+        if projection is None:
+            return ["whether real bodies can have these parameters is not known: the search for them did not converge"]
+        if projection.distance == 0.0:
+            return []
+        distance, names = f"{projection.distance:.2g} standard deviations", ", ".join(projection.active)
+        return [
+            f"no real bodies have these parameters, because of {names}: the nearest that some have are {distance} away"
+        ]
+
+    @cached_property
+    def notices(self) -> list[str]:
+        """What happened to the samples, a sentence each."""
+        now, system = self.statistics, self.statistics.setup.system
+        out = []
+        if now.dropped_rows:
+            out.append(f"{now.dropped_rows} rows of the balance dropped: a value in them is beyond all numbers")
+        period = 1.0 / system.sample_rate
+        fastest = float(np.nanmin(now.periods, initial=np.inf))
+        if np.isfinite(fastest) and not 0.8 < fastest / period < 1.25:
+            out.append(f"the capture has {1.0 / fastest:.4g} samples/s, the system file says {system.sample_rate:g}")
+        late = [name for sensor in system.sensors if sensor.latency > 0.0 for name in sensor.channels]
+        if late:
+            out.append(f"latency of {', '.join(late)} is described but not corrected")
+        if now.counters.gaps:
+            out.append(f"{now.counters.gaps} gaps too long to bridge; each begins a new window of the balance")
+        if now.counters.interpolated_cells:
+            out.append(f"{now.counters.interpolated_cells} cells interpolated")
+        out += self.unstated_latency
+        if now.setup.unused:
+            out.append(f"channels not used: {', '.join(now.setup.unused)}")
+        return out
+
+    @property
+    def unstated_latency(self) -> list[str]:
+        """That a source is late against the others by more than the system file says, if one is."""
+        found = None if self.statistics.momentum is None else self.statistics.momentum.latency
+        if found is None:
+            return []
+        late = f"{1e3 * abs(found.size):.3g} ± {1e3 * found.std:.2g} ms"
+        if found.size < 0.0:
+            return [f"all sources but {found.source}: {late} later than their stated latencies"]
+        more = [f"{len(found.effects) - NAMED} more"] if len(found.effects) > NAMED else []
+        effects = ", ".join([*found.effects[:NAMED], *more])
+        return [f"{found.source}: {late} later than its stated latency ({effects})"]

@@ -1,0 +1,165 @@
+"""What an estimator knows at an instant, as one record: whatever is said of a session is a function of it.
+
+Taking it costs microseconds: what is large is shared, for the estimator writes such arrays once. It can be pickled, and
+says the same in another process. A session cannot be continued from it; `Estimator.state` is for that.
+"""
+
+from __future__ import annotations
+
+import pickle
+from copy import copy
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import TYPE_CHECKING, Any, Literal
+
+from sms_online.description.schema import System
+from sms_online.model.base_parameters import BaseParameters
+from sms_online.model.model import Model
+from sms_online.pipeline.energy_balance import SharedErrors
+from sms_online.pipeline.errors_in_variables import NoiseBias, unbiased
+from sms_online.pipeline.events import Event
+from sms_online.pipeline.joint_balance import SquaredResidual
+from sms_online.pipeline.latency import Latency
+from sms_online.pipeline.plain_rows import PlainRows
+from sms_online.pipeline.sensing import Sensing
+from sms_online.pipeline.synchronise import SyncCounters
+from sms_online.smoother.session import SmootherStatistics
+from sms_online.stream import Array
+from sms_online.threads import one_blas_thread
+from sms_online.trackers.interface import Estimate, Prior, State
+from sms_online.trackers.square_root import session_tracker
+
+if TYPE_CHECKING:
+    from sms_online.pipeline.estimator import Estimator
+
+# What the estimate comes from.
+Method = Literal["smoother", "momentum", "energy"]
+
+
+@dataclass(frozen=True)
+class Setup:
+    """What is estimated, from one event of a session to the next.
+
+    system: as described. model, base: with what events have added; described: base parameters of the system itself.
+    unused: channels of the source that play no part. prior: on `described`; current_prior: on `base`, of which nothing
+    is known beforehand where something has changed. Pickled once, and one object wherever the same is read again.
+    """
+
+    system: System
+    model: Model
+    base: BaseParameters
+    described: BaseParameters
+    sensing: Sensing
+    unused: tuple[str, ...]
+    prior: Prior | None
+    current_prior: Prior | None
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        packed = vars(self).get("_packed")
+        if packed is None:
+            packed = pickle.dumps(vars(self), protocol=5)
+            object.__setattr__(self, "_packed", packed)
+        return _setup, (packed,)
+
+
+@lru_cache(maxsize=2)
+def _setup(packed: bytes) -> Setup:
+    setup = object.__new__(Setup)
+    vars(setup).update(pickle.loads(packed))
+    return setup
+
+
+@dataclass(frozen=True)
+class MomentumStatistics:
+    """Of the momentum balance.
+
+    tracker, bias: states of the tracker and of what noise in its columns does. rows: unwhitened rows and their misfit.
+    started: weights are known. tested: there are rows enough for a test of what they leave. alarm: type of the rows
+    that the sequential test finds more than noise in. unexplained: joint (from 0) whose torque forbids weights.
+    latency: source that is late against the others, if one is.
+    """
+
+    tracker: State
+    bias: dict[str, Any]
+    rows: PlainRows
+    started: bool
+    tested: bool
+    alarm: str | None
+    unexplained: int | None
+    latency: Latency | None
+
+
+@dataclass(frozen=True)
+class Statistics:
+    """Sufficient statistics, counts and events of a session up to now.
+
+    finished: no more samples come. periods (channels,): s a sample, NaN where unknown. energy: state of the energy
+    balance's tracker; shared: what errors that its rows share do. joints: sums behind the relative residual of each.
+    """
+
+    setup: Setup
+    method: Method
+    finished: bool
+    samples: int
+    duration: float
+    dropped_rows: int
+    counters: SyncCounters
+    periods: Array
+    events: tuple[Event, ...]
+    energy: State
+    shared: SharedErrors
+    joints: tuple[SquaredResidual, ...]
+    momentum: MomentumStatistics | None
+    smoother: SmootherStatistics | None
+
+    @staticmethod
+    def of(estimator: Estimator) -> Statistics:
+        """Those of now; nothing in them changes as the session goes on."""
+        momentum, smoother = estimator.momentum, estimator.smoother
+        return Statistics(
+            setup=estimator.setup,
+            method=estimator.method,
+            finished=estimator.finished,
+            samples=estimator.samples,
+            duration=estimator.duration,
+            dropped_rows=estimator.dropped_rows,
+            counters=copy(estimator.counters),
+            periods=estimator.periods.copy(),
+            events=tuple(estimator.events),
+            energy=estimator.energy_tracker.state(),
+            shared=copy(estimator.shared_errors),
+            joints=tuple([copy(joint) for joint in estimator.joint_residuals]),
+            momentum=None if momentum is None else momentum.statistics(),
+            smoother=None if smoother is None else smoother.statistics(),
+        )
+
+    @one_blas_thread()
+    def estimate(self) -> Estimate:
+        """The base parameters, the same bits as from the estimator itself; takes milliseconds."""
+        setup = self.setup
+        if self.method == "smoother":
+            assert self.smoother is not None
+            return self.smoother.estimate(setup.prior)
+        if self.method == "energy":
+            return self.energy_estimate()
+        assert self.momentum is not None
+        tracker = session_tracker(setup.base.n, setup.current_prior)
+        tracker.restore(self.momentum.tracker)
+        return unbiased(tracker.estimate(), self._bias())
+
+    def _bias(self) -> NoiseBias:
+        assert self.momentum is not None
+        bias = NoiseBias(self.setup.base.n)
+        bias.restore(self.momentum.bias)
+        return bias
+
+    def shift(self, estimate: Estimate) -> Array:
+        """By how much noise in the columns pulls the momentum balance's estimate (n,), as far as that is known."""
+        return self._bias().correction(estimate.determined)[0]
+
+    @one_blas_thread()
+    def energy_estimate(self) -> Estimate:
+        """What the energy balance alone says."""
+        tracker = session_tracker(self.setup.described.n, self.setup.prior)
+        tracker.restore(self.energy)
+        return tracker.estimate()

@@ -1,0 +1,267 @@
+"""A session: samples in, whole or one at a time, and a result at any time. `estimate` runs one over recorded data."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from io import BytesIO
+from itertools import chain
+from pathlib import Path
+from time import perf_counter
+from typing import Any, overload
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from sms_online.capture import Capture, check_channels
+from sms_online.checkpoint import Checkpoint
+from sms_online.cramer_rao import MotionRecord, session_bound
+from sms_online.description.channels import channels as known_channels
+from sms_online.description.schema import System
+from sms_online.diagnosis.online import Immediate, OnlineDiagnosis, Searcher
+from sms_online.errors import InputError
+from sms_online.evaluation import Evaluation
+from sms_online.pipeline.estimator import Estimator
+from sms_online.pipeline.statistics import Statistics
+from sms_online.priors import base_prior
+from sms_online.result import Result, result_of
+from sms_online.stream import Array, Block, Source
+from sms_online.truth import true_values
+
+
+class Session:
+    """Estimates a system's parameters while samples come, and names effects that the system file lacks.
+
+    channels: names, in the order of the values to come. prior: start from the nominal values, each ± 10 %; priors that
+    the system file states hold without it too. adopt: go on with effects as soon as they are named. source: name of
+    what samples come from, for messages. searcher: who makes the diagnosis' searches, by default at once and here.
+    checkpoint: state to go on from.
+    The result depends on the samples alone, to the last bit, however they are cut into updates.
+    Raises InputError for a channel that the system does not have or one that is missing.
+    """
+
+    def __init__(
+        self,
+        system: System,
+        channels: Sequence[str],
+        *,
+        prior: bool = False,
+        adopt: bool = False,
+        source: str = "session",
+        searcher: Searcher | None = None,
+        checkpoint: Checkpoint | None = None,
+    ) -> None:
+        self.channels = tuple(channels)
+        check_channels(self.channels, known_channels(system), source)
+        self.estimator = Estimator(system, self.channels, source)
+        if prior or system.priors:
+            # A prior is on the base parameters, which the estimator has found.
+            self.estimator.set_prior(base_prior(system, self.estimator.base, prior))
+        if checkpoint is not None:
+            checkpoint.put_into(self.estimator)
+        self.diagnosis = OnlineDiagnosis(self.estimator, Immediate() if searcher is None else searcher, adopt)
+        self.busy = 0.0  # s of computing
+        self._begun = {"channels": self.channels, "prior": prior, "adopt": adopt, "source": source}
+        self._source = source
+        self._last = -np.inf  # time of the newest sample, s
+        self._result: Result | None = None
+
+    @property
+    def system(self) -> System:
+        """The system as described."""
+        return self.estimator.system
+
+    @overload
+    def update(self, samples: Block, /) -> None: ...
+
+    @overload
+    def update(self, t: ArrayLike, values: ArrayLike, /) -> None: ...
+
+    def update(self, samples: Block | ArrayLike, values: ArrayLike | None = None, /) -> None:
+        """Take samples: a block, or t (B,), s, and values (B, C), or one instant and its values (C,).
+
+        Values are in SI units, in the order of the session's channels, NaN where there is none. InputError where shapes
+        or channels do not fit, times go back, a value is infinite, or the session is finished.
+        """
+        block = samples if isinstance(samples, Block) else self._block(samples, values)
+        self._check(block)
+        start = perf_counter()
+        self.estimator.push(block)
+        self.busy += perf_counter() - start
+        self._result = None
+
+    def _block(self, t: ArrayLike, values: ArrayLike | None) -> Block:
+        times = np.atleast_1d(np.asarray(t, dtype=np.float64))
+        numbers = np.asarray([] if values is None else values, dtype=np.float64)
+        if numbers.ndim == 1 and times.size == 1:
+            numbers = numbers[None]
+        if times.ndim != 1 or numbers.shape != (times.size, len(self.channels)):
+            expected = f"({times.size}, {len(self.channels)}): a row a time, a column a channel"
+            raise InputError(self._source, "update", f"values of shape {numbers.shape}", expected)
+        return Block(times, self.channels, numbers)
+
+    def _check(self, block: Block) -> None:
+        if self.estimator.finished:
+            raise InputError(self._source, "update", "samples after finish()", "a new session")
+        if block.channels != self.channels:
+            raise InputError(
+                self._source, "update", f"channels {', '.join(block.channels)}", f"{', '.join(self.channels)}"
+            )
+        step = np.diff(block.t, prepend=self._last)
+        if not (step >= 0.0).all():
+            at = float(block.t[int(np.argmin(step >= 0.0))])
+            raise InputError(self._source, "update", f"time {at:g} s", "times that do not go back")
+        if np.isinf(block.values).any():
+            column = int(np.isinf(block.values).any(axis=0).argmax())
+            found, expected = f"an infinite value of {self.channels[column]}", "finite numbers, or NaN for none"
+            raise InputError(self._source, "update", found, expected)
+        if block.t.size:
+            self._last = float(block.t[-1])
+
+    def finish(self) -> None:
+        """No more samples come: use what still waits for more of them. The result is then final."""
+        if self.estimator.finished:
+            return
+        start = perf_counter()
+        self.estimator.finish()
+        self.diagnosis.finish()
+        self.busy += perf_counter() - start
+        self._result = None
+
+    @property
+    def result(self) -> Result:
+        """What is known now. Before `finish` it says nothing of whether real bodies can have the parameters."""
+        if self._result is None:
+            self._result = self.evaluate()
+        return self._result
+
+    def evaluation(self, troubles: Sequence[str] = ()) -> Evaluation:
+        """What is known now, evaluated only as far as it is asked for. troubles: what else speaks against it."""
+        statistics = Statistics.of(self.estimator)
+        return Evaluation(statistics, self.estimator.estimate(), self.diagnosis.discrepancies, troubles)
+
+    def evaluate(
+        self,
+        truth: Mapping[str, Any] | None = None,
+        bound: Array | None = None,
+        warnings: Sequence[str] = (),
+        throughput: float | None = None,
+    ) -> Result:
+        """The result with what is known from beside the session.
+
+        truth: of a simulated capture, see `Capture`. bound (n,): Cramér–Rao bound of each parameter's std. warnings: of
+        the source. throughput: samples/s, by default of computing alone.
+        """
+        true = None if truth is None else true_values(truth, self.system, self.diagnosis.system)
+        if throughput is None:
+            throughput = self.estimator.samples / self.busy if self.busy else 0.0
+        return result_of(self.evaluation(), true, bound, warnings, self.diagnosis.document(), throughput)
+
+    def checkpoint(self) -> Checkpoint:
+        """The state of now, to go on from; takes milliseconds."""
+        return Checkpoint.of(self.estimator, self._begun)
+
+    def save(self) -> bytes:
+        """The state of now, for `restore`; the system, its channels and options are part of it."""
+        return self.checkpoint().to_bytes()
+
+    @staticmethod
+    def restore(saved: bytes) -> Session:
+        """Go on from what `save` gave: the estimate comes out the same to the last bit.
+
+        Limitations: the running diagnosis begins anew; samples before are no longer searched, and what it has found by
+        then is in the estimate if it was adopted, but no longer among the findings. InputError where `saved` is none.
+        """
+        checkpoint = Checkpoint.read(BytesIO(saved), "saved session")
+        begun = checkpoint.begun
+        if not begun:
+            raise InputError("saved session", "", "a checkpoint of another kind", "what Session.save gave")
+        system = System.model_validate(checkpoint.identity["system"])
+        return Session(system, begun.pop("channels"), checkpoint=checkpoint, **begun)
+
+
+@dataclass(frozen=True)
+class Recorded:
+    """A recorded session: its samples, a name for messages, and what lies beside them.
+
+    truth: of a simulation. checkpoint: what the session resumed from. searcher: of its diagnosis, from whether effects
+    are adopted.
+    """
+
+    source: Source
+    name: str
+    truth: Mapping[str, Any] | None = None
+    checkpoint: Checkpoint | None = None
+    searcher: Callable[[bool], Searcher] = lambda adopt: Immediate()
+
+
+# What can be estimated from: a capture, the path of one, of a log or of a recording, or blocks in order of time.
+Data = Capture | Recorded | str | Path | Iterable[Block]
+
+
+def estimate(
+    system: System,
+    data: Data,
+    *,
+    prior: bool = False,
+    adopt: bool = False,
+    bound: bool = False,
+) -> Result:
+    """Estimate the parameters of a system from recorded data; the same bits as a replay of them, or the live session.
+
+    data: a capture, the path of one, of a log or of a recording, or blocks of samples in order of time. prior, adopt:
+    as for `Session`. bound: the Cramér–Rao bound of every parameter too, as the yardstick of its standard deviation.
+    Raises InputError where the data cannot be read or do not fit the system.
+    """
+    recorded = recorded_session(system, data)
+    source = recorded.source
+    session = Session(
+        system,
+        source.channels,
+        prior=prior,
+        adopt=adopt,
+        source=recorded.name,
+        searcher=recorded.searcher(adopt),
+        checkpoint=recorded.checkpoint,
+    )
+    record = MotionRecord(system.sample_rate) if bound else None
+    if record is not None:
+        session.estimator.observers.append(record)
+    for block in source:
+        session.update(block)
+    session.finish()
+    least = None if record is None else session_bound(session.estimator, record)
+    return session.evaluate(recorded.truth, least, source.warnings)
+
+
+def recorded_session(system: System, data: Data) -> Recorded:
+    """Data as a recorded session; InputError where a path cannot be read, or there are no blocks."""
+    if isinstance(data, Recorded):
+        return data
+    if isinstance(data, Capture):
+        return Recorded(data, data.source, data.truth)
+    if isinstance(data, str | Path):
+        from sms_adapters.recorded import open_recorded
+
+        return open_recorded(Path(data), system)
+    return Recorded(_Blocks(data), "blocks")
+
+
+class _Blocks:
+    """Blocks as a source, once."""
+
+    def __init__(self, data: Iterable[Block]) -> None:
+        blocks = iter(data)
+        first = next(blocks, None)
+        if first is None:
+            raise InputError("blocks", "", "none", "at least one block of samples")
+        self.channels = first.channels
+        self._data, self._blocks = data, chain([first], blocks)
+
+    @property
+    def warnings(self) -> Sequence[str]:
+        """Those of a source, so far."""
+        return getattr(self._data, "warnings", ())
+
+    def __iter__(self) -> Iterator[Block]:
+        return self._blocks

@@ -1,0 +1,43 @@
+"""Numbers as people read them: digits by their standard deviation, and plain tables for a terminal and a notebook."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from html import escape
+
+# Significant digits of an estimate: as many as show two of its standard deviation, within these bounds.
+LEAST_DIGITS, MOST_DIGITS = 2, 7
+# Powers of ten below this one are written as such.
+SMALLEST_PLAIN = -4
+
+
+def formatter(estimate: float, std: float) -> Callable[[float], str]:
+    """Formats an estimate and its interval down to the second digit of the standard deviation."""
+    magnitude = math.floor(math.log10(abs(estimate))) if estimate else 0
+    second = math.floor(math.log10(std)) - 1 if std else -math.inf
+    digits = int(min(MOST_DIGITS, max(LEAST_DIGITS, magnitude - second + 1)))
+    if magnitude < SMALLEST_PLAIN:
+        return lambda value: f"{value:.{digits - 1}e}"
+    return lambda value: f"{value:.{max(0, digits - 1 - magnitude)}f}"
+
+
+def text_table(headings: Sequence[str], rows: Sequence[Sequence[str]], left: int = 1) -> str:
+    """Rows below their headings, columns aligned; the first `left` of them to the left."""
+    widths = [max(map(len, column)) for column in zip(headings, *rows, strict=True)]
+
+    def line(cells: Sequence[str]) -> str:
+        aligned = [
+            cell.ljust(width) if k < left else cell.rjust(width)
+            for k, (cell, width) in enumerate(zip(cells, widths, strict=True))
+        ]
+        return "  ".join(aligned).rstrip()
+
+    return "\n".join(line(cells) for cells in (headings, *rows))
+
+
+def html_table(headings: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    """The same as a table of HTML, its cells escaped."""
+    head = "".join(f"<th>{escape(cell)}</th>" for cell in headings)
+    body = "".join("<tr>" + "".join(f"<td>{escape(cell)}</td>" for cell in cells) + "</tr>" for cells in rows)
+    return f"<table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table>"
