@@ -11,6 +11,7 @@ import pytest
 from sms_adapters.system_file import load_system
 from sms_online.description.schema import Effect, System
 from sms_online.diagnosis import diagnose
+from sms_online.diagnosis.candidate import Candidate
 from sms_online.diagnosis.record import Segment
 from sms_online.diagnosis.residuals import RowResidual
 from sms_online.diagnosis.reversals import Reversals
@@ -20,7 +21,7 @@ from sms_online.pipeline.smoothing import smooth
 
 
 def _finding(name: str, where: str) -> Any:
-    return SimpleNamespace(candidate=SimpleNamespace(effect=Effect(name=name, where=where)))
+    return SimpleNamespace(candidate=Candidate(Effect(name=name, where=where), (), np.empty((0, 0, 0))))
 
 
 @pytest.mark.parametrize(
