@@ -23,6 +23,18 @@ deformations = ["bending_z"]
 """
 
 
+def joints(n: int) -> str:
+    """Tables of more axes, n in all."""
+    table = '[joint_{0}]\ntransmission = "rigid"\n[link_{0}]\nkind = "rigid"\ninertia = {{ zz = 1.0 }}\n'
+    return "".join(table.format(i) for i in range(2, n + 1))
+
+
+def elements(n: int) -> str:
+    """Tables of a second axis whose link has so many elements."""
+    link = FLEXIBLE_LINK.replace("link_1", "link_2").replace("0.0", "1.0", 1)
+    return '[joint_2]\ntransmission = "rigid"' + link.replace("elements = 1", f"elements = {n}")
+
+
 @pytest.fixture
 def bench(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A working directory with a good system and a good capture."""
@@ -95,6 +107,8 @@ def test_a_capture_that_is_none(
     [
         ("3.0,1", "run.csv, line 602: 2 cells; expected 3"),
         ("3.0,one,1", "run.csv, line 602, column force_1: 'one'"),
+        ("3.0,1e300,1", "run.csv, line 602, column force_1: '1e300'; expected a number of 1e+30 at most"),
+        ("1e300,1,1", "run.csv, line 602, column t: '1e300'; expected a number of 1e+10 at most"),
         ("2.9,1,1", "run.csv, line 602: time 2.9 s, before that of the line above"),
     ],
 )
@@ -113,6 +127,12 @@ def test_a_malformed_line_in_the_middle(bench: Path, capsys: pytest.CaptureFixtu
         (AXIS + '[prior."link_1.inertai"]\nvalue = 1.0\nstd = 0.1\n', "'link_1.inertia'"),
         (AXIS + '[known]\n"link_1.inertai" = 1.0\n', "link_1.inertai"),
         ("name = ", "expected valid TOML"),
+        (AXIS.replace("200.0", "1e308"), "sample_rate: 1e+308 Hz; expected 20480 Hz at most"),
+        (AXIS.replace("200.0", "1" + 5000 * "0"), "a number of thousands of digits"),
+        ("reference = " + 5000 * "[" + 5000 * "]" + AXIS, "no more than 6 levels"),
+        ("reference = " + 400 * "[" + 400 * "]" + AXIS, "no more than 6 levels"),
+        (AXIS + joints(399), "399 positions of joints, rotors and nodes; expected 256 at most"),
+        (AXIS + elements(100000), "200002 positions of joints, rotors and nodes; expected 256 at most"),
         (None, "axis.toml: no such file or directory"),
     ],
 )

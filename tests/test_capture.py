@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sms_adapters.capture import CaptureReader, CaptureWriter
+from sms_adapters.capture import LARGEST, CaptureReader, CaptureWriter
 from sms_adapters.sources import open_source
 from sms_adapters.truth import read_truth, truth_path, write_truth
 from sms_online.description.schema import Joint, System
@@ -41,15 +41,15 @@ def refusal(path: Path, **options: object) -> str:
 
 @pytest.fixture
 def samples() -> Block:
-    """Two chunks of text: doubles of every magnitude, and gaps. Seed 1."""
+    """Two chunks of text: doubles of every magnitude that a capture may hold, and gaps. Seed 1."""
     rng = np.random.default_rng(1)
     bits = rng.integers(0, 2**64, size=(40_000, 2), dtype=np.uint64).view(np.float64)
-    values = np.where(np.isfinite(bits), bits, np.nan)
-    values[:4, 0] = [-0.0, 5e-324, 1.7976931348623157e308, 0.1]
+    values = np.where(np.abs(bits) <= LARGEST, bits, np.nan)
+    values[:4, 0] = [-0.0, 5e-324, LARGEST, 0.1]
     return Block(np.cumsum(rng.uniform(1e-4, 1e-3, 40_000)), ("q_1", "tau_1"), values)
 
 
-def test_every_double_survives_a_capture(tmp_path: Path, samples: Block) -> None:
+def test_every_double_of_any_sense_survives_a_capture(tmp_path: Path, samples: Block) -> None:
     path = tmp_path / "run.csv"
     with CaptureWriter(path, samples.channels) as writer:
         for part in (slice(0, 7), slice(7, None)):

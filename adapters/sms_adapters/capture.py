@@ -19,6 +19,10 @@ from sms_online.errors import InputError
 from sms_online.stream import Array, Block
 
 BLOCK = 16384  # rows: most that one block holds
+# Beyond all that a testbed has in SI units, and small enough that products of a few of them are numbers.
+LARGEST = 1e30
+# Seconds since 1970 until the year 2286; a time beyond that is none.
+LATEST = 1e10
 _NUMBER = re.compile(r"\s*[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?\s*")
 
 
@@ -31,8 +35,8 @@ class CaptureReader:
 
     Empty and NaN cells are NaN in the block, a later sample with an equal time is skipped, and so is a last line that
     does not end in a newline; each is counted in `warnings`.
-    Raises InputError, on construction for the file and its header, while iterating for a malformed line, an infinite
-    value, a time that is missing or goes back, or no sample at all. Rows of earlier chunks are out by then.
+    Raises InputError, on construction for the file and its header, while iterating for a malformed line, a value beyond
+    all sense, a time that is missing or goes back, or no sample at all. Rows of earlier chunks are out by then.
     """
 
     def __init__(
@@ -125,9 +129,9 @@ class CaptureReader:
             lines = bytes(chunk).splitlines()
             k = _first_malformed(lines, names)
             raise self._malformed(line + k, lines[k].decode("utf-8", "replace").split(",")) from None
-        infinite = np.isinf(rows)
-        if infinite.any():
-            number, text = sampled_line(line, chunk, int(infinite.any(axis=1).argmax()))
+        too_large = np.abs(rows) > np.array([LATEST, *[LARGEST] * len(self._channels)])
+        if too_large.any():
+            number, text = sampled_line(line, chunk, int(too_large.any(axis=1).argmax()))
             raise self._malformed(number, text.split(","))
         return rows
 
@@ -137,10 +141,12 @@ class CaptureReader:
         if len(cells) != len(names):
             return InputError(str(self._path), place, f"{len(cells)} cells", f"{len(names)}, as in the header")
         for name, cell in zip(names, cells, strict=True):
-            if cell and cell.strip().lower() != "nan" and not (_NUMBER.fullmatch(cell) and math.isfinite(float(cell))):
-                return InputError(
-                    str(self._path), f"{place}, column {name}", repr(cell[:40]), "a finite number or nothing"
-                )
+            if cell and cell.strip().lower() != "nan":
+                where, most = f"{place}, column {name}", LATEST if name == "t" else LARGEST
+                if not (_NUMBER.fullmatch(cell) and math.isfinite(float(cell))):
+                    return InputError(str(self._path), where, repr(cell[:40]), "a finite number or nothing")
+                if abs(float(cell)) > most:
+                    return InputError(str(self._path), where, repr(cell[:40]), f"a number of {most:g} at most")
         return InputError(str(self._path), place, repr(",".join(cells)[:40]), "plain decimal numbers")
 
     def _check_times(self, line: int, chunk: memoryview, t: Array, step: Array) -> None:

@@ -25,6 +25,8 @@ PLAIN = ("name", "title", "reference", "motion", "gravity", "sample_rate", "bala
 RENAMED = {"sensor": "sensors", "source": "sources", "effect": "effects", "prior": "priors"}
 WITHOUT_NUMBERS = (*PLAIN, *RENAMED, "controller", "trajectory", "windows")
 NUMBERED = re.compile(r"(joint|motor|link)_([1-9]\d*)")
+# Levels of tables and lists in a file: one more than a signal of a source or a harmonic of a joint needs.
+DEPTH = 6
 SYNTAX_ERROR_PLACE = re.compile(r"(?P<what>.*) \(at (?P<place>[^()]*)\)", re.DOTALL)
 
 
@@ -35,10 +37,17 @@ def parse_system(text: str, source: str) -> System:
     """
     try:
         document = tomllib.loads(text)
+        depth = _depth(document)
+    except RecursionError:
+        depth = DEPTH + 1
     except tomllib.TOMLDecodeError as error:
         parts = SYNTAX_ERROR_PLACE.fullmatch(str(error))
         what, place = (parts["what"], parts["place"]) if parts else (str(error), "")
         raise InputError(source, place, " ".join(what.split()), "valid TOML") from None
+    except ValueError:  # Python's own limit on the digits of a number
+        raise InputError(source, "", "a number of thousands of digits", "valid TOML") from None
+    if depth > DEPTH:
+        raise InputError(source, "", "tables or lists deep in each other", f"no more than {DEPTH} levels of them")
     return system_of(document, source)
 
 
@@ -52,6 +61,12 @@ def system_of(document: Mapping[str, Any], source: str) -> System:
         raise explain(error, source) from None
     check_system(system, source)
     return system
+
+
+def _depth(value: Any) -> int:
+    """Levels of tables and lists."""
+    inside = value.values() if isinstance(value, dict) else value if isinstance(value, list) else None
+    return 0 if inside is None else 1 + max((_depth(item) for item in inside), default=0)
 
 
 def _arrange(document: Mapping[str, Any], source: str) -> dict[str, Any]:
