@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
-from types import SimpleNamespace
-from typing import Any
+from dataclasses import dataclass
 
 import numpy as np
 import pytest
@@ -15,6 +13,7 @@ from numpy.typing import NDArray
 from sms_online.description.schema import Effect
 from sms_online.diagnosis.candidate import Candidate, LeftOpen
 from sms_online.diagnosis.trace import Tracing
+from sms_online.diagnosis.weak_rows import WeakRows
 from sms_online.effects import catalogue
 from sms_online.effects.build import build_model
 from sms_online.effects.catalogue import ENTRIES
@@ -26,40 +25,11 @@ WINDOWS, SPEEDS = 300, 2
 FITTED = np.arange(WINDOWS) < 200
 
 
-@dataclass
-class MadeUpRows:
-    """What the search asks of a session's rows: here independent of each other, with unit noise unless weighed."""
-
-    Y: Array
-    b: Array
-    errors: Array = field(default_factory=lambda: np.zeros((WINDOWS, SPEEDS)))
-    model: Any = field(
-        default_factory=lambda: SimpleNamespace(
-            layout=SimpleNamespace(n_v=SPEEDS), system=SimpleNamespace(effects=(), sample_rate=1000.0)
-        )
-    )
-
-    @property
-    def base(self) -> Any:
-        return SimpleNamespace(n=self.Y.shape[2])
-
-    @property
-    def count(self) -> int:
-        return WINDOWS
-
-    @property
-    def std(self) -> Array:
-        return np.ones_like(self.b)
-
-    @property
-    def white_std(self) -> Array:
-        return np.sqrt(1.0 + self.errors)
-
-    def whiten(self, own: Array, free: Array | None = None) -> None:
-        self.errors = own if free is None else own + free[:, 0]
-
-    def white(self, columns: Array) -> Array:
-        return np.asarray((columns / self.white_std[..., None]).reshape(WINDOWS * SPEEDS, -1))
+def made_up_rows(Y: Array, b: Array) -> WeakRows:
+    """Rows that are independent of each other, with unit noise."""
+    rows = WeakRows(Y, b, 1000.0)
+    rows.have_noise([[np.eye(SPEEDS)]] * WINDOWS)
+    return rows
 
 
 @dataclass
@@ -83,7 +53,9 @@ class Sticking:
 def _candidate(name: str, column: Array) -> Candidate:
     columns = np.zeros((WINDOWS, SPEEDS, 1))
     columns[:, 0, 0] = column
-    return Candidate(Effect(name=name, where="joint_1"), (Parameter(name, "", "N m", 0.0),), columns)
+    return Candidate(
+        Effect(name=name, where="joint_1"), (Parameter(name, "", "N m", 0.0),), columns, ENTRIES[name].traits
+    )
 
 
 def _found(candidates: list[Candidate], force: Array, seed: int) -> list[str]:
@@ -91,7 +63,7 @@ def _found(candidates: list[Candidate], force: Array, seed: int) -> list[str]:
     Y = rng.standard_normal((WINDOWS, SPEEDS, 3))
     b = Y @ np.array([1.0, -2.0, 0.5]) + rng.standard_normal((WINDOWS, SPEEDS))
     b[:, 0] += force
-    tracing = Tracing(MadeUpRows(Y, b), candidates, FITTED)  # type: ignore[arg-type]
+    tracing = Tracing(made_up_rows(Y, b), candidates, FITTED)
     return [tracing.candidates[k].effect.name for k in tracing.run(lambda chosen, k: None)]
 
 
@@ -147,7 +119,7 @@ def test_an_effect_whose_own_noise_hides_what_it_takes_stays_and_what_stood_for_
     b = Y @ np.array([1.0, -2.0, 0.5]) + rng.standard_normal((WINDOWS, SPEEDS))
     b[:, 0] += held
 
-    rows: Any = MadeUpRows(Y, b)
+    rows = made_up_rows(Y, b)
     tracing = Tracing(rows, [friction, ripple], FITTED, laws=Sticking(stuck, 0.0, 10.0))
     found = tracing.run(lambda chosen, k: None)
     assert [taken for taken, _ in tracing.path] == [1, 0]
@@ -169,7 +141,7 @@ def test_friction_that_holds_an_axis_much_of_the_time_is_found_beside_what_fits_
         _candidate("cogging", other),
         _candidate("torque_offset", offset),
     ]
-    rows: Any = MadeUpRows(rng.standard_normal((WINDOWS, SPEEDS, 3)), b)
+    rows = made_up_rows(rng.standard_normal((WINDOWS, SPEEDS, 3)), b)
 
     def steps(share: float) -> list[list[int]]:
         tracing = Tracing(rows, candidates, FITTED, laws=Sticking(stuck, share, 2.0))
@@ -189,6 +161,6 @@ def test_what_another_effect_has_replaced_comes_back_for_what_that_leaves(times:
     b = rng.standard_normal((WINDOWS, SPEEDS))
     b[:, 0] += 50.0 * friction + 5.0 * ripple
     candidates = [_candidate("coulomb_friction", friction), _candidate("cogging", ripple)]
-    rows: Any = MadeUpRows(rng.standard_normal((WINDOWS, SPEEDS, 3)), b)
+    rows = made_up_rows(rng.standard_normal((WINDOWS, SPEEDS, 3)), b)
     found = Tracing(rows, candidates, FITTED, laws=Sticking(stuck, 0.0, times)).run(lambda chosen, k: None)
     assert sorted(found) == [0, 1]

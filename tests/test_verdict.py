@@ -12,20 +12,22 @@ from sms_adapters.system_file import load_system
 from sms_online.description.schema import Effect, System
 from sms_online.diagnosis import diagnose
 from sms_online.diagnosis.candidate import Candidate
+from sms_online.diagnosis.hypothesis import verdict
 from sms_online.diagnosis.record import Segment
 from sms_online.diagnosis.residuals import RowResidual
 from sms_online.diagnosis.reversals import Reversals
 from sms_online.diagnosis.standstill import SessionStandstill
 from sms_online.diagnosis.weak_windows import Motion
+from sms_online.effects.catalogue import ENTRIES
 from sms_online.pipeline.smoothing import smooth
 
 
-def _finding(name: str, where: str) -> Any:
-    return SimpleNamespace(candidate=Candidate(Effect(name=name, where=where), (), np.empty((0, 0, 0))))
+def _found(name: str, where: str) -> Candidate:
+    return Candidate(Effect(name=name, where=where), (), np.empty((0, 0, 0)), ENTRIES[name].traits)
 
 
 @pytest.mark.parametrize(
-    ("found", "left", "before", "after", "verdict"),
+    ("found", "left", "before", "after", "said"),
     [
         # Multiples of the noise of the rows of joint 1.
         ([], 0.0, 1.0, 1.0, "clean"),
@@ -42,11 +44,10 @@ def _finding(name: str, where: str) -> Any:
     ],
 )
 def test_the_verdict_follows_from_what_is_left(
-    found: list[str], left: float, before: float, after: float, verdict: str
+    found: list[str], left: float, before: float, after: float, said: str
 ) -> None:
     rows = [{"joint_1": RowResidual(times, 1.2), "base": RowResidual(1.0, 1.2)} for times in (before, after)]
-    findings = [_finding(name, "joint_1") for name in found]
-    assert diagnose._verdict(bool(found), left, rows[0], rows[1], findings) == verdict
+    assert verdict(bool(found), left, rows[0], rows[1], [_found(name, "joint_1") for name in found]) == said
 
 
 def test_friction_of_one_joint_excuses_nothing_at_another() -> None:
@@ -54,9 +55,8 @@ def test_friction_of_one_joint_excuses_nothing_at_another() -> None:
         {f"joint_{k}": RowResidual(times, 1.2) for k, times in enumerate(each, start=1)}
         for each in ((600.0, 600.0), (1.0, 14.0))
     )
-    for where, verdict in (("joint_1", "unexplained"), ("joint_2", "named")):
-        findings = [_finding("coulomb_friction", where)]
-        assert diagnose._verdict(True, 5e-4, before, after, findings) == verdict
+    for where, said in (("joint_1", "unexplained"), ("joint_2", "named")):
+        assert verdict(True, 5e-4, before, after, [_found("coulomb_friction", where)]) == said
 
 
 @pytest.mark.parametrize(

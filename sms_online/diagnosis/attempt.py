@@ -13,15 +13,14 @@ from numpy.typing import NDArray
 from sms_online.description.schema import Effect, System
 from sms_online.diagnosis.candidate import Candidate
 from sms_online.diagnosis.candidates import CandidateColumns
-from sms_online.diagnosis.constants import applied, corrected, improved, is_constant
+from sms_online.diagnosis.constants import applied, corrected, is_constant
 from sms_online.diagnosis.evidence import together
 from sms_online.diagnosis.followed import least_samples
-from sms_online.diagnosis.record import LONGEST, Segment, excerpts
+from sms_online.diagnosis.hypothesis import FITTED, LARGEST_SHARE_LEFT, REWEIGHED, Hypothesis
+from sms_online.diagnosis.record import LONGEST, Segment, bounded, excerpts
 from sms_online.diagnosis.relative import RelativeResiduals
 from sms_online.diagnosis.residuals import ResidualTest, RowResidual, whitened
 from sms_online.diagnosis.rows import SessionRows
-from sms_online.diagnosis.shape import refine
-from sms_online.diagnosis.trace import Tracing
 from sms_online.effects.build import build_model
 from sms_online.errors import InputError
 from sms_online.pipeline.conditioning import noise_gains
@@ -34,26 +33,11 @@ from sms_online.trackers.interface import Prior
 
 # Part of a session that tells which kinematics of links are nearer, and improves channels' constants, s.
 SOME = 8.0
-# Constants are improved as far as the data tell when they move by less than this share of their deviation.
-SETTLED = 0.1
-# Share of a session that coefficients are fitted to where no other capture is held out; the rest checks them.
-FITTED = 2.0 / 3.0
-# A verdict names effects that take away all but this share of what is beyond noise: a wrong one that is 10° from the
-# right one leaves sin² 10°.
-LARGEST_SHARE_LEFT = 0.03
-# No right effect leaves a row type more than this multiple of its noise, unless that is what its law is uncertain by.
-MOST_LEFT = 2.0
-# Windows that a session is judged by at most: of a longer one stretches are taken.
-MOST_WINDOWS = 2500
-# Stretches of a session that is used in part, in window lengths.
-STRETCH = 5.0
 # Times that all candidates are fitted together for the first weights of the rows: without weights, then with those.
 STARTS = 2
 # Rows for a column at least, for all candidates to be fitted together.
 LEAST_ROWS = 4
-# Times at most that rows are weighed anew by what was found, to search again; weights are the same where the size of
-# the rows' terms changes by less than this share.
-REWEIGHED = 2
+# Weights are the same where the size of the rows' terms changes by less than this share.
 SAME_WEIGHTS = 0.1
 
 
@@ -128,8 +112,23 @@ def _noise_behind(described: Estimator, case: Case) -> SensorNoise:
     return replace(case.noise, grid=grid, coordinates=coordinates)
 
 
-class Attempt:
-    """One description of the system against the samples of a session."""
+def _start(rows: SessionRows, candidates: Sequence[Candidate], prior: Prior | None) -> None:
+    """Weigh the rows with what the model and all candidates together make of them.
+
+    Weights of a model that lacks a large force are no start: most rows are homogeneous in π, and where it cannot
+    explain them it shrinks π, with π their noise, and with that their weight grows without end.
+    """
+    columns = np.concatenate([rows.Y, *(candidate.columns for candidate in candidates)], axis=2)
+    if LEAST_ROWS * columns.shape[2] > rows.b.size:
+        columns = rows.Y
+    std = np.ones_like(rows.b)
+    for _ in range(STARTS):
+        rows.weigh(together(columns / std[..., None], rows.b / std, prior)[: rows.base.n])
+        std = rows.std
+
+
+class Attempt(Hypothesis):
+    """One description of the system against the samples of a whole capture."""
 
     def __init__(
         self,
@@ -144,16 +143,16 @@ class Attempt:
         """constants: see that module. beta (n,): behind the noise of rows, from the rows themselves unless given.
         candidates: all by default. most: s of the session that are used. second_order: see `SessionRows`.
         """
-        self.case, self.system, self.constants = case, system, list(constants)
+        self.case, self.system = case, system
         session = case.session
         described = applied(system, constants)
         same = described == session.system
         estimator = session if same else Estimator(described, session.sensing.channels, case.source)
-        self.prior = case.prior(estimator)
+        prior = case.prior(estimator)
         noise = _noise_behind(estimator, case)
         span = system.windows.momentum
-        most = min(most, MOST_WINDOWS * span / HOPS)
-        length, longest = (round(seconds * system.sample_rate) for seconds in (STRETCH * span, most))
+        length, longest = bounded(system)
+        longest = min(longest, round(most * system.sample_rate))
         least = least_samples(system)
         # Corrections reach beyond a stretch.
         channels = session.sensing.channels
@@ -161,31 +160,30 @@ class Attempt:
         fitting, held = (
             [part for part in excerpts(each, length, longest) if part.index.size > least] for each in whole
         )
-        self.rows = SessionRows(
+        rows = SessionRows(
             estimator.model, estimator.base, estimator.sensing, noise, (*fitting, *held), second_order=second_order
         )
-        self.make = CandidateColumns(self.rows, described)
+        make = CandidateColumns(rows, described)
         self._fitting = len(fitting)
-        first, last = self.rows.time[:1].sum(), self.rows.time[-1:].sum()
+        first, last = rows.time[:1].sum(), rows.time[-1:].sum()
         self._split = np.inf if held else first + FITTED * (last - first)
-        fitted = self._fitted(self.rows.time, self.rows.weak.windows.segment)
-        enough = min(int(fitted.sum()) * self.rows.model.layout.n_v // (2 * self.rows.base.n), int((~fitted).sum()))
+        fitted = self._fitted(rows.time, rows.weak.windows.segment)
+        enough = min(int(fitted.sum()) * rows.model.layout.n_v // (2 * rows.base.n), int((~fitted).sum()))
         if enough == 0:
             # Windows begin a hop apart; those fitted give twice as many rows as there are parameters.
-            hops = 2 * self.rows.base.n / self.rows.model.layout.n_v / (1.0 if held else FITTED)
+            hops = 2 * rows.base.n / rows.model.layout.n_v / (1.0 if held else FITTED)
             seconds = least / system.sample_rate + hops * span / HOPS
             expected = f"some {seconds:.1f} s without a gap, to fit and to check"
-            raise InputError(case.source, "", f"too few windows of {span:g} s: {self.rows.count}", expected)
-        self._fitted_windows = fitted
-        effects = list(self.make.effects()) if candidates is None else candidates
+            raise InputError(case.source, "", f"too few windows of {span:g} s: {rows.count}", expected)
+        effects = list(make.effects()) if candidates is None else candidates
         self._lasting = [effect for effect in effects if is_constant(effect)]
         forces = [effect for effect in effects if not is_constant(effect)]
-        made = self.make.seen(forces) if candidates is None else [self.make.of(effect) for effect in forces]
+        made = make.seen(forces) if candidates is None else [make.of(effect) for effect in forces]
         if beta is None:
-            self._start(made)
+            _start(rows, made, prior)
         else:
-            self.rows.weigh(beta)
-        self._trace(made)
+            rows.weigh(beta)
+        super().__init__(make, [*make.seen(self._lasting), *made], fitted, prior, constants)
 
     def trial(self, system: System, constants: Sequence[Effect], beta: Array, effects: Sequence[Effect]) -> Attempt:
         """A quick attempt with no candidates but some effects, on stretches of the session.
@@ -197,34 +195,12 @@ class Attempt:
         states = build_model(system.model_copy(update={"effects": forces})).n_states
         return Attempt(self.case, system, constants, beta, effects, LONGEST if states else SOME, self.rows.second_order)
 
-    def _start(self, candidates: Sequence[Candidate]) -> None:
-        """Weigh the rows with what the model and all candidates together make of them.
-
-        Weights of a model that lacks a large force are no start: most rows are homogeneous in π, and where it cannot
-        explain them it shrinks π, with π their noise, and with that their weight grows without end.
-        """
-        rows = self.rows
-        columns = np.concatenate([rows.Y, *(candidate.columns for candidate in candidates)], axis=2)
-        if LEAST_ROWS * columns.shape[2] > rows.b.size:
-            columns = rows.Y
-        std = np.ones_like(rows.b)
-        for _ in range(STARTS):
-            rows.weigh(together(columns / std[..., None], rows.b / std, self.prior)[: rows.base.n])
-            std = rows.std
-
-    def _trace(self, forces: Sequence[Candidate]) -> None:
-        """Begin to trace with the weights that the rows have now."""
-        constants = self.make.seen(self._lasting)
-        self.fixed = [self.make.of(effect) for effect in self.constants]
-        parts = self._fitted_windows, self.prior, self.fixed, self.make
-        self.tracing = Tracing(self.rows, [*constants, *forces], *parts)
-
     def _fitted(self, time: NDArray[np.floating[Any]], segment: NDArray[np.int64]) -> NDArray[np.bool_]:
         return np.asarray((segment < self._fitting) & (time < self._split))
 
     def search(self) -> list[int]:
         """Numbers of the candidates found, with rows weighed by what was found if it explains them."""
-        chosen = self._search()
+        chosen = self.run()
         for _ in range(REWEIGHED):
             beta = self.solution(chosen)[: self.rows.base.n]
             if self.prior is not None:
@@ -232,64 +208,22 @@ class Attempt:
             if self._same_weights(beta) or self.excess(chosen) > LARGEST_SHARE_LEFT * self.excess([]):
                 break
             self.rows.weigh(beta)
-            chosen = self._search_again()
+            forces = [candidate for candidate in self.tracing.candidates if not candidate.constant]
+            self.trace([*self.make.seen(self._lasting), *forces])
+            chosen = self.run()
         return chosen
-
-    def _search_again(self) -> list[int]:
-        self._trace([candidate for candidate in self.tracing.candidates if not candidate.constant])
-        return self._search()
-
-    def _search(self) -> list[int]:
-        return self.tracing.run(lambda chosen, k: refine(self.tracing, self.make, chosen, k))
 
     def _same_weights(self, beta: Array) -> bool:
         """Whether rows would be weighed alike with beta (n,): their noise goes with the size of their terms."""
         sizes = [np.linalg.norm(self.rows.Y * values, axis=(0, 2)) for values in (beta, self.rows.beta)]
         return bool(np.all(np.abs(sizes[0] - sizes[1]) <= SAME_WEIGHTS * sizes[1]))
 
-    def solution(self, chosen: Sequence[int]) -> Array:
-        """Parameters and coefficients from all windows."""
-        return self.tracing.solution(chosen, np.ones(self.rows.count, dtype=bool))
-
-    def excess(self, chosen: Sequence[int]) -> float:
-        """Sum of squares that is left beyond noise."""
-        residual = self.tracing.residual(chosen, self.solution(chosen))
-        return float(np.sum(residual**2) - residual.size)
-
-    def improved(self, solution: Array) -> tuple[list[Effect], bool]:
-        """The constants improved by a solution, and whether there is nothing more to improve."""
-        own = self._of_constants
-        everything = range(len(self.tracing.candidates))
-        std = np.sqrt(np.diag(self.tracing.covariance(everything))[own])
-        return self._improved(self.fixed, solution[own]), bool(np.all(np.abs(solution[own]) < SETTLED * std))
-
     def conclude(self, chosen: Sequence[int]) -> None:
         """Improve the constants by all the rows, once more: they were found on stretches.
 
         The rows stay, whose columns tell to second order what so small a change makes of them.
         """
-        self.constants = self._improved(self.fixed, self.solution(chosen)[self._of_constants])
-
-    @property
-    def _of_constants(self) -> slice:
-        """Where a solution holds what the constants change by."""
-        n = self.rows.base.n
-        return slice(n, n + sum(len(candidate.parameters) for candidate in self.fixed))
-
-    def found(self, chosen: Sequence[int], solution: Array) -> tuple[list[Effect], list[Effect]]:
-        """Of the effects chosen, those that become constants, with their values, and the others."""
-        candidates = [self.tracing.candidates[k] for k in chosen]
-        everything = self._improved(candidates, solution[self._of_constants.stop :])
-        return [e for e in everything if is_constant(e)], [e for e in everything if not is_constant(e)]
-
-    @staticmethod
-    def _improved(candidates: Sequence[Candidate], values: Array) -> list[Effect]:
-        out, at = [], 0
-        for candidate in candidates:
-            own = values[at : at + len(candidate.parameters)]
-            at += len(candidate.parameters)
-            out.append(improved(candidate.effect, own) if candidate.constant else candidate.effect)
-        return out
+        self.constants = self.improved(self.solution(chosen))
 
     def adopted(self, chosen: Sequence[int]) -> System:
         """The described system with everything that was found."""
@@ -308,13 +242,13 @@ class Attempt:
 
     def _checked(self, chosen: Sequence[int]) -> Array:
         """Parameters and coefficients fitted to the fitted windows alone."""
-        return self.tracing.solution(chosen, self.tracing.fitted)
+        return self.tracing.solution(chosen, self.fitted)
 
     def state(self, chosen: Sequence[int]) -> State:
         """Residuals of the model with the effects chosen."""
         rows, tracing, joints = self.rows, self.tracing, self._joints
         tracing.settle(chosen)
-        fitted = tracing.fitted
+        fitted = self.fitted
         solution = self._checked(chosen)
         residual = tracing.residual(chosen, solution)
         joints.declare([*self.constants, *(tracing.candidates[k].effect for k in chosen)])

@@ -6,9 +6,7 @@ from dataclasses import dataclass
 from typing import Protocol
 
 from sms_online.description.schema import Effect
-from sms_online.diagnosis.constants import is_constant
 from sms_online.diagnosis.evidence import Gain
-from sms_online.effects.catalogue import ENTRIES
 from sms_online.effects.traits import Traits
 from sms_online.model.parameters import Parameter
 from sms_online.stream import Array
@@ -19,12 +17,15 @@ class Candidate:
     """An effect that may be missing.
 
     effect: as a system file would declare it, shape constants included. parameters: its linear coefficients (c,).
-    columns (W, n_v, c): what one unit of each adds to the rows.
+    columns (W, n_v, c): what one unit of each adds to the rows. traits: of the effect. constant: whether its
+    coefficients become constants of the description, no unknowns of π: see `constants`.
     """
 
     effect: Effect
     parameters: tuple[Parameter, ...]
     columns: Array
+    traits: Traits
+    constant: bool = False
 
     @property
     def key(self) -> str:
@@ -32,20 +33,10 @@ class Candidate:
         return f"{self.effect.name}@{self.effect.where}"
 
     @property
-    def traits(self) -> Traits:
-        """Those of its effect."""
-        return ENTRIES[self.effect.name].traits
-
-    @property
     def extends(self) -> str | None:
         """Key of a simpler effect that it contains: it refines a law."""
         simpler = self.traits.extends
         return None if simpler is None else f"{simpler}@{self.effect.where}"
-
-    @property
-    def constant(self) -> bool:
-        """Whether its coefficients become constants of the description, no unknowns of π: see `constants`."""
-        return is_constant(self.effect)
 
 
 @dataclass(frozen=True)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
 from fnmatch import fnmatchcase
 from functools import cached_property
@@ -137,15 +137,19 @@ class CandidateColumns:
             self._declaring(effect), self.rows.base.physical_values(self.rows.beta) if is_constant(effect) else None
         )
         added = [k for k, p in enumerate(model.parameters) if p.name not in self._own]
-        parameters = tuple(model.parameters[k] for k in added)
+        parameters = [model.parameters[k] for k in added]
         if ENTRIES[effect.name].kind == "inertia":
 
             def inertia(motion: Motion) -> tuple[Array | None, Array]:
                 P, G = model.momentum_columns(motion.x, motion.v, inputs=self.inputs(motion))
                 return P[..., added], G[..., added]
 
-            return Candidate(effect, parameters, self._weak.columns(inertia))
-        return Candidate(effect, parameters, self._force(model))
+            return self._candidate(effect, parameters, self._weak.columns(inertia))
+        return self._candidate(effect, parameters, self._force(model))
+
+    @staticmethod
+    def _candidate(effect: Effect, parameters: Sequence[Parameter], columns: Array) -> Candidate:
+        return Candidate(effect, tuple(parameters), columns, ENTRIES[effect.name].traits, is_constant(effect))
 
     def _force(self, model: Model) -> Array:
         """Columns (W, n_v, c) of a model's last effect."""
@@ -318,4 +322,4 @@ class CandidateColumns:
                 response = sign * self.rows.responses[displacement][:, :, acts].sum(axis=2)
             columns.append(response)
             parameters.append(Parameter(f"{effect.name}@{effect.where}.{quantity}", quantity, unit, 0.0))
-        return Candidate(effect, tuple(parameters), np.stack(columns, axis=2))
+        return self._candidate(effect, parameters, np.stack(columns, axis=2))

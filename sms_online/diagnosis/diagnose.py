@@ -2,30 +2,28 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
 from sms_online.description.schema import Effect, System
-from sms_online.diagnosis.attempt import LARGEST_SHARE_LEFT, MOST_LEFT, Attempt, Case, PriorOf, State, Step
+from sms_online.diagnosis.attempt import Attempt, Case, PriorOf, State, Step
 from sms_online.diagnosis.candidate import Finding, Ranked
 from sms_online.diagnosis.constants import stands
+from sms_online.diagnosis.hypothesis import corrections, share_left, verdict
 from sms_online.diagnosis.late_sensors import LateSensor, find_late
 from sms_online.diagnosis.record import SampleRecord
-from sms_online.diagnosis.residuals import RowResidual
 from sms_online.diagnosis.trace import DECISIVE
 from sms_online.diagnosis.unexplained import Unexplained, describe_residual
 from sms_online.effects.catalogue import kinematic_candidates
-from sms_online.effects.traits import INEXACT
 from sms_online.errors import InputError
 from sms_online.pipeline.estimator import Estimator
 from sms_online.pipeline.momentum_windows import HOPS
-from sms_online.stream import Block
+from sms_online.stream import Array, Block
 from sms_online.threads import one_blas_thread
 
-# Times that the constants of channels' effects are improved, each with samples corrected by those found before.
-CORRECTIONS = 3
 # Exact links have to take this share of what straight ones leave beyond noise.
 STIFFENING_TAKES = 0.1
 
@@ -58,33 +56,7 @@ class Diagnosis:
     @property
     def left(self) -> float:
         """Share of what was beyond noise that is left with what was found."""
-        return _left(self.before, self.after)
-
-
-def _left(before: State, after: State) -> float:
-    """Share of what is beyond noise that is left."""
-    return max(0.0, after.excess) / max(before.excess, 1.0)
-
-
-def _verdict(
-    named: bool,
-    left: float,
-    before: Mapping[str, RowResidual],
-    after: Mapping[str, RowResidual],
-    findings: Sequence[Finding],
-) -> str:
-    """What may be said where effects were named or not, and leave this share of what was beyond noise."""
-    if not any(row.beyond for row in after.values()):
-        return "named" if named else "clean"
-    if not named or left > LARGEST_SHARE_LEFT:
-        return "unexplained"
-    # Friction of a joint acts on the rows of that joint.
-    found = [finding.candidate for finding in findings]
-    for name, row in after.items():
-        inexact = max((each.traits.inexact for each in found if each.effect.where == name), default=INEXACT)
-        if row.whitened > MOST_LEFT and row.whitened**2 > inexact * before[name].whitened ** 2:
-            return "unexplained"
-    return "named"
+        return share_left(self.before.excess, self.after.excess)
 
 
 def _exact(system: System, links: Sequence[Effect]) -> System:
@@ -130,6 +102,10 @@ def _stiffened(case: Case, attempt: Attempt, chosen: Sequence[int]) -> Attempt |
         return None
 
 
+def _trial(attempt: Attempt, forces: Sequence[Effect], constants: Sequence[Effect], beta: Array) -> Attempt:
+    return attempt.trial(attempt.system, constants, beta, forces)
+
+
 def _with_constants(
     case: Case, attempt: Attempt, chosen: list[int], progress: Callable[[str], None]
 ) -> tuple[Attempt, list[int], list[Finding]]:
@@ -145,12 +121,10 @@ def _with_constants(
         solution = attempt.solution(chosen)
         fresh, forces = attempt.found(chosen, solution)
         constants, beta = [*attempt.constants, *fresh], solution[:n]
-        for _ in range(CORRECTIONS):
-            some = attempt.trial(attempt.system, constants, beta, forces)
-            solution = some.solution(range(len(forces)))
-            constants, settled = some.improved(solution)
-            beta = solution[:n]
-            if settled:
+        trial = partial(_trial, attempt, forces)
+        for correction in corrections(trial, constants, beta):
+            constants, beta = correction.constants, correction.solution[:n]
+            if correction.settled:
                 break
         keys = {(effect.name, effect.where) for effect in constants}
         constants = [effect for effect in constants if stands(effect, case.session.system.sample_rate)]
@@ -231,13 +205,14 @@ def diagnose(
     progress("fitting the model with what was found")
     named = after.system != system
     estimator_after = _session(after.system, blocks, source, prior)[0] if named else before
-    left = _left(bare, after)
-    verdict = _verdict(named, left, bare.test, after.test, findings)
+    said = verdict(
+        named, share_left(bare.excess, after.excess), bare.test, after.test, [each.candidate for each in findings]
+    )
     unexplained = None
-    if verdict == "unexplained":
+    if said == "unexplained":
         unexplained = describe_residual(attempt.rows, attempt.tracing.columns(chosen), after.residual, bare.test)
     return Diagnosis(
-        verdict=verdict,
+        verdict=said,
         findings=findings,
         late=late,
         ranking=ranking,

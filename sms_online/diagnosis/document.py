@@ -8,10 +8,11 @@ from typing import Any
 
 import numpy as np
 
-from sms_online.diagnosis.attempt import LARGEST_SHARE_LEFT, Attempt, Part
+from sms_online.diagnosis.attempt import Attempt, Part
 from sms_online.diagnosis.candidate import Finding
 from sms_online.diagnosis.constants import deviations
 from sms_online.diagnosis.diagnose import Diagnosis
+from sms_online.diagnosis.hypothesis import LARGEST_SHARE_LEFT
 from sms_online.diagnosis.shape import slopes
 from sms_online.effects.base import report
 from sms_online.effects.catalogue import ENTRIES, declarable

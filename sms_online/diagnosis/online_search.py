@@ -14,23 +14,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sms_online.description.schema import Effect, System
-from sms_online.diagnosis.attempt import FITTED, LARGEST_SHARE_LEFT, MOST_WINDOWS, REWEIGHED, STRETCH
 from sms_online.diagnosis.candidate import Candidate, LeftOpen
 from sms_online.diagnosis.candidates import CandidateColumns
 from sms_online.diagnosis.constants import applied, corrected, deviations, improved, is_constant, stands
-from sms_online.diagnosis.diagnose import CORRECTIONS
-from sms_online.diagnosis.record import Segment, excerpts
+from sms_online.diagnosis.hypothesis import FITTED, REWEIGHED, Hypothesis, corrections, share_left, verdict
+from sms_online.diagnosis.record import Segment, bounded, excerpts
 from sms_online.diagnosis.residuals import ResidualTest
 from sms_online.diagnosis.rows import SessionRows
-from sms_online.diagnosis.shape import refine
-from sms_online.diagnosis.trace import Tracing
 from sms_online.diagnosis.weak_windows import WeakWindows
 from sms_online.effects.base import report
 from sms_online.effects.build import build_model
-from sms_online.effects.catalogue import ENTRIES, LINEAR, declarable
+from sms_online.effects.catalogue import ENTRIES, declarable
 from sms_online.model.base_parameters import BaseParameters
 from sms_online.model.model import Model
-from sms_online.pipeline.momentum_windows import HOPS
 from sms_online.pipeline.sensing import Sensing
 from sms_online.pipeline.sensor_noise import SensorNoise
 from sms_online.stream import Array
@@ -162,7 +158,8 @@ def _search(request: Request) -> Outcome | None:
     outcome = _trace(request, rows, everything, request.late)
     for _ in range(0 if request.weighed else REWEIGHED):
         # Nothing was known of the rows' noise that was worth the name, for nothing explained the torques.
-        outcome = _trace(request, _rows(request, outcome.beta), everything, request.late)
+        rows.weigh(outcome.beta)
+        outcome = _trace(request, rows, everything, request.late)
     if outcome.verdict != "unexplained" or request.late == 0:
         return outcome
     always = _trace(request, rows, everything, 0)
@@ -171,8 +168,7 @@ def _search(request: Request) -> Outcome | None:
 
 def _bounded(request: Request) -> Request:
     """Stretches of the record, where its windows are so short that it holds too many of them."""
-    windows, rate = request.model.system.windows, request.model.system.sample_rate
-    length, most = round(STRETCH * windows.momentum * rate), round(MOST_WINDOWS * windows.momentum / HOPS * rate)
+    length, most = bounded(request.model.system)
     before = excerpts(request.segments[: request.late], length, most // 3)
     after = excerpts(request.segments[request.late :], length, most - most // 3)
     return replace(request, segments=(*before, *after), late=len(before))
@@ -202,10 +198,10 @@ def _trace(request: Request, rows: SessionRows, everything: Sequence[Candidate],
     system = request.model.system
     make = LateColumns(rows, system, late)
     limited = [make.limited(candidate) for candidate in everything]
-    fitted = _fitted(rows, late)
-    tracing = Tracing(rows, [c for c in limited if np.any(c.columns)], fitted, request.prior, (), make)
+    some = Hypothesis(make, [c for c in limited if np.any(c.columns)], _fitted(rows, late), request.prior)
+    tracing = some.tracing
     ranking = tracing.ranking()[:TOLD]
-    chosen = tracing.run(lambda found, k: refine(tracing, make, found, k))
+    chosen = some.run()
     findings = [tracing.finding(chosen, k) for k in chosen]
     gains = {k: finding.gain.gain for k, finding in zip(chosen, findings, strict=True)}
     kept = [k for k in chosen if gains[k] >= LEAST_SHARE * max(gains.values())]
@@ -216,91 +212,68 @@ def _trace(request: Request, rows: SessionRows, everything: Sequence[Candidate],
     if kept != chosen:
         tracing.settle(kept)
         chosen, findings = kept, [tracing.finding(kept, k) for k in kept]
-    before = _excess(tracing, [])
-    final, used, constant = tracing, list(chosen), None
+    before, test_before = some.excess([]), ResidualTest(rows).of(some.residual([]))
+    final, used, constants = some, chosen, list[Effect]()
     if channels:
-        final, used, constant = _corrected(request, tracing, chosen, late)
-        if not stands(constant, system.sample_rate):
+        final, constants = _corrected(request, some, chosen, late)
+        used = list(final.everything)
+        if not stands(constants[0], system.sample_rate):
             key = tracing.candidates[chosen[-1]].key
             return _trace(request, rows, [candidate for candidate in everything if candidate.key != key], late)
-    after = _excess(final, used)
-    left = max(0.0, after) / max(before, 1.0)
-    beyond = any(row.beyond for row in ResidualTest(final.rows).of(_residual(final, used)).values())
-    unknown = beyond and (not chosen or left > LARGEST_SHARE_LEFT)
-    verdict = "unexplained" if unknown else "named" if chosen else "clean"
-    solution, covariance = _solution(final, used), final.covariance(used)
-    named = [
-        Named(
-            effect=improved(effect, solution[own]) if is_constant(effect) and effect is not constant else effect,
-            parameters=tuple(p.name for p in finding.candidate.parameters) if effect is not constant else (),
-            units=tuple(p.unit for p in finding.candidate.parameters) if effect is not constant else (),
-            values=solution[own] if effect is not constant else np.empty(0),
-            stds=np.sqrt(np.diag(covariance))[own] if effect is not constant else np.empty(0),
-            coefficients=_coefficients(request, final, used, effect, own, effect is constant),
-            gain=finding.gain.gain,
-            limit=finding.limit,
-            ambiguous=finding.ambiguous,
+    left = share_left(before, final.excess(used))
+    test = ResidualTest(final.rows).of(final.residual(used))
+    candidates = [final.tracing.candidates[k] for k in used]
+    places = final.places(candidates)
+    # A constant was found last.
+    effects = [*(candidate.effect for candidate in candidates), *constants]
+    places = [*places[len(constants) :], *places[: len(constants)]]
+    solution, covariance = final.solution(used), final.tracing.covariance(used)
+    stds = np.sqrt(np.diag(covariance))
+    named = []
+    for finding, effect, own in zip(findings, effects, places, strict=True):
+        parameters = () if effect in constants else finding.candidate.parameters
+        told = own if parameters else slice(0)
+        named.append(
+            Named(
+                effect=improved(effect, solution[own]) if parameters and is_constant(effect) else effect,
+                parameters=tuple(p.name for p in parameters),
+                units=tuple(p.unit for p in parameters),
+                values=solution[told],
+                stds=stds[told],
+                coefficients=_coefficients(request, solution, covariance, effect, own, not parameters),
+                gain=finding.gain.gain,
+                limit=finding.limit,
+                ambiguous=finding.ambiguous,
+            )
         )
-        for finding, (effect, own) in zip(findings, _places(final, used, constant), strict=True)
-    ]
     scores = {ranked.candidate.key: ranked.gain for ranked in ranking}
-    return Outcome(verdict, tuple(named), scores, left, late > 0, solution[: rows.base.n])
+    said = verdict(bool(chosen), left, test_before, test, [finding.candidate for finding in findings])
+    return Outcome(said, tuple(named), scores, left, late > 0, solution[: rows.base.n])
 
 
-def _solution(tracing: Tracing, used: Sequence[int]) -> Array:
-    return tracing.solution(used, np.ones(tracing.rows.count, dtype=bool))
-
-
-def _residual(tracing: Tracing, used: Sequence[int]) -> Array:
-    return tracing.residual(used, _solution(tracing, used))
-
-
-def _excess(tracing: Tracing, used: Sequence[int]) -> float:
-    """Sum of squares beyond noise."""
-    residual = _residual(tracing, used)
-    return float(np.sum(residual**2) - residual.size)
-
-
-def _places(tracing: Tracing, used: Sequence[int], constant: Effect | None) -> list[tuple[Effect, slice]]:
-    """The effects in the order of the search, and where the solution holds them; a constant, the last, comes first."""
-    candidates = [tracing.candidates[k] for k in used]
-    at = tracing.rows.base.n if constant is None else tracing.rows.base.n + len(LINEAR[constant.name])
-    out = []
-    for candidate in candidates:
-        out.append((candidate.effect, slice(at, at + len(candidate.parameters))))
-        at += len(candidate.parameters)
-    if constant is not None:
-        out.append((constant, slice(tracing.rows.base.n, tracing.rows.base.n + len(LINEAR[constant.name]))))
-    return out
-
-
-def _corrected(
-    request: Request, tracing: Tracing, chosen: Sequence[int], late: int
-) -> tuple[Tracing, list[int], Effect]:
+def _corrected(request: Request, some: Hypothesis, chosen: Sequence[int], late: int) -> tuple[Hypothesis, list[Effect]]:
     """The same effects, with the readings free of the last one, a channel's, and its constants improved."""
-    system, n = request.model.system, request.base.n
-    forces = [tracing.candidates[k].effect for k in chosen[:-1]]
-    solution = _solution(tracing, chosen)
-    last = tracing.candidates[chosen[-1]]
-    constant = improved(last.effect, solution[len(solution) - len(last.parameters) :])
-    used = list(range(len(forces)))
-    for _ in range(CORRECTIONS):
-        rows = _rows(request, solution[:n], late, [constant])
-        make = LateColumns(rows, applied(system, [constant]), late)
-        candidates = [make.of(force) for force in forces]
-        tracing = Tracing(rows, candidates, _fitted(rows, late), request.prior, [make.of(constant)], make)
-        tracing.settle(used)
-        solution = _solution(tracing, used)
-        constant = improved(constant, solution[n : n + len(last.parameters)])
-    return tracing, used, constant
+    solution = some.solution(chosen)
+    candidates = [some.tracing.candidates[k] for k in chosen]
+    *forces, last = (candidate.effect for candidate in candidates)
+    constant = improved(last, solution[some.places(candidates)[-1]])
+
+    def trial(constants: Sequence[Effect], beta: Array) -> Hypothesis:
+        rows = _rows(request, beta, late, constants)
+        make = LateColumns(rows, applied(request.model.system, constants), late)
+        trial = Hypothesis(make, [make.of(force) for force in forces], _fitted(rows, late), request.prior, constants)
+        trial.tracing.settle(trial.everything)
+        return trial
+
+    *_, best = corrections(trial, [constant], solution[: request.base.n])
+    return best.hypothesis, best.constants
 
 
 def _coefficients(
-    request: Request, tracing: Tracing, used: Sequence[int], effect: Effect, own: slice, constant: bool
+    request: Request, solution: Array, covariance: Array, effect: Effect, own: slice, constant: bool
 ) -> dict[str, tuple[float, float | None, str]]:
     """What people read of an effect."""
     system, base = request.model.system, request.base
-    solution, covariance = _solution(tracing, used), tracing.covariance(used)
     units = declarable(ENTRIES[effect.name], system)
     if constant:
         stds = deviations(effect, covariance[own, own])

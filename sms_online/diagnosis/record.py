@@ -8,12 +8,16 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from sms_online.description.schema import System
+from sms_online.pipeline.momentum_windows import HOPS
 from sms_online.pipeline.observer import Observer
 from sms_online.pipeline.synchronise import GridSamples
 from sms_online.stream import Array
 
 # What is kept at most, s: twenty minutes of a planar arm at 1 kHz are 200 MB, and no effect needs more to be found.
 LONGEST = 1200.0
+# Windows that a session is judged by at most: of a longer one stretches are taken, in window lengths.
+MOST_WINDOWS, STRETCH = 2500, 5.0
 
 
 @dataclass(frozen=True)
@@ -52,6 +56,12 @@ def joined(pieces: Sequence[GridSamples]) -> dict[int, Segment]:
         index, values = (np.concatenate([getattr(piece, part) for piece in own]) for part in ("index", "values"))
         out[number] = Segment(index, values)
     return out
+
+
+def bounded(system: System) -> tuple[int, int]:
+    """Samples of a stretch, and most samples, of a session that is used in part: more windows tell nothing new."""
+    windows, rate = system.windows, system.sample_rate
+    return round(STRETCH * windows.momentum * rate), round(MOST_WINDOWS * windows.momentum / HOPS * rate)
 
 
 def excerpts(segments: Sequence[Segment], length: int, most: int) -> list[Segment]:

@@ -80,7 +80,7 @@ def _settle(tracing: Tracing, make: CandidateColumns, chosen: Sequence[int], k: 
         sizes = [len(tracing.candidates[other].parameters) for other in chosen]
         first = len(solution) - sum(sizes[chosen.index(k) :])
         own = solution[first : first + sizes[chosen.index(k)]]
-        told = make.reported(effect, solution[: tracing.rows.base.n], own)
+        told = make.reported(effect, solution[: tracing.rows.Y.shape[2]], own)
         moved = effect.coefficients | {name: told[name] for name in effect.coefficients.keys() & told.keys()}
         if moved == effect.coefficients or min(moved.values()) <= 0.0:
             return

@@ -10,7 +10,7 @@ Source of the selection: Pati, Rezaiifar and Krishnaprasad, Asilomar Conf. Signa
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from sms_online.diagnosis.candidate import Candidate, Finding, Laws, Ranked
 from sms_online.diagnosis.evidence import Gain, basis, free_of, gain, least_squares, threshold, together
-from sms_online.diagnosis.rows import SessionRows
+from sms_online.diagnosis.weak_rows import WeakRows
 from sms_online.pipeline.momentum_windows import HOPS
 from sms_online.stream import Array
 from sms_online.trackers.factor import solve
@@ -57,19 +57,21 @@ class Tracing:
 
     def __init__(
         self,
-        rows: SessionRows,
+        rows: WeakRows,
         candidates: Sequence[Candidate],
         fitted: NDArray[np.bool_],
         prior: Prior | None = None,
         fixed: Sequence[Candidate] = (),
         laws: Laws | None = None,
+        declared: Iterable[str] = (),
     ) -> None:
         """fixed: effects of the model already, whose columns come right after its parameters'. laws: without them
-        candidates leave nothing open.
+        candidates leave nothing open. declared: keys of the effects that the model has.
         """
         self.rows, self.candidates, self.fitted = rows, list(candidates), fitted
         self._laws, self._prior = laws, prior
-        self._n_v = rows.model.layout.n_v
+        self._n, self._n_v = rows.Y.shape[2], rows.Y.shape[1]
+        self._declared = frozenset(declared)
         self._model = np.concatenate([rows.Y, *(candidate.columns for candidate in fixed)], axis=2)
         self.trials = len(self.candidates)
         # Which candidate each step of the search took, and all that were chosen then.
@@ -110,9 +112,9 @@ class Tracing:
         own = self.floor * self.std**2 + HOPS * self._own
         rows.whiten(own, self._free if np.any(self._free) else None)
         # What is known beforehand are rows too, of parameters alone.
-        known = prior_factor(self._prior, rows.base.n)
+        known = prior_factor(self._prior, self._n)
         self._known = len(known)
-        n, width = rows.base.n, self._model.shape[2]
+        n, width = self._n, self._model.shape[2]
         parts = [self._model, rows.b[..., None], *(candidate.columns for candidate in self.candidates)]
         white = self._whitened(np.concatenate(parts, axis=2))
         if self._known:
@@ -140,7 +142,7 @@ class Tracing:
 
     def _plausible(self, candidate: Candidate, found: Gain) -> Gain:
         """The gain, none where the effect cannot have the coefficients."""
-        possible = candidate.traits.plausible(found.coefficients, self.rows.model.system.sample_rate)
+        possible = candidate.traits.plausible(found.coefficients, self.rows.sample_rate)
         return found if possible else replace(found, gain=0.0)
 
     def gain_of(self, candidate: Candidate, chosen: Sequence[int]) -> Gain:
@@ -290,7 +292,7 @@ class Tracing:
     def _eligible(self, chosen: Sequence[int], refused: set[str]) -> list[int]:
         """Candidates that may come to those chosen; one that extends another comes after it, and then replaces it."""
         taken = {self.candidates[k].key for k in chosen}
-        held = taken | {f"{effect.name}@{effect.where}" for effect in self.rows.model.system.effects}
+        held = taken | self._declared
         return [
             k
             for k, candidate in enumerate(self.candidates)

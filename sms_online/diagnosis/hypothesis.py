@@ -1,0 +1,161 @@
+"""A model with effects against the rows of a session: the search and the verdict of captures and running sessions."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sms_online.description.schema import Effect
+from sms_online.diagnosis.candidate import Candidate
+from sms_online.diagnosis.candidates import CandidateColumns
+from sms_online.diagnosis.constants import improved
+from sms_online.diagnosis.residuals import RowResidual
+from sms_online.diagnosis.shape import refine
+from sms_online.diagnosis.trace import Tracing
+from sms_online.effects.traits import INEXACT
+from sms_online.stream import Array
+from sms_online.trackers.interface import Prior
+
+# Constants are improved as far as the data tell when they move by less than this share of their deviation.
+SETTLED = 0.1
+# Times that constants are improved, each with samples corrected by those found before.
+CORRECTIONS = 3
+# Share of a session that coefficients are fitted to where no other capture is held out; the rest checks them.
+FITTED = 2.0 / 3.0
+# Times at most that rows are weighed anew by what was found, to search again.
+REWEIGHED = 2
+# A verdict names effects that take away all but this share of what is beyond noise: a wrong one that is 10° from the
+# right one leaves sin² 10°.
+LARGEST_SHARE_LEFT = 0.03
+# No right effect leaves a row type more than this multiple of its noise, unless that is what its law is uncertain by.
+MOST_LEFT = 2.0
+
+
+class Hypothesis:
+    """A model, constants that are taken off its samples, and candidates for what it lacks, against a session's rows.
+
+    make: of candidates. constants: with fixed, their columns: of what they are still off by. tracing: the search.
+    """
+
+    def __init__(
+        self,
+        make: CandidateColumns,
+        candidates: Sequence[Candidate],
+        fitted: NDArray[np.bool_],
+        prior: Prior | None,
+        constants: Sequence[Effect] = (),
+    ) -> None:
+        """fitted (W,): windows that tell coefficients; the others check them."""
+        self.make, self.rows = make, make.rows
+        self.prior, self.fitted = prior, fitted
+        self.constants = list(constants)
+        self.trace(candidates)
+
+    def trace(self, candidates: Sequence[Candidate]) -> None:
+        """Begin to search with the weights that the rows have now."""
+        self.fixed = [self.make.of(effect) for effect in self.constants]
+        declared = (f"{effect.name}@{effect.where}" for effect in self.rows.model.system.effects)
+        self.tracing = Tracing(self.rows, candidates, self.fitted, self.prior, self.fixed, self.make, declared)
+
+    def run(self) -> list[int]:
+        """Numbers of the candidates found, with the rows' weights as they are."""
+        return self.tracing.run(lambda chosen, k: refine(self.tracing, self.make, chosen, k))
+
+    @property
+    def everything(self) -> range:
+        """Numbers of all candidates."""
+        return range(len(self.tracing.candidates))
+
+    def solution(self, chosen: Sequence[int]) -> Array:
+        """Parameters, what constants change by, and coefficients, from all windows."""
+        return self.tracing.solution(chosen, np.ones(self.rows.count, dtype=bool))
+
+    def residual(self, chosen: Sequence[int]) -> Array:
+        """What is left of every row (W, n_v) over its deviation."""
+        return self.tracing.residual(chosen, self.solution(chosen))
+
+    def excess(self, chosen: Sequence[int]) -> float:
+        """Sum of squares that is left beyond noise."""
+        residual = self.residual(chosen)
+        return float(np.sum(residual**2) - residual.size)
+
+    def places(self, candidates: Sequence[Candidate]) -> list[slice]:
+        """Where a solution holds the coefficients of constants and then of candidates chosen, one after the other."""
+        sizes = [len(each.parameters) for each in (*self.fixed, *candidates)]
+        ends = self.rows.base.n + np.cumsum([0, *sizes])
+        return [slice(start, end) for start, end in zip(ends[:-1].tolist(), ends[1:].tolist(), strict=True)]
+
+    def improved(self, solution: Array) -> list[Effect]:
+        """The constants improved by a solution."""
+        places = self.places([])
+        return [improved(effect, solution[own]) for effect, own in zip(self.constants, places, strict=True)]
+
+    def settled(self, solution: Array) -> bool:
+        """Whether there is nothing more to improve in the constants."""
+        n = self.rows.base.n
+        own = slice(n, n + sum(len(candidate.parameters) for candidate in self.fixed))
+        std = np.sqrt(np.diag(self.tracing.covariance(self.everything))[own])
+        return bool(np.all(np.abs(solution[own]) < SETTLED * std))
+
+    def found(self, chosen: Sequence[int], solution: Array) -> tuple[list[Effect], list[Effect]]:
+        """Of the effects chosen, those that become constants, with their values, and the others."""
+        candidates = [self.tracing.candidates[k] for k in chosen]
+        places = self.places(candidates)[len(self.fixed) :]
+        constants = [improved(c.effect, solution[own]) for c, own in zip(candidates, places, strict=True) if c.constant]
+        return constants, [candidate.effect for candidate in candidates if not candidate.constant]
+
+
+@dataclass(frozen=True)
+class Correction:
+    """One improvement of constants: what tells it, its solution (n + c,), and the constants improved."""
+
+    hypothesis: Hypothesis
+    solution: Array
+    constants: list[Effect]
+
+    @property
+    def settled(self) -> bool:
+        """Whether the next one would change nothing."""
+        return self.hypothesis.settled(self.solution)
+
+
+def corrections(
+    trial: Callable[[Sequence[Effect], Array], Hypothesis], constants: Sequence[Effect], beta: Array
+) -> Iterator[Correction]:
+    """Constants improved, each time with samples free of those found before.
+
+    trial: makes the hypothesis of constants, rows weighed with beta (n,); its candidates are all chosen.
+    """
+    for _ in range(CORRECTIONS):
+        some = trial(constants, beta)
+        solution = some.solution(some.everything)
+        constants, beta = some.improved(solution), solution[: beta.size]
+        yield Correction(some, solution, list(constants))
+
+
+def share_left(before: float, after: float) -> float:
+    """Share of what is beyond noise, a sum of squares, that is left."""
+    return max(0.0, after) / max(before, 1.0)
+
+
+def verdict(
+    named: bool,
+    left: float,
+    before: Mapping[str, RowResidual],
+    after: Mapping[str, RowResidual],
+    found: Sequence[Candidate],
+) -> str:
+    """What may be said where effects were named or not, and leave this share of what was beyond noise."""
+    if not any(row.beyond for row in after.values()):
+        return "named" if named else "clean"
+    if not named or left > LARGEST_SHARE_LEFT:
+        return "unexplained"
+    # Friction of a joint acts on the rows of that joint.
+    for name, row in after.items():
+        inexact = max((each.traits.inexact for each in found if each.effect.where == name), default=INEXACT)
+        if row.whitened > MOST_LEFT and row.whitened**2 > inexact * before[name].whitened ** 2:
+            return "unexplained"
+    return "named"
