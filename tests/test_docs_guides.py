@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from tracker_rows import PI_TRUE, N, exciting_rows, rows_of
 
-from sms_online.trackers import RecursiveLeastSquares, Rows
+from sms_online.trackers import Information, RecursiveLeastSquares, Rows
 
 ROOT = Path(__file__).parents[1]
 LARGEST_README = 6000  # bytes
@@ -69,6 +69,16 @@ def test_the_guides_tracker_without_fading_is_least_squares() -> None:
     np.testing.assert_allclose(
         [one.rss, one.dof, one.condition_number], [other.rss, other.dof, other.condition_number], rtol=1e-6
     )
+
+
+def test_the_guides_tracker_goes_on_from_what_others_know() -> None:
+    rows = exciting_rows(seed=5, count=500)
+    tracker, reference = guide_tracker()(N, 1e12), guide_tracker()(N, 1e12)
+    tracker.begin(Information.none(N).with_rows(rows.whitened(N)))
+    reference.update(rows)
+    one, other = tracker.estimate(), reference.estimate()
+    np.testing.assert_allclose(one.pi, other.pi, rtol=1e-8)
+    np.testing.assert_allclose([one.rows, one.dof], [other.rows, other.dof], rtol=1e-9)
 
 
 def test_the_guides_tracker_follows_a_change_and_goes_on_after_a_save() -> None:

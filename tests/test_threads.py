@@ -17,6 +17,7 @@ from sms_adapters.system_file import load_system
 from sms_online.diagnosis import online_search
 from sms_online.diagnosis.online import Immediate, OnlineDiagnosis
 from sms_online.pipeline.estimator import Estimator
+from sms_online.pipeline.observer import Observer
 from sms_online.threads import one_blas_thread
 from sms_sim.simulate import sampled_blocks, simulate
 
@@ -27,6 +28,7 @@ import json, sys
 import numpy as np
 from sms_adapters.system_file import load_system
 from sms_online.pipeline.estimator import Estimator
+from sms_online.pipeline.observer import Observer
 from evaluated import results_document
 from sms_online.stream import Block
 
@@ -72,15 +74,13 @@ def test_blocks_and_searches_are_worked_off_by_one_thread(monkeypatch: pytest.Mo
         estimator = Estimator(BARE, block.channels, "test")
         requests: list[online_search.Request] = []
         online = OnlineDiagnosis(estimator, Immediate(), adopt=False)
-        monkeypatch.setattr(online._searcher, "submit", lambda number, request: bool(requests.append(request)))
-        step = estimator.on_block
-        assert step is not None
+        monkeypatch.setattr(online.searcher, "submit", lambda number, request: bool(requests.append(request)))
 
-        def on_block() -> None:
-            seen.append(threads())
-            step()
+        class Watcher(Observer):
+            def block_through(self) -> None:
+                seen.append(threads())
 
-        estimator.on_block = on_block
+        estimator.observers.append(Watcher())
         for piece in block.pieces(7):
             estimator.push(piece)
             assert threads() == {MORE}
