@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from copy import copy
 from pathlib import Path
 
 import numpy as np
@@ -153,10 +154,10 @@ def test_colours_go_from_good_to_bad() -> None:
 
 
 class Watched:
-    """As much of an estimator as a residual needs."""
+    """As much of a session's statistics as a residual needs."""
 
     def __init__(self) -> None:
-        self.joint_residuals = [SquaredResidual(np.zeros((2, 2)))]
+        self.joints = [SquaredResidual(np.zeros((2, 2)))]
         self.events: list[Event] = []
 
 
@@ -167,7 +168,8 @@ def test_the_recent_residual_forgets_what_is_over() -> None:
     for t in np.arange(0.0, 3.0, 0.25):
         # Nothing of the torque of 4 is explained by β Y = 2 at first, all of 2 later.
         measured = 4.0 if t < 1.0 else 2.0
-        estimator.joint_residuals[0].add(rows, np.array([measured]), measured)
+        estimator.joints = [copy(estimator.joints[0])]
+        estimator.joints[0].add(rows, np.array([measured]), measured)
         share = recent.push(float(t), estimator, beta)  # type: ignore[arg-type]
         if t < 1.0:
             assert share[0] == pytest.approx(0.5)

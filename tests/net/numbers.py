@@ -33,7 +33,9 @@ Value = float | int | bool | str | None
 Numbers = dict[str, Value]
 
 # Keys of the documents that hold what was put in, or sentences.
-LEFT_OUT = ("schema", "system", "summary", "warnings", "throughput_samples_per_s", "unit", "symbol", "separated_by")
+LEFT_OUT = (
+    "schema", "system", "summary", "warnings", "throughput_samples_per_s", "unit", "symbol", "separated_by", "nominal",
+)  # fmt: skip
 PIECE = 1024  # samples
 
 
