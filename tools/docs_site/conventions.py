@@ -33,11 +33,11 @@ def spatial_frames() -> str:
         | {f"link_{i}.marker_{j}.{name}": value * j**2 for i in (1, 2) for j in (1, 2) for name, value in BENT.items()},
     )  # fmt: skip
     configuration = model.chain.configure(x)
-    figure, axes = _paper(8.0, 5.6)
+    figure, axes = _paper(8.0, 3.4)
     frames = configuration.frames
     _base(axes, model, configuration, frames)
     _links(axes, model, configuration)
-    for k, name, offset in ((2, "{1}", (14, -20)), (4, "{2}", (20, -12)), (5, "tip", (22, 4))):
+    for k, name, offset in ((2, "{1}", (16, -22)), (4, "{2}", (20, -12)), (5, "tip", (22, 4))):
         _triad(axes, frames[k], name, offset)
     for i, reach in ((1, 0.75), (2, -0.75)):
         mount, axis = frames[2 * i - 1], model.chain.axes[i - 1]
@@ -101,7 +101,7 @@ def _links(axes: Axes, model: Model, configuration: Configuration) -> None:
             at = origin + rotation @ np.array([straight, *(readings[f"marker_{j}.{u}"] for u in ("u_y", "u_z"))])
             axes.plot(*_seen(at), "o", color="#d68910", markersize=7, zorder=5)
             if j < link.elements:
-                _text(axes, at, f"marker_{j} of link_{i + 1}", color="#9c640c", offset=((-48, -14), (6, -14))[i])
+                _text(axes, at, f"marker_{j} of link_{i + 1}", color="#9c640c", offset=((-24, -26), (6, -14))[i])
 
 
 def link_conventions() -> str:
@@ -111,7 +111,7 @@ def link_conventions() -> str:
     kinematics, link = model.chain.flexible[0], system.links[0]
     assert kinematics is not None
     assert isinstance(link, FlexibleLink)
-    figure = Figure(figsize=(8.0, 3.0), layout="constrained")
+    figure = Figure(figsize=(8.0, 2.1), layout="constrained")
     readings = {"u_y": 0.07, "theta_z": 0.13, "u_z": 0.07, "theta_y": -0.13}
     bent = {f"marker_{j}.{name}": value * (1.0, 2.9)[j - 1] for j in (1, 2) for name, value in readings.items()}
     q_f = np.array([[bent.get(name, 0.0) for name in kinematics.marker_names]])

@@ -8,6 +8,7 @@ from types import NoneType, UnionType
 from typing import Annotated, Any, Literal, Union, get_args, get_origin
 
 from annotated_types import Ge, Gt, MinLen
+from markdown.extensions.toc import slugify
 from pydantic.fields import FieldInfo
 
 from sms_online.description import schema
@@ -101,7 +102,7 @@ def _records(annotation: Any) -> list[type[Record]]:
 
 def _section(record: type[Record], heading: str) -> str:
     about, fields = described_fields(record)
-    lines = [f"## {heading} {{ #{record.__name__.lower()} }}", "", about, ""]
+    lines = [f"## {heading}", "", about, ""]
     lines += ["| key | value | default | meaning |", "|---|---|---|---|"]
     tables = {field: key for key, field in RENAMED.items()}
     for name, field in record.model_fields.items():
@@ -136,7 +137,8 @@ def _named(annotation: Any, limits: list[Any]) -> str:
     if origin is dict:
         return f"table of {_named(inner[1], [])}"
     if isinstance(annotation, type) and issubclass(annotation, Record):
-        return f"[{annotation.__name__}](#{annotation.__name__.lower()})"
+        heading = HEADINGS[annotation].replace("`", "")
+        return f"[{annotation.__name__}](#{slugify(heading, '-')})"
     return _limited({float: "number", int: "whole number", str: "text", bool: "true or false"}[annotation], limits)
 
 
