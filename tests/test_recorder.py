@@ -18,12 +18,13 @@ from bus_streams import AxisBus, axis_testbed, merged
 
 from sms_adapters import recorder as recorder_module
 from sms_adapters.raw import ERROR_FRAME, EXTENDED, FD_FRAME, MOST_BYTES, REMOTE_FRAME, CanFrames, SerialChunk
-from sms_adapters.recorder import Recorder
+from sms_adapters.recorder import Recorder, being_recorded
 from sms_adapters.recording import Recording
 from sms_adapters.session_log import RULES, RecordedItems, SessionHeader, read_header
 from sms_adapters.sources import open_source
 from sms_online.errors import InputError
 from sms_online.stream import Array
+from sms_tools.results_file import results_directory
 
 EPOCH = 1_700_000_000_123_456
 HEADER = SessionHeader(EPOCH, {"drive": "can", "encoder": "serial"}, 0.0, {"numpy": np.__version__})
@@ -131,7 +132,7 @@ import sys, time
 import numpy as np
 from pathlib import Path
 from sms_adapters.raw import SerialChunk
-from sms_adapters.recorder import Recorder
+from sms_adapters.recorder import Recorder, being_recorded
 from sms_adapters.session_log import SessionHeader
 recorder = Recorder(Path({str(tmp_path / "run")!r}), SessionHeader({EPOCH}, {{"encoder": "serial"}}, 0.0, {{}}))
 start = time.monotonic()
@@ -229,3 +230,27 @@ def until(condition: object, patience: float = 5.0) -> None:
     while not condition():
         assert time.monotonic() < end
         time.sleep(0.01)
+
+
+def test_nothing_else_goes_into_a_running_sessions_folder(tmp_path: Path) -> None:
+    recorder = Recorder(tmp_path / "run", HEADER)
+    with pytest.raises(InputError, match="the folder of a session that runs"):
+        results_directory(tmp_path / "run")
+    recorder.close(1.0)
+    assert results_directory(tmp_path / "run") == tmp_path / "run"
+
+
+def test_a_killed_sessions_folder_is_free(tmp_path: Path) -> None:
+    program = (
+        "import time; from pathlib import Path; from sms_adapters.recorder import Recorder; "
+        "from sms_adapters.session_log import SessionHeader; "
+        "recorder = Recorder(Path('run'), SessionHeader(0, {}, 0.0, {})); print('recording', flush=True); "
+        "time.sleep(60)"
+    )
+    process = subprocess.Popen([sys.executable, "-c", program], cwd=tmp_path, stdout=subprocess.PIPE, text=True)
+    assert process.stdout is not None
+    assert process.stdout.readline() == "recording\n"
+    assert being_recorded(tmp_path / "run")
+    process.kill()
+    process.wait()
+    assert results_directory(tmp_path / "run") == tmp_path / "run"

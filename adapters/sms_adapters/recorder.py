@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import fcntl
 import os
 import threading
 from collections import deque
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -84,6 +86,18 @@ class _Track:
             self.dropped.write(f"{first} {count}\n")
 
 
+def being_recorded(directory: Path) -> bool:
+    """Whether a process that lives records into the directory."""
+    try:
+        with (directory / SESSION).open("rb") as session:
+            fcntl.flock(session, fcntl.LOCK_SH | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return True
+    except OSError:  # no recording, or none that can be looked at
+        return False
+    return False
+
+
 class Recorder:
     """Writes the raw items of all sources into a directory, see `session_log`.
 
@@ -104,7 +118,11 @@ class Recorder:
             directory.mkdir(parents=True, exist_ok=True)
             if (directory / SESSION).exists():
                 raise InputError(str(directory), "", "a recording that is there already", "a new directory")
-            (directory / SESSION).write_text(header_text(header), encoding="utf-8")
+            self._session = (directory / SESSION).open("w", encoding="utf-8")
+            with suppress(OSError):  # not every network's disk has locks, and none is worth the session
+                fcntl.flock(self._session, fcntl.LOCK_EX)
+            self._session.write(header_text(header))
+            self._session.flush()
             for name, content in (files or {}).items():
                 (directory / name).write_bytes(content)
         except OSError as error:
@@ -139,8 +157,8 @@ class Recorder:
             for file in (track.main, track.stamps, track.dropped):
                 file.close()
         try:
-            with (self.directory / SESSION).open("a", encoding="utf-8") as session:
-                session.write(ending_text(duration, self.unrecorded, warnings))
+            with self._session:
+                self._session.write(ending_text(duration, self.unrecorded, warnings))
         except OSError as error:
             self.problem = error.strerror or str(error)
 

@@ -6,6 +6,7 @@ from datetime import datetime
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
+from sms_adapters.recorder import being_recorded
 from sms_online.errors import InputError
 
 NAME = "results.json"
@@ -15,12 +16,15 @@ RUNS = Path("runs")
 def results_directory(out: Path | None) -> Path:
     """The directory asked for, or a new name in runs/; it is made when results are written.
 
-    Raises InputError where it cannot be made, before a long session has run for nothing.
+    Raises InputError where it cannot be made, or a running session records into it, before a long session has run for
+    nothing.
     """
     directory = _new_run() if out is None else out
     existing = next(path for path in (directory, *directory.absolute().parents) if path.exists())
     if not existing.is_dir():
         raise InputError(str(directory), "", f"{existing} is no directory", "a directory that can be made")
+    if being_recorded(directory):
+        raise InputError(str(directory), "", "the folder of a session that runs", "another directory")
     try:
         # Trying tells more than permissions do: of a disk that is full or read-only, and to root.
         with TemporaryDirectory(prefix=".sms-online-", dir=existing) as tried:
