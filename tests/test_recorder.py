@@ -165,6 +165,22 @@ def test_a_torn_last_line_is_left_out(tmp_path: Path) -> None:
     assert items.cut
 
 
+def test_the_replay_of_a_recording_warns_of_a_cut_line(tmp_path: Path) -> None:
+    system = axis_testbed(tmp_path)
+    bus = AxisBus(seconds=2.0)
+    recorder = Recorder(tmp_path / "run", HEADER)
+    recorder.put("drive", [bus.drive()], dropped=False)
+    recorder.put("encoder", bus.encoder(system), dropped=False)
+    recorder.close(2.0)
+    recording = Recording(tmp_path / "run", system, tmp_path)
+    list(recording)
+    assert "cut" not in " ".join(recording.warnings)
+    log = tmp_path / "run" / "encoder.serial"
+    log.write_bytes(log.read_bytes()[:-1])
+    list(recording)
+    assert "encoder.serial: the last line is cut (no newline at its end) and left out" in recording.warnings
+
+
 def test_a_full_disk_is_named_and_writing_goes_on_when_there_is_room(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

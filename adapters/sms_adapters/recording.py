@@ -62,6 +62,7 @@ class Recording:
             expected = f"those of the system: {', '.join(names) or 'none'}; --system {directory / SYSTEM} has its own"
             raise InputError(str(directory), "sources", found, expected)
         self._merger = merger(system, system_directory, self._header.start)
+        self._items: list[RecordedItems] = []  # of the current iteration
 
     @property
     def channels(self) -> tuple[str, ...]:
@@ -77,7 +78,12 @@ class Recording:
     @property
     def warnings(self) -> list[str]:
         """What was wrong with the devices, and with the recording."""
-        found = self._merger.warnings
+        cut = [
+            f"{items.path.name}: the last line is cut (no newline at its end) and left out"
+            for items in self._items
+            if items.cut
+        ]
+        found = self._merger.warnings + cut
         if self._header.rules != RULES:
             found.append(f"{self._directory.name}: recorded by another version, results differ a little from its own")
         if self._ending is None:
@@ -87,11 +93,12 @@ class Recording:
 
     def __iter__(self) -> Iterator[Block]:
         """Yield the blocks from the beginning."""
-        self._merger = ours = merger(self._system, self._system_directory, self._header.start)
-        recorded = [
-            iter(RecordedItems(self._directory, source.name, self._header.sources[source.name], self._header.epoch))
+        self._items = [
+            RecordedItems(self._directory, source.name, self._header.sources[source.name], self._header.epoch)
             for source in self._system.sources
         ]
+        self._merger = ours = merger(self._system, self._system_directory, self._header.start)
+        recorded = [iter(items) for items in self._items]
         waiting: list[list[Raw]] = [[] for _ in recorded]
         number = 0
         last = 0 if self._ending is None else round(self._ending["duration_s"] / TICK)
