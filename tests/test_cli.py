@@ -8,6 +8,7 @@ import math
 import signal
 import subprocess
 import sys
+from importlib.metadata import version
 from pathlib import Path
 from time import perf_counter
 from typing import Any
@@ -320,7 +321,7 @@ def test_markers_of_the_papers_links(bench: Path, capsys: pytest.CaptureFixture[
 
 
 def test_the_program_runs_as_a_module_and_helps(bench: Path) -> None:
-    said = python("-m", "sms_tools", "--help")
+    said = python("-m", "sms_online", "--help")
     assert said.returncode == 0
     for verb in ("demo", "simulate", "replay", "import", "markers"):
         assert f"\n    {verb} " in said.stdout
@@ -344,3 +345,25 @@ def test_a_reader_that_leaves_early_is_no_error(bench: Path) -> None:
     process.stderr.close()
     assert process.wait(timeout=60) == 0
     assert (bench / "done" / "results.json").exists()
+
+
+def test_the_version_is_that_of_the_package(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["--version"]) == 0
+    assert capsys.readouterr().out == f"sms-online {version('sms-online')}\n"
+
+
+@pytest.mark.parametrize(
+    ("typed", "completed"),
+    [("sms-online rep", "replay"), ("sms-online replay --ad", "--adopt"), ("sms-online replay ru", "run.csv")],
+)
+def test_bash_completes_verbs_options_and_files(
+    bench: Path, capsys: pytest.CaptureFixture[str], typed: str, completed: str
+) -> None:
+    assert main(["--print-completion", "bash"]) == 0
+    script = capsys.readouterr().out
+    words = typed.split()
+    state = f"COMP_WORDS=({typed}); COMP_CWORD={len(words) - 1}; COMP_LINE={typed!r}; COMP_POINT={len(typed)}"
+    function = "$(complete -p sms-online | sed 's/.*-F \\([^ ]*\\).*/\\1/')"
+    call = f'{state}; {function} sms-online {words[-1]} {words[-2]}; printf "%s\\n" "${{COMPREPLY[@]}}"'
+    done = subprocess.run(["bash", "-c", f"{script}\n{call}"], cwd=bench, capture_output=True, text=True, timeout=60)
+    assert completed in done.stdout.split(), done.stderr

@@ -33,6 +33,33 @@ class Parser(argparse.ArgumentParser):
         self.exit(BAD_INPUT, f"{self.prog}: {message}\n")
 
 
+class Version(argparse.Action):
+    """Prints which version this is."""
+
+    def __call__(self, parser: argparse.ArgumentParser, *_: object) -> NoReturn:
+        """Exit with code 0."""
+        from importlib.metadata import version  # costs as much as all the rest of a usage error
+
+        print(f"{PROGRAM} {version(PROGRAM)}")
+        parser.exit(OK)
+
+
+class Completion(argparse.Action):
+    """Prints the completion of verbs, options and files for a shell."""
+
+    def __call__(self, parser: argparse.ArgumentParser, _: argparse.Namespace, shell: Any, *more: object) -> NoReturn:
+        """Exit with code 0."""
+        import shtab
+
+        for each in (parser, *parser._subparsers._group_actions[0].choices.values()):  # type: ignore[union-attr]
+            for action in each._actions:
+                if action.type is Path or action.dest == "system":
+                    files = shtab.DIRECTORY if action.metavar == "DIR" else shtab.FILE
+                    action.complete = files
+        print(shtab.complete(parser, shell))
+        parser.exit(OK)
+
+
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run one verb and return its exit code: 0, 2 bad input, 3 nothing determined, 130 interrupted."""
     for stream in (sys.stdout, sys.stderr):
@@ -67,6 +94,9 @@ def _parser() -> Parser:
         description="Online parameter estimation for flexible space manipulators.",
         epilog="Exit codes: 0 done, 2 bad input, 3 nothing is determined (results are written), 130 interrupted.",
     )
+    parser.add_argument("--version", action=Version, nargs=0, help="which version this is")
+    text = "how bash, zsh or tcsh complete what is typed, to be written where the shell looks for it"
+    parser.add_argument("--print-completion", action=Completion, choices=("bash", "zsh", "tcsh"), help=text)
     verbs = parser.add_subparsers(metavar="VERB", required=True)
     verb_parsers = (
         _add_demo, _add_live, _add_record, _add_simulate, _add_replay, _add_diagnose, _add_import, _add_markers,
