@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 
 import pytest
@@ -52,9 +53,26 @@ def test_bounds_rise_with_the_noise_and_without_a_sensor(rig: Path, capsys: pyte
     assert all(bounds[1][name] > 4.0 * bounds[0][name] for name in bounds[0])
 
 
-def test_a_bound_needs_noise(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["bound", "--system", "paper-planar"]) == 2
-    assert "no noise is stated" in capsys.readouterr().err
+# All that have a trajectory; ak80-pendulum states its noise.
+WITHOUT_NOISE = (
+    "emps", "paper-planar", "paper-planar-exact", "paper-planar-table-v", "seven-joint", "spatial-two-link",
+)  # fmt: skip
+
+
+@pytest.mark.parametrize("name", WITHOUT_NOISE)
+def test_a_shipped_system_without_stated_noise_has_the_bounds_of_grade_b(
+    name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "system.toml"
+    path.write_text(re.sub(r"(?m)^duration = .*", "duration = 0.4", shipped_text(name)), encoding="utf-8")
+    assert main(["bound", "--system", str(path), "--json"]) == 0
+    out, said = capsys.readouterr()
+    assert f"noise: grade B, for {path} does not state that of every sensor" in said
+    assert main(["bound", "--system", str(path), "--json", "--grade", "B"]) == 0
+    same, said = capsys.readouterr()
+    assert same == out
+    assert json.loads(out)["grade"] == "B"
+    assert "noise: " not in said
 
 
 def test_a_replay_states_the_bound_on_demand(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

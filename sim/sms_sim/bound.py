@@ -29,6 +29,8 @@ from sms_sim.simulate import exact_states
 
 # A bound needs every drive measured, so these are never left out.
 DRIVES = ("tau_", "force_")
+# Noise of sensors whose system states none, as that of the demo.
+DEFAULT_GRADE = "B"
 
 
 @dataclass(frozen=True)
@@ -59,10 +61,14 @@ def percent(std: float, value: float) -> float | None:
 
 @dataclass(frozen=True)
 class Bounds:
-    """Cramér–Rao bounds of a system's parameters, for a motion and a set of sensors; parameters: by name."""
+    """Cramér–Rao bounds of a system's parameters, for a motion and a set of sensors; parameters: by name.
+
+    grade: of the noise, None where it is the described or recorded one.
+    """
 
     system: str
     parameters: Mapping[str, Bound]
+    grade: str | None
 
     def rows(self) -> tuple[list[str], list[list[str]]]:
         """Headings, and a row of cells for each parameter."""
@@ -89,7 +95,7 @@ class Bounds:
             }
             for p in self.parameters.values()
         ]
-        return {"schema": "sms-online/bound/1", "system": self.system, "parameters": parameters}
+        return {"schema": "sms-online/bound/1", "system": self.system, "grade": self.grade, "parameters": parameters}
 
     def to_json(self) -> str:
         """The document as text; numbers that do not exist are null."""
@@ -112,7 +118,8 @@ def bound(
     """The least standard deviation of each parameter that a motion and its sensors allow (Cramér–Rao).
 
     data: recorded samples, whose sensors are what they are; without them the described trajectory is simulated. grade:
-    noise in place of the described one, "A", "B" or "C". each_sensor: also without each of the described sensors.
+    noise in place of the described one, "A", "B" or "C"; "B" where a sensor's is not described. each_sensor: also
+    without each of the described sensors.
     Raises InputError where there is no trajectory, a drive is not measured, or an effect needs more than a motion
     holds.
     """
@@ -139,6 +146,8 @@ def bound(
 
 def _of_simulation(system: System, grade: str | None, each_sensor: bool) -> Bounds:
     plant = Plant(system)
+    if grade is None and not _noise(Sensors(system, _readable(plant), None, seed=0)).all():
+        grade = DEFAULT_GRADE
     # Sensors come first: what is missing of them is known before a long simulation.
     described = _sensors(plant, system, grade)
     without = {}
@@ -156,11 +165,16 @@ def _of_simulation(system: System, grade: str | None, each_sensor: bool) -> Boun
         return cramer_rao_bound(plant.dynamics, base, [motion], sensors)
 
     reduced_bounds = {left: least(sensors) for left, sensors in without.items()}
-    return _bounds(system, base.parameters, base.values(plant.parameters), least(described), reduced_bounds)
+    return _bounds(system, base.parameters, base.values(plant.parameters), least(described), reduced_bounds, grade)
 
 
 def _bounds(
-    system: System, parameters: Iterable[Any], values: Array, stds: Array, without: Mapping[str, Array] | None = None
+    system: System,
+    parameters: Iterable[Any],
+    values: Array,
+    stds: Array,
+    without: Mapping[str, Array] | None = None,
+    grade: str | None = None,
 ) -> Bounds:
     return Bounds(
         system.name,
@@ -175,13 +189,20 @@ def _bounds(
             )
             for k, p in enumerate(parameters)
         },
+        grade,
     )
 
 
 def _sensors(plant: Plant, system: System, grade: str | None) -> SensorSet:
     """The sensors that `system` describes on a plant, or those of positions and drives with a grade's noise."""
-    readable = (*plant.channels[: len(system.joints)], *readable_channels(plant.model))
-    sensors = Sensors(system, readable if grade is None else plant.channels, grade, seed=0)
-    # Rounding to a resolution r adds r²/12.
-    sigma = np.hypot(sensors.noise, sensors.resolution / math.sqrt(12.0))
-    return sensor_set(plant.model, sensors.channels, sigma, sensors.rate)
+    sensors = Sensors(system, _readable(plant) if grade is None else plant.channels, grade, seed=0)
+    return sensor_set(plant.model, sensors.channels, _noise(sensors), sensors.rate)
+
+
+def _readable(plant: Plant) -> tuple[str, ...]:
+    return *plant.channels[: len(plant.system.joints)], *readable_channels(plant.model)
+
+
+def _noise(sensors: Sensors) -> Array:
+    """σ (channels,) of a sample; rounding to a resolution r adds r²/12."""
+    return np.asarray(np.hypot(sensors.noise, sensors.resolution / math.sqrt(12.0)))

@@ -259,7 +259,7 @@ def _add_bound(verbs: Verbs) -> None:
     text = "a capture; without one the described trajectory is simulated"
     parser.add_argument("capture", metavar="CAPTURE", type=Path, nargs="?", help=text)
     _add_system(parser)
-    text = "noise of all sensors in place of the described one: A, B, C ever more"
+    text = "noise of all sensors in place of the described one: A, B, C ever more; B where none is described"
     parser.add_argument("--grade", choices=("A", "B", "C"), help=text)
     text = "what the bounds would be without each of the described sensors"
     parser.add_argument("--each-sensor", action="store_true", help=text)

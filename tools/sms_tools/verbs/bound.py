@@ -19,7 +19,10 @@ def run(args: argparse.Namespace) -> int:
     system, folder = described_system(args)
     recorded = None if args.capture is None else open_recorded(args.capture, system, directory=folder)
     bounds = bound(system, recorded, grade=args.grade, each_sensor=args.each_sensor)
-    show(report_console(args.json), _table(bounds))
+    console = report_console(args.json)
+    if bounds.grade != args.grade:
+        show(console, f"noise: grade {bounds.grade}, for {args.system} does not state that of every sensor")
+    show(console, _table(bounds))
     if args.json:
         print(bounds.to_json())
     determined = any(math.isfinite(parameter.std) for parameter in bounds.parameters.values())
