@@ -1,0 +1,215 @@
+"""An estimate that does not change when rows without a torque are scaled: for rows that leave more than noise.
+
+Rows of links and base hold no torque: they are homogeneous in π, and so is what noise makes of them. Least squares,
+weighted anew with the noise that π itself predicts, lowers their residual by shrinking π wherever they hold more than
+noise; the weights follow, and it ends at zero. With w = (π, -1), A the Gram matrix of a row type's whitened rows [Y b]
+and G that of what sensors' noise adds to them, the estimate is the minimum of
+
+    Σ n/2 log(wᵀ A w / wᵀ (G + e² M) w) + Σ n/2 wᵀ A w / (wᵀ G w + r),
+
+the first sum over the types that leave more than noise, the second over the others. The quotient of a homogeneous type
+is the same for every scale of π, so nothing draws π to zero, and only rows with a torque fix its scale. e² M is what
+the model lacks beside noise: an error of each column in proportion to its size, the same share e of all of them, M the
+diagonal of A - G; of rows that hold a joint's torque an error of that torque alone, for with errors of columns that
+large the inverse regression of a badly explained torque would enlarge π without end. e follows from the residual. G in
+the denominators also frees the minimum of what noise in the columns does to least squares. r is what weights have as
+noise beside G.
+
+Reading: the concentrated likelihood of the functional errors-in-variables model, one variance factor a row type.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sms_online.pipeline.momentum_windows import EXPONENT, HOPS
+from sms_online.pipeline.weak_form import test_function
+from sms_online.stream import Array
+
+# Directions of scaled columns with less information than this share of the largest are not moved along.
+RANK_TOLERANCE = 1e-10
+# Half the square of the Newton step in standard deviations at which the minimum is found, and steps at most.
+CONVERGED, MOST_STEPS = 1e-8, 100
+# Curvature of the criterion is no less than this share of that of its squares, for the length of a step.
+LEAST_CURVATURE = 1e-2
+# Rounding of a sum of products, in units of its last place.
+ROUNDED = 16.0
+# A step is halved until it gains this share of what the slope promises, so many times at most.
+SUFFICIENT, HALVINGS = 1e-4, 30
+
+
+def _overlap() -> float:
+    """How many windows share one error that each row has of its own, hop by hop, as test functions overlap."""
+    phi, _, _ = test_function(100 * HOPS, 1.0, EXPONENT)
+    return float(phi.sum() ** 2 / (phi @ phi) / 100.0)
+
+
+# Windows whose rows leave more than noise are not told apart by whitening: so many of them count as one.
+OVERLAP = _overlap()
+
+
+class RowGrams:
+    """Sums over windows of whitened rows, by generalized speed.
+
+    signal (n_v, n + 1, n + 1): Gram matrices of [Y b]. noise: the same of what the sensors' noise adds to the rows, to
+    first order, told by synthetic noise. windows: how many. No array is written twice, see `PlainRows`.
+    """
+
+    def __init__(self, n_v: int, n: int) -> None:
+        self.signal, self.noise = np.zeros((2, n_v, n + 1, n + 1))
+        self.windows = 0
+
+    def add(self, rows: Array, noisy: Array) -> None:
+        """Rows [Y b] (n_v, n + 1) of a window, and the same with synthetic noise added and subtracted (2, n_v, n + 1)."""
+        added = 0.5 * (noisy[0] - noisy[1])
+        self.signal = self.signal + rows[:, :, None] * rows[:, None, :]
+        self.noise = self.noise + added[:, :, None] * added[:, None, :]
+        self.windows += 1
+
+    def weaken(self, share: Array) -> None:
+        """Have the rows so far count less, (n_v,) of their squares: they were whitened with too small a variance."""
+        self.signal, self.noise = share[:, None, None] * self.signal, share[:, None, None] * self.noise
+
+    def state(self) -> dict[str, Any]:
+        """What `restore` needs to continue; it does not change when the session goes on."""
+        return {"signal_grams": self.signal, "noise_grams": self.noise, "gram_windows": self.windows}
+
+    def restore(self, state: Mapping[str, NDArray[Any]]) -> None:
+        """Continue from a saved state."""
+        self.signal, self.noise = np.array(state["signal_grams"]), np.array(state["noise_grams"])
+        self.windows = int(state["gram_windows"])
+
+
+@dataclass(frozen=True)
+class Minimum:
+    """beta (n,): where the criterion is least. covariance (n, n): inverse of its curvature, rows as independent as they
+    count; of directions without information zero. slopes (n_v, n): of each speed's part of it, which add up to what
+    priors pull with. errors (n_v,): the share e that each column is off by beyond noise.
+    """
+
+    beta: Array
+    covariance: Array
+    slopes: Array
+    errors: Array
+
+
+class _Criterion:
+    """The criterion of some rows; lacking, torque (n_v,): which leave more than noise, and which hold a torque."""
+
+    def __init__(
+        self, grams: RowGrams, lacking: NDArray[np.bool_], torque: NDArray[np.bool_], prior: Array, start: Array
+    ) -> None:
+        self._A, self._G, self._lacking, self._prior = grams.signal, grams.noise, lacking, prior
+        self._count = np.where(lacking, grams.windows / OVERLAP, float(grams.windows))
+        own = np.maximum(np.einsum("vii->vi", grams.signal - grams.noise), 0.0)
+        own[torque, :-1] = 0.0
+        self._M = own
+        self._rest = np.where(lacking, 0.0, np.maximum(grams.windows - self._quadratic(grams.noise, start), 0.0))
+
+    @staticmethod
+    def _quadratic(matrices: Array, w: Array) -> Array:
+        return np.asarray(np.einsum("i,vij,j->v", w, matrices, w))
+
+    def _least(self, w: Array) -> Array:
+        """Rounding (n_v,) of such sums."""
+        size = np.einsum("vii,i->v", self._A, w**2)
+        return np.asarray(ROUNDED * np.finfo(np.float64).eps * size + np.finfo(np.float64).tiny)
+
+    def squares(self, w: Array) -> Array:
+        """Sums of squares (n_v,) of the residual."""
+        return np.maximum(self._quadratic(self._A, w), self._least(w))
+
+    def errors(self, w: Array) -> Array:
+        """e² (n_v,) that explains what the residual holds beyond noise."""
+        beyond = np.maximum(self.squares(w) - self._quadratic(self._G, w), 0.0)
+        size = np.maximum(self._M @ w**2, self._least(w))
+        return np.where(self._lacking, beyond / size, 0.0)
+
+    def predicted(self, w: Array, errors: Array) -> Array:
+        """Expected sums of squares (n_v,)."""
+        noise = self._quadratic(self._G, w) + errors * (self._M @ w**2) + self._rest
+        return np.maximum(noise, self._least(w))
+
+    def value(self, w: Array, errors: Array) -> float:
+        """Of the criterion, with e² (n_v,) given."""
+        ratio = self.squares(w) / self.predicted(w, errors)
+        each = np.where(self._lacking, np.log(ratio), ratio)
+        return 0.5 * float(self._count @ each) + 0.5 * float(np.sum((self._prior @ w) ** 2))
+
+    def relative(self, w: Array) -> float:
+        """Sum of the logarithms of the residuals' shares of their rows, by which different starts compare."""
+        share = self.squares(w) / np.einsum("vii,i->v", self._A, w**2)
+        return 0.5 * float(self._count @ np.log(share)) + 0.5 * float(np.sum((self._prior @ w) ** 2))
+
+    def slopes(self, w: Array, errors: Array) -> tuple[Array, Array, Array]:
+        """By speed: slopes (n_v, n + 1), curvature of the squares and of the whole (n + 1, n + 1), priors left out."""
+        S, D, n = self.squares(w), self.predicted(w, errors), self._count
+        a = self._A @ w
+        g = self._G @ w + errors[:, None] * self._M * w
+        inside = np.where(self._lacking, n / S, n / D)  # weight of the squares
+        outside = np.where(self._lacking, n / D, n * S / D**2)  # and of what is expected
+        slopes = inside[:, None] * a - outside[:, None] * g
+        squares = np.einsum("v,vij->ij", inside, self._A)
+        whole = squares - np.einsum("v,vij->ij", outside, self._G) - np.diag((outside * errors) @ self._M)
+        log, plain = np.where(self._lacking, n, 0.0), np.where(self._lacking, 0.0, n)
+        whole += np.einsum("v,vi,vj->ij", -2.0 * log / S**2, a, a)
+        cross = np.einsum("v,vi,vj->ij", -2.0 * plain / D**2, a, g)
+        whole += np.einsum("v,vi,vj->ij", 2.0 * log / D**2 + 4.0 * plain * S / D**3, g, g) + cross + cross.T
+        return slopes, squares, whole
+
+
+def minimum(
+    grams: RowGrams, lacking: NDArray[np.bool_], torque: NDArray[np.bool_], starts: list[Array], prior: Array
+) -> Minimum:
+    """The minimum of the criterion that is nearest to the best of some starts β (n,).
+
+    lacking, torque (n_v,): which speeds' rows leave more than noise, and which hold a torque. prior (k, n + 1): what
+    else is known of β, as rows [Y b] of unit variance.
+    """
+    w = np.append(starts[0], -1.0)
+    criterion = _Criterion(grams, lacking, torque, prior, w)
+    found = [_descended(criterion, np.append(start, -1.0), prior) for start in starts]
+    w = min(found, key=criterion.relative)
+    slopes, squares, _ = criterion.slopes(w, criterion.errors(w))
+    basis = _basis(squares[:-1, :-1] + prior[:, :-1].T @ prior[:, :-1])
+    return Minimum(w[:-1], basis @ basis.T, slopes[:, :-1], np.sqrt(criterion.errors(w)))
+
+
+def _basis(information: Array) -> Array:
+    """Directions (n, rank) of unit information."""
+    size = np.sqrt(np.diag(information))
+    scale = np.divide(1.0, size, out=np.zeros_like(size), where=size > 0.0)
+    values, vectors = np.linalg.eigh(information * np.outer(scale, scale))
+    kept = values > RANK_TOLERANCE * values[-1]
+    return np.asarray(scale[:, None] * vectors[:, kept] / np.sqrt(values[kept]))
+
+
+def _descended(criterion: _Criterion, w: Array, prior: Array) -> Array:
+    """Newton steps from w; e follows from step to step."""
+    for _ in range(MOST_STEPS):
+        errors = criterion.errors(w)
+        slopes, squares, whole = criterion.slopes(w, errors)
+        known = prior[:, :-1].T @ prior[:, :-1]
+        basis = _basis(squares[:-1, :-1] + known)
+        slope = basis.T @ (slopes.sum(axis=0)[:-1] + prior[:, :-1].T @ (prior @ w))
+        values, vectors = np.linalg.eigh(basis.T @ (whole[:-1, :-1] + known) @ basis)
+        step = -vectors @ ((vectors.T @ slope) / np.maximum(np.abs(values), LEAST_CURVATURE))
+        gain = -float(slope @ step)
+        if gain < CONVERGED:
+            break
+        before, length = criterion.value(w, errors), 1.0
+        for _ in range(HALVINGS):
+            moved = w.copy()
+            moved[:-1] += length * (basis @ step)
+            if criterion.value(moved, errors) <= before - SUFFICIENT * length * gain:
+                break
+            length *= 0.5
+        else:
+            break
+        w = moved
+    return w
