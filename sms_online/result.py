@@ -259,6 +259,8 @@ class Result:
     def __str__(self) -> str:
         return f"{self.parameters}\n\n{self.trust}"
 
+    __repr__ = __str__
+
     def _repr_html_(self) -> str:
         others = "".join(f"<li>{escape(other)}</li>" for other in self.trust.others)
         return f"<p><b>{escape(self.trust.sentence)}</b></p><ul>{others}</ul>{self.parameters._repr_html_()}"

@@ -1,23 +1,41 @@
-"""The effect that the guide to effects adds, as it is written there."""
+"""The effect and the tracker that the guides add, as they are written there."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
+from types import ModuleType
 from typing import cast
 
 import numpy as np
 
 from sms_online.effects.base import Entry, Force
 from sms_online.effects.friction import MotorSide
+from sms_online.trackers import Tracker
 
-GUIDE = Path(__file__).parents[1] / "docs" / "how-to" / "add-an-effect.md"
+HOW_TO = Path(__file__).parents[1] / "docs" / "how-to"
+# What a guide asks for in one file, at most.
+MOST_LINES = 60
+
+
+def code_of(page: str, beginning: str) -> str:
+    """The page's block of Python that begins so."""
+    blocks = (HOW_TO / page).read_text(encoding="utf-8").split("```python\n")
+    code = next(block for block in blocks if block.startswith(beginning)).split("```")[0]
+    assert len(code.splitlines()) <= MOST_LINES, page
+    return code
 
 
 def windage() -> type[Force]:
-    """Its class."""
-    blocks = GUIDE.read_text(encoding="utf-8").split("```python\n")
-    code = next(block for block in blocks if block.startswith("class WindageFriction")).split("```")[0]
+    """The class of the effect."""
+    code = code_of("add-an-effect.md", "class WindageFriction")
     names = {"np": np, "MotorSide": MotorSide, "Entry": Entry, "Mapping": Mapping}
     exec(f"from __future__ import annotations\n\n{code}", names)
     return cast(type[Force], names["WindageFriction"])
+
+
+def fading(n: int, memory: float) -> Tracker:
+    """The tracker, of n parameters and a memory in s."""
+    module = ModuleType("fading")
+    exec(compile(code_of("add-a-tracker.md", "from __future__"), "add-a-tracker.md", "exec"), module.__dict__)
+    return cast(Tracker, module.__dict__["FadingLeastSquares"](n, memory))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -17,7 +18,8 @@ from axis import AXIS, axis_block
 import sms_online as sms
 from sms_tools.cli import main
 
-# As in the issue, word for word.
+README = Path(__file__).parents[1] / "README.md"
+# What a notebook may rely on, word for word.
 TEN_LINES = """
 import sms_online as sms
 system = sms.load_system("paper-planar")
@@ -40,13 +42,15 @@ def without_timing(document: dict[str, Any]) -> dict[str, Any]:
 
 @pytest.fixture(scope="module")
 def ten() -> dict[str, Any]:
-    """What the ten lines leave, their source being the same data."""
-    first, second = TEN_LINES.split("\n\n")
+    """What the README's Python leaves: these lines, their source being the same data."""
     names: dict[str, Any] = {}
-    exec(first, names)
-    names |= {"channels": names["data"].channels, "source": names["data"]}
-    exec(second, names)
+    for block in re.findall(r"^```python\n(.*?)^```", README.read_text(encoding="utf-8"), re.DOTALL | re.MULTILINE):
+        exec(block, names)
     return names
+
+
+def test_the_readme_holds_the_ten_lines() -> None:
+    assert set(TEN_LINES.splitlines()) <= set(README.read_text(encoding="utf-8").splitlines())
 
 
 def test_the_ten_lines_run(ten: dict[str, Any]) -> None:

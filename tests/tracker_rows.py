@@ -6,6 +6,7 @@ from collections.abc import Callable
 from functools import partial
 
 import numpy as np
+from guide import fading
 
 from sms_online.stream import Array
 from sms_online.trackers import (
@@ -33,6 +34,7 @@ def kalman(process_std: float = 0.01, initial_std: float = 10.0) -> KalmanTracke
 TRACKERS: dict[str, Callable[[], Tracker]] = {
     **{type(kind).__name__: partial(RecursiveLeastSquares, N, kind) for kind in ALL_FORGETTING},
     "KalmanTracker": kalman,
+    "the guide's": partial(fading, N, 10.0),
 }
 
 

@@ -115,6 +115,8 @@ class Diagnosis:
         table = f"{text_table(*self._rows(), left=2)}\n\n" if self.effects else ""
         return f"{self.summary}\n\n{table}{self.trust}"
 
+    __repr__ = __str__
+
     def _repr_html_(self) -> str:
         table = html_table(*self._rows()) if self.effects else ""
         return f"<p><b>{escape(self.summary)}</b></p>{table}<p>{escape(self.trust.sentence)}</p>"

@@ -12,7 +12,7 @@ from nbconvert import MarkdownExporter
 def page_of_notebook(file: File) -> dict[str, str | bytes]:
     """Names of files of the site to their contents: the page, and the pictures that it shows.
 
-    The notebook is not executed: its outputs are those of `pytest --nbmake --overwrite docs/tutorials`.
+    The notebook is not executed: its outputs are those that it holds, see CONTRIBUTING.md.
     """
     notebook = nbformat.reads(file.content_string, as_version=4)  # type: ignore[no-untyped-call]
     path = PurePosixPath(file.src_uri)
