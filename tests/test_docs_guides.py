@@ -9,7 +9,7 @@ import numpy as np
 from guide import fading
 from tracker_rows import PI_TRUE, N, exciting_rows, rows_of
 
-from sms_online.trackers import Information, RecursiveLeastSquares, Rows
+from sms_online.trackers import RecursiveLeastSquares, Rows
 
 ROOT = Path(__file__).parents[1]
 LARGEST_README = 6000  # bytes
