@@ -47,7 +47,7 @@ def test_the_verdict_follows_from_what_is_left(
     found: list[str], left: float, before: float, after: float, said: str
 ) -> None:
     rows = [{"joint_1": RowResidual(times, 1.2), "base": RowResidual(1.0, 1.2)} for times in (before, after)]
-    assert verdict(bool(found), left, rows[0], rows[1], [_found(name, "joint_1") for name in found]) == said
+    assert verdict(bool(found), left, rows[1], rows[0], [_found(name, "joint_1") for name in found]) == said
 
 
 def test_friction_of_one_joint_excuses_nothing_at_another() -> None:
@@ -56,7 +56,7 @@ def test_friction_of_one_joint_excuses_nothing_at_another() -> None:
         for each in ((600.0, 600.0), (1.0, 14.0))
     )
     for where, said in (("joint_1", "unexplained"), ("joint_2", "named")):
-        assert verdict(True, 5e-4, before, after, [_found("coulomb_friction", where)]) == said
+        assert verdict(True, 5e-4, after, before, [_found("coulomb_friction", where)]) == said
 
 
 @pytest.mark.parametrize(

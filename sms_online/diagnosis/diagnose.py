@@ -206,7 +206,7 @@ def diagnose(
     named = after.system != system
     estimator_after = _session(after.system, blocks, source, prior)[0] if named else before
     said = verdict(
-        named, share_left(bare.excess, after.excess), bare.test, after.test, [each.candidate for each in findings]
+        named, share_left(bare.excess, after.excess), after.test, bare.test, [each.candidate for each in findings]
     )
     unexplained = None
     if said == "unexplained":

@@ -10,11 +10,10 @@ import numpy as np
 
 from sms_online.diagnosis.attempt import Attempt, Part
 from sms_online.diagnosis.candidate import Finding
-from sms_online.diagnosis.constants import deviations
 from sms_online.diagnosis.diagnose import Diagnosis
 from sms_online.diagnosis.hypothesis import LARGEST_SHARE_LEFT
+from sms_online.diagnosis.reported import Coefficients, of_constant, of_unknowns
 from sms_online.diagnosis.shape import slopes
-from sms_online.effects.base import report
 from sms_online.effects.catalogue import ENTRIES, declarable
 from sms_online.evaluation import NORMAL_95, Evaluation, identifiable
 from sms_online.judgement import Facts, Residual, Trust, judge, judge_diagnosis
@@ -26,9 +25,6 @@ from sms_online.stream import Array
 from sms_online.threads import one_blas_thread
 
 SCHEMA = "sms-online/diagnosis/1"
-
-# Reported coefficients: name to estimate and standard deviation, None where there is none.
-Coefficients = dict[str, tuple[float, float | None]]
 
 
 @one_blas_thread()
@@ -224,28 +220,12 @@ def coefficients(diagnosis: Diagnosis, finding: Finding) -> Coefficients:
             at = attempt.rows.base.n + sum(len(other.parameters) for other in attempt.fixed[:k])
             own = slice(at, at + len(candidate.parameters))
             covariance = attempt.tracing.covariance(diagnosis.chosen)[own, own]
-            stds = deviations(constant, covariance)
-            return {name: (value, stds.get(name)) for name, value in constant.coefficients.items()}
-    session = diagnosis.estimator_after
-    batch = _batch(attempt, diagnosis.chosen)
-    names, values = [p.name for p in batch.parameters], batch.values
-    covariance = np.where(np.isfinite(batch.covariance), batch.covariance, 0.0)
-    for force in session.model.effects:
-        if (force.name, force.where) == (effect.name, effect.where):
-            # What only a combination of parameters is known of counts as zero in the others' favour.
-            absent = [p.name for p in force.parameters if p.name not in names]
-            grown = np.pad(covariance, (0, len(absent)))
-            told = report(force, [*names, *absent], np.pad(values, (0, len(absent))), grown)
-            return {
-                name: (value, batch.shapes.get((finding.candidate.key, name)) if name in force.shapes else std)
-                for name, (value, std) in told.items()
-            }
-    own_names = [p.name for p in finding.candidate.parameters]
-    return {
-        name.rsplit(".", 1)[1]: (float(values[k]), float(np.sqrt(covariance[k, k])))
-        for k, name in enumerate(names)
-        if name in own_names
-    }
+            return of_constant(constant, covariance)
+    batch, model = _batch(attempt, diagnosis.chosen), diagnosis.estimator_after.model
+    names = [p.name for p in batch.parameters]
+    told = of_unknowns(effect, finding.candidate.parameters, model, names, batch.values, batch.covariance)
+    shapes = {name: std for (key, name), std in batch.shapes.items() if key == finding.candidate.key}
+    return {name: (value, shapes.get(name, std)) for name, (value, std) in told.items()}
 
 
 def _posterior(attempt: Attempt, chosen: Sequence[int]) -> list[dict[str, Any]]:

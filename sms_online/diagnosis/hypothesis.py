@@ -144,15 +144,21 @@ def share_left(before: float, after: float) -> float:
 def verdict(
     named: bool,
     left: float,
-    before: Mapping[str, RowResidual],
     after: Mapping[str, RowResidual],
-    found: Sequence[Candidate],
+    before: Mapping[str, RowResidual] | None = None,
+    found: Sequence[Candidate] = (),
 ) -> str:
-    """What may be said where effects were named or not, and leave this share of what was beyond noise."""
+    """What may be said where effects were named or not, and leave this share of what was beyond noise.
+
+    after: by row type; before, found: with the effects left out, and these, of a whole capture. A running session goes on
+    with what is named and searches again, so that single rows may hold something still.
+    """
     if not any(row.beyond for row in after.values()):
         return "named" if named else "clean"
     if not named or left > LARGEST_SHARE_LEFT:
         return "unexplained"
+    if before is None:
+        return "named"
     # Friction of a joint acts on the rows of that joint.
     for name, row in after.items():
         inexact = max((each.traits.inexact for each in found if each.effect.where == name), default=INEXACT)

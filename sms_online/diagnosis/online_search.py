@@ -16,17 +16,18 @@ from numpy.typing import NDArray
 from sms_online.description.schema import Effect, System
 from sms_online.diagnosis.candidate import Candidate, LeftOpen
 from sms_online.diagnosis.candidates import CandidateColumns
-from sms_online.diagnosis.constants import applied, corrected, deviations, improved, is_constant, stands
+from sms_online.diagnosis.constants import applied, corrected, improved, is_constant, stands
 from sms_online.diagnosis.hypothesis import FITTED, REWEIGHED, Hypothesis, corrections, share_left, verdict
 from sms_online.diagnosis.record import Segment, bounded, excerpts
+from sms_online.diagnosis.reported import of_constant, of_unknowns
 from sms_online.diagnosis.residuals import ResidualTest
 from sms_online.diagnosis.rows import SessionRows
 from sms_online.diagnosis.weak_windows import WeakWindows
-from sms_online.effects.base import report
 from sms_online.effects.build import build_model
 from sms_online.effects.catalogue import ENTRIES, declarable
 from sms_online.model.base_parameters import BaseParameters
 from sms_online.model.model import Model
+from sms_online.model.parameters import Parameter
 from sms_online.pipeline.sensing import Sensing
 from sms_online.pipeline.sensor_noise import SensorNoise
 from sms_online.stream import Array
@@ -212,7 +213,7 @@ def _trace(request: Request, rows: SessionRows, everything: Sequence[Candidate],
     if kept != chosen:
         tracing.settle(kept)
         chosen, findings = kept, [tracing.finding(kept, k) for k in kept]
-    before, test_before = some.excess([]), ResidualTest(rows).of(some.residual([]))
+    before = some.excess([])
     final, used, constants = some, chosen, list[Effect]()
     if channels:
         final, constants = _corrected(request, some, chosen, late)
@@ -240,14 +241,14 @@ def _trace(request: Request, rows: SessionRows, everything: Sequence[Candidate],
                 units=tuple(p.unit for p in parameters),
                 values=solution[told],
                 stds=stds[told],
-                coefficients=_coefficients(request, solution, covariance, effect, own, not parameters),
+                coefficients=_coefficients(request, solution, covariance, effect, parameters, own),
                 gain=finding.gain.gain,
                 limit=finding.limit,
                 ambiguous=finding.ambiguous,
             )
         )
     scores = {ranked.candidate.key: ranked.gain for ranked in ranking}
-    said = verdict(bool(chosen), left, test_before, test, [finding.candidate for finding in findings])
+    said = verdict(bool(chosen), left, test)
     return Outcome(said, tuple(named), scores, left, late > 0, solution[: rows.base.n])
 
 
@@ -270,33 +271,18 @@ def _corrected(request: Request, some: Hypothesis, chosen: Sequence[int], late: 
 
 
 def _coefficients(
-    request: Request, solution: Array, covariance: Array, effect: Effect, own: slice, constant: bool
+    request: Request, solution: Array, covariance: Array, effect: Effect, parameters: Sequence[Parameter], own: slice
 ) -> dict[str, tuple[float, float | None, str]]:
-    """What people read of an effect."""
+    """What people read of an effect; parameters: none of a constant."""
     system, base = request.model.system, request.base
     units = declarable(ENTRIES[effect.name], system)
-    if constant:
-        stds = deviations(effect, covariance[own, own])
-        return {name: (value, stds.get(name), units.get(name, "")) for name, value in effect.coefficients.items()}
-    names = [p.name for p in base.parameters]
-    declared = system.model_copy(update={"effects": (*system.effects, effect)})
-    model = build_model(declared, base.physical_values(solution[: base.n]))
-    known = [*range(base.n), *range(own.start, own.stop)]
-    values, spread = solution[known], covariance[np.ix_(known, known)]
-    spread = np.where(np.isfinite(spread), spread, 0.0)
-    for force in model.effects:
-        if (force.name, force.where) == (effect.name, effect.where):
-            names += [p.name for p in force.parameters]
-            # What only a combination of parameters is known of counts as zero in the others' favour.
-            absent = [name for name in force.relative_to if name not in names]
-            told = report(force, [*names, *absent], np.pad(values, (0, len(absent))), np.pad(spread, (0, len(absent))))
-            return {
-                name: (value, None if name in force.shapes else std, units.get(name, ""))
-                for name, (value, std) in told.items()
-            }
-    fresh = [p for p in model.parameters if p.name.startswith(f"{effect.name}@{effect.where}.")]
-    stds_own = np.sqrt(np.diag(spread))[base.n :]
-    return {
-        p.quantity: (float(value), float(std), p.unit)
-        for p, value, std in zip(fresh, values[base.n :], stds_own, strict=True)
-    }
+    if parameters:
+        declared = system.model_copy(update={"effects": (*system.effects, effect)})
+        model = build_model(declared, base.physical_values(solution[: base.n]))
+        known = [*range(base.n), *range(own.start, own.stop)]
+        names = [p.name for p in (*base.parameters, *parameters)]
+        told = of_unknowns(effect, parameters, model, names, solution[known], covariance[np.ix_(known, known)])
+        units = {p.quantity: p.unit for p in parameters} | units
+    else:
+        told = of_constant(effect, covariance[own, own])
+    return {name: (value, std, units.get(name, "")) for name, (value, std) in told.items()}
