@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from copy import copy
 from functools import partial
 from typing import Any
 
@@ -218,7 +217,7 @@ class Momentum:
         return MomentumStatistics(
             tracker=self.tracker.state(),
             bias=self.bias.state(),
-            rows=copy(self.fit.plain),
+            rows=self.fit.plain.copy(),
             started=self.started,
             tested=self.settled,
             alarm=None if alarm is None else alarm.row,

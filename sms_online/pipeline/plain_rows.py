@@ -30,6 +30,12 @@ class PlainRows:
         self.windows = 0
         self.misfit = np.zeros(n_v)
 
+    def copy(self) -> PlainRows:
+        """The sums of now, in microseconds."""
+        out = object.__new__(PlainRows)
+        vars(out).update(vars(self))
+        return out
+
     def clear(self) -> None:
         """Forget the windows, not the misfit."""
         self.gram, self.windows = np.zeros_like(self.gram), 0

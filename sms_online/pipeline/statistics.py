@@ -7,7 +7,6 @@ says the same in another process. A session cannot be continued from it; `Estima
 from __future__ import annotations
 
 import pickle
-from copy import copy
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import TYPE_CHECKING, Any, Literal
@@ -123,12 +122,12 @@ class Statistics:
             samples=estimator.samples,
             duration=estimator.duration,
             dropped_rows=estimator.dropped_rows,
-            counters=copy(estimator.counters),
+            counters=SyncCounters(**vars(estimator.counters)),
             periods=estimator.periods.copy(),
             events=tuple(estimator.events),
             energy=estimator.energy_tracker.state(),
-            shared=copy(estimator.shared_errors),
-            joints=tuple([copy(joint) for joint in estimator.joint_residuals]),
+            shared=estimator.shared_errors.copy(),
+            joints=tuple([SquaredResidual(joint.gram, joint.signal) for joint in estimator.joint_residuals]),
             momentum=None if momentum is None else momentum.statistics(),
             smoother=None if smoother is None else smoother.statistics(),
         )
