@@ -28,6 +28,7 @@ from sms_adapters.raw import (
     concatenate_frames,
 )
 from sms_online.description.schema import CanBus, CanSource
+from sms_online.errors import InputError
 
 DATA = Path(__file__).parents[2] / "shared" / "data" / "ak80_pendulum"
 CHANNELS = itertools.count()
@@ -156,17 +157,21 @@ def test_bus_off_and_a_dead_bus_are_lost_devices_that_can_be_opened_again(bus: t
         reader.read(0.0)
 
 
-@pytest.mark.parametrize(
-    ("interface", "found"),
-    [("nonesuch", "nonesuch"), ("slcan", "slcan /dev/absent"), ("socketcan", "socketcan /dev/absent")],
-)
-def test_a_bus_that_cannot_be_opened_is_lost(interface: str, found: str) -> None:
-    source = CanSource(kind="can", name="arm", interface=interface, channel="/dev/absent", dbc="a.dbc", signals={})
+def test_a_bus_that_cannot_be_opened_is_lost() -> None:
+    source = CanSource(kind="can", name="arm", interface="slcan", channel="/dev/absent", dbc="a.dbc", signals={})
     reader = make_reader(source, time.monotonic)
     with pytest.raises(LostDevice, match=r"^arm: ") as lost:
         reader.open()
-    assert found in lost.value.why
+    assert "slcan /dev/absent" in lost.value.why
     assert "\n" not in str(lost.value)
+
+
+@pytest.mark.parametrize("interface", ["nonesuch", "nican", "vector"])
+def test_a_bus_that_can_never_be_opened_is_bad_input(interface: str) -> None:
+    source = CanSource(kind="can", name="arm", interface=interface, channel="0", dbc="a.dbc", signals={})
+    with pytest.raises(InputError, match=f"^arm, {interface} 0: ") as refused:
+        make_reader(source, time.monotonic).open()
+    assert "\n" not in str(refused.value)
 
 
 def test_one_bad_byte_on_a_serial_line_adapter_is_an_error_frame() -> None:

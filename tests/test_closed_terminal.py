@@ -31,16 +31,16 @@ def terminal() -> Iterator[tuple[int, int]]:
 
 
 CASES = {
-    # What each says when it runs; devices that are not there are waited for.
-    "live": (["--system", "testbed.toml"], "samples/s", "report.html"),
-    "record": (["--serial", "absent"], "absent: gone", "session.toml"),
-    "replay": (["run.csv", "--system", "axis.toml", "--speed", "1"], "run.csv", "report.html"),
+    # What each says when it runs, writes and returns; devices that are not there are waited for.
+    "live": (["--system", "testbed.toml"], "samples/s", "report.html", 130),
+    "record": (["--serial", "absent"], "absent: gone", "session.toml", 1),
+    "replay": (["run.csv", "--system", "axis.toml", "--speed", "1"], "run.csv", "report.html", 130),
 }
 
 
 @pytest.mark.parametrize("verb", CASES)
 def test_a_closed_terminal_ends_a_session_with_results(tmp_path: Path, terminal: tuple[int, int], verb: str) -> None:
-    arguments, running, written = CASES[verb]
+    arguments, running, written, code = CASES[verb]
     described_testbed(tmp_path)
     (tmp_path / "axis.toml").write_text(AXIS)
     (tmp_path / "run.csv").write_text("\n".join(capture_lines(60.0)) + "\n")
@@ -57,7 +57,7 @@ def test_a_closed_terminal_ends_a_session_with_results(tmp_path: Path, terminal:
         while running not in said and process.poll() is None:
             said += os.read(near, 4096).decode(errors="replace")
         os.close(near)  # the kernel tells the session's first process
-        assert process.wait(PATIENCE) == 130, said
+        assert process.wait(PATIENCE) == code, said
     finally:
         kill(process)
     assert (tmp_path / "done" / written).is_file()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import socket
 import time
@@ -27,6 +28,7 @@ from sms_adapters.raw import (
     one_line,
 )
 from sms_online.description.schema import CanBus
+from sms_online.errors import InputError
 from sms_online.stream import Array
 
 # Where the host stamps frames they wait in the driver until so long before the session's next tick, s. Nobody else
@@ -53,14 +55,25 @@ MOST_TRIES = 10
 
 
 def open_bus(source: CanBus) -> can.BusABC:
-    """The python-can bus of a source; raises LostDevice where it cannot be opened."""
+    """The python-can bus of a source; LostDevice where it cannot be opened now, InputError where it never can."""
     options = source.options if source.bitrate is None else {"bitrate": source.bitrate} | source.options
     try:
         # The system file alone says what is opened, not a python-can configuration of the user's or the machine's.
         return can.Bus(source.channel, source.interface, ignore_config=True, **options)  # type: ignore[arg-type]
     # Interfaces raise what their drivers raise: OSError, ImportError of a missing driver, TypeError for a wrong option.
     except Exception as error:
+        if _for_ever(error):
+            place = f"{source.interface} {source.channel}"
+            raise InputError(source.name, place, one_line(error), "a bus that python-can can open here") from error
         raise LostDevice(source.name, f"{source.interface} {source.channel}: {one_line(error)}") from error
+
+
+def _for_ever(error: Exception) -> bool:
+    """Whether no cable or switch can mend it: an interface, library or kernel that is not there, a wrong option."""
+    if isinstance(error, OSError):
+        # A missing library has no number.
+        return error.errno == errno.EAFNOSUPPORT or (type(error) is OSError and error.errno is None)
+    return isinstance(error, ImportError | NotImplementedError | TypeError | ValueError)
 
 
 class CanReader:
@@ -87,7 +100,7 @@ class CanReader:
         self._lost: LostDevice | None = None  # found while frames were at hand, to be told after them
 
     def open(self) -> None:
-        """Open the bus; raises LostDevice where that fails."""
+        """Open the bus; raises LostDevice where that fails, InputError where it always will."""
         self.close()
         self._bus = open_bus(self._source)
         if self._source.interface == "udp_multicast":

@@ -92,7 +92,8 @@ def _parser() -> Parser:
     parser = Parser(
         prog=PROGRAM,
         description="Online parameter estimation for flexible space manipulators.",
-        epilog="Exit codes: 0 done, 2 bad input, 3 nothing is determined (results are written), 130 interrupted.",
+        epilog="Exit codes: 0 done, 1 nothing was received to record, 2 bad input, 3 nothing is determined (results "
+        "are written), 130 interrupted.",
     )
     parser.add_argument("--version", action=Version, nargs=0, help="which version this is")
     text = "how bash, zsh or tcsh complete what is typed, to be written where the shell looks for it"
@@ -173,7 +174,10 @@ def _add_live(verbs: Verbs) -> None:
 
 def _add_record(verbs: Verbs) -> None:
     parser = _add_verb(verbs, "record", "record", "Record what devices send, without estimating anything.")
-    text = "a CAN bus by python-can's names: [NAME=]INTERFACE:CHANNEL[:BITRATE], such as socketcan:can0"
+    text = (
+        "a CAN bus by python-can's names: [NAME=]INTERFACE:CHANNEL[:BITRATE][?OPTION=VALUE&…], such as "
+        "socketcan:can0?fd=true"
+    )
     parser.add_argument("--can", metavar="BUS", action="append", default=[], help=text)
     text = "a serial port: [NAME=]PATH[:BAUDRATE], such as /dev/ttyUSB0:115200"
     parser.add_argument("--serial", metavar="PORT", action="append", default=[], help=text)

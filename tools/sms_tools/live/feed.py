@@ -13,6 +13,7 @@ from sms_adapters.recorder import Recorder
 from sms_adapters.recording import split
 from sms_adapters.session_log import Kind, from_microseconds, number_of_items, quantised
 from sms_online.description.schema import SerialPort, Source
+from sms_online.errors import InputError
 
 # Longest wait in a read, s: how late a reader notices that the session ends.
 READ_TIMEOUT = 0.1
@@ -80,6 +81,7 @@ class Feed:
         self.last_loss = ""
         self.dropped = 0
         self.received = 0
+        self._refused: InputError | None = None
         self.tried = threading.Event()  # to open the device, at least once
         self._fetched = inf  # machine's time when the last read came back, s; infinite while nothing can be read
         self._reader = reader
@@ -95,6 +97,11 @@ class Feed:
     def start(self) -> None:
         """Begin to read."""
         self._thread.start()
+
+    def check(self) -> None:
+        """Raise the InputError of a device that can never be opened."""
+        if self._refused is not None:
+            raise self._refused
 
     def stop(self) -> None:
         """Stop reading and release the device."""
@@ -134,6 +141,10 @@ class Feed:
                     self._fetched = time.monotonic()
             except LostDevice as error:
                 self._lose(error.why)
+            except InputError as error:
+                self._refused = error
+                self.tried.set()
+                return
             # A driver may raise anything; a thread that ended silently would look like a device that says nothing.
             except Exception as error:
                 self._lose(f"{type(error).__name__}: {error}")

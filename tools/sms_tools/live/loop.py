@@ -90,12 +90,13 @@ class LiveSession:
 
         ready: called when every device is open or found missing. Each block has to be pushed into the estimator before
         the next one is asked for. At the end the devices are released and a checkpoint is written, which knows nothing
-        of the estimator's own end.
+        of the estimator's own end. Raises InputError where a device can never be opened.
         """
         for feed in self._feeds:
             feed.start()
         for feed in self._feeds:
             feed.tried.wait(OPENING)
+            feed.check()
         # What is there by now stays, and looking through it for garbage would stop the loop for a tenth of a second.
         gc.collect()
         gc.freeze()

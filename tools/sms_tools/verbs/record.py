@@ -6,14 +6,17 @@ import argparse
 import math
 import re
 from pathlib import Path
+from urllib.parse import parse_qsl
+
+from can.util import cast_from_string
 
 from sms_adapters.devices import make_reader
 from sms_adapters.recorder import Recorder
 from sms_adapters.session_log import SessionHeader
-from sms_online.description.schema import CanSource, SerialField, SerialLines, Source
+from sms_online.description.schema import CanSource, SerialField, SerialLines, SerialPort, Source
 from sms_online.errors import InputError
 from sms_online.result import json_text
-from sms_tools.exit_codes import INTERRUPTED, OK
+from sms_tools.exit_codes import INTERRUPTED, NOTHING_RECEIVED, OK
 from sms_tools.interruption import Interruption
 from sms_tools.live.feed import Feed, SessionClock, kind_of
 from sms_tools.live.signals import termination_interrupts
@@ -22,6 +25,7 @@ from sms_tools.report import Document, report_console, show
 from sms_tools.results_file import results_directory
 
 BAUDRATE = 115200
+EXPECTED = "[NAME=]INTERFACE:CHANNEL[:BITRATE][?OPTION=VALUE&…], such as socketcan:can0"
 # A look at the devices, s.
 INTERVAL = 0.1
 # A line on what has come, s.
@@ -29,7 +33,7 @@ LINE_INTERVAL = 5.0
 
 
 def run(args: argparse.Namespace) -> int:
-    """Record until interrupted (130) or for --duration (0)."""
+    """Record until interrupted (130) or for --duration (0); 1 where nothing came."""
     sources: list[Source] = [*(_can(text) for text in args.can), *(_serial(text) for text in args.serial)]
     if not sources:
         raise InputError("record", "", "no device", "--can or --serial, once for each device")
@@ -46,6 +50,8 @@ def run(args: argparse.Namespace) -> int:
             feed.start()
         said = 0.0
         while not interruption.requested and clock() < end:
+            for feed in feeds:
+                feed.check()
             interruption.sleep(min(INTERVAL, end - clock()))
             if clock() >= said + LINE_INTERVAL:
                 said = clock()
@@ -65,9 +71,23 @@ def run(args: argparse.Namespace) -> int:
     }
     parts = [f"{name}: {count} items" for name, count in document["sources"].items()]
     show(console, *parts, *(f"warning: {warning}" for warning in warnings), f"recording: {directory}")
+    received = any(document["sources"].values())
+    if not received:
+        listened = ", ".join(f"{source.name} ({_device(source)})" for source in sources)
+        show(console, f"nothing was received from {listened}")
     if args.json:
         print(json_text(document))
+    if not received:
+        return NOTHING_RECEIVED
     return INTERRUPTED if interruption.requested else OK
+
+
+def _device(source: Source) -> str:
+    if isinstance(source, SerialPort):
+        return f"{source.port} at {source.baudrate} bit/s"
+    options = [f"{name} {value}" for name, value in source.options.items()]
+    bitrate = [] if source.bitrate is None else [f"{source.bitrate} bit/s"]
+    return ", ".join([f"{source.interface} {source.channel}", *bitrate, *options])
 
 
 def _line(feed: Feed) -> str:
@@ -75,17 +95,23 @@ def _line(feed: Feed) -> str:
 
 
 def _can(text: str) -> CanSource:
-    """[NAME=]INTERFACE:CHANNEL[:BITRATE]; the channel may be a path or a group's address."""
+    """[NAME=]INTERFACE:CHANNEL[:BITRATE][?OPTION=VALUE&…]; the channel may be a path or a group's address."""
+    text, _, query = text.partition("?")
     name, address = _split_name(text)
+    try:
+        options = {key: cast_from_string(value) for key, value in parse_qsl(query, strict_parsing=bool(query))}
+    except ValueError:
+        raise InputError("--can", "", repr(query), "options as OPTION=VALUE, & between them, such as fd=true") from None
     interface, _, rest = address.partition(":")
     channel, _, bitrate = rest.rpartition(":")
     if not (channel and bitrate.isdecimal()):
         channel, bitrate = rest, ""
     if not (interface and channel):
-        raise InputError("--can", "", repr(text), "[NAME=]INTERFACE:CHANNEL[:BITRATE], such as socketcan:can0")
+        raise InputError("--can", "", repr(text), EXPECTED)
     bus = {"name": name or _name(channel), "interface": interface, "channel": channel}
     # Nothing is decoded.
-    return CanSource(kind="can", dbc="", signals={}, bitrate=int(bitrate) if bitrate else None, **bus)
+    rate = int(bitrate) if bitrate else None
+    return CanSource(kind="can", dbc="", signals={}, bitrate=rate, options=options, **bus)
 
 
 def _serial(text: str) -> SerialLines:
