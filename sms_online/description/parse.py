@@ -1,7 +1,8 @@
 """From the text of a system file (TOML) to a checked `System`, and the texts that are shipped with the package.
 
 Tables of a file: [spacecraft], then [joint_i], [motor_i] (optional) and [link_i] for i = 1..N, [payload], [[sensor]],
-[[source]], [[effect]], [known], [prior], [controller], [trajectory], [windows]; keys are the fields of `schema`.
+[[source]], [[effect]], [known], [prior], [controller], [trajectory], [windows],
+[tolerances]; keys are the fields of `schema`.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ from sms_online.errors import InputError
 # Top-level keys of a file and the field of `System` that each fills; numbered tables come beside them.
 PLAIN = ("name", "title", "reference", "motion", "gravity", "sample_rate", "balance", "spacecraft", "payload", "known")
 RENAMED = {"sensor": "sensors", "source": "sources", "effect": "effects", "prior": "priors"}
-WITHOUT_NUMBERS = (*PLAIN, *RENAMED, "controller", "trajectory", "windows")
+WITHOUT_NUMBERS = (*PLAIN, *RENAMED, "controller", "trajectory", "windows", "tolerances")
 NUMBERED = re.compile(r"(joint|motor|link)_([1-9]\d*)")
 # Levels of tables and lists in a file: one more than a signal of a source or a harmonic of a joint needs.
 DEPTH = 6
@@ -96,7 +97,7 @@ def _arrange(document: Mapping[str, Any], source: str) -> dict[str, Any]:
                     "no such table",
                     f"joints and links numbered 1 to {n} without holes, since there is [{last}]",
                 )
-    record = {key: document[key] for key in (*PLAIN, "controller", "windows") if key in document}
+    record = {key: document[key] for key in (*PLAIN, "controller", "windows", "tolerances") if key in document}
     record |= {field: document[key] for key, field in RENAMED.items() if key in document}
     record["joints"] = [document[f"joint_{i}"] for i in range(1, n + 1)]
     record["links"] = [document[f"link_{i}"] for i in range(1, n + 1)]

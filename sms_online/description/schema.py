@@ -389,6 +389,50 @@ class Windows(Record):
     momentum: Positive = 0.4
 
 
+class Tolerances(Record):
+    """How well a testbed is measured out and its sensors are calibrated, 1σ each; 0 means exactly.
+
+    Within them the estimator corrects its description as the samples ask for, and error bars count what they leave
+    unknown. In a system file `tolerances = "none"` is short for 0 everywhere.
+
+    tracked_point: of S, along each axis of the base, m.
+    length: of a link, and of a joint's place along each axis, m.
+    axis: direction of a joint's axis and mount, rad.
+    gravity: direction of gravity, rad.
+    marker_station: place of a marker along its link, m.
+    clock: a device's clock against that of the torques, s; where no [[source]] is described, of encoders, base and
+    markers.
+    encoder_zero: zero of an encoder, rad (m).
+    once_per_turn: sine and cosine of an encoder's error once a turn, rad.
+    base_angle: zero of the base's measured attitude, rad.
+    marker_zero: zero of a marker's displacement, m.
+    marker_zero_angle: zero of a marker's rotation, rad.
+    camera_scale: scale of the base's position and the markers' displacements.
+    torque_gain: gain of a joint's torque relative to that of joint 1.
+    torque_offset: zero of a joint's torque or force, after the gear, N m (N); not stated: unknown.
+    """
+
+    tracked_point: NonNegative = 5e-4
+    length: NonNegative = 3e-4
+    axis: NonNegative = 5e-4
+    gravity: NonNegative = 1e-3
+    marker_station: NonNegative = 5e-4
+    clock: NonNegative = 5e-5
+    encoder_zero: NonNegative = 1e-4
+    once_per_turn: NonNegative = 5e-5
+    base_angle: NonNegative = 1e-3
+    marker_zero: NonNegative = 1e-4
+    marker_zero_angle: NonNegative = 1e-3
+    camera_scale: NonNegative = 1e-3
+    torque_gain: NonNegative = 0.01
+    torque_offset: NonNegative | None = None
+
+    @model_validator(mode="before")
+    @classmethod
+    def _from_none(cls, given: Any) -> Any:
+        return dict.fromkeys(cls.model_fields, 0.0) if given == "none" else given
+
+
 class System(Record):
     """A whole testbed; joints, motors and links are in order from the base outwards.
 
@@ -411,6 +455,7 @@ class System(Record):
     controller: of the simulator.
     trajectory: of the simulator.
     windows: widths of the test functions.
+    tolerances: of geometry, clocks and calibration.
     balance: which rows are fitted. `both`: the momentum balance, and the energy balance until its weights are known.
     `smoother`: state and parameters together, which links with too few sensors get unless it says `energy`.
     """
@@ -434,6 +479,7 @@ class System(Record):
     controller: Controller | None = None
     trajectory: Trajectory | None = None
     windows: Windows = Windows()
+    tolerances: Tolerances = Tolerances()
     balance: Literal["both", "energy", "momentum", "smoother"] = "both"
 
     @property

@@ -7,15 +7,18 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from sms_online.description.schema import FlexibleLink, Joint, RigidLink, System
+from sms_online.description.schema import FlexibleLink, Joint, RigidLink, System, Tolerances
 from sms_online.stream import Array
 
-# 1σ of a direction of a joint's axis and mount, rad; of a link's length and a joint's place along each axis, m; of the
-# tracked point along each axis, m; of gravity's direction, rad. What a careful assembly and a calliper give.
-AXIS_TOLERANCE = 5e-4
-LENGTH_TOLERANCE = 3e-4
-TRACKED_POINT_TOLERANCE = 5e-4
-GRAVITY_TOLERANCE = 1e-3
+
+def geometry_tolerances(system: System) -> Tolerances:
+    """Those of a system; where it calls its geometry exact, what a careful assembly and a calliper give.
+
+    A description has so many digits, and no combination of parameters follows from the last of them.
+    """
+    stated, usual = system.tolerances, Tolerances()
+    names = ("axis", "length", "tracked_point", "gravity")
+    return usual.model_copy(update={name: getattr(stated, name) or getattr(usual, name) for name in names})
 
 
 def perturbed(system: System, rng: np.random.Generator) -> System:
@@ -24,6 +27,7 @@ def perturbed(system: System, rng: np.random.Generator) -> System:
     Of a planar system only what keeps it planar moves. Sizes and directions are drawn independently, from `rng`.
     """
     inside = np.array([1.0, 1.0, 0.0]) if system.motion == "planar" else np.ones(3)
+    tolerances = geometry_tolerances(system)
     about = np.array([0.0, 0.0, 1.0]) if system.motion == "planar" else np.ones(3)
 
     def moved(point: tuple[float, float, float], tolerance: float) -> tuple[float, ...]:
@@ -31,21 +35,21 @@ def perturbed(system: System, rng: np.random.Generator) -> System:
 
     def turned(joint: Joint) -> Joint:
         described = Rotation.from_rotvec(joint.mount_rotation)
-        draw = Rotation.from_rotvec(AXIS_TOLERANCE * about * rng.standard_normal(3))
+        draw = Rotation.from_rotvec(tolerances.axis * about * rng.standard_normal(3))
         return joint.model_copy(update={"mount_rotation": _vector((described * draw).as_rotvec())})
 
     def resized(link: RigidLink | FlexibleLink) -> RigidLink | FlexibleLink:
         if isinstance(link, RigidLink):
-            return link.model_copy(update={"tip": moved(link.tip, LENGTH_TOLERANCE)})
-        return link.model_copy(update={"length": link.length + LENGTH_TOLERANCE * rng.standard_normal()})
+            return link.model_copy(update={"tip": moved(link.tip, tolerances.length)})
+        return link.model_copy(update={"length": link.length + tolerances.length * rng.standard_normal()})
 
     update: dict[str, Any] = {
         "joints": tuple(turned(joint) for joint in system.joints),
         "links": tuple(resized(link) for link in system.links),
-        "gravity": moved(system.gravity, GRAVITY_TOLERANCE * float(np.linalg.norm(system.gravity))),
+        "gravity": moved(system.gravity, tolerances.gravity * float(np.linalg.norm(system.gravity))),
     }
     if system.spacecraft is not None:
-        point = moved(system.spacecraft.tracked_point, TRACKED_POINT_TOLERANCE)
+        point = moved(system.spacecraft.tracked_point, tolerances.tracked_point)
         update["spacecraft"] = system.spacecraft.model_copy(update={"tracked_point": point})
     return system.model_copy(update=update)
 

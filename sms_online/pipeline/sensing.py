@@ -128,6 +128,19 @@ class Sensing:
         markers = (column for _, columns in self._links.values() for column in columns)
         return [*self._base, *self._q, *self._theta_m, *markers]
 
+    def readings(self, x: Array) -> Array:
+        """Readings (K, n_x) of the position sensors at coordinates x (K, n_x): where no marker is missing."""
+        out = x.copy()
+        for angle, motor in self._beyond_coordinates:
+            out[:, angle] -= x[:, motor]
+        layout = self.model.layout
+        offset = layout.n_base_positions - layout.n_base_speeds
+        for i, (kinematics, q_f) in enumerate(zip(self.model.chain.flexible, layout.q_f, strict=True)):
+            if kinematics is not None:
+                own = slice(q_f.start + offset, q_f.stop + offset)
+                out[:, own] = kinematics.markers(self.model.chain.elastic(x, i))
+        return out
+
     def displacements(self, x: Array) -> Array:
         """Displacements (K, n_v, n_x) along the speeds, at x (K, n_x), for one more unit of each sensor's reading."""
         layout = self.model.layout

@@ -138,6 +138,10 @@ class Sensitivities:
                 told = _differences(probed[0] @ pi, probed[1] @ pi, int(np.count_nonzero(sparse)))
             self._derivatives = np.concatenate((self._derivatives, told))
 
+    def rates(self, count: int) -> Array:
+        """Rates of the readings (count, sensors) at the last instants."""
+        return self._rates[len(self._rates) - count :]
+
     def window(self, start: int) -> Sensitivity:
         """At the instants from number `start` on."""
         n_v = self.model.layout.n_v

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from sms_online.calibration.columns import CalibrationColumns
 from sms_online.model.base_parameters import BaseParameters
 from sms_online.model.model import Model
 from sms_online.pipeline.latency import SourceGroup
@@ -31,13 +32,14 @@ class PropagatedNoise:
     covariances: list[Array]
     kernel: Array
     late: Array
+    calibration: Array
 
 
 class WindowNoise:
     """Propagates the sensors' noise to the rows of windows, one after the other, with parameters β (n,), see `begin`.
 
     readings: x (K, n_x) to the displacements (K, n_v, sensors) that unit noise of each position sensor makes. clocks:
-    see `RowNoise`. beta: β, None before it has begun. n_v: rows of a window.
+    see `RowNoise`. calibration: makes the columns beside Y. beta: β, None before it has begun. n_v: rows of a window.
     """
 
     def __init__(
@@ -47,12 +49,14 @@ class WindowNoise:
         balance: MomentumBalance,
         readings: Callable[[Array], Array],
         clocks: Sequence[SourceGroup] = (),
+        calibration: CalibrationColumns | None = None,
     ) -> None:
         self.n_v = model.layout.n_v
         self._base, self._rough = base, balance.rough
         self._sample_rate = balance.sample_rate
         self._sensitivities = Sensitivities(model, readings, balance.span / INSTANTS)
         self._noise = RowNoise(model.layout.theta_m, balance.span, clocks)
+        self._calibration = calibration
         self.beta: Array | None = None
         self.sensor_noise: SensorNoise | None = None
 
@@ -64,6 +68,8 @@ class WindowNoise:
     def begin_segment(self, instant: int = 0) -> None:
         """The window that starts at an instant is the next, and shares no samples with those before."""
         self._sensitivities.forget(instant)
+        if self._calibration is not None:
+            self._calibration.forget(instant)
         self._noise.begin_segment()
 
     @property
@@ -81,11 +87,16 @@ class WindowNoise:
         assert self.beta is not None
         pi = self._rough.without(self._base.physical_values(self.beta))
         probed = next((piece.probed for piece in instants if piece.number == needed), None)
-        self._sensitivities.tell(pi, x[fresh:], v[fresh:], signals[fresh:], probed)
+        x, v, signals = x[fresh:], v[fresh:], signals[fresh:]
+        self._sensitivities.tell(pi, x, v, signals, probed)
+        if self._calibration is not None:
+            self._calibration.tell(pi, x, v, signals, self._sensitivities.rates(len(x)))
 
     def drop(self, instant: int) -> None:
         """Forget what no window that starts at an instant or later asks for."""
         self._sensitivities.drop(instant)
+        if self._calibration is not None:
+            self._calibration.drop(instant)
 
     def push(self, window: Window, errors: Array) -> PropagatedNoise:
         """Of the next window; errors (n_v,): variance of each row that nothing propagates."""
@@ -100,18 +111,23 @@ class WindowNoise:
         covariances = self._noise.covariance(kernel, sensitivity.rates, noise.sensors, noise.torque, free, age)
         diagonal = np.einsum("ii->i", covariances[-1])
         diagonal += errors
-        return PropagatedNoise(covariances, kernel, self._noise.late)
+        none = np.empty((self.n_v, 0))
+        calibration = none if self._calibration is None else self._calibration.window(window.start, kernel)
+        return PropagatedNoise(covariances, kernel, self._noise.late, calibration)
 
     def state(self) -> dict[str, Any]:
         """What `restore` needs to continue."""
         return {
             "weights": np.empty(0) if self.beta is None else self.beta, **self._noise.state(),
             **self._sensitivities.state(), **noise_state("weighed", self.sensor_noise),
+            **({} if self._calibration is None else self._calibration.state()),
         }  # fmt: skip
 
     def restore(self, state: Mapping[str, NDArray[Any]]) -> None:
         """Continue from a saved state."""
         self.beta = np.array(state["weights"]) if state["weights"].size else None
         self._sensitivities.restore(state)
+        if self._calibration is not None:
+            self._calibration.restore(state)
         self._noise.restore(state)
         self.sensor_noise = noise_from_state("weighed", state)

@@ -1,0 +1,179 @@
+"""Nuisances of channels: what a reading differs by from the true one, for one unit of each."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from functools import partial
+
+import numpy as np
+
+from sms_online.calibration.nuisance import Nuisance
+from sms_online.description.channels import AXES
+from sms_online.description.schema import Tolerances
+from sms_online.pipeline.latency import clock_groups
+from sms_online.pipeline.sensing import Sensing
+from sms_online.stream import Array
+
+MARKER = re.compile(r"(?P<marker>link_(?P<link>\d+)\.marker_\d+)\.(?P<kind>u|theta)_(?P<axis>[xyz])")
+# Along the link a displacement changes by this rotation, with this sign.
+SLOPES = {"y": ("z", 1.0), "z": ("y", -1.0)}
+
+
+@dataclass(frozen=True)
+class Motion:
+    """Readings (K, sensors) of the position sensors at K instants, with their rates, and the torques n τ (K, joints).
+
+    base_rotation (K, 3, 3): T_0.
+    """
+
+    readings: Array
+    rates: Array
+    torque: Array
+    base_rotation: Array
+
+
+@dataclass(frozen=True)
+class Family:
+    """Nuisances of one kind; adds: motion to what one unit of each adds to readings, (K, sensors, c)."""
+
+    nuisances: tuple[Nuisance, ...]
+    adds: Callable[[Motion], Array]
+
+
+@dataclass(frozen=True)
+class TorqueFamily:
+    """Nuisances of torques; adds: motion to what one unit of each adds to n τ, (K, joints, c)."""
+
+    nuisances: tuple[Nuisance, ...]
+    adds: Callable[[Motion], Array]
+
+
+def position_families(sensing: Sensing, tolerances: Tolerances) -> list[Family]:
+    """Those of position sensors that have a tolerance."""
+    names = [sensing.channels[column] for column in sensing.position_columns]
+    every = [
+        *_clocks(sensing, names, tolerances.clock),
+        *_encoders(sensing, names, tolerances),
+        *_markers(names, tolerances),
+        *_camera(sensing, names, tolerances),
+    ]
+    return [family for family in every if family.nuisances and all(each.tolerance > 0.0 for each in family.nuisances)]
+
+
+def torque_families(sensing: Sensing, tolerances: Tolerances) -> list[TorqueFamily]:
+    """Those of torques that have a tolerance, but for what the system file declares as effects."""
+    declared = {(effect.name, effect.where) for effect in sensing.model.system.effects}
+    joints = range(len(sensing.model.layout.q))
+    units = ["N" if joint.kind == "prismatic" else "N m" for joint in sensing.model.system.joints]
+    offset = np.inf if tolerances.torque_offset is None else tolerances.torque_offset
+    gained = [i for i in joints if i > 0 and ("torque_gain", f"joint_{i + 1}") not in declared]
+    shifted = [i for i in joints if ("torque_offset", f"joint_{i + 1}") not in declared]
+    every = [
+        TorqueFamily(
+            tuple(Nuisance("torque_gain", f"joint_{i + 1}", "", tolerances.torque_gain) for i in gained),
+            partial(_of_torque, gained),
+        ),
+        TorqueFamily(
+            tuple(Nuisance("torque_offset", f"joint_{i + 1}", units[i], offset) for i in shifted),
+            partial(_one_torque, shifted),
+        ),
+    ]
+    return [family for family in every if family.nuisances and all(each.tolerance > 0.0 for each in family.nuisances)]
+
+
+def _of_torque(joints: Sequence[int], motion: Motion) -> Array:
+    return motion.torque[:, :, None] * np.eye(motion.torque.shape[1])[:, list(joints)]
+
+
+def _one_torque(joints: Sequence[int], motion: Motion) -> Array:
+    return np.ones_like(motion.torque)[:, :, None] * np.eye(motion.torque.shape[1])[:, list(joints)]
+
+
+def _clocks(sensing: Sensing, names: Sequence[str], tolerance: float) -> Iterator[Family]:
+    """Later than the torques; without devices of their own, encoders, base and markers have one clock each."""
+    groups: dict[str, list[int]] = {}
+    if sensing.model.system.sources:
+        devices = clock_groups(sensing)
+        reference = next((device for device in devices if device.joints), None)
+        groups = {device.name: list(device.sensors) for device in devices if device is not reference}
+    else:
+        base = sensing.model.layout.n_base_positions
+        for k, name in enumerate(names):
+            kind = "base" if k < base else "markers" if MARKER.fullmatch(name) else "encoders"
+            groups.setdefault(kind, []).append(k)
+    chosen = {name: sensors for name, sensors in groups.items() if sensors}
+    select = np.zeros((len(names), len(chosen)))
+    for column, sensors in zip(select.T, chosen.values(), strict=True):
+        column[sensors] = -1.0
+    nuisances = tuple(Nuisance("clock", name, "s", tolerance) for name in chosen)
+    yield Family(nuisances, lambda motion: motion.rates[:, :, None] * select)
+
+
+def _encoders(sensing: Sensing, names: Sequence[str], tolerances: Tolerances) -> Iterator[Family]:
+    joints = sensing.model.system.joints
+    encoders = [k for k, name in enumerate(names) if name.startswith(("q_", "theta_m_"))]
+    turning = [k for k in encoders if joints[int(names[k].rsplit("_", 1)[1]) - 1].kind == "revolute"]
+    one, turn = _selection(names, encoders), _selection(names, turning)
+    units = ["rad" if k in turning else "m" for k in encoders]
+    zeros = [
+        Nuisance("encoder_zero", names[k], unit, tolerances.encoder_zero)
+        for k, unit in zip(encoders, units, strict=True)
+    ]
+    yield Family(tuple(zeros), partial(_constant, one))
+    for part, wave in (("sine", np.sin), ("cosine", np.cos)):
+        waves = [Nuisance("once_per_turn", names[k], "rad", tolerances.once_per_turn, part) for k in turning]
+        yield Family(tuple(waves), lambda motion, wave=wave: wave(motion.readings)[:, :, None] * turn)
+
+
+def _markers(names: Sequence[str], tolerances: Tolerances) -> Iterator[Family]:
+    found = {k: match for k, name in enumerate(names) if (match := MARKER.fullmatch(name))}
+    for kind, tolerance, unit in (("u", "marker_zero", "m"), ("theta", "marker_zero_angle", "rad")):
+        own = [k for k, match in found.items() if match["kind"] == kind]
+        nuisances = tuple(Nuisance(tolerance, names[k], unit, getattr(tolerances, tolerance)) for k in own)
+        yield Family(nuisances, partial(_constant, _selection(names, own)))
+    # A marker further along its link reads the displacement there.
+    markers = list(dict.fromkeys(match["marker"] for match in found.values()))
+    steps = np.zeros((len(names), len(names), len(markers)))  # reading, rotation that it changes by, marker
+    for k, match in found.items():
+        if match["kind"] == "u" and match["axis"] in SLOPES:
+            axis, sign = SLOPES[match["axis"]]
+            rotation = f"{match['marker']}.theta_{axis}"
+            if rotation in names:
+                steps[k, names.index(rotation), markers.index(match["marker"])] = sign
+    nuisances = tuple(Nuisance("marker_station", marker, "m", tolerances.marker_station) for marker in markers)
+    yield Family(nuisances, lambda motion: np.einsum("ks,rsm->krm", motion.readings, steps))
+
+
+def _camera(sensing: Sensing, names: Sequence[str], tolerances: Tolerances) -> Iterator[Family]:
+    layout = sensing.model.layout
+    metres = [k for k, name in enumerate(names) if (match := MARKER.fullmatch(name)) and match["kind"] == "u"]
+    if layout.free:
+        metres += range(len(layout.base_linear))
+    if metres:
+        scale = (
+            Nuisance("camera_scale", "base and markers" if layout.free else "markers", "", tolerances.camera_scale),
+        )
+        seen = np.isin(np.arange(len(names)), metres)
+        yield Family(scale, lambda motion: (motion.readings * seen)[:, :, None])
+    if not layout.free:
+        return
+    linear = list(layout.base_linear)
+    points = tuple(Nuisance("tracked_point", "base", "m", tolerances.tracked_point, AXES[axis]) for axis in linear)
+    yield Family(points, partial(_tracked_point, linear))
+
+
+def _tracked_point(linear: Sequence[int], motion: Motion) -> Array:
+    """The tracked point is further along an axis of the base, and its measured position with it."""
+    out = np.zeros((*motion.readings.shape, len(linear)))
+    out[:, : len(linear)] = motion.base_rotation[:, linear][:, :, linear]
+    return out
+
+
+def _selection(names: Sequence[str], chosen: Sequence[int]) -> Array:
+    return np.eye(len(names))[:, list(chosen)]
+
+
+def _constant(selection: Array, motion: Motion) -> Array:
+    return np.broadcast_to(selection, (len(motion.readings), *selection.shape))

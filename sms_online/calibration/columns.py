@@ -1,0 +1,120 @@
+"""Columns of weak-form rows for what the description may be wrong in: Y π + N ν = b.
+
+A reading that is n(t) too large adds ∫ c n dt to Y π, with the c of `row_noise`, so that N = -∫ c n dt. A torque that
+is read too large by n(t) adds ∫ φ n dt to b, so N. With the right geometry momentum and force are others by ∂P π and
+∂G π, and N = -∫ (φ̇ ∂P + φ ∂G) dt π. All three are linear in ν, and hold as long as ν is so small that nothing bends.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.interpolate import CubicSpline
+
+from sms_online.calibration.channels import Motion, position_families, torque_families
+from sms_online.calibration.geometry import GeometryDerivatives, geometries
+from sms_online.calibration.nuisance import Nuisance
+from sms_online.model.model import Model
+from sms_online.pipeline.momentum_windows import EXPONENT, INSTANTS, STEPS
+from sms_online.pipeline.sensing import Sensing
+from sms_online.pipeline.weak_form import test_function
+from sms_online.stream import Array
+
+
+def nuisances(sensing: Sensing) -> tuple[Nuisance, ...]:
+    """What a session's description may be wrong in, in the order of its columns."""
+    system = sensing.model.system
+    families = (*position_families(sensing, system.tolerances), *torque_families(sensing, system.tolerances))
+    channels = [nuisance for family in families for nuisance in family.nuisances]
+    return (*channels, *(each.nuisance for each in geometries(system)))
+
+
+class CalibrationColumns:
+    """Evaluates the columns window by window, at the instants that sensitivities are told at.
+
+    count: of nuisances.
+    """
+
+    def __init__(self, model: Model, sensing: Sensing, span: float) -> None:
+        self.count = len(nuisances(sensing))
+        self._model, self._sensing = model, sensing
+        self._positions = position_families(sensing, model.system.tolerances)
+        self._torques = torque_families(sensing, model.system.tolerances)
+        self._geometry = GeometryDerivatives(model, list(geometries(model.system)))
+        self._joint_rows = list(model.layout.theta_m)
+        # From instants to steps of a window, and the weights of its integrals.
+        fine = np.linspace(0.0, INSTANTS, STEPS + 1)
+        self._to_steps = np.asarray(CubicSpline(np.arange(INSTANTS + 1.0), np.eye(INSTANTS + 1))(fine))
+        self._to_steps *= span / STEPS
+        phi, phi_dot, _ = test_function(INSTANTS, span, EXPONENT)
+        self._phi, self._phi_dot = phi * span / INSTANTS, phi_dot * span / INSTANTS
+        self.forget(0)
+
+    def forget(self, next_instant: int) -> None:
+        """Begin anew: `next_instant` is the number of the first one to be told."""
+        layout = self._model.layout
+        sensors = len(self._sensing.position_columns)
+        widths = [sum(len(each.nuisances) for each in family) for family in (self._positions, self._torques)]
+        moved = self.count - sum(widths)
+        self._first = next_instant
+        self._added = np.empty((0, sensors, widths[0]))
+        self._torque = np.empty((0, len(layout.q), widths[1]))
+        self._momentum, self._force = np.empty((2, 0, layout.n_v, moved))
+
+    def tell(self, pi: Array, x: Array, v: Array, signals: Array, rates: Array) -> None:
+        """Take the next instants: x (K, n_x), v (K, n_v), signals as in `Instants`, with parameters π (n_pi,).
+
+        rates (K, sensors): of the readings.
+        """
+        if not self.count or not len(x):
+            return
+        torque = signals[:, : len(self._model.layout.q)]
+        _, T_0 = self._model.layout.base_pose(x)
+        motion = Motion(self._sensing.readings(x), rates, torque, T_0)
+        K = len(x)
+        added = [np.empty((K, *self._added.shape[1:2], 0)), *(family.adds(motion) for family in self._positions)]
+        torques = [np.empty((K, *self._torque.shape[1:2], 0)), *(family.adds(motion) for family in self._torques)]
+        momentum, force = self._geometry.at(pi, x, v, signals)
+        self._added = np.concatenate((self._added, np.concatenate(added, axis=2)))
+        self._torque = np.concatenate((self._torque, np.concatenate(torques, axis=2)))
+        self._momentum = np.concatenate((self._momentum, momentum))
+        self._force = np.concatenate((self._force, force))
+
+    def window(self, start: int, kernel: Array) -> Array:
+        """N (n_v, count) of the window that starts at an instant; kernel (STEPS + 1, n_v, sensors): its c."""
+        if not self.count:
+            return np.empty((kernel.shape[1], 0))
+        inside = slice(start - self._first, start - self._first + INSTANTS + 1)
+        weights = np.tensordot(self._to_steps.T, kernel, 1)  # (INSTANTS + 1, n_v, sensors)
+        n_v = kernel.shape[1]
+        flat = weights.swapaxes(0, 1).reshape(n_v, -1)
+        positions = -flat @ self._added[inside].reshape(flat.shape[1], -1)
+        torques = np.zeros((n_v, self._torque.shape[2]))
+        torques[self._joint_rows] = np.tensordot(self._phi, self._torque[inside], 1)
+        moved = -np.tensordot(self._phi_dot, self._momentum[inside], 1)
+        moved -= np.tensordot(self._phi, self._force[inside], 1)
+        return np.concatenate((positions, torques, moved), axis=1)
+
+    def drop(self, before: int) -> None:
+        """Forget instants with smaller numbers."""
+        if self.count:
+            kept = slice(before - self._first, None)
+            self._added, self._torque = self._added[kept], self._torque[kept]
+            self._momentum, self._force = self._momentum[kept], self._force[kept]
+        self._first = before
+
+    def state(self) -> dict[str, Any]:
+        """What `restore` needs to continue."""
+        return {
+            "calibration_first": self._first, "calibration_added": self._added, "calibration_torque": self._torque,
+            "calibration_momentum": self._momentum, "calibration_force": self._force,
+        }  # fmt: skip
+
+    def restore(self, state: Mapping[str, NDArray[Any]]) -> None:
+        """Continue from a saved state."""
+        self._first = int(state["calibration_first"])
+        self._added, self._torque = np.array(state["calibration_added"]), np.array(state["calibration_torque"])
+        self._momentum, self._force = np.array(state["calibration_momentum"]), np.array(state["calibration_force"])

@@ -1,0 +1,149 @@
+"""Nuisances of geometry: what momentum and force of the model change by, for one unit of each."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from sms_online.calibration.nuisance import Nuisance
+from sms_online.description.channels import AXES
+from sms_online.description.schema import FlexibleLink, System
+from sms_online.model.beam import LinearLink
+from sms_online.model.model import Model
+from sms_online.stream import Array
+
+# Step of the differences that give derivatives, m or rad: 1e-6 of them is lost to curvature, less to rounding.
+DIFFERENCE = 1e-6
+
+
+# Makes states x (K, n_x), v (K, n_v) of a model to which the described one and its states are given, and by how much.
+States = Callable[[Model, Model, Array, Array, float], tuple[Array, Array]]
+
+
+def same_readings(described: Model, moved: Model, x: Array, v: Array, by: float) -> tuple[Array, Array]:
+    """States of the moved geometry that its sensors read the same in: strains of exact links follow from markers."""
+    x, v = x.copy(), v.copy()
+    offset = described.layout.n_base_positions - described.layout.n_base_speeds
+    pairs = zip(described.chain.flexible, moved.chain.flexible, described.layout.q_f, strict=True)
+    for link, other, q_f in pairs:
+        if link is None or other is None or link is other or isinstance(link, LinearLink):
+            continue
+        own = slice(q_f.start + offset, q_f.stop + offset)
+        rates = link.marker_jacobian(x[:, own]) @ v[:, q_f, None]
+        x[:, own] = other.coordinates(link.markers(x[:, own]))
+        v[:, q_f] = np.linalg.solve(other.marker_jacobian(x[:, own]), rates)[..., 0]
+    return x, v
+
+
+@dataclass(frozen=True)
+class Geometry:
+    """A nuisance of geometry; moved: the system with so much of it; states: of the system that was moved."""
+
+    nuisance: Nuisance
+    moved: Callable[[System, float], System]
+    states: States = same_readings
+
+
+def geometries(system: System) -> Iterator[Geometry]:
+    """Those of a system that have a tolerance; of a planar one only what keeps it planar."""
+    planar, tolerances = system.motion == "planar", system.tolerances
+    for i, link in enumerate(system.links):
+        if tolerances.length == 0.0:
+            break
+        if isinstance(link, FlexibleLink):
+            yield Geometry(Nuisance("length", f"link_{i + 1}", "m", tolerances.length), _longer(i))
+        elif i + 1 < len(system.links) or system.payload is not None:
+            for axis in range(2 if planar else 3):
+                nuisance = Nuisance("length", f"link_{i + 1}", "m", tolerances.length, AXES[axis])
+                yield Geometry(nuisance, _tip_moved(i, axis))
+    for i in range(len(system.joints)):
+        for axis in (2,) if planar else (0, 1, 2):
+            if tolerances.axis > 0.0:
+                nuisance = Nuisance("axis", f"joint_{i + 1}", "rad", tolerances.axis, AXES[axis])
+                yield Geometry(nuisance, _mount_turned(i, axis))
+    if system.spacecraft is not None and tolerances.base_angle > 0.0:
+        for axis in (2,) if planar else (0, 1, 2):
+            nuisance = Nuisance("base_angle", "base", "rad", tolerances.base_angle, AXES[axis])
+            yield Geometry(nuisance, lambda system, by: system, _base_turned(axis))
+    gravity = np.array(system.gravity)
+    if gravity.any() and tolerances.gravity > 0.0:
+        about = [np.array([0.0, 0.0, 1.0])] if planar else [np.array(v) for v in np.linalg.svd(gravity[None])[2][1:]]
+        for k, axis in enumerate(about, start=1):
+            part = "z" if planar else f"direction {k}"
+            yield Geometry(Nuisance("gravity", "base", "rad", tolerances.gravity, part), _tilted(axis))
+
+
+def _with(records: tuple[object, ...], i: int, **changed: object) -> tuple[object, ...]:
+    record = records[i].model_copy(update=changed)  # type: ignore[attr-defined]
+    return (*records[:i], record, *records[i + 1 :])
+
+
+def _longer(i: int) -> Callable[[System, float], System]:
+    def moved(system: System, by: float) -> System:
+        link = system.links[i]
+        assert isinstance(link, FlexibleLink)
+        return system.model_copy(update={"links": _with(system.links, i, length=link.length + by)})
+
+    return moved
+
+
+def _tip_moved(i: int, axis: int) -> Callable[[System, float], System]:
+    def moved(system: System, by: float) -> System:
+        link = system.links[i]
+        assert not isinstance(link, FlexibleLink)
+        tip = np.array(link.tip) + by * np.eye(3)[axis]
+        return system.model_copy(update={"links": _with(system.links, i, tip=tuple(tip.tolist()))})
+
+    return moved
+
+
+def _mount_turned(i: int, axis: int) -> Callable[[System, float], System]:
+    def moved(system: System, by: float) -> System:
+        mount = Rotation.from_rotvec(system.joints[i].mount_rotation) * Rotation.from_rotvec(by * np.eye(3)[axis])
+        turned = tuple(mount.as_rotvec().tolist())
+        return system.model_copy(update={"joints": _with(system.joints, i, mount_rotation=turned)})
+
+    return moved
+
+
+def _tilted(about: Array) -> Callable[[System, float], System]:
+    def moved(system: System, by: float) -> System:
+        gravity = Rotation.from_rotvec(by * about).apply(np.array(system.gravity))
+        return system.model_copy(update={"gravity": tuple(gravity.tolist())})
+
+    return moved
+
+
+def _base_turned(axis: int) -> States:
+    """The base's frame is turned about an axis of it against the frame that is measured: ω_0 is the same."""
+
+    def states(described: Model, moved: Model, x: Array, v: Array, by: float) -> tuple[Array, Array]:
+        layout = described.layout
+        turn = np.zeros_like(v)
+        about = layout.base_pose(x)[1][:, list(layout.base_angular), axis]
+        turn[:, len(layout.base_linear) : layout.n_base_speeds] = -by * about
+        return x + layout.position_rate(x, turn), v
+
+    return states
+
+
+class GeometryDerivatives:
+    """Derivatives of momentum P π and force G π by each of some geometries, at states that the readings give."""
+
+    def __init__(self, model: Model, chosen: list[Geometry]) -> None:
+        self._model = model
+        self._moved = [(model.of_geometry(each.moved(model.system, DIFFERENCE)), each.states) for each in chosen]
+
+    def at(self, pi: Array, x: Array, v: Array, signals: Array) -> tuple[Array, Array]:
+        """∂Pπ and ∂Gπ (K, n_v, c) at x (K, n_x), v (K, n_v), signals as in `Instants`; readings stay as they are."""
+        out = np.zeros((2, len(x), v.shape[1], len(self._moved)))
+        if self._moved and len(x):
+            inputs = self._model.inputs(signals)
+            described = self._model.dynamics(pi).momentum_and_force(x, v, inputs)
+            for k, (moved, states) in enumerate(self._moved):
+                there = moved.dynamics(pi).momentum_and_force(*states(self._model, moved, x, v, DIFFERENCE), inputs)
+                out[..., k] = (np.array(there) - np.array(described)) / DIFFERENCE
+        return out[0], out[1]

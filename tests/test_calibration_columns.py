@@ -1,0 +1,154 @@
+"""Columns of calibration are what rows change by when samples or geometry are off by a little."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+from model_systems import paper, spatial
+from prescribed_motion import prescribed
+
+from scipy.spatial.transform import Rotation
+
+from sms_adapters.system_file import load_system
+from sms_online.calibration.channels import Motion, position_families, torque_families
+from sms_online.calibration.columns import CalibrationColumns, nuisances
+from sms_online.calibration.geometry import Geometry, geometries
+from sms_online.description.channels import AXES
+from sms_online.description.schema import System
+from sms_online.effects.build import build_model
+from sms_online.model.base_parameters import find_base_parameters
+from sms_online.model.model import Model
+from sms_online.pipeline.momentum_balance import MomentumBalance
+from sms_online.pipeline.momentum_windows import COPIES, INSTANTS, Instants, Window
+from sms_online.pipeline.row_noise import RowNoise
+from sms_online.pipeline.sensing import Sensing
+from sms_online.pipeline.sensitivity import Sensitivities
+from sms_online.stream import Array
+from sms_sim.plant import Plant
+
+SPAN = 0.4  # s
+# m, rad, s and so on: rows are linear in it, and it is large against rounding.
+STEP = 1e-5
+# Share of the largest entry of a column: derivatives by positions are told at every other instant and interpolated.
+AGREEMENT = 7e-3
+ROUNDING = 1e-6  # N s and so on for a unit of a nuisance
+SYSTEMS: dict[str, Callable[[], System]] = {
+    "planar": paper,
+    "planar, exact links": lambda: paper("exact"),
+    "spatial": lambda: load_system("spatial-two-link"),
+    "spatial, prismatic joint, gravity, effects": lambda: spatial(free=False),
+}
+
+
+class Rows:
+    """Residuals Y β - b of windows of one stretch of motion, exact parameters, for samples and geometries at will."""
+
+    def __init__(self, system: System) -> None:
+        self.model = model = build_model(system)
+        self.base = find_base_parameters(model)
+        self.beta = self.base.values(model.nominal)
+        plant = Plant(system)
+        self.sensing = sensing = Sensing(model, plant.channels, "test")
+        order = [plant.channels.index(name) for name in sensing.channels]
+        balance = MomentumBalance(model, self.base, system.sample_rate, SPAN)
+        self.motion = prescribed(model, balance.width + balance.lead + balance.margin + balance.hop + 1, seed=1)
+        torque = self.motion.Q[:, list(model.layout.theta_m)]
+        self.exact = plant.channel_values(torque, self.motion.x)[:, order]
+        self.columns = self._columns(balance)
+
+    def _columns(self, balance: MomentumBalance) -> Array:
+        pi = balance.rough.without(self.base.physical_values(self.beta))
+        found, instants = self._windows(balance, self.sensing, self.exact)
+        told = Sensitivities(self.model, self.sensing.displacements, balance.span / INSTANTS)
+        calibration = CalibrationColumns(self.model, self.sensing, balance.span)
+        for piece in instants:
+            told.tell(pi, piece.x, piece.v, piece.signals)
+            calibration.tell(pi, piece.x, piece.v, piece.signals, told.rates(len(piece.x)))
+        noise = RowNoise(self.model.layout.theta_m, balance.span)
+        out = []
+        for window in found:
+            sensitivity = told.window(window.start)
+            kernel = noise.kernel(sensitivity)
+            kernel += balance.rough.kernel(
+                window.rough, self.base.physical_values(self.beta), sensitivity.displacements
+            )
+            out.append(calibration.window(window.start, kernel))
+        return np.concatenate(out)
+
+    def _windows(
+        self, balance: MomentumBalance, sensing: Sensing, values: Array
+    ) -> tuple[list[Window], list[Instants]]:
+        sigma = np.full(self.model.layout.n_x, 1e-9)
+        return balance.push(np.arange(len(values)), [sensing.motion(values)] * COPIES, sigma)
+
+    def residual(self, values: Array, model: Model | None = None) -> Array:
+        """Y β - b, all windows' rows one below the other."""
+        model = self.model if model is None else model
+        sensing = Sensing(model, self.sensing.channels, "test")
+        balance = MomentumBalance(model, self.base, self.model.system.sample_rate, SPAN)
+        dense = [balance.dense(window)[0] for window in self._windows(balance, sensing, values)[0]]
+        return np.concatenate([rows[:, :-1] @ self.beta - rows[:, -1] for rows in dense])
+
+    def moved(self, geometry: Geometry, by: float) -> Array:
+        """The same of another geometry, or of the base's frame turned against what is measured."""
+        values = self.exact.copy()
+        if geometry.nuisance.name == "base_angle":
+            positions, layout = self.sensing.position_columns, self.model.layout
+            if layout.planar:
+                values[:, positions[2]] -= by
+            else:
+                # Scalar last in both.
+                turn = Rotation.from_rotvec(by * np.eye(3)[AXES.index(geometry.nuisance.part)])
+                values[:, positions[3:7]] = (Rotation.from_quat(values[:, positions[3:7]]) * turn.inv()).as_quat()
+                values[:, positions[3:7]] *= np.sign(
+                    np.sum(values[:, positions[3:7]] * self.exact[:, positions[3:7]], 1)
+                )[:, None]
+        return self.residual(values, self.model.of_geometry(geometry.moved(self.model.system, by)))
+
+    def added(self) -> Array:
+        """What a unit of each channel's nuisance adds to the samples, (nuisances, samples, channels)."""
+        sensing, model = self.sensing, self.model
+        x, v = self.motion.x, self.motion.v
+        readings = sensing.readings(x)
+        displacements = sensing.displacements(x)
+        rates = (np.linalg.pinv(displacements) @ v[:, :, None])[..., 0]
+        np.testing.assert_allclose(readings, self.exact[:, sensing.position_columns], atol=1e-9)
+        torque = sensing.joint_torque(self.exact)
+        motion = Motion(readings, rates, torque, model.layout.base_pose(x)[1])
+        gear = sensing.joint_torque(np.ones_like(self.exact[:1]))[0]
+        out = []
+        for family in position_families(sensing, model.system.tolerances):
+            for column in np.moveaxis(family.adds(motion), 2, 0):
+                out.append(np.zeros_like(self.exact))
+                out[-1][:, sensing.position_columns] = column
+        for torques in torque_families(sensing, model.system.tolerances):
+            for column in np.moveaxis(torques.adds(motion), 2, 0):
+                out.append(np.zeros_like(self.exact))
+                out[-1][:, sensing.torque_columns] = column / gear
+        return np.array(out)
+
+
+@pytest.mark.parametrize("system", SYSTEMS.values(), ids=SYSTEMS.keys())
+def test_columns_are_what_rows_change_by(system: Callable[[], System]) -> None:
+    """Samples or description changed, rows rebuilt, central differences: Y β - b changes by -N ν."""
+    rows = Rows(system())
+    model, found = rows.model, nuisances(rows.sensing)
+    numeric = []
+    for added in rows.added():
+        numeric.append(
+            (rows.residual(rows.exact + STEP * added) - rows.residual(rows.exact - STEP * added)) / -(2 * STEP)
+        )
+    for geometry in geometries(model.system):
+        there, back = (rows.moved(geometry, by) for by in (STEP, -STEP))
+        numeric.append((there - back) / (2 * STEP))
+    assert len(numeric) == len(found) == rows.columns.shape[1]
+    size = np.abs(np.array(numeric)).max(axis=1)
+    off = np.abs(np.array(numeric) - rows.columns.T).max(axis=1)
+    bad = {
+        (nuisance.name, nuisance.where, nuisance.part): (float(error), float(largest))
+        for nuisance, error, largest in zip(found, off, size, strict=True)
+        if error > AGREEMENT * largest + ROUNDING
+    }
+    assert bad == {}
