@@ -40,6 +40,16 @@ def test_pages_use_the_fields_words() -> None:
     assert found == []
 
 
+def test_the_architecture_page_names_every_module_once() -> None:
+    page = (ROOT / "docs" / "explanation" / "architecture.md").read_text(encoding="utf-8")
+    rows = re.findall(r"^\| (`.*?`) \|", page.split("## Inside sms_online")[1], re.MULTILINE)
+    named = [name for row in rows for name in re.findall(r"`([^`]+)`", row)]
+    here = [path for path in (ROOT / "sms_online").iterdir() if not path.name.startswith(("_", "."))]
+    modules = {path.name for path in here if path.suffix == ".py"}
+    folders = {f"{path.name}/" for path in here if (path / "__init__.py").exists()}
+    assert sorted(named) == sorted(modules | folders)
+
+
 def test_the_guides_tracker_without_fading_is_least_squares() -> None:
     """Rows of seed 1; a memory of 1e12 s is none. The information matrix squares a condition number of 1.2."""
     rows = exciting_rows(seed=1, count=500)

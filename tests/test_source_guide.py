@@ -8,8 +8,11 @@ import time
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
+from axis import AXIS, axis_block
 
+import sms_online as sms
 from sms_adapters.raw import LostDevice, SerialChunk
 from sms_online.description.parse import parse_system
 
@@ -33,8 +36,23 @@ def test_the_system_file_of_the_guide_is_accepted() -> None:
     assert set(system.known) | set(system.priors) == {"joint_1.damping", "motor_1.rotor_inertia"}
 
 
+def test_the_guides_log_gives_the_estimate_of_its_samples(tmp_path: Path) -> None:
+    """Twelve seconds of a described axis, noise of seed 3."""
+    scope: dict[str, Any] = {"__name__": "guide"}
+    exec(compile(shown("add-a-source.md", "python")[0], "add-a-source.md", "exec"), scope)
+    block, system = axis_block(coulomb=0.0), parse_system(AXIS, "axis")
+    path = tmp_path / "run.npz"
+    np.savez(path, t=block.t, values=block.values, channels=block.channels)
+    expected = sms.estimate(system, sms.Capture(block.t, block.channels, block.values)).parameters
+    found = sms.estimate(system, scope["NumpyLog"](path)).parameters
+    assert [p.value for p in found.values()] == [p.value for p in expected.values()]
+    np.savez(path, t=block.t, values=block.values)
+    with pytest.raises(sms.InputError, match="channels"):
+        scope["NumpyLog"](path)
+
+
 def test_the_guides_own_source_reads_and_decodes() -> None:
-    (code,) = shown("add-a-source.md", "python")
+    code = shown("add-a-source.md", "python")[1]
     assert len(code.splitlines()) < 50
     scope: dict[str, Any] = {"__name__": "guide"}
     exec(compile(code, "add-a-source.md", "exec"), scope)
