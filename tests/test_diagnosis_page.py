@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import html
 import json
 import re
 from pathlib import Path
@@ -24,7 +25,7 @@ from sms_online.effects.build import build_model
 from sms_online.truth import true_values
 from sms_tools.adopted_system import added_lines, adopted_text, remarks
 from sms_tools.cli import main
-from sms_tools.html_report.arm_drawing import MARK, marked_arm
+from sms_tools.html_report.arm_drawing import marked_arm
 from sms_tools.html_report.diagnosis_page import write_diagnosis
 from sms_tools.report import Document
 from sms_tools.view.places import places_of
@@ -61,18 +62,39 @@ def test_the_curve_from_the_data_is_the_friction_that_was_there(diagnosis: Diagn
 
 def test_the_page_is_whole_and_well_formed(diagnosis: Diagnosis, tmp_path: Path) -> None:
     document, page = page_of(diagnosis, tmp_path, ['name = "coulomb_friction" # & more'])
-    assert not re.search(r"(src|href)=|https?://|@import|<script", page)
+    assert not re.search(r"src=|(href=\"|url\()(?!#)|https?://|@import|<script", page)
     drawings = re.findall(r"<svg.*?</svg>", page, re.DOTALL)
+    assert len(drawings) >= 3
     for drawing in drawings:
         ElementTree.fromstring(drawing)
-    names = re.findall(r'clipPath id="(\w+)"', page)
+    names = re.findall(r' id="([^"]+)"', page)
     assert len(names) == len(set(names)) >= 3
     assert document["summary"] in page
     assert "a warning with &lt;angle brackets&gt;" in page
     assert "# &amp; more" in page
     assert "found: 1" in page
     for p in document["after"]["parameters"]:
-        assert p["name"] in page
+        assert p["name"] in page.replace("<wbr>", "")
+
+
+def test_candidates_are_drawn_by_what_they_explain_of_everything(diagnosis: Diagnosis, tmp_path: Path) -> None:
+    _, page = page_of(diagnosis, tmp_path, [])
+    drawn = [float(width) for width in re.findall(r'class="share.*?width: ([\d.]+)%', page)]
+    assert drawn == sorted(drawn, reverse=True)
+    before, after = (float(np.sum(state.residual**2)) for state in (diagnosis.before, diagnosis.after))
+    # Windows overlap, and only the shares are of rows that count what these have in common once.
+    assert drawn[0] == pytest.approx(100.0 * (1.0 - after / before), abs=1.0)
+    # What explains no more than chance is not among them.
+    assert len(drawn) < len(diagnosis.ranking)
+
+
+def test_what_was_found_has_no_nominal_value(diagnosis: Diagnosis, tmp_path: Path) -> None:
+    document, page = page_of(diagnosis, tmp_path, [])
+    nominal = re.findall(r'<td data-label="nominal">(.*?)</td>', page)
+    stated = {p.name: p.nominal for p in diagnosis.estimator_before.base.parameters}
+    names = [p["name"] for p in document["after"]["parameters"]]
+    assert nominal == [f"{stated[name]:.6g}" if stated.get(name) else "" for name in names]
+    assert "" in nominal
 
 
 def test_the_same_session_gives_the_same_page(diagnosis: Diagnosis, tmp_path: Path) -> None:
@@ -83,7 +105,9 @@ def test_a_clean_session_has_a_page_without_effects(tmp_path: Path) -> None:
     document, page = page_of(diagnosed(0.0), tmp_path, [])
     assert document["verdict"] == "clean"
     assert "What and where" not in page
-    assert ">after" not in page.split("Parameters before and after")[1]
+    assert "before and after" not in page
+    assert 'class="share' not in page
+    assert "none explains more of the residual than chance" in page
 
 
 def test_diagnose_writes_the_page_beside_its_document(tmp_path: Path) -> None:
@@ -95,7 +119,7 @@ def test_diagnose_writes_the_page_beside_its_document(tmp_path: Path) -> None:
     assert main(["diagnose", str(capture), "--system", str(system), "--out", str(out)]) == 0
     page = (out / "diagnosis.html").read_text()
     assert json.loads((out / "diagnosis.json").read_text())["summary"] in page
-    assert "[[effect]]\nname = &quot;coulomb_friction&quot;\nwhere = &quot;joint_1&quot;" in page
+    assert '[[effect]]\nname = "coulomb_friction"\nwhere = "joint_1"' in html.unescape(page)
 
 
 def test_every_place_of_an_effect_is_marked() -> None:
@@ -103,11 +127,10 @@ def test_every_place_of_an_effect_is_marked() -> None:
     scene = Scene(build_model(system))
     x = np.zeros((3, scene.model.layout.n_x))
     places = {"base": "1", "joint_1": "2", "joint_2": "3, 4", "link_1": "5", "link_2": "6", "tip": "?"}
-    root = ElementTree.fromstring(marked_arm(scene, x, 1, places))
-    badges = [text.text for text in root.iter("text") if text.get("class") == "badge"]
-    assert badges == list(places.values())
-    rings = [ring for ring in root.iter("circle") if ring.get("stroke") == MARK]
-    assert len(rings) == 3
+    drawing = marked_arm(scene, x, 1, places)
+    assert re.findall(r"<text[^>]*font-weight: 700[^>]*>([^<]*)<", drawing) == list(places.values())
+    # A ring about each joint and about the tip.
+    assert len(re.findall("<use [^>]*stroke: var.--mark.", drawing)) == 3
 
 
 @pytest.mark.parametrize(

@@ -1,36 +1,39 @@
-"""report.html: self-contained, well-formed, and saying what the results say."""
+"""report.html: self-contained, well-formed, readable at any width, and saying what the results say."""
 
 from __future__ import annotations
 
-import html
 import json
 import re
+import shutil
+import subprocess
+import sys
 from pathlib import Path
 from xml.etree import ElementTree
 
 import numpy as np
 import pytest
 from evaluated import results_document
-from sms_tools.html_report.error_bars import Bar, error_bars
-from sms_tools.html_report.svg import Axis, Series, chart
 
 from sms_adapters.capture import CaptureWriter
 from sms_adapters.system_file import load_system
 from sms_online.effects.build import build_model
 from sms_online.pipeline.estimator import Estimator
-from sms_online.stream import Array, Block
+from sms_online.stream import Block
 from sms_sim.simulate import Simulation
 from sms_tools.cli import main
 from sms_tools.html_report import history as history_module
-from sms_tools.html_report import svg
 from sms_tools.html_report.arm_drawing import arm_drawings
-from sms_tools.html_report.history import History
+from sms_tools.html_report.figures import PALETTE, Series, chart
+from sms_tools.html_report.history import MOST_INSTANTS, Course, History
 from sms_tools.html_report.page import write_report
+from sms_tools.html_report.pages import error_bar
 from sms_tools.html_report.paper_example import figure_6
 from sms_tools.view.scene import Scene
-from sms_tools.view.session import references
 
-SVG = "{http://www.w3.org/2000/svg}"
+CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
+WARNING = "a warning with <angle brackets>"
+# Bytes of a page, at most.
+LARGEST = 2_000_000
 
 
 def watched(block: Block) -> tuple[Estimator, History]:
@@ -44,18 +47,26 @@ def watched(block: Block) -> tuple[Estimator, History]:
     return estimator, history
 
 
+def report_of(estimator: Estimator, history: History, directory: Path, throughput: float = 1000.0) -> str:
+    truth = {p.name: p.nominal for p in estimator.base.physical}
+    document = results_document(estimator, throughput, [WARNING], truth)
+    nominal = {p.name: p.nominal for p in estimator.base.parameters if p.nominal}
+    return write_report(directory, document, history.course, nominal, Scene(estimator.model)).read_text()
+
+
 @pytest.fixture(scope="module")
 def page(planar_block: Block, tmp_path_factory: pytest.TempPathFactory) -> str:
     """The report of the planar example."""
-    estimator, history = watched(planar_block)
-    truth = {p.name: p.nominal for p in estimator.base.physical}
-    document = results_document(estimator, 1000.0, ["a warning with <angle brackets>"], truth)
-    directory = tmp_path_factory.mktemp("report")
-    return write_report(directory, document, estimator, history, references(estimator, truth)).read_text()
+    return report_of(*watched(planar_block), tmp_path_factory.mktemp("report"))
+
+
+def cells(page: str, label: str) -> list[str]:
+    """Texts of all cells of a column."""
+    return re.findall(rf'<td data-label="{re.escape(label)}">(.*?)</td>', page)
 
 
 def test_nothing_is_fetched_from_elsewhere(page: str) -> None:
-    assert not re.search(r"(src|href)=|https?://|@import|<script", page)
+    assert not re.search(r"src=|(href=\"|url\()(?!#)|https?://|@import|<script", page)
 
 
 def test_every_drawing_is_well_formed(page: str) -> None:
@@ -63,23 +74,92 @@ def test_every_drawing_is_well_formed(page: str) -> None:
     assert len(drawings) >= 10
     for drawing in drawings:
         ElementTree.fromstring(drawing)
-    names = re.findall(r'clipPath id="(\w+)"', page)
+
+
+def test_every_reference_within_the_page_has_one_target(page: str) -> None:
+    names = re.findall(r' id="([^"]+)"', page)
     assert len(names) == len(set(names))
+    assert set(re.findall(r'(?:href="|url\()#([\w.]+)', page)) == set(names)
 
 
-def test_every_parameter_and_warning_is_told(page: str, planar_block: Block) -> None:
+def test_every_parameter_and_warning_is_on_the_page(page: str, planar_block: Block) -> None:
     estimator = Estimator(load_system("paper-planar"), planar_block.channels, "test")
     for p in estimator.base.parameters:
-        assert html.escape(p.name) in page
+        assert p.name in page.replace("<wbr>", "")
     assert "a warning with &lt;angle brackets&gt;" in page
 
 
-def test_the_same_session_gives_the_same_page(page: str, planar_block: Block, tmp_path: Path) -> None:
+def test_a_nominal_value_is_beside_each_estimate(page: str, planar_block: Block) -> None:
+    estimator = Estimator(load_system("paper-planar"), planar_block.channels, "test")
+    nominal = estimator.base.values(estimator.model.nominal)
+    np.testing.assert_allclose([float(cell) for cell in cells(page, "nominal")], nominal, rtol=1e-5)
+
+
+def test_an_unstated_nominal_value_is_left_out(planar_block: Block, tmp_path: Path) -> None:
     estimator, history = watched(planar_block)
-    truth = {p.name: p.nominal for p in estimator.base.physical}
-    document = results_document(estimator, 1000.0, ["a warning with <angle brackets>"], truth)
-    again = write_report(tmp_path, document, estimator, history, references(estimator, truth)).read_text()
-    assert again == page
+    document = results_document(estimator, 1000.0, [])
+    (stated, value), *_ = nominal = [(p.name, p.nominal) for p in estimator.base.parameters]
+    page = write_report(tmp_path, document, history.course, {stated: value}, Scene(estimator.model)).read_text()
+    assert cells(page, "nominal") == [f"{value:.6g}"] + [""] * (len(nominal) - 1)
+    assert [bool(cell) for cell in cells(page, "% off nominal")] == [True] + [False] * (len(nominal) - 1)
+
+
+def test_the_same_session_gives_the_same_page(page: str, planar_block: Block, tmp_path: Path) -> None:
+    # How fast the computer was is no property of the session.
+    assert report_of(*watched(planar_block), tmp_path, throughput=2000.0) == page
+
+
+def test_matplotlib_waits_for_the_first_page() -> None:
+    modules = "sms_tools.showing", "sms_tools.verbs.replay", "sms_tools.verbs.diagnose"
+    code = f"import sys, {', '.join(modules)}; sys.exit(any(name in sys.modules for name in ('matplotlib', 'jinja2')))"
+    assert subprocess.run([sys.executable, "-c", code]).returncode == 0
+
+
+def test_the_page_of_a_long_session_stays_small(tmp_path: Path) -> None:
+    """Of the arm with most parameters, all determined, each of them as rough as can be, with as many instants as a
+    history holds."""
+    system = load_system("seven-joint")
+    model = Model(system)
+    channels = tuple(system_channels(model))
+    estimator = Estimator(system, channels, "test")
+    document = results_document(estimator, 1000.0, [])
+    rng = np.random.default_rng(2)
+    for p in document["parameters"]:
+        p |= {"identifiable": True, "estimate": 1.0, "std": 0.1, "lower95": 0.8, "upper95": 1.2}
+    n = len(document["parameters"])
+    course = Course(
+        t=np.linspace(0.0, 3600.0, MOST_INSTANTS),
+        estimate=1.0 + 0.1 * rng.standard_normal((MOST_INSTANTS, n)),
+        std=0.1 * rng.random((MOST_INSTANTS, n)),
+        residual=rng.random((MOST_INSTANTS, len(system.joints))),
+        x=np.tile(np.eye(model.layout.n_x)[6], (MOST_INSTANTS, 1)),
+    )
+    assert write_report(tmp_path, document, course, {}, Scene(model)).stat().st_size < LARGEST
+
+
+def system_channels(model: Model) -> list[str]:
+    return [*model.layout.position_names, *(f"tau_{i}" for i in range(1, len(model.layout.q) + 1))]
+
+
+@pytest.mark.browser
+@pytest.mark.skipif(CHROMIUM is None, reason="no Chromium; tools/install_browser.sh installs it")
+@pytest.mark.parametrize("width", [400, 1400])
+def test_every_estimate_is_within_the_window(page: str, tmp_path: Path, width: int) -> None:
+    from playwright.sync_api import sync_playwright
+
+    (tmp_path / "report.html").write_text(page)
+    with sync_playwright() as playwright:
+        browser = playwright.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
+        window = browser.new_page(viewport={"width": width, "height": 900})
+        window.goto((tmp_path / "report.html").as_uri())
+        assert window.evaluate("document.documentElement.scrollWidth") <= width
+        boxes = [cell.bounding_box() for cell in window.locator("tbody td:not(:empty)").all()]
+        browser.close()
+    assert len(boxes) > 16 * 8
+    for box in boxes:
+        assert box is not None
+        assert box["x"] >= 0.0
+        assert box["x"] + box["width"] <= width
 
 
 def test_the_history_ends_with_the_results(planar_block: Block) -> None:
@@ -116,34 +196,30 @@ def test_replay_writes_it_beside_the_results(tmp_path: Path, planar_block: Block
     assert found["system"]["title"] in (tmp_path / "report.html").read_text()
 
 
-def polylines(text: str) -> list[Array]:
-    root = ElementTree.fromstring(text.replace("<svg ", '<svg xmlns="http://www.w3.org/2000/svg" '))
-    return [
-        np.array([point.split(",") for point in line.attrib["points"].split()], dtype=float)
-        for line in root.iter(f"{SVG}polyline")
-    ]
+def curves(svg: str, color: str) -> list[str]:
+    """Paths of a drawing's lines of a colour, as they are written."""
+    return re.findall(rf'<path d="([^"]*)"[^>]*style="fill: none; [^"]*stroke: var\(--{color}\)', svg)
 
 
 def test_a_gap_interrupts_a_line() -> None:
-    y = np.array([0.0, 1.0, np.nan, 1.0, 2.0, 3.0])
-    assert [len(line) for line in polylines(chart("c", np.arange(6.0), [Series("a", y)], "x"))] == [2, 3]
+    y = np.array([0.0, 1.0, np.nan, 1.0, 2.0, 4.0])
+    (line,) = curves(chart("c", [Series("a", np.arange(6.0), y)], "x").svg, "blue")
+    assert line.count("M") == 2
 
 
-def test_a_line_stands_where_its_axis_says() -> None:
-    (line,) = polylines(chart("c", np.array([0.0, 10.0]), [Series("a", np.array([0.0, 4.0]))], "x", (0.0, 4.0)))
-    assert line[0].tolist() == [svg.LEFT, svg.HEIGHT - svg.BOTTOM]
-    assert line[1].tolist() == [svg.WIDTH - svg.RIGHT, svg.TOP]
+def test_an_axis_holds_the_lines_not_their_bounds() -> None:
+    x, y = np.arange(3.0), np.array([0.0, 1.0, 2.0])
+    wide = Series("a", x, y, y - 1000.0, y + 1000.0)
+    ticks = [re.findall(r"<text[^>]*>([^<]*)<", chart("c", [each], "x").svg) for each in (Series("a", x, y), wide)]
+    assert ticks[0] == ticks[1]
 
 
-@pytest.mark.parametrize(("low", "high"), [(0.0, 1.0), (-20.0, 20.0), (3e-6, 4e-6), (-7.0, 1234.0)])
-def test_ticks_are_round_and_inside(low: float, high: float) -> None:
-    ticks = Axis(low, high, 0.0, 100.0).ticks()
-    assert 3 <= len(ticks) <= 7
-    assert all(low - 1e-9 * (high - low) <= tick <= high + 1e-9 * (high - low) for tick in ticks)
-    steps = np.diff(ticks)
-    np.testing.assert_allclose(steps, steps[0], rtol=1e-9)
-    mantissa = steps[0] / 10.0 ** np.floor(np.log10(steps[0]) + 1e-9)
-    assert min(abs(mantissa - m) for m in (1.0, 2.0, 5.0)) < 1e-6
+def test_drawings_have_the_colours_of_the_page() -> None:
+    svg = chart("c", [Series("a", np.arange(3.0), np.arange(3.0))], "x", marks=[1.0], shaded=[(1.0, 2.0)]).svg
+    assert not re.search("#[0-9a-f]{6}\\b", svg)
+    assert set(re.findall(r"var\(--(\w+)\)", svg)) <= set(PALETTE)
+    light = [light for light, _ in PALETTE.values()]
+    assert len(light) == len(set(light))
 
 
 @pytest.mark.parametrize("name", ["paper-planar", "seven-joint", "emps"])
@@ -153,17 +229,24 @@ def test_any_arm_can_be_drawn(name: str) -> None:
     if name == "seven-joint":
         x[:, 6] = 1.0
     for figure in arm_drawings(scene, x, [0, 2], ["a", "b"]):
-        ElementTree.fromstring(figure)
+        ElementTree.fromstring(figure.svg)
 
 
 def test_figure_6_shows_angles_rates_and_torques(planar_session: Simulation) -> None:
-    drawings = re.findall(r"<svg.*?</svg>", figure_6(planar_session), re.DOTALL)
-    assert [len(polylines(drawing)) for drawing in drawings] == [4, 4, 2]
+    figures = figure_6(planar_session)
+    assert [len(figure.key) for figure in figures] == [4, 4, 2]
+    for figure in figures:
+        for _, color, _ in figure.key:
+            assert len(curves(figure.svg, color)) == 1
 
 
 def test_a_bar_that_goes_on_beyond_its_scale_says_so() -> None:
-    inside, right, both = (error_bars([Bar(*bar, "#000")], 1.0) for bar in ((0.0, 0.9), (0.5, 0.9), (0.0, 3.0)))
-    assert [drawing.count("<path") for drawing in (inside, right, both)] == [0, 1, 2]
+    bars = [error_bar(deviation, bound, 1.0, "blue") for deviation, bound in ((0.0, 0.9), (0.5, 0.9), (0.0, 3.0))]
+    assert [(bar.below, bar.above) for bar in bars if bar] == [(False, False), (False, True), (True, True)]
+    outside = error_bar(-2.0, 0.5, 1.0, "blue")
+    assert outside is not None
+    assert (outside.start, outside.end, outside.middle) == (0.0, 0.0, None)
+    assert error_bar(0.0, np.nan, 1.0, "blue") is None
 
 
 def test_the_judgement_is_the_first_thing_on_the_page(page: str) -> None:

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from sms_adapters.system_file import load_system
+from sms_online.description.parse import parse_system
 from sms_online.description.schema import FlexibleLink
 from sms_online.effects.build import build_model
 from sms_online.model.base_parameters import random_states
@@ -14,9 +15,22 @@ from sms_online.model.so3 import RotationVector
 from sms_online.pipeline.sensing import Sensing
 from sms_online.stream import Array, Block
 from sms_tools.view.readings import Readings, SampleAndHold
-from sms_tools.view.scene import Scene
+from sms_tools.view.scene import STUB, Scene
 
 SEED = 11
+RIGID_AXIS = """
+name = "axis"
+motion = "planar"
+sample_rate = 100.0
+[joint_1]
+kind = "{kind}"
+axis = {axis}
+transmission = "rigid"
+[link_1]
+kind = "rigid"
+mass = 1.0
+{link}
+"""
 SYSTEMS = ("paper-planar", "paper-planar-exact", "spatial-two-link", "seven-joint", "quanser-2dsfl")
 
 
@@ -41,6 +55,31 @@ def test_links_hang_together(name: str) -> None:
         np.testing.assert_allclose(line[:, 0], drawing.joints[:, i], rtol=0, atol=1e-12)
         if i + 1 < len(drawing.links):
             np.testing.assert_allclose(line[:, -1], drawing.joints[:, i + 1], rtol=0, atol=1e-12)
+
+
+def rigid_axis(kind: str, link: str) -> Scene:
+    axis = "[0.0, 0.0, 1.0]" if kind == "revolute" else "[1.0, 0.0, 0.0]"
+    return Scene(Model(parse_system(RIGID_AXIS.format(kind=kind, axis=axis, link=link), "axis.toml")))
+
+
+def test_a_rigid_link_without_a_tip_ends_in_its_centre_of_mass() -> None:
+    drawing = rigid_axis("revolute", "center_of_mass = [0.2, 0.1, 0.0]").draw(np.array([[0.0], [np.pi / 2.0]]))
+    np.testing.assert_allclose(drawing.links[0][:, 0], 0.0, atol=1e-12)
+    np.testing.assert_allclose(drawing.links[0][:, -1], [[0.2, 0.1, 0.0], [-0.1, 0.2, 0.0]], atol=1e-12)
+    np.testing.assert_array_equal(drawing.tip, drawing.links[0][:, -1])
+    np.testing.assert_array_equal(drawing.ghost[:, -1], drawing.tip)
+
+
+def test_a_link_of_no_stated_point_is_seen_to_turn() -> None:
+    scene = rigid_axis("revolute", "")
+    tip = scene.draw(np.array([[0.0], [np.pi / 2.0]])).tip
+    assert np.linalg.norm(tip, axis=1) == pytest.approx(STUB * scene.reach)
+    assert np.dot(*tip) == pytest.approx(0.0, abs=1e-12)
+
+
+def test_a_slide_is_drawn_from_where_it_is_mounted() -> None:
+    (line,) = rigid_axis("prismatic", "").draw(np.array([[0.3]])).links
+    np.testing.assert_allclose(line[0, [0, -1]], [[0.0, 0.0, 0.0], [0.3, 0.0, 0.0]], atol=1e-12)
 
 
 def measured_marker(model: Model, readings: dict[str, float], i: int, j: int) -> Array:

@@ -83,11 +83,9 @@ def marked_arm(scene: Scene, x: Array, row: int, marks: Mapping[str, str]) -> Ma
             else:
                 at = paper(drawing.tip[row] if kind == "tip" else drawing.joints[row, int(number) - 1])
                 axes.plot(*at, "o", markersize=16.0, color="none", markeredgecolor=ink("mark"), markeredgewidth=3.0)
-            badge = {"boxstyle": "round,pad=0.4,rounding_size=0.7", "facecolor": ink("mark"), "edgecolor": "none"}
-            axes.annotate(
-                text, (at[0], at[1]), (0.0, ABOVE), textcoords="offset points", ha="center", va="center", color="white",
-                weight="bold", bbox=badge, gid="badge",
-            )  # fmt: skip
+            box = {"boxstyle": "round,pad=0.4,rounding_size=0.7", "facecolor": ink("mark"), "edgecolor": "none"}
+            badge = {"ha": "center", "va": "center", "color": ink("ground"), "weight": "bold", "bbox": box}
+            axes.annotate(text, (at[0], at[1]), (0.0, ABOVE), textcoords="offset points", **badge)
 
     return drawn("where", *MARKED, draw, bare=True)
 

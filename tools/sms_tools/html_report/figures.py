@@ -102,7 +102,8 @@ def chart(
     colors = [line.color or LINES[k % len(LINES)] for k, line in enumerate(series)]
 
     def draw(axes: Axes) -> None:
-        axes.set_yscale("log" if log else "linear")
+        if log:
+            axes.set_yscale("log", nonpositive="mask")
         for line, name in zip(series, colors, strict=True):
             rows = _thinned(line)
             axes.plot(line.x[rows], line.y[rows], "--" if line.dashed else "-", color=ink(name))
