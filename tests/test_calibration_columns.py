@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 from model_systems import paper, spatial
 from prescribed_motion import prescribed
-
 from scipy.spatial.transform import Rotation
 
 from sms_adapters.system_file import load_system

@@ -26,8 +26,8 @@ from sms_tools.html_report.arm_drawing import arm_drawings
 from sms_tools.html_report.figures import PALETTE, Series, chart
 from sms_tools.html_report.history import MOST_INSTANTS, Course, History
 from sms_tools.html_report.page import write_report
-from sms_tools.html_report.pages import error_bar
 from sms_tools.html_report.paper_example import figure_6
+from sms_tools.html_report.parameter_rows import error_bar
 from sms_tools.view.scene import Scene
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -12,10 +12,9 @@ from markupsafe import Markup
 from sms_online.diagnosis.diagnose import Diagnosis
 from sms_tools.html_report.arm_drawing import marked_arm
 from sms_tools.html_report.diagnosis_charts import AFTER, BEFORE, law_charts, residual_charts
-from sms_tools.html_report.pages import error_bar, estimate_cells, number, write_page
+from sms_tools.html_report.pages import write_page
+from sms_tools.html_report.parameter_rows import parameter_rows
 from sms_tools.report import Document
-from sms_tools.view.known import BOUNDS
-from sms_tools.view.parameter_groups import half_range
 from sms_tools.view.places import places_of
 from sms_tools.view.scene import Scene
 
@@ -34,6 +33,10 @@ def write_diagnosis(
     source: the capture. added: lines that the system file gains. Raises InputError where the file cannot be written.
     """
     system = diagnosis.described.system
+    before, after = (document[state]["parameters"] for state in ("before", "after"))
+    columns = (
+        {"before": (before, BEFORE), "after": (after, AFTER)} if document["effects"] else {"estimate": (after, AFTER)}
+    )
     found = bool(document["effects"] or document["unexplained"])
     rows = diagnosis.attempt.rows
     return write_page(
@@ -54,7 +57,7 @@ def write_diagnosis(
         colors={"before": BEFORE, "after": AFTER},
         changed=diagnosis.after.system != diagnosis.before.system,
         candidates=_candidates(document, diagnosis),
-        parameters=_parameters(document, _nominal(diagnosis)),
+        parameters=parameter_rows(columns, _nominal(diagnosis)),
         added="\n".join(added),
     )
 
@@ -77,9 +80,9 @@ def _arm(document: Document, diagnosis: Diagnosis) -> Markup:
     x = np.concatenate([motion.x for motion in motions])[order][:: max(1, order.size // WAY_POINTS)]
     channels = diagnosis.estimator_before.sensing.channels
     marks: dict[str, list[str]] = {}
-    for number_, effect in enumerate(document["effects"], start=1):
+    for number, effect in enumerate(document["effects"], start=1):
         for place in places_of(effect["where"], channels):
-            marks.setdefault(place, []).append(str(number_))
+            marks.setdefault(place, []).append(str(number))
     if document["unexplained"] is not None:
         marks.setdefault(document["unexplained"]["row"], []).append("?")
     return marked_arm(Scene(rows.model), x, len(x) // 2, {place: ", ".join(texts) for place, texts in marks.items()})
@@ -106,37 +109,3 @@ def _candidates(document: Document, diagnosis: Diagnosis) -> list[dict[str, Any]
         if ranked.explained and (rank <= LISTED or row["found"]):
             rows.append(row)
     return rows
-
-
-def _parameters(document: Document, nominal: Mapping[str, float]) -> dict[str, Any]:
-    """Estimates of both models; bars about the true value where it is known, else about the estimate after."""
-    before = {p["name"]: p for p in document["before"]["parameters"]}
-    after = document["after"]["parameters"]
-    changed = bool(document["effects"])
-    is_true = any(p["true"] is not None for p in after)
-    deviations = np.full((len(after), 2, 2), np.nan)  # before and after; estimate from reference, 2σ, %
-    for k, p in enumerate(after):
-        reference = p["true"] if is_true else p["estimate"] if p["identifiable"] else None
-        for j, each in enumerate((before.get(p["name"]), p)):
-            if each is not None and each["identifiable"] and reference:
-                size = abs(reference) / 100.0
-                deviations[k, j] = (each["estimate"] - reference) / size, BOUNDS * each["std"] / size
-    limit = half_range(np.abs(deviations).sum(axis=2).ravel())
-    columns = ("before", "after") if changed else ("after",)
-    rows = []
-    for p, own in zip(after, deviations, strict=True):
-        shown = {"before": (before.get(p["name"]), own[0], BEFORE), "after": (p, own[1], AFTER)}
-        cells = [shown[column] for column in columns]
-        rows.append(
-            {
-                "name": p["name"],
-                "unit": p["unit"],
-                "determined": p["identifiable"],
-                "estimates": [("", "") if each is None else estimate_cells(each)[:2] for each, _, _ in cells],
-                "nominal": number(nominal.get(p["name"]), ".6g"),
-                "true": number(p["true"], ".6g"),
-                "deviations": [number(deviation, "+.2g") for _, (deviation, _), _ in cells],
-                "bars": [error_bar(deviation, bound, limit, color) for _, (deviation, bound), color in cells],
-            }
-        )
-    return {"rows": rows, "columns": columns if changed else ("estimate",), "is_true": is_true, "limit": f"{limit:g}"}

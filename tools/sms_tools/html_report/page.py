@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -12,11 +11,12 @@ from sms_online.model.parameters import Parameter
 from sms_tools.html_report.arm_drawing import arm_drawings
 from sms_tools.html_report.figures import Chart, Series, chart
 from sms_tools.html_report.history import Course
-from sms_tools.html_report.pages import error_bar, estimate_cells, number, with_subscripts, write_page
+from sms_tools.html_report.pages import write_page
+from sms_tools.html_report.parameter_rows import parameter_rows, with_subscripts
 from sms_tools.report import METHODS, Document, event_line
 from sms_tools.view.frames import Reference
 from sms_tools.view.known import BOUNDS
-from sms_tools.view.parameter_groups import HALF_RANGES, Basis, half_range, parameter_groups, shortened
+from sms_tools.view.parameter_groups import HALF_RANGES, Basis, half_range, parameter_groups
 from sms_tools.view.scene import Scene
 
 NAME = "report.html"
@@ -41,7 +41,7 @@ def write_report(
         document=document,
         facts=_facts(document),
         events=[event_line(event) for event in document["events"]],
-        parameters=_parameters(document, nominal),
+        parameters=parameter_rows({"estimate": (document["parameters"], "blue")}, nominal),
         convergence=_convergence(document, nominal, course),
         residual=_residual(course),
         episodes=[(episode["summary"], _evidence(episode)) for episode in document.get("diagnosis", [])],
@@ -60,48 +60,6 @@ def _facts(document: Document) -> dict[str, str]:
         "lost samples": str(document["lost_samples"]),
         "condition number": "infinite" if condition is None else f"{condition:.3g}",
     }
-
-
-def _parameters(document: Document, nominal: Mapping[str, float]) -> dict[str, Any]:
-    """The table, each parameter with its error bar about the true value, or where none is known about the estimate."""
-    parameters = document["parameters"]
-    is_true = any(p["true"] is not None for p in parameters)
-    deviations, drawn = np.full((2, len(parameters), 2), np.nan)  # of the estimate from something, and 2σ, in % of that
-    for k, p in enumerate(parameters):
-        reference = p["true"] if is_true else nominal.get(p["name"])
-        if p["identifiable"]:
-            if reference:
-                deviations[k] = _relative(p, reference)
-            drawn[k] = deviations[k] if is_true else _relative(p, p["estimate"])
-    limit = half_range(np.abs(drawn).sum(axis=1))
-    rows = []
-    for p, (deviation, _), (middle, bound) in zip(parameters, deviations, drawn, strict=True):
-        estimate, std, interval = estimate_cells(p)
-        rows.append(
-            {
-                "name": p["name"],
-                "symbol": p["symbol"],
-                "short": shortened(p["symbol"]),
-                "unit": p["unit"],
-                "determined": p["identifiable"],
-                "estimate": estimate,
-                "std": std,
-                "interval": interval,
-                "nominal": number(nominal.get(p["name"]), ".6g"),
-                "true": number(p["true"], ".6g"),
-                "deviation": number(deviation, "+.3g"),
-                # Where what it is compared with lies outside the bounds it is an alarm.
-                "bars": [error_bar(middle, bound, limit, "blue" if abs(middle) <= bound else "alarm")],
-            }
-        )
-    compared = "true" if is_true else "nominal"
-    return {"rows": rows, "is_true": is_true, "compared": compared, "limit": f"{limit:g}"}
-
-
-def _relative(p: Document, value: float) -> tuple[float, float]:
-    """Deviation of an estimate from a value, and 2σ, % of it."""
-    size = abs(value) / 100.0
-    return (p["estimate"] - value) / size, BOUNDS * p["std"] / size
 
 
 def _convergence(document: Document, nominal: Mapping[str, float], course: Course) -> list[Chart]:
