@@ -17,6 +17,7 @@ from evaluated import results_document
 from sms_adapters.capture import CaptureWriter
 from sms_adapters.system_file import load_system
 from sms_online.effects.build import build_model
+from sms_online.model.layout import Layout
 from sms_online.pipeline.estimator import Estimator
 from sms_online.stream import Block
 from sms_sim.simulate import Simulation
@@ -119,8 +120,8 @@ def test_the_page_of_a_long_session_stays_small(tmp_path: Path) -> None:
     """Of the arm with most parameters, all determined, each of them as rough as can be, with as many instants as a
     history holds."""
     system = load_system("seven-joint")
-    model = Model(system)
-    channels = tuple(system_channels(model))
+    model = build_model(system)
+    channels = tuple(system_channels(model.layout))
     estimator = Estimator(system, channels, "test")
     document = results_document(estimator, 1000.0, [])
     rng = np.random.default_rng(2)
@@ -137,8 +138,8 @@ def test_the_page_of_a_long_session_stays_small(tmp_path: Path) -> None:
     assert write_report(tmp_path, document, course, {}, Scene(model)).stat().st_size < LARGEST
 
 
-def system_channels(model: Model) -> list[str]:
-    return [*model.layout.position_names, *(f"tau_{i}" for i in range(1, len(model.layout.q) + 1))]
+def system_channels(layout: Layout) -> list[str]:
+    return [*layout.position_names, *(f"tau_{i}" for i in range(1, len(layout.q) + 1))]
 
 
 @pytest.mark.browser

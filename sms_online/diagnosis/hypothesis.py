@@ -150,8 +150,8 @@ def verdict(
 ) -> str:
     """What may be said where effects were named or not, and leave this share of what was beyond noise.
 
-    after: by row type; before, found: with the effects left out, and these, of a whole capture. A running session goes on
-    with what is named and searches again, so that single rows may hold something still.
+    after: by row type; before, found: with the effects left out, and these, of a whole capture. A running session goes
+    on with what is named and searches again, so that single rows may hold something still.
     """
     if not any(row.beyond for row in after.values()):
         return "named" if named else "clean"

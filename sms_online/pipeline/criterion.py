@@ -65,7 +65,7 @@ class RowGrams:
         self.windows = 0
 
     def add(self, rows: Array, noisy: Array) -> None:
-        """Rows [Y b] (n_v, n + 1) of a window, and the same with synthetic noise added and subtracted (2, n_v, n + 1)."""
+        """Rows [Y b] (n_v, n + 1) of a window, and with synthetic noise added and subtracted (2, n_v, n + 1)."""
         added = 0.5 * (noisy[0] - noisy[1])
         self.signal = self.signal + rows[:, :, None] * rows[:, None, :]
         self.noise = self.noise + added[:, :, None] * added[:, None, :]
