@@ -33,9 +33,7 @@ Value = float | int | bool | str | None
 Numbers = dict[str, Value]
 
 # Keys of the documents that hold what was put in, or sentences.
-LEFT_OUT = (
-    "schema", "system", "summary", "warnings", "throughput_samples_per_s", "unit", "symbol", "separated_by", "nominal",
-)  # fmt: skip
+LEFT_OUT = ("schema", "system", "summary", "warnings", "throughput_samples_per_s", "unit", "symbol", "separated_by")
 PIECE = 1024  # samples
 
 
