@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 from pathlib import Path
 
@@ -13,6 +14,9 @@ from sms_online.trackers import RecursiveLeastSquares, Rows
 
 ROOT = Path(__file__).parents[1]
 LARGEST_README = 6000  # bytes
+LARGEST_NOTEBOOK = 100_000  # characters
+# Outputs of a notebook that ran to its end.
+HARMLESS = {"stream", "execute_result", "display_data"}
 # Of estimation and diagnosis the field has words of its own, see docs/explanation/glossary.md.
 RETIRED = (
     r"\btells?\b", r"\btold\b", r"\bbears?\b", r"\bborne\b", r"\bleaves? open\b", r"\bleft open\b", r"\bsettles?\b",
@@ -38,6 +42,16 @@ def test_pages_use_the_fields_words() -> None:
         for match in re.finditer(word, page.read_text(encoding="utf-8"))
     ]
     assert found == []
+
+
+def test_tutorials_hold_the_outputs_of_one_run_and_no_paths() -> None:
+    for path in (ROOT / "docs" / "tutorials").glob("*.ipynb"):
+        text = path.read_text(encoding="utf-8")
+        cells = [cell for cell in json.loads(text)["cells"] if cell["cell_type"] == "code"]
+        assert [cell["execution_count"] for cell in cells] == list(range(1, len(cells) + 1)), path.name
+        assert {output["output_type"] for cell in cells for output in cell["outputs"]} <= HARMLESS, path.name
+        assert not re.search(r"(?<![\w.])/(home|root|tmp|Users|work)/", text), path.name
+        assert len(text) < LARGEST_NOTEBOOK, path.name
 
 
 def test_the_architecture_page_names_every_module_once() -> None:

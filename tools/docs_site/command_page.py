@@ -3,8 +3,12 @@
 from __future__ import annotations
 
 import argparse
+import re
 
 from sms_tools.cli import PROGRAM, _parser
+
+# What Markdown would take for more than text.
+SIGNS = re.compile(r"[\\`*_\[\]<>|]")
 
 
 def command_page() -> str:
@@ -38,4 +42,4 @@ def _help(parser: argparse.ArgumentParser, action: argparse.Action) -> str:
     """The help text with argparse's own substitutions."""
     text = parser._get_formatter()._expand_help(action) if action.help else ""
     repeated = "; may be repeated" if isinstance(action, argparse._AppendAction) and "repeated" not in text else ""
-    return (text + repeated).replace("|", "\\|").replace("<", "&lt;")
+    return SIGNS.sub(r"\\\g<0>", text + repeated)

@@ -32,6 +32,7 @@ HEADINGS: dict[type[Record], str] = {
     schema.Trajectory: "`[trajectory]`",
     schema.Harmonic: "Harmonics of a trajectory",
     schema.Windows: "`[windows]`",
+    schema.Tolerances: "`[tolerances]`",
     schema.CanSource: '`[[source]]` of `kind = "can"`',
     schema.CanopenSource: '`[[source]]` of `kind = "canopen"`',
     schema.SerialFrames: '`[[source]]` of `kind = "serial"` and `format = "frames"`',
