@@ -122,9 +122,15 @@ class Evaluation:
         for name, speeds in row_types(self.model.layout).items():
             # Where the smoother knows better, rows of the balance see shapes that are not the links'.
             momentum = None if now.method == "smoother" else now.momentum
-            whitened = None if momentum is None else momentum.rows.whitened(speeds, beta)
+            whitened = None if momentum is None else momentum.rows.whitened(speeds, self._joint)
             out[name] = Residual(relative.get(name), whitened)
         return out
+
+    @property
+    def _joint(self) -> Array:
+        """Nuisances and parameters; zeros for the nuisances where another balance gives the estimate."""
+        estimate, m = self.estimate, len(self.statistics.setup.nuisances)
+        return estimate.joint if estimate.nuisances.size == m else np.concatenate((np.zeros(m), estimate.pi))
 
     @cached_property
     @one_blas_thread()

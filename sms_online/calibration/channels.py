@@ -124,7 +124,7 @@ def _encoders(sensing: Sensing, names: Sequence[str], tolerances: Tolerances) ->
     yield Family(tuple(zeros), partial(_constant, one))
     for part, wave in (("sine", np.sin), ("cosine", np.cos)):
         waves = [Nuisance("once_per_turn", names[k], "rad", tolerances.once_per_turn, part) for k in turning]
-        yield Family(tuple(waves), lambda motion, wave=wave: wave(motion.readings)[:, :, None] * turn)
+        yield Family(tuple(waves), partial(_wave, wave, turn))
 
 
 def _markers(names: Sequence[str], tolerances: Tolerances) -> Iterator[Family]:
@@ -173,6 +173,10 @@ def _tracked_point(linear: Sequence[int], motion: Motion) -> Array:
 
 def _selection(names: Sequence[str], chosen: Sequence[int]) -> Array:
     return np.eye(len(names))[:, list(chosen)]
+
+
+def _wave(wave: np.ufunc, selection: Array, motion: Motion) -> Array:
+    return np.asarray(wave(motion.readings)[:, :, None] * selection)
 
 
 def _constant(selection: Array, motion: Motion) -> Array:

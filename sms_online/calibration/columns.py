@@ -8,6 +8,7 @@ is read too large by n(t) adds ∫ φ n dt to b, so N. With the right geometry m
 from __future__ import annotations
 
 from collections.abc import Mapping
+from itertools import chain
 from typing import Any
 
 import numpy as np
@@ -27,9 +28,9 @@ from sms_online.stream import Array
 def nuisances(sensing: Sensing) -> tuple[Nuisance, ...]:
     """What a session's description may be wrong in, in the order of its columns."""
     system = sensing.model.system
-    families = (*position_families(sensing, system.tolerances), *torque_families(sensing, system.tolerances))
-    channels = [nuisance for family in families for nuisance in family.nuisances]
-    return (*channels, *(each.nuisance for each in geometries(system)))
+    positions = [each.nuisances for each in position_families(sensing, system.tolerances)]
+    torques = [each.nuisances for each in torque_families(sensing, system.tolerances)]
+    return (*chain.from_iterable((*positions, *torques)), *(each.nuisance for each in geometries(system)))
 
 
 class CalibrationColumns:

@@ -71,9 +71,9 @@ def geometries(system: System) -> Iterator[Geometry]:
     gravity = np.array(system.gravity)
     if gravity.any() and tolerances.gravity > 0.0:
         about = [np.array([0.0, 0.0, 1.0])] if planar else [np.array(v) for v in np.linalg.svd(gravity[None])[2][1:]]
-        for k, axis in enumerate(about, start=1):
+        for k, vector in enumerate(about, start=1):
             part = "z" if planar else f"direction {k}"
-            yield Geometry(Nuisance("gravity", "base", "rad", tolerances.gravity, part), _tilted(axis))
+            yield Geometry(Nuisance("gravity", "base", "rad", tolerances.gravity, part), _tilted(vector))
 
 
 def _with(records: tuple[object, ...], i: int, **changed: object) -> tuple[object, ...]:

@@ -222,7 +222,7 @@ class OnlineDiagnosis(Observer):
             return
         seen = detector.before(last) if last >= 0 else None
         if seen is None or last - self._valid < LEAST_BEFORE * self._unit:
-            self._onset = _Onset(None, self._valid, Information.none(self._estimator.base.n))
+            self._onset = _Onset(None, self._valid, self._momentum.changes.beforehand)
         else:
             self._onset = _Onset(last, first, seen.known)
         began = None if self._onset.last is None else self._time(0.5 * (last + first))
@@ -267,8 +267,8 @@ class OnlineDiagnosis(Observer):
             earliest = max(self._valid, onset.last - round(BEFORE * self._unit))
             before = self._segments(earliest, onset.last)
         after = self._segments(onset.first, None)
-        beta = onset.known.solution().pi if before else estimator.estimate().pi
         momentum = self._momentum
+        beta = momentum.changes.parameters(onset.known) if before else estimator.estimate().pi
         assert momentum.sensor_noise is not None
         if not after:
             return None
@@ -323,7 +323,7 @@ class OnlineDiagnosis(Observer):
             return
         first, known = onset.first, onset.known
         if not outcome.began or onset.last is None:
-            first, known = self._valid, Information.none(estimator.base.n)
+            first, known = self._valid, self._momentum.changes.beforehand
         last = self._record[-1].segment
         newest = joined(self._record)[last]
         late = newest.index >= first

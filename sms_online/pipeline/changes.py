@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from functools import partial
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from sms_online.calibration.columns import CalibrationColumns
+from sms_online.calibration.nuisance import Nuisance, known_beforehand, prior_rows
 from sms_online.description.schema import Effect
 from sms_online.effects.build import changed_model
 from sms_online.model.base_parameters import BaseParameters
@@ -65,11 +67,15 @@ class Adoption:
 class Changes:
     """Events of one session.
 
-    model, base: current ones, with what events have added to the system's own. adopted: effects among that.
+    model, base: current ones, with what events have added to the system's own. adopted: effects among that. Information
+    is on the session's nuisances and then on the parameters.
     """
 
-    def __init__(self, model: Model, base: BaseParameters, sensing: Sensing) -> None:
+    def __init__(
+        self, model: Model, base: BaseParameters, sensing: Sensing, nuisances: Sequence[Nuisance] = ()
+    ) -> None:
         self.model, self.base = model, base
+        self._nuisances = tuple(nuisances)
         self.events: list[Event] = []
         self._system, self._described = model.system, base
         self._sensing = sensing
@@ -85,7 +91,20 @@ class Changes:
         self._wanted = DECISION
 
     def _new_detector(self) -> ChangeDetector:
-        return ChangeDetector(self.base.n, self.model.layout.n_v, 2 * self._half_hop / self._system.sample_rate)
+        n, hop = len(self._nuisances) + self.base.n, 2 * self._half_hop / self._system.sample_rate
+        detector = ChangeDetector(n, self.model.layout.n_v, hop)
+        if self._nuisances:
+            detector.begin(self.beforehand)
+        return detector
+
+    @property
+    def beforehand(self) -> Information:
+        """What is known of the nuisances before any row, and nothing of the parameters."""
+        return known_beforehand(self._nuisances, self.base.n)
+
+    def parameters(self, known: Information) -> Array:
+        """β (n,) as it is known."""
+        return known.solution().pi[len(self._nuisances) :]
 
     @property
     def window_samples(self) -> int:
@@ -138,42 +157,49 @@ class Changes:
         time = start_time + 0.5 * (onset + self.detector.alarm) / self._system.sample_rate
         dropped = sum(seen.end > before.end for seen in self.detector.history)
         self.events.append(Event(time, "undecided", (), (), (), (), dropped))
-        weights = before.known.solution().pi
+        weights = self.parameters(before.known)
         nothing = GridSamples(self._index[:0], self._values[:0], self._segment)
         return Adoption(self.model, self.base, before.known, weights, nothing)
 
     def _explain(self, model: Model, base: BaseParameters, before: Seen, start: int, noise: SensorNoise) -> Explanation:
-        n = self.base.n
-        jumps = hypotheses(base.parameters)
+        n, m = self.base.n, len(self._nuisances)
+        jumps = [replace(jump, columns=tuple(m + k for k in jump.columns)) for jump in hypotheses(base.parameters)]
         after = self._index >= start
         values = self._values[after]
         balance = MomentumBalance(model, base, self._system.sample_rate, self._system.windows.momentum)
         windows, instants = balance.push(self._index[after], [self._sensing.motion(values)] * COPIES, noise.coordinates)
         weights = np.zeros(base.n)
-        weights[:n] = before.known.solution().pi
+        weights[:n] = self.parameters(before.known)
         # What the rows before left decides, where it is more than noise.
         factor = before.known.factor
-        left = max(1.0, abs(factor[-1, -1]) / np.sqrt(max(1, before.known.rows - n)))
-        new_noise = partial(WindowNoise, model, base, balance, self._sensing.displacements)
+        left = max(1.0, abs(factor[-1, -1]) / np.sqrt(max(1, before.known.rows - m - n)))
+
+        def new_noise() -> WindowNoise:
+            calibration = CalibrationColumns(model, self._sensing, balance.span) if m else None
+            return WindowNoise(model, base, balance, self._sensing.displacements, calibration=calibration)
+
         for _ in range(PASSES):
-            fit = MomentumFit(model, base, balance, new_noise, weights.copy)
+            prior = prior_rows(self._nuisances, base.n)
+            known = partial(np.append, np.zeros(m), weights)
+            fit = MomentumFit(model, base, balance, new_noise, known, prior=prior)
             fit.go_on(weights, noise)
             rows = np.concatenate([white.Y for white in fit.push(windows, instants, noise)])
             explanation = explain(factor / left, rows / left, jumps)
             weights = np.zeros(base.n)
-            weights[:n] = explanation.beta
+            weights[:n] = explanation.beta[m:]
             if explanation.jump is not None:
-                weights[list(explanation.jump.columns)] += explanation.sizes
+                weights[[k - m for k in explanation.jump.columns]] += explanation.sizes
         return explanation
 
     def _adopt(
         self, whole: Model, base: BaseParameters, explanation: Explanation, onset: int, alarm: int, start_time: float
     ) -> Adoption:
-        jump, n = explanation.jump if explanation.explained else None, self.base.n
+        jump, n, m = explanation.jump if explanation.explained else None, self.base.n, len(self._nuisances)
+        columns = () if jump is None else tuple(k - m for k in jump.columns)
         instant = None
         if jump is not None:
             by = np.zeros(whole.n_pi)
-            by[[base.independent[k] for k in jump.columns]] = explanation.sizes
+            by[[base.independent[k] for k in columns]] = explanation.sizes
             x, signals = self._sensing.coordinates(self._values), self._sensing.signals(self._values)
             between = (onset - self.window_samples // 2, alarm)
             instant = event_instant(
@@ -184,7 +210,6 @@ class Changes:
         first, last = (onset, alarm) if instant is None else (int(instant) - guard, int(np.ceil(instant)) + guard)
         at = 0.5 * (first + last) if instant is None else instant
         before = self.detector.before(first - MARGIN) or self.detector.history[0]
-        columns = () if jump is None else jump.columns
         fresh = [base.parameters[k].name for k in columns if k >= n]
         if fresh:
             self._added += fresh
@@ -192,13 +217,13 @@ class Changes:
         names = [p.name for p in self.base.parameters]
         jumped = [names.index(base.parameters[k].name) for k in columns]
         weights = np.zeros(self.base.n)
-        weights[:n] = explanation.beta if jumped else before.known.solution().pi
+        weights[:n] = explanation.beta[m:] if jumped else self.parameters(before.known)
         weights[jumped] += explanation.sizes[: len(jumped)]
         reach = last + self.window_samples
         # What no hypothesis explains leaves nothing of what was known.
-        known = Information.none(self.base.n)
+        known = self.beforehand
         if jump is not None:
-            known = before.known.widened(len(fresh)).without(jumped)
+            known = before.known.widened(len(fresh)).without([m + k for k in jumped])
         event = Event(
             time=start_time + at / self._system.sample_rate,
             kind="unexplained" if jump is None else jump.kind,

@@ -34,8 +34,9 @@ MOST_CLUSTERS = 128
 class NoiseBias:
     """Gathers normal equations with and without additional noise, in columns and right-hand sides."""
 
-    def __init__(self, n: int) -> None:
-        self._gram = np.zeros((n + 1, n + 1))
+    def __init__(self, n: int, prior: Array | None = None) -> None:
+        """prior (k, n + 1): what is known beforehand, as rows [Y b] of unit variance without noise."""
+        self._gram = np.zeros((n + 1, n + 1)) if prior is None else prior.T @ prior
         # What additional noise changes, by clusters of windows: whole ones, and one that windows still join. Written
         # once and shared with saved states: those of a large arm are 9 MB, too much to be copied often.
         self._whole = np.zeros((MOST_CLUSTERS, n + 1, n + 1))

@@ -186,7 +186,9 @@ class Estimator:
         if self._setup is None or self._setup[0] != len(self.events):
             current = None if self.momentum is None else self.momentum.current_prior
             now = self.model, self.base, self._base
-            self._setup = len(self.events), Setup(self.system, *now, self.sensing, self.unused, self.prior, current)
+            nuisances = () if self.momentum is None else self.momentum.nuisances
+            setup = Setup(self.system, *now, self.sensing, self.unused, self.prior, current, nuisances)
+            self._setup = len(self.events), setup
         return self._setup[1]
 
     @property

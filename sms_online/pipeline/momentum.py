@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from functools import partial
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from sms_online.calibration.columns import CalibrationColumns, nuisances
+from sms_online.calibration.nuisance import prior_rows
 from sms_online.model.base_parameters import BaseParameters
 from sms_online.model.model import Model
 from sms_online.pipeline.changes import Adoption, Changes
@@ -42,13 +43,15 @@ class Momentum:
     tracker: fed with rows of unit variance. bias: what noise in the columns does to the estimate. fit:
     what makes rows independent, and its sums. windows: how many it took since the last event. latencies: of the
     sources, since then too. test: whether rows leave more than noise, likewise. changes: events, and the model and
-    parameters that the session goes on with after them. prior: what is known of the described ones beforehand.
+    parameters that the session goes on with after them. nuisances: what the description may be wrong in. prior: what is
+    known of the described ones beforehand.
     """
 
     def __init__(self, model: Model, base: BaseParameters, sensing: Sensing) -> None:
         system = model.system
         self.sensing = sensing
-        self.changes = Changes(model, base, sensing)
+        self.nuisances = nuisances(sensing)
+        self.changes = Changes(model, base, sensing, self.nuisances)
         self.dropped_windows = 0
         self.newest_row = -np.inf  # time of the last window's end, s
         self.sensor_noise: SensorNoise | None = None
@@ -67,12 +70,12 @@ class Momentum:
     def _build(self) -> None:
         """Empty stages for the current model and parameters."""
         model, base = self.changes.model, self.changes.base
-        self.bias = NoiseBias(base.n)
+        m, known = len(self.nuisances), prior_rows(self.nuisances, base.n)
+        self.bias = NoiseBias(m + base.n, known)
         self.windows = 0
         self._balance = MomentumBalance(model, base, self._sample_rate, self._span)
         self.latencies = Latencies(self._sources, base.n)
-        new_noise = partial(WindowNoise, model, base, self._balance, self.sensing.displacements, self._clocks)
-        self.fit = MomentumFit(model, base, self._balance, new_noise, self._solved, self._sources)
+        self.fit = MomentumFit(model, base, self._balance, self._new_noise, self._solved, self._sources, known)
         self.tracker = self._new_tracker()
         self.test = SequentialTest(model.layout, self._balance.span / HOPS)
 
@@ -81,8 +84,16 @@ class Momentum:
         """What is known beforehand of the current parameters."""
         return None if self.prior is None else self.changes.prior(self.prior)
 
+    def _new_noise(self) -> WindowNoise:
+        model, balance, sensing = self.changes.model, self._balance, self.sensing
+        calibration = CalibrationColumns(model, sensing, balance.span) if self.nuisances else None
+        return WindowNoise(model, self.changes.base, balance, sensing.displacements, self._clocks, calibration)
+
     def _new_tracker(self) -> Tracker:
-        return session_tracker(self.changes.base.n, self.current_prior)
+        tracker = session_tracker(self.changes.base.n, self.current_prior, len(self.nuisances))
+        if self.nuisances:
+            tracker.begin(self.changes.beforehand)
+        return tracker
 
     def set_prior(self, prior: Prior) -> None:
         """Weigh the rows against what is known of the base parameters beforehand; before the first sample."""
@@ -106,11 +117,15 @@ class Momentum:
 
     def estimate(self) -> Estimate:
         """The base parameters as known now, free of what noise in the columns does; with a prior, as the rows say."""
+        return self._joint().without_nuisances(len(self.nuisances))
+
+    def _joint(self) -> Estimate:
+        """The nuisances, then the base parameters."""
         return unbiased(self.tracker.estimate(), self.bias)
 
     def _solved(self) -> Array:
-        """β where the rows determine it, else NaN."""
-        estimate = self.estimate()
+        """Nuisances and β where the rows determine them, else NaN."""
+        estimate = self._joint()
         return np.where(estimate.determined, estimate.pi, np.nan)
 
     def observe(self, t: Array, values: Array) -> None:
@@ -164,7 +179,7 @@ class Momentum:
     def _adopt(self, adoption: Adoption, noise: SensorNoise) -> None:
         """Go on after an event with what is known from before it."""
         bias = self.bias
-        bias.widen(adoption.base.n - bias.parameters)
+        bias.widen(len(self.nuisances) + adoption.base.n - bias.parameters)
         self._build()
         self.bias = bias
         self.tracker.begin(adoption.known)
@@ -208,7 +223,7 @@ class Momentum:
             self.tracker.update(Rows(rows.Y[:, :-1], rows.Y[:, -1], np.ones(M), np.full(M, t)))
             self.newest_row = t
             self.bias.add(rows.Y, rows.noisy)
-            self.latencies.add(rows.Y, rows.late)
+            self.latencies.add(rows.Y[:, len(self.nuisances) :], rows.late)
             self.windows += 1
 
     def statistics(self) -> MomentumStatistics:

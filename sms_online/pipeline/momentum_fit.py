@@ -82,9 +82,10 @@ RANK_TOLERANCE = 1e-10
 
 @dataclass(frozen=True)
 class WhiteRows:
-    """Rows of one window, n_v of them: Y (n_v, n + 1) with b as its last column, independent, errors of unit variance.
+    """Rows of one window, n_v of them: Y (n_v, m + n + 1), [N Y b], independent, errors of unit variance.
 
-    noisy (2, n_v, n + 1): the same with synthetic noise added and subtracted. raw (n_v, n + 1): the rows as they were,
+    N holds the columns of what the description may be wrong in, see `calibration`. noisy (2, n_v, m + n + 1): the same
+    with synthetic noise added and subtracted, but in N. raw (n_v, m + n + 1): the rows as they were,
     with their own covariance (n_v, n_v), of which noise is the part that the sensors make. end: grid index of the
     window's last sample. late (n_v, G): columns of the sources' latencies, independent like Y.
     """
@@ -101,8 +102,9 @@ class WhiteRows:
 class MomentumFit:
     """Whitens the windows of a session, segment by segment.
 
-    new_noise: makes what propagates noise, for the same model, base and balance. solve: gives the estimate of β so far
-    (n,), NaN where nothing is known of it. sources: whose latencies are told. weighing: who weighs now.
+    new_noise: makes what propagates noise, for the same model, base and balance. solve: gives the estimate so far of
+    nuisances and β (m + n,), NaN where nothing is known of it. sources: whose latencies are told. prior: rows [N Y b]
+    (k, m + n + 1) of what is known of the nuisances beforehand. weighing: who weighs now.
     """
 
     def __init__(
@@ -113,9 +115,12 @@ class MomentumFit:
         new_noise: Callable[[], WindowNoise],
         solve: Callable[[], Array],
         sources: Sequence[SourceGroup] = (),
+        prior: Array | None = None,
     ) -> None:
         self.model = model
         self.base = base
+        self._prior = np.zeros((0, base.n + 1)) if prior is None else prior
+        self._nuisances = self._prior.shape[1] - base.n - 1
         self._balance = balance
         self._solve = solve
         self._new_noise, self._sources = new_noise, sources
@@ -130,7 +135,7 @@ class MomentumFit:
         self._second_order = SecondOrderNoise({half_width: np.zeros(model.layout.n_v) for half_width in HALF_WIDTHS})
         self._sampled = dict.fromkeys(HALF_WIDTHS, 0)
         self._largest = np.zeros(model.layout.n_v)  # largest sum of a row's terms
-        self.plain = PlainRows(model.layout.n_v, base.n)
+        self.plain = PlainRows(model.layout.n_v, self._nuisances + base.n)
         self._begin_segment()
 
     def _new_weighing(self) -> Weighing:
@@ -214,11 +219,14 @@ class MomentumFit:
         self.plain.misfit = np.zeros(self.model.layout.n_v)
         for _ in range(passes):
             self._retell(weights, noise)
-            fitted, determined = _least_squares(np.concatenate([self._white(window).Y for window in self._held]))
-            if not self._explains_torques(fitted):
+            white = [self._white(window).Y for window in self._held]
+            white += [self._prior] if len(self._prior) else []
+            fitted, determined = _least_squares(np.concatenate(white))
+            beta, known = fitted[self._nuisances :], determined[self._nuisances :]
+            if not self._explains_torques(beta):
                 return None
             self.plain.judge(fitted)
-            weights = np.where(determined, fitted, weights) if partly else fitted
+            weights = np.where(known, beta, weights) if partly else beta
         return weights
 
     def _explains_torques(self, beta: Array) -> bool:
@@ -257,11 +265,12 @@ class MomentumFit:
         """
         if self._since < self._renewal:
             return
-        beta = self._solve()
+        estimate = self._solve()
+        nuisances, beta = np.nan_to_num(estimate[: self._nuisances]), estimate[self._nuisances :]
         beta = np.where(np.isnan(beta), self._known_weights, beta)
         self._since = 0
         self._renewal = min(2 * self._renewal, self._count(LATEST_RENEWAL))
-        self.plain.judge(beta)
+        self.plain.judge(np.concatenate((nuisances, beta)))
         used, misfit = self.weighing, self.plain.misfit
         if np.any(np.abs(misfit - used.misfit) > SAME_MISFIT * (1.0 + used.misfit)):
             self._next = None
@@ -274,7 +283,7 @@ class MomentumFit:
         """Whether β (n,) and the noise of now would weigh rows otherwise."""
         used = self.weighing.noise
         assert used.sensor_noise is not None
-        squares = np.einsum("vii->vi", self.plain.gram)[:, :-1]
+        squares = np.einsum("vii->vi", self.plain.gram)[:, self._nuisances : -1]
         changed, size = (np.sqrt(squares @ values**2) for values in (beta - self._known_weights, beta))
         densities = [(noise.sensors, used.sensor_noise.sensors), (noise.torque, used.sensor_noise.torque)]
         louder = any(np.any(np.abs(now - then) > SAME_NOISE * then) for now, then in densities)
@@ -311,11 +320,16 @@ class MomentumFit:
         self._largest = np.maximum(self._largest, size(rows[0], self._known_weights))
         errors = self._second_order.variance(M) + rounding(self._largest)
         weighed = self._weigh(window, rows.swapaxes(0, 1).reshape(n_v, -1), errors)
-        self.plain.add(rows[0], np.diag(weighed.noise))
         white = weighed.rows.reshape(n_v, COPIES, -1).swapaxes(0, 1)
+        raw = rows[0]
+        if self._nuisances:
+            columns, white_columns = weighed.calibration
+            raw = np.concatenate((columns, raw), axis=1)
+            white = np.concatenate((np.broadcast_to(white_columns, (COPIES, *columns.shape)), white), axis=2)
+        self.plain.add(raw, np.diag(weighed.noise))
         unsteady = np.diag(UNSTEADY * sample**2)
         return WhiteRows(
-            white[0], white[1:], rows[0], weighed.covariance + unsteady, weighed.noise + unsteady, window.end,
+            white[0], white[1:], raw, weighed.covariance + unsteady, weighed.noise + unsteady, window.end,
             weighed.late,
         )  # fmt: skip
 

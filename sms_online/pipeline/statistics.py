@@ -11,6 +11,9 @@ from dataclasses import dataclass
 from functools import lru_cache
 from typing import TYPE_CHECKING, Any, Literal
 
+import numpy as np
+
+from sms_online.calibration.nuisance import Nuisance
 from sms_online.description.schema import System
 from sms_online.model.base_parameters import BaseParameters
 from sms_online.model.model import Model
@@ -41,7 +44,8 @@ class Setup:
 
     system: as described. model, base: with what events have added; described: base parameters of the system itself.
     unused: channels of the source that play no part. prior: on `described`; current_prior: on `base`, of which nothing
-    is known beforehand where something has changed. Pickled once, and one object wherever the same is read again.
+    is known beforehand where something has changed. nuisances: what the description may be wrong in. Pickled
+    once, and one object wherever the same is read again.
     """
 
     system: System
@@ -52,6 +56,7 @@ class Setup:
     unused: tuple[str, ...]
     prior: Prior | None
     current_prior: Prior | None
+    nuisances: tuple[Nuisance, ...]
 
     def __reduce__(self) -> tuple[Any, ...]:
         packed = vars(self).get("_packed")
@@ -142,19 +147,22 @@ class Statistics:
         if self.method == "energy":
             return self.energy_estimate()
         assert self.momentum is not None
-        tracker = session_tracker(setup.base.n, setup.current_prior)
+        m = len(setup.nuisances)
+        tracker = session_tracker(setup.base.n, setup.current_prior, m)
         tracker.restore(self.momentum.tracker)
-        return unbiased(tracker.estimate(), self._bias())
+        return unbiased(tracker.estimate(), self._bias()).without_nuisances(m)
 
     def _bias(self) -> NoiseBias:
         assert self.momentum is not None
-        bias = NoiseBias(self.setup.base.n)
+        bias = NoiseBias(len(self.setup.nuisances) + self.setup.base.n)
         bias.restore(self.momentum.bias)
         return bias
 
     def shift(self, estimate: Estimate) -> Array:
         """By how much noise in the columns pulls the momentum balance's estimate (n,), as far as that is known."""
-        return self._bias().correction(estimate.determined)[0]
+        m = len(self.setup.nuisances)
+        determined = np.concatenate((np.isfinite(estimate.nuisances_std), estimate.determined))
+        return self._bias().correction(determined)[0][m:]
 
     @one_blas_thread()
     def energy_estimate(self) -> Estimate:

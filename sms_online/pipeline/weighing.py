@@ -27,12 +27,14 @@ from sms_online.stream import Array
 class Weighed:
     """A window's rows (n_v, width), independent of all before and of each other, errors of unit variance.
 
-    late (n_v, G): columns of the sources' latencies, likewise. noise (n_v, n_v): covariance of the rows as they came,
-    as far as it is noise; covariance (n_v, n_v): with what the model lacks.
+    late (n_v, G): columns of the sources' latencies, likewise. calibration (n_v, m), twice: columns of what the
+    description may be wrong in, as they came and likewise. noise (n_v, n_v): covariance of the rows as they came, as
+    far as it is noise; covariance (n_v, n_v): with what the model lacks.
     """
 
     rows: Array
     late: Array
+    calibration: tuple[Array, Array]
     noise: Array
     covariance: Array
 
@@ -40,14 +42,15 @@ class Weighed:
 class Weighing:
     """Whitens windows with the noise that parameters β (n,) and sensors give them, and a misfit (n_v,), see `begin`.
 
-    noise: that of the windows. sources: whose latencies are told. width: of the rows, in columns.
+    noise: that of the windows. sources: whose latencies are told. width: of the rows, in columns, those of calibration
+    not counted.
     """
 
     def __init__(self, noise: WindowNoise, width: int, sources: Sequence[SourceGroup] = ()) -> None:
         self.noise = noise
         self.misfit = np.zeros(noise.n_v)
         self._late = LatencyColumns(sources)
-        self._whitener = Whitener(width + len(sources))
+        self._whitener = Whitener(width + len(sources) + noise.nuisances)
 
     @property
     def beta(self) -> Array | None:
@@ -76,10 +79,14 @@ class Weighing:
         diagonal = np.einsum("ii->i", own)
         diagonal += self.misfit * diagonal
         width = rows.shape[1]
+        calibrated = width + len(self._late)
         if len(self._late):
             rows = np.concatenate((rows, self._late.of(noise.late)), axis=1)
+        if noise.calibration.shape[1]:
+            rows = np.concatenate((rows, noise.calibration), axis=1)
         white = self._whitener.push(noise.covariances, rows)
-        return Weighed(white[:, :width], white[:, width:], of_noise, own)
+        calibration = noise.calibration, white[:, calibrated:]
+        return Weighed(white[:, :width], white[:, width:calibrated], calibration, of_noise, own)
 
     def state(self) -> dict[str, Any]:
         """What `restore` needs to continue."""

@@ -40,6 +40,7 @@ class WindowNoise:
 
     readings: x (K, n_x) to the displacements (K, n_v, sensors) that unit noise of each position sensor makes. clocks:
     see `RowNoise`. calibration: makes the columns beside Y. beta: β, None before it has begun. n_v: rows of a window.
+    nuisances: columns of calibration.
     """
 
     def __init__(
@@ -57,6 +58,7 @@ class WindowNoise:
         self._sensitivities = Sensitivities(model, readings, balance.span / INSTANTS)
         self._noise = RowNoise(model.layout.theta_m, balance.span, clocks)
         self._calibration = calibration
+        self.nuisances = 0 if calibration is None else calibration.count
         self.beta: Array | None = None
         self.sensor_noise: SensorNoise | None = None
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from typing import Protocol
 
 import numpy as np
@@ -102,6 +102,7 @@ class Estimate:
     factor, inf where its rank is not full. rows: number of rows, less where old ones count less.
     rss: residual sum of squares of the whitened rows, priors included. dof: its degrees of freedom. scale: what the
     rows' stated std were multiplied with to weigh them against a prior; None where they were taken as stated.
+    nuisances, nuisances_std (m,): what was estimated beside π, see `without_nuisances`.
     """
 
     pi: Array
@@ -113,6 +114,28 @@ class Estimate:
     rss: float
     dof: float
     scale: float | None = None
+    nuisances: Array = field(default_factory=lambda: np.empty(0))
+    nuisances_std: Array = field(default_factory=lambda: np.empty(0))
+
+    def without_nuisances(self, m: int) -> Estimate:
+        """Of an estimate of m nuisances and then π, the marginal one of π."""
+        if m == 0:
+            return self
+        robust = self.covariance_robust
+        return replace(
+            self,
+            pi=self.pi[m:],
+            covariance=self.covariance[m:, m:],
+            covariance_robust=None if robust is None else robust[m:, m:],
+            determined=self.determined[m:],
+            nuisances=self.pi[:m],
+            nuisances_std=self.std[:m],
+        )
+
+    @property
+    def joint(self) -> Array:
+        """Nuisances, then π."""
+        return np.concatenate((self.nuisances, self.pi))
 
     @property
     def std(self) -> Array:

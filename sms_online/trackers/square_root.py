@@ -122,9 +122,15 @@ class RecursiveLeastSquares:
         self.enabled = enabled
 
 
-def session_tracker(n: int, prior: Prior | None) -> RecursiveLeastSquares:
-    """The tracker of a balance's rows; beside a prior, the rows' std are right up to a common factor."""
-    return RecursiveLeastSquares(n, prior=prior, scaled_by_residual=prior is not None)
+def session_tracker(n: int, prior: Prior | None, nuisances: int = 0) -> RecursiveLeastSquares:
+    """The tracker of a balance's rows, of nuisances and then n parameters.
+
+    Beside a prior on the parameters, the rows' std are right up to a common factor.
+    """
+    if prior is not None and nuisances:
+        nothing = np.full(nuisances, np.nan)
+        prior = Prior(np.concatenate((nothing, prior.value)), np.concatenate((nothing, prior.std)))
+    return RecursiveLeastSquares(nuisances + n, prior=prior, scaled_by_residual=prior is not None)
 
 
 def _residual_std(content: Content) -> float:

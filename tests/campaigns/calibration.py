@@ -1,0 +1,238 @@
+"""Sessions of the planar example that its description is a little wrong of: do the intervals still hold?
+
+    python -m tests.campaigns.calibration run RESULTS.jsonl --seeds 10 [--kinds clean clock …]
+    python -m tests.campaigns.calibration summary RESULTS.jsonl
+
+Every session is a line of RESULTS.jsonl; `run` goes on where it was stopped. Signs of what is wrong are drawn anew for
+every seed, its size is that of the kind.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from collections.abc import Callable
+from functools import cache
+from pathlib import Path
+from time import process_time
+from typing import Any
+
+import numpy as np
+from evaluated import standard_deviation
+from scipy.interpolate import make_interp_spline
+from scipy.spatial.transform import Rotation
+
+from sms_adapters.system_file import load_system
+from sms_online.description.schema import System, Tolerances
+from sms_online.evaluation import NORMAL_95, Evaluation
+from sms_online.pipeline.estimator import Estimator
+from sms_online.pipeline.statistics import Statistics
+from sms_online.stream import Array, Block
+from tests.campaigns.accuracy import Record, read
+from tests.campaigns.sessions import disguised, exact_session, noisy_session, true_parameters
+
+SYSTEM = "paper-planar"
+GRADE = "B"
+PIECE = 1000  # samples
+# The true arm where its geometry is another than the described one.
+LENGTH, AXIS = 1.2e-4, 5e-4  # m, rad: of link 1, and of joint 2
+
+Samples = Callable[[System, Block, np.random.Generator], None]
+
+
+def _columns(block: Block, *beginnings: str) -> list[int]:
+    return [k for k, name in enumerate(block.channels) if name.startswith(beginnings)]
+
+
+def _sign(random: np.random.Generator) -> float:
+    return float(random.choice((-1.0, 1.0)))
+
+
+def tracked_point(by: float) -> Samples:
+    """S is elsewhere by so much along both axes of the base, m."""
+
+    def distort(system: System, block: Block, random: np.random.Generator) -> None:
+        theta = block.values[:, block.channels.index("theta_0")]
+        along, across = by * _sign(random), by * _sign(random)
+        x, y = block.channels.index("r_S_x"), block.channels.index("r_S_y")
+        block.values[:, x] += along * np.cos(theta) - across * np.sin(theta)
+        block.values[:, y] += along * np.sin(theta) + across * np.cos(theta)
+
+    return distort
+
+
+def clock(by: float) -> Samples:
+    """The camera, which sees base and markers, is late or early by so much, s."""
+
+    def distort(system: System, block: Block, random: np.random.Generator) -> None:
+        seen = _columns(block, "r_S", "theta_0", "link_")
+        late = by * _sign(random)
+        block.values[:, seen] = make_interp_spline(block.t, block.values[:, seen], 5)(block.t - late)
+
+    return distort
+
+
+def once_per_turn(by: float) -> Samples:
+    """Every encoder is off by so much once a turn, rad."""
+
+    def distort(system: System, block: Block, random: np.random.Generator) -> None:
+        for k in _columns(block, "q_", "theta_m"):
+            block.values[:, k] += by * np.sin(block.values[:, k] + random.uniform(0.0, 2.0 * np.pi))
+
+    return distort
+
+
+def marker_zero(by: float) -> Samples:
+    """Every marker's displacement has a zero of so much, m."""
+
+    def distort(system: System, block: Block, random: np.random.Generator) -> None:
+        for k in _columns(block, "link_"):
+            if ".u_" in block.channels[k]:
+                block.values[:, k] += by * _sign(random)
+
+    return distort
+
+
+def torque_gain(by: float) -> Samples:
+    """The torque of joint 2 is read with another gain."""
+
+    def distort(system: System, block: Block, random: np.random.Generator) -> None:
+        block.values[:, block.channels.index("tau_2")] *= 1.0 + by * _sign(random)
+
+    return distort
+
+
+def _geometry(system: System, length: float, axis: float) -> System:
+    first, *others = system.links
+    joint = system.joints[1]
+    mount = (Rotation.from_rotvec(joint.mount_rotation) * Rotation.from_rotvec((0.0, 0.0, axis))).as_rotvec()
+    turned = joint.model_copy(update={"mount_rotation": tuple(mount.tolist())})
+    longer = first.model_copy(update={"length": first.length + length})  # type: ignore[union-attr]
+    joints = (system.joints[0], turned, *system.joints[2:])
+    return system.model_copy(update={"links": (longer, *others), "joints": joints})
+
+
+# Kind to how much longer link 1 is, by how much joint 2 is turned, and what befalls the samples.
+KINDS: dict[str, tuple[float, float, tuple[Samples, ...]]] = {
+    "clean": (0.0, 0.0, ()),
+    "tracked point 0.2 mm": (0.0, 0.0, (tracked_point(2e-4),)),
+    "tracked point 1 mm": (0.0, 0.0, (tracked_point(1e-3),)),
+    "length 0.12 mm": (LENGTH, 0.0, ()),
+    "axis 0.5 mrad": (0.0, AXIS, ()),
+    "camera 50 us": (0.0, 0.0, (clock(5e-5),)),
+    "once per turn 2e-5": (0.0, 0.0, (once_per_turn(2e-5),)),
+    "marker zero 1e-4": (0.0, 0.0, (marker_zero(1e-4),)),
+    "torque gain 0.1 %": (0.0, 0.0, (torque_gain(1e-3),)),
+    "all": (
+        LENGTH,
+        AXIS,
+        (tracked_point(2e-4), clock(5e-5), once_per_turn(2e-5), marker_zero(1e-4), torque_gain(1e-3)),
+    ),
+}
+
+
+@cache
+def _exact(folder: Path, length: float, axis: float) -> Block:
+    system = _geometry(load_system(SYSTEM), length, axis)
+    return exact_session(system, folder / f"{SYSTEM}-{length:g}-{axis:g}.npz")
+
+
+def run(results: Path, folder: Path, seeds: int, kinds: list[str]) -> None:
+    """Append the sessions that `results` lacks, seed by seed."""
+    done = (
+        {(record["kind"], record["tolerances"], record["seed"]) for record in read(results)}
+        if results.exists()
+        else set()
+    )
+    for seed in range(seeds):
+        for kind in kinds:
+            for tolerances in ("none", "default"):
+                if (kind, tolerances, seed) in done:
+                    continue
+                record = one_session(folder, kind, tolerances, seed)
+                with results.open("a", encoding="utf-8") as file:
+                    file.write(json.dumps({"kind": kind, "tolerances": tolerances, "seed": seed, **record}) + "\n")
+
+
+def one_session(folder: Path, kind: str, tolerances: str, seed: int) -> Record:
+    """Estimate, its deviations and judgement."""
+    described = load_system(SYSTEM)
+    length, axis, distortions = KINDS[kind]
+    exact = _exact(folder, length, axis)
+    block = Block(exact.t, exact.channels, exact.values.copy())
+    random = np.random.default_rng(seed)
+    for distort in distortions:
+        distort(described, block, random)
+    block = noisy_session(described, block, GRADE, seed)
+    stated = Tolerances() if tolerances == "default" else Tolerances.model_validate(tolerances)
+    system = disguised(described).model_copy(update={"tolerances": stated})
+    start = process_time()
+    estimator = Estimator(system, block.channels, "campaign")
+    for piece in block.pieces(PIECE):
+        estimator.push(piece)
+    estimator.finish()
+    estimate = estimator.estimate()
+    trust = Evaluation(Statistics.of(estimator)).trust
+    return {
+        "estimate": estimate.pi.tolist(),
+        "std": standard_deviation(estimator).tolist(),
+        "chi2": estimate.rss / estimate.dof,
+        "level": trust.level,
+        "sentence": trust.sentence,
+        "seconds": process_time() - start,
+    }
+
+
+def summary(records: list[Record]) -> str:
+    """Coverage of the 95 % intervals, root mean square of errors over their bars, and bars, kind by kind."""
+    truth = true_parameters(load_system(SYSTEM))
+    clean = _stds(records, "clean", "none")
+    names = ("sessions", "cover", "rms z", "worst z", "bars", "green", "s")
+    lines = [f"{'kind':24}{'tolerances':>12}" + "".join(f"{name:>9}" for name in names)]
+    for kind in KINDS:
+        for tolerances in ("none", "default"):
+            own = [r for r in records if (r["kind"], r["tolerances"]) == (kind, tolerances)]
+            if own:
+                lines.append(_line(kind, tolerances, own, truth, clean))
+    return "\n".join(lines)
+
+
+def _stds(records: list[Record], kind: str, tolerances: str) -> Array:
+    own = [r["std"] for r in records if (r["kind"], r["tolerances"]) == (kind, tolerances)]
+    return np.median(np.array(own, dtype=float), axis=0)
+
+
+def _line(kind: str, tolerances: str, own: list[dict[str, Any]], truth: Array, clean: Array) -> str:
+    estimate, std = (np.array([r[key] for r in own], dtype=float) for key in ("estimate", "std"))
+    z = (estimate - truth) / std
+    green = sum(r["level"] == "trust" for r in own)
+    bars = float(np.median(np.median(std, axis=0) / clean))
+    seconds = float(np.median([r["seconds"] for r in own]))
+    numbers = [
+        f"{len(own)}", f"{np.mean(np.abs(z) < NORMAL_95):.3f}", f"{np.sqrt(np.mean(z**2)):.2f}",
+        f"{np.abs(z).max():.1f}", f"{bars:.2f}", f"{green}", f"{seconds:.1f}",
+    ]  # fmt: skip
+    return f"{kind:24}{tolerances:>12}" + "".join(f"{number:>9}" for number in numbers)
+
+
+def main() -> int:
+    """Parse the command line."""
+    parser = argparse.ArgumentParser(prog="python -m tests.campaigns.calibration", description=__doc__.splitlines()[0])
+    verbs = parser.add_subparsers(dest="verb", required=True)
+    runner = verbs.add_parser("run", help="append the sessions that RESULTS lacks")
+    runner.add_argument("results", metavar="RESULTS", type=Path)
+    runner.add_argument("--seeds", type=int, default=10, help="seeds 0, 1, … of each kind, 10 by default")
+    runner.add_argument("--kinds", nargs="+", choices=list(KINDS), default=list(KINDS))
+    shower = verbs.add_parser("summary", help="print what the sessions show")
+    shower.add_argument("results", metavar="RESULTS", type=Path)
+    args = parser.parse_args()
+    if args.verb == "run":
+        run(args.results, args.results.parent, args.seeds, args.kinds)
+    else:
+        print(summary(read(args.results)))
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
