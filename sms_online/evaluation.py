@@ -12,7 +12,8 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from sms_online.judgement import Discrepancy, Facts, Residual, Trust, judge
+from sms_online.calibration.found import Calibration, found
+from sms_online.judgement import Discrepancy, Facts, Reason, Residual, Trust, judge
 from sms_online.model.parameters import Parameter
 from sms_online.physical import PhysicalSet, Projection
 from sms_online.pipeline.statistics import Statistics
@@ -133,6 +134,14 @@ class Evaluation:
         return estimate.joint if estimate.nuisances.size == m else np.concatenate((np.zeros(m), estimate.pi))
 
     @cached_property
+    def calibration(self) -> list[Calibration]:
+        """What the session tells of its calibration better than the description's tolerances."""
+        estimate, nuisances = self.estimate, self.statistics.setup.nuisances
+        if estimate.nuisances.size != len(nuisances) or estimate.dof <= 0.0:
+            return []
+        return found(nuisances, estimate, max(1.0, float(np.sqrt(estimate.rss / estimate.dof))))
+
+    @cached_property
     @one_blas_thread()
     def pulled(self) -> list[str]:
         """Names of parameters that noise in the columns pulls by more than their std: errors in variables.
@@ -189,9 +198,20 @@ class Evaluation:
                 distance=0.0 if projection is None else projection.distance,
                 lost=lost / max(1, lost + now.samples),
                 discrepancies=self._discrepancies,
+                miscalibrated=tuple(self._miscalibrated()),
                 troubles=(*self._troubles, *self._weaknesses()),
             )
         )
+
+    def _miscalibrated(self) -> list[Reason]:
+        """Where the description is wrong by more than its tolerances allow."""
+        return [
+            Reason(
+                f"{each}: {abs(each.estimate / each.tolerance):.0f} tolerances", False, full=f"{each}: {each.advice}"
+            )
+            for each in self.calibration
+            if each.tolerance is not None and each.beyond
+        ]
 
     def _settling(self) -> str:
         """Why the estimate will still move by more than its error bars."""

@@ -63,10 +63,11 @@ class Facts:
     determined: parameters that the data determine, and of how many. undetermined: names of the others. settling: why
     the estimate will still move by more than its error bars, empty where it will not. negative: names of estimates that
     are negative and must not be. pulled: names of those that noise in the columns pulls beyond their bars. alarm: type
-    of the rows that the sequential test finds more than noise in, of a session without diagnosis. unweighed: that
-    of the joint whose torque is explained so little that rows get no weights. undecided: times, s, of changes that the
+    of the rows that the sequential test finds more than noise in, of a session without diagnosis. unweighed: that of
+    the joint whose torque is explained so little that rows get no weights. undecided: times, s, of changes that the
     session ended too early to tell. distance: from the nearest real bodies, in standard deviations. lost: share of the
-    samples. troubles: whatever else, a short sentence each, such as of the devices of a live session.
+    samples. miscalibrated: what is off by more than the description's tolerances allow. troubles: whatever else, a
+    short sentence each, such as of the devices of a live session.
     """
 
     determined: tuple[int, int]
@@ -81,6 +82,7 @@ class Facts:
     distance: float = 0.0
     lost: float = 0.0
     discrepancies: tuple[Discrepancy, ...] = ()
+    miscalibrated: tuple[Reason, ...] = ()
     troubles: tuple[str, ...] = ()
 
 
@@ -287,7 +289,7 @@ def _negative(names: Sequence[str]) -> list[Reason]:
 
 def _cautions(facts: Facts) -> list[Reason]:
     """What makes some of the numbers, or their bars, worse than they look."""
-    out = [Reason(trouble, False) for trouble in facts.troubles]
+    out = [*facts.miscalibrated, *(Reason(trouble, False) for trouble in facts.troubles)]
     if facts.pulled:
         names = ", ".join(facts.pulled)
         out.append(

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from sms_online.calibration.found import Calibration
 from sms_online.description.parse import describe
 from sms_online.description.schema import System
 from sms_online.evaluation import NORMAL_95, Evaluation
@@ -197,6 +198,7 @@ class Result:
     that the running diagnosis has named. trust: may the numbers be trusted, and why. warnings: a sentence each. method:
     what the estimate comes from, "smoother", "momentum" or "energy" balance. samples, lost_samples: counts. duration:
     s. condition_number: of the scaled information, inf without full rank. throughput: samples/s of computing time.
+    calibration: what the description is off by, told better than its tolerances.
     physical: None of a session that still runs. diagnosis: episodes of the running diagnosis, as in results.json.
     """
 
@@ -213,6 +215,7 @@ class Result:
     condition_number: float
     lost_samples: int
     throughput: float = 0.0
+    calibration: tuple[Calibration, ...] = ()
     physical: Consistency | None = field(default=None, repr=False)
     diagnosis: tuple[Mapping[str, Any], ...] = field(default=(), repr=False)
 
@@ -226,6 +229,7 @@ class Result:
             "method": self.method,
             "verdict": self.trust.document(),
             "parameters": [parameter.document() for parameter in self.parameters.values()],
+            "calibration": [each.document() for each in self.calibration],
             "events": [event_document(event) for event in self.events],
             "residual": residual_document(self.residuals),
             "physical": None
@@ -257,7 +261,8 @@ class Result:
         return frame.astype(dict.fromkeys(("nominal", "true", "bound"), float))
 
     def __str__(self) -> str:
-        return f"{self.parameters}\n\n{self.trust}"
+        calibration = [f"calibration: {each}\n" for each in self.calibration if each.certain]
+        return f"{self.parameters}\n\n{''.join(calibration)}{self.trust}"
 
     __repr__ = __str__
 
@@ -327,6 +332,7 @@ def result_of(
         condition_number=estimate.condition_number,
         lost_samples=now.counters.lost_samples,
         throughput=throughput,
+        calibration=tuple(evaluation.calibration),
         physical=None if projection is None else Consistency(projection.distance, projection.active),
         diagnosis=tuple(episodes),
     )

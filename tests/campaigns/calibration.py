@@ -19,7 +19,6 @@ from time import process_time
 from typing import Any
 
 import numpy as np
-from evaluated import standard_deviation
 from scipy.interpolate import make_interp_spline
 from scipy.spatial.transform import Rotation
 
@@ -172,14 +171,16 @@ def one_session(folder: Path, kind: str, tolerances: str, seed: int) -> Record:
     for piece in block.pieces(PIECE):
         estimator.push(piece)
     estimator.finish()
-    estimate = estimator.estimate()
-    trust = Evaluation(Statistics.of(estimator)).trust
+    evaluation = Evaluation(Statistics.of(estimator))
+    estimate, nuisances = evaluation.estimate, evaluation.statistics.setup.nuisances
+    found = zip(nuisances, estimate.nuisances.tolist(), estimate.nuisances_std.tolist(), strict=True)
     return {
         "estimate": estimate.pi.tolist(),
-        "std": standard_deviation(estimator).tolist(),
+        "std": evaluation.std.tolist(),
+        "nuisances": [[n.name, n.where, n.part, value, std] for n, value, std in found],
         "chi2": estimate.rss / estimate.dof,
-        "level": trust.level,
-        "sentence": trust.sentence,
+        "level": evaluation.trust.level,
+        "sentence": evaluation.trust.sentence,
         "seconds": process_time() - start,
     }
 

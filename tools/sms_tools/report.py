@@ -10,6 +10,7 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
+from sms_online.calibration.found import Calibration
 from sms_online.tables import formatter
 
 # Width of a table that goes to a file or a pipe, where there is no terminal to ask.
@@ -94,10 +95,15 @@ def event_line(event: Document) -> str:
     return f"event at {event['time']:.3f} s: {event['kind']} {', '.join(jumps)}".rstrip()
 
 
+def _calibration(document: Document) -> list[Calibration]:
+    return [Calibration(**entry) for entry in document.get("calibration", [])]
+
+
 def trust_lines(document: Document) -> list[str]:
-    """Events, residual, condition number, amount of data, throughput and warnings, a line each."""
+    """Events, calibration, residual, condition number, amount of data, throughput and warnings, a line each."""
     lines = [event_line(event) for event in document["events"]]
     lines += [f"diagnosis: {episode['summary']}" for episode in document.get("diagnosis", [])]
+    lines += [f"calibration: {each}" for each in _calibration(document) if each.certain]
     for rows, residual in document["residual"].items():
         if residual["relative"] is not None:
             lines.append(f"residual {rows}: {residual['relative']:.3g} of the measured torque or force")

@@ -1,0 +1,116 @@
+"""What a session says of its calibration, in the words and units of the person at the testbed."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from sms_online.calibration.nuisance import Nuisance
+from sms_online.trackers.interface import Estimate
+
+# A nuisance is a result where its deviation is below this share of its tolerance, or, without one, below this share of
+# its size.
+IMPROVED, OF_ITS_SIZE = 0.7, 1.0 / 3.0
+# And beyond this many tolerances the description is wrong there: what else bends to it, no error bar says.
+BEYOND = 3.0
+# It is told to people from so many of its deviations on.
+CERTAIN = 3.0
+# What people call it, with a positive size and with a negative one.
+WORDS = {
+    "clock": ("late", "early"),
+    "length": ("longer", "shorter"),
+}
+NAMES = {
+    "tracked_point": "tracked point",
+    "axis": "axis",
+    "gravity": "direction of gravity",
+    "marker_station": "place along the link",
+    "encoder_zero": "zero",
+    "once_per_turn": "once per turn",
+    "base_angle": "zero of the attitude",
+    "marker_zero": "zero",
+    "marker_zero_angle": "zero",
+    "camera_scale": "scale",
+    "torque_gain": "gain of the torque",
+    "torque_offset": "zero of the torque",
+}
+# Units as people say them: factor from the SI unit, from which size on.
+SCALES = {
+    "s": (("s", 1.0), ("ms", 1e-3), ("µs", 1e-6)),
+    "m": (("m", 1.0), ("mm", 1e-3), ("µm", 1e-6)),
+    "rad": (("rad", 1.0), ("mrad", 1e-3), ("µrad", 1e-6)),
+    "": (("%", 1e-2),),
+}
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """A number of the description that the samples tell better than its tolerance; estimates are corrected by it.
+
+    name: of a tolerance in the system file. where: `base`, `joint_i`, `link_i`, a channel or a device; part: an axis,
+    or the sine or cosine of an error once per turn. estimate: by how much the description is off, unit; std: its
+    standard deviation; tolerance: that of the system file, None where nothing was known.
+    """
+
+    name: str
+    where: str
+    part: str
+    unit: str
+    estimate: float
+    std: float
+    tolerance: float | None
+
+    @property
+    def beyond(self) -> bool:
+        """Whether the description is wrong by more than its tolerance allows."""
+        return self.tolerance is not None and abs(self.estimate) > BEYOND * self.tolerance
+
+    @property
+    def certain(self) -> bool:
+        """Whether it is no accident that it is not zero."""
+        return abs(self.estimate) > CERTAIN * self.std
+
+    def __str__(self) -> str:
+        positive, negative = WORDS.get(self.name, ("off", "off"))
+        words = positive if self.estimate >= 0.0 else negative
+        value = abs(self.estimate) if positive != negative else self.estimate
+        scales = SCALES.get(self.unit, ((self.unit, 1.0),))
+        unit, factor = next((each for each in scales if max(abs(value), self.std) >= each[1]), scales[-1])
+        place = self.where if self.name in WORDS else f"{self.where}: {NAMES[self.name]}"
+        part = f" ({self.part})" if self.part else ""
+        return f"{place}{part} {_rounded(value / factor, self.std / factor)} {unit} {words}"
+
+    @property
+    def advice(self) -> str:
+        """What to do where it is beyond its tolerance."""
+        if self.name == "clock" and self.estimate > 0.0:
+            return f"state latency = {self.estimate:.2g} of it, or a larger tolerances.clock"
+        return f"correct the system file or the sensor, or state a larger tolerances.{self.name}"
+
+    def document(self) -> dict[str, str | float | None]:
+        """As results.json holds it."""
+        return {
+            "name": self.name, "where": self.where, "part": self.part, "estimate": self.estimate, "std": self.std,
+            "tolerance": self.tolerance, "unit": self.unit,
+        }  # fmt: skip
+
+
+def _rounded(value: float, std: float) -> str:
+    """Both down to the second digit of the deviation."""
+    decimals = int(np.clip(1 - np.floor(np.log10(std)), 0, 9)) if std > 0.0 else 3
+    return f"{value:.{decimals}f} ± {std:.{decimals}f}"
+
+
+def found(nuisances: Sequence[Nuisance], estimate: Estimate, scale: float = 1.0) -> list[Calibration]:
+    """What is told better than its tolerance; scale: of the deviations, where rows leave more than noise."""
+    out = []
+    for nuisance, value, std in zip(
+        nuisances, estimate.nuisances.tolist(), (scale * estimate.nuisances_std).tolist(), strict=True
+    ):
+        known = np.isfinite(nuisance.tolerance)
+        if std < (IMPROVED * nuisance.tolerance if known else OF_ITS_SIZE * abs(value)):
+            tolerance = nuisance.tolerance if known else None
+            out.append(Calibration(nuisance.name, nuisance.where, nuisance.part, nuisance.unit, value, std, tolerance))
+    return out

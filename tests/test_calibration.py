@@ -1,0 +1,133 @@
+"""What the description is off by within its tolerances: estimated, said, corrected, and in the error bars."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from net.sessions import TOLERANCE
+
+from sms_adapters.system_file import load_system
+from sms_online.calibration.found import Calibration
+from sms_online.calibration.nuisance import Nuisance, known_beforehand, prior_rows
+from sms_online.description.parse import parse_system, shipped_text
+from sms_online.description.schema import Tolerances
+from sms_online.errors import InputError
+from sms_online.evaluation import Evaluation
+from sms_online.pipeline.estimator import Estimator
+from sms_online.pipeline.statistics import Statistics
+from sms_online.stream import Array, Block
+from sms_online.trackers.interface import Rows
+from sms_online.trackers.square_root import session_tracker
+from sms_sim.simulate import sampled_blocks, simulate
+
+EXACTLY = Tolerances.model_validate("none")
+# Two clocks and two parameters, of rows that tell all of them.
+NUISANCES = (Nuisance("clock", "a", "s", 0.5), Nuisance("clock", "b", "s", np.inf))
+
+
+def test_the_prior_solution_is_that_of_rows_with_the_nuisance_marginalised() -> None:
+    """Random rows, seed 1: the same as generalised least squares whose covariance holds N P Nᵀ."""
+    random = np.random.default_rng(1)
+    Y, N, b = (random.standard_normal((40, k)) for k in (2, 1, 1))
+    known = known_beforehand(NUISANCES[:1], 2)
+    tracker = session_tracker(2, None, 1)
+    tracker.begin(known)
+    tracker.update(Rows(np.column_stack((N, Y)), b[:, 0], np.ones(40), np.arange(40.0)))
+    estimate = tracker.estimate().without_nuisances(1)
+    weight = np.linalg.inv(np.eye(40) + 0.25 * N @ N.T)
+    covariance = np.linalg.inv(Y.T @ weight @ Y)
+    np.testing.assert_allclose(estimate.covariance, covariance, rtol=1e-10)
+    np.testing.assert_allclose(estimate.pi, covariance @ (Y.T @ weight @ b[:, 0]), rtol=1e-10)
+    assert estimate.nuisances.shape == estimate.nuisances_std.shape == (1,)
+
+
+def test_nothing_is_known_of_a_nuisance_without_a_tolerance() -> None:
+    np.testing.assert_array_equal(prior_rows(NUISANCES, 1), [[2.0, 0.0, 0.0, 0.0]])
+    assert known_beforehand(NUISANCES, 1).rows == 1
+
+
+@pytest.fixture(scope="module")
+def exact() -> Block:
+    """8 s of the planar example without noise."""
+    blocks = list(sampled_blocks(simulate(load_system("paper-planar"), 8.0, position_tolerance=TOLERANCE), "0"))
+    t, values = (np.concatenate([getattr(block, part) for block in blocks]) for part in ("t", "values"))
+    return Block(t, blocks[0].channels, values)
+
+
+def evaluated(exact: Block, tolerances: Tolerances, changed: dict[str, Array] | None = None) -> Evaluation:
+    """Of the samples with white noise of 1e-5 on positions and 0.02 N m on torques, seed 3."""
+    random = np.random.default_rng(3)
+    values = exact.values.copy()
+    for name, column in (changed or {}).items():
+        values[:, exact.channels.index(name)] = column
+    torque = [name.startswith("tau") for name in exact.channels]
+    values += np.where(torque, 2e-2, 1e-5) * random.standard_normal(values.shape)
+    system = load_system("paper-planar").model_copy(update={"tolerances": tolerances})
+    estimator = Estimator(system, exact.channels, "test")
+    estimator.push(Block(exact.t, exact.channels, values))
+    estimator.finish()
+    return Evaluation(Statistics.of(estimator))
+
+
+def off(evaluation: Evaluation) -> Array:
+    """Errors of the parameters over their bars."""
+    base = evaluation.base
+    return np.asarray((evaluation.estimate.pi - base.values(evaluation.model.nominal)) / evaluation.std)
+
+
+def late(exact: Block, seconds: float) -> dict[str, Array]:
+    """What base and markers read so much later."""
+    seen = [name for name in exact.channels if name.startswith(("r_S", "theta_0", "link_"))]
+    columns = (exact.values[:, exact.channels.index(name)] for name in seen)
+    return {name: np.interp(exact.t - seconds, exact.t, column) for name, column in zip(seen, columns, strict=True)}
+
+
+def of(evaluation: Evaluation, name: str, where: str) -> Calibration:
+    (found,) = (each for each in evaluation.calibration if (each.name, each.where) == (name, where))
+    return found
+
+
+def test_a_late_camera_within_its_tolerance_is_said_and_corrected(exact: Block) -> None:
+    """By 100 µs: the bars hold that do not when the clocks are taken as exact."""
+    changed = late(exact, 1e-4)
+    assert np.abs(off(evaluated(exact, EXACTLY, changed))).max() > 4.0
+    evaluation = evaluated(exact, Tolerances(), changed)
+    assert np.abs(off(evaluation)).max() < 4.0
+    for where in ("base", "markers"):
+        clock = of(evaluation, "clock", where)
+        assert clock.estimate == pytest.approx(1e-4, abs=4.0 * clock.std)
+        assert clock.std < 1e-5
+        assert not clock.beyond
+        assert str(clock).endswith("µs late")
+
+
+def test_a_camera_later_than_its_tolerance_is_not_trusted(exact: Block) -> None:
+    evaluation = evaluated(exact, Tolerances(), late(exact, 5e-4))
+    assert evaluation.trust.level == "doubt"
+    assert any("late: 10 tolerances" in reason for reason in evaluation.trust.reasons)
+    assert any("latency" in warning for warning in evaluation.trust.warnings)
+
+
+@pytest.mark.parametrize(
+    ("name", "where", "part", "unit", "estimate", "std", "sentence"),
+    [
+        ("clock", "markers", "", "s", 4.8e-5, 1e-6, "markers 48.0 ± 1.0 µs late"),
+        ("clock", "base", "", "s", -4e-3, 1e-5, "base 4.000 ± 0.010 ms early"),
+        ("tracked_point", "base", "x", "m", -9e-4, 2e-4, "base: tracked point (x) -0.90 ± 0.20 mm off"),
+        ("torque_gain", "joint_2", "", "", 1e-3, 4e-5, "joint_2: gain of the torque 0.1000 ± 0.0040 % off"),
+    ],
+)
+def test_calibration_is_said_in_units_of_the_workshop(
+    name: str, where: str, part: str, unit: str, estimate: float, std: float, sentence: str
+) -> None:
+    assert str(Calibration(name, where, part, unit, estimate, std, None)) == sentence
+
+
+def test_tolerances_none_says_that_all_is_exact() -> None:
+    text = shipped_text("paper-planar")
+    assert parse_system('tolerances = "none"\n' + text, "test").tolerances == EXACTLY
+    assert parse_system(text + "\n[tolerances]\nclock = 1e-3\n", "test").tolerances.clock == 1e-3
+    with pytest.raises(InputError, match=r"tolerances\.clok"):
+        parse_system(text + "\n[tolerances]\nclok = 1e-3\n", "test")
+    with pytest.raises(InputError, match=r"tolerances.*'nothing'"):
+        parse_system('tolerances = "nothing"\n' + text, "test")
