@@ -16,11 +16,11 @@ if TYPE_CHECKING:
     from sms_online.description.schema import System
     from sms_online.diagnosis.diagnosed import Diagnosis, diagnose
     from sms_online.errors import InputError
-    from sms_online.judgement import Residual, Trust
     from sms_online.pipeline.events import Event
     from sms_online.result import Coefficient, Finding, Parameter, Parameters, Result
     from sms_online.session import Session, estimate
     from sms_online.stream import Block
+    from sms_online.trust import Residual, Trust
     from sms_sim.bound import Bounds, bound
     from sms_sim.capture import simulate
 

@@ -13,14 +13,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sms_online.calibration.found import Calibration, found
-from sms_online.judgement import Discrepancy, Facts, Reason, Residual, Trust, judge
+from sms_online.judgement import Discrepancy, Facts, judge
 from sms_online.model.parameters import Parameter
+from sms_online.nominal import Comparison, compare, unit_factors
 from sms_online.physical import PhysicalSet, Projection
 from sms_online.pipeline.statistics import Statistics
 from sms_online.row_types import ENERGY, joint_rows, row_types
 from sms_online.stream import Array
 from sms_online.threads import one_blas_thread
 from sms_online.trackers.interface import Estimate
+from sms_online.trust import Reason, Residual, Trust
 
 # Half width of a 95 % interval in standard deviations.
 NORMAL_95 = 1.959963984540054
@@ -174,6 +176,14 @@ class Evaluation:
             return None
 
     @cached_property
+    def comparison(self) -> Comparison:
+        """The determined parameters against the values that the system file states; those of effects count as none."""
+        known = np.flatnonzero(self.determined)
+        names = [self.parameters[k].name for k in known]
+        nominal = {p.name: p.nominal for p in self.parameters if "@" not in p.name}
+        return compare(names, self.estimate.pi[known], self.std[known], nominal, unit_factors(self.model.system))
+
+    @cached_property
     def trust(self) -> Trust:
         """May the estimate be trusted? The answer changes while a session runs."""
         now, estimate, flags = self.statistics, self.estimate, self.determined
@@ -196,6 +206,7 @@ class Evaluation:
                 unweighed=unweighed,
                 undecided=tuple(event.time for event in now.events if event.kind == "undecided"),
                 distance=0.0 if projection is None else projection.distance,
+                comparison=self.comparison,
                 lost=lost / max(1, lost + now.samples),
                 discrepancies=self._discrepancies,
                 miscalibrated=tuple(self._miscalibrated()),
@@ -207,7 +218,10 @@ class Evaluation:
         """Where the description is wrong by more than its tolerances allow."""
         return [
             Reason(
-                f"{each}: {abs(each.estimate / each.tolerance):.0f} tolerances", False, full=f"{each}: {each.advice}"
+                f"{each}: {abs(each.estimate / each.tolerance):.0f} tolerances",
+                False,
+                full=f"{each}: {each.advice}",
+                then=each.advice,
             )
             for each in self.calibration
             if each.tolerance is not None and each.beyond

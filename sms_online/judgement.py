@@ -6,40 +6,38 @@ judgement, so that none of them is calmer than another.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, Literal, NamedTuple
+
+from sms_online.nominal import AS_STATED, Comparison
+from sms_online.trust import Reason, Residuals, Trust
 
 # A joint whose unexplained torque reaches this share of the measured one lacks an effect, whatever the error bars say.
 LARGEST_RESIDUAL = 0.5
-# Rows that hold this many times their predicted deviation bend parameters by more than bars from the residual tell.
+# Rows that hold this many times their predicted deviation distort parameters by more than the reported deviations.
 LARGEST_WHITENED = 3.0
+# Sessions whose model holds leave up to 1.3 of it. Rows beyond this hold more than noise, and green claims too much.
+NOISE_WHITENED = 1.5
+# Share of a torque that friction nobody described leaves; more without rows that say it is noise is no green.
+NOISE_RESIDUAL = 0.1
 # Up to here a multiple of the noise is not told: it is rounded to one, or samples are exact and there is no noise.
 JUST_NOISE = 1.05
 # Share of the samples that may be lost before the rest is no fair part of the motion.
 LARGEST_LOSS = 0.01
 # Further from the nearest real bodies than this, in standard deviations, no noise brings an estimate.
 LARGEST_DISTANCE = 3.0
-# A sentence is read at a glance, and fits on a line.
-LONGEST_SENTENCE = 100
 # Names in a sentence; the others are counted.
 NAMED = 2
-
-Level = Literal["trust", "doubt", "not yet"]
-
-
-class Residual(NamedTuple):
-    """What one type of rows leaves, root mean square; None where it is not known.
-
-    relative: to the measured torque or force. whitened: over the standard deviation that the sensors' noise predicts,
-    so that 1 is noise alone.
-    """
-
-    relative: float | None
-    whitened: float | None
-
-
-Residuals = Mapping[str, Residual]  # by type of the rows
+# Without a spring, a mass or a rigidity nobody simulates the arm: green needs them, by the ends of their names.
+VITAL = ("mass", "mass_per_length", "stiffness", "rigidity", "rigidity_y", "rigidity_z")
+# What to do next.
+DIAGNOSE = "run `sms-online diagnose` on the recording"
+ADD_EFFECT = "run `sms-online diagnose` and replay with the system.toml that it writes, or use --adopt"
+CHECK_TORQUE = "check sign, unit and gear ratio of that torque, then run `sms-online diagnose`"
+CHECK_ROWS = "check geometry, clocks and stated noise of the sensors in these rows, then run `sms-online diagnose`"
+CHECK_SCALE = "check unit and gear of the torques, or weigh one part and state it under [known]"
+CHECK_LOSSES = "look at the faults that the session counted: a bus that is too busy, a loose cable"
+MOVE = "move all joints, faster and over a larger range, and long enough"
 
 
 @dataclass(frozen=True)
@@ -63,11 +61,12 @@ class Facts:
     determined: parameters that the data determine, and of how many. undetermined: names of the others. settling: why
     the estimate will still move by more than its error bars, empty where it will not. negative: names of estimates that
     are negative and must not be. pulled: names of those that noise in the columns pulls beyond their bars. alarm: type
-    of the rows that the sequential test finds more than noise in, of a session without diagnosis. unweighed: that of
-    the joint whose torque is explained so little that rows get no weights. undecided: times, s, of changes that the
-    session ended too early to tell. distance: from the nearest real bodies, in standard deviations. lost: share of the
-    samples. miscalibrated: what is off by more than the description's tolerances allow. troubles: whatever else, a
-    short sentence each, such as of the devices of a live session.
+    of the rows that the sequential test finds more than noise in, of a session without diagnosis. unweighed: that
+    of the joint whose torque is explained so little that rows get no weights. undecided: times, s, of changes that the
+    session ended too early to decide on. distance: from the nearest real bodies, in standard deviations. comparison:
+    with the values that the system file states. lost: share of the samples. miscalibrated: what is off by more than the
+    description's tolerances allow. troubles: whatever else, a short sentence each, such as of the devices of a live
+    session.
     """
 
     determined: tuple[int, int]
@@ -80,77 +79,11 @@ class Facts:
     unweighed: str | None = None
     undecided: tuple[float, ...] = ()
     distance: float = 0.0
+    comparison: Comparison = AS_STATED
     lost: float = 0.0
     discrepancies: tuple[Discrepancy, ...] = ()
     miscalibrated: tuple[Reason, ...] = ()
     troubles: tuple[str, ...] = ()
-
-
-@dataclass(frozen=True)
-class Reason:
-    """Why to doubt: a short sentence; grave where the error bars cannot tell how wrong the numbers are.
-
-    places: where on the arm it sits, `joint_i`, `link_i`, `base`, `tip` or a channel; empty where nowhere. mark: a word
-    or two for there. full: the same with what it means, for results.json's warnings; empty where they say it otherwise.
-    """
-
-    text: str
-    grave: bool
-    places: tuple[str, ...] = ()
-    mark: str = ""
-    full: str = ""
-
-
-@dataclass(frozen=True)
-class Trust:
-    """May the numbers be trusted?
-
-    level: "trust", "doubt" or "not yet". grave: of a doubt, that the numbers may be wrong by more than any error bar
-    says. grounds: the strongest first; of trust, what it rests on.
-    """
-
-    level: Level
-    grounds: tuple[Reason, ...]
-    grave: bool = False
-
-    @property
-    def reasons(self) -> tuple[str, ...]:
-        """The reasons, a short sentence each, the strongest first; of trust, what it rests on."""
-        return tuple(reason.text for reason in self.grounds)
-
-    @property
-    def sentence(self) -> str:
-        """The level, and whether a doubt is grave, with the strongest reason, on one line."""
-        heading = "Do not trust" if self.grave else self.level.capitalize()
-        return _fitted(f"{heading}: {self.grounds[0].text}")
-
-    @property
-    def others(self) -> tuple[str, ...]:
-        """The reasons but for the strongest."""
-        return self.reasons[1:]
-
-    @property
-    def warnings(self) -> tuple[str, ...]:
-        """Reasons with what they mean, where nothing else in results.json says it."""
-        return tuple(reason.full for reason in self.grounds if reason.full)
-
-    @property
-    def marks(self) -> dict[str, str]:
-        """Where on the arm reasons to doubt sit, and a word or two for there: the strongest of each place."""
-        marks: dict[str, str] = {}
-        for reason in self.grounds:
-            for place in reason.places:
-                marks.setdefault(place, reason.mark)
-        return marks
-
-    def document(self) -> dict[str, Any]:
-        """As results.json holds it."""
-        return {
-            "level": self.level, "grave": self.grave, "sentence": self.sentence, "reasons": list(self.reasons),
-        }  # fmt: skip
-
-    def __str__(self) -> str:
-        return "\n".join([self.sentence, *(f"  {other}" for other in self.others)])
 
 
 def judge(facts: Facts) -> Trust:
@@ -160,7 +93,7 @@ def judge(facts: Facts) -> Trust:
     nothing: it was made of other, poorer rows.
     """
     settled = not facts.settling
-    doubts = [*_named(facts.discrepancies)]
+    doubts = [*_scaled(facts.comparison), *_named(facts.discrepancies)]
     if settled or facts.unweighed is not None:
         torques = _unexplained_torques(facts.residual)
         doubts += torques
@@ -170,9 +103,8 @@ def judge(facts: Facts) -> Trust:
         doubts += _loud_rows(facts.residual)
     doubts += _unnamed(facts.discrepancies)
     if facts.alarm is not None and not any(_open(discrepancy) for discrepancy in facts.discrepancies):
-        doubts.append(
-            Reason(f"the residual of {facts.alarm} is more than noise", True, (facts.alarm,), "more than noise")
-        )
+        text = f"the residual of {facts.alarm} is more than noise"
+        doubts.append(Reason(text, True, (facts.alarm,), "more than noise", then=DIAGNOSE))
     if settled:
         doubts += _negative(facts.negative)
     # What befell the samples comes before what that may have done to the estimate.
@@ -180,7 +112,7 @@ def judge(facts: Facts) -> Trust:
     if doubts:
         return Trust("doubt", (*losses, *doubts, *_cautions(facts)), grave=True)
     if facts.settling:
-        return Trust("not yet", (Reason(facts.settling, False), *losses, *_cautions(facts)))
+        return Trust("not yet", (Reason(facts.settling, False, then=MOVE), *losses, *_cautions(facts)))
     cautions = (*losses, *_cautions(facts))
     return Trust("doubt", cautions) if cautions else Trust("trust", tuple(_grounds(facts)))
 
@@ -220,7 +152,7 @@ def _open(discrepancy: Discrepancy) -> bool:
 
 def _unweighed(row: str) -> Reason:
     text = f"no weights: by a first fit, most of the torque or force of {row} is not explained"
-    return Reason(text, True, (row,), "not explained")
+    return Reason(text, True, (row,), "not explained", then=CHECK_TORQUE)
 
 
 def _named(discrepancies: Iterable[Discrepancy]) -> list[Reason]:
@@ -230,7 +162,7 @@ def _named(discrepancies: Iterable[Discrepancy]) -> list[Reason]:
         if discrepancy.verdict == "named" and not discrepancy.adopted:
             places = tuple(_place(effect) for effect in discrepancy.effects)
             mark = ", ".join(dict.fromkeys(_kind(effect) for effect in discrepancy.effects))
-            out.append(Reason(f"the model lacks {_listed(discrepancy.effects)}", True, places, mark))
+            out.append(Reason(f"the model lacks {_listed(discrepancy.effects)}", True, places, mark, then=ADD_EFFECT))
     return out
 
 
@@ -241,8 +173,21 @@ def _unnamed(discrepancies: Iterable[Discrepancy]) -> list[Reason]:
         if discrepancy.verdict in ("noticed", "unexplained"):
             why = "not named yet" if discrepancy.verdict == "noticed" else "no known effect explains it"
             text = f"more than noise in the residual of {discrepancy.row} since {discrepancy.noticed:.1f} s, {why}"
-            out.append(Reason(text, True, (discrepancy.row,), "more than noise"))
+            out.append(Reason(text, True, (discrepancy.row,), "more than noise", then=DIAGNOSE))
     return out
+
+
+def _scaled(comparison: Comparison) -> list[Reason]:
+    """That everything is off by one factor, which rows cannot show."""
+    factor = comparison.common
+    if factor is None:
+        return []
+    cause = f": {comparison.cause}" if comparison.cause else ""
+    text = f"everything is {factor:.3g} × its description{cause}"
+    full = (
+        f"all parameters are about {factor:.3g} × what the system file states{cause}; no residual shows such a factor"
+    )
+    return [Reason(text, True, (), "", full, CHECK_SCALE)]
 
 
 def _unexplained_torques(residual: Residuals) -> list[Reason]:
@@ -252,7 +197,8 @@ def _unexplained_torques(residual: Residuals) -> list[Reason]:
         if share > LARGEST_RESIDUAL:
             percent = f"{100.0 * share:.0f} % of the torque or force of {name} is not explained"
             means = "the model lacks an effect there, and the parameters bend to replace it"
-            out.append(Reason(percent, True, (name,), f"{100.0 * share:.0f} % unexplained", f"{percent}: {means}"))
+            mark = f"{100.0 * share:.0f} % unexplained"
+            out.append(Reason(percent, True, (name,), mark, f"{percent}: {means}", CHECK_TORQUE))
     return out
 
 
@@ -265,7 +211,8 @@ def _loud_rows(residual: Residuals) -> list[Reason]:
         f"rows of {worst} hold {noise:.0f} times what the sensors' noise explains: the model or the samples are wrong "
         "there, by more than error bars can tell"
     )
-    return [Reason(f"the residual of {worst} is {noise:.0f} × noise", True, (worst,), f"{noise:.0f} × noise", full)]
+    mark = f"{noise:.0f} × noise"
+    return [Reason(f"the residual of {worst} is {mark}", True, (worst,), mark, full, CHECK_ROWS)]
 
 
 def _loudest(residual: Residuals) -> tuple[str | None, float]:
@@ -282,6 +229,7 @@ def _negative(names: Sequence[str]) -> list[Reason]:
             place_of(name),
             "negative",
             f"{name} is negative, which is not physical: the model lacks an effect, or the data are weak",
+            DIAGNOSE,
         )
         for name in names
     ]
@@ -290,6 +238,9 @@ def _negative(names: Sequence[str]) -> list[Reason]:
 def _cautions(facts: Facts) -> list[Reason]:
     """What makes some of the numbers, or their bars, worse than they look."""
     out = [*facts.miscalibrated, *(Reason(trouble, False) for trouble in facts.troubles)]
+    out += [*_beyond_noise(facts.residual), *_apart(facts.comparison)]
+    if vital := [name for name in facts.undetermined if name.endswith(VITAL)]:
+        out.append(Reason(f"not determined: {_listed(vital)}", False, place_of(vital[0]), "not determined", then=MOVE))
     if facts.pulled:
         names = ", ".join(facts.pulled)
         out.append(
@@ -308,8 +259,38 @@ def _cautions(facts: Facts) -> list[Reason]:
     return out
 
 
+def _beyond_noise(residual: Residuals) -> list[Reason]:
+    """Rows that hold somewhat more than noise, and torques that are not all explained."""
+    out = []
+    worst, noise = _loudest(residual)
+    if worst is not None and NOISE_WHITENED < noise <= LARGEST_WHITENED:
+        mark = f"{noise:.2g} × noise"
+        out.append(Reason(f"the residual of {worst} is {mark}", False, (worst,), mark, then=DIAGNOSE))
+    for name, rows in residual.items():
+        unknown = rows.whitened is None or rows.whitened > NOISE_WHITENED
+        if rows.relative is not None and NOISE_RESIDUAL < rows.relative <= LARGEST_RESIDUAL and unknown:
+            percent = f"{100.0 * rows.relative:.0f} %"
+            text = f"{percent} of the torque or force of {name} is not explained"
+            out.append(Reason(text, False, (name,), f"{percent} unexplained", then=DIAGNOSE))
+    return out
+
+
+def _apart(comparison: Comparison) -> list[Reason]:
+    return [
+        Reason(
+            f"{p.name} is {p.value:.3g}, described as {p.nominal:.3g}",
+            False,
+            place_of(p.name),
+            "not as described",
+            then=f"check the stated value of {p.name}, and unit and gear of the channels beside it",
+        )
+        for p in comparison.apart
+    ]
+
+
 def _losses(share: float) -> list[Reason]:
-    return [Reason(f"{100.0 * share:.0f} % of the samples are lost", False)] if share > LARGEST_LOSS else []
+    lost = Reason(f"{100.0 * share:.0f} % of the samples are lost", False, then=CHECK_LOSSES)
+    return [lost] if share > LARGEST_LOSS else []
 
 
 def _grounds(facts: Facts) -> list[Reason]:
@@ -350,10 +331,3 @@ def _kind(effect: str) -> str:
 def _listed(names: Sequence[str]) -> str:
     more = f" and {len(names) - NAMED} more" if len(names) > NAMED else ""
     return ", ".join(names[:NAMED]) + more
-
-
-def _fitted(text: str) -> str:
-    """Cut at a word where it is too long to be read at a glance."""
-    if len(text) <= LONGEST_SENTENCE:
-        return text
-    return text[: LONGEST_SENTENCE - 1].rsplit(" ", 1)[0] + "…"

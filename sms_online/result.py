@@ -16,11 +16,11 @@ from sms_online.calibration.found import Calibration
 from sms_online.description.parse import describe
 from sms_online.description.schema import System
 from sms_online.evaluation import NORMAL_95, Evaluation
-from sms_online.judgement import Residual, Residuals, Trust
 from sms_online.pipeline.events import Event
 from sms_online.pipeline.statistics import Method
 from sms_online.stream import Array
 from sms_online.tables import formatter, html_table, text_table
+from sms_online.trust import Residual, Residuals, Trust
 
 if TYPE_CHECKING:
     import pandas

@@ -9,11 +9,14 @@ from axis import AXIS, axis_block
 from evaluated import judged, results_document
 
 from sms_online.description.parse import parse_system
-from sms_online.judgement import LONGEST_SENTENCE, Discrepancy, Facts, Residual, judge, judge_diagnosis, place_of
+from sms_online.judgement import CHECK_ROWS, Discrepancy, Facts, judge, judge_diagnosis, place_of
+from sms_online.nominal import Apart, Comparison
 from sms_online.pipeline.estimator import Estimator
+from sms_online.trust import LONGEST_SENTENCE, Residual
 
 QUIET = {"energy": Residual(None, None), "joint_1": Residual(0.01, 1.1), "joint_2": Residual(0.02, 0.9)}
 GOOD = Facts(determined=(15, 16), undetermined=("motor_2.stator_inertia",), residual=QUIET)
+SOFT = Apart("joint_1.stiffness", 39.8, 100.0)
 LACKING = Discrepancy("joint_2", 2.7, "named", ("coulomb_friction@joint_2",))
 
 
@@ -46,6 +49,11 @@ def test_what_nothing_speaks_against_is_trusted_and_its_reach_is_told() -> None:
         ),
         (replace(GOOD, alarm="base"), "the residual of base is more than noise", {"base": "more than noise"}),
         (replace(GOOD, negative=("motor_2.mass",)), "motor_2.mass is negative", {"joint_2": "negative"}),
+        (
+            replace(GOOD, comparison=Comparison(50.0, "tau_i looks like X")),
+            "50 × its description: tau_i looks like X",
+            {},
+        ),
     ],
 )
 def test_what_error_bars_do_not_know_of_is_a_grave_doubt(facts: Facts, said: str, marks: dict[str, str]) -> None:
@@ -64,6 +72,10 @@ def test_what_error_bars_do_not_know_of_is_a_grave_doubt(facts: Facts, said: str
         (replace(GOOD, distance=39.0), "no real bodies are nearer than 39 standard deviations"),
         (replace(GOOD, lost=0.2), "20 % of the samples are lost"),
         (replace(GOOD, troubles=("drive: silent",)), "drive: silent"),
+        (with_row("joint_1", relative=0.4, whitened=2.1), "the residual of joint_1 is 2.1 × noise"),
+        (with_row("joint_1", relative=0.4, whitened=None), "40 % of the torque or force of joint_1"),
+        (replace(GOOD, undetermined=("joint_1.stiffness",)), "not determined: joint_1.stiffness"),
+        (replace(GOOD, comparison=Comparison(apart=(SOFT,))), "joint_1.stiffness is 39.8, described as 100"),
     ],
 )
 def test_what_harms_some_numbers_is_a_doubt_that_is_not_grave(facts: Facts, said: str) -> None:
@@ -77,7 +89,7 @@ def test_what_harms_some_numbers_is_a_doubt_that_is_not_grave(facts: Facts, said
     [
         replace(GOOD, discrepancies=(replace(LACKING, adopted=True), Discrepancy("base", 9.0, "change"))),
         replace(GOOD, lost=1e-4, distance=1.0),
-        with_row("joint_1", relative=0.4, whitened=2.9),
+        with_row("joint_1", relative=0.4, whitened=1.4),
     ],
 )
 def test_what_is_explained_or_harmless_leaves_trust(facts: Facts) -> None:
@@ -227,4 +239,20 @@ def test_a_judgement_is_plain_data_in_results() -> None:
         "grave": True,
         "sentence": "Do not trust: the residual of joint_2 is 5 × noise",
         "reasons": ["the residual of joint_2 is 5 × noise"],
+        "next_step": CHECK_ROWS,
     }
+
+
+def test_beside_every_grave_doubt_stands_what_to_do_next() -> None:
+    for facts in (
+        with_row("joint_2", whitened=62.0),
+        with_row("joint_1", relative=0.96),
+        replace(GOOD, discrepancies=(LACKING,)),
+        replace(GOOD, discrepancies=(Discrepancy("base", 3.0, "unexplained"),)),
+        replace(GOOD, alarm="base"),
+        replace(GOOD, unweighed="joint_1"),
+        replace(GOOD, negative=("motor_2.mass",)),
+        replace(GOOD, comparison=Comparison(50.0)),
+    ):
+        assert judge(facts).grave
+        assert judge(facts).next_step

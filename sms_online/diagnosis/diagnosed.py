@@ -15,7 +15,6 @@ from sms_online.diagnosis.diagnose import Diagnosis as Search
 from sms_online.diagnosis.diagnose import diagnose as search_for_effects
 from sms_online.diagnosis.document import diagnosis_document, trust_of
 from sms_online.errors import InputError
-from sms_online.judgement import Residual, Residuals, Trust
 from sms_online.pipeline.estimator import Estimator
 from sms_online.priors import base_prior
 from sms_online.result import Finding, Parameter, Parameters, json_text
@@ -23,6 +22,7 @@ from sms_online.session import Data, recorded_session
 from sms_online.stream import Block
 from sms_online.tables import html_table, text_table
 from sms_online.trackers.interface import Prior
+from sms_online.trust import Residual, Residuals, Trust
 from sms_online.truth import true_values
 
 

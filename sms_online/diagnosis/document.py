@@ -16,13 +16,14 @@ from sms_online.diagnosis.reported import Coefficients, of_constant, of_unknowns
 from sms_online.diagnosis.shape import slopes
 from sms_online.effects.catalogue import ENTRIES, declarable
 from sms_online.evaluation import NORMAL_95, Evaluation, identifiable
-from sms_online.judgement import Facts, Residual, Trust, judge, judge_diagnosis
+from sms_online.judgement import Facts, judge, judge_diagnosis
 from sms_online.model.parameters import Parameter
 from sms_online.pipeline.estimator import Estimator
 from sms_online.pipeline.statistics import Statistics
 from sms_online.result import residual_document, result_of
 from sms_online.stream import Array
 from sms_online.threads import one_blas_thread
+from sms_online.trust import Residual, Trust
 
 SCHEMA = "sms-online/diagnosis/1"
 

@@ -47,7 +47,8 @@ def show(console: Console, *parts: Table | str | Text) -> None:
 def verdict_text(verdict: Document) -> Text:
     """Whether to trust the numbers, in its colour, and the other reasons below."""
     style = GRAVE_STYLE if verdict["grave"] else LEVEL_STYLES[verdict["level"]]
-    return Text("\n").join([Text(verdict["sentence"], style), *(Text(f"  {each}") for each in verdict["reasons"][1:])])
+    lines = [Text(verdict["sentence"], style), *(Text(f"  {each}") for each in verdict["reasons"][1:])]
+    return Text("\n").join([*lines, *([Text(f"  next: {verdict['next_step']}")] if verdict["next_step"] else [])])
 
 
 def parameter_table(document: Document, width: int, title: str | Text | None = None) -> Table:

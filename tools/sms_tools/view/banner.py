@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import rerun as rr
 
-from sms_online.judgement import Trust
+from sms_online.trust import Trust
 from sms_tools.view import style
 from sms_tools.view.arm_log import times
 
@@ -39,9 +39,9 @@ class Banner:
 
 
 def markdown(trust: Trust) -> str:
-    """The sentence as a heading, the other reasons on a line below."""
+    """The sentence as a heading, the other reasons and the next step on a line below."""
     level, _, reason = trust.sentence.partition(": ")
-    others = " · ".join(trust.others)
+    others = " · ".join([*trust.others, *([f"next: {trust.next_step}"] if trust.next_step else [])])
     return f"# {level.upper()}: {_plain(reason)}\n\n{_plain(others)}"
 
 

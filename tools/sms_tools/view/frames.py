@@ -6,9 +6,10 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
-from sms_online.judgement import Discrepancy, Trust
+from sms_online.judgement import Discrepancy
 from sms_online.pipeline.statistics import Statistics
 from sms_online.stream import Block
+from sms_online.trust import Trust
 from sms_tools.view.choice import Choice
 
 
