@@ -77,7 +77,7 @@ def test_a_wrong_unit_of_everything_is_named(
     """Rows fit as well as ever, so that green would be the worst of answers."""
     trust = trust_in(sms.load_system(RIG), scaled(capture, factors))
     assert trust.grave, trust
-    assert trust.reasons[0].startswith(f"everything is {factor} × its description")
+    assert trust.reasons[0].startswith(f"everything is {factor}")
     assert cause in trust.reasons[0]
     assert "unit" in trust.next_step
 
