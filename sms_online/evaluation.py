@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sms_online.calibration.found import Calibration, found
-from sms_online.judgement import Discrepancy, Facts, judge
+from sms_online.judgement import Discrepancy, Dispute, Facts, judge
 from sms_online.model.parameters import Parameter
 from sms_online.nominal import Comparison, compare, unit_factors
 from sms_online.physical import PhysicalSet, Projection
@@ -34,6 +34,8 @@ LARGEST_ROW_VARIANCE = 1.2
 ROWS_A_PARAMETER = 10
 # Noise in the columns matters where it pulls an estimate by more than this many standard deviations.
 LARGEST_PULL = 1.0
+# An estimate further from its prior than this many of the prior's deviations agrees with it by no chance.
+LARGEST_DISPUTE = 3.0
 # Quantities that cannot be negative, as the ends of names.
 POSITIVE = ("mass", "mass_per_length", "stiffness", "damping", "rotor_inertia", "rigidity", "rigidity_y", "rigidity_z")
 # Effects of one cause that a warning names.
@@ -191,7 +193,6 @@ class Evaluation:
         lost = now.counters.lost_samples
         below = flags & (estimate.pi + NORMAL_95 * np.where(flags, self.std, 0.0) < 0.0)
         momentum, projection = now.momentum, self.projection
-        unweighed = None if momentum is None or momentum.unexplained is None else joint_rows(momentum.unexplained)
         return judge(
             Facts(
                 determined=(int(np.count_nonzero(flags)), flags.size),
@@ -203,7 +204,7 @@ class Evaluation:
                 ),
                 pulled=tuple(self.pulled),
                 alarm=None if momentum is None else momentum.alarm,
-                unweighed=unweighed,
+                disputed=tuple(self._disputes()),
                 undecided=tuple(event.time for event in now.events if event.kind == "undecided"),
                 distance=0.0 if projection is None else projection.distance,
                 comparison=self.comparison,
@@ -226,6 +227,29 @@ class Evaluation:
             for each in self.calibration
             if each.tolerance is not None and each.beyond
         ]
+
+    def _disputes(self) -> list[Dispute]:
+        """Parameters that the data pull further from what was known of them beforehand than that allows."""
+        now, prior = self.statistics, self.statistics.setup.current_prior
+        if prior is None:
+            return []
+        off = np.zeros(prior.std.size)
+        off[prior.known] = ((self.estimate.pi - prior.value) / prior.std)[prior.known]
+        far = np.flatnonzero(np.abs(off) > LARGEST_DISPUTE)
+        scale_free = None if now.method != "momentum" or now.momentum is None else now.momentum.scale_free
+        slopes = (
+            None if scale_free is None or not far.size else scale_free.minimum().slopes[:, len(now.setup.nuisances) :]
+        )
+        out = []
+        for k in far.tolist():
+            row = None
+            if slopes is not None:
+                # The criterion falls on the way from the prior to where rows want the parameter.
+                types = row_types(self.model.layout)
+                pulls = {name: -np.sign(off[k]) * slopes[rows, k].sum() for name, rows in types.items()}
+                row = max(pulls, key=lambda name: float(pulls[name]))
+            out.append(Dispute(self.parameters[k].name, float(off[k]), row))
+        return out
 
     def _settling(self) -> str:
         """Why the estimate will still move by more than its error bars."""

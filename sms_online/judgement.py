@@ -36,6 +36,7 @@ ADD_EFFECT = "run `sms-online diagnose` and replay with the system.toml that it 
 CHECK_TORQUE = "check sign, unit and gear ratio of that torque, then run `sms-online diagnose`"
 CHECK_ROWS = "check geometry, clocks and stated noise of the sensors in these rows, then run `sms-online diagnose`"
 CHECK_SCALE = "check unit and gear of the torques, or weigh one part and state it under [known]"
+CHECK_PRIOR = "check that prior, and run `sms-online diagnose` for what the model lacks in these rows"
 CHECK_LOSSES = "look at the faults that the session counted: a bus that is too busy, a loose cable"
 MOVE = "move all joints, faster and over a larger range, and long enough"
 
@@ -55,18 +56,29 @@ class Discrepancy:
 
 
 @dataclass(frozen=True)
+class Dispute:
+    """A parameter that the data pull further from its prior than that allows.
+
+    deviations: of the prior, by which it is off. row: type of the rows that pull most; None where that is not known.
+    """
+
+    parameter: str
+    deviations: float
+    row: str | None
+
+
+@dataclass(frozen=True)
 class Facts:
     """What is known of a session for or against its estimate.
 
     determined: parameters that the data determine, and of how many. undetermined: names of the others. settling: why
     the estimate will still move by more than its error bars, empty where it will not. negative: names of estimates that
     are negative and must not be. pulled: names of those that noise in the columns pulls beyond their bars. alarm: type
-    of the rows that the sequential test finds more than noise in, of a session without diagnosis. unweighed: that
-    of the joint whose torque is explained so little that rows get no weights. undecided: times, s, of changes that the
-    session ended too early to decide on. distance: from the nearest real bodies, in standard deviations. comparison:
-    with the values that the system file states. lost: share of the samples. miscalibrated: what is off by more than the
-    description's tolerances allow. troubles: whatever else, a short sentence each, such as of the devices of a live
-    session.
+    of the rows that the sequential test finds more than noise in, of a session without diagnosis. disputed: parameters
+    that the data pull away from their prior. undecided: times, s, of changes that the session ended too early to decide
+    on. distance: from the nearest real bodies, in standard deviations. comparison: with the values that the system file
+    states. lost: share of the samples. miscalibrated: what is off by more than the description's tolerances allow.
+    troubles: whatever else, a short sentence each, such as of the devices of a live session.
     """
 
     determined: tuple[int, int]
@@ -76,7 +88,7 @@ class Facts:
     negative: tuple[str, ...] = ()
     pulled: tuple[str, ...] = ()
     alarm: str | None = None
-    unweighed: str | None = None
+    disputed: tuple[Dispute, ...] = ()
     undecided: tuple[float, ...] = ()
     distance: float = 0.0
     comparison: Comparison = AS_STATED
@@ -94,12 +106,8 @@ def judge(facts: Facts) -> Trust:
     """
     settled = not facts.settling
     doubts = [*_scaled(facts.comparison), *_named(facts.discrepancies)]
-    if settled or facts.unweighed is not None:
-        torques = _unexplained_torques(facts.residual)
-        doubts += torques
-        if facts.unweighed is not None and facts.unweighed not in [reason.places[0] for reason in torques]:
-            doubts.append(_unweighed(facts.unweighed))
     if settled:
+        doubts += _unexplained_torques(facts.residual)
         doubts += _loud_rows(facts.residual)
     doubts += _unnamed(facts.discrepancies)
     if facts.alarm is not None and not any(_open(discrepancy) for discrepancy in facts.discrepancies):
@@ -107,6 +115,7 @@ def judge(facts: Facts) -> Trust:
         doubts.append(Reason(text, True, (facts.alarm,), "more than noise", then=DIAGNOSE))
     if settled:
         doubts += _negative(facts.negative)
+        doubts += _disputed(facts.disputed)
     # What befell the samples comes before what that may have done to the estimate.
     losses = _losses(facts.lost)
     if doubts:
@@ -148,11 +157,6 @@ def judge_diagnosis(verdict: str, effects: Sequence[str], row: str | None, after
 def _open(discrepancy: Discrepancy) -> bool:
     """Whether an alarm is this episode's. A test that alarms after an effect was taken up tells of something else."""
     return not discrepancy.adopted and discrepancy.verdict != "change"
-
-
-def _unweighed(row: str) -> Reason:
-    text = f"no weights: by a first fit, most of the torque or force of {row} is not explained"
-    return Reason(text, True, (row,), "not explained", then=CHECK_TORQUE)
 
 
 def _named(discrepancies: Iterable[Discrepancy]) -> list[Reason]:
@@ -233,6 +237,16 @@ def _negative(names: Sequence[str]) -> list[Reason]:
         )
         for name in names
     ]
+
+
+def _disputed(disputes: Sequence[Dispute]) -> list[Reason]:
+    out = []
+    for dispute in sorted(disputes, key=lambda each: -abs(each.deviations)):
+        by = "" if dispute.row is None else f": rows of {dispute.row} pull it"
+        off = f"{dispute.parameter} is {abs(dispute.deviations):.0f} σ off its prior"
+        full = f"{off}{by}; the prior, the model or the samples are wrong there"
+        out.append(Reason(off + by, True, place_of(dispute.parameter), "off its prior", full, CHECK_PRIOR))
+    return out
 
 
 def _cautions(facts: Facts) -> list[Reason]:

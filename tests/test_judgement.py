@@ -9,7 +9,7 @@ from axis import AXIS, axis_block
 from evaluated import judged, results_document
 
 from sms_online.description.parse import parse_system
-from sms_online.judgement import CHECK_ROWS, Discrepancy, Facts, judge, judge_diagnosis, place_of
+from sms_online.judgement import CHECK_ROWS, Discrepancy, Dispute, Facts, judge, judge_diagnosis, place_of
 from sms_online.nominal import Apart, Comparison
 from sms_online.pipeline.estimator import Estimator
 from sms_online.trust import LONGEST_SENTENCE, Residual
@@ -115,8 +115,7 @@ def test_residuals_of_an_estimate_that_is_settling_show_nothing() -> None:
     loud = replace(with_row("joint_1", relative=3.0, whitened=80.0), settling="too few rows")
     assert judge(loud).level == "not yet"
     assert judge(loud).sentence == "Not yet: too few rows"
-    # Unless no fit explains the torques at all, or a test says so.
-    assert judge(replace(loud, unweighed="joint_1")).grave
+    # Unless a test says so.
     assert judge(replace(loud, alarm="joint_1")).grave
 
 
@@ -127,10 +126,12 @@ def test_an_alarm_is_that_of_what_the_diagnosis_looks_into_and_a_doubt_of_its_ow
     assert judge(replace(GOOD, alarm="joint_1", discrepancies=(replace(LACKING, adopted=True),))).grave
 
 
-def test_a_torque_that_forbids_weights_is_a_grave_doubt_whatever_the_energy_balance_says_of_it() -> None:
-    judgement = judge(replace(GOOD, settling="no weights", unweighed="joint_2"))
-    assert judgement.grave
-    assert judgement.marks == {"joint_2": "not explained"}
+def test_a_prior_that_data_pull_from_is_a_grave_doubt() -> None:
+    off = Dispute("joint_2.stiffness", -6.2, "link_2")
+    judgement = judge(replace(GOOD, disputed=(Dispute("link_1.mass", 3.4, None), off)))
+    assert judgement.sentence == "Do not trust: joint_2.stiffness is 6 σ off its prior: rows of link_2 pull it"
+    assert judgement.marks == {"joint_2": "off its prior", "link_1": "off its prior"}
+    assert not judge(replace(GOOD, settling="too few rows", disputed=(off,))).grave
 
 
 def test_the_energy_balance_alone_is_never_trusted() -> None:
@@ -250,7 +251,7 @@ def test_beside_every_grave_doubt_stands_what_to_do_next() -> None:
         replace(GOOD, discrepancies=(LACKING,)),
         replace(GOOD, discrepancies=(Discrepancy("base", 3.0, "unexplained"),)),
         replace(GOOD, alarm="base"),
-        replace(GOOD, unweighed="joint_1"),
+        replace(GOOD, disputed=(Dispute("link_1.mass", 3.4, None),)),
         replace(GOOD, negative=("motor_2.mass",)),
         replace(GOOD, comparison=Comparison(50.0)),
     ):

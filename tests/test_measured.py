@@ -129,8 +129,9 @@ def test_quanser_without_its_friction_leaves_the_residual_as_large_as_it_is(quan
     with_maker = results_document(replayed("quanser-2dsfl", quanser_capture, prior=0.1), 0.0, [])
     for joint in ("joint_1", "joint_2"):
         assert 0.9 < with_maker["residual"][joint]["relative"] < 1.0
-    # Without the maker's values the fit bends every parameter to explain friction as something else, and says so.
+    # Without the maker's values it explains little more, with masses that no bodies have, and says so.
     alone = results_document(replayed("quanser-2dsfl", quanser_capture), 0.0, [])
-    assert 5.0 < alone["residual"]["joint_1"]["relative"] < 20.0
+    for joint in ("joint_1", "joint_2"):
+        assert 0.8 < alone["residual"][joint]["relative"] < 1.01
     assert any("joint_1 is not explained" in warning for warning in alone["warnings"])
     assert all(parameter["std"] is not None for parameter in alone["parameters"])

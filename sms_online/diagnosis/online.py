@@ -31,7 +31,6 @@ from sms_online.pipeline.momentum import Momentum
 from sms_online.pipeline.momentum_balance import MARGIN
 from sms_online.pipeline.observer import Observer
 from sms_online.pipeline.synchronise import GridSamples
-from sms_online.row_types import joint_rows
 from sms_online.trackers.information import Information
 
 # Times are in units of the windows of the momentum balance, those of 0.4 s at least.
@@ -215,9 +214,6 @@ class OnlineDiagnosis(Observer):
             row = max(test.evidence, key=lambda name: test.evidence[name])
         elif test.alarm is not None:
             last, first, row = test.alarm.since - width, test.alarm.end - width, test.alarm.row
-        elif (joint := self._momentum.fit.unexplained) is not None:
-            # Rows are not even weighed.
-            last, first, row = -1, 0, joint_rows(joint)
         else:
             return
         seen = detector.before(last) if last >= 0 else None

@@ -181,7 +181,7 @@ class Changes:
         for _ in range(PASSES):
             prior = prior_rows(self._nuisances, base.n)
             known = partial(np.append, np.zeros(m), weights)
-            fit = MomentumFit(model, base, balance, new_noise, known, prior=prior)
+            fit = MomentumFit(model, base, balance, new_noise, known, calibration=prior)
             fit.go_on(weights, noise)
             rows = np.concatenate([white.Y for white in fit.push(windows, instants, noise)])
             explanation = explain(factor / left, rows / left, jumps)

@@ -5,15 +5,16 @@ weighted anew with the noise that π itself predicts, lowers their residual by s
 noise; the weights follow, and it ends at zero. With w = (π, -1), A the Gram matrix of a row type's whitened rows [Y b]
 and G that of what sensors' noise adds to them, the estimate is the minimum of
 
-    Σ n/2 log(wᵀ A w / wᵀ (G + e² M) w) + Σ n/2 wᵀ A w / (wᵀ G w + r),
+    Σ n/2 log(wᵀ A w / wᵀ (G + e² M) w) + Σ n/2 wᵀ A w / (ρ wᵀ G w),
 
 the first sum over the types that leave more than noise, the second over the others. The quotient of a homogeneous type
 is the same for every scale of π, so nothing draws π to zero, and only rows with a torque fix its scale. e² M is what
 the model lacks beside noise: an error of each column in proportion to its size, the same share e of all of them, M the
-diagonal of A - G; of rows that hold a joint's torque an error of that torque alone, for with errors of columns that
-large the inverse regression of a badly explained torque would enlarge π without end. e follows from the residual. G in
-the denominators also frees the minimum of what noise in the columns does to least squares. r is what weights have as
-noise beside G.
+diagonal of A - G. e follows from the residual. G in the denominators also frees the minimum of what noise in the
+columns does to least squares. Of rows that hold a joint's torque all error counts as that of the torque, and no G is in
+their denominators: along columns that are little more than noise, which nothing else determines, these would grow as
+fast as the residual, and π without end. ρ makes the variance of
+whitened rows one at the weights' own π, whatever else these hold as noise.
 
 Reading: the concentrated likelihood of the functional errors-in-variables model, one variance factor a row type.
 """
@@ -21,7 +22,7 @@ Reading: the concentrated likelihood of the functional errors-in-variables model
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -30,6 +31,8 @@ from numpy.typing import NDArray
 from sms_online.pipeline.momentum_windows import EXPONENT, HOPS
 from sms_online.pipeline.weak_form import test_function
 from sms_online.stream import Array
+from sms_online.trackers.factor import masked_covariance
+from sms_online.trackers.interface import Estimate
 
 # Directions of scaled columns with less information than this share of the largest are not moved along.
 RANK_TOLERANCE = 1e-10
@@ -37,6 +40,8 @@ RANK_TOLERANCE = 1e-10
 CONVERGED, MOST_STEPS = 1e-8, 100
 # Curvature of the criterion is no less than this share of that of its squares, for the length of a step.
 LEAST_CURVATURE = 1e-2
+# Noise in whitened rows below this share of their variance is none: they are weighed by what else they are off by.
+LEAST_NOISE = 0.1
 # Rounding of a sum of products, in units of its last place.
 ROUNDED = 16.0
 # A step is halved until it gains this share of what the slope promises, so many times at most.
@@ -56,8 +61,8 @@ OVERLAP = _overlap()
 class RowGrams:
     """Sums over windows of whitened rows, by generalized speed.
 
-    signal (n_v, n + 1, n + 1): Gram matrices of [Y b]. noise: the same of what the sensors' noise adds to the rows, to
-    first order, told by synthetic noise. windows: how many. No array is written twice, see `PlainRows`.
+    signal (n_v, n + 1, n + 1): Gram matrices of [Y b]. noise: the same of what the sensors' noise adds to the rows, of
+    first and of second order, from synthetic noise. windows: how many. No array is written twice, see `PlainRows`.
     """
 
     def __init__(self, n_v: int, n: int) -> None:
@@ -65,10 +70,10 @@ class RowGrams:
         self.windows = 0
 
     def add(self, rows: Array, noisy: Array) -> None:
-        """Rows [Y b] (n_v, n + 1) of a window, and with synthetic noise added and subtracted (2, n_v, n + 1)."""
-        added = 0.5 * (noisy[0] - noisy[1])
+        """Rows [Y b] (n_v, n + 1) of a window; noisy (2, n_v, n + 1): with synthetic noise added and subtracted."""
+        first, second = 0.5 * (noisy[0] - noisy[1]), 0.5 * (noisy[0] + noisy[1]) - rows
         self.signal = self.signal + rows[:, :, None] * rows[:, None, :]
-        self.noise = self.noise + added[:, :, None] * added[:, None, :]
+        self.noise = self.noise + first[:, :, None] * first[:, None, :] + second[:, :, None] * second[:, None, :]
         self.windows += 1
 
     def weaken(self, share: Array) -> None:
@@ -98,18 +103,58 @@ class Minimum:
     errors: Array
 
 
+@dataclass(frozen=True)
+class ScaleFree:
+    """What the criterion needs of a session's rows; see `minimum`. weights (n,): values behind the rows' whitening.
+
+    alone: nothing is known of β beside the rows.
+    """
+
+    grams: RowGrams
+    lacking: NDArray[np.bool_]
+    torque: NDArray[np.bool_]
+    weights: Array
+    prior: Array
+    alone: bool
+
+    def minimum(self) -> Minimum:
+        """The minimum next to the weights."""
+        return minimum(self.grams, self.lacking, self.torque, [self.weights], self.prior)
+
+    def estimate(self, squares: Estimate) -> Estimate:
+        """That minimum; squares: the estimate by least squares, whose robust covariance stays.
+
+        Its covariance is that of rows as independent as they count, their variance taken from what they leave.
+        """
+        found, known = self.minimum(), squares.determined
+        return replace(
+            squares,
+            pi=np.where(known, found.beta, squares.pi),
+            covariance=masked_covariance(found.covariance, known),
+            rss=squares.dof,
+            scale=None if self.alone else 1.0,
+        )
+
+
 class _Criterion:
     """The criterion of some rows; lacking, torque (n_v,): which leave more than noise, and which hold a torque."""
 
     def __init__(
         self, grams: RowGrams, lacking: NDArray[np.bool_], torque: NDArray[np.bool_], prior: Array, start: Array
     ) -> None:
-        self._A, self._G, self._lacking, self._prior = grams.signal, grams.noise, lacking, prior
+        self._A, self._lacking, self._prior = grams.signal, lacking, prior
         self._count = np.where(lacking, grams.windows / OVERLAP, float(grams.windows))
         own = np.maximum(np.einsum("vii->vi", grams.signal - grams.noise), 0.0)
         own[torque, :-1] = 0.0
         self._M = own
-        self._rest = np.where(lacking, 0.0, np.maximum(grams.windows - self._quadratic(grams.noise, start), 0.0))
+        # Rows without noise have a constant deviation: one.
+        noise = self._quadratic(grams.noise, start)
+        noisy = ~lacking & ~torque & (noise > grams.windows * LEAST_NOISE)
+        self._scale = np.where(
+            noisy, grams.windows / np.where(noisy, noise, 1.0), np.where(lacking & ~torque, 1.0, 0.0)
+        )
+        self._constant = np.where(lacking | noisy, 0.0, float(grams.windows))
+        self._G = self._scale[:, None, None] * grams.noise
 
     @staticmethod
     def _quadratic(matrices: Array, w: Array) -> Array:
@@ -122,7 +167,7 @@ class _Criterion:
 
     def squares(self, w: Array) -> Array:
         """Sums of squares (n_v,) of the residual."""
-        return np.maximum(self._quadratic(self._A, w), self._least(w))
+        return np.asarray(np.maximum(self._quadratic(self._A, w), self._least(w)))
 
     def errors(self, w: Array) -> Array:
         """e² (n_v,) that explains what the residual holds beyond noise."""
@@ -132,8 +177,8 @@ class _Criterion:
 
     def predicted(self, w: Array, errors: Array) -> Array:
         """Expected sums of squares (n_v,)."""
-        noise = self._quadratic(self._G, w) + errors * (self._M @ w**2) + self._rest
-        return np.maximum(noise, self._least(w))
+        noise = self._quadratic(self._G, w) + errors * (self._M @ w**2) + self._constant
+        return np.asarray(np.maximum(noise, self._least(w)))
 
     def value(self, w: Array, errors: Array) -> float:
         """Of the criterion, with e² (n_v,) given."""

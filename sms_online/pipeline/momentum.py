@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from copy import copy
 from typing import Any
 
 import numpy as np
@@ -13,10 +14,11 @@ from sms_online.calibration.nuisance import prior_rows
 from sms_online.model.base_parameters import BaseParameters
 from sms_online.model.model import Model
 from sms_online.pipeline.changes import Adoption, Changes
+from sms_online.pipeline.criterion import RowGrams, ScaleFree
 from sms_online.pipeline.errors_in_variables import NoiseBias, unbiased
 from sms_online.pipeline.latency import Latencies, clock_groups, source_groups
 from sms_online.pipeline.momentum_balance import MomentumBalance
-from sms_online.pipeline.momentum_fit import FIRST_MOTION, MomentumFit, WhiteRows
+from sms_online.pipeline.momentum_fit import DETERMINED, FIRST_MOTION, MomentumFit, WhiteRows
 from sms_online.pipeline.momentum_windows import COPIES, HOPS
 from sms_online.pipeline.residual_test import SequentialTest
 from sms_online.pipeline.sensing import Sensing
@@ -26,7 +28,7 @@ from sms_online.pipeline.synchronise import GridSamples
 from sms_online.pipeline.waiting import waiting_from_state, waiting_state
 from sms_online.pipeline.window_noise import WindowNoise
 from sms_online.stream import Array
-from sms_online.trackers.interface import Estimate, Prior, Rows, Tracker
+from sms_online.trackers.interface import Estimate, Prior, Rows, Tracker, prior_factor
 from sms_online.trackers.square_root import session_tracker
 
 # The synthetic noise is the same in every session, so that the same samples give the same bits.
@@ -40,7 +42,8 @@ NOISE_RENEWED = 1.0
 class Momentum:
     """Balance, weights and tracker of one session.
 
-    tracker: fed with rows of unit variance. bias: what noise in the columns does to the estimate. fit:
+    tracker: fed with rows of unit variance. bias: what noise in the columns does to the estimate. grams:
+    sums of rows by generalized speed, for an estimate where they leave more than noise. fit:
     what makes rows independent, and its sums. windows: how many it took since the last event. latencies: of the
     sources, since then too. test: whether rows leave more than noise, likewise. changes: events, and the model and
     parameters that the session goes on with after them. nuisances: what the description may be wrong in. prior: what is
@@ -70,12 +73,18 @@ class Momentum:
     def _build(self) -> None:
         """Empty stages for the current model and parameters."""
         model, base = self.changes.model, self.changes.base
-        m, known = len(self.nuisances), prior_rows(self.nuisances, base.n)
-        self.bias = NoiseBias(m + base.n, known)
+        m, self._calibration = len(self.nuisances), prior_rows(self.nuisances, base.n)
+        self.bias = NoiseBias(m + base.n, self._calibration)
+        self.grams = RowGrams(model.layout.n_v, m + base.n)
+        self._misfit = np.zeros(model.layout.n_v)  # behind the rows that came last
+        self._known = np.zeros((0, m + base.n + 1))  # before an event, as rows [N Y b] of unit variance
         self.windows = 0
         self._balance = MomentumBalance(model, base, self._sample_rate, self._span)
         self.latencies = Latencies(self._sources, base.n)
-        self.fit = MomentumFit(model, base, self._balance, self._new_noise, self._solved, self._sources, known)
+        self.fit = MomentumFit(
+            model, base, self._balance, self._new_noise, self._solved, self._sources, self._calibration,
+            self._prior_rows,
+        )  # fmt: skip
         self.tracker = self._new_tracker()
         self.test = SequentialTest(model.layout, self._balance.span / HOPS)
 
@@ -121,12 +130,32 @@ class Momentum:
 
     def _joint(self) -> Estimate:
         """The nuisances, then the base parameters."""
-        return unbiased(self.tracker.estimate(), self.bias)
+        estimate, scale_free = self.tracker.estimate(), self.scale_free
+        return unbiased(estimate, self.bias) if scale_free is None else scale_free.estimate(estimate)
+
+    @property
+    def scale_free(self) -> ScaleFree | None:
+        """Where rows leave more than noise, what gives the estimate in place of least squares."""
+        if not self.misfit or self.grams.windows == 0:
+            return None
+        assert self.fit.weights is not None
+        prior = np.concatenate((self._prior_rows(), self._known))
+        weights = np.pad(self.fit.weights, (len(self.nuisances), 0))
+        lacking = self.fit.plain.misfit > 0.0
+        return ScaleFree(copy(self.grams), lacking, self.fit.torque, weights, prior, self.prior is None)
+
+    def _prior_rows(self) -> Array:
+        """What is known beforehand of nuisances and parameters, as rows [N Y b] (k, m + n + 1) of unit variance."""
+        known = prior_factor(self.current_prior, self.changes.base.n)
+        return np.concatenate((self._calibration, np.pad(known, ((0, 0), (len(self.nuisances), 0)))))
 
     def _solved(self) -> Array:
         """Nuisances and β where the rows determine them, else NaN."""
-        estimate = self._joint()
-        return np.where(estimate.determined, estimate.pi, np.nan)
+        estimate, m = self._joint(), len(self.nuisances)
+        known = estimate.determined.copy()
+        if self.misfit:
+            known[m:] &= np.abs(estimate.pi[m:]) > DETERMINED * estimate.std[m:]
+        return np.where(known, estimate.pi, np.nan)
 
     def observe(self, t: Array, values: Array) -> None:
         """Take the channels' own samples (B, channels) at t (B,), NaN where there is none, to tell their noise."""
@@ -183,6 +212,7 @@ class Momentum:
         self._build()
         self.bias = bias
         self.tracker.begin(adoption.known)
+        self._known = adoption.known.factor
         self.fit.go_on(adoption.weights, noise)
         if adoption.samples.index.size:
             self._process(adoption.samples, noise)
@@ -223,6 +253,11 @@ class Momentum:
             self.tracker.update(Rows(rows.Y[:, :-1], rows.Y[:, -1], np.ones(M), np.full(M, t)))
             self.newest_row = t
             self.bias.add(rows.Y, rows.noisy)
+            if np.any(rows.misfit != self._misfit):
+                # Rows that were whitened as if the model lacked less must not outweigh those to come.
+                self.grams.weaken(np.minimum(1.0, (1.0 + self._misfit) / (1.0 + rows.misfit)))
+                self._misfit = rows.misfit
+            self.grams.add(rows.Y, rows.noisy)
             self.latencies.add(rows.Y[:, len(self.nuisances) :], rows.late)
             self.windows += 1
 
@@ -236,7 +271,7 @@ class Momentum:
             started=self.started,
             tested=self.settled,
             alarm=None if alarm is None else alarm.row,
-            unexplained=self.fit.unexplained,
+            scale_free=self.scale_free,
             latency=self.latencies.found,
         )
 
@@ -255,6 +290,9 @@ class Momentum:
                 **waiting_state("waiting", self._waiting, columns),
                 **noise_state("noise", self.sensor_noise),
                 **self.bias.state(),
+                **self.grams.state(),
+                "misfit": self._misfit,
+                "known": self._known,
                 **self.latencies.state(),
             },
             "momentum_noise": self._estimate.state(),
@@ -280,6 +318,8 @@ class Momentum:
         self.sensor_noise = noise_from_state("noise", state)
         self._waiting = waiting_from_state("waiting", state)
         self.bias.restore(state)
+        self.grams.restore(state)
+        self._misfit, self._known = np.array(state["misfit"]), np.array(state["known"])
         self.latencies.restore(state)
         self._estimate.restore(saved["momentum_noise"])
         self._balance.restore(saved["momentum_balance"])

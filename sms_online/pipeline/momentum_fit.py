@@ -4,7 +4,8 @@ Weights follow from the sensors' noise and the parameters, never from residuals:
 parameters come from the fit itself: the first windows that move are held back, fitted without weights and then with
 them; from then on the estimate so far is taken where it would weigh rows otherwise. A start that is 70 % off gives the
 same answer. Where such a fit leaves more than noise, for it had to tell too many parameters apart without weights, the
-described values are tried as its start, and stay in the weights until the rows determine better ones.
+described values are tried as its start, and stay in the weights until the rows determine better ones. Where that does
+too, the model lacks something, and weights come from a fit that no such lack draws to zero, see `criterion`.
 
 Where rows leave clearly more than the sensors' noise, the model lacks something, and neighbouring rows that share noise
 almost fully must not be subtracted from each other as if that were all: what is left over counts as an error of each
@@ -22,6 +23,7 @@ from numpy.typing import NDArray
 
 from sms_online.model.base_parameters import BaseParameters
 from sms_online.model.model import Model
+from sms_online.pipeline.criterion import RowGrams, minimum
 from sms_online.pipeline.latency import SourceGroup
 from sms_online.pipeline.momentum_balance import MomentumBalance
 from sms_online.pipeline.momentum_windows import (
@@ -62,8 +64,6 @@ UNSTEADY = 4.0
 # Windows of one filter's width over which the square of such a sample is averaged. The samples of windows that overlap
 # are nearly one, so a mean over few of them follows its own luck: rows in which it is low would be trusted too much.
 MOST_SAMPLES = 100
-# Share of a joint's torque that a fit may leave for its weights to be used.
-LARGEST_UNEXPLAINED = 0.5
 # Time from one look at the weights to the next, s: it doubles from the first to the latest.
 FIRST_RENEWAL = 1.0
 LATEST_RENEWAL = 4.0
@@ -87,7 +87,8 @@ class WhiteRows:
     N holds the columns of what the description may be wrong in, see `calibration`. noisy (2, n_v, m + n + 1): the same
     with synthetic noise added and subtracted, but in N. raw (n_v, m + n + 1): the rows as they were,
     with their own covariance (n_v, n_v), of which noise is the part that the sensors make. end: grid index of the
-    window's last sample. late (n_v, G): columns of the sources' latencies, independent like Y.
+    window's last sample. late (n_v, G): columns of the sources' latencies, independent like Y. misfit (n_v,): what the
+    model lacks in each row, over the variance of its noise, as far as it is in the covariance.
     """
 
     Y: Array
@@ -97,14 +98,16 @@ class WhiteRows:
     noise: Array
     end: int
     late: Array
+    misfit: Array
 
 
 class MomentumFit:
     """Whitens the windows of a session, segment by segment.
 
     new_noise: makes what propagates noise, for the same model, base and balance. solve: gives the estimate so far of
-    nuisances and β (m + n,), NaN where nothing is known of it. sources: whose latencies are told. prior: rows [N Y b]
-    (k, m + n + 1) of what is known of the nuisances beforehand. weighing: who weighs now.
+    nuisances and β (m + n,), NaN where nothing is known of it. sources: whose latencies are told. calibration: rows
+    [N Y b] (k, m + n + 1) of what is known of the nuisances beforehand. prior: gives these and whatever else is known
+    beforehand, likewise. weighing: who weighs now.
     """
 
     def __init__(
@@ -115,19 +118,20 @@ class MomentumFit:
         new_noise: Callable[[], WindowNoise],
         solve: Callable[[], Array],
         sources: Sequence[SourceGroup] = (),
-        prior: Array | None = None,
+        calibration: Array | None = None,
+        prior: Callable[[], Array] | None = None,
     ) -> None:
         self.model = model
         self.base = base
-        self._prior = np.zeros((0, base.n + 1)) if prior is None else prior
-        self._nuisances = self._prior.shape[1] - base.n - 1
+        self._calibration = np.zeros((0, base.n + 1)) if calibration is None else calibration
+        self._nuisances = self._calibration.shape[1] - base.n - 1
         self._balance = balance
         self._solve = solve
+        self._prior = prior if prior is not None else lambda: self._calibration
         self._new_noise, self._sources = new_noise, sources
         self.weighing = self._new_weighing()
         self._next: Weighing | None = None  # with new weights, that takes over when it has been told enough windows
         self._warm = 0  # windows that it has been told
-        self.unexplained: int | None = None  # joint whose torque is least explained, where that forbids weights
         self._since = 0  # windows since they were looked at
         self._moving = 0
         self._renewal = 0  # windows from one look to the next
@@ -184,26 +188,17 @@ class MomentumFit:
         self._renewal = self._count(FIRST_RENEWAL)
 
     def flush(self, noise: SensorNoise) -> list[WhiteRows]:
-        """Fit the windows held back, without weights and then with those of the fit before, and return their rows.
-
-        Nothing where the model does not explain the torques: then the rows without a torque, which are homogeneous in
-        π, would win, and weights that follow π would shrink it to zero. More motion is waited for.
-        """
+        """Fit the windows held back, without weights and then with those of the fit before, and return their rows."""
         self._moving = 0
         unweighted, _ = _least_squares(np.concatenate([self._balance.dense(window)[0] for window in self._held]))
-        weights = self._settled(unweighted, noise, PASSES, partly=False) if self._explains_torques(unweighted) else None
-        if weights is None:
-            self.weighing = self._new_weighing()
-            self.plain.clear()
-            self.plain.misfit = np.zeros_like(self.plain.misfit)
-            return []
+        weights = self._settled(unweighted, noise, PASSES, partly=False)
         if self.plain.misfit.any():
-            misfit = self.plain.misfit
-            described = self._settled(self.base.values(self.model.nominal), noise, PASSES_DESCRIBED, partly=True)
-            if described is not None and self.plain.misfit.sum() < misfit.sum():
+            misfit, nominal = self.plain.misfit, self.base.values(self.model.nominal)
+            described = self._settled(nominal, noise, PASSES_DESCRIBED, partly=True)
+            if self.plain.misfit.sum() < misfit.sum():
                 weights = described
-            else:
-                self.plain.misfit, self.unexplained = misfit, None
+            if self.plain.misfit.any() and misfit.any():
+                weights = self._scale_free([unweighted, nominal], noise)
         self._retell(weights, noise)
         out = [self._white(window) for window in self._held]
         self._since = 0
@@ -211,8 +206,8 @@ class MomentumFit:
         self._held = []
         return out
 
-    def _settled(self, weights: Array, noise: SensorNoise, passes: int, partly: bool) -> Array | None:
-        """Weights (n,) from fits of the windows held back, each with those of the fit before; None where one fails.
+    def _settled(self, weights: Array, noise: SensorNoise, passes: int, partly: bool) -> Array:
+        """Weights (n,) from fits of the windows held back, each with those of the fit before.
 
         weights: of the first fit. partly: they take what the rows determine, and keep the rest.
         """
@@ -220,24 +215,52 @@ class MomentumFit:
         for _ in range(passes):
             self._retell(weights, noise)
             white = [self._white(window).Y for window in self._held]
-            white += [self._prior] if len(self._prior) else []
+            white += [self._calibration] if len(self._calibration) else []
             fitted, determined = _least_squares(np.concatenate(white))
             beta, known = fitted[self._nuisances :], determined[self._nuisances :]
-            if not self._explains_torques(beta):
-                return None
             self.plain.judge(fitted)
             weights = np.where(known, beta, weights) if partly else beta
         return weights
 
-    def _explains_torques(self, beta: Array) -> bool:
-        """Whether β (n,) explains every joint's torque over the windows held back, by and large."""
-        joints = list(self.model.layout.theta_m)
-        rows = np.stack([self._balance.dense(window)[0, joints] for window in self._held])
-        left = rows[..., -1] - rows[..., :-1] @ beta
-        left_norm, torque = np.linalg.norm(left, axis=0), np.linalg.norm(rows[..., -1], axis=0)
-        explained = bool(np.all(left_norm <= LARGEST_UNEXPLAINED * torque))
-        self.unexplained = None if explained else int(np.argmax(left_norm / np.maximum(torque, np.finfo(float).tiny)))
-        return explained
+    def _scale_free(self, starts: list[Array], noise: SensorNoise) -> Array:
+        """Weights (n,) from fits of the windows held back by `criterion`, first of the rows as they are.
+
+        Weights that follow a least-squares fit of rows that hold more than noise would shrink π to zero.
+        """
+        n_v, m = self.model.layout.n_v, self._nuisances
+        grams = RowGrams(n_v, m + self.base.n)
+        for window in self._held:
+            rows = np.pad(self._balance.dense(window), ((0, 0), (0, 0), (m, 0)))
+            grams.add(rows[0], rows[1:])
+        lacking = np.ones(n_v, dtype=np.bool_)
+        starts = [np.pad(start, (m, 0)) for start in starts]
+        for _ in range(PASSES):
+            joint = self._least(grams, lacking, starts)
+            # What the rows leave of the new weights' noise, and the rows whitened with it.
+            for _ in range(2):
+                self._retell(joint[m:], noise)
+                white = [self._white(window) for window in self._held]
+                self.plain.judge(joint)
+            grams = RowGrams(n_v, m + self.base.n)
+            for each in white:
+                grams.add(each.Y, each.noisy)
+            lacking, starts = self.plain.misfit > 0.0, [joint]
+        return self._least(grams, lacking, starts)[m:]
+
+    def _least(self, grams: RowGrams, lacking: NDArray[np.bool_], starts: list[Array]) -> Array:
+        """Nuisances and β (m + n,) of the minimum as far as the rows determine them, else the described values.
+
+        Noise that follows a parameter which rows do not determine may be any.
+        """
+        found = minimum(grams, lacking, self.torque, starts, self._prior())
+        determined = np.abs(found.beta) > DETERMINED * np.sqrt(np.diag(found.covariance))
+        determined[: self._nuisances] = True
+        return np.where(determined, found.beta, np.pad(self.base.values(self.model.nominal), (self._nuisances, 0)))
+
+    @property
+    def torque(self) -> NDArray[np.bool_]:
+        """Which speeds' rows hold a torque (n_v,)."""
+        return np.isin(np.arange(self.model.layout.n_v), self.model.layout.theta_m)
 
     @property
     def weights(self) -> Array | None:
@@ -293,6 +316,7 @@ class MomentumFit:
         """Work off the windows held back from the first one on, with weights β (n,)."""
         self.plain.clear()
         self._sampled = dict.fromkeys(HALF_WIDTHS, 0)
+        self._largest = np.zeros_like(self._largest)  # a fit that fails may have made them larger than any row is
         self.weighing.begin(weights, noise, self.plain.misfit, self._first)
         self._tell()
 
@@ -319,6 +343,7 @@ class MomentumFit:
         means[M] = means[M] + (sample**2 - means[M]) / self._sampled[M]
         self._largest = np.maximum(self._largest, size(rows[0], self._known_weights))
         errors = self._second_order.variance(M) + rounding(self._largest)
+        misfit = self.weighing.misfit
         weighed = self._weigh(window, rows.swapaxes(0, 1).reshape(n_v, -1), errors)
         white = weighed.rows.reshape(n_v, COPIES, -1).swapaxes(0, 1)
         raw = rows[0]
@@ -330,7 +355,7 @@ class MomentumFit:
         unsteady = np.diag(UNSTEADY * sample**2)
         return WhiteRows(
             white[0], white[1:], raw, weighed.covariance + unsteady, weighed.noise + unsteady, window.end,
-            weighed.late,
+            weighed.late, misfit,
         )  # fmt: skip
 
     def _weigh(self, window: Window, rows: Array, errors: Array) -> Weighed:
@@ -363,7 +388,6 @@ class MomentumFit:
             "x": self._x, "v": self._v, "signals": self._signals,
             "second_order": np.array([*self._second_order.means.values()]),
             "sampled": np.array([*self._sampled.values()]),
-            "unexplained": -1 if self.unexplained is None else self.unexplained,
             "largest": self._largest, **self.plain.state(), "renewal": self._renewal, "last": self._last,
             "warm": -1 if self._next is None else self._warm, **self.weighing.state(),
             **windows_state("held", self._held),
@@ -378,7 +402,6 @@ class MomentumFit:
         self._second_order.means = dict(zip(HALF_WIDTHS, np.array(state["second_order"]), strict=True))
         self._sampled = dict(zip(HALF_WIDTHS, state["sampled"].tolist(), strict=True))
         self.plain.restore(state)
-        self.unexplained = None if state["unexplained"] < 0 else int(state["unexplained"])
         self._held = windows_from_state("held", state)
         self._renewal, self._last = int(state["renewal"]), int(state["last"])
         self.weighing.restore(state)

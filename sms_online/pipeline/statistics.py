@@ -17,6 +17,7 @@ from sms_online.calibration.nuisance import Nuisance
 from sms_online.description.schema import System
 from sms_online.model.base_parameters import BaseParameters
 from sms_online.model.model import Model
+from sms_online.pipeline.criterion import ScaleFree
 from sms_online.pipeline.energy_balance import SharedErrors
 from sms_online.pipeline.errors_in_variables import NoiseBias, unbiased
 from sms_online.pipeline.events import Event
@@ -79,8 +80,8 @@ class MomentumStatistics:
 
     tracker, bias: states of the tracker and of what noise in its columns does. rows: unwhitened rows and their misfit.
     started: weights are known. tested: there are rows enough for a test of what they leave. alarm: type of the rows
-    that the sequential test finds more than noise in. unexplained: joint (from 0) whose torque forbids weights.
-    latency: source that is late against the others, if one is.
+    that the sequential test finds more than noise in. scale_free: what gives the estimate where rows leave more than
+    noise. latency: source that is late against the others, if one is.
     """
 
     tracker: State
@@ -89,7 +90,7 @@ class MomentumStatistics:
     started: bool
     tested: bool
     alarm: str | None
-    unexplained: int | None
+    scale_free: ScaleFree | None
     latency: Latency | None
 
 
@@ -150,7 +151,9 @@ class Statistics:
         m = len(setup.nuisances)
         tracker = session_tracker(setup.base.n, setup.current_prior, m)
         tracker.restore(self.momentum.tracker)
-        return unbiased(tracker.estimate(), self._bias()).without_nuisances(m)
+        rows, scale_free = tracker.estimate(), self.momentum.scale_free
+        joint = unbiased(rows, self._bias()) if scale_free is None else scale_free.estimate(rows)
+        return joint.without_nuisances(m)
 
     def _bias(self) -> NoiseBias:
         assert self.momentum is not None
