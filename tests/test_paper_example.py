@@ -14,8 +14,8 @@ from sms_adapters.checkpoint import read_checkpoint, write_checkpoint
 from sms_adapters.system_file import load_system
 from sms_online.checkpoint import Checkpoint
 from sms_online.description.schema import Harmonic, System, Trajectory
+from sms_online.effects.build import build_model
 from sms_online.model.base_parameters import find_base_parameters
-from sms_online.model.model import Model
 from sms_online.pipeline.estimator import Estimator
 from sms_online.stream import Array, Block
 from sms_sim.simulate import Simulation, exact_states, simulate
@@ -126,7 +126,7 @@ def test_identified_dynamics_move_an_unseen_trajectory_to_a_tenth_of_a_millimetr
     estimator = streamed("paper-planar", planar_block)
     document = json.loads(json.dumps(results_document(estimator, 0.0, [])))
     # The document alone gives H, C and K_f of (40): the description's nominal values play no part.
-    model = Model(System.model_validate(document["system"]))
+    model = build_model(System.model_validate(document["system"]))
     base = find_base_parameters(model)
     estimates = {entry["name"]: entry["estimate"] for entry in document["parameters"]}
     pi = base.physical_values(np.array([estimates[p.name] for p in base.parameters]))

@@ -59,7 +59,7 @@ def test_links_hang_together(name: str) -> None:
 
 def rigid_axis(kind: str, link: str) -> Scene:
     axis = "[0.0, 0.0, 1.0]" if kind == "revolute" else "[1.0, 0.0, 0.0]"
-    return Scene(Model(parse_system(RIGID_AXIS.format(kind=kind, axis=axis, link=link), "axis.toml")))
+    return Scene(build_model(parse_system(RIGID_AXIS.format(kind=kind, axis=axis, link=link), "axis.toml")))
 
 
 def test_a_rigid_link_without_a_tip_ends_in_its_centre_of_mass() -> None:
