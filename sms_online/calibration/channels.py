@@ -9,6 +9,7 @@ from functools import partial
 
 import numpy as np
 
+from sms_online.calibration.geometry import own_axis
 from sms_online.calibration.nuisance import Nuisance
 from sms_online.description.channels import AXES
 from sms_online.description.schema import Tolerances
@@ -122,6 +123,14 @@ def _encoders(sensing: Sensing, names: Sequence[str], tolerances: Tolerances) ->
         for k, unit in zip(encoders, units, strict=True)
     ]
     yield Family(tuple(zeros), partial(_constant, one))
+    # A joint that is mounted turned about its own axis reads as if it stood elsewhere.
+    mounted = {i: axis for i, joint in enumerate(joints) if (axis := own_axis(joint)) is not None}
+    turned = np.zeros((len(names), len(mounted)))
+    for column, (i, axis) in zip(turned.T, mounted.items(), strict=True):
+        own = [k for k in encoders if int(names[k].rsplit("_", 1)[1]) == i + 1]
+        column[own] = -np.sign(joints[i].axis[axis])
+    mounts = [Nuisance("axis", f"joint_{i + 1}", "rad", tolerances.axis, AXES[axis]) for i, axis in mounted.items()]
+    yield Family(tuple(mounts), partial(_constant, turned))
     for part, wave in (("sine", np.sin), ("cosine", np.cos)):
         waves = [Nuisance("once_per_turn", names[k], "rad", tolerances.once_per_turn, part) for k in turning]
         yield Family(tuple(waves), partial(_wave, wave, turn))
@@ -162,6 +171,9 @@ def _camera(sensing: Sensing, names: Sequence[str], tolerances: Tolerances) -> I
     linear = list(layout.base_linear)
     points = tuple(Nuisance("tracked_point", "base", "m", tolerances.tracked_point, AXES[axis]) for axis in linear)
     yield Family(points, partial(_tracked_point, linear))
+    if layout.planar:
+        angle = (Nuisance("base_angle", "base", "rad", tolerances.base_angle, "z"),)
+        yield Family(angle, partial(_constant, _selection(names, [names.index("theta_0")])))
 
 
 def _tracked_point(linear: Sequence[int], motion: Motion) -> Array:

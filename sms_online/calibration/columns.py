@@ -21,6 +21,7 @@ from sms_online.calibration.nuisance import Nuisance
 from sms_online.model.model import Model
 from sms_online.pipeline.momentum_windows import EXPONENT, INSTANTS, STEPS
 from sms_online.pipeline.sensing import Sensing
+from sms_online.pipeline.sensitivity import SPARSE, Sensitivity, nodes
 from sms_online.pipeline.weak_form import test_function
 from sms_online.stream import Array
 
@@ -31,6 +32,12 @@ def nuisances(sensing: Sensing) -> tuple[Nuisance, ...]:
     positions = [each.nuisances for each in position_families(sensing, system.tolerances)]
     torques = [each.nuisances for each in torque_families(sensing, system.tolerances)]
     return (*chain.from_iterable((*positions, *torques)), *(each.nuisance for each in geometries(system)))
+
+
+def _interpolation(at: NDArray[np.int64], derivative: int = 0) -> Array:
+    """Weights (STEPS + 1, at) of a cubic spline through values at some instants, or of its slope, by instants."""
+    fine = np.linspace(0.0, INSTANTS, STEPS + 1)
+    return np.asarray(CubicSpline(at, np.eye(at.size))(fine, derivative))
 
 
 class CalibrationColumns:
@@ -46,10 +53,9 @@ class CalibrationColumns:
         self._torques = torque_families(sensing, model.system.tolerances)
         self._geometry = GeometryDerivatives(model, list(geometries(model.system)))
         self._joint_rows = list(model.layout.theta_m)
-        # From instants to steps of a window, and the weights of its integrals.
-        fine = np.linspace(0.0, INSTANTS, STEPS + 1)
-        self._to_steps = np.asarray(CubicSpline(np.arange(INSTANTS + 1.0), np.eye(INSTANTS + 1))(fine))
-        self._to_steps *= span / STEPS
+        # What is added at the instants, in the sum over steps; and that sum of c, by parts of a `Sensitivity`.
+        self._to_steps = _interpolation(np.arange(INSTANTS + 1)) * span / STEPS
+        self._kernels = [self._kernel(offset, span) for offset in range(SPARSE)]
         phi, phi_dot, _ = test_function(INSTANTS, span, EXPONENT)
         self._phi, self._phi_dot = phi * span / INSTANTS, phi_dot * span / INSTANTS
         self.forget(0)
@@ -84,14 +90,31 @@ class CalibrationColumns:
         self._momentum = np.concatenate((self._momentum, momentum))
         self._force = np.concatenate((self._force, force))
 
-    def window(self, start: int, kernel: Array) -> Array:
-        """N (n_v, count) of the window that starts at an instant; kernel (STEPS + 1, n_v, sensors): its c."""
+    def _kernel(self, offset: int, span: float) -> Array:
+        """Weights (INSTANTS + 1, ·) of H, ∂Pπ/∂x, ∂Gπ/∂v and ∂Gπ/∂x in the integral of c times what is added.
+
+        As `RowNoise.kernel`, but by splines: noise is known to a tenth, these are to be known to a thousandth.
+        """
+        phi, phi_dot, phi_ddot = (part[:, None] for part in test_function(STEPS, span, EXPONENT))
+        every, some, per_second = np.arange(INSTANTS + 1), nodes(offset), INSTANTS / span
+        of_mass = phi_ddot * _interpolation(every) + phi_dot * _interpolation(every, 1) * per_second
+        sparse, slope = _interpolation(some), _interpolation(some, 1) * per_second
+        of_force = (-phi_dot * sparse, phi_dot * sparse + phi * slope, -phi * sparse)
+        return np.asarray(self._to_steps.T @ np.concatenate((of_mass, *of_force), axis=1))
+
+    def window(self, start: int, sensitivity: Sensitivity, rough: Array) -> Array:
+        """N (n_v, count) of the window that starts at an instant.
+
+        rough (STEPS + 1, n_v, sensors): what rough forces add to c.
+        """
+        n_v, sensors = sensitivity.H.shape[1:]
         if not self.count:
-            return np.empty((kernel.shape[1], 0))
+            return np.empty((n_v, 0))
         inside = slice(start - self._first, start - self._first + INSTANTS + 1)
-        weights = np.tensordot(self._to_steps.T, kernel, 1)  # (INSTANTS + 1, n_v, sensors)
-        n_v = kernel.shape[1]
-        flat = weights.swapaxes(0, 1).reshape(n_v, -1)
+        told = (sensitivity.H, sensitivity.P_x, sensitivity.G_v, sensitivity.G_x)
+        weights = self._kernels[sensitivity.offset] @ np.concatenate(told).reshape(-1, n_v * sensors)
+        weights += self._to_steps.T @ rough.reshape(STEPS + 1, -1)
+        flat = weights.reshape(-1, n_v, sensors).swapaxes(0, 1).reshape(n_v, -1)
         positions = -flat @ self._added[inside].reshape(flat.shape[1], -1)
         torques = np.zeros((n_v, self._torque.shape[2]))
         torques[self._joint_rows] = np.tensordot(self._phi, self._torque[inside], 1)

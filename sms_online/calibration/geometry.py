@@ -10,8 +10,9 @@ from scipy.spatial.transform import Rotation
 
 from sms_online.calibration.nuisance import Nuisance
 from sms_online.description.channels import AXES
-from sms_online.description.schema import FlexibleLink, System
+from sms_online.description.schema import FlexibleLink, Joint, System
 from sms_online.model.beam import LinearLink
+from sms_online.model.dynamics import Dynamics
 from sms_online.model.model import Model
 from sms_online.stream import Array
 
@@ -47,8 +48,17 @@ class Geometry:
     states: States = same_readings
 
 
+def own_axis(joint: Joint) -> int | None:
+    """Axis of the mount that a joint turns about, of which its encoders' readings say all; None where there is none."""
+    turning = np.flatnonzero(np.abs(joint.axis) == 1.0)
+    return int(turning[0]) if joint.kind == "revolute" and turning.size else None
+
+
 def geometries(system: System) -> Iterator[Geometry]:
-    """Those of a system that have a tolerance; of a planar one only what keeps it planar."""
+    """Those of a system that have a tolerance; of a planar one only what keeps it planar.
+
+    Not those that other readings stand for: see `channels`.
+    """
     planar, tolerances = system.motion == "planar", system.tolerances
     for i, link in enumerate(system.links):
         if tolerances.length == 0.0:
@@ -59,13 +69,13 @@ def geometries(system: System) -> Iterator[Geometry]:
             for axis in range(2 if planar else 3):
                 nuisance = Nuisance("length", f"link_{i + 1}", "m", tolerances.length, AXES[axis])
                 yield Geometry(nuisance, _tip_moved(i, axis))
-    for i in range(len(system.joints)):
+    for i, joint in enumerate(system.joints):
         for axis in (2,) if planar else (0, 1, 2):
-            if tolerances.axis > 0.0:
+            if tolerances.axis > 0.0 and axis != own_axis(joint):
                 nuisance = Nuisance("axis", f"joint_{i + 1}", "rad", tolerances.axis, AXES[axis])
                 yield Geometry(nuisance, _mount_turned(i, axis))
-    if system.spacecraft is not None and tolerances.base_angle > 0.0:
-        for axis in (2,) if planar else (0, 1, 2):
+    if system.spacecraft is not None and tolerances.base_angle > 0.0 and not planar:
+        for axis in range(3):
             nuisance = Nuisance("base_angle", "base", "rad", tolerances.base_angle, AXES[axis])
             yield Geometry(nuisance, lambda system, by: system, _base_turned(axis))
     gravity = np.array(system.gravity)
@@ -135,15 +145,20 @@ class GeometryDerivatives:
 
     def __init__(self, model: Model, chosen: list[Geometry]) -> None:
         self._model = model
+        self._pi: Array | None = None
+        self._dynamics: list[Dynamics] = []  # of the last π: the described geometry, then the others
         self._moved = [(model.of_geometry(each.moved(model.system, DIFFERENCE)), each.states) for each in chosen]
 
     def at(self, pi: Array, x: Array, v: Array, signals: Array) -> tuple[Array, Array]:
         """∂Pπ and ∂Gπ (K, n_v, c) at x (K, n_x), v (K, n_v), signals as in `Instants`; readings stay as they are."""
         out = np.zeros((2, len(x), v.shape[1], len(self._moved)))
         if self._moved and len(x):
+            if self._pi is None or not np.array_equal(pi, self._pi):
+                self._pi = pi
+                self._dynamics = [each.dynamics(pi) for each in (self._model, *(moved for moved, _ in self._moved))]
             inputs = self._model.inputs(signals)
-            described = self._model.dynamics(pi).momentum_and_force(x, v, inputs)
-            for k, (moved, states) in enumerate(self._moved):
-                there = moved.dynamics(pi).momentum_and_force(*states(self._model, moved, x, v, DIFFERENCE), inputs)
+            described = self._dynamics[0].momentum_and_force(x, v, inputs)
+            for k, ((moved, states), dynamics) in enumerate(zip(self._moved, self._dynamics[1:], strict=True)):
+                there = dynamics.momentum_and_force(*states(self._model, moved, x, v, DIFFERENCE), inputs)
                 out[..., k] = (np.array(there) - np.array(described)) / DIFFERENCE
         return out[0], out[1]

@@ -107,14 +107,15 @@ class WindowNoise:
         pi = self._base.physical_values(self.beta)
         sensitivity = self._sensitivities.window(window.start)
         age = window.end / self._sample_rate
-        kernel = self._noise.kernel(sensitivity) + self._rough.kernel(window.rough, pi, sensitivity.displacements)
+        rough = self._rough.kernel(window.rough, pi, sensitivity.displacements)
+        kernel = self._noise.kernel(sensitivity) + rough
         noise = self.sensor_noise
         free = self._rough.at_rest(window.rest, pi)
         covariances = self._noise.covariance(kernel, sensitivity.rates, noise.sensors, noise.torque, free, age)
         diagonal = np.einsum("ii->i", covariances[-1])
         diagonal += errors
         none = np.empty((self.n_v, 0))
-        calibration = none if self._calibration is None else self._calibration.window(window.start, kernel)
+        calibration = none if self._calibration is None else self._calibration.window(window.start, sensitivity, rough)
         return PropagatedNoise(covariances, kernel, self._noise.late, calibration)
 
     def state(self) -> dict[str, Any]:
