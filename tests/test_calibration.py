@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from net.sessions import TOLERANCE
+from scipy.interpolate import make_interp_spline
 
 from sms_adapters.system_file import load_system
 from sms_online.calibration.found import Calibration
@@ -55,13 +56,13 @@ def exact() -> Block:
 
 
 def evaluated(exact: Block, tolerances: Tolerances, changed: dict[str, Array] | None = None) -> Evaluation:
-    """Of the samples with white noise of 1e-5 on positions and 0.02 N m on torques, seed 3."""
+    """Of the samples with white noise of 1e-4 on positions and 0.01 N m on torques, seed 3."""
     random = np.random.default_rng(3)
     values = exact.values.copy()
     for name, column in (changed or {}).items():
         values[:, exact.channels.index(name)] = column
     torque = [name.startswith("tau") for name in exact.channels]
-    values += np.where(torque, 2e-2, 1e-5) * random.standard_normal(values.shape)
+    values += np.where(torque, 1e-2, 1e-4) * random.standard_normal(values.shape)
     system = load_system("paper-planar").model_copy(update={"tolerances": tolerances})
     estimator = Estimator(system, exact.channels, "test")
     estimator.push(Block(exact.t, exact.channels, values))
@@ -78,8 +79,8 @@ def off(evaluation: Evaluation) -> Array:
 def late(exact: Block, seconds: float) -> dict[str, Array]:
     """What base and markers read so much later."""
     seen = [name for name in exact.channels if name.startswith(("r_S", "theta_0", "link_"))]
-    columns = (exact.values[:, exact.channels.index(name)] for name in seen)
-    return {name: np.interp(exact.t - seconds, exact.t, column) for name, column in zip(seen, columns, strict=True)}
+    between = make_interp_spline(exact.t, exact.values[:, [exact.channels.index(name) for name in seen]], 5)
+    return dict(zip(seen, between(exact.t - seconds).T, strict=True))
 
 
 def of(evaluation: Evaluation, name: str, where: str) -> Calibration:
@@ -94,7 +95,7 @@ def test_a_late_camera_within_its_tolerance_is_said_and_corrected(exact: Block) 
     for where in ("base", "markers"):
         clock = of(evaluation, "clock", where)
         assert clock.estimate == pytest.approx(1e-4, abs=4.0 * clock.std)
-        assert clock.std < 1e-5
+        assert clock.std < 2e-5
         assert not clock.beyond
         assert str(clock).endswith("µs late")
 
@@ -111,7 +112,7 @@ def test_a_camera_later_than_its_tolerance_is_not_trusted(exact: Block) -> None:
     [
         ("clock", "markers", "", "s", 4.8e-5, 1e-6, "markers 48.0 ± 1.0 µs late"),
         ("clock", "base", "", "s", -4e-3, 1e-5, "base 4.000 ± 0.010 ms early"),
-        ("tracked_point", "base", "x", "m", -9e-4, 2e-4, "base: tracked point (x) -0.90 ± 0.20 mm off"),
+        ("tracked_point", "base", "x", "m", -9e-4, 2e-4, "base: tracked point (x) -900 ± 200 µm off"),
         ("torque_gain", "joint_2", "", "", 1e-3, 4e-5, "joint_2: gain of the torque 0.1000 ± 0.0040 % off"),
     ],
 )

@@ -33,6 +33,7 @@ from tests.campaigns.sessions import disguised, exact_session, noisy_session, tr
 
 SYSTEM = "paper-planar"
 GRADE = "B"
+TOLERANCES = ("none", "default")
 PIECE = 1000  # samples
 # The true arm where its geometry is another than the described one.
 LENGTH, AXIS = 1.2e-4, 5e-4  # m, rad: of link 1, and of joint 2
@@ -137,7 +138,7 @@ def _exact(folder: Path, length: float, axis: float) -> Block:
     return exact_session(system, folder / f"{SYSTEM}-{length:g}-{axis:g}.npz")
 
 
-def run(results: Path, folder: Path, seeds: int, kinds: list[str]) -> None:
+def run(results: Path, folder: Path, seeds: int, kinds: list[str], tolerances: list[str]) -> None:
     """Append the sessions that `results` lacks, seed by seed."""
     done = (
         {(record["kind"], record["tolerances"], record["seed"]) for record in read(results)}
@@ -146,12 +147,12 @@ def run(results: Path, folder: Path, seeds: int, kinds: list[str]) -> None:
     )
     for seed in range(seeds):
         for kind in kinds:
-            for tolerances in ("none", "default"):
-                if (kind, tolerances, seed) in done:
+            for each in tolerances:
+                if (kind, each, seed) in done:
                     continue
-                record = one_session(folder, kind, tolerances, seed)
+                record = one_session(folder, kind, each, seed)
                 with results.open("a", encoding="utf-8") as file:
-                    file.write(json.dumps({"kind": kind, "tolerances": tolerances, "seed": seed, **record}) + "\n")
+                    file.write(json.dumps({"kind": kind, "tolerances": each, "seed": seed, **record}) + "\n")
 
 
 def one_session(folder: Path, kind: str, tolerances: str, seed: int) -> Record:
@@ -192,7 +193,7 @@ def summary(records: list[Record]) -> str:
     names = ("sessions", "cover", "rms z", "worst z", "bars", "green", "s")
     lines = [f"{'kind':24}{'tolerances':>12}" + "".join(f"{name:>9}" for name in names)]
     for kind in KINDS:
-        for tolerances in ("none", "default"):
+        for tolerances in TOLERANCES:
             own = [r for r in records if (r["kind"], r["tolerances"]) == (kind, tolerances)]
             if own:
                 lines.append(_line(kind, tolerances, own, truth, clean))
@@ -225,11 +226,12 @@ def main() -> int:
     runner.add_argument("results", metavar="RESULTS", type=Path)
     runner.add_argument("--seeds", type=int, default=10, help="seeds 0, 1, … of each kind, 10 by default")
     runner.add_argument("--kinds", nargs="+", choices=list(KINDS), default=list(KINDS))
+    runner.add_argument("--tolerances", nargs="+", choices=TOLERANCES, default=list(TOLERANCES))
     shower = verbs.add_parser("summary", help="print what the sessions show")
     shower.add_argument("results", metavar="RESULTS", type=Path)
     args = parser.parse_args()
     if args.verb == "run":
-        run(args.results, args.results.parent, args.seeds, args.kinds)
+        run(args.results, args.results.parent, args.seeds, args.kinds, args.tolerances)
     else:
         print(summary(read(args.results)))
     return 0
