@@ -32,6 +32,7 @@ RECORDS: dict[str, type[BaseModel]] = {
     "controller": schema.Controller,
     "trajectory": schema.Harmonic,
     "windows": schema.Windows,
+    "tolerances": schema.Tolerances,
 }
 # Records that a key of the table tells apart, by its values; a serial source needs two such keys.
 LINKS: dict[str, type[BaseModel]] = {"rigid": schema.RigidLink, "flexible": schema.FlexibleLink}
