@@ -5,6 +5,7 @@ from __future__ import annotations
 import html
 import json
 import re
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
@@ -21,6 +22,7 @@ from sms_online.description.schema import Effect
 from sms_online.diagnosis.diagnose import Diagnosis, diagnose
 from sms_online.diagnosis.document import diagnosis_document
 from sms_online.diagnosis.force_curves import added_variables, force_curves
+from sms_online.diagnosis.unexplained import describe_residual
 from sms_online.effects.build import build_model
 from sms_online.truth import true_values
 from sms_tools.adopted_system import added_lines, adopted_text, remarks
@@ -108,6 +110,16 @@ def test_a_clean_session_has_a_page_without_effects(tmp_path: Path) -> None:
     assert "before and after" not in page
     assert 'class="share' not in page
     assert "none explains more of the residual than chance" in page
+
+
+def test_what_nothing_explains_is_marked_and_drawn(diagnosis: Diagnosis, tmp_path: Path) -> None:
+    before, rows = diagnosis.before, diagnosis.attempt.rows
+    unexplained = describe_residual(rows, diagnosis.attempt.tracing.columns([]), before.residual, before.test)
+    nothing = {"verdict": "unexplained", "findings": [], "chosen": [], "after": before}
+    _, page = page_of(replace(diagnosis, **nothing, unexplained=unexplained), tmp_path, [])
+    assert re.findall(r"<text[^>]*font-weight: 700[^>]*>([^<]*)<", page) == ["?"]
+    assert f"a free curve over {unexplained.variable} in {unexplained.speed} explains" in page
+    assert "force in place of what is unknown" in page
 
 
 def test_diagnose_writes_the_page_beside_its_document(tmp_path: Path) -> None:

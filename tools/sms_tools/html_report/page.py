@@ -83,7 +83,7 @@ def _convergence(document: Document, nominal: Mapping[str, float], course: Cours
         series = [
             Series(with_subscripts(label), course.t, y, y - bound, y + bound)
             for label, y, bound in zip(group.labels, drawn.T, width.T, strict=True)
-            if np.isfinite(y).any()
+            if np.isfinite(y[-1])
         ]
         y_range = None if group.half_range is None else (-limit, limit)
         if series:

@@ -43,7 +43,7 @@ def error_bar(deviation: float, bound: float, limit: float, color: str) -> Bar |
 
 def with_subscripts(symbol: str) -> Markup:
     """A parameter's symbol with its indices set low."""
-    return Markup(re.sub("_([0-9A-Za-z]+)", r"<sub>\1</sub>", str(escape(symbol))))
+    return Markup(re.sub("_([+-]?[0-9A-Za-z]+)", r"<sub>\1</sub>", str(escape(symbol))))
 
 
 def breakable(name: str) -> Markup:
