@@ -34,7 +34,7 @@ WAY_POINTS = 200
 
 def arm_drawings(scene: Scene, x: Array, chosen: Sequence[int], captions: Sequence[str]) -> list[Chart]:
     """Pictures of positions x (B, n_x) at chosen rows, all on one scale, with the tip's places in all rows behind."""
-    arm = _Arm(scene, x, chosen)
+    arm = _Arm(scene, x, chosen, SMALL)
     return [
         Chart(caption, (), drawn(f"arm at {caption}", *SMALL, partial(arm.draw, row), bare=True))
         for row, caption in zip(chosen, captions, strict=True)
@@ -46,7 +46,7 @@ def marked_arm(scene: Scene, x: Array, row: int, marks: Mapping[str, str]) -> Ma
 
     The tip's places in all rows are behind.
     """
-    arm = _Arm(scene, x, [row])
+    arm = _Arm(scene, x, [row], MARKED)
 
     def draw(axes: Axes) -> None:
         arm.draw(row, axes)
@@ -57,9 +57,13 @@ def marked_arm(scene: Scene, x: Array, row: int, marks: Mapping[str, str]) -> Ma
 
 
 class _Arm:
-    """Pictures of positions x (B, n_x) on the paper, (..., 2), m, on one scale that holds the rows shown."""
+    """Pictures of positions x (B, n_x) on the paper, (..., 2), m, on one scale that holds the rows shown.
 
-    def __init__(self, scene: Scene, x: Array, shown: Sequence[int]) -> None:
+    size: of a picture, pt.
+    """
+
+    def __init__(self, scene: Scene, x: Array, shown: Sequence[int], size: tuple[float, float]) -> None:
+        self.size = np.array(size)
         drawing = scene.draw(x)
         onto = (PLANAR if scene.model.layout.planar else OBLIQUE).T
         center, half = scene.box
@@ -82,11 +86,14 @@ class _Arm:
             axes.plot(*line[row].T, color=ink("ink"), linewidth=3.0, solid_capstyle="round")
         axes.plot(*self.joints[row].T, "o", color=ink("orange"), markersize=7.0, markeredgewidth=0.0)
         axes.plot(*self.markers[row].T, "o", color=ink("green"), markersize=5.0, markeredgewidth=0.0)
+        # A metre is as long to the right as it is up.
         extent = float((self.high - self.low).max())
-        (left, bottom), (right, top) = self.low - MARGIN * extent, self.high + MARGIN * extent
-        self._scale_bar(axes, left, bottom - BELOW * extent / 2.0, extent)
-        axes.set(xlim=(left, right), ylim=(bottom - BELOW * extent, top))
-        axes.set_aspect("equal", adjustable="datalim")
+        room = self.high - self.low + 2.0 * MARGIN * extent + np.array((0.0, BELOW * extent))
+        half = self.size * float((room / self.size).max()) / 2.0
+        middle = (self.low + self.high - np.array((0.0, BELOW * extent))) / 2.0
+        (left, bottom), (right, top) = middle - half, middle + half
+        axes.set(xlim=(left, right), ylim=(bottom, top))
+        self._scale_bar(axes, left + MARGIN * extent, bottom + MARGIN * extent, extent)
 
     def mark(self, row: int, axes: Axes, place: str, text: str) -> None:
         """Mark a place with a text above it."""
