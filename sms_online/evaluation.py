@@ -341,8 +341,8 @@ class Evaluation:
         if np.isfinite(fastest) and not 0.8 < fastest / period < 1.25:
             out.append(f"the capture has {1.0 / fastest:.4g} samples/s, the system file says {system.sample_rate:g}")
         late = [name for sensor in system.sensors if sensor.latency > 0.0 for name in sensor.channels]
-        if late:
-            out.append(f"latency of {', '.join(late)} is described but not corrected")
+        if late and now.method == "smoother":
+            out.append(f"latency of {', '.join(late)} is described but not corrected by the smoother")
         if now.counters.gaps:
             out.append(f"{now.counters.gaps} gaps too long to bridge; each begins a new window of the balance")
         if now.counters.interpolated_cells:

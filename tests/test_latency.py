@@ -6,14 +6,18 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from axis import AXIS
 from bus_streams import AxisBus, axis_testbed, merged
 from evaluated import results_document
 
-from sms_online.description.schema import System
+from sms_online.description.parse import parse_system
+from sms_online.description.schema import Sensor, System
 from sms_online.effects.build import build_model
+from sms_online.pipeline.conditioning import Conditioning
 from sms_online.pipeline.estimator import Estimator
 from sms_online.pipeline.latency import Latencies, LatencyColumns, SourceGroup, source_groups
 from sms_online.pipeline.sensing import Sensing
+from sms_online.pipeline.synchronise import GridSamples
 from sms_online.stream import Block
 
 
@@ -113,3 +117,16 @@ def test_latencies_are_told_from_white_rows() -> None:
     assert found.source == "encoder"
     assert found.std == pytest.approx(1e-4 / np.sqrt(300), rel=0.15)
     assert found.size == pytest.approx(1e-3, abs=4.0 * found.std)
+
+
+@pytest.mark.parametrize("latency", [0.003, 0.0105])
+def test_the_stated_latency_of_a_sensor_is_taken_off(latency: float) -> None:
+    """Whole samples and half ones; what a motion of 1 Hz does between samples is a cubic to 1e-9 of it."""
+    axis = parse_system(AXIS, "axis.toml")
+    sensors = (Sensor(channels=("q_*",), latency=latency),)
+    system = axis.model_copy(update={"sensors": sensors, "sample_rate": 1000.0})
+    t = np.arange(2000) / 1000.0
+    late = np.column_stack((np.sin(2.0 * np.pi * t), np.sin(2.0 * np.pi * (t - latency))))
+    stage = Conditioning(system, ("force_1", "q_1"))
+    (piece,) = stage.push(GridSamples(np.arange(2000), late, 0))
+    np.testing.assert_allclose(piece.values[:, 1], piece.values[:, 0], atol=1e-9)

@@ -151,7 +151,7 @@ class Sensor(Record):
     rate: samples a second, Hz; none means the system's sample_rate.
     resolution: step of its readings, in the channel's unit.
     noise: 1σ of its white noise per sample, in the channel's unit; 0 means that it is estimated from the samples.
-    latency: its delay behind the others, s; warned of, not corrected.
+    latency: its delay behind the others, s; it is corrected, but by the smoother.
     """
 
     channels: Annotated[tuple[str, ...], Field(min_length=1)]

@@ -10,7 +10,7 @@ from collections.abc import Iterable, Sequence
 
 from sms_online.description.schema import Effect, System
 from sms_online.diagnosis.record import Segment
-from sms_online.effects.catalogue import CONSTANTS, channel_effects
+from sms_online.effects.catalogue import CONSTANTS, corrections
 from sms_online.effects.channel import Convolved
 from sms_online.stream import Array
 
@@ -44,10 +44,10 @@ def applied(system: System, constants: Iterable[Effect]) -> System:
 
 
 def corrected(system: System, channels: Sequence[str], segment: Segment) -> Segment:
-    """Samples of the channels without the effects on them that the system declares, the last of which was the first."""
+    """Samples of the channels without what the system says to take off, the last of which was the first."""
     values = segment.values.copy()
     # A sensor's lag acts on what its disc or its zero has already distorted.
-    last_first = channel_effects(system)[::-1]
+    last_first = corrections(system)[::-1]
     for effect in sorted(last_first, key=lambda effect: not isinstance(effect, Convolved)):
         for k, channel in enumerate(channels):
             if effect.acts_on(channel):

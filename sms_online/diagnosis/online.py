@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sms_online.description.schema import Effect, System
-from sms_online.diagnosis.constants import applied, is_constant
+from sms_online.diagnosis.constants import applied, corrected, is_constant
 from sms_online.diagnosis.episodes import Episode, Evidence, discrepancy, episode_document, line
 from sms_online.diagnosis.followed import least_samples
 from sms_online.diagnosis.online_search import Named, Outcome, Request, search
@@ -286,8 +286,11 @@ class OnlineDiagnosis(Observer):
         for each in joined(self._record).values():
             inside: NDArray[np.bool_] = (each.index >= first) & (True if last is None else each.index <= last)
             if int(inside.sum()) > least_samples(self._estimator.system):
-                out.append(Segment(each.index[inside], each.values[inside]))
+                out.append(self._corrected(Segment(each.index[inside], each.values[inside])))
         return out
+
+    def _corrected(self, segment: Segment) -> Segment:
+        return corrected(self._estimator.system, self._estimator.sensing.channels, segment)
 
     def _hear(self, evidence: Evidence) -> None:
         """What a search said."""
@@ -321,7 +324,7 @@ class OnlineDiagnosis(Observer):
         if not outcome.began or onset.last is None:
             first, known = self._valid, self._momentum.changes.beforehand
         last = self._record[-1].segment
-        newest = joined(self._record)[last]
+        newest = self._corrected(joined(self._record)[last])
         late = newest.index >= first
         samples = GridSamples(newest.index[late], newest.values[late], last)
         time = self._time(int(samples.index[0])) if episode.began is None or not outcome.began else episode.began

@@ -14,7 +14,7 @@ from sms_online.description.explain import hint, nearest
 from sms_online.description.schema import Effect, FlexibleLink, System
 from sms_online.effects.base import Constant, Entry, Place, Site
 from sms_online.effects.channel import ChannelEffect, EncoderEccentricity, EncoderOffset, Linear
-from sms_online.effects.delay import LONGEST_DELAY, SensorLag, TorqueDelay
+from sms_online.effects.delay import LONGEST_DELAY, SensorLag, SensorLatency, TorqueDelay
 from sms_online.effects.drive import Cogging, TorqueGain, TorqueOffset, TorqueRipple
 from sms_online.effects.friction import (
     CoulombFriction,
@@ -166,6 +166,12 @@ def channel_effects(system: System) -> tuple[ChannelEffect, ...]:
                 raise InputError(system.name, f"effect {k}", f"{effect.name} without coefficients", expected)
             out.append(_CHANNELS[effect.name](effect.where, with_shapes(effect, system).coefficients))
     return tuple(out)
+
+
+def corrections(system: System) -> tuple[ChannelEffect, ...]:
+    """What a system says to take off its channels: effects as declared, then latencies of sensors."""
+    late = [SensorLatency(sensor.channels, sensor.latency) for sensor in system.sensors if sensor.latency > 0.0]
+    return (*channel_effects(system), *late)
 
 
 def candidates(system: System) -> list[Effect]:

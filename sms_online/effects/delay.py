@@ -149,15 +149,8 @@ class TorqueDelay(Convolved):
         return np.asarray(np.interp(seconds - self.coefficients["time"], seconds, samples))
 
     def kernel(self, sample_rate: float) -> Array:
-        """Weights (2M + 1,) of the samples about an instant in the cubic through the four around d later."""
-        ahead, part = divmod(self.coefficients["time"] * sample_rate, 1.0)
-        M = int(ahead) + 2
-        nodes = np.arange(-1, 3)
-        weights = np.zeros(2 * M + 1)
-        for node in nodes:
-            others = nodes[nodes != node]
-            weights[M + int(ahead) + node] = np.prod((part - others) / (node - others))
-        return weights
+        """Weights (2M + 1,) of the samples about an instant in the value d later."""
+        return _ahead(self.coefficients["time"], sample_rate)
 
     @classmethod
     def improved(cls, given: Mapping[str, float], increments: Array) -> dict[str, float]:
@@ -168,6 +161,37 @@ class TorqueDelay(Convolved):
     def possible(cls, given: Mapping[str, float], sample_rate: float) -> bool:
         """Whether it is the delay of a drive."""
         return cls.entry.traits.plausible(np.array([given["time"]]), sample_rate)
+
+
+class SensorLatency(Convolved):
+    """A reading of x(t - d), d `latency` of a sensor in the system file.
+
+    Limitations: constant; what a reading does between samples is a cubic.
+    """
+
+    def __init__(self, patterns: tuple[str, ...], latency: float) -> None:
+        super().__init__("latency", ", ".join(patterns), {"time": latency})
+        self._patterns = patterns
+
+    def acts_on(self, channel: str) -> bool:
+        """Whether the sensor fills the channel."""
+        return any(fnmatchcase(channel, pattern) for pattern in self._patterns)
+
+    def kernel(self, sample_rate: float) -> Array:
+        """Weights (2M + 1,) of the samples about an instant in the value d later."""
+        return _ahead(self.coefficients["time"], sample_rate)
+
+
+def _ahead(seconds: float, sample_rate: float) -> Array:
+    """Weights (2M + 1,) of the samples about an instant in the cubic through the four around so much later."""
+    ahead, part = divmod(seconds * sample_rate, 1.0)
+    M = int(ahead) + 2
+    nodes = np.arange(-1, 3)
+    weights = np.zeros(2 * M + 1)
+    for node in nodes:
+        others = nodes[nodes != node]
+        weights[M + int(ahead) + node] = np.prod((part - others) / (node - others))
+    return weights
 
 
 @lru_cache(maxsize=16)

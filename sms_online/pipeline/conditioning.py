@@ -1,4 +1,4 @@
-"""Declared effects on channels, taken off the grid samples before anything is made of them.
+"""Declared effects on channels and latencies of sensors, taken off the grid samples before anything is made of them.
 
 Offsets and eccentricities are functions of a sample; lags and delays ask for samples on both sides, so that every
 channel is passed on as much later, and what lies so close to a gap is lost.
@@ -12,7 +12,7 @@ import numpy as np
 from scipy.ndimage import correlate1d
 
 from sms_online.description.schema import System
-from sms_online.effects.catalogue import channel_effects
+from sms_online.effects.catalogue import corrections
 from sms_online.effects.channel import Convolved
 from sms_online.pipeline.synchronise import GridSamples, StageState
 from sms_online.stream import Array
@@ -21,7 +21,7 @@ from sms_online.stream import Array
 def channel_kernels(system: System, channels: Sequence[str]) -> dict[int, Array]:
     """Weights of the samples on both sides that take lags and delays off, by the channel's number."""
     kernels: dict[int, Array] = {}
-    for effect in channel_effects(system):
+    for effect in corrections(system):
         for k, channel in enumerate(channels):
             if isinstance(effect, Convolved) and effect.acts_on(channel):
                 # One after the other is one by both.
@@ -50,7 +50,7 @@ class Conditioning:
 
     def __init__(self, system: System, channels: tuple[str, ...]) -> None:
         self._sample_rate = system.sample_rate
-        effects = [(k, e) for e in channel_effects(system) for k, channel in enumerate(channels) if e.acts_on(channel)]
+        effects = [(k, e) for e in corrections(system) for k, channel in enumerate(channels) if e.acts_on(channel)]
         self._kernels = channel_kernels(system, channels)
         self._of_value = [(k, effect) for k, effect in effects if not isinstance(effect, Convolved)]
         self.margin = max((kernel.size // 2 for kernel in self._kernels.values()), default=0)
