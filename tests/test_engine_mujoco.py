@@ -19,6 +19,7 @@ from engine_mujoco import (
     mujoco_capture,
     with_noise,
 )
+from exactly_known import exactly_known
 from numpy.testing import assert_allclose
 
 from sms_adapters.system_file import load_system
@@ -237,7 +238,7 @@ def test_noise_of_a_grade_comes_on_top() -> None:
 
 
 def test_the_estimator_finds_the_parameters_that_the_engine_was_built_with(engine_capture: Block) -> None:
-    estimator = Estimator(SYSTEM, engine_capture.channels, "engine")
+    estimator = Estimator(exactly_known(SYSTEM), engine_capture.channels, "engine")
     estimator.push(engine_capture)
     estimator.finish()
     assert estimator.by_momentum
