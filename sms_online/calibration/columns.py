@@ -53,9 +53,10 @@ class CalibrationColumns:
     def __init__(self, model: Model, sensing: Sensing, span: float) -> None:
         self.count = len(nuisances(sensing))
         self._model, self._sensing = model, sensing
-        self._positions = position_families(sensing, model.system.tolerances)
-        self._torques = torque_families(sensing, model.system.tolerances)
-        self._geometry = GeometryDerivatives(model, list(geometries(model.system)))
+        self._positions = position_families(sensing, sensing.model.system.tolerances)
+        self._torques = torque_families(sensing, sensing.model.system.tolerances)
+        # Of the session's system: an event's may hold more that has a geometry.
+        self._geometry = GeometryDerivatives(model, list(geometries(sensing.model.system)))
         self._joint_rows = list(model.layout.theta_m)
         # What is added at the instants, in the sum over steps; and that sum of c, by parts of a `Sensitivity`.
         self._to_steps = _interpolation(np.arange(INSTANTS + 1)) * span / STEPS
