@@ -63,8 +63,8 @@ def test_replay_prints_a_table_and_writes_the_document(bench: Path, capsys: pyte
     found = document(bench / "done")
     assert sorted(path.name for path in (bench / "done").iterdir()) == ["report.html", "results.json"]
     assert list(found) == [
-        "schema", "system", "samples", "duration_s", "method", "verdict", "parameters", "events", "residual",
-        "physical", "condition_number", "throughput_samples_per_s", "lost_samples", "warnings", "diagnosis",
+        "schema", "system", "samples", "duration_s", "method", "verdict", "parameters", "calibration", "events",
+        "residual", "physical", "condition_number", "throughput_samples_per_s", "lost_samples", "warnings", "diagnosis",
     ]  # fmt: skip
     assert found["schema"] == "sms-online/results/1"
     assert found["samples"] == 1200
@@ -216,8 +216,11 @@ def test_a_prior_decides_what_the_motion_does_not(bench: Path) -> None:
     # At constant speed friction alone takes work; the kinetic energy never changes.
     rows = [f"{k / 200},{DAMPING * 0.5},{0.5 * k / 200}" for k in range(1200)]
     (bench / "run.csv").write_text("\n".join(["t,force_1,q_1", *rows]) + "\n")
-    (bench / "prior.toml").write_text(AXIS + '[prior."link_1.inertia"]\nvalue = 0.31\nstd = 0.01\n')
-    assert main(["replay", "run.csv", "--system", "axis.toml", "--out", "without"]) == 0
+    # An unknown offset of the force would take the same work.
+    exact = 'tolerances = "none"\n' + AXIS
+    (bench / "exact.toml").write_text(exact)
+    (bench / "prior.toml").write_text(exact + '[prior."link_1.inertia"]\nvalue = 0.31\nstd = 0.01\n')
+    assert main(["replay", "run.csv", "--system", "exact.toml", "--out", "without"]) == 0
     assert main(["replay", "run.csv", "--system", "prior.toml", "--out", "with"]) == 0
     flags = {p["name"]: p["identifiable"] for p in document(bench / "without")["parameters"]}
     assert flags == {"link_1.inertia": False, "viscous_friction@joint_1.damping": True}
@@ -286,7 +289,9 @@ def test_at_a_terminal_the_demo_draws_its_table_again_and_again(
     assert out.count("link_1.inertia") >= 10
     assert str(Path("done") / "results.json") in out
     assert str(Path("done") / "report.html") in out
-    assert out.rstrip().splitlines()[-1].removeprefix("\x1b[1;90m").startswith("Not yet: ")
+    verdict, then = out.rstrip().splitlines()[-2:]
+    assert verdict.removeprefix("\x1b[1;90m").startswith("Not yet: ")
+    assert then.startswith("  next: ")
 
 
 # import, markers
