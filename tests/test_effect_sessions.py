@@ -14,7 +14,7 @@ from scipy.integrate import solve_ivp
 from sms_adapters.truth import read_truth
 from sms_online.cramer_rao import cramer_rao_bound
 from sms_online.description.parse import parse_system, shipped_text
-from sms_online.description.schema import System
+from sms_online.description.schema import System, Tolerances
 from sms_online.diagnosis.constants import corrected
 from sms_online.diagnosis.record import Segment
 from sms_online.effects.base import report
@@ -149,10 +149,11 @@ def test_geometric_stiffening_of_one_link_is_sampled_and_estimated() -> None:
 
 @pytest.fixture(scope="module")
 def session() -> tuple[System, Estimator]:
-    """Three seconds of grade A with the effects of FOUND, and an estimator that knows their names alone."""
+    """Three seconds of grade A with the effects of FOUND, and an estimator that knows their names and the geometry."""
     true = declaring(*FOUND)
     blocks = list(sampled_blocks(simulate(true, 3.0), "A", seed=1))
-    estimator = Estimator(declaring(*FOUND.values()), blocks[0].channels, "session")
+    exactly = {"tolerances": Tolerances.model_validate("none")}
+    estimator = Estimator(declaring(*FOUND.values()).model_copy(update=exactly), blocks[0].channels, "session")
     for block in blocks:
         estimator.push(block)
     estimator.finish()
