@@ -13,6 +13,7 @@ from sms_online.calibration.geometry import own_axis
 from sms_online.calibration.nuisance import Nuisance
 from sms_online.description.channels import AXES
 from sms_online.description.schema import Tolerances
+from sms_online.effects.catalogue import ENTRIES
 from sms_online.pipeline.latency import clock_groups
 from sms_online.pipeline.sensing import Sensing
 from sms_online.stream import Array
@@ -65,19 +66,19 @@ def position_families(sensing: Sensing, tolerances: Tolerances) -> list[Family]:
 
 def torque_families(sensing: Sensing, tolerances: Tolerances) -> list[TorqueFamily]:
     """Those of torques that have a tolerance, but for what the system file declares as effects."""
-    declared = {(effect.name, effect.where) for effect in sensing.model.system.effects}
+    declared = {(ENTRIES[e.name].traits.calibrates, e.where) for e in sensing.model.system.effects}
     joints = range(len(sensing.model.layout.q))
     units = ["N" if joint.kind == "prismatic" else "N m" for joint in sensing.model.system.joints]
-    offset = np.inf if tolerances.torque_offset is None else tolerances.torque_offset
-    gained = [i for i in joints if i > 0 and ("torque_gain", f"joint_{i + 1}") not in declared]
-    shifted = [i for i in joints if ("torque_offset", f"joint_{i + 1}") not in declared]
+    offset = np.inf if tolerances.drive_offset is None else tolerances.drive_offset
+    gained = [i for i in joints if i > 0 and ("drive_gain", f"joint_{i + 1}") not in declared]
+    shifted = [i for i in joints if ("drive_offset", f"joint_{i + 1}") not in declared]
     every = [
         TorqueFamily(
-            tuple(Nuisance("torque_gain", f"joint_{i + 1}", "", tolerances.torque_gain) for i in gained),
+            tuple(Nuisance("drive_gain", f"joint_{i + 1}", "", tolerances.drive_gain) for i in gained),
             partial(_of_torque, gained),
         ),
         TorqueFamily(
-            tuple(Nuisance("torque_offset", f"joint_{i + 1}", units[i], offset) for i in shifted),
+            tuple(Nuisance("drive_offset", f"joint_{i + 1}", units[i], offset) for i in shifted),
             partial(_one_torque, shifted),
         ),
     ]

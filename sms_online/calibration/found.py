@@ -33,8 +33,8 @@ NAMES = {
     "marker_zero": "zero",
     "marker_zero_angle": "zero",
     "camera_scale": "scale",
-    "torque_gain": "gain of the torque",
-    "torque_offset": "zero of the torque",
+    "drive_gain": "gain of the torque",
+    "drive_offset": "zero of the torque",
 }
 # Units as people say them: factor from the SI unit, from which size on.
 SCALES = {

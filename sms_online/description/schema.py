@@ -408,8 +408,8 @@ class Tolerances(Record):
     marker_zero: zero of a marker's displacement, m.
     marker_zero_angle: zero of a marker's rotation, rad.
     camera_scale: scale of the base's position and the markers' displacements.
-    torque_gain: gain of a joint's torque relative to that of joint 1.
-    torque_offset: zero of a joint's torque or force, after the gear, N m (N); not stated: unknown.
+    drive_gain: gain of a joint's torque relative to that of joint 1.
+    drive_offset: zero of a joint's torque or force, after the gear, N m (N); not stated: unknown.
     """
 
     tracked_point: NonNegative = 5e-4
@@ -424,8 +424,8 @@ class Tolerances(Record):
     marker_zero: NonNegative = 1e-4
     marker_zero_angle: NonNegative = 1e-3
     camera_scale: NonNegative = 1e-3
-    torque_gain: NonNegative = 0.01
-    torque_offset: NonNegative | None = None
+    drive_gain: NonNegative = 0.01
+    drive_offset: NonNegative | None = None
 
     @model_validator(mode="before")
     @classmethod

@@ -91,7 +91,7 @@ class TorqueOffset(MotorSide):
 
     entry = Entry(
         "torque_offset", "force", "joint", {"torque": "N m"}, "standstill under a known torque",
-        traits=Traits(signed=True, curve=Curve("motor speed"), begins=True),
+        traits=Traits(signed=True, curve=Curve("motor speed"), begins=True, calibrates="drive_offset"),
     )  # fmt: skip
 
     def __init__(self, site: Site, given: Mapping[str, float]) -> None:
@@ -111,7 +111,9 @@ class TorqueGain(MotorSide):
 
     entry = Entry(
         "torque_gain", "force", "later joint", {"ratio": ""}, "motion of each joint alone, then of all",
-        traits=Traits(signed=True, least=LEAST_RATIO, most=LARGEST_RATIO, curve=Curve("torque")),
+        traits=Traits(
+            signed=True, least=LEAST_RATIO, most=LARGEST_RATIO, curve=Curve("torque"), calibrates="drive_gain"
+        ),
     )  # fmt: skip
     needs_torque = True
 

@@ -41,7 +41,8 @@ class Traits:
     late may not. least, most: norm of the linear coefficients; a fit that needs others is of something else. behind: of
     a delay in s, the samples that it has to exceed. curve: None where the force is not a function of one variable.
     extends: name of a simpler effect that this one contains, which is tried first, as is everything else. begins:
-    whether it is tried where something changes while a session runs, at any joint.
+    whether it is tried where something changes while a session runs, at any joint. calibrates: the field of
+    `Tolerances` that a declaration at the same place replaces, for it is the same column; empty for none.
     """
 
     signed: bool = False
@@ -52,6 +53,7 @@ class Traits:
     curve: Curve | None = None
     extends: str | None = None
     begins: bool = False
+    calibrates: str = ""
 
     @property
     def reversing(self) -> bool:
