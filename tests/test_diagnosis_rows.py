@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 from evaluated import standard_deviation
+from exactly_known import exactly_known
 from numpy.testing import assert_allclose
 
 from sms_adapters.system_file import load_system
@@ -35,7 +36,7 @@ from sms_sim.simulate import sampled_blocks, simulate
 @cache
 def session() -> tuple[Estimator, SessionRows]:
     """Four seconds of the planar example at grade B (seed 2)."""
-    system = load_system("paper-planar")
+    system = exactly_known(load_system("paper-planar"))
     blocks = list(sampled_blocks(simulate(system, 4.0, position_tolerance=1e-8), "B", seed=2))
     estimator = Estimator(system, blocks[0].channels, "test")
     record = SampleRecord(system.sample_rate)

@@ -393,7 +393,8 @@ class Tolerances(Record):
     """How well a testbed is measured out and its sensors are calibrated, 1σ each; 0 means exactly.
 
     Within them the estimator corrects its description as the samples ask for, and error bars count what they leave
-    unknown. In a system file `tolerances = "none"` is short for 0 everywhere.
+    unknown. A system file asks for that by a table [tolerances], whose keys have the values below where they are not
+    stated; `tolerances = "none"`, which holds without such a table, is short for 0 everywhere.
 
     tracked_point: of S, along each axis of the base, m.
     length: of a link, and of a joint's place along each axis, m.
@@ -431,6 +432,9 @@ class Tolerances(Record):
     @classmethod
     def _from_none(cls, given: Any) -> Any:
         return dict.fromkeys(cls.model_fields, 0.0) if given == "none" else given
+
+
+EXACT = Tolerances.model_validate("none")
 
 
 class System(Record):
@@ -479,7 +483,7 @@ class System(Record):
     controller: Controller | None = None
     trajectory: Trajectory | None = None
     windows: Windows = Windows()
-    tolerances: Tolerances = Tolerances()
+    tolerances: Tolerances = EXACT
     balance: Literal["both", "energy", "momentum", "smoother"] = "both"
 
     @property

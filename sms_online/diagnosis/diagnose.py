@@ -19,6 +19,7 @@ from sms_online.diagnosis.trace import DECISIVE
 from sms_online.diagnosis.unexplained import Unexplained, describe_residual
 from sms_online.effects.catalogue import kinematic_candidates
 from sms_online.errors import InputError
+from sms_online.judgement import LARGEST_RESIDUAL
 from sms_online.pipeline.estimator import Estimator
 from sms_online.pipeline.momentum_windows import HOPS
 from sms_online.stream import Array, Block
@@ -175,9 +176,7 @@ def diagnose(
     except np.linalg.LinAlgError as error:
         raise InputError(source, "", str(error), "the links' own markers, in their frames") from error
     late: list[LateSensor] = []
-    while not (before.by_momentum or before.by_smoother) and (
-        found := find_late(attempt.rows, attempt.make, attempt.tracing.fitted)
-    ):
+    while _explains_little(before) and (found := find_late(attempt.rows, attempt.make, attempt.tracing.fitted)):
         progress("taking off a sensor's lag")
         late.append(found)
         lagging = attempt.system.model_copy(update={"effects": (*attempt.system.effects, found.effect)})
@@ -226,6 +225,13 @@ def diagnose(
         estimator_after=estimator_after,
         unexplained=unexplained,
     )
+
+
+def _explains_little(estimator: Estimator) -> bool:
+    """Whether a session's own fit leaves more than half of a joint's torque."""
+    beta = estimator.estimate().pi
+    shares = [joint.relative(beta) for joint in estimator.joint_residuals]
+    return not estimator.by_smoother and any(share is not None and share > LARGEST_RESIDUAL for share in shares)
 
 
 def _session(system: System, blocks: Sequence[Block], source: str, prior: PriorOf) -> tuple[Estimator, SampleRecord]:
