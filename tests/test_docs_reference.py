@@ -73,7 +73,9 @@ def capture(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_results_json_has_the_keys_of_its_page(capture: Path, tmp_path: Path) -> None:
-    assert main(["replay", str(capture), "--system", "paper-planar", "--out", str(tmp_path)]) == 0
+    described = tmp_path / "rig.toml"
+    described.write_text(shipped_text("paper-planar") + "\n[tolerances]\n", encoding="utf-8")
+    assert main(["replay", str(capture), "--system", str(described), "--out", str(tmp_path)]) == 0
     document = json.loads((tmp_path / "results.json").read_text(encoding="utf-8"))
     assert document["diagnosis"], "the friction was not noticed, so its keys are not tested"
     check("results.md", document, EVENTS, ("system.",))

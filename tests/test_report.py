@@ -55,7 +55,8 @@ def test_what_is_not_determined_has_no_interval(width: int) -> None:
     [("trust", False, "green"), ("doubt", False, "yellow"), ("doubt", True, "red"), ("not yet", False, "bright_black")],
 )
 def test_a_verdict_has_the_colour_of_its_level(level: str, grave: bool, color: str) -> None:
-    verdict = {"level": level, "grave": grave, "sentence": "What is said", "reasons": ["first", "another"]}
+    reasons = ["first", "another"]
+    verdict = {"level": level, "grave": grave, "sentence": "What is said", "reasons": reasons, "next_step": "do it"}
     text = verdict_text(verdict)
-    assert text.plain == "What is said\n  another"
+    assert text.plain == "What is said\n  another\n  next: do it"
     assert any(color in str(span.style) for span in text.spans if span.start == 0)
