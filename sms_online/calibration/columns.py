@@ -45,7 +45,7 @@ def _interpolation(at: NDArray[np.int64], derivative: int = 0) -> Array:
 
 
 class CalibrationColumns:
-    """Evaluates the columns window by window, at the instants that sensitivities are told at.
+    """Evaluates the columns window by window, at the instants of the sensitivities.
 
     count: of nuisances.
     """

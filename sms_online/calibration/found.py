@@ -15,7 +15,7 @@ from sms_online.trackers.interface import Estimate
 IMPROVED, OF_ITS_SIZE = 0.7, 1.0 / 3.0
 # And beyond this many tolerances the description is wrong there: what else bends to it, no error bar says.
 BEYOND = 3.0
-# It is told to people from so many of its deviations on.
+# It is reported to people from so many of its deviations on.
 CERTAIN = 3.0
 # What people call it, with a positive size and with a negative one.
 WORDS = {
@@ -104,7 +104,7 @@ def _rounded(value: float, std: float) -> str:
 
 
 def found(nuisances: Sequence[Nuisance], estimate: Estimate, scale: float = 1.0) -> list[Calibration]:
-    """What is told better than its tolerance; scale: of the deviations, where rows leave more than noise."""
+    """What is estimated better than its tolerance; scale: of the deviations, where rows leave more than noise."""
     out = []
     for nuisance, value, std in zip(
         nuisances, estimate.nuisances.tolist(), (scale * estimate.nuisances_std).tolist(), strict=True

@@ -54,7 +54,7 @@ def _overlap() -> float:
     return float(phi.sum() ** 2 / (phi @ phi) / 100.0)
 
 
-# Windows whose rows leave more than noise are not told apart by whitening: so many of them count as one.
+# Whitening does not separate windows whose rows leave more than noise: so many of them count as one.
 OVERLAP = _overlap()
 
 
