@@ -15,7 +15,7 @@ from sms_online.calibration.channels import Motion, position_families, torque_fa
 from sms_online.calibration.columns import CalibrationColumns, nuisances
 from sms_online.calibration.geometry import Geometry, geometries
 from sms_online.description.channels import AXES
-from sms_online.description.schema import System
+from sms_online.description.schema import System, Tolerances
 from sms_online.effects.build import build_model
 from sms_online.model.base_parameters import find_base_parameters
 from sms_online.model.model import Model
@@ -44,6 +44,7 @@ class Rows:
     """Residuals Y β - b of windows of one stretch of motion, exact parameters, for samples and geometries at will."""
 
     def __init__(self, system: System) -> None:
+        system = system.model_copy(update={"tolerances": Tolerances()})
         self.model = model = build_model(system)
         self.base = find_base_parameters(model)
         self.beta = self.base.values(model.nominal)
