@@ -1,102 +1,102 @@
-"""A session's state as arrays: NumPy's .npz without pickle, so that it can be read anywhere and runs no code."""
+"""A session's checkpoint: the states of its stages in one piece, and what session they belong to."""
 
 from __future__ import annotations
 
-import json
-import zipfile
 from collections.abc import Mapping
 from dataclasses import dataclass
-from io import BytesIO
-from typing import Any, BinaryIO
+from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
+import msgspec
 
+from sms_online import __version__
 from sms_online.description.parse import describe
 from sms_online.errors import InputError
-from sms_online.pipeline.estimator import Estimator, SessionState
+from sms_online.pipeline.estimator import Estimator
+from sms_online.state import encode, put_back
 
-# What session a state belongs to: its system and channels, as JSON; and how it was begun.
-IDENTITY, BEGUN = "identity", "begun"
-# Separates stage and entry in the archive's names.
-SEPARATOR = "/"
+EXPECTED = "a checkpoint that a session of this system has saved"
+
+
+class Head(msgspec.Struct, frozen=True):
+    """What session a checkpoint belongs to.
+
+    version: of the program that wrote it. system: as described. channels: those used. begun: how the session was begun.
+    """
+
+    version: str
+    system: dict[str, Any]
+    channels: tuple[str, ...]
+    begun: dict[str, Any]
+
+
+class _File(msgspec.Struct, frozen=True):
+    """What is written: the head and the estimator's encoded states."""
+
+    head: Head
+    estimator: bytes
+
+
+class _Versioned(msgspec.Struct):
+    """As much of a file as is the same in all versions."""
+
+    version: str
+
+
+class _AnyFile(msgspec.Struct):
+    head: _Versioned
 
 
 @dataclass(frozen=True)
 class Checkpoint:
     """What a session of the same system and channels needs to go on, bit for bit. source: its name, for messages."""
 
-    arrays: Mapping[str, NDArray[Any]]
+    head: Head
+    estimator: bytes
     source: str = "saved session"
 
     @staticmethod
     def of(estimator: Estimator, begun: Mapping[str, Any] | None = None) -> Checkpoint:
-        """The state of now, in arrays of its own: the estimator may go on before they are written.
-
-        begun: how the session was begun, as plain JSON types.
-        """
-        arrays = {
-            f"{stage}{SEPARATOR}{key}": np.array(value)
-            for stage, entries in estimator.state().items()
-            for key, value in entries.items()
-        }
-        own = {IDENTITY: np.array(_identity(estimator)), BEGUN: np.array(json.dumps(begun or {}))}
-        return Checkpoint(own | arrays)
-
-    @property
-    def identity(self) -> dict[str, Any]:
-        """System and used channels of the session."""
-        return self._document(IDENTITY)
-
-    @property
-    def begun(self) -> dict[str, Any]:
-        """How the session was begun."""
-        return self._document(BEGUN)
-
-    def _document(self, name: str) -> dict[str, Any]:
-        try:
-            document: dict[str, Any] = json.loads(str(self.arrays[name]))
-        except (KeyError, ValueError) as error:
-            raise self._unusable(error) from None
-        return document
-
-    def write(self, file: BinaryIO) -> None:
-        """Write it as .npz."""
-        np.savez(file, allow_pickle=False, **self.arrays)
+        """The state of now; takes milliseconds. begun: how the session was begun, as plain JSON types."""
+        head = Head(__version__, describe(estimator.system), estimator.channels, dict(begun or {}))
+        return Checkpoint(head, encode(estimator))
 
     def to_bytes(self) -> bytes:
-        """The same in memory."""
-        buffer = BytesIO()
-        self.write(buffer)
-        return buffer.getvalue()
+        """As it is written to files, msgpack."""
+        return msgspec.msgpack.encode(_File(self.head, self.estimator))
 
     @staticmethod
-    def read(file: BinaryIO, source: str) -> Checkpoint:
-        """Read one; InputError where it is none."""
+    def from_bytes(data: bytes, source: str) -> Checkpoint:
+        """Of `to_bytes`; InputError where it is none, or one of another version."""
         try:
-            with np.load(file, allow_pickle=False) as archive:
-                return Checkpoint({name: archive[name] for name in archive.files}, source)
-        except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
-            raise Checkpoint({}, source)._unusable(error) from error
+            found = msgspec.msgpack.decode(data, type=_AnyFile).head.version
+            if found != __version__:
+                raise InputError(source, "", f"a checkpoint of version {found}", f"one of version {__version__}")
+            file = msgspec.msgpack.decode(data, type=_File)
+        except msgspec.DecodeError as error:
+            raise _unusable(source, error) from None
+        return Checkpoint(file.head, file.estimator, source)
 
     def put_into(self, estimator: Estimator) -> None:
         """Have an estimator of the same system and channels go on from here; InputError where it does not fit."""
-        state: SessionState = {}
+        here = Head(self.head.version, describe(estimator.system), estimator.channels, self.head.begun)
+        if self.head != here:
+            raise InputError(self.source, "", *_difference(self.head, here))
         try:
-            if str(self.arrays[IDENTITY]) != _identity(estimator):
-                raise ValueError("it belongs to another system or other channels")
-            for name in self.arrays.keys() - {IDENTITY, BEGUN}:
-                stage, key = name.split(SEPARATOR, 1)
-                state.setdefault(stage, {})[key] = self.arrays[name]
-            estimator.restore(state)
-        except (ValueError, KeyError) as error:
-            raise self._unusable(error) from error
-
-    def _unusable(self, error: Exception) -> InputError:
-        return InputError(
-            self.source, "", f"no usable checkpoint ({error})", "a file saved by a session of this system"
-        )
+            put_back(estimator, self.estimator)
+        except (msgspec.DecodeError, ValueError) as error:
+            raise _unusable(self.source, error) from None
 
 
-def _identity(estimator: Estimator) -> str:
-    return json.dumps({"system": describe(estimator.system), "channels": estimator.channels}, sort_keys=True)
+def _difference(saved: Head, here: Head) -> tuple[str, str]:
+    """What a checkpoint is of, and what it should be of."""
+    if saved.channels != here.channels:
+        return f"a checkpoint of channels {', '.join(saved.channels)}", ", ".join(here.channels)
+    keys = sorted(
+        key for key in saved.system.keys() | here.system.keys() if saved.system.get(key) != here.system.get(key)
+    )
+    names = [head.system.get("name") for head in (saved, here)]
+    return f"a checkpoint of system {names[0]}", f"system {names[1]}, which differs in {', '.join(keys)}"
+
+
+def _unusable(source: str, error: Exception) -> InputError:
+    return InputError(source, "", f"no usable checkpoint ({error})", EXPECTED)

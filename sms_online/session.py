@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from io import BytesIO
 from itertools import chain
 from pathlib import Path
 from time import perf_counter
@@ -172,11 +171,11 @@ class Session:
         Limitations: the running diagnosis begins anew; samples before are no longer searched, and what it has found by
         then is in the estimate if it was adopted, but no longer among the findings. InputError where `saved` is none.
         """
-        checkpoint = Checkpoint.read(BytesIO(saved), "saved session")
-        begun = checkpoint.begun
+        checkpoint = Checkpoint.from_bytes(saved, "saved session")
+        begun = dict(checkpoint.head.begun)
         if not begun:
             raise InputError("saved session", "", "a checkpoint of another kind", "what Session.save gave")
-        system = System.model_validate(checkpoint.identity["system"])
+        system = System.model_validate(checkpoint.head.system)
         return Session(system, begun.pop("channels"), checkpoint=checkpoint, **begun)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Mapping
 from pathlib import Path
 from types import ModuleType
@@ -37,5 +38,6 @@ def windage() -> type[Force]:
 def fading(n: int, memory: float) -> Tracker:
     """The tracker, of n parameters and a memory in s."""
     module = ModuleType("fading")
+    sys.modules[module.__name__] = module  # where the annotations of its state are evaluated
     exec(compile(code_of("add-a-tracker.md", "from __future__"), "add-a-tracker.md", "exec"), module.__dict__)
     return cast(Tracker, module.__dict__["FadingLeastSquares"](n, memory))

@@ -23,7 +23,7 @@ def _rows(windows: int, noise: float, lack: float, seed: int = 0) -> RowGrams:
     lack: of the second, a share.
     """
     random = np.random.default_rng(seed)
-    grams = RowGrams(2, 2)
+    grams = RowGrams.none(2, 2)
     deviation = noise * np.array([[1.0], [np.sqrt(TRUE @ TRUE)]])
     for _ in range(windows):
         x, y, u, other = random.standard_normal(4)
@@ -68,7 +68,7 @@ def test_noise_of_rows_without_a_torque_does_not_shrink_the_parameters() -> None
 
 def test_a_badly_explained_torque_does_not_enlarge_the_parameters() -> None:
     random = np.random.default_rng(1)
-    grams = RowGrams(1, 1)
+    grams = RowGrams.none(1, 1)
     for _ in range(4000):
         x, other = random.standard_normal(2)
         rows, added = np.array([[x, 2.0 * x + 6.0 * other]]), np.array([[1e-4, 0.0]])

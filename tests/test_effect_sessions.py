@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
+from saved import resumed
 from scipy.integrate import solve_ivp
 
 from sms_adapters.truth import read_truth
@@ -209,9 +210,7 @@ def test_effects_with_internal_states_are_identified_and_survive_a_restart() -> 
         whole.push(block)
         parted.push(block)
         if k == 0:
-            saved = parted.state()
-            parted = Estimator(stated, blocks[0].channels, "session")
-            parted.restore(saved)
+            parted = resumed(Estimator(stated, blocks[0].channels, "session"), parted)
     whole.finish()
     parted.finish()
     assert whole.by_momentum
@@ -325,9 +324,7 @@ def test_conditioning_is_the_same_however_samples_arrive_and_after_a_restart() -
     pieces = []
     for part in np.split(np.arange(400), [3, 50, 51, 130]):
         pieces += stage.push(GridSamples(index[part], values[part], 0))
-        saved = stage.state()
-        stage = Conditioning(system, channels)
-        stage.restore(saved)
+        stage = resumed(Conditioning(system, channels), stage)
     assert np.array_equal(np.concatenate([piece.values for piece in pieces]), whole.values)
     assert np.array_equal(np.concatenate([piece.index for piece in pieces]), whole.index)
     # All channels are passed on for the same instants, and a gap begins anew.

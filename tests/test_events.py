@@ -9,6 +9,7 @@ import pytest
 from axis import AXIS, DAMPING, INERTIA
 from changed_session import changed_session, noisy
 from evaluated import judged, results_document, standard_deviation
+from saved import resumed
 
 from sms_adapters.system_file import load_system
 from sms_online.description.parse import parse_system
@@ -224,8 +225,7 @@ def test_a_saved_session_goes_on_to_the_same_bits(saved_at: float) -> None:
     whole.push(first)
     assert whole.momentum is not None
     assert (whole.momentum.changes.detector.alarm is not None) == (saved_at == 11.0)
-    continued = Estimator(SYSTEM, block.channels, "test")
-    continued.restore(whole.state())
+    continued = resumed(Estimator(SYSTEM, block.channels, "test"), whole)
     for estimator in (whole, continued):
         estimator.push(second)
         estimator.finish()

@@ -142,7 +142,7 @@ def test_the_walk_of_a_kalman_tracker_stops_at_its_initial_std() -> None:
     tracker.update(quiet)
     lost = tracker.estimate()
     assert not lost.determined.any()
-    np.testing.assert_allclose(np.diag(tracker.state()["P"]), 1.0, rtol=1e-12)
+    np.testing.assert_allclose(np.diag(tracker.state.P), 1.0, rtol=1e-12)
     again = exciting_rows(seed=29, count=300, pi=-PI_TRUE)
     tracker.update(Rows(again.Y, again.b, again.std, again.t + 30_000.0))
     estimate = tracker.estimate()

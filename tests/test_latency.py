@@ -9,6 +9,7 @@ import pytest
 from axis import AXIS
 from bus_streams import AxisBus, axis_testbed, merged
 from evaluated import results_document
+from saved import resumed
 
 from sms_online.description.parse import parse_system
 from sms_online.description.schema import Sensor, System
@@ -74,8 +75,7 @@ def test_what_is_known_of_latencies_is_saved_with_the_session(tmp_path: Path) ->
     whole = Estimator(system, blocks[0].channels, "made up")
     for block in blocks[:half]:
         whole.push(block)
-    continued = Estimator(system, blocks[0].channels, "made up")
-    continued.restore(whole.state())
+    continued = resumed(Estimator(system, blocks[0].channels, "made up"), whole)
     for estimator in (whole, continued):
         for block in blocks[half:]:
             estimator.push(block)

@@ -231,14 +231,14 @@ def test_a_checkpoint_is_there_while_the_session_runs_and_goes_on_to_the_same_bi
     states: list[tuple[bytes, int]] = []
 
     def look() -> None:
-        path = bench.directory / "checkpoint.npz"
+        path = bench.directory / "checkpoint.msgpack"
         if path.is_file() and bench.estimator.samples > 3000 and not states:
             states.append((path.read_bytes(), bench.estimator.samples))
 
     bench.run(21.0, look)
-    (tmp_path / "killed.npz").write_bytes(states[0][0])
+    (tmp_path / "killed.msgpack").write_bytes(states[0][0])
     resumed = Estimator(system, bench.merger.channels, "resumed")
-    read_checkpoint(tmp_path / "killed.npz").put_into(resumed)
+    read_checkpoint(tmp_path / "killed.msgpack").put_into(resumed)
     assert 0 < resumed.samples <= states[0][1]
     skip = resumed.samples
     for block in open_source(bench.directory, system, directory=tmp_path):

@@ -8,6 +8,7 @@ from axis import AXIS, DAMPING, INERTIA
 from evaluated import results_document
 from model_systems import FRICTION, paper, spatial
 from prescribed_motion import prescribed
+from saved import resumed
 
 from sms_adapters.system_file import load_system
 from sms_online.description.parse import parse_system
@@ -199,8 +200,8 @@ def test_no_window_spans_a_gap_and_none_beside_it_is_lost() -> None:
     for begin, end in ((0, 1500), (1700, 2500), (2600, 4000)):
         first = begin + balance.lead + balance.width
         expected += (end - balance.margin - 1) // balance.hop - -(-first // balance.hop) + 1
-    assert momentum.windows == expected
-    assert momentum.dropped_windows == 0
+    assert momentum.grams.windows == expected
+    assert momentum.state.dropped_windows == 0
 
 
 @pytest.mark.parametrize("cut", [0.2, 1.2, 1.6, 3.0], ids=lambda cut: f"at {cut} s")
@@ -211,7 +212,7 @@ def test_a_session_restored_at_any_time_gives_the_same_bits(cut: float) -> None:
     first = Estimator(parse_system(AXIS, "axis.toml"), block.channels, "axis")
     first.push(Block(block.t[:split], block.channels, block.values[:split]))
     second = Estimator(parse_system(AXIS, "axis.toml"), block.channels, "axis")
-    second.restore(first.state())
+    resumed(second, first)
     second.push(Block(block.t[split:], block.channels, block.values[split:]))
     second.finish()
     assert results_document(second, 0.0, []) == results_document(fitted(block), 0.0, [])
@@ -228,10 +229,10 @@ def test_a_session_restored_while_new_weights_are_told_windows_gives_the_same_bi
         split = int(np.searchsorted(block.t, cut))
         first = Estimator(parse_system(AXIS, "axis.toml"), block.channels, "axis")
         first.push(Block(block.t[:split], block.channels, block.values[:split]))
-        saved = first.state()
-        warm.append(saved["momentum_fit"]["warm"] >= 0)
+        assert first.momentum is not None
+        warm.append(first.momentum.fit.state.warm is not None)
         second = Estimator(parse_system(AXIS, "axis.toml"), block.channels, "axis")
-        second.restore(saved)
+        resumed(second, first)
         second.push(Block(block.t[split:], block.channels, block.values[split:]))
         second.finish()
         assert results_document(second, 0.0, []) == results_document(fitted(block), 0.0, [])

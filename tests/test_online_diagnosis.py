@@ -11,6 +11,7 @@ from axis import DAMPING, INERTIA
 from axis_effects import BARE, COGGING, PHASE, SYSTEM, axis_block, cogging, nothing
 from changed_session import changed_session, noisy
 from evaluated import elsewhere, results_document
+from saved import resumed
 
 from sms_adapters.system_file import load_system
 from sms_online.description.schema import Effect, System
@@ -173,8 +174,7 @@ def test_a_session_with_an_adopted_effect_is_saved_and_goes_on_to_the_same_bits(
     running.push(first)
     assert running.momentum is not None
     assert [effect.name for effect in running.momentum.changes.adopted] == ["cogging"]
-    continued = Estimator(SYSTEM, block.channels, "continued")
-    continued.restore(running.state())
+    continued = resumed(Estimator(SYSTEM, block.channels, "continued"), running)
     running.observers.clear()
     for estimator in (running, continued):
         estimator.push(second)

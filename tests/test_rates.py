@@ -236,17 +236,6 @@ def test_blocks_do_not_change_a_bit() -> None:
         assert all(np.array_equal(a, b) for a, b in zip(found, reference, strict=True))
 
 
-@pytest.mark.parametrize("cut", [700, 2300])
-def test_a_restored_stage_continues_identically(cut: int) -> None:
-    values = noisy_capture()
-    reference = joined(run(RatesStage(RATE, (0, 1), UNSTATED), values))
-    first, second = RatesStage(RATE, (0, 1), UNSTATED), RatesStage(RATE, (0, 1), UNSTATED)
-    pieces = first.push(GridSamples(np.arange(cut), values[:cut], 0))
-    second.restore(first.state())
-    pieces += second.push(GridSamples(np.arange(cut, 5000), values[cut:], 0)) + second.flush()
-    assert all(np.array_equal(a, b) for a, b in zip(joined(pieces), reference, strict=True))
-
-
 def test_each_segment_loses_only_its_borders() -> None:
     positions, rates = motion(6000)
     stage = RatesStage(RATE, (0, 1, 2), UNSTATED)

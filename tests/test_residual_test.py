@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from axis import AXIS
+from saved import resumed
 from scipy.integrate import quad
 from scipy.stats import chi2
 
@@ -85,7 +86,7 @@ def test_a_row_type_notices_what_none_of_its_coordinates_shows_alone() -> None:
     test = after(errors)
     assert test.alarm is not None
     assert test.alarm.row == "link_1"
-    assert test._sums[:, : LAYOUT.n_v].max() < test.limit
+    assert test.state.sums[:, : LAYOUT.n_v].max() < test.limit
 
 
 def test_bursts_of_two_windows_do_not_alarm() -> None:
@@ -115,10 +116,8 @@ def test_a_saved_test_goes_on_as_if_it_had_not_been() -> None:
         if k >= 70:
             continued.push(rows, factor)
         if k == 69:
-            continued.restore({name: np.asarray(value) for name, value in whole.state().items()})
+            resumed(continued, whole)
     assert whole.alarm is not None
     assert continued.alarm == whole.alarm
     assert continued.evidence == whole.evidence
-    again = SequentialTest(LAYOUT, HOP)
-    again.restore({name: np.asarray(value) for name, value in whole.state().items()})
-    assert again.alarm == whole.alarm
+    assert resumed(SequentialTest(LAYOUT, HOP), whole).alarm == whole.alarm

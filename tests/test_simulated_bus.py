@@ -161,7 +161,7 @@ def test_a_live_session_that_is_stopped_has_saved_everything_and_replays_to_the_
     assert "link_1.inertia" in out
     assert "samples/s" in err
     files = {path.name for path in (tmp_path / "run").iterdir()}
-    assert files >= {"session.toml", "system.toml", DBC, "can.log", "results.json", "checkpoint.npz"}
+    assert files >= {"session.toml", "system.toml", DBC, "can.log", "results.json", "checkpoint.msgpack"}
     system = str(tmp_path / "run" / "system.toml")
     assert main(["replay", str(tmp_path / "run"), "--system", system, "--out", str(tmp_path / "again")]) in (0, 3)
     assert document(tmp_path / "again") == document(tmp_path / "run")
@@ -175,7 +175,7 @@ def test_after_a_kill_the_recording_is_readable_and_a_new_session_resumes(
     process = live(file, tmp_path / "killed")
     moving.start()
     end = time.monotonic() + 30.0
-    while not (tmp_path / "killed" / "checkpoint.npz").exists():
+    while not (tmp_path / "killed" / "checkpoint.msgpack").exists():
         assert time.monotonic() < end
         time.sleep(0.1)
     process.kill()

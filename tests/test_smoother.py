@@ -141,8 +141,8 @@ def test_the_same_samples_give_the_same_bits_however_they_come(
     whole.finish()
     for piece in pieces(cuts[:4]):
         stopped.push(piece)
-    write_checkpoint(tmp_path / "half.npz", Checkpoint.of(stopped))
-    read_checkpoint(tmp_path / "half.npz").put_into(resumed)
+    write_checkpoint(tmp_path / "half.msgpack", Checkpoint.of(stopped))
+    read_checkpoint(tmp_path / "half.msgpack").put_into(resumed)
     for piece in pieces(cuts[3:]):
         resumed.push(piece)
     resumed.finish()
@@ -161,7 +161,7 @@ def test_a_gap_of_the_torque_begins_a_new_span_and_holes_of_other_channels_do_no
     holed = session(one_link("linear"), Block(block.t, block.channels, values))
     for estimator, spans in ((parted, 2), (holed, 1)):
         assert estimator.smoother is not None
-        assert estimator.smoother.spans == spans
+        assert estimator.smoother.known.spans == spans
         assert np.all(np.abs(normalised(estimator)) < 4.0)
 
 
@@ -172,8 +172,8 @@ def test_friction_that_the_model_lacks_widens_the_error_bars() -> None:
     assert lacking.smoother is not None
     assert holding.smoother is not None
     assert lacking.by_smoother
-    assert lacking.smoother.level > 0.0
-    assert holding.smoother.level == 0.0
+    assert lacking.smoother.known.level > 0.0
+    assert holding.smoother.known.level == 0.0
     assert any(
         "do not agree with the equations" in warning for warning in results_document(lacking, 1.0, [])["warnings"]
     )

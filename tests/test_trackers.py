@@ -4,14 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from functools import partial
-from pathlib import Path
 
+import msgspec
 import numpy as np
 import pytest
 from batch_solution import batch_least_squares
+from saved import resumed
 from scipy.signal import lfilter
 from tracker_rows import ALL_FORGETTING, PI_TRUE, TRACKERS, N, exciting_rows, ill_conditioned_rows, kalman, rows_of
 
+from sms_online.state import snapshot
 from sms_online.stream import Array
 from sms_online.trackers import (
     Directional,
@@ -121,36 +123,37 @@ def test_partition_changes_no_bit_while_clusters_merge() -> None:
 
 
 @pytest.mark.parametrize("name", TRACKERS)
-def test_a_restored_tracker_continues_bit_for_bit(name: str, tmp_path: Path) -> None:
+def test_a_restored_tracker_continues_bit_for_bit(name: str) -> None:
     rows = exciting_rows(seed=13, count=1777)
     first = Rows(rows.Y[:1000], rows.b[:1000], rows.std[:1000], rows.t[:1000])
     rest = Rows(rows.Y[1000:], rows.b[1000:], rows.std[1000:], rows.t[1000:])
     original = TRACKERS[name]()
     original.update(first)
-    np.savez(tmp_path / "state.npz", **original.state())  # type: ignore[arg-type]
-    with np.load(tmp_path / "state.npz") as file:
-        restored = TRACKERS[name]()
-        restored.restore(dict(file))
+    restored = resumed(TRACKERS[name](), original)
     assert_same_bits(original, restored)
     original.update(rest)
     restored.update(rest)
     assert_same_bits(original, restored)
 
 
-def test_a_state_that_does_not_fit_is_refused_and_leaves_the_tracker_as_it_was() -> None:
-    saved = RecursiveLeastSquares(4, Exponential(0.99)).state()
-    tracker = RecursiveLeastSquares(N)
-    tracker.update(exciting_rows(seed=14, count=100))
-    before = tracker.estimate().pi
-    with pytest.raises(ValueError, match="saved tracker state"):
-        tracker.restore(saved)
-    with pytest.raises(ValueError, match="saved tracker state"):
-        tracker.restore(RecursiveLeastSquares(N, SlidingWindow(100)).state())
-    assert np.array_equal(tracker.estimate().pi, before)
+@pytest.mark.parametrize("other", [Exponential(0.99), SlidingWindow(100)])
+def test_the_state_of_another_kind_of_tracker_is_refused(other: Forgetting) -> None:
+    with pytest.raises(msgspec.ValidationError, match=r"missing required field|states of|no state"):
+        resumed(RecursiveLeastSquares(N), RecursiveLeastSquares(N, other))
 
 
 @pytest.mark.parametrize("name", TRACKERS)
-def test_a_tracker_goes_on_from_what_others_know(name: str, tmp_path: Path) -> None:
+def test_a_snapshot_stays_while_its_tracker_goes_on(name: str) -> None:
+    tracker, alike = TRACKERS[name](), TRACKERS[name]()
+    for each in (tracker, alike):
+        each.update(exciting_rows(seed=14, count=1777))
+    then = snapshot(tracker)
+    tracker.update(exciting_rows(seed=30, count=1777))
+    assert_same_bits(then, alike)
+
+
+@pytest.mark.parametrize("name", TRACKERS)
+def test_a_tracker_goes_on_from_what_others_know(name: str) -> None:
     """As when a session goes on with further parameters: what was known of the old ones is known to a new tracker."""
     rows = exciting_rows(seed=18, count=640)
     known = Information.none(N - 1).with_rows(rows.whitened(N)[:, 1:]).widened(1)
@@ -162,10 +165,7 @@ def test_a_tracker_goes_on_from_what_others_know(name: str, tmp_path: Path) -> N
     np.testing.assert_allclose(estimate.pi[:-1], expected.pi[:-1], rtol=1e-4)
     np.testing.assert_allclose(estimate.std[:-1], np.sqrt(np.diag(expected.covariance()))[:-1], rtol=1e-4)
     assert estimate.rows == 640
-    restored = TRACKERS[name]()
-    np.savez(tmp_path / "state.npz", **tracker.state())  # type: ignore[arg-type]
-    with np.load(tmp_path / "state.npz") as file:
-        restored.restore(dict(file))
+    restored = resumed(TRACKERS[name](), tracker)
     later = exciting_rows(seed=20, count=320)
     for each in (tracker, restored):
         each.update(later)

@@ -7,9 +7,7 @@ is read too large by n(t) adds ∫ φ n dt to b, so N. With the right geometry m
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from itertools import chain
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,6 +21,7 @@ from sms_online.pipeline.momentum_windows import EXPONENT, INSTANTS, STEPS
 from sms_online.pipeline.sensing import Sensing
 from sms_online.pipeline.sensitivity import SPARSE, Sensitivity, nodes
 from sms_online.pipeline.weak_form import test_function
+from sms_online.state import Stage, State
 from sms_online.stream import Array
 
 # Degree of splines between instants: of a vibration of 10 Hz, 50 times a second, it loses a thousandth, a cubic a
@@ -44,7 +43,21 @@ def _interpolation(at: NDArray[np.int64], derivative: int = 0) -> Array:
     return np.asarray(make_interp_spline(at, np.eye(at.size), DEGREE)(fine, derivative))
 
 
-class CalibrationColumns:
+class CalibrationState(State):
+    """What nuisances change at a segment's instants.
+
+    From instant number `first` on: what a position sensor reads too much, added (K, sensors, ·), a torque, torque
+    (K, joints, ·), and by what another geometry changes momentum and force (K, n_v, ·), each by nuisance.
+    """
+
+    first: int
+    added: Array
+    torque: Array
+    momentum: Array
+    force: Array
+
+
+class CalibrationColumns(Stage):
     """Evaluates the columns window by window, at the instants of the sensitivities.
 
     count: of nuisances.
@@ -71,10 +84,12 @@ class CalibrationColumns:
         sensors = len(self._sensing.position_columns)
         widths = [sum(len(each.nuisances) for each in family) for family in (self._positions, self._torques)]
         moved = self.count - sum(widths)
-        self._first = next_instant
-        self._added = np.empty((0, sensors, widths[0]))
-        self._torque = np.empty((0, len(layout.q), widths[1]))
-        self._momentum, self._force = np.empty((2, 0, layout.n_v, moved))
+        self.state = CalibrationState(
+            next_instant,
+            np.empty((0, sensors, widths[0])),
+            np.empty((0, len(layout.q), widths[1])),
+            *np.empty((2, 0, layout.n_v, moved)),
+        )
 
     def tell(self, pi: Array, x: Array, v: Array, signals: Array, rates: Array) -> None:
         """Take the next instants: x (K, n_x), v (K, n_v), signals as in `Instants`, with parameters π (n_pi,).
@@ -87,13 +102,13 @@ class CalibrationColumns:
         _, T_0 = self._model.layout.base_pose(x)
         motion = Motion(self._sensing.readings(x), rates, torque, T_0)
         K = len(x)
-        added = [np.empty((K, *self._added.shape[1:2], 0)), *(family.adds(motion) for family in self._positions)]
-        torques = [np.empty((K, *self._torque.shape[1:2], 0)), *(family.adds(motion) for family in self._torques)]
+        added = [np.empty((K, *self.state.added.shape[1:2], 0)), *(family.adds(motion) for family in self._positions)]
+        torques = [np.empty((K, *self.state.torque.shape[1:2], 0)), *(family.adds(motion) for family in self._torques)]
         momentum, force = self._geometry.at(pi, x, v, signals)
-        self._added = np.concatenate((self._added, np.concatenate(added, axis=2)))
-        self._torque = np.concatenate((self._torque, np.concatenate(torques, axis=2)))
-        self._momentum = np.concatenate((self._momentum, momentum))
-        self._force = np.concatenate((self._force, force))
+        self.state.added = np.concatenate((self.state.added, np.concatenate(added, axis=2)))
+        self.state.torque = np.concatenate((self.state.torque, np.concatenate(torques, axis=2)))
+        self.state.momentum = np.concatenate((self.state.momentum, momentum))
+        self.state.force = np.concatenate((self.state.force, force))
 
     def _kernel(self, offset: int, span: float) -> Array:
         """Weights (INSTANTS + 1, ·) of H, ∂Pπ/∂x, ∂Gπ/∂v and ∂Gπ/∂x in the integral of c times what is added.
@@ -115,35 +130,22 @@ class CalibrationColumns:
         n_v, sensors = sensitivity.H.shape[1:]
         if not self.count:
             return np.empty((n_v, 0))
-        inside = slice(start - self._first, start - self._first + INSTANTS + 1)
+        inside = slice(start - self.state.first, start - self.state.first + INSTANTS + 1)
         told = (sensitivity.H, sensitivity.P_x, sensitivity.G_v, sensitivity.G_x)
         weights = self._kernels[sensitivity.offset] @ np.concatenate(told).reshape(-1, n_v * sensors)
         weights += self._to_steps.T @ rough.reshape(STEPS + 1, -1)
         flat = weights.reshape(-1, n_v, sensors).swapaxes(0, 1).reshape(n_v, -1)
-        positions = -flat @ self._added[inside].reshape(flat.shape[1], -1)
-        torques = np.zeros((n_v, self._torque.shape[2]))
-        torques[self._joint_rows] = np.tensordot(self._phi, self._torque[inside], 1)
-        moved = -np.tensordot(self._phi_dot, self._momentum[inside], 1)
-        moved -= np.tensordot(self._phi, self._force[inside], 1)
+        positions = -flat @ self.state.added[inside].reshape(flat.shape[1], -1)
+        torques = np.zeros((n_v, self.state.torque.shape[2]))
+        torques[self._joint_rows] = np.tensordot(self._phi, self.state.torque[inside], 1)
+        moved = -np.tensordot(self._phi_dot, self.state.momentum[inside], 1)
+        moved -= np.tensordot(self._phi, self.state.force[inside], 1)
         return np.concatenate((positions, torques, moved), axis=1)
 
     def drop(self, before: int) -> None:
         """Forget instants with smaller numbers."""
         if self.count:
-            kept = slice(before - self._first, None)
-            self._added, self._torque = self._added[kept], self._torque[kept]
-            self._momentum, self._force = self._momentum[kept], self._force[kept]
-        self._first = before
-
-    def state(self) -> dict[str, Any]:
-        """What `restore` needs to continue."""
-        return {
-            "calibration_first": self._first, "calibration_added": self._added, "calibration_torque": self._torque,
-            "calibration_momentum": self._momentum, "calibration_force": self._force,
-        }  # fmt: skip
-
-    def restore(self, state: Mapping[str, NDArray[Any]]) -> None:
-        """Continue from a saved state."""
-        self._first = int(state["calibration_first"])
-        self._added, self._torque = np.array(state["calibration_added"]), np.array(state["calibration_torque"])
-        self._momentum, self._force = np.array(state["calibration_momentum"]), np.array(state["calibration_force"])
+            kept = slice(before - self.state.first, None)
+            self.state.added, self.state.torque = self.state.added[kept], self.state.torque[kept]
+            self.state.momentum, self.state.force = self.state.momentum[kept], self.state.force[kept]
+        self.state.first = before

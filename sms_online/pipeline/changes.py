@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import json
-from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
@@ -35,6 +34,7 @@ from sms_online.pipeline.sensing import Sensing
 from sms_online.pipeline.sensor_noise import SensorNoise
 from sms_online.pipeline.synchronise import GridSamples
 from sms_online.pipeline.window_noise import WindowNoise
+from sms_online.state import Stage, State
 from sms_online.stream import Array
 from sms_online.trackers.information import Information
 from sms_online.trackers.interface import Prior
@@ -64,31 +64,67 @@ class Adoption:
     samples: GridSamples
 
 
-class Changes:
+class ChangesState(State):
+    """Events so far, and what the next one is decided by.
+
+    index (B,), values (B, ·): samples of the last segment, as far back as windows are remembered. events: so far;
+    added: names of the parameters that they have added, adopted: effects among these. clear: grid index from which on
+    no sample is from before the event. wanted: windows after it that the next decision takes.
+    """
+
+    index: NDArray[np.int64]
+    values: Array
+    events: list[Event] = msgspec.field(default_factory=list)
+    added: list[str] = msgspec.field(default_factory=list)
+    adopted: tuple[Effect, ...] = ()
+    segment: int = -1
+    clear: int = 0
+    wanted: int = DECISION
+
+
+class Changes(Stage):
     """Events of one session.
 
-    model, base: current ones, with what events have added to the system's own. adopted: effects among that. Information
-    is on the session's nuisances and then on the parameters.
+    model, base: current ones, with what events have added to the system's own. Information is on the session's
+    nuisances and then on the parameters. renewed: called when a saved state has put other events here.
     """
 
     def __init__(
-        self, model: Model, base: BaseParameters, sensing: Sensing, nuisances: Sequence[Nuisance] = ()
+        self,
+        model: Model,
+        base: BaseParameters,
+        sensing: Sensing,
+        nuisances: Sequence[Nuisance],
+        renewed: Callable[[], None],
     ) -> None:
         self.model, self.base = model, base
         self._nuisances = tuple(nuisances)
-        self.events: list[Event] = []
         self._system, self._described = model.system, base
         self._sensing = sensing
-        self._added: list[str] = []
-        self.adopted: tuple[Effect, ...] = ()
+        self._renewed = renewed
         rate, span = self._system.sample_rate, self._system.windows.momentum
         self._half_hop = max(1, round(span * rate / INSTANTS))
         self.detector = self._new_detector()
-        self._segment = -1
-        self._index = np.empty(0, dtype=np.int64)
-        self._values = np.empty((0, len(sensing.channels) + model.n_states))
-        self._clear = 0  # grid index from which on no sample is from before the event
-        self._wanted = DECISION
+        columns = len(sensing.channels) + model.n_states
+        self.state = ChangesState(np.empty(0, dtype=np.int64), np.empty((0, columns)))
+
+    def renew(self) -> None:
+        """See Stage."""
+        if self.events:
+            adopted, self.state.adopted = self.state.adopted, ()
+            self._follow_adopted(adopted)
+            self.detector = self._new_detector()
+            self._renewed()
+
+    @property
+    def events(self) -> list[Event]:
+        """Of the session so far."""
+        return self.state.events
+
+    @property
+    def adopted(self) -> tuple[Effect, ...]:
+        """Effects that the session goes on with, beside those of the system."""
+        return self.state.adopted
 
     def _new_detector(self) -> ChangeDetector:
         n, hop = len(self._nuisances) + self.base.n, 2 * self._half_hop / self._system.sample_rate
@@ -113,19 +149,21 @@ class Changes:
 
     def keep(self, piece: GridSamples) -> None:
         """Remember samples of the grid: those of one segment, as far back as windows are remembered."""
-        if piece.segment != self._segment:
-            self._segment, self._clear = piece.segment, int(piece.index[0])
-            self._index, self._values = self._index[:0], self._values[:0]
+        if piece.segment != self.state.segment:
+            self.state.segment, self.state.clear = piece.segment, int(piece.index[0])
+            self.state.index, self.state.values = self.state.index[:0], self.state.values[:0]
         kept = 2 * REMEMBERED * self._half_hop + self.window_samples + 2 * MARGIN
-        self._index = np.concatenate((self._index, piece.index))[-kept:]
-        self._values = np.concatenate((self._values, piece.values))[-kept:]
+        self.state.index = np.concatenate((self.state.index, piece.index))[-kept:]
+        self.state.values = np.concatenate((self.state.values, piece.values))[-kept:]
 
     @property
     def windows_after(self) -> int:
         """Number of windows that samples from after the event give."""
-        if self.detector.alarm is None or self._index.size == 0:
+        if self.detector.alarm is None or self.state.index.size == 0:
             return 0
-        samples = int(self._index[-1]) - max(self.detector.alarm, self._clear) - self.window_samples - 2 * MARGIN
+        samples = (
+            int(self.state.index[-1]) - max(self.detector.alarm, self.state.clear) - self.window_samples - 2 * MARGIN
+        )
         return max(0, samples // (2 * self._half_hop))
 
     def decide(self, noise: SensorNoise, start_time: float, last: bool) -> Adoption | None:
@@ -134,18 +172,18 @@ class Changes:
         start_time: s of grid index 0.
         """
         alarm = self.detector.alarm
-        if alarm is None or self.windows_after < (LEAST_DECISION if last else self._wanted):
+        if alarm is None or self.windows_after < (LEAST_DECISION if last else self.state.wanted):
             return None
         whole = changed_model(self.model, everything(self._system))
         names = additional(self._system, whole, self.base)
-        base = extended(self._described, whole, [*self._added, *names])
+        base = extended(self._described, whole, [*self.state.added, *names])
         onset = self.detector.onset - MARGIN
         before = self.detector.before(onset) or self.detector.history[0]
-        explanation = self._explain(whole, base, before, max(alarm, self._clear), noise)
+        explanation = self._explain(whole, base, before, max(alarm, self.state.clear), noise)
         if not (explanation.explained and explanation.decisive) and self.windows_after < LONGEST_DECISION and not last:
-            self._wanted = self.windows_after + DECISION
+            self.state.wanted = self.windows_after + DECISION
             return None
-        self._wanted = DECISION
+        self.state.wanted = DECISION
         return self._adopt(whole, base, explanation, onset, alarm, start_time)
 
     def abandon(self, start_time: float) -> Adoption | None:
@@ -156,18 +194,20 @@ class Changes:
         before = self.detector.before(onset) or self.detector.history[0]
         time = start_time + 0.5 * (onset + self.detector.alarm) / self._system.sample_rate
         dropped = sum(seen.end > before.end for seen in self.detector.history)
-        self.events.append(Event(time, "undecided", (), (), (), (), dropped))
+        self.state.events.append(Event(time, "undecided", (), (), (), (), dropped))
         weights = self.parameters(before.known)
-        nothing = GridSamples(self._index[:0], self._values[:0], self._segment)
+        nothing = GridSamples(self.state.index[:0], self.state.values[:0], self.state.segment)
         return Adoption(self.model, self.base, before.known, weights, nothing)
 
     def _explain(self, model: Model, base: BaseParameters, before: Seen, start: int, noise: SensorNoise) -> Explanation:
         n, m = self.base.n, len(self._nuisances)
         jumps = [replace(jump, columns=tuple(m + k for k in jump.columns)) for jump in hypotheses(base.parameters)]
-        after = self._index >= start
-        values = self._values[after]
+        after = self.state.index >= start
+        values = self.state.values[after]
         balance = MomentumBalance(model, base, self._system.sample_rate, self._system.windows.momentum)
-        windows, instants = balance.push(self._index[after], [self._sensing.motion(values)] * COPIES, noise.coordinates)
+        windows, instants = balance.push(
+            self.state.index[after], [self._sensing.motion(values)] * COPIES, noise.coordinates
+        )
         weights = np.zeros(base.n)
         weights[:n] = self.parameters(before.known)
         # What the rows before left decides, where it is more than noise.
@@ -200,11 +240,11 @@ class Changes:
         if jump is not None:
             by = np.zeros(whole.n_pi)
             by[[base.independent[k] for k in columns]] = explanation.sizes
-            x, signals = self._sensing.coordinates(self._values), self._sensing.signals(self._values)
+            x, signals = self._sensing.coordinates(self.state.values), self._sensing.signals(self.state.values)
             between = (onset - self.window_samples // 2, alarm)
             instant = event_instant(
-                whole, by, explanation.beta, self.detector.history, self._index, x, signals, between, self._half_hop,
-                self._system.sample_rate,
+                whole, by, explanation.beta, self.detector.history, self.state.index, x, signals, between,
+                self._half_hop, self._system.sample_rate,
             )  # fmt: skip
         guard = GUARD * self._half_hop
         first, last = (onset, alarm) if instant is None else (int(instant) - guard, int(np.ceil(instant)) + guard)
@@ -212,7 +252,7 @@ class Changes:
         before = self.detector.before(first - MARGIN) or self.detector.history[0]
         fresh = [base.parameters[k].name for k in columns if k >= n]
         if fresh:
-            self._added += fresh
+            self.state.added += fresh
             self._extend()
         names = [p.name for p in self.base.parameters]
         jumped = [names.index(base.parameters[k].name) for k in columns]
@@ -233,9 +273,9 @@ class Changes:
             stds=tuple(float(std) for std in explanation.stds[: len(jumped)]),
             dropped_windows=sum(first - MARGIN < seen.end <= reach for seen in self.detector.history),
         )
-        self.events.append(event)
-        after = self._index >= max(last, self._clear)
-        samples = GridSamples(self._index[after], self._values[after], self._segment)
+        self.state.events.append(event)
+        after = self.state.index >= max(last, self.state.clear)
+        samples = GridSamples(self.state.index[after], self.state.values[after], self.state.segment)
         self.detector = self._new_detector()
         self.detector.begin(known)
         return Adoption(self.model, self.base, known, weights, samples)
@@ -249,60 +289,37 @@ class Changes:
         in. weights (n + c,): of the parameters, then the effects'. samples: those of the session's last segment that
         hold the effects.
         """
-        self._added += event.parameters
-        self._follow_adopted((*self.adopted, *effects))
+        self.state.added += event.parameters
+        self._follow_adopted((*self.state.adopted, *effects))
         known = known.widened(len(event.parameters))
-        self.events.append(event)
-        self._clear, self._wanted = int(samples.index[0]), DECISION
+        self.state.events.append(event)
+        self.state.clear, self.state.wanted = int(samples.index[0]), DECISION
         self.detector = self._new_detector()
         self.detector.begin(known)
         return Adoption(self.model, self.base, known, weights, samples)
 
     def _follow_adopted(self, adopted: tuple[Effect, ...]) -> None:
-        fresh = adopted[len(self.adopted) :]
+        fresh = adopted[len(self.state.adopted) :]
         self._system = self._system.model_copy(update={"effects": (*self._system.effects, *fresh)})
-        self.adopted = adopted
+        self.state.adopted = adopted
         self._extend()
 
     def prior(self, described: Prior) -> Prior:
         """What is known beforehand of the current parameters: nothing of those that have jumped."""
         more = np.full(self.base.n - described.value.size, np.nan)
         std = np.concatenate((described.std, more))
-        jumped = {name for event in self.events for name in event.parameters}
-        everything_jumped = any(event.kind == "unexplained" for event in self.events)
+        jumped = {name for event in self.state.events for name in event.parameters}
+        everything_jumped = any(event.kind == "unexplained" for event in self.state.events)
         std[[everything_jumped or p.name in jumped for p in self.base.parameters]] = np.nan
         return Prior(np.concatenate((described.value, more)), std)
 
     def _extend(self) -> None:
         """Model and base with the parameters that events have added."""
-        if self._added:
-            self.model = changed_model(self.model, restricted(self._system, self._added))
-            self.base = extended(self._described, self.model, self._added)
-
-    def state(self) -> dict[str, Any]:
-        """What `restore` needs to continue."""
-        return {
-            "events": np.array(json.dumps([asdict(event) for event in self.events])),
-            "added": np.array(json.dumps(self._added)),
-            "adopted": np.array(json.dumps([effect.model_dump() for effect in self.adopted])),
-            "place": np.array([self._segment, self._clear, self._wanted]),
-            "index": self._index,
-            "values": self._values,
-            **self.detector.state(),
-        }
+        if self.state.added:
+            self.model = changed_model(self.model, restricted(self._system, self.state.added))
+            self.base = extended(self._described, self.model, self.state.added)
 
     @property
     def added(self) -> tuple[str, ...]:
         """Names of the parameters that events have added, in their order."""
-        return tuple(self._added)
-
-    def restore(self, state: Mapping[str, NDArray[Any]]) -> None:
-        """Continue from a saved state."""
-        events = [Event.from_saved(entry) for entry in json.loads(str(state["events"]))]
-        adopted = [Effect.model_validate(entry) for entry in json.loads(str(state["adopted"]))]
-        self.events, self._added = events, json.loads(str(state["added"]))
-        self._follow_adopted(tuple(adopted))
-        self._segment, self._clear, self._wanted = (int(number) for number in state["place"])
-        self._index, self._values = np.array(state["index"]), np.array(state["values"])
-        self.detector = self._new_detector()
-        self.detector.restore(state)
+        return tuple(self.state.added)

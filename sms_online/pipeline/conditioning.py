@@ -14,7 +14,8 @@ from scipy.ndimage import correlate1d
 from sms_online.description.schema import System
 from sms_online.effects.catalogue import corrections
 from sms_online.effects.channel import Convolved
-from sms_online.pipeline.synchronise import GridSamples, StageState
+from sms_online.pipeline.synchronise import GridSamples
+from sms_online.state import Stage, State
 from sms_online.stream import Array
 
 
@@ -42,7 +43,17 @@ def noise_gains(system: System, channels: Sequence[str]) -> Array:
     return gains
 
 
-class Conditioning:
+class ConditioningState(State):
+    """What conditioning keeps.
+
+    values (B, C): last samples of a segment, which the next ones ask for.
+    """
+
+    values: Array
+    segment: int = -1
+
+
+class Conditioning(Stage):
     """Corrects the channels of one session by the constants that its system file states.
 
     Lags and delays come off first, for they act on what the sensor reads. InputError as `channel_effects`.
@@ -54,16 +65,15 @@ class Conditioning:
         self._kernels = channel_kernels(system, channels)
         self._of_value = [(k, effect) for k, effect in effects if not isinstance(effect, Convolved)]
         self.margin = max((kernel.size // 2 for kernel in self._kernels.values()), default=0)
-        self._values = np.empty((0, len(channels)))
-        self._segment = -1
+        self.state = ConditioningState(np.empty((0, len(channels))))
 
     def push(self, piece: GridSamples) -> list[GridSamples]:
         """The samples that can be corrected by now."""
-        if piece.segment != self._segment:
-            self._segment = piece.segment
-            self._values = self._values[:0]
-        values = np.concatenate((self._values, piece.values))
-        self._values = values[max(0, len(values) - 2 * self.margin) :]
+        if piece.segment != self.state.segment:
+            self.state.segment = piece.segment
+            self.state.values = self.state.values[:0]
+        values = np.concatenate((self.state.values, piece.values))
+        self.state.values = values[max(0, len(values) - 2 * self.margin) :]
         inner = slice(self.margin, len(values) - self.margin)
         if inner.stop <= inner.start:
             return []
@@ -75,11 +85,3 @@ class Conditioning:
         last = int(piece.index[-1]) - self.margin
         index = np.arange(last + 1 - len(corrected), last + 1, dtype=np.int64)
         return [GridSamples(index, corrected, piece.segment)]
-
-    def state(self) -> StageState:
-        """What `restore` needs to continue."""
-        return {"values": self._values, "segment": np.array(self._segment)}
-
-    def restore(self, state: StageState) -> None:
-        """Continue from a saved state."""
-        self._values, self._segment = np.array(state["values"]), int(state["segment"])

@@ -21,15 +21,14 @@ Reading: the concentrated likelihood of the functional errors-in-variables model
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from sms_online.pipeline.momentum_windows import EXPONENT, HOPS
 from sms_online.pipeline.weak_form import test_function
+from sms_online.state import State
 from sms_online.stream import Array
 from sms_online.trackers.factor import masked_covariance
 from sms_online.trackers.interface import Estimate
@@ -58,16 +57,21 @@ def _overlap() -> float:
 OVERLAP = _overlap()
 
 
-class RowGrams:
+class RowGrams(State):
     """Sums over windows of whitened rows, by generalized speed.
 
     signal (n_v, n + 1, n + 1): Gram matrices of [Y b]. noise: the same of what the sensors' noise adds to the rows, of
     first and of second order, from synthetic noise. windows: how many. No array is written twice, see `PlainRows`.
     """
 
-    def __init__(self, n_v: int, n: int) -> None:
-        self.signal, self.noise = np.zeros((2, n_v, n + 1, n + 1))
-        self.windows = 0
+    signal: Array
+    noise: Array
+    windows: int = 0
+
+    @staticmethod
+    def none(n_v: int, n: int) -> RowGrams:
+        """Of no windows, with rows of n_v speeds and n parameters."""
+        return RowGrams(*np.zeros((2, n_v, n + 1, n + 1)))
 
     def add(self, rows: Array, noisy: Array) -> None:
         """Rows [Y b] (n_v, n + 1) of a window; noisy (2, n_v, n + 1): with synthetic noise added and subtracted."""
@@ -79,15 +83,6 @@ class RowGrams:
     def weaken(self, share: Array) -> None:
         """Have the rows so far count less, (n_v,) of their squares: they were whitened with too small a variance."""
         self.signal, self.noise = share[:, None, None] * self.signal, share[:, None, None] * self.noise
-
-    def state(self) -> dict[str, Any]:
-        """What `restore` needs to continue; it does not change when the session goes on."""
-        return {"signal_grams": self.signal, "noise_grams": self.noise, "gram_windows": self.windows}
-
-    def restore(self, state: Mapping[str, NDArray[Any]]) -> None:
-        """Continue from a saved state."""
-        self.signal, self.noise = np.array(state["signal_grams"]), np.array(state["noise_grams"])
-        self.windows = int(state["gram_windows"])
 
 
 @dataclass(frozen=True)

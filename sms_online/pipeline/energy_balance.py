@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from sms_online.model.base_parameters import BaseParameters
 from sms_online.model.model import Model
+from sms_online.state import Stage, State
 from sms_online.stream import Array
 
 # Rows a second: the balance's own frequencies stay below some 20 Hz; denser rows repeat each other's noise.
@@ -43,7 +44,7 @@ class BalanceRows:
     index: NDArray[np.int64]
 
 
-class SharedErrors:
+class SharedErrors(State):
     """What the errors that rows of a window share do to a least-squares estimate, which takes them for independent.
 
     All rows of a window are differences to its first instant and share that instant's error. The noise of the measured
@@ -51,65 +52,72 @@ class SharedErrors:
     window. An error e that enters every row from row j on moves the estimate by Λ⁻¹ S_j e, Λ = YᵀY, with S_j the sum
     of the window's rows from j on. So the start adds var(e_0) Λ⁻¹ S_1 S_1ᵀ Λ⁻¹ to the covariance, the walk Σ_j q_j S_j
     S_jᵀ in place of S_1 S_1ᵀ, with q_j the variance of the work's noise since the row before.
+
+    starts (n, n): Σ S_1 S_1ᵀ over finished windows; walks (n, n): Σ q_j S_j S_jᵀ. S_j = S_1 - P_j with P_j the sum of
+    the rows before j, so of the open window there is S_1 as `sum` (n,), Σ q_j, Σ q_j P_j and Σ q_j P_j P_jᵀ.
     """
 
-    def __init__(self, n: int) -> None:
-        self._starts = np.zeros((n, n))  # Σ S_1 S_1ᵀ over finished windows
-        self._walks = np.zeros((n, n))  # Σ q_j S_j S_jᵀ over finished windows
-        self.rows = 0
-        self._open(n)
+    starts: Array
+    walks: Array
+    sum: Array
+    qP: Array
+    qPP: Array
+    q: float = 0.0
+    rows: int = 0
 
-    def copy(self) -> SharedErrors:
-        """What is known now, in microseconds; no array is written twice."""
-        out = object.__new__(SharedErrors)
-        vars(out).update(vars(self))
-        return out
-
-    def _open(self, n: int) -> None:
-        # S_j = S_1 - P_j with P_j the sum of the rows before j, so a window needs the q-weighted moments of P alone.
-        self._sum = np.zeros(n)
-        self._q, self._qP, self._qPP = 0.0, np.zeros(n), np.zeros((n, n))
+    @staticmethod
+    def none(n: int) -> SharedErrors:
+        """Of no rows of n parameters."""
+        starts, walks, qPP = np.zeros((3, n, n))
+        total, qP = np.zeros((2, n))
+        return SharedErrors(starts, walks, total, qP, qPP)
 
     def add(self, Y: Array, q: Array) -> None:
         """Rows (M, n) of the open window and the variance (M,) of the work's noise since the row before each, J²."""
-        before = self._sum + np.concatenate((np.zeros((1, Y.shape[1])), np.cumsum(Y, axis=0)[:-1]))
-        self._q += float(q.sum())
-        self._qP = self._qP + q @ before
-        self._qPP = self._qPP + (before * q[:, None]).T @ before
-        self._sum = self._sum + Y.sum(axis=0)
+        before = self.sum + np.concatenate((np.zeros((1, Y.shape[1])), np.cumsum(Y, axis=0)[:-1]))
+        self.q += float(q.sum())
+        self.qP = self.qP + q @ before
+        self.qPP = self.qPP + (before * q[:, None]).T @ before
+        self.sum = self.sum + Y.sum(axis=0)
         self.rows += Y.shape[0]
 
     def _open_walk(self) -> Array:
-        cross = np.outer(self._sum, self._qP)
-        return np.asarray(self._q * np.outer(self._sum, self._sum) - cross - cross.T + self._qPP)
+        cross = np.outer(self.sum, self.qP)
+        return np.asarray(self.q * np.outer(self.sum, self.sum) - cross - cross.T + self.qPP)
 
     def close(self) -> None:
         """The next rows belong to another window."""
-        self._starts = self._starts + np.outer(self._sum, self._sum)
-        self._walks = self._walks + self._open_walk()
-        self._open(self._sum.size)
+        self.starts = self.starts + np.outer(self.sum, self.sum)
+        self.walks = self.walks + self._open_walk()
+        self.q, self.sum = 0.0, np.zeros_like(self.sum)
+        self.qP, self.qPP = np.zeros_like(self.qP), np.zeros_like(self.qPP)
 
     def variance(self, inverse: Array, start_variance: float) -> Array:
         """Variance (n,) that shared errors add, from Λ⁻¹ (n, n) and var(e_0), J²."""
-        starts = self._starts + np.outer(self._sum, self._sum)
-        shared = start_variance * starts + self._walks + self._open_walk()
+        starts = self.starts + np.outer(self.sum, self.sum)
+        shared = start_variance * starts + self.walks + self._open_walk()
         # Differences of moments may round below zero where there is nothing.
         return np.asarray(np.maximum(0.0, np.einsum("ij,jk,ik->i", inverse, shared, inverse)))
 
-    def state(self) -> dict[str, Array | float]:
-        """What `restore` needs to continue."""
-        return {
-            "starts": self._starts, "walks": self._walks, "rows": self.rows,
-            "sum": self._sum, "q": self._q, "qP": self._qP, "qPP": self._qPP,
-        }  # fmt: skip
 
-    def restore(self, state: dict[str, Array]) -> None:
-        """Continue from a saved state."""
-        self._starts, self._walks, self.rows = state["starts"], state["walks"], int(state["rows"])
-        self._sum, self._q, self._qP, self._qPP = state["sum"], float(state["q"]), state["qP"], state["qPP"]
+class EnergyState(State):
+    """What an energy balance keeps of its segment.
+
+    x (B, n_x), v (B, n_v), power (B, columns + 1): of the last 2 SIDE - 1 samples; the instant up to which the
+    integral is known is number SIDE - 1 of them. instant: its number in the segment. noise_told: variance of the work's
+    noise up to the last row. window_start: balance at the window's first instant.
+    """
+
+    x: Array
+    v: Array
+    power: Array
+    integral: Array
+    instant: int = 0
+    noise_told: float = 0.0
+    window_start: Array | None = None
 
 
-class EnergyBalance:
+class EnergyBalance(Stage):
     """Turns consecutive samples of positions, speeds and torques into rows of (44), in J."""
 
     def __init__(self, model: Model, base: BaseParameters, sample_rate: float) -> None:
@@ -121,19 +129,15 @@ class EnergyBalance:
         self._weights = interval_weights() / sample_rate
         # What is integrated: the columns that dissipate, then the work of the motors.
         self._columns = [*model.dissipative, model.n_pi]
-        self.shared = SharedErrors(base.n)
+        self.shared = SharedErrors.none(base.n)
         self.begin_segment()
 
     def begin_segment(self) -> None:
         """Forget the samples before a gap; a new window starts with the next ones."""
         layout = self.model.layout
-        # The last 2 SIDE - 1 samples; the instant up to which the integral is known is number SIDE - 1 of them.
-        self._x, self._v = np.empty((0, layout.n_x)), np.empty((0, layout.n_v))
-        self._power = np.empty((0, len(self._columns) + 1))
-        self._integral = np.zeros(len(self._columns) + 1)
-        self._instant = 0  # number of that instant in its segment
-        self._noise_told = 0.0  # variance of the work's noise up to the last row
-        self._window_start: Array | None = None  # balance at the window's first instant
+        integral = np.zeros(len(self._columns) + 1)
+        x, v, power = (np.empty((0, columns)) for columns in (layout.n_x, layout.n_v, integral.size))
+        self.state = EnergyState(x, v, power, integral)
         self.shared.close()
 
     def push(
@@ -155,31 +159,31 @@ class EnergyBalance:
         noise = (motor_rates**2 @ torque_noise**2) / self.sample_rate
         taken = self.model.power_columns(x, v, self.model.inputs(signals))
         power = np.column_stack((taken[:, self._columns[:-1]], work, noise))
-        x, v = np.concatenate((self._x, x)), np.concatenate((self._v, v))
-        power = np.concatenate((self._power, power))
+        x, v = np.concatenate((self.state.x, x)), np.concatenate((self.state.v, v))
+        power = np.concatenate((self.state.power, power))
         kept = 2 * SIDE - 1
         intervals = max(0, power.shape[0] - kept)
-        self._x, self._v, self._power = x[-kept:], v[-kept:], power[-kept:]
+        self.state.x, self.state.v, self.state.power = x[-kept:], v[-kept:], power[-kept:]
         if intervals == 0:
             return self._rows(np.empty((0, self.model.n_pi + 1)), index[:0])
         steps = sliding_window_view(power, 2 * SIDE, axis=0) @ self._weights
-        integral = np.cumsum(np.concatenate((self._integral[None], steps)), axis=0)
-        instants = self._instant + np.arange(intervals + 1)
-        fresh = instants >= (0 if self._window_start is None else self._instant + 1)
+        integral = np.cumsum(np.concatenate((self.state.integral[None], steps)), axis=0)
+        instants = self.state.instant + np.arange(intervals + 1)
+        fresh = instants >= (0 if self.state.window_start is None else self.state.instant + 1)
         chosen = np.flatnonzero(fresh & (instants % self.stride == 0))
         balance = np.zeros((chosen.size, self.model.n_pi + 1))
         if chosen.size:
             balance[:, :-1] = self.model.energy_columns(x[SIDE - 1 + chosen], v[SIDE - 1 + chosen])
         balance[:, self._columns] += integral[chosen, :-1]
-        self._integral, self._instant = integral[-1], int(instants[-1])
-        q = np.diff(integral[chosen, -1], prepend=self._noise_told)
+        self.state.integral, self.state.instant = integral[-1], int(instants[-1])
+        q = np.diff(integral[chosen, -1], prepend=self.state.noise_told)
         if chosen.size:
-            self._noise_told = float(integral[chosen[-1], -1])
+            self.state.noise_told = float(integral[chosen[-1], -1])
         grid = index[-1] - SIDE + 1 - intervals + chosen
         differences = np.empty_like(balance)
         # A segment's first instant is no row: it is what the others are compared with.
-        reported = np.arange(1 if self._window_start is None else 0, chosen.size)
-        start = balance[0] if self._window_start is None and chosen.size else self._window_start
+        reported = np.arange(1 if self.state.window_start is None else 0, chosen.size)
+        start = balance[0] if self.state.window_start is None and chosen.size else self.state.window_start
         closes = instants[chosen] % self.window == 0
         for rows in np.split(reported, np.flatnonzero(closes[reported]) + 1):
             if rows.size and start is not None:
@@ -189,26 +193,10 @@ class EnergyBalance:
                     # The last instant of a window is the first of the next.
                     start = balance[rows[-1]]
                     self.shared.close()
-        self._window_start = start
+        self.state.window_start = start
         return self._rows(differences[reported], grid[reported])
 
     def _rows(self, differences: Array, ends: NDArray[np.int64]) -> BalanceRows:
         columns = differences[:, :-1]
         b = differences[:, -1] - self.base.known_part(columns)
         return BalanceRows(self.base.columns(columns), b, ends)
-
-    def state(self) -> dict[str, Array | float]:
-        """What `restore` needs to continue."""
-        start = np.empty(0) if self._window_start is None else self._window_start
-        return {
-            "x": self._x, "v": self._v, "power": self._power, "integral": self._integral,
-            "instant": self._instant, "window_start": start,
-            "noise_told": self._noise_told,
-        }  # fmt: skip
-
-    def restore(self, state: dict[str, Array]) -> None:
-        """Continue from a saved state."""
-        self._x, self._v, self._power = state["x"], state["v"], state["power"]
-        self._integral, self._instant = state["integral"], int(state["instant"])
-        self._window_start = state["window_start"] if state["window_start"].size else None
-        self._noise_told = float(state["noise_told"])

@@ -10,13 +10,13 @@ efficient one as an alarm: Hausman, Econometrica 46 (1978) 1251.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import replace
-from typing import Any
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+from sms_online.state import State
 from sms_online.stream import Array
 from sms_online.trackers.interface import Estimate
 
@@ -31,44 +31,42 @@ LARGEST_SHARE = 0.5
 MOST_CLUSTERS = 128
 
 
-class NoiseBias:
-    """Gathers normal equations with and without additional noise, in columns and right-hand sides."""
+class NoiseBias(State):
+    """Gathers normal equations with and without additional noise, in columns and right-hand sides.
 
-    def __init__(self, n: int, prior: Array | None = None) -> None:
-        """prior (k, n + 1): what is known beforehand, as rows [Y b] of unit variance without noise."""
-        self._gram = np.zeros((n + 1, n + 1)) if prior is None else prior.T @ prior
-        # What additional noise changes, by clusters of windows: whole ones, and one that windows still join. Written
-        # once and shared with saved states: those of a large arm are 9 MB, too much to be copied often.
-        self._whole = np.zeros((MOST_CLUSTERS, n + 1, n + 1))
-        self._count = 0
-        self._last = np.zeros((n + 1, n + 1))
-        self._length = CLUSTER
-        self._open = 0  # windows in the last cluster
+    gram (n + 1, n + 1): of rows [Y b]. whole: what additional noise changes, by clusters of `length` windows, in order
+    of time; last: of the cluster that windows still join, `joined` so far.
+    """
+
+    gram: Array
+    last: Array
+    whole: list[Array] = msgspec.field(default_factory=list)
+    length: int = CLUSTER
+    joined: int = 0
+
+    @staticmethod
+    def none(n: int, prior: Array | None = None) -> NoiseBias:
+        """Of no rows; prior (k, n + 1): what is known beforehand, as rows [Y b] of unit variance without noise."""
+        gram, last = np.zeros((2, n + 1, n + 1))
+        return NoiseBias(gram if prior is None else prior.T @ prior, last)
 
     def add(self, rows: Array, noisy: Array) -> None:
         """Rows [Y b] (M, n + 1) of a window, and the same with noise added and subtracted (2, M, n + 1)."""
         gram = rows.T @ rows
-        self._gram = self._gram + gram
-        if self._open == 0 and self._count == MOST_CLUSTERS:
-            self._count //= 2
-            merged = self._whole[::2] + self._whole[1::2]
-            self._whole = np.zeros_like(self._whole)
-            self._whole[: self._count] = merged
-            self._length *= 2
-        self._last = self._last + (0.5 * (noisy[0].T @ noisy[0] + noisy[1].T @ noisy[1]) - gram)
-        self._open = (self._open + 1) % self._length
-        if self._open == 0:
-            if self._count == len(self._whole):
-                self._whole = np.concatenate((self._whole, np.zeros((MOST_CLUSTERS - self._count, *gram.shape))))
-            self._whole[self._count] = self._last
-            self._count += 1
-            self._last = np.zeros_like(self._last)
+        self.gram = self.gram + gram
+        if self.joined == 0 and len(self.whole) == MOST_CLUSTERS:
+            self.whole = [one + other for one, other in zip(self.whole[::2], self.whole[1::2], strict=True)]
+            self.length *= 2
+        self.last = self.last + (0.5 * (noisy[0].T @ noisy[0] + noisy[1].T @ noisy[1]) - gram)
+        self.joined = (self.joined + 1) % self.length
+        if self.joined == 0:
+            self.whole.append(self.last)
+            self.last = np.zeros_like(self.last)
 
     @property
     def _clusters(self) -> Array:
         """All of them (C, n + 1, n + 1), in order of time."""
-        whole = self._whole[: self._count]
-        return whole if self._open == 0 else np.concatenate((whole, self._last[None]))
+        return np.array(self.whole if self.joined == 0 else [*self.whole, self.last]).reshape(-1, *self.gram.shape)
 
     def correction(self, determined: NDArray[np.bool_]) -> tuple[Array, Array]:
         """What to add to the least-squares estimate (n,) to free it of this bias, and to its covariance (n, n).
@@ -85,13 +83,13 @@ class NoiseBias:
         shift, covariance = np.zeros(determined.size), np.zeros((determined.size, determined.size))
         clusters = self._clusters
         changed = np.diag(clusters.sum(axis=0))[:-1]
-        kept = np.flatnonzero(determined & (changed < LARGEST_SHARE * np.diag(self._gram)[:-1]))
+        kept = np.flatnonzero(determined & (changed < LARGEST_SHARE * np.diag(self.gram)[:-1]))
         rows = np.append(kept, determined.size)
-        size = np.sqrt(np.diag(self._gram)[rows])
+        size = np.sqrt(np.diag(self.gram)[rows])
         if kept.size == 0 or not (size > 0.0).all():
             return shift, covariance
         scale = np.outer(size, size)
-        gram = self._gram[np.ix_(rows, rows)] / scale
+        gram = self.gram[np.ix_(rows, rows)] / scale
         clusters = clusters[:, rows[:, None], rows] / scale
         corrected = gram - clusters.sum(axis=0)
         biased = np.linalg.solve(gram[:-1, :-1], gram[:-1, -1])
@@ -113,28 +111,17 @@ class NoiseBias:
     @property
     def parameters(self) -> int:
         """Number n of parameters."""
-        return int(self._gram.shape[0]) - 1
+        return int(self.gram.shape[0]) - 1
 
     def widen(self, more: int) -> None:
         """Go on with so many parameters more, in which the rows so far have no part."""
-        at = [self._gram.shape[0] - 1] * more
-        self._gram = np.insert(np.insert(self._gram, at, 0.0, 0), at, 0.0, 1)
-        self._whole = np.insert(np.insert(self._whole, at, 0.0, 1), at, 0.0, 2)
-        self._last = np.insert(np.insert(self._last, at, 0.0, 0), at, 0.0, 1)
+        at = [self.gram.shape[0] - 1] * more
 
-    def state(self) -> dict[str, Any]:
-        """What `restore` needs to continue; it does not change when the session goes on."""
-        return {
-            "bias_gram": self._gram, "bias_clusters": self._whole[: self._count], "bias_last": self._last,
-            "bias_length": self._length, "bias_open": self._open,
-        }  # fmt: skip
+        def widened(gram: Array) -> Array:
+            return np.insert(np.insert(gram, at, 0.0, 0), at, 0.0, 1)
 
-    def restore(self, state: Mapping[str, NDArray[Any]]) -> None:
-        """Continue from a saved state, whose arrays are shared."""
-        self._gram, self._last = np.asarray(state["bias_gram"]), np.asarray(state["bias_last"])
-        self._whole = np.asarray(state["bias_clusters"])
-        self._count = len(self._whole)
-        self._length, self._open = int(state["bias_length"]), int(state["bias_open"])
+        self.gram, self.last = widened(self.gram), widened(self.last)
+        self.whole = [widened(cluster) for cluster in self.whole]
 
 
 def unbiased(estimate: Estimate, bias: NoiseBias) -> Estimate:

@@ -11,8 +11,8 @@ from __future__ import annotations
 
 from itertools import groupby, pairwise
 from operator import attrgetter
-from typing import Any
 
+import msgspec
 import numpy as np
 
 from sms_online.description.schema import System
@@ -34,18 +34,34 @@ from sms_online.pipeline.rates import RateSamples, RatesStage
 from sms_online.pipeline.sensing import AttitudeContinuity, Sensing, stated_period
 from sms_online.pipeline.statistics import Method, Setup
 from sms_online.pipeline.synchronise import GridSamples, SyncCounters, Synchroniser
-from sms_online.pipeline.waiting import waiting_from_state, waiting_state
 from sms_online.smoother.session import Smoother
+from sms_online.state import Stage, State
 from sms_online.stream import Array, Block
 from sms_online.threads import one_blas_thread
 from sms_online.trackers.interface import Estimate, Prior, Rows, Tracker
 from sms_online.trackers.square_root import session_tracker
 
-# What a session saves: arrays and numbers, by stage.
-SessionState = dict[str, dict[str, Any]]
+
+class EstimatorState(State):
+    """What an estimator keeps beside its stages.
+
+    samples: received, over `duration` s from `first_time` on. pending_t (B,), pending (B, channels): samples that
+    wait for their block to be whole. unbalanced: coordinates and torques that wait for the energy balance; segment: of
+    the last that it took. newest_energy_row: time, s. dropped_rows: of the energy balance, not finite.
+    """
+
+    pending_t: Array
+    pending: Array
+    samples: int = 0
+    first_time: float = np.nan
+    duration: float = 0.0
+    unbalanced: list[GridSamples] = msgspec.field(default_factory=list)
+    segment: int = -1
+    newest_energy_row: float = -np.inf
+    dropped_rows: int = 0
 
 
-class Estimator:
+class Estimator(Stage):
     """Streams one session of a described system.
 
     channels: what the source's blocks hold. source: its name, for messages. Raises InputError when a channel is missing
@@ -62,10 +78,6 @@ class Estimator:
             _refuse_unknown_masses(model)
         self._base = base = find_base_parameters(model)
         self.sensing = Sensing(model, channels, source)
-        self.samples = 0
-        self.dropped_rows = 0
-        self.duration = 0.0
-        self._newest_energy_row = -np.inf
         self.observers: list[Observer] = []
         self.smoother: Smoother | None = None
         # It reads the channels as they come.
@@ -84,22 +96,22 @@ class Estimator:
         layout = model.layout
         # Positions choose the filter's width; torques pass the same filter for the sake of the lag.
         self._rates = RatesStage(system.sample_rate, range(layout.n_x), self.sensing.noise)
-        self._unbalanced: list[GridSamples] = []  # coordinates and torques that wait for the energy balance
         self._followed = FollowedStates(model, self.sensing, system.sample_rate)
         self._energy = EnergyBalance(model, base, system.sample_rate)
         # A balance of forces does not hold in a shape that is not the link's; energies bear it best.
         by_energy = system.balance == "energy" or self.sensing.missing
-        self.momentum = None if by_energy else Momentum(model, base, self.sensing)
+        self.momentum = None if by_energy else Momentum(model, base, self.sensing, self._begin_joints)
         self.energy_tracker: Tracker = session_tracker(base.n, None)
         self._begin_joints()
         self._first_block, self._block = self._blocks()
-        self._segment = -1
-        self._first_time = np.nan
         self.finished = False  # no more samples come
         self.prior: Prior | None = None
         self._setup: tuple[int, Setup] | None = None  # and the number of events that it is since
-        self._pending_t = np.empty(0)
-        self._pending = np.empty((0, len(self._columns)))
+        self.state = EstimatorState(np.empty(0), np.empty((0, len(self._columns))))
+
+    def renew(self) -> None:
+        """See Stage."""
+        self._setup = None
 
     def _blocks(self) -> tuple[float, float]:
         """See `blocks`."""
@@ -143,14 +155,27 @@ class Estimator:
 
     def _begin_joints(self) -> None:
         """Residuals of the joints count since the last event, in the parameters that hold since then."""
-        n = self.base.n
         self._joints = JointBalance(self.model, self.base, self.system.sample_rate)
-        self.joint_residuals = [SquaredResidual(np.zeros((n + 1, n + 1))) for _ in self.model.layout.q]
+
+    @property
+    def samples(self) -> int:
+        """Samples received."""
+        return self.state.samples
+
+    @property
+    def duration(self) -> float:
+        """Time from the first sample to the last, s."""
+        return self.state.duration
+
+    @property
+    def joint_residuals(self) -> list[SquaredResidual]:
+        """Sums behind the relative residual of each joint, since the last event."""
+        return self._joints.state.residuals
 
     @property
     def end(self) -> float:
         """Time of the newest sample, s; NaN before the first."""
-        return self._first_time + self.duration
+        return self.state.first_time + self.state.duration
 
     @property
     def newest_row(self) -> float:
@@ -159,12 +184,12 @@ class Estimator:
             return self.smoother.end
         if self.momentum is not None and self.by_momentum:
             return self.momentum.newest_row
-        return self._newest_energy_row
+        return self.state.newest_energy_row
 
     @property
     def by_smoother(self) -> bool:
         """Whether the estimate comes from the smoother, which holds as long as nothing changes."""
-        return self.smoother is not None and self.smoother.spans > 0 and not self.events
+        return self.smoother is not None and self.smoother.known.spans > 0 and not self.events
 
     @property
     def by_momentum(self) -> bool:
@@ -220,37 +245,34 @@ class Estimator:
         """Take samples, in order of time; any number at a time."""
         if block.t.size == 0:
             return
-        if np.isnan(self._first_time):
-            self._first_time = float(block.t[0])
-        self.samples += block.t.size
-        self.duration = float(block.t[-1]) - self._first_time
-        self._pending_t = np.concatenate((self._pending_t, block.t))
-        self._pending = np.concatenate((self._pending, block.values[:, self._columns]))
-        number = np.floor((self._pending_t - self._first_time - self._first_block) / self._block)
+        if np.isnan(self.state.first_time):
+            self.state.first_time = float(block.t[0])
+        self.state.samples += block.t.size
+        self.state.duration = float(block.t[-1]) - self.state.first_time
+        self.state.pending_t = np.concatenate((self.state.pending_t, block.t))
+        self.state.pending = np.concatenate((self.state.pending, block.values[:, self._columns]))
+        number = np.floor((self.state.pending_t - self.state.first_time - self._first_block) / self._block)
         ends = np.flatnonzero(np.diff(number)) + 1
         if ends.size:
             with one_blas_thread():
                 for start, stop in pairwise([0, *ends.tolist()]):
-                    self._synchronise(self._pending_t[start:stop], self._pending[start:stop])
-            self._pending_t, self._pending = self._pending_t[ends[-1] :], self._pending[ends[-1] :]
+                    self._synchronise(self.state.pending_t[start:stop], self.state.pending[start:stop])
+            self.state.pending_t, self.state.pending = self.state.pending_t[ends[-1] :], self.state.pending[ends[-1] :]
 
     @one_blas_thread()
     def finish(self) -> None:
         """End of the session: process what is still pending."""
         self.finished = True
-        if self._pending_t.size:
-            self._synchronise(self._pending_t, self._pending)
-        self._pending_t, self._pending = self._pending_t[:0], self._pending[:0]
+        if self.state.pending_t.size:
+            self._synchronise(self.state.pending_t, self.state.pending)
+        self.state.pending_t, self.state.pending = self.state.pending_t[:0], self.state.pending[:0]
         for piece in self._synchroniser.flush():
             self._condition(piece)
         self._balance_waiting()
         for rates in self._rates.flush():
             self._balance(rates)
         if self.momentum is not None:
-            events = len(self.events)
             self.momentum.finish(self.periods)
-            if len(self.events) > events:
-                self._begin_joints()
         if self.smoother is not None:
             self.smoother.work(self._balanced, last=True)
 
@@ -259,7 +281,7 @@ class Estimator:
             torque = self.sensing.joint_torque(values[:, : len(self.sensing.channels)])
             self.smoother.push(t, torque, values[:, self._smoothed_columns])
         block = Block(t, self.sensing.channels, values[:, : len(self.sensing.channels)])
-        block = self._attitude.restore(block)
+        block = self._attitude.continued(block)
         if self.momentum is not None:
             self.momentum.observe(block.t, block.values)
         for piece in self._synchroniser.push(block):
@@ -273,7 +295,6 @@ class Estimator:
         """Go on with effects that the model lacked, see `Changes.adopt`; from within `Observer.block_through` alone."""
         assert self.momentum is not None
         self.momentum.adopt(adoption)
-        self._begin_joints()
 
     def _condition(self, piece: GridSamples) -> None:
         for observer in self.observers:
@@ -284,15 +305,15 @@ class Estimator:
     def _differentiate(self, piece: GridSamples) -> None:
         for followed in self._followed.push(piece):
             motion = self.sensing.motion(followed.values[:, : len(self.sensing.channels)])
-            self._unbalanced.append(GridSamples(followed.index, motion, followed.segment))
-            waiting = sum(each.index.size for each in self._unbalanced)
+            self.state.unbalanced.append(GridSamples(followed.index, motion, followed.segment))
+            waiting = sum(each.index.size for each in self.state.unbalanced)
             # Beside momentum rows nobody waits for those of the energy.
             if self.momentum is None or waiting >= ENERGY_BLOCK:
                 self._balance_waiting()
             self._fit(followed)
 
     def _balance_waiting(self) -> None:
-        waiting, self._unbalanced = self._unbalanced, []
+        waiting, self.state.unbalanced = self.state.unbalanced, []
         for segment, run in groupby(waiting, key=attrgetter("segment")):
             pieces = list(run)
             index, values = (np.concatenate([getattr(each, part) for each in pieces]) for part in ("index", "values"))
@@ -302,14 +323,11 @@ class Estimator:
     def _fit(self, piece: GridSamples) -> None:
         """Hand samples, with their internal states, on to the momentum balance."""
         if self.momentum is not None:
-            events = len(self.events)
             self.momentum.push(piece, self._synchroniser.start_time, self.periods)
-            if len(self.events) > events:
-                self._begin_joints()
 
     def _balance(self, rates: RateSamples) -> None:
-        if rates.segment != self._segment:
-            self._segment = rates.segment
+        if rates.segment != self.state.segment:
+            self.state.segment = rates.segment
             self._energy.begin_segment()
             self._joints.begin_segment()
         n_x = self.model.layout.n_x
@@ -322,11 +340,11 @@ class Estimator:
         signals = np.concatenate((torque, self._followed.beside(rates)), axis=1)
         rows = self._energy.push(rates.index, x, v, signals, self._rates.sigma[n_x:])
         finite = np.isfinite(rows.Y).all(axis=1) & np.isfinite(rows.b)
-        self.dropped_rows += int(np.sum(~finite))
+        self.state.dropped_rows += int(np.sum(~finite))
         if finite.any():
             fresh = self._stamped(BalanceRows(rows.Y[finite], rows.b[finite], rows.index[finite]))
             self.energy_tracker.update(fresh)
-            self._newest_energy_row = float(fresh.t[-1])
+            self.state.newest_energy_row = float(fresh.t[-1])
         for window, measured in self._joints.push(rates.index, x, v, signals):
             for residual, Y, b, signal in zip(self.joint_residuals, window.Y, window.b, measured, strict=True):
                 if np.isfinite(Y).all() and np.isfinite(b):
@@ -348,61 +366,6 @@ class Estimator:
         if self.momentum is not None and self.by_momentum:
             return self.momentum.estimate()
         return self.energy_tracker.estimate()
-
-    def state(self) -> SessionState:
-        """Everything that a new estimator of the same system and channels needs to continue to the same bits."""
-        return {
-            "session": {
-                "samples": self.samples,
-                "duration": self.duration,
-                "first_time": self._first_time,
-                "segment": self._segment,
-                "attitude": self._attitude.last,
-                "pending_t": self._pending_t,
-                "pending": self._pending,
-                "joint_gram": np.stack([residual.gram for residual in self.joint_residuals]),
-                "joint_signal": np.array([residual.signal for residual in self.joint_residuals]),
-                "dropped_rows": self.dropped_rows,
-                **waiting_state("unbalanced", self._unbalanced, self._rates.sigma.size),
-            },
-            "synchroniser": dict(self._synchroniser.state()),
-            "conditioning": dict(self._conditioning.state()),
-            "rates": dict(self._rates.state()),
-            "followed": dict(self._followed.state()),
-            "energy": dict(self._energy.state()),
-            "shared": dict(self._energy.shared.state()),
-            "joints": dict(self._joints.state()),
-            "tracker": dict(self.energy_tracker.state()),
-            **({} if self.momentum is None else self.momentum.state()),
-            **({} if self.smoother is None else self.smoother.state()),
-        }
-
-    @one_blas_thread()
-    def restore(self, state: SessionState) -> None:
-        """Continue from a saved state."""
-        self._setup = None
-        session = state["session"]
-        if self.momentum is not None:
-            self.momentum.restore(state)
-            self._begin_joints()
-        if self.smoother is not None:
-            self.smoother.restore(state)
-        self.samples, self.duration = int(session["samples"]), float(session["duration"])
-        self._first_time, self._segment = float(session["first_time"]), int(session["segment"])
-        self._attitude.last = np.array(session["attitude"])
-        self._pending_t, self._pending = np.array(session["pending_t"]), np.array(session["pending"])
-        self.dropped_rows = int(session["dropped_rows"])
-        self._unbalanced = waiting_from_state("unbalanced", session)
-        grams, signals = np.array(session["joint_gram"]), np.array(session["joint_signal"])
-        self.joint_residuals = [SquaredResidual(gram, float(s)) for gram, s in zip(grams, signals, strict=True)]
-        self._synchroniser.restore(state["synchroniser"])
-        self._conditioning.restore(state["conditioning"])
-        self._rates.restore(state["rates"])
-        self._followed.restore(state["followed"])
-        self._energy.restore(state["energy"])
-        self._energy.shared.restore(state["shared"])
-        self._joints.restore(state["joints"])
-        self.energy_tracker.restore(state["tracker"])
 
 
 def _refuse_unknown_masses(model: Model) -> None:

@@ -10,16 +10,14 @@ window to the next, since what the two widths pass of the same noise differs in 
 
 from __future__ import annotations
 
-from collections import deque
-from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
 
+import msgspec
 import numpy as np
 import scipy.linalg
-from numpy.typing import NDArray
 
 from sms_online.pipeline.momentum_fit import WhiteRows
+from sms_online.state import Stage, State
 from sms_online.stream import Array
 from sms_online.trackers.factor import triangular_factor
 from sms_online.trackers.information import Information
@@ -63,12 +61,6 @@ class Event:
     stds: tuple[float, ...]
     dropped_windows: int
 
-    @staticmethod
-    def from_saved(entry: dict[str, Any]) -> Event:
-        """The event of which `entry` is dataclasses.asdict, read back from JSON."""
-        fields: dict[str, Any] = {k: tuple(value) if isinstance(value, list) else value for k, value in entry.items()}
-        return Event(**fields)
-
 
 @dataclass(frozen=True)
 class Seen:
@@ -84,12 +76,29 @@ class Seen:
     known: Information
 
 
-class ChangeDetector:
+class DetectorState(State):
+    """What a test keeps of the windows that it has seen, and its sums.
+
+    known, history, alarm, onset: see `ChangeDetector`. tested: windows; levels: sum of their χ² / n_v, none for more
+    than the cumulative sum counts it; level: what the next ones are measured by. sum: the cumulative sum. loud: windows
+    in a row beyond ALARM.
+    """
+
+    known: Information
+    history: list[Seen] = msgspec.field(default_factory=list)
+    alarm: int | None = None
+    onset: int = -1
+    tested: int = 0
+    level: float = 1.0
+    levels: float = 0.0
+    sum: float = 0.0
+    loud: int = 0
+
+
+class ChangeDetector(Stage):
     """Sequential test of windows against the estimate before them.
 
-    hop: from one window to the next, s. known: information of the rows taken in. history: the last windows, oldest
-    first. alarm: grid index that an event is surely before, None while nothing has changed. onset: grid index of the
-    last window that is surely undisturbed.
+    hop: from one window to the next, s.
     """
 
     def __init__(self, n: int, n_v: int, hop: float) -> None:
@@ -99,42 +108,55 @@ class ChangeDetector:
 
     def begin(self, known: Information) -> None:
         """Start, or continue after an event, with what is known by then."""
-        self.known = known
-        self.history: deque[Seen] = deque(maxlen=REMEMBERED)
-        self.alarm: int | None = None
-        self.onset = -1
-        self._tested = 0
-        self._level = 1.0
-        self._levels = 0.0  # sum of the tested windows' χ² / n_v, none for more than the cumulative sum counts it
-        self._sum = 0.0
-        self._loud = 0  # windows in a row beyond ALARM
+        self.state = DetectorState(known)
+
+    @property
+    def known(self) -> Information:
+        """Of the rows taken in."""
+        return self.state.known
+
+    @property
+    def history(self) -> list[Seen]:
+        """The last windows, oldest first."""
+        return self.state.history
+
+    @property
+    def alarm(self) -> int | None:
+        """Grid index that an event is surely before, None while nothing has changed."""
+        return self.state.alarm
+
+    @property
+    def onset(self) -> int:
+        """Grid index of the last window that is surely undisturbed."""
+        return self.state.onset
 
     def push(self, rows: WhiteRows, misfit: bool) -> bool:
         """Test a window; whether to take its rows in: not from an alarm on.
 
         misfit: the model lacks something already, and what it lacks varies with the motion: the test sleeps.
         """
-        if self.alarm is None:
+        if self.state.alarm is None:
             self._test(rows, misfit)
-        if self.alarm is None:
-            self.known = self.known.with_rows(rows.Y)
-        self.history.append(Seen(rows.end, rows.raw, rows.covariance, self.known))
-        return self.alarm is None
+        if self.state.alarm is None:
+            self.state.known = self.state.known.with_rows(rows.Y)
+        seen = Seen(rows.end, rows.raw, rows.covariance, self.state.known)
+        self.state.history = [*self.state.history, seen][-REMEMBERED:]
+        return self.state.alarm is None
 
     def _test(self, rows: WhiteRows, misfit: bool) -> None:
         excess = self._excess(rows)
-        if misfit or self._tested <= self._warm_up or excess is None:
-            self._sum, self._loud = 0.0, 0
+        if misfit or self.state.tested <= self._warm_up or excess is None:
+            self.state.sum, self.state.loud = 0.0, 0
             return
-        if self._sum == 0.0:
-            self.onset = self.history[-1].end
-        self._sum = max(0.0, self._sum + min(excess, CAPPED) - SLACK)
-        self._loud = self._loud + 1 if excess > ALARM else 0
-        loud = self._loud == IN_A_ROW or excess > LOUDEST
+        if self.state.sum == 0.0:
+            self.state.onset = self.state.history[-1].end
+        self.state.sum = max(0.0, self.state.sum + min(excess, CAPPED) - SLACK)
+        self.state.loud = self.state.loud + 1 if excess > ALARM else 0
+        loud = self.state.loud == IN_A_ROW or excess > LOUDEST
         if loud:
-            self.onset = self.history[-IN_A_ROW].end
-        if loud or self._sum > CUMULATIVE_ALARM:
-            self.alarm = rows.end
+            self.state.onset = self.state.history[-IN_A_ROW].end
+        if loud or self.state.sum > CUMULATIVE_ALARM:
+            self.state.alarm = rows.end
 
     def _excess(self, rows: WhiteRows) -> float | None:
         """χ² of the window less its expectation, in standard deviations √(2 n_v); None where the test sleeps."""
@@ -142,46 +164,20 @@ class ChangeDetector:
         own = scipy.linalg.solve_triangular(L, rows.raw, lower=True, check_finite=False)
         # What the rows add to the residual sum of squares is χ² of their innovations, with the estimate's own
         # uncertainty counted; directions that nothing is known of add nothing.
-        known = self.known.factor.copy()
+        known = self.state.known.factor.copy()
         known[-1, -1] = 0.0
         chi2 = float(triangular_factor(known, own)[-1, -1] ** 2)
-        if self._sum == 0.0:
+        if self.state.sum == 0.0:
             # What may be an event is measured by what was before it.
-            self._level = max(1.0, self._levels / max(1, self._tested))
+            self.state.level = max(1.0, self.state.levels / max(1, self.state.tested))
         deviation = np.sqrt(2.0 / self._n_v)
-        self._tested += 1
-        self._levels += min(chi2 / self._n_v, 1.0 + CAPPED * deviation)
-        return None if self._level > LARGEST_LEVEL else float((chi2 / self._n_v / self._level - 1.0) / deviation)
+        self.state.tested += 1
+        self.state.levels += min(chi2 / self._n_v, 1.0 + CAPPED * deviation)
+        return (
+            None if self.state.level > LARGEST_LEVEL else float((chi2 / self._n_v / self.state.level - 1.0) / deviation)
+        )
 
     def before(self, end: int) -> Seen | None:
         """The last window that ends at or before a grid index; None where it is forgotten."""
-        earlier = [seen for seen in self.history if seen.end <= end]
+        earlier = [seen for seen in self.state.history if seen.end <= end]
         return earlier[-1] if earlier else None
-
-    def state(self) -> dict[str, Any]:
-        """What `restore` needs to continue."""
-        n1, alarm = len(self.known.factor), -1 if self.alarm is None else self.alarm
-        return {
-            "factor": self.known.factor,
-            "numbers": np.array([self.known.rows, alarm, self.onset, self._tested, self._loud]),
-            "sums": np.array([self._sum, self._level, self._levels]),
-            "seen_end": np.array([(seen.end, seen.known.rows) for seen in self.history], dtype=np.int64).reshape(-1, 2),
-            "seen_raw": np.array([seen.raw for seen in self.history]).reshape(-1, self._n_v, n1),
-            "seen_covariance": np.array([s.covariance for s in self.history]).reshape(-1, self._n_v, self._n_v),
-            "seen_factor": np.array([seen.known.factor for seen in self.history]).reshape(-1, n1, n1),
-        }
-
-    def restore(self, state: Mapping[str, NDArray[Any]]) -> None:
-        """Continue from a saved state."""
-        rows, alarm, self.onset, self._tested, self._loud = (int(number) for number in state["numbers"])
-        self.known = Information(np.array(state["factor"]), rows)
-        self.alarm = None if alarm < 0 else alarm
-        self._sum, self._level, self._levels = (float(number) for number in state["sums"])
-        entries = zip(state["seen_end"], state["seen_raw"], state["seen_covariance"], state["seen_factor"], strict=True)
-        self.history = deque(
-            (
-                Seen(int(end), np.array(raw), np.array(C), Information(np.array(factor), int(rows)))
-                for (end, rows), raw, C, factor in entries
-            ),
-            maxlen=REMEMBERED,
-        )

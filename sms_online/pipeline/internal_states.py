@@ -7,9 +7,7 @@ Source: Hochbruck and Ostermann, Exponential integrators, Acta Numerica 19 (2010
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Any
-
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
@@ -19,7 +17,7 @@ from sms_online.pipeline.rates import RateSamples
 from sms_online.pipeline.sensing import Sensing
 from sms_online.pipeline.smoothing import HALF_WIDTHS, smooth
 from sms_online.pipeline.synchronise import GridSamples
-from sms_online.pipeline.waiting import waiting_from_state, waiting_state
+from sms_online.state import Stage, State
 from sms_online.stream import Array
 
 # Half width of the filter of the motion behind the states, s, which passes 50 Hz: a hysteresis forgets with every way
@@ -46,7 +44,18 @@ def smooth_from_the_start(
     return np.concatenate([part[0] for part in parts]), np.concatenate([part[1] for part in parts])
 
 
-class InternalStates:
+class InternalState(State):
+    """Internal states at the last sample.
+
+    Of the last sample: z (n_states,), and ż = A z + b, A (1, n_states, n_states), b (1, n_states).
+    """
+
+    z: Array
+    A: Array
+    b: Array
+
+
+class InternalStates(Stage):
     """States z (n_states,) of a model's effects along one gap-free motion, begun as if it had been at rest."""
 
     def __init__(self, model: Model, sample_rate: float) -> None:
@@ -56,9 +65,8 @@ class InternalStates:
 
     def begin_segment(self) -> None:
         """Forget the motion before a gap."""
-        self._z = np.empty(0)
-        self._A = np.empty((0, self.model.n_states, self.model.n_states))  # of the last sample: ż = A z + b
-        self._b = np.empty((0, self.model.n_states))
+        n = self.model.n_states
+        self.state = InternalState(np.empty(0), np.empty((0, n, n)), np.empty((0, n)))
 
     def push(self, x: Array, v: Array) -> Array:
         """z (B, n_states) at consecutive samples x (B, n_x), v (B, n_v); other pieces give other last digits."""
@@ -69,27 +77,19 @@ class InternalStates:
         b = self.model.state_rate(x, v, np.zeros((len(x), n)))
         units = [np.broadcast_to(unit, (len(x), n)) for unit in np.eye(n)]
         A = np.stack([self.model.state_rate(x, v, unit) - b for unit in units], axis=2)
-        begun = 0 if self._z.size else 1
+        begun = 0 if self.state.z.size else 1
         if begun:
-            self._z = out[0] = self.model.initial_state(x[0])
-        A_both, b_both = np.concatenate((self._A, A)), np.concatenate((self._b, b))
+            self.state.z = out[0] = self.model.initial_state(x[0])
+        A_both, b_both = np.concatenate((self.state.A, A)), np.concatenate((self.state.b, b))
         X = 0.5 * self._h * (A_both[:-1] + A_both[1:])
         one, twelfth = np.eye(n), X @ X / 12.0
         inverse = np.linalg.inv(one - 0.5 * X + twelfth)
         step = inverse @ (one + 0.5 * X + twelfth)
         change = (b_both[1:] - b_both[:-1])[..., None]
         push = self._h * (inverse @ (b_both[:-1, :, None] + (0.5 * one - X / 12.0) @ change))[..., 0]
-        out[begun:] = _along(step, push, self._z)
-        self._z, self._A, self._b = out[-1].copy(), A[-1:], b[-1:]
+        out[begun:] = _along(step, push, self.state.z)
+        self.state.z, self.state.A, self.state.b = out[-1].copy(), A[-1:], b[-1:]
         return out
-
-    def state(self) -> dict[str, Array]:
-        """What `restore` needs to continue."""
-        return {"z": self._z, "z_A": self._A, "z_b": self._b}
-
-    def restore(self, state: Mapping[str, NDArray[Any]]) -> None:
-        """Continue from a saved state."""
-        self._z, self._A, self._b = (np.array(state[name]) for name in ("z", "z_A", "z_b"))
 
 
 def _along(step: Array, push: Array, z: Array) -> Array:
@@ -118,7 +118,21 @@ def _along(step: Array, push: Array, z: Array) -> Array:
     return np.asarray((turned @ begin + pushed).reshape(-1, n)[:count])
 
 
-class FollowedStates:
+class FollowedState(State):
+    """Samples that wait for their states, and states that wait to be asked for.
+
+    values (B, channels): samples, from number `first` in the segment on. next: number of the first one whose states
+    are not known yet. unasked: states that nobody has asked for.
+    """
+
+    values: Array
+    segment: int = -1
+    first: int = 0
+    next: int = HALF_WIDTHS[0]
+    unasked: list[GridSamples] = msgspec.field(default_factory=list)
+
+
+class FollowedStates(Stage):
     """Internal states beside the grid samples: these wait until the motion behind the states is known.
 
     A model without internal states lets its samples pass at once.
@@ -128,15 +142,12 @@ class FollowedStates:
         self._states = InternalStates(model, sample_rate)
         self._sensing, self._rate = sensing, sample_rate
         self._n, self._half_width = model.n_states, half_width(model.system)
-        self._segment = -1
-        self._begin_segment()
-        self._unasked: list[GridSamples] = []  # states that nobody has asked for
+        self.state = FollowedState(np.empty((0, len(sensing.channels))))
 
     def _begin_segment(self) -> None:
         self._states.begin_segment()
-        self._values = np.empty((0, len(self._sensing.channels)))
-        self._first = 0  # number in the segment of the first of these
-        self._next = HALF_WIDTHS[0]  # of the first sample whose states are not known yet
+        self.state.values = self.state.values[:0]
+        self.state.first, self.state.next = 0, HALF_WIDTHS[0]
 
     def push(self, piece: GridSamples) -> list[GridSamples]:
         """Take samples of the channels (B, channels); return those whose states are known (·, channels + n_states).
@@ -145,48 +156,34 @@ class FollowedStates:
         """
         if self._n == 0:
             return [piece]
-        if piece.segment != self._segment:
-            self._segment = piece.segment
+        if piece.segment != self.state.segment:
+            self.state.segment = piece.segment
             self._begin_segment()
-        self._values = np.concatenate((self._values, piece.values))
-        end = self._first + len(self._values)
-        samples = np.arange(self._next, end - self._half_width)
+        self.state.values = np.concatenate((self.state.values, piece.values))
+        end = self.state.first + len(self.state.values)
+        samples = np.arange(self.state.next, end - self._half_width)
         if not samples.size:
             return []
-        x = self._sensing.coordinates(self._values)
-        smoothed, rates = smooth_from_the_start(x, self._first, samples, self._half_width, self._rate)
+        x = self._sensing.coordinates(self.state.values)
+        smoothed, rates = smooth_from_the_start(x, self.state.first, samples, self._half_width, self._rate)
         z = self._states.push(smoothed, self._sensing.model.layout.speeds(smoothed, rates))
         index = samples + (int(piece.index[-1]) - (end - 1))
-        self._unasked.append(GridSamples(index, z, self._segment))
-        joined = np.concatenate((self._values[samples - self._first], z), axis=1)
-        self._next = int(samples[-1]) + 1
-        drop = max(0, self._next - self._half_width - self._first)
-        self._values, self._first = self._values[drop:], self._first + drop
-        return [GridSamples(index, joined, self._segment)]
+        self.state.unasked.append(GridSamples(index, z, self.state.segment))
+        joined = np.concatenate((self.state.values[samples - self.state.first], z), axis=1)
+        self.state.next = int(samples[-1]) + 1
+        drop = max(0, self.state.next - self._half_width - self.state.first)
+        self.state.values, self.state.first = self.state.values[drop:], self.state.first + drop
+        return [GridSamples(index, joined, self.state.segment)]
 
     def beside(self, rates: RateSamples) -> Array:
         """States (B, n_states) at samples that have been known for as long as a filter takes."""
         if self._n == 0:
             return np.empty((len(rates.index), 0))
-        own = [piece for piece in self._unasked if piece.segment == rates.segment]
+        own = [piece for piece in self.state.unasked if piece.segment == rates.segment]
         index, z = (np.concatenate([getattr(piece, part) for piece in own]) for part in ("index", "values"))
-        self._unasked = [
+        self.state.unasked = [
             piece
-            for piece in self._unasked
+            for piece in self.state.unasked
             if (piece.segment, int(piece.index[-1])) > (rates.segment, int(rates.index[-1]))
         ]
         return np.asarray(z[np.searchsorted(index, rates.index)])
-
-    def state(self) -> dict[str, Any]:
-        """What `restore` needs to continue."""
-        return {
-            "position": np.array([self._segment, self._first, self._next]), "values": self._values,
-            **waiting_state("unasked", self._unasked, self._n), **self._states.state(),
-        }  # fmt: skip
-
-    def restore(self, state: Mapping[str, NDArray[Any]]) -> None:
-        """Continue from a saved state."""
-        self._segment, self._first, self._next = (int(number) for number in state["position"])
-        self._values = np.array(state["values"])
-        self._unasked = waiting_from_state("unasked", state)
-        self._states.restore(state)

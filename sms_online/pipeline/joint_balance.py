@@ -6,8 +6,6 @@ only positions and speeds appear: -∫ (φ̇ P + φ G) dt π = ∫ φ n τ dt.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -15,6 +13,7 @@ from sms_online.model.base_parameters import BaseParameters
 from sms_online.model.model import Model
 from sms_online.pipeline.energy_balance import BalanceRows
 from sms_online.pipeline.weak_form import test_function
+from sms_online.state import Stage, State
 from sms_online.stream import Array
 
 # Exponent of the test function: with its first three derivatives zero at the ends, sums over samples are integrals.
@@ -24,8 +23,7 @@ EXPONENT = 4
 LARGEST_HOP = 0.4
 
 
-@dataclass
-class SquaredResidual:
+class SquaredResidual(State):
     """Sums that give the rms of Y β - b for any β: the Gram matrix of [Y b], (n + 1, n + 1), and the measured signal's.
 
     A Gram matrix tells a residual down to 1e-8 of b, which is enough for a share of the signal. It is replaced, never
@@ -49,7 +47,20 @@ class SquaredResidual:
         return float(np.sqrt(max(0.0, w @ self.gram @ w) / self.signal))
 
 
-class JointBalance:
+class JointState(State):
+    """What the joints' balances keep.
+
+    samples (B, ·): x, v and signals that windows to come ask for; skip: samples to pass over before the next one.
+
+    residuals: of each joint.
+    """
+
+    samples: Array
+    residuals: list[SquaredResidual]
+    skip: int = 0
+
+
+class JointBalance(Stage):
     """Turns consecutive samples into weak-form rows of every joint, in N m s (N s)."""
 
     def __init__(self, model: Model, base: BaseParameters, sample_rate: float) -> None:
@@ -60,29 +71,30 @@ class JointBalance:
         self.hop = max(self.width // 2, min(4 * self.width, round(LARGEST_HOP * sample_rate)))
         phi, phi_dot, _ = test_function(self.width, self.width / sample_rate, EXPONENT)
         self._phi, self._phi_dot = phi / sample_rate, phi_dot / sample_rate
-        self.begin_segment()
+        layout, n = model.layout, base.n
+        columns = layout.n_x + layout.n_v + len(layout.q) + model.n_states
+        residuals = [SquaredResidual(np.zeros((n + 1, n + 1))) for _ in layout.q]
+        self.state = JointState(np.empty((0, columns)), residuals)
 
     def begin_segment(self) -> None:
         """Forget the samples before a gap."""
-        layout = self.model.layout
-        self._samples = np.empty((0, layout.n_x + layout.n_v + len(layout.q) + self.model.n_states))
-        self._skip = 0  # samples to pass over before the next window
+        self.state.samples, self.state.skip = self.state.samples[:0], 0
 
     def push(self, index: NDArray[np.int64], x: Array, v: Array, signals: Array) -> list[tuple[BalanceRows, Array]]:
         """For each window that the samples complete, its rows, one a joint, and the torques (joints,) behind them.
 
         signals (B, joints + n_states): n τ, then internal states of effects.
         """
-        samples = np.concatenate((self._samples, np.concatenate((x, v, signals), axis=1)))
+        samples = np.concatenate((self.state.samples, np.concatenate((x, v, signals), axis=1)))
         grid_end = int(index[-1])
         rows = []
-        start = self._skip
+        start = self.state.skip
         while start + self.width + 1 <= samples.shape[0]:
             end = grid_end - (samples.shape[0] - 1) + start + self.width
             rows.append(self._window(samples[start : start + self.width + 1], end))
             start += self.hop
         dropped = min(start, samples.shape[0])
-        self._samples, self._skip = samples[dropped:], start - dropped
+        self.state.samples, self.state.skip = samples[dropped:], start - dropped
         return rows
 
     def _window(self, samples: Array, end: int) -> tuple[BalanceRows, Array]:
@@ -93,11 +105,3 @@ class JointBalance:
         measured = self._phi @ signals[:, : len(layout.q)]
         b = measured - self.base.known_part(columns)
         return BalanceRows(self.base.columns(columns), b, np.full(len(layout.q), end)), measured
-
-    def state(self) -> dict[str, Array | int]:
-        """What `restore` needs to continue."""
-        return {"samples": self._samples, "skip": self._skip}
-
-    def restore(self, state: dict[str, Array]) -> None:
-        """Continue from a saved state."""
-        self._samples, self._skip = state["samples"], int(state["skip"])

@@ -8,16 +8,15 @@ of all the others with its sign changed.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sms_online.description.schema import SerialFrames, SerialLines, Source
 from sms_online.effects.delay import late_keys
 from sms_online.pipeline.sensing import Sensing
+from sms_online.state import Stage, State
 from sms_online.stream import Array
 from sms_online.trackers.factor import triangular_factor
 
@@ -94,30 +93,42 @@ def clock_groups(sensing: Sensing) -> tuple[SourceGroup, ...]:
     return groups if len(groups) > 1 else ()
 
 
-class Latencies:
+class LatencyState(State):
+    """What rows say of latencies.
+
+    factor (n + G + 1, n + G + 1): of rows with columns of the latencies; rows: how many.
+    """
+
+    factor: Array
+    rows: int = 0
+
+
+class Latencies(Stage):
     """Information on the latency of each of G sources, beside that on n parameters."""
 
     def __init__(self, groups: Sequence[SourceGroup], n: int) -> None:
         self.groups = tuple(groups)
-        self._factor = np.zeros((n + len(groups) + 1, n + len(groups) + 1))
-        self._rows = 0
+        size = n + len(groups) + 1
+        self.state = LatencyState(np.zeros((size, size)))
 
     def add(self, Y: Array, columns: Array) -> None:
         """Take in white rows [Y b] (M, n + 1) with the columns (M, G) of the latencies."""
         if self.groups:
-            self._factor = triangular_factor(self._factor, np.concatenate((Y[:, :-1], columns, Y[:, -1:]), axis=1))
-            self._rows += len(Y)
+            self.state.factor = triangular_factor(
+                self.state.factor, np.concatenate((Y[:, :-1], columns, Y[:, -1:]), axis=1)
+            )
+            self.state.rows += len(Y)
 
     @property
     def found(self) -> Latency | None:
         """The source that is late against the others, the most certain one; None where there is none."""
         G = len(self.groups)
-        n = len(self._factor) - G - 1
-        freedom = self._rows - n - 1
+        n = len(self.state.factor) - G - 1
+        freedom = self.state.rows - n - 1
         if not G or freedom <= 0:
             return None
         # What the parameters leave of the columns and of the right-hand side.
-        left = self._factor[n:, n:]
+        left = self.state.factor[n:, n:]
         information = np.sum(left[:, :G] ** 2, axis=0)
         known = information > 0.0
         size = np.divide(left[:, :G].T @ left[:, -1], information, out=np.zeros(G), where=known)
@@ -133,14 +144,6 @@ class Latencies:
         group = self.groups[k]
         positions = [name for name in group.channels if not name.startswith(("tau_", "force_"))]
         return Latency(group.name, float(size[k]), float(std[k]), tuple(late_keys(group.joints, positions)))
-
-    def state(self) -> dict[str, Any]:
-        """What `restore` needs to continue."""
-        return {"latency_factor": self._factor, "latency_rows": self._rows}
-
-    def restore(self, state: Mapping[str, NDArray[Any]]) -> None:
-        """Continue from a saved state."""
-        self._factor, self._rows = np.array(state["latency_factor"]), int(state["latency_rows"])
 
 
 class LatencyColumns:

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable
 from copy import copy
-from typing import Any
 
+import msgspec
 import numpy as np
-from numpy.typing import NDArray
 
 from sms_online.calibration.columns import CalibrationColumns, nuisances
 from sms_online.calibration.nuisance import prior_rows
@@ -22,11 +21,11 @@ from sms_online.pipeline.momentum_fit import DETERMINED, FIRST_MOTION, MomentumF
 from sms_online.pipeline.momentum_windows import COPIES, HOPS
 from sms_online.pipeline.residual_test import SequentialTest
 from sms_online.pipeline.sensing import Sensing
-from sms_online.pipeline.sensor_noise import NoiseEstimate, SensorNoise, noise_from_state, noise_state
+from sms_online.pipeline.sensor_noise import NoiseEstimate, SensorNoise
 from sms_online.pipeline.statistics import MomentumStatistics
 from sms_online.pipeline.synchronise import GridSamples
-from sms_online.pipeline.waiting import waiting_from_state, waiting_state
 from sms_online.pipeline.window_noise import WindowNoise
+from sms_online.state import Stage, State, snapshot, state_copy
 from sms_online.stream import Array
 from sms_online.trackers.interface import Estimate, Prior, Rows, Tracker, prior_factor
 from sms_online.trackers.square_root import session_tracker
@@ -39,46 +38,68 @@ TESTED = FIRST_MOTION + 1.0
 NOISE_RENEWED = 1.0
 
 
-class Momentum:
-    """Balance, weights and tracker of one session.
+class MomentumState(State):
+    """What a momentum balance keeps beside its stages.
 
-    tracker: fed with rows of unit variance. bias: what noise in the columns does to the estimate. grams:
-    sums of rows by generalized speed, for an estimate where they leave more than noise. fit:
-    what makes rows independent, and its sums. windows: how many it took since the last event. latencies: of the
-    sources, since then too. test: whether rows leave more than noise, likewise. changes: events, and the model and
-    parameters that the session goes on with after them. nuisances: what the description may be wrong in. prior: what is
-    known of the described ones beforehand.
+    known (k, m + n + 1): what is known from before an event, as rows [N Y b] of unit variance. misfit (n_v,): behind
+    the rows that came last. sensor_noise: as estimated at grid index `noise_told`. waiting: samples, until the noise is
+    known. newest_row: time of the last window's end, s. start_time: of grid index 0, s. random: gives the synthetic
+    noise.
     """
 
-    def __init__(self, model: Model, base: BaseParameters, sensing: Sensing) -> None:
+    known: Array
+    misfit: Array
+    random: np.random.Generator
+    sensor_noise: SensorNoise | None = None
+    noise_told: int = 0
+    waiting: list[GridSamples] = msgspec.field(default_factory=list)
+    segment: int = -1
+    start_time: float = np.nan
+    newest_row: float = -np.inf
+    dropped_windows: int = 0
+
+
+class Momentum(Stage):
+    """Balance, weights and tracker of one session.
+
+    tracker: fed with rows of unit variance. bias: what noise in the columns does to the estimate. grams: sums of rows
+    by generalized speed, for an estimate where they leave more than noise. fit: what makes rows independent, and its
+    sums. latencies: of the sources, since the last event. test: whether rows leave more than noise, likewise. changes:
+    events, and the model and parameters that the session goes on with after them. nuisances: what the description may
+    be wrong in. prior: what is known of the described ones beforehand. changed: called where others come to be
+    estimated.
+    """
+
+    def __init__(self, model: Model, base: BaseParameters, sensing: Sensing, changed: Callable[[], None]) -> None:
         system = model.system
         self.sensing = sensing
         self.nuisances = nuisances(sensing)
-        self.changes = Changes(model, base, sensing, self.nuisances)
-        self.dropped_windows = 0
-        self.newest_row = -np.inf  # time of the last window's end, s
-        self.sensor_noise: SensorNoise | None = None
+        self.changes = Changes(model, base, sensing, self.nuisances, self._rebuild)
+        self._changed = changed
         self._sample_rate = system.sample_rate
         self._estimate = NoiseEstimate(sensing, system.sample_rate)
         self._span = system.windows.momentum
         self.prior: Prior | None = None
         self._sources, self._clocks = source_groups(sensing), clock_groups(sensing)
         self._build()
-        self._random = np.random.default_rng(SEED)
-        self._segment = -1
-        self._start_time = np.nan
-        self._noise_told = 0  # grid index at which the noise was estimated last
-        self._waiting: list[GridSamples] = []  # until the noise is known
+        n, n_v = len(self.nuisances) + base.n, model.layout.n_v
+        self.bias, self.grams = NoiseBias.none(n, self._calibration), RowGrams.none(n_v, n)
+        self.state = MomentumState(np.zeros((0, n + 1)), np.zeros(n_v), np.random.default_rng(SEED))
+
+    @property
+    def newest_row(self) -> float:
+        """Time of the last window's end, s; -inf before the first."""
+        return self.state.newest_row
+
+    @property
+    def sensor_noise(self) -> SensorNoise | None:
+        """As estimated last, None while it is not known."""
+        return self.state.sensor_noise
 
     def _build(self) -> None:
         """Empty stages for the current model and parameters."""
         model, base = self.changes.model, self.changes.base
-        m, self._calibration = len(self.nuisances), prior_rows(self.nuisances, base.n)
-        self.bias = NoiseBias(m + base.n, self._calibration)
-        self.grams = RowGrams(model.layout.n_v, m + base.n)
-        self._misfit = np.zeros(model.layout.n_v)  # behind the rows that came last
-        self._known = np.zeros((0, m + base.n + 1))  # before an event, as rows [N Y b] of unit variance
-        self.windows = 0
+        self._calibration = prior_rows(self.nuisances, base.n)
         self._balance = MomentumBalance(model, base, self._sample_rate, self._span)
         self.latencies = Latencies(self._sources, base.n)
         self.fit = MomentumFit(
@@ -87,6 +108,11 @@ class Momentum:
         )  # fmt: skip
         self.tracker = self._new_tracker()
         self.test = SequentialTest(model.layout, self._balance.span / HOPS)
+
+    def _rebuild(self) -> None:
+        """The same after an event."""
+        self._build()
+        self._changed()
 
     @property
     def current_prior(self) -> Prior | None:
@@ -139,7 +165,7 @@ class Momentum:
         if not self.misfit or self.grams.windows == 0:
             return None
         assert self.fit.weights is not None
-        prior = np.concatenate((self._prior_rows(), self._known))
+        prior = np.concatenate((self._prior_rows(), self.state.known))
         weights = np.pad(self.fit.weights, (len(self.nuisances), 0))
         lacking = self.fit.plain.misfit > 0.0
         return ScaleFree(copy(self.grams), lacking, self.fit.torque, weights, prior, self.prior is None)
@@ -166,25 +192,25 @@ class Momentum:
 
         start_time: s of grid index 0. periods (channels,): sample periods, s.
         """
-        self._start_time = start_time
-        self._waiting.append(piece)
-        due = self._noise_told + round(NOISE_RENEWED * self._sample_rate)
-        if (self.sensor_noise is None or piece.index[-1] >= due) and self._estimate.ready:
-            self.sensor_noise = self._estimate.noise(periods)
-            self._noise_told = int(piece.index[-1])
-        if self.sensor_noise is None:
+        self.state.start_time = start_time
+        self.state.waiting.append(piece)
+        due = self.state.noise_told + round(NOISE_RENEWED * self._sample_rate)
+        if (self.state.sensor_noise is None or piece.index[-1] >= due) and self._estimate.ready:
+            self.state.sensor_noise = self._estimate.noise(periods)
+            self.state.noise_told = int(piece.index[-1])
+        if self.state.sensor_noise is None:
             return
-        waiting, self._waiting = self._waiting, []
+        waiting, self.state.waiting = self.state.waiting, []
         for each in waiting:
-            self._advance(each, self.sensor_noise)
+            self._advance(each, self.state.sensor_noise)
 
     def _advance(self, piece: GridSamples, noise: SensorNoise) -> None:
-        if piece.segment != self._segment:
-            if self._segment >= 0:
+        if piece.segment != self.state.segment:
+            if self.state.segment >= 0:
                 self._absorb(self.fit.end_segment(noise))
                 self._decide(noise, last=True)
             self._balance.begin_segment()
-            self._segment = piece.segment
+            self.state.segment = piece.segment
         self.changes.keep(piece)
         self._process(piece, noise)
         self._decide(noise, last=False)
@@ -196,23 +222,23 @@ class Momentum:
 
     def _decide(self, noise: SensorNoise, last: bool) -> None:
         """Where rows are held back for an event: decide on it, when there is enough to tell, and go on."""
-        adoption = self.changes.decide(noise, self._start_time, last)
+        adoption = self.changes.decide(noise, self.state.start_time, last)
         if adoption is not None:
             self._adopt(adoption, noise)
 
     def adopt(self, adoption: Adoption) -> None:
         """Go on with effects that the model lacked, see `Changes.adopt`; rows are there already."""
-        assert self.sensor_noise is not None
-        self._adopt(adoption, self.sensor_noise)
+        assert self.state.sensor_noise is not None
+        self._adopt(adoption, self.state.sensor_noise)
 
     def _adopt(self, adoption: Adoption, noise: SensorNoise) -> None:
         """Go on after an event with what is known from before it."""
-        bias = self.bias
-        bias.widen(len(self.nuisances) + adoption.base.n - bias.parameters)
-        self._build()
-        self.bias = bias
+        n, n_v = len(self.nuisances) + adoption.base.n, adoption.model.layout.n_v
+        self.bias.widen(n - self.bias.parameters)
+        self.grams, self.state.misfit = RowGrams.none(n_v, n), np.zeros(n_v)
+        self.state.known = adoption.known.factor
+        self._rebuild()
         self.tracker.begin(adoption.known)
-        self._known = adoption.known.factor
         self.fit.go_on(adoption.weights, noise)
         if adoption.samples.index.size:
             self._process(adoption.samples, noise)
@@ -224,105 +250,52 @@ class Momentum:
             return [measured] * COPIES
         added = np.zeros_like(values)
         columns = [*self.sensing.position_columns, *self.sensing.torque_columns]
-        added[:, columns] = self._random.standard_normal((values.shape[0], len(columns))) * noise.grid
+        added[:, columns] = self.state.random.standard_normal((values.shape[0], len(columns))) * noise.grid
         return [measured, self.sensing.motion(values + added), self.sensing.motion(values - added)]
 
     def finish(self, periods: Array) -> None:
         """End of the session: fit what is still held back."""
-        if self.sensor_noise is None and self._waiting and self._estimate.ready:
-            self.sensor_noise = self._estimate.noise(periods)
-        if self.sensor_noise is not None:
-            self._absorb(self.fit.end_segment(self.sensor_noise))
-            self._decide(self.sensor_noise, last=True)
-            adoption = self.changes.abandon(self._start_time)
+        if self.state.sensor_noise is None and self.state.waiting and self._estimate.ready:
+            self.state.sensor_noise = self._estimate.noise(periods)
+        if self.state.sensor_noise is not None:
+            self._absorb(self.fit.end_segment(self.state.sensor_noise))
+            self._decide(self.state.sensor_noise, last=True)
+            adoption = self.changes.abandon(self.state.start_time)
             if adoption is not None:
-                self._adopt(adoption, self.sensor_noise)
+                self._adopt(adoption, self.state.sensor_noise)
 
     def _absorb(self, fresh: list[WhiteRows]) -> None:
         for rows in fresh:
             if not np.isfinite(rows.Y).all():
-                self.dropped_windows += 1
+                self.state.dropped_windows += 1
                 continue
             detector = self.changes.detector
-            if self.sensor_noise is not None and not self.sensor_noise.exact:
+            if self.state.sensor_noise is not None and not self.state.sensor_noise.exact:
                 self.test.push(rows, detector.known.factor)
             if not detector.push(rows, self.misfit):
                 continue
-            t = self._start_time + rows.end / self._sample_rate
+            t = self.state.start_time + rows.end / self._sample_rate
             M = rows.Y.shape[0]
             self.tracker.update(Rows(rows.Y[:, :-1], rows.Y[:, -1], np.ones(M), np.full(M, t)))
-            self.newest_row = t
+            self.state.newest_row = t
             self.bias.add(rows.Y, rows.noisy)
-            if np.any(rows.misfit != self._misfit):
+            if np.any(rows.misfit != self.state.misfit):
                 # Rows that were whitened as if the model lacked less must not outweigh those to come.
-                self.grams.weaken(np.minimum(1.0, (1.0 + self._misfit) / (1.0 + rows.misfit)))
-                self._misfit = rows.misfit
+                self.grams.weaken(np.minimum(1.0, (1.0 + self.state.misfit) / (1.0 + rows.misfit)))
+                self.state.misfit = rows.misfit
             self.grams.add(rows.Y, rows.noisy)
             self.latencies.add(rows.Y[:, len(self.nuisances) :], rows.late)
-            self.windows += 1
 
     def statistics(self) -> MomentumStatistics:
         """What is known now; nothing in it changes as the session goes on."""
         alarm = self.test.alarm
         return MomentumStatistics(
-            tracker=self.tracker.state(),
-            bias=self.bias.state(),
-            rows=self.fit.plain.copy(),
+            tracker=snapshot(self.tracker),
+            bias=state_copy(self.bias),
+            rows=state_copy(self.fit.plain),
             started=self.started,
             tested=self.settled,
             alarm=None if alarm is None else alarm.row,
             scale_free=self.scale_free,
             latency=self.latencies.found,
         )
-
-    def state(self) -> dict[str, dict[str, Any]]:
-        """Everything that `restore` needs to continue to the same bits."""
-        columns = len(self.sensing.channels) + self.changes.model.n_states
-        random = self._random.bit_generator.state["state"]
-        return {
-            "momentum": {
-                "windows": self.windows,
-                "dropped_windows": self.dropped_windows,
-                "segment": self._segment,
-                "start_time": self._start_time,
-                "noise_told": self._noise_told,
-                "random": np.array([str(random["state"]), str(random["inc"])]),
-                **waiting_state("waiting", self._waiting, columns),
-                **noise_state("noise", self.sensor_noise),
-                **self.bias.state(),
-                **self.grams.state(),
-                "misfit": self._misfit,
-                "known": self._known,
-                **self.latencies.state(),
-            },
-            "momentum_noise": self._estimate.state(),
-            "momentum_balance": self._balance.state(),
-            "momentum_fit": self.fit.state(),
-            "momentum_changes": self.changes.state(),
-            "momentum_tracker": dict(self.tracker.state()),
-            "momentum_test": self.test.state(),
-        }
-
-    def restore(self, saved: Mapping[str, Mapping[str, NDArray[Any]]]) -> None:
-        """Continue from a saved state."""
-        state = saved["momentum"]
-        self.changes.restore(saved["momentum_changes"])
-        self._build()
-        self.windows, self.dropped_windows = int(state["windows"]), int(state["dropped_windows"])
-        self._noise_told = int(state["noise_told"])
-        self._segment, self._start_time = int(state["segment"]), float(state["start_time"])
-        position, increment = (int(number) for number in state["random"])
-        generator = dict(self._random.bit_generator.state)
-        generator["state"] = {"state": position, "inc": increment}
-        self._random.bit_generator.state = generator
-        self.sensor_noise = noise_from_state("noise", state)
-        self._waiting = waiting_from_state("waiting", state)
-        self.bias.restore(state)
-        self.grams.restore(state)
-        self._misfit, self._known = np.array(state["misfit"]), np.array(state["known"])
-        self.latencies.restore(state)
-        self._estimate.restore(saved["momentum_noise"])
-        self._balance.restore(saved["momentum_balance"])
-        self.fit.restore(saved["momentum_fit"])
-        self.tracker.restore(saved["momentum_tracker"])
-        self.test.restore(saved["momentum_test"])

@@ -6,12 +6,12 @@ of it (windows side by side cost fifteen times the error).
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import groupby
 from operator import itemgetter
-from typing import Any
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
@@ -32,6 +32,7 @@ from sms_online.pipeline.rough_forces import RoughForces, open_at_rest, response
 from sms_online.pipeline.smoothing import HALF_WIDTHS, WidthChoice, smooth, stride
 from sms_online.pipeline.standstill import Standstill
 from sms_online.pipeline.weak_form import test_function
+from sms_online.state import Stage, State
 from sms_online.stream import Array
 
 # Random states that tell which entries of a row are zero by structure.
@@ -94,7 +95,26 @@ _Samples = Sequence[tuple[NDArray[np.int64], int]]
 _Evaluation = Callable[[_Samples], Array]
 
 
-class MomentumBalance:
+class MomentumBalanceState(State):
+    """What a momentum balance keeps of its segment.
+
+    samples (B, ·): of all copies, from number `first` in the segment on. skip: samples of the segment that are in no
+    window, None before the first. window: number of the next window's first sample; told: of the next instant, in half
+    hops. compared: squares of the hops from the next window on. thinned, dense: of all columns and of rough forces, by
+    the filter's half width.
+    """
+
+    samples: Array
+    skip: int | None = None
+    first: int = 0
+    window: int = 0
+    told: int = 0
+    compared: list[Array] = msgspec.field(default_factory=list)
+    thinned: dict[int, _Smoothed] = msgspec.field(default_factory=dict)
+    dense: dict[int, _Smoothed] = msgspec.field(default_factory=dict)
+
+
+class MomentumBalance(Stage):
     """Turns grid samples of one segment into windows of rows.
 
     prompt: windows end at multiples of a hop on the grid, whenever the segment began, and come after `margin` samples
@@ -135,15 +155,8 @@ class MomentumBalance:
     def begin_segment(self) -> None:
         """Forget the samples before a gap."""
         layout = self.model.layout
-        self._skip: int | None = None  # samples of the segment that are in no window, None before the first
-        self._samples = np.empty((0, COPIES * (layout.n_x + len(layout.q) + self.model.n_states)))
-        self._first = 0  # number in the segment of the buffer's first sample
-        self._window = 0  # number of the next window's first sample
-        self._told = 0  # number of the next instant, in half hops
-        self._compared: list[Array] = []  # squares of the hops from the next window on
-        # By the filter's half width, of all that is thinned and of the rough forces.
-        self._thinned: dict[int, _Smoothed] = {}
-        self._dense: dict[int, _Smoothed] = {}
+        columns = COPIES * (layout.n_x + len(layout.q) + self.model.n_states)
+        self.state = MomentumBalanceState(np.empty((0, columns)))
         self._standstill = Standstill(self._motors.size, self.sample_rate)
 
     def push(
@@ -154,18 +167,18 @@ class MomentumBalance:
         index (B,): grid index. copies: x, n τ and internal states of effects side by side (B, n_x + joints + n_states)
         as measured, then with noise added and with the same subtracted. sigma (n_x,): noise of x, 1σ per sample.
         """
-        if self._skip is None:
-            self._skip = -(int(index[0]) + self.lead) % self.hop if self._prompt else 0
-        skipped, self._skip = min(self._skip, index.size), max(0, self._skip - index.size)
-        self._samples = np.concatenate((self._samples, np.concatenate(copies, axis=1)[skipped:]))
+        if self.state.skip is None:
+            self.state.skip = -(int(index[0]) + self.lead) % self.hop if self._prompt else 0
+        skipped, self.state.skip = min(self.state.skip, index.size), max(0, self.state.skip - index.size)
+        self.state.samples = np.concatenate((self.state.samples, np.concatenate(copies, axis=1)[skipped:]))
         if self._motors.size:
             self._standstill.push(copies[0][skipped:, self._motors], sigma[self._motors])
-        grid = int(index[-1]) - (self._first + self._samples.shape[0] - 1)
+        grid = int(index[-1]) - (self.state.first + self.state.samples.shape[0] - 1)
         chosen: list[tuple[int, int]] = []  # first sample and half width of each window
-        while self._window + self.width + self.lead + self.margin < self._first + self._samples.shape[0]:
-            chosen.append((self._window, self._choose(sigma)))
-            self._window += self.hop
-            self._compared.pop(0)
+        while self.state.window + self.width + self.lead + self.margin < self.state.first + self.state.samples.shape[0]:
+            chosen.append((self.state.window, self._choose(sigma)))
+            self.state.window += self.hop
+            self.state.compared.pop(0)
         instants = [piece for window, half_width in chosen for piece in self._tell(window, half_width)]
         windows: list[Window] = []
         # Windows of one width in a row are worked off together.
@@ -178,10 +191,10 @@ class MomentumBalance:
             windows += rows
             if fresh is not None:
                 instants = [replace(fresh, probed=probed)]
-        drop = self._window - self._first
+        drop = self.state.window - self.state.first
         if drop > 0:
-            self._samples, self._first = self._samples[drop:], self._window
-            self._standstill.drop(self._window + self.lead)
+            self.state.samples, self.state.first = self.state.samples[drop:], self.state.window
+            self._standstill.drop(self.state.window + self.lead)
         return windows, instants
 
     def _choose(self, sigma: Array) -> int:
@@ -190,22 +203,22 @@ class MomentumBalance:
         Sample n of the segment is at n - first + lead of the buffer.
         """
         n_x = self.model.layout.n_x
-        while len(self._compared) < HOPS - 1:
-            start = self._window + len(self._compared) * self.hop - self._first + self.lead
+        while len(self.state.compared) < HOPS - 1:
+            start = self.state.window + len(self.state.compared) * self.hop - self.state.first + self.lead
             centres = start + (np.arange(COMPARED) * self.hop) // COMPARED
-            self._compared.append(self._choice.squares(self._samples[:, :n_x], centres))
-        return self._choice.widest(np.sum(self._compared, axis=0) / ((HOPS - 1) * COMPARED), sigma)
+            self.state.compared.append(self._choice.squares(self.state.samples[:, :n_x], centres))
+        return self._choice.widest(np.sum(self.state.compared, axis=0) / ((HOPS - 1) * COMPARED), sigma)
 
     def _tell(self, window: int, half_width: int) -> list[Instants]:
         """States at the instants up to the end of a window that have not been told yet."""
         last = (window + self.width) // self.half_hop
-        numbers = np.arange(self._told, last + 1)
+        numbers = np.arange(self.state.told, last + 1)
         if numbers.size == 0:
             return []
         widths = np.minimum(half_width, self.margin + (last - numbers) * self.half_hop)
         apart = [(numbers[widths == M] * self.half_hop, M) for M in np.unique(widths)[::-1].tolist()]
         x, v, signals = self._states(apart)
-        self._told = last + 1
+        self.state.told = last + 1
         return [Instants(int(numbers[0]), x[0], v[0], signals[0])]
 
     def _states(self, samples: _Samples) -> tuple[Array, Array, Array]:
@@ -213,8 +226,8 @@ class MomentumBalance:
 
         samples: their numbers, K in all, and half width M of their filter.
         """
-        layout, before = self.model.layout, self.lead - self._first
-        smoothed = [smooth(self._samples, numbers + before, M, self.sample_rate) for numbers, M in samples]
+        layout, before = self.model.layout, self.lead - self.state.first
+        smoothed = [smooth(self.state.samples, numbers + before, M, self.sample_rate) for numbers, M in samples]
         values, rates = (np.concatenate(parts) for parts in zip(*smoothed, strict=True))
         apart = len(values), COPIES, values.shape[1] // COPIES
         values, rates = (part.reshape(apart).swapaxes(0, 1) for part in (values, rates))
@@ -233,7 +246,7 @@ class MomentumBalance:
             columns, probed = self._columns(*self._states(samples), further)
             return columns
 
-        kept = self._kept(self._thinned, half_width, s, windows[0], self._entries)
+        kept = self._kept(self.state.thinned, half_width, s, windows[0], self._entries)
         phi, phi_dot = self._phi[s]
         width = COPIES * (entries + n_v)
         out = []
@@ -250,7 +263,7 @@ class MomentumBalance:
         phi, _ = self._phi[1]
         windows = [row.start * self.half_hop for row in rows]
         parts = np.cumsum([COPIES * (self._rough.size + self.model.layout.n_v), 2 * self.rough.rows.size])
-        kept = self._kept(self._dense, half_width, 1, windows[0], int(parts[-1]) + self.rough.dry.size)
+        kept = self._kept(self.state.dense, half_width, 1, windows[0], int(parts[-1]) + self.rough.dry.size)
         offset = self.model.layout.n_base_positions - self.model.layout.n_base_speeds
         motor_of = np.searchsorted(self._motors, self.rough.motors + offset)
         # Entries of columns and slopes by laws of dry friction: at a standstill they tell noise's sign for friction's.
@@ -340,9 +353,9 @@ class MomentumBalance:
 
     def _change(self, samples: _Samples, v: Array) -> Array:
         """What the rates of joints with rough forces change by from the sample before (K, n_v), of the motion v."""
-        layout, before = self.model.layout, self.lead - self._first
+        layout, before = self.model.layout, self.lead - self.state.first
         speeds = np.unique(self.rough.coordinates)
-        angles = self._samples[:, speeds + layout.n_base_positions - layout.n_base_speeds]
+        angles = self.state.samples[:, speeds + layout.n_base_positions - layout.n_base_speeds]
         out = np.zeros_like(v)
         if speeds.size:
             # The first sample of all has none before it.
@@ -369,38 +382,3 @@ class MomentumBalance:
         rows[:, self.rows, self.columns] = window.Y
         rows[:, :, -1] = window.b
         return rows
-
-    def state(self) -> dict[str, Any]:
-        """What `restore` needs to continue."""
-        return {
-            "samples": self._samples,
-            "position": np.array([self._first, self._window, self._told, -1 if self._skip is None else self._skip]),
-            "compared": np.array(self._compared),
-            **_smoothed_state("thinned", self._thinned),
-            **_smoothed_state("dense", self._dense),
-            **self._standstill.state(),
-        }
-
-    def restore(self, state: Mapping[str, NDArray[Any]]) -> None:
-        """Continue from a saved state."""
-        self._samples = np.array(state["samples"])
-        self._first, self._window, self._told, skip = (int(k) for k in state["position"])
-        self._skip = None if skip < 0 else skip
-        self._compared = list(np.array(state["compared"]))
-        self._standstill.restore(state)
-        self._thinned, self._dense = (_smoothed_from_state(name, state) for name in ("thinned", "dense"))
-
-
-def _smoothed_state(name: str, smoothed: dict[int, _Smoothed]) -> dict[str, Any]:
-    places = [(M, kept.step, kept.first) for M, kept in smoothed.items()]
-    return {
-        f"{name}_place": np.array(places, dtype=np.int64).reshape(-1, 3),
-        **{f"{name}_{M}": kept.columns for M, kept in smoothed.items()},
-    }
-
-
-def _smoothed_from_state(name: str, state: Mapping[str, NDArray[Any]]) -> dict[int, _Smoothed]:
-    return {
-        int(M): _Smoothed(int(step), int(first), np.array(state[f"{name}_{M}"]))
-        for M, step, first in state[f"{name}_place"]
-    }

@@ -14,10 +14,10 @@ row's own.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
@@ -33,8 +33,6 @@ from sms_online.pipeline.momentum_windows import (
     Instants,
     Probes,
     Window,
-    windows_from_state,
-    windows_state,
 )
 from sms_online.pipeline.plain_rows import PlainRows
 from sms_online.pipeline.second_order import SecondOrderNoise, beyond_first_order, rounding, size
@@ -42,6 +40,7 @@ from sms_online.pipeline.sensor_noise import SensorNoise
 from sms_online.pipeline.smoothing import HALF_WIDTHS
 from sms_online.pipeline.weighing import Weighed, Weighing
 from sms_online.pipeline.window_noise import WindowNoise
+from sms_online.state import Stage, State
 from sms_online.stream import Array
 
 # Motion before weights are made, s: at the usual width, four windows side by side.
@@ -101,7 +100,31 @@ class WhiteRows:
     misfit: Array
 
 
-class MomentumFit:
+class MomentumFitState(State):
+    """What a fit keeps of the windows so far.
+
+    moving: windows with motion since the segment began. since: windows since the weights were looked at; renewal:
+    windows from one look to the next. warm: windows that the weighing to come has been told, None where none is to
+    come. held: windows held back. last: first instant that a window to come asks for, at least; x, v, signals: states
+    at the instants from number `first` on. sampled: windows behind the second-order noise, by the filter's half width.
+    largest (n_v,): largest sum of a row's terms.
+    """
+
+    x: Array
+    v: Array
+    signals: Array
+    sampled: dict[int, int]
+    largest: Array
+    moving: int = 0
+    since: int = 0
+    renewal: int = 0
+    warm: int | None = None
+    held: list[Window] = msgspec.field(default_factory=list)
+    last: int = 0
+    first: int = 0
+
+
+class MomentumFit(Stage):
     """Whitens the windows of a session, segment by segment.
 
     new_noise: makes what propagates noise, for the same model, base and balance. solve: gives the estimate so far of
@@ -131,66 +154,66 @@ class MomentumFit:
         self._new_noise, self._sources = new_noise, sources
         self.weighing = self._new_weighing()
         self._next: Weighing | None = None  # with new weights, that takes over when it has been told enough windows
-        self._warm = 0  # windows that it has been told
-        self._since = 0  # windows since they were looked at
-        self._moving = 0
-        self._renewal = 0  # windows from one look to the next
-        # By the filter's width, and of how many windows.
-        self._second_order = SecondOrderNoise({half_width: np.zeros(model.layout.n_v) for half_width in HALF_WIDTHS})
-        self._sampled = dict.fromkeys(HALF_WIDTHS, 0)
-        self._largest = np.zeros(model.layout.n_v)  # largest sum of a row's terms
-        self.plain = PlainRows(model.layout.n_v, self._nuisances + base.n)
-        self._begin_segment()
+        layout = model.layout
+        widths = (layout.n_x, layout.n_v, len(layout.q) + model.n_states)
+        x, v, signals = (np.empty((0, columns)) for columns in widths)
+        self.state = MomentumFitState(x, v, signals, dict.fromkeys(HALF_WIDTHS, 0), np.zeros(layout.n_v))
+        self._second_order = SecondOrderNoise({half_width: np.zeros(layout.n_v) for half_width in HALF_WIDTHS})
+        self.plain = PlainRows.none(layout.n_v, self._nuisances + base.n)
+
+    def renew(self) -> None:
+        """See Stage."""
+        self._next = None if self.state.warm is None else self._new_weighing()
 
     def _new_weighing(self) -> Weighing:
         return Weighing(self._new_noise(), COPIES * (self.base.n + 1), self._sources)
 
     def end_segment(self, noise: SensorNoise) -> list[WhiteRows]:
         """Rows of the windows held back, if they tell enough for weights; the next ones share no samples with them."""
-        out = self.flush(noise) if self._held and self._moving >= self._count(LEAST_MOTION) else []
+        out = self.flush(noise) if self.state.held and self.state.moving >= self._count(LEAST_MOTION) else []
         self._begin_segment()
         return out
 
     def _begin_segment(self) -> None:
-        layout = self.model.layout
-        self._held: list[Window] = []
-        self._moving = 0
-        self._last = 0  # number of the first instant that a window to come asks for, at least
-        self._first = 0  # number of the first instant kept
-        self._x, self._v = np.empty((0, layout.n_x)), np.empty((0, layout.n_v))
-        self._signals = np.empty((0, len(layout.q) + self.model.n_states))
+        now = self.state
+        now.held, now.moving, now.last, now.first = [], 0, 0, 0
+        now.x, now.v, now.signals = now.x[:0], now.v[:0], now.signals[:0]
         if self._next is not None:
             # A chain that begins anew need not be warmed up.
-            self.weighing, self._next = self._next, None
+            self._take_over(self._next)
         self.weighing.begin_segment()
+
+    def _take_over(self, weighing: Weighing) -> None:
+        """Go on with the weighing that was to come."""
+        self.weighing, self._next, self.state.warm = weighing, None, None
 
     def push(self, windows: list[Window], instants: list[Instants], noise: SensorNoise) -> list[WhiteRows]:
         """Rows of the windows that a push completed, and of those held back before."""
-        self._x = np.concatenate((self._x, *(piece.x for piece in instants)))
-        self._v = np.concatenate((self._v, *(piece.v for piece in instants)))
-        self._signals = np.concatenate((self._signals, *(piece.signals for piece in instants)))
+        self.state.x = np.concatenate((self.state.x, *(piece.x for piece in instants)))
+        self.state.v = np.concatenate((self.state.v, *(piece.v for piece in instants)))
+        self.state.signals = np.concatenate((self.state.signals, *(piece.signals for piece in instants)))
         if self.weights is not None:
             if windows:
                 self._look(noise, windows[0])
             self._tell(instants)
             out = [self._white(window) for window in windows]
         else:
-            self._held += windows
-            self._moving += sum(self._moves(window, noise) for window in windows)
-            out = self.flush(noise) if self._moving >= self._count(FIRST_MOTION) else []
-            self._held = self._held[-self._count(HELD_BACK) :]
+            self.state.held += windows
+            self.state.moving += sum(self._moves(window, noise) for window in windows)
+            out = self.flush(noise) if self.state.moving >= self._count(FIRST_MOTION) else []
+            self.state.held = self.state.held[-self._count(HELD_BACK) :]
         self._forget_instants()
         return out
 
     def go_on(self, weights: Array, noise: SensorNoise) -> None:
         """Begin with weights β (n,) that are known."""
-        self.weighing.begin(weights, noise, self.plain.misfit, self._first)
-        self._renewal = self._count(FIRST_RENEWAL)
+        self.weighing.begin(weights, noise, self.plain.misfit, self.state.first)
+        self.state.renewal = self._count(FIRST_RENEWAL)
 
     def flush(self, noise: SensorNoise) -> list[WhiteRows]:
         """Fit the windows held back, without weights and then with those of the fit before, and return their rows."""
-        self._moving = 0
-        unweighted, _ = _least_squares(np.concatenate([self._balance.dense(window)[0] for window in self._held]))
+        self.state.moving = 0
+        unweighted, _ = _least_squares(np.concatenate([self._balance.dense(window)[0] for window in self.state.held]))
         weights = self._settled(unweighted, noise, PASSES, partly=False)
         if self.plain.misfit.any():
             misfit, nominal = self.plain.misfit, self.base.values(self.model.nominal)
@@ -200,10 +223,10 @@ class MomentumFit:
             if self.plain.misfit.any() and misfit.any():
                 weights = self._scale_free([unweighted, nominal], noise)
         self._retell(weights, noise)
-        out = [self._white(window) for window in self._held]
-        self._since = 0
-        self._renewal = self._count(FIRST_RENEWAL)
-        self._held = []
+        out = [self._white(window) for window in self.state.held]
+        self.state.since = 0
+        self.state.renewal = self._count(FIRST_RENEWAL)
+        self.state.held = []
         return out
 
     def _settled(self, weights: Array, noise: SensorNoise, passes: int, partly: bool) -> Array:
@@ -214,7 +237,7 @@ class MomentumFit:
         self.plain.misfit = np.zeros(self.model.layout.n_v)
         for _ in range(passes):
             self._retell(weights, noise)
-            white = [self._white(window).Y for window in self._held]
+            white = [self._white(window).Y for window in self.state.held]
             white += [self._calibration] if len(self._calibration) else []
             fitted, determined = _least_squares(np.concatenate(white))
             beta, known = fitted[self._nuisances :], determined[self._nuisances :]
@@ -228,8 +251,8 @@ class MomentumFit:
         Weights that follow a least-squares fit of rows that hold more than noise would shrink π to zero.
         """
         n_v, m = self.model.layout.n_v, self._nuisances
-        grams = RowGrams(n_v, m + self.base.n)
-        for window in self._held:
+        grams = RowGrams.none(n_v, m + self.base.n)
+        for window in self.state.held:
             rows = np.pad(self._balance.dense(window), ((0, 0), (0, 0), (m, 0)))
             grams.add(rows[0], rows[1:])
         lacking = np.ones(n_v, dtype=np.bool_)
@@ -239,9 +262,9 @@ class MomentumFit:
             # What the rows leave of the new weights' noise, and the rows whitened with it.
             for _ in range(2):
                 self._retell(joint[m:], noise)
-                white = [self._white(window) for window in self._held]
+                white = [self._white(window) for window in self.state.held]
                 self.plain.judge(joint)
-            grams = RowGrams(n_v, m + self.base.n)
+            grams = RowGrams.none(n_v, m + self.base.n)
             for each in white:
                 grams.add(each.Y, each.noisy)
             lacking, starts = self.plain.misfit > 0.0, [joint]
@@ -277,8 +300,8 @@ class MomentumFit:
         return max(1, round(seconds * HOPS / self._balance.span))
 
     def _moves(self, window: Window, noise: SensorNoise) -> bool:
-        inside = slice(window.start - self._first, window.start - self._first + INSTANTS + 1)
-        return bool(np.any(np.ptp(self._x[inside], axis=0) > MOTION * noise.coordinates))
+        inside = slice(window.start - self.state.first, window.start - self.state.first + INSTANTS + 1)
+        return bool(np.any(np.ptp(self.state.x[inside], axis=0) > MOTION * noise.coordinates))
 
     def _look(self, noise: SensorNoise, window: Window) -> None:
         """Now and then, with the window to come: begin to weigh with the estimate and the noise so far, if it matters.
@@ -286,20 +309,20 @@ class MomentumFit:
         The chain so far goes on until the new one has been told enough windows. What the model lacks counts at once: it
         is each row's own, and chains of such rows are short.
         """
-        if self._since < self._renewal:
+        if self.state.since < self.state.renewal:
             return
         estimate = self._solve()
         nuisances, beta = np.nan_to_num(estimate[: self._nuisances]), estimate[self._nuisances :]
         beta = np.where(np.isnan(beta), self._known_weights, beta)
-        self._since = 0
-        self._renewal = min(2 * self._renewal, self._count(LATEST_RENEWAL))
+        self.state.since = 0
+        self.state.renewal = min(2 * self.state.renewal, self._count(LATEST_RENEWAL))
         self.plain.judge(np.concatenate((nuisances, beta)))
         used, misfit = self.weighing, self.plain.misfit
         if np.any(np.abs(misfit - used.misfit) > SAME_MISFIT * (1.0 + used.misfit)):
-            self._next = None
+            self._next = self.state.warm = None
             used.begin(beta, noise, misfit, window.start)
         elif self._next is None and self._matters(beta, noise):
-            self._next, self._warm = self._new_weighing(), 0
+            self._next, self.state.warm = self._new_weighing(), 0
             self._next.begin(beta, noise, self.plain.misfit, window.start)
 
     def _matters(self, beta: Array, noise: SensorNoise) -> bool:
@@ -315,9 +338,11 @@ class MomentumFit:
     def _retell(self, weights: Array, noise: SensorNoise) -> None:
         """Work off the windows held back from the first one on, with weights β (n,)."""
         self.plain.clear()
-        self._sampled = dict.fromkeys(HALF_WIDTHS, 0)
-        self._largest = np.zeros_like(self._largest)  # a fit that fails may have made them larger than any row is
-        self.weighing.begin(weights, noise, self.plain.misfit, self._first)
+        self.state.sampled = dict.fromkeys(HALF_WIDTHS, 0)
+        self.state.largest = np.zeros_like(
+            self.state.largest
+        )  # a fit that fails may have made them larger than any row is
+        self.weighing.begin(weights, noise, self.plain.misfit, self.state.first)
         self._tell()
 
     @property
@@ -328,7 +353,7 @@ class MomentumFit:
     def _tell(self, instants: Sequence[Instants] = ()) -> None:
         """Have the states of the instants known to who weighs; instants: those that came last."""
         for weighing in self._weighings:
-            weighing.noise.tell(self._first, self._x, self._v, self._signals, instants)
+            weighing.noise.tell(self.state.first, self.state.x, self.state.v, self.state.signals, instants)
 
     @property
     def _weighings(self) -> list[Weighing]:
@@ -339,10 +364,10 @@ class MomentumFit:
         rows = self._balance.dense(window)
         sample = beyond_first_order(rows, self._known_weights)
         M, means = window.half_width, self._second_order.means
-        self._sampled[M] = min(self._sampled[M] + 1, MOST_SAMPLES)
-        means[M] = means[M] + (sample**2 - means[M]) / self._sampled[M]
-        self._largest = np.maximum(self._largest, size(rows[0], self._known_weights))
-        errors = self._second_order.variance(M) + rounding(self._largest)
+        self.state.sampled[M] = min(self.state.sampled[M] + 1, MOST_SAMPLES)
+        means[M] = means[M] + (sample**2 - means[M]) / self.state.sampled[M]
+        self.state.largest = np.maximum(self.state.largest, size(rows[0], self._known_weights))
+        errors = self._second_order.variance(M) + rounding(self.state.largest)
         misfit = self.weighing.misfit
         weighed = self._weigh(window, rows.swapaxes(0, 1).reshape(n_v, -1), errors)
         white = weighed.rows.reshape(n_v, COPIES, -1).swapaxes(0, 1)
@@ -360,55 +385,30 @@ class MomentumFit:
 
     def _weigh(self, window: Window, rows: Array, errors: Array) -> Weighed:
         """Rows (n_v, width) of the next window; the weighing to come is told them too, and then may take over."""
-        self._last = window.start
-        self._since += 1
+        self.state.last = window.start
+        self.state.since += 1
         weighed = self.weighing.push(window, rows, errors)
         if self._next is not None:
             self._next.push(window, rows, errors)
-            self._warm += 1
-            if self._warm >= self._count(WARM_UP):
-                self.weighing, self._next = self._next, None
-                self._since = 0
+            self.state.warm = (self.state.warm or 0) + 1
+            if self.state.warm >= self._count(WARM_UP):
+                self._take_over(self._next)
+                self.state.since = 0
         return weighed
 
     def _forget_instants(self) -> None:
         """Drop the states that no window to come asks for."""
-        needed = max(self._first, self._held[0].start if self._held else self._last)
-        drop = needed - self._first
-        self._first = needed
-        self._x, self._v, self._signals = self._x[drop:], self._v[drop:], self._signals[drop:]
+        needed = max(self.state.first, self.state.held[0].start if self.state.held else self.state.last)
+        drop = needed - self.state.first
+        self.state.first = needed
+        self.state.x, self.state.v, self.state.signals = (
+            self.state.x[drop:],
+            self.state.v[drop:],
+            self.state.signals[drop:],
+        )
         if self.weights is not None:
             for weighing in self._weighings:
                 weighing.noise.drop(needed)
-
-    def state(self) -> dict[str, Any]:
-        """What `restore` needs to continue."""
-        return {
-            "since": self._since, "moving": self._moving, "first": self._first,
-            "x": self._x, "v": self._v, "signals": self._signals,
-            "second_order": np.array([*self._second_order.means.values()]),
-            "sampled": np.array([*self._sampled.values()]),
-            "largest": self._largest, **self.plain.state(), "renewal": self._renewal, "last": self._last,
-            "warm": -1 if self._next is None else self._warm, **self.weighing.state(),
-            **windows_state("held", self._held),
-            **({} if self._next is None else {f"next_{name}": value for name, value in self._next.state().items()}),
-        }  # fmt: skip
-
-    def restore(self, state: Mapping[str, NDArray[Any]]) -> None:
-        """Continue from a saved state."""
-        self._since, self._moving, self._first = int(state["since"]), int(state["moving"]), int(state["first"])
-        self._x, self._v, self._signals = (np.array(state[name]) for name in ("x", "v", "signals"))
-        self._largest = np.array(state["largest"])
-        self._second_order.means = dict(zip(HALF_WIDTHS, np.array(state["second_order"]), strict=True))
-        self._sampled = dict(zip(HALF_WIDTHS, state["sampled"].tolist(), strict=True))
-        self.plain.restore(state)
-        self._held = windows_from_state("held", state)
-        self._renewal, self._last = int(state["renewal"]), int(state["last"])
-        self.weighing.restore(state)
-        self._next = None
-        if state["warm"] >= 0:
-            self._next, self._warm = self._new_weighing(), int(state["warm"])
-            self._next.restore({name[5:]: value for name, value in state.items() if name.startswith("next_")})
 
 
 def _least_squares(rows: Array) -> tuple[Array, NDArray[np.bool_]]:

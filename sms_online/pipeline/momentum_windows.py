@@ -2,12 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
-
-import numpy as np
-from numpy.typing import NDArray
 
 from sms_online.stream import Array
 
@@ -63,23 +59,3 @@ class Window:
     half_width: int
     rough: Array
     rest: Array
-
-
-def windows_state(name: str, windows: list[Window]) -> dict[str, Any]:
-    """Windows as arrays, to be saved under names that begin with `name`."""
-    return {
-        f"{name}_place": np.array([(w.start, w.end, w.half_width) for w in windows], dtype=np.int64).reshape(-1, 3),
-        f"{name}_Y": np.array([w.Y for w in windows]),
-        f"{name}_b": np.array([w.b for w in windows]),
-        f"{name}_rough": np.array([w.rough for w in windows]),
-        f"{name}_rest": np.array([w.rest for w in windows]),
-    }
-
-
-def windows_from_state(name: str, state: Mapping[str, NDArray[Any]]) -> list[Window]:
-    """The windows that `windows_state` saved."""
-    places, *parts = (state[f"{name}_{part}"] for part in ("place", "Y", "b", "rough", "rest"))
-    return [
-        Window(int(start), int(end), np.array(Y), np.array(b), int(half_width), np.array(rough), np.array(rest))
-        for (start, end, half_width), Y, b, rough, rest in zip(places, *parts, strict=True)
-    ]

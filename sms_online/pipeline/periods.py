@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Any
-
 import numpy as np
 from numpy.typing import NDArray
 
+from sms_online.state import Stage, State
 from sms_online.stream import Array
 
 # First intervals of a channel whose median is its period: four of nine may be disturbed.
@@ -17,22 +15,36 @@ PERIOD_INTERVALS = 9
 LONGEST_HOLE = 1.0
 
 
-class Periods:
-    """Sample period of each of C channels. known: (C,) s, NaN where it is not known yet.
+class PeriodsState(State):
+    """What is known of periods.
+
+    known (C,): s, NaN while it is not known. intervals (C, PERIOD_INTERVALS): a channel's first, NaN to come.
+    """
+
+    known: Array
+    intervals: Array
+
+
+class Periods(Stage):
+    """Sample period of each of C channels.
 
     gap_limit: longest interval between two samples that is no gap, in periods, at most LONGEST_HOLE.
     """
 
     def __init__(self, count: int, gap_limit: int) -> None:
-        self.known = np.full(count, np.nan)
         self._gap_limit = gap_limit
-        self._intervals = np.full((count, PERIOD_INTERVALS), np.nan)
+        self.state = PeriodsState(np.full(count, np.nan), np.full((count, PERIOD_INTERVALS), np.nan))
+
+    @property
+    def known(self) -> Array:
+        """(C,) s, NaN where it is not known yet."""
+        return self.state.known
 
     def learn(self, channel: int, intervals: Array) -> None:
         """Take a channel's next intervals, s, until nine are known, or a hole ends those that are."""
-        first = self._intervals[channel]
+        first = self.state.intervals[channel]
         for interval in intervals:
-            if not np.isnan(self.known[channel]):
+            if not np.isnan(self.state.known[channel]):
                 return
             count = np.count_nonzero(~np.isnan(first))
             if interval > LONGEST_HOLE:
@@ -44,20 +56,12 @@ class Periods:
 
     def settle(self, channel: int) -> None:
         """Take the period from the intervals so far, where there are any."""
-        first = self._intervals[channel]
+        first = self.state.intervals[channel]
         if not np.isnan(first[0]):
-            self.known[channel] = np.nanmedian(first)
+            self.state.known[channel] = np.nanmedian(first)
 
     def is_gap(self, interval: Array, channel: int) -> NDArray[np.bool_]:
         """Which intervals are gaps. Before the period is known only the absolute limit can tell."""
         gap = interval > LONGEST_HOLE
-        period = self.known[channel]
+        period = self.state.known[channel]
         return gap if np.isnan(period) else gap | (np.rint(interval / period) > self._gap_limit)
-
-    def state(self) -> dict[str, NDArray[Any]]:
-        """What `restore` needs to continue."""
-        return {"intervals": self._intervals.copy(), "period": self.known.copy()}
-
-    def restore(self, state: Mapping[str, NDArray[Any]]) -> None:
-        """Continue from a saved state."""
-        self._intervals, self.known = state["intervals"].copy(), state["period"].copy()

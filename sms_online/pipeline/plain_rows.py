@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Any
-
 import numpy as np
-from numpy.typing import NDArray
 
+from sms_online.state import State
 from sms_online.stream import Array
 
 # Mean square of a coordinate's residual over its predicted variance beyond which the model lacks something there: a
@@ -17,24 +14,21 @@ LARGEST_RATIO = 2.0
 ROUNDED = 16.0
 
 
-class PlainRows:
+class PlainRows(State):
     """Sums over windows, by generalized speed.
 
     gram (n_v, n + 1, n + 1): Gram matrices of rows [Y b] over their deviations. windows: how many. misfit (n_v,):
     excess over one of the mean square of such rows' residual, zero where it may be chance.
     """
 
-    def __init__(self, n_v: int, n: int) -> None:
-        # No array is written twice, so whoever keeps one has the sum of then: of a large arm they are 3 MB.
-        self.gram = np.zeros((n_v, n + 1, n + 1))
-        self.windows = 0
-        self.misfit = np.zeros(n_v)
+    gram: Array
+    misfit: Array
+    windows: int = 0
 
-    def copy(self) -> PlainRows:
-        """The sums of now, in microseconds."""
-        out = object.__new__(PlainRows)
-        vars(out).update(vars(self))
-        return out
+    @staticmethod
+    def none(n_v: int, n: int) -> PlainRows:
+        """Of no windows, with rows of n_v speeds and n parameters."""
+        return PlainRows(np.zeros((n_v, n + 1, n + 1)), np.zeros(n_v))
 
     def clear(self) -> None:
         """Forget the windows, not the misfit."""
@@ -67,12 +61,3 @@ class PlainRows:
         if self.windows:
             ratio = self._squares(beta) / self.windows
             self.misfit = np.where(ratio > LARGEST_RATIO, ratio - 1.0, 0.0)
-
-    def state(self) -> dict[str, Any]:
-        """What `restore` needs to continue."""
-        return {"misfit": self.misfit, "plain_gram": self.gram, "plain_windows": self.windows}
-
-    def restore(self, state: Mapping[str, NDArray[Any]]) -> None:
-        """Continue from a saved state."""
-        self.misfit, self.gram = np.array(state["misfit"]), np.array(state["plain_gram"])
-        self.windows = int(state["plain_windows"])

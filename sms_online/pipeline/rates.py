@@ -14,10 +14,9 @@ Applications 35 (1990) 454; Goldenshluger and Nemirovski, Mathematical Methods o
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Any
 
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
@@ -25,7 +24,8 @@ from numpy.typing import NDArray
 from scipy.ndimage import correlate1d
 
 from sms_online.pipeline.noise import noise_std
-from sms_online.pipeline.synchronise import GridSamples, StageState
+from sms_online.pipeline.synchronise import GridSamples
+from sms_online.state import Stage, State
 from sms_online.stream import Array
 
 DEGREE = 8
@@ -139,7 +139,26 @@ def _agree(leftover: Array, difference: Array, sigma: Array) -> bool:
     return bool(np.all(found <= AGREEMENT * expected))
 
 
-class RatesStage:
+class RatesState(State):
+    """What the filter keeps, and what it has chosen.
+
+    half_width: M. sigma (C,): white noise, 1σ per sample. buffer (B, C): samples from grid index `start` on. next:
+    grid index of the next sample to deliver. decided: index up to which half_width holds. noise_known: of the window
+    that is being decided. moved: windows that moved throughout.
+    """
+
+    sigma: Array
+    buffer: Array
+    half_width: int = HALF_WIDTHS[0]
+    segment: int = -1
+    start: int = 0
+    next: int = 0
+    decided: int = 0
+    noise_known: bool = False
+    moved: int = 0
+
+
+class RatesStage(Stage):
     """Smoothed values and rates of all columns, behind the same lag of M samples.
 
     The third window of `warm_up` samples in which the channels move throughout fixes M for good. Windows before it, at
@@ -154,61 +173,49 @@ class RatesStage:
 
     def __init__(self, sample_rate: float, deciding: Sequence[int], sigma: Array, warm_up: int = WARM_UP) -> None:
         self.sample_rate = sample_rate
-        self.half_width = HALF_WIDTHS[0]
-        self.sigma = sigma.copy()
         self._stated = sigma.copy()
         self._deciding = np.array(deciding, dtype=np.int64)
         self._warm_up = warm_up
-        self._segment = -1
-        self._buffer = np.empty((0, sigma.size))
-        self._start = 0  # grid index of the buffer's first row
-        self._next = 0  # grid index of the next sample to deliver
-        self._decided = 0  # grid index up to which half_width holds
-        self._noise_known = False  # of the window that is being decided
-        self._moved = 0  # windows that moved throughout
+        self.state = RatesState(sigma.copy(), np.empty((0, sigma.size)))
+
+    @property
+    def half_width(self) -> int:
+        """Half width M of the filter, samples."""
+        return self.state.half_width
+
+    @property
+    def sigma(self) -> Array:
+        """White noise of each column (C,), 1σ per sample."""
+        return self.state.sigma
 
     @property
     def fixed(self) -> bool:
         """Whether M (half_width) and the noise (sigma) are fixed for the rest of the capture."""
-        return self._moved >= MOVING_WINDOWS
+        return self.state.moved >= MOVING_WINDOWS
 
     def push(self, samples: GridSamples) -> list[RateSamples]:
         """Take consecutive grid samples and return those that have become final."""
         pieces: list[RateSamples] = []
-        if samples.segment != self._segment:
+        if samples.segment != self.state.segment:
             pieces = self.flush()
-            self._segment = samples.segment
-            self._start = self._next = int(samples.index[0])
-            self._decided = NEVER if self.fixed else self._start
-        self._buffer = np.concatenate([self._buffer, samples.values])
+            self.state.segment = samples.segment
+            self.state.start = self.state.next = int(samples.index[0])
+            self.state.decided = NEVER if self.fixed else self.state.start
+        self.state.buffer = np.concatenate([self.state.buffer, samples.values])
         return pieces + self._advance(int(PACE * samples.index.size) + 1)
 
     def flush(self) -> list[RateSamples]:
         """End of a segment or of the capture: return what has a full filter."""
         pieces = self._advance(NEVER)
-        rest = self._buffer[max(self._decided - self._start, 0) :]
+        rest = self.state.buffer[max(self.state.decided - self.state.start, 0) :]
         if not self.fixed and rest.shape[0] >= SAMPLES_PER_HALF_WIDTH * HALF_WIDTHS[1]:
             self._estimate_noise(rest)
             self._choose(rest)
-        self._decided, self._noise_known = NEVER, False
+        self.state.decided, self.state.noise_known = NEVER, False
         pieces += self._deliver(NEVER)
-        self._buffer = self._buffer[:0]
-        self._segment = -1
+        self.state.buffer = self.state.buffer[:0]
+        self.state.segment = -1
         return pieces
-
-    def state(self) -> StageState:
-        """Everything that the next push depends on, as arrays."""
-        numbers = [
-            self.half_width, self._moved, self._segment, self._start, self._next, self._decided, self._noise_known
-        ]  # fmt: skip
-        return {"buffer": self._buffer.copy(), "sigma": self.sigma.copy(), "numbers": np.array(numbers, dtype=np.int64)}
-
-    def restore(self, state: Mapping[str, NDArray[Any]]) -> None:
-        """Continue from a saved state of a stage made with the same arguments."""
-        self._buffer, self.sigma = state["buffer"].copy(), state["sigma"].copy()
-        numbers = [int(number) for number in state["numbers"]]
-        self.half_width, self._moved, self._segment, self._start, self._next, self._decided, noise_known = numbers
-        self._noise_known = bool(noise_known)
 
     def _advance(self, budget: int) -> list[RateSamples]:
         """Deliver and decide, as far as the samples reach and the budget lasts."""
@@ -219,8 +226,8 @@ class RatesStage:
                 pieces += delivered
                 budget -= delivered[0].index.size
             elif self._window_is_full and (budget >= DECISION_COST or not pieces):
-                offset = self._decided - self._start
-                self._decide(self._buffer[offset : offset + self._warm_up])
+                offset = self.state.decided - self.state.start
+                self._decide(self.state.buffer[offset : offset + self._warm_up])
                 budget -= DECISION_COST
             else:
                 break
@@ -229,43 +236,44 @@ class RatesStage:
     @property
     def _window_is_full(self) -> bool:
         """Whether the samples that wait for M are enough to decide on it."""
-        return not self.fixed and self._start + self._buffer.shape[0] - self._warm_up >= self._decided
+        return not self.fixed and self.state.start + self.state.buffer.shape[0] - self._warm_up >= self.state.decided
 
     def _decide(self, window: Array) -> None:
         """One step towards M for a full window: first its noise, then M."""
-        if not self._noise_known:
+        if not self.state.noise_known:
             self._estimate_noise(window)
-            self._noise_known = True
+            self.state.noise_known = True
             return
         self._choose(window)
-        self._noise_known = False
-        self._moved += self._moves_throughout(window)
-        self._decided = NEVER if self.fixed else self._decided + self._warm_up
+        self.state.noise_known = False
+        self.state.moved += self._moves_throughout(window)
+        self.state.decided = NEVER if self.fixed else self.state.decided + self._warm_up
 
     def _estimate_noise(self, window: Array) -> None:
         estimate = np.isnan(self._stated)
-        self.sigma = self._stated.copy()
-        self.sigma[estimate] = noise_std(window[:, estimate])
+        self.state.sigma = self._stated.copy()
+        self.state.sigma[estimate] = noise_std(window[:, estimate])
 
     def _choose(self, window: Array) -> None:
-        self.half_width = choose_half_width(window[:, self._deciding], self.sigma[self._deciding])
+        self.state.half_width = choose_half_width(window[:, self._deciding], self.state.sigma[self._deciding])
 
     def _moves_throughout(self, window: Array) -> bool:
         halves = np.array_split(window[:, self._deciding], 2)
         span = np.array([np.ptp(half, axis=0) for half in halves])
-        return bool(np.any(np.all(span > MOTION * self.sigma[self._deciding], axis=0)))
+        return bool(np.any(np.all(span > MOTION * self.state.sigma[self._deciding], axis=0)))
 
     def _deliver(self, most: int) -> list[RateSamples]:
         """Filter what half_width holds for and has M samples on either side, at most `most`; drop what is done with."""
-        first = max(self._next, self._start + self.half_width)
-        stop = min(self._decided, self._start + self._buffer.shape[0] - self.half_width)
+        now = self.state
+        first = max(now.next, now.start + now.half_width)
+        stop = min(now.decided, now.start + now.buffer.shape[0] - now.half_width)
         stop = min(stop, first + most) if most < NEVER else stop
         if stop <= first:
             return []
-        rows = self._buffer[first - self.half_width - self._start : stop + self.half_width - self._start]
-        values, rates = smooth_and_differentiate(rows, self.half_width, self.sample_rate)
-        self._next = stop
-        reach = self.half_width if self.fixed else HALF_WIDTHS[-1]
-        drop = max(stop - reach - self._start, 0)
-        self._buffer, self._start = self._buffer[drop:].copy(), self._start + drop
-        return [RateSamples(np.arange(first, stop), values, rates, self._segment, self.half_width)]
+        rows = now.buffer[first - now.half_width - now.start : stop + now.half_width - now.start]
+        values, rates = smooth_and_differentiate(rows, now.half_width, self.sample_rate)
+        now.next = stop
+        reach = now.half_width if self.fixed else HALF_WIDTHS[-1]
+        drop = max(stop - reach - now.start, 0)
+        now.buffer, now.start = now.buffer[drop:].copy(), now.start + drop
+        return [RateSamples(np.arange(first, stop), values, rates, now.segment, now.half_width)]

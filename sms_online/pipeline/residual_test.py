@@ -14,7 +14,6 @@ Sources: Page, Biometrika 41 (1954) 100; Lorden, Annals of Mathematical Statisti
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -25,6 +24,7 @@ from sms_online.model.layout import Layout
 from sms_online.pipeline.momentum_fit import WhiteRows
 from sms_online.pipeline.momentum_windows import HOPS
 from sms_online.row_types import row_types
+from sms_online.state import Stage, State
 from sms_online.stream import Array
 
 # False alarms an hour, at most: one in a hundred hours of motion.
@@ -53,10 +53,29 @@ class Alarm:
     since: int
 
 
-class SequentialTest:
+class TestState(State):
+    """What a test keeps of its windows.
+
+    sums (HOPS, tests): the coordinates', then the types'. since: window's end at which each sum was zero last.
+    waiting (n + 1, n + 1): factor that the next estimate is made of. beta, scale (n,), root (n, rank), null (n, ·): the
+    estimate, and directions that are known and unknown, columns scaled to unit length.
+    """
+
+    sums: Array
+    since: NDArray[np.int64]
+    beta: Array
+    scale: Array
+    root: Array
+    null: Array
+    waiting: Array | None = None
+    windows: int = 0
+    alarm: Alarm | None = None
+
+
+class SequentialTest(Stage):
     """Tests the windows of a session, in order, until the first alarm.
 
-    hop: time from one window to the next, s. alarm: None while all is noise. limit: h.
+    hop: time from one window to the next, s. limit: h.
     """
 
     def __init__(self, layout: Layout, hop: float) -> None:
@@ -64,53 +83,53 @@ class SequentialTest:
         self._types = {name: speeds for name, speeds in row_types(layout).items() if len(speeds) > 1}
         tests = layout.n_v + len(self._types)
         self.limit = float(np.log(tests * 3600.0 / hop / FALSE_ALARMS))
-        self.alarm: Alarm | None = None
-        self._sums = np.zeros((HOPS, tests))  # the coordinates', then the types'
-        self._since = np.full((HOPS, tests), -1, dtype=np.int64)  # window's end at which each sum was zero last
-        self._windows = 0
-        self._waiting: Array | None = None  # factor that the next estimate is made of
-        self._known = np.zeros((0, 0))  # factor behind the estimate
-        self._beta, self._scale = np.zeros(0), np.zeros(0)
-        self._root, self._null = np.zeros((0, 0)), np.zeros((0, 0))
+        nothing = np.zeros(0), np.zeros(0), np.zeros((0, 0)), np.zeros((0, 0))
+        self.state = TestState(np.zeros((HOPS, tests)), np.full((HOPS, tests), -1, dtype=np.int64), *nothing)
+
+    @property
+    def alarm(self) -> Alarm | None:
+        """None while all is noise."""
+        return self.state.alarm
 
     def push(self, rows: WhiteRows, factor: Array) -> None:
         """Test a window; factor (n + 1, n + 1): information of the rows before it."""
-        turn = self._windows % HOPS
+        turn = self.state.windows % HOPS
         if turn == 0:
-            self._know(factor if self._waiting is None else self._waiting)
-            self._waiting = factor
-        self._windows += 1
-        if self.alarm is not None:
+            self._know(factor if self.state.waiting is None else self.state.waiting)
+            self.state.waiting = factor
+        self.state.windows += 1
+        if self.state.alarm is not None:
             return
         ratios = self._log_likelihood(rows)
-        sums = np.maximum(0.0, self._sums[turn] + np.minimum(ratios, self.limit / LEAST_WINDOWS))
-        self._sums[turn] = sums
-        self._since[turn] = np.where((sums == 0.0) | (self._since[turn] < 0), rows.end, self._since[turn])
+        sums = np.maximum(0.0, self.state.sums[turn] + np.minimum(ratios, self.limit / LEAST_WINDOWS))
+        self.state.sums[turn] = sums
+        self.state.since[turn] = np.where(
+            (sums == 0.0) | (self.state.since[turn] < 0), rows.end, self.state.since[turn]
+        )
         worst = int(np.argmax(sums))
         if sums[worst] > self.limit:
             row, speed = self._place(worst, turn)
-            self.alarm = Alarm(row, speed, rows.end, int(self._since[turn, worst]))
+            self.state.alarm = Alarm(row, speed, rows.end, int(self.state.since[turn, worst]))
 
     def _know(self, factor: Array) -> None:
         """Take β̂ from a factor; null holds the directions of which it knows nothing, columns scaled to unit length."""
-        self._known = factor
         n = len(factor) - 1
         norm = np.linalg.norm(factor[:, :n], axis=0)
-        self._scale = scale = np.where(norm > 0.0, norm, 1.0)
+        self.state.scale = scale = np.where(norm > 0.0, norm, 1.0)
         U, s, Vt = np.linalg.svd(factor[:, :n] / scale, full_matrices=False)
         rank = int(np.count_nonzero(s > RANK_TOLERANCE * max(float(s[0]), 1.0)))
-        self._root = Vt[:rank].T / s[:rank] / scale[:, None]
-        self._beta = self._root @ (U[:, :rank].T @ factor[:, -1])
-        self._null = Vt[rank:].T
+        self.state.root = Vt[:rank].T / s[:rank] / scale[:, None]
+        self.state.beta = self.state.root @ (U[:, :rank].T @ factor[:, -1])
+        self.state.null = Vt[rank:].T
 
     def _log_likelihood(self, rows: WhiteRows) -> Array:
         """Of every test (tests,); what nothing is known of says nothing."""
         Y, n_v = rows.raw[:, :-1], self._layout.n_v
-        e = rows.raw[:, -1] - Y @ self._beta
-        spread = Y @ self._root
+        e = rows.raw[:, -1] - Y @ self.state.beta
+        spread = Y @ self.state.root
         S = rows.noise + spread @ spread.T
-        scaled = Y / self._scale
-        tested = np.linalg.norm(scaled @ self._null, axis=1) <= KNOWN * np.linalg.norm(scaled, axis=1)
+        scaled = Y / self.state.scale
+        tested = np.linalg.norm(scaled @ self.state.null, axis=1) <= KNOWN * np.linalg.norm(scaled, axis=1)
         out = np.zeros(n_v + len(self._types))
         out[:n_v] = np.where(tested, _ratio(e**2 / np.diag(S), 1), 0.0)
         for k, speeds in enumerate(self._types.values(), start=n_v):
@@ -126,39 +145,17 @@ class SequentialTest:
         types = row_types(self._layout)
         row = next(name for name, speeds in types.items() if test in speeds) if test < n_v else ""
         name = row or list(self._types)[test - n_v]
-        worst = max(types[name], key=lambda speed: self._sums[turn, speed])
+        worst = max(types[name], key=lambda speed: self.state.sums[turn, speed])
         return name, self._layout.speed_names[worst]
 
     @property
     def evidence(self) -> dict[str, float]:
         """By row type, the largest sum over its limit: 1 alarms."""
-        n_v, shares = self._layout.n_v, self._sums.max(axis=0) / self.limit
+        n_v, shares = self._layout.n_v, self.state.sums.max(axis=0) / self.limit
         out = {name: float(shares[speeds].max()) for name, speeds in row_types(self._layout).items()}
         for k, name in enumerate(self._types, start=n_v):
             out[name] = max(out[name], float(shares[k]))
         return out
-
-    def state(self) -> dict[str, Any]:
-        """What `restore` needs to continue."""
-        waiting = self._known[:0] if self._waiting is None else self._waiting
-        alarm = ("", "", -1, -1) if self.alarm is None else (
-            self.alarm.row, self.alarm.speed, self.alarm.end, self.alarm.since,
-        )  # fmt: skip
-        return {
-            "sums": self._sums.copy(), "since": self._since.copy(), "windows": self._windows, "waiting": waiting,
-            "known": self._known, "place": np.array(alarm[:2]), "alarm": np.array(alarm[2:]),
-        }  # fmt: skip
-
-    def restore(self, state: Mapping[str, NDArray[Any]]) -> None:
-        """Continue from a saved state."""
-        self._sums, self._since = np.array(state["sums"]), np.array(state["since"])
-        self._windows = int(state["windows"])
-        self._waiting = np.array(state["waiting"]) if self._windows else None
-        if self._windows:
-            self._know(np.array(state["known"]))
-        row, speed = (str(text) for text in state["place"])
-        end, since = (int(number) for number in state["alarm"])
-        self.alarm = Alarm(row, speed, end, since) if row else None
 
 
 def _ratio(chi2: Any, freedom: int) -> Any:

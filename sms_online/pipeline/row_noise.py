@@ -14,17 +14,16 @@ window that is an error of the row in proportion to the rates of that device's r
 
 from __future__ import annotations
 
-from collections import deque
-from collections.abc import Iterable, Mapping, Sequence
-from typing import Any
+from collections.abc import Iterable, Sequence
 
+import msgspec
 import numpy as np
-from numpy.typing import NDArray
 
 from sms_online.pipeline.latency import SourceGroup
 from sms_online.pipeline.momentum_windows import EXPONENT, HOPS, INSTANTS, STEPS
 from sms_online.pipeline.sensitivity import SPARSE, Sensitivity, nodes
 from sms_online.pipeline.weak_form import test_function
+from sms_online.state import Stage, State
 from sms_online.stream import Array
 
 STEPS_A_HOP = STEPS // HOPS
@@ -35,7 +34,20 @@ OWN_SHARE = 1e-7
 CLOCK_ERROR, YOUNG_CLOCK_ERROR, CLOCK_KNOWN = 5e-5, 1e-4, 10.0
 
 
-class RowNoise:
+class RowNoiseState(State):
+    """What is kept of the last windows.
+
+    Of the last windows: kernel by time (·, n_v), density of torques (joints,), lateness by clock (n_v, clocks), and
+    deviation by unknown forces (INSTANTS, n_v).
+    """
+
+    before: list[Array] = msgspec.field(default_factory=list)
+    torque: list[Array] = msgspec.field(default_factory=list)
+    late: list[Array] = msgspec.field(default_factory=list)
+    free: list[Array] = msgspec.field(default_factory=list)
+
+
+class RowNoise(Stage):
     """Covariance of each window's rows with those of the windows before it.
 
     joint_rows: rows that hold each joint's torque. clocks: what comes by each clock; the rest is as late as the grid.
@@ -51,11 +63,7 @@ class RowNoise:
         # ∫ φ(t) φ(t + k hops) dt.
         shifted = [self._phi[: STEPS + 1 - k * STEPS_A_HOP] @ self._phi[k * STEPS_A_HOP :] for k in range(HOPS)]
         self._overlap = self._step * np.array(shifted)
-        # Of the last windows, this one included.
-        self._before: deque[Array] = deque(maxlen=HOPS)
-        self._torque_before: deque[Array] = deque(maxlen=HOPS)
-        self._late_before: deque[Array] = deque(maxlen=HOPS)
-        self._free_before: deque[Array] = deque(maxlen=HOPS)
+        self.state = RowNoiseState()  # this window included
         self.late = np.empty((0, 0))
 
     def _told(self, offset: int, span: float) -> Array:
@@ -70,10 +78,7 @@ class RowNoise:
 
     def begin_segment(self) -> None:
         """The next window shares no samples with those before."""
-        self._before.clear()
-        self._torque_before.clear()
-        self._late_before.clear()
-        self._free_before.clear()
+        self.state = RowNoiseState()
 
     def kernel(self, window: Sensitivity) -> Array:
         """c (STEPS + 1, n_v, sensors): what a displacement n(t) of each sensor adds to the rows is ∫ c(t) n(t) dt.
@@ -102,23 +107,24 @@ class RowNoise:
         c = c.reshape(-1, n_v)
         self.late = self._lateness(kernel, rates)
         late = (CLOCK_ERROR if age >= CLOCK_KNOWN else YOUNG_CLOCK_ERROR) * self._by_clock(self.late)
-        self._before.append(c)
-        self._torque_before.append(torque_density)
-        self._late_before.append(late)
-        hops = np.arange(len(self._before) - 1, -1, -1)  # from each window to this one
+        now = self.state
+        now.before = [*now.before, c][-HOPS:]
+        now.torque = [*now.torque, torque_density][-HOPS:]
+        now.late = [*now.late, late][-HOPS:]
+        hops = np.arange(len(self.state.before) - 1, -1, -1)  # from each window to this one
         out = np.empty((hops.size, n_v, n_v))
-        for block, other, first in zip(out, self._before, (hops * (STEPS_A_HOP * sensors)).tolist(), strict=True):
+        for block, other, first in zip(out, self.state.before, (hops * (STEPS_A_HOP * sensors)).tolist(), strict=True):
             np.matmul(c[: len(c) - first].T, other[first:], out=block)
-        torque = np.sqrt(torque_density * np.array(self._torque_before))
+        torque = np.sqrt(torque_density * np.array(self.state.torque))
         out[:, self._joint_rows, self._joint_rows] += self._overlap[hops, None] * torque
         if self._clocks:
             # What windows share fades out where they no longer overlap, for the covariance to stay banded.
-            out += ((1.0 - hops / HOPS)[:, None, None] * late) @ np.array(self._late_before).swapaxes(1, 2)
+            out += ((1.0 - hops / HOPS)[:, None, None] * late) @ np.array(self.state.late).swapaxes(1, 2)
         own = np.einsum("ii->i", out[-1])
         own += OWN_SHARE * own
         if len(free):
-            self._free_before.append(free)
-            np.einsum("hii->hi", out)[:] += common(free, self._free_before)
+            now.free = [*now.free, free][-HOPS:]
+            np.einsum("hii->hi", out)[:] += common(free, now.free)
         return list(out)
 
     def _lateness(self, kernel: Array, rates: Array) -> Array:
@@ -137,22 +143,6 @@ class RowNoise:
             column += late[:, sensors].sum(axis=1)
             column[joint_rows] += torque[joint_rows]
         return columns
-
-    def state(self) -> dict[str, Array]:
-        """What `restore` needs to continue."""
-        return {
-            "before": np.array(self._before),
-            "torque_before": np.array(self._torque_before),
-            "late_before": np.array(self._late_before),
-            "free_before": np.array(self._free_before),
-        }
-
-    def restore(self, state: Mapping[str, NDArray[Any]]) -> None:
-        """Continue from a saved state."""
-        self._before = deque(np.array(state["before"]), maxlen=HOPS)
-        self._torque_before = deque(np.array(state["torque_before"]), maxlen=HOPS)
-        self._late_before = deque(np.array(state["late_before"]), maxlen=HOPS)
-        self._free_before = deque(np.array(state["free_before"]), maxlen=HOPS)
 
 
 def common(free: Array, before: Iterable[Array]) -> Array:

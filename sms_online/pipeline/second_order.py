@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-
 import numpy as np
 
 from sms_online.pipeline.sensor_noise import FINEST
+from sms_online.state import State
 from sms_online.stream import Array
 
 
@@ -29,14 +28,13 @@ def rounding(largest: Array) -> Array:
     return np.asarray((FINEST * largest) ** 2 + np.finfo(np.float64).tiny)
 
 
-class SecondOrderNoise:
+class SecondOrderNoise(State):
     """Variance of rows by what noise does beyond first order, by half width M of the motion's filter.
 
     means, M to (n_v,): mean squares of its samples.
     """
 
-    def __init__(self, means: Mapping[int, Array]) -> None:
-        self.means = dict(means)
+    means: dict[int, Array]
 
     def variance(self, half_width: int) -> Array:
         """(n_v,) for one half width; a width without samples counts as the nearest one that has some.

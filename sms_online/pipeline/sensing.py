@@ -13,6 +13,7 @@ from sms_online.errors import InputError
 from sms_online.model.beam import LinearLink
 from sms_online.model.model import Model
 from sms_online.model.static_shape import SensedShape
+from sms_online.state import Stage, State
 from sms_online.stream import Array, Block
 
 EULER_PARAMETERS = ("eps_x", "eps_y", "eps_z", "eta")
@@ -200,13 +201,22 @@ class Sensing:
         return np.concatenate((self.joint_torque(values), values[:, len(self.channels) :]), axis=1)
 
 
-class AttitudeContinuity:
+class AttitudeState(State):
+    """What the sign of Euler parameters follows.
+
+    last (4,): Euler parameters of the last sample.
+    """
+
+    last: Array
+
+
+class AttitudeContinuity(Stage):
     """Turns the sign of Euler parameters, which is arbitrary, so that they are continuous from sample to sample."""
 
     def __init__(self) -> None:
-        self.last = np.zeros(4)
+        self.state = AttitudeState(np.zeros(4))
 
-    def restore(self, block: Block) -> Block:
+    def continued(self, block: Block) -> Block:
         """The block with continuous Euler parameters; blocks without them pass as they are."""
         if not set(EULER_PARAMETERS) <= set(block.channels):
             return block
@@ -215,10 +225,10 @@ class AttitudeContinuity:
         if rows.size == 0:
             return block
         attitude = block.values[np.ix_(rows, columns)]
-        before = np.concatenate((self.last[None], attitude[:-1]))
+        before = np.concatenate((self.state.last[None], attitude[:-1]))
         flips = np.where(np.einsum("bi,bi->b", attitude, before) < 0.0, -1.0, 1.0)
         values = block.values.copy()
         attitude *= np.cumprod(flips)[:, None]
         values[np.ix_(rows, columns)] = attitude
-        self.last = attitude[-1]
+        self.state.last = attitude[-1]
         return Block(block.t, block.channels, values)

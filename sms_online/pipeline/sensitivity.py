@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,6 +11,7 @@ from numpy.typing import NDArray
 from sms_online.model.dynamics import Dynamics
 from sms_online.model.model import Model
 from sms_online.pipeline.momentum_windows import INSTANTS, Columns, Instants
+from sms_online.state import Stage, State
 from sms_online.stream import Array
 
 # Step of the differences that give derivatives: 1e-8 of their size is lost to curvature, as much to rounding.
@@ -78,7 +78,21 @@ def nodes(offset: int) -> NDArray[np.int64]:
     return np.arange(offset, INSTANTS + 1, SPARSE)
 
 
-class Sensitivities:
+class SensitivityState(State):
+    """What is kept of a segment's instants.
+
+    first: number of the first instant kept. dense (K, n_v, n_v + n_x): H and readings at each instant; rates (K,
+    n_x): of the readings. numbers: instants of the derivatives (·, n_v, 3 n_v).
+    """
+
+    first: int
+    dense: Array
+    rates: Array
+    numbers: NDArray[np.int64]
+    derivatives: Array
+
+
+class Sensitivities(Stage):
     """Sensitivity at the instants of a segment, as far as windows still need them.
 
     readings: x (K, n_x) to displacements (K, n_v, sensors) that unit noise of each position sensor makes. half_hop: s
@@ -96,16 +110,18 @@ class Sensitivities:
     def forget(self, next_instant: int) -> None:
         """Begin anew: `next_instant` is the number of the first one to be told."""
         n_v, n_x = self.model.layout.n_v, self.model.layout.n_x
-        self._first = next_instant
-        self._dense = np.empty((0, n_v, n_v + n_x))  # H and readings at each instant
-        self._rates = np.empty((0, n_x))
-        self._numbers = np.empty(0, dtype=np.int64)  # instants of the derivatives
-        self._derivatives = np.empty((0, n_v, 3 * n_v))
+        self.state = SensitivityState(
+            first=next_instant,
+            dense=np.empty((0, n_v, n_v + n_x)),
+            rates=np.empty((0, n_x)),
+            numbers=np.empty(0, dtype=np.int64),
+            derivatives=np.empty((0, n_v, 3 * n_v)),
+        )
 
     @property
     def next_instant(self) -> int:
         """Number of the instant after the last one told."""
-        return self._first + len(self._dense)
+        return self.state.first + len(self.state.dense)
 
     def probes(self, instants: Instants) -> tuple[Array, Array, Array]:
         """See `Probes`."""
@@ -118,6 +134,7 @@ class Sensitivities:
 
         probed: columns at their `probes`, where they are known already.
         """
+        now = self.state
         if not len(x):
             return
         if self._dynamics is None or not np.array_equal(self._dynamics.pi, pi):
@@ -126,51 +143,42 @@ class Sensitivities:
         numbers = self.next_instant + np.arange(len(x))
         sparse = numbers % SPARSE == 0
         readings = self._readings(x)
-        self._dense = np.concatenate((self._dense, np.concatenate((dynamics.mass_matrix(x), readings), axis=2)))
+        now.dense = np.concatenate((now.dense, np.concatenate((dynamics.mass_matrix(x), readings), axis=2)))
         # The rates of the readings themselves, of which Euler parameters are one more than speeds.
         inverse = np.linalg.inv(readings) if v.shape[1] == readings.shape[2] else np.linalg.pinv(readings)
-        self._rates = np.concatenate((self._rates, (inverse @ v[:, :, None])[:, :, 0]))
+        now.rates = np.concatenate((now.rates, (inverse @ v[:, :, None])[:, :, 0]))
         if sparse.any():
-            self._numbers = np.concatenate((self._numbers, numbers[sparse]))
+            now.numbers = np.concatenate((now.numbers, numbers[sparse]))
             if probed is None:
                 told = derivatives(dynamics, x[sparse], v[sparse], signals[sparse])
             else:
                 told = _differences(probed[0] @ pi, probed[1] @ pi, int(np.count_nonzero(sparse)))
-            self._derivatives = np.concatenate((self._derivatives, told))
+            now.derivatives = np.concatenate((now.derivatives, told))
 
     def rates(self, count: int) -> Array:
         """Rates of the readings (count, sensors) at the last instants."""
-        return self._rates[len(self._rates) - count :]
+        return self.state.rates[len(self.state.rates) - count :]
 
     def window(self, start: int) -> Sensitivity:
         """At the instants from number `start` on."""
         n_v = self.model.layout.n_v
-        inside = slice(start - self._first, start - self._first + INSTANTS + 1)
-        H, readings = self._dense[inside, :, :n_v], self._dense[inside, :, n_v:]
+        inside = slice(start - self.state.first, start - self.state.first + INSTANTS + 1)
+        H, readings = self.state.dense[inside, :, :n_v], self.state.dense[inside, :, n_v:]
         H_dot = (self._slope @ H.reshape(INSTANTS + 1, -1)).reshape(H.shape)
         offset = -start % SPARSE
-        first = int(np.searchsorted(self._numbers, start))
-        told = self._derivatives[first : first + nodes(offset).size]
+        first = int(np.searchsorted(self.state.numbers, start))
+        told = self.state.derivatives[first : first + nodes(offset).size]
         P_x, G_v, G_x = (told[:, :, k * n_v : (k + 1) * n_v] @ readings[nodes(offset)] for k in range(3))
         middle = readings[INSTANTS // 2]
-        return Sensitivity(H @ readings, H_dot @ readings, P_x, G_v, G_x, offset, self._rates[inside], middle)
+        return Sensitivity(H @ readings, H_dot @ readings, P_x, G_v, G_x, offset, self.state.rates[inside], middle)
 
     def drop(self, before: int) -> None:
         """Forget instants with smaller numbers."""
-        self._dense, self._rates = self._dense[before - self._first :], self._rates[before - self._first :]
-        self._first = before
-        kept = self._numbers >= before
-        self._numbers, self._derivatives = self._numbers[kept], self._derivatives[kept]
-
-    def state(self) -> dict[str, Any]:
-        """What `restore` needs to continue."""
-        return {
-            "told_first": self._first, "told_dense": self._dense, "told_rates": self._rates,
-            "told_numbers": self._numbers, "told_derivatives": self._derivatives,
-        }  # fmt: skip
-
-    def restore(self, state: Mapping[str, NDArray[Any]]) -> None:
-        """Continue from a saved state."""
-        self._first, self._dense = int(state["told_first"]), np.array(state["told_dense"])
-        self._rates = np.array(state["told_rates"])
-        self._numbers, self._derivatives = np.array(state["told_numbers"]), np.array(state["told_derivatives"])
+        now = self.state
+        now.dense, now.rates = (
+            now.dense[before - now.first :],
+            now.rates[before - now.first :],
+        )
+        now.first = before
+        kept = now.numbers >= before
+        now.numbers, now.derivatives = now.numbers[kept], now.derivatives[kept]

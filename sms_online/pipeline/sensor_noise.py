@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
 
+import msgspec
 import numpy as np
-from numpy.typing import NDArray
 
 from sms_online.pipeline.conditioning import noise_gains
 from sms_online.pipeline.noise import noise_std
 from sms_online.pipeline.sensing import Sensing
+from sms_online.state import Stage, State
 from sms_online.stream import Array
 
 # A channel's last samples that an estimate takes: 2 % scatter.
@@ -42,25 +41,20 @@ class SensorNoise:
     exact: bool
 
 
-NOISE_ARRAYS = ("sensors", "torque", "coordinates", "grid")
+class NoiseEstimateState(State):
+    """What is kept of the channels' samples.
+
+    samples: instants and values (2, ·) of each channel's last ones. largest (channels,): reading of each. fresh:
+    instants and values that no channel has yet; unsorted: how many.
+    """
+
+    samples: list[Array]
+    largest: Array
+    fresh: list[tuple[Array, Array]] = msgspec.field(default_factory=list)
+    unsorted: int = 0
 
 
-def noise_state(name: str, noise: SensorNoise | None) -> dict[str, Any]:
-    """A noise as arrays, to be saved under names that begin with `name`."""
-    if noise is None:
-        return {f"{name}_known": False}
-    return {f"{name}_known": True} | {f"{name}_{part}": getattr(noise, part) for part in (*NOISE_ARRAYS, "exact")}
-
-
-def noise_from_state(name: str, state: Mapping[str, NDArray[Any]]) -> SensorNoise | None:
-    """The noise that `noise_state` saved."""
-    if not bool(state[f"{name}_known"]):
-        return None
-    sensors, torque, coordinates, grid = (np.array(state[f"{name}_{part}"]) for part in NOISE_ARRAYS)
-    return SensorNoise(sensors, torque, coordinates, grid, bool(state[f"{name}_exact"]))
-
-
-class NoiseEstimate:
+class NoiseEstimate(Stage):
     """Collects each channel's own samples, which are not interpolated, and tells the noise of all.
 
     sample_rate: of the grid, Hz.
@@ -70,37 +64,34 @@ class NoiseEstimate:
         self._sensing = sensing
         self._sample_rate = sample_rate
         count = len(sensing.channels)
-        self._samples = [np.empty((2, 0)) for _ in range(count)]  # instants and values
-        self._largest = np.zeros(count)
-        self._fresh: list[tuple[Array, Array]] = []  # instants and values that no channel has yet
-        self._unsorted = 0  # how many
+        self.state = NoiseEstimateState([np.empty((2, 0)) for _ in range(count)], np.zeros(count))
 
     def push(self, t: Array, values: Array) -> None:
         """Take samples (B, channels) at instants t (B,), NaN where a channel has none."""
-        self._fresh.append((t, values))
-        self._unsorted += t.size
-        if self._unsorted >= SAMPLES:
+        self.state.fresh.append((t, values))
+        self.state.unsorted += t.size
+        if self.state.unsorted >= SAMPLES:
             self._sort()
 
     def _sort(self) -> None:
         """Give each channel the samples that came since the noise was asked for last."""
-        if not self._fresh:
+        if not self.state.fresh:
             return
-        t = np.concatenate([t for t, _ in self._fresh])
-        values = np.concatenate([values for _, values in self._fresh])
-        self._fresh, self._unsorted = [], 0
+        t = np.concatenate([t for t, _ in self.state.fresh])
+        values = np.concatenate([values for _, values in self.state.fresh])
+        self.state.fresh, self.state.unsorted = [], 0
         for k, column in enumerate(values.T):
             fresh = np.stack((t, column))[:, np.isfinite(column)]
-            last = self._samples[k][0, -1:] if self._samples[k].size else -np.inf
+            last = self.state.samples[k][0, -1:] if self.state.samples[k].size else -np.inf
             fresh = fresh[:, np.diff(fresh[0], prepend=last) > 0.0]  # duplicates tell nothing
-            self._largest[k] = max(self._largest[k], np.abs(fresh[1]).max(initial=0.0))
-            self._samples[k] = np.concatenate((self._samples[k], fresh), axis=1)[:, -SAMPLES:]
+            self.state.largest[k] = max(self.state.largest[k], np.abs(fresh[1]).max(initial=0.0))
+            self.state.samples[k] = np.concatenate((self.state.samples[k], fresh), axis=1)[:, -SAMPLES:]
 
     @property
     def ready(self) -> bool:
         """Whether every channel has samples enough."""
         self._sort()
-        return all(kept.shape[1] >= FEWEST_SAMPLES for kept in self._samples)
+        return all(kept.shape[1] >= FEWEST_SAMPLES for kept in self.state.samples)
 
     def noise(self, periods: Array) -> SensorNoise:
         """Noise from what is stated and, where nothing is, from the samples so far; periods (channels,): s, or NaN."""
@@ -108,9 +99,9 @@ class NoiseEstimate:
         sigma = self._sensing.stated_noise
         silent = np.flatnonzero(np.isnan(sigma))
         for k in silent:
-            times, samples = self._samples[k]
+            times, samples = self.state.samples[k]
             sigma[k] = noise_std(samples[:, None], times)[0]
-        floor = FINEST * self._largest + np.finfo(np.float64).tiny
+        floor = FINEST * self.state.largest + np.finfo(np.float64).tiny
         positions = self._sensing.position_columns
         exact = bool(np.all(sigma[positions] <= ROUGHLY_EXACT * floor[positions]))
         period = np.maximum(np.where(np.isnan(periods), 0.0, periods), 1.0 / self._sample_rate)
@@ -122,14 +113,3 @@ class NoiseEstimate:
         grid = (gains * np.sqrt(density * self._sample_rate))[columns]
         coordinates = self._sensing.coordinate_noise(grid[: len(positions)])
         return SensorNoise(sensors, torque, coordinates, grid, exact)
-
-    def state(self) -> dict[str, Any]:
-        """What `restore` needs to continue."""
-        self._sort()
-        sizes = np.array([kept.shape[1] for kept in self._samples])
-        return {"samples": np.concatenate(self._samples, axis=1), "sizes": sizes, "largest": self._largest}
-
-    def restore(self, state: Mapping[str, NDArray[Any]]) -> None:
-        """Continue from a saved state."""
-        self._samples = np.split(np.array(state["samples"]), np.cumsum(state["sizes"])[:-1], axis=1)
-        self._largest = np.array(state["largest"])

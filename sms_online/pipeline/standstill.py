@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Any
-
 import numpy as np
 from numpy.typing import NDArray
 
 from sms_online.pipeline.smoothing import HALF_WIDTHS, kernel, smooth_all
+from sms_online.state import Stage, State
 from sms_online.stream import Array
 
 # An axis stands still where its rate is below this multiple of the rate's noise for so long, s. At a reversal it is for
@@ -36,7 +34,18 @@ def lasting(slow: NDArray[np.bool_], sample_rate: float) -> NDArray[np.bool_]:
     return still
 
 
-class Standstill:
+class StandstillState(State):
+    """What is kept of a motion.
+
+    angles (B, D): from number `first` on. still (·, D): from a filter's half width of samples after that on.
+    """
+
+    angles: Array
+    still: NDArray[np.bool_]
+    first: int = 0
+
+
+class Standstill(Stage):
     """Where motors (D,) stand still along one gap-free motion, as far as its samples tell by now.
 
     samples are numbered from 0.
@@ -44,38 +53,33 @@ class Standstill:
 
     def __init__(self, motors: int, sample_rate: float) -> None:
         self._rate, self._half_width = sample_rate, rate_filter(sample_rate)
-        self._first = 0  # number of the first angle kept
-        self._angles = np.empty((0, motors))
-        self._still = np.empty((0, motors), dtype=bool)  # from `_half_width` samples after that on
+        self.state = StandstillState(np.empty((0, motors)), np.empty((0, motors), dtype=bool))
 
     def push(self, angles: Array, noise: Array) -> None:
         """Take the next angles (B, D); noise (D,): of each, 1σ per sample."""
         M = self._half_width
-        self._angles = np.concatenate((self._angles, angles))
-        if len(self._angles) <= 2 * M:
+        self.state.angles = np.concatenate((self.state.angles, angles))
+        if len(self.state.angles) <= 2 * M:
             return
-        rates = smooth_all(self._angles, M, self._rate)[1]
+        rates = smooth_all(self.state.angles, M, self._rate)[1]
         limits = [slowest(sigma, M, self._rate) for sigma in noise.tolist()]
-        self._still = np.stack([lasting(slow, self._rate) for slow in (np.abs(rates) < limits).T], axis=1)
+        self.state.still = np.stack([lasting(slow, self._rate) for slow in (np.abs(rates) < limits).T], axis=1)
 
     def at(self, samples: NDArray[np.int64]) -> NDArray[np.bool_]:
         """Whether they do at samples (K,), (K, D); what is not known yet is as what is known last."""
-        if not len(self._still):
-            return np.zeros((samples.size, self._still.shape[1]), dtype=bool)
-        return np.asarray(self._still[np.clip(samples - self._first - self._half_width, 0, len(self._still) - 1)])
+        now = self.state
+        if not len(now.still):
+            return np.zeros((samples.size, now.still.shape[1]), dtype=bool)
+        return np.asarray(now.still[np.clip(samples - now.first - self._half_width, 0, len(now.still) - 1)])
 
     def drop(self, before: int) -> None:
         """Forget what nobody asks for who asks for samples from number `before` on."""
+        now = self.state
         # The newest rates are as far behind as the filter reaches, and with them what they have lasted is told.
         reach = 2 * self._half_width + round(LASTING * self._rate) + 1
-        drop = max(0, before - reach - self._first)
-        self._angles, self._still, self._first = self._angles[drop:], self._still[drop:], self._first + drop
-
-    def state(self) -> dict[str, Any]:
-        """What `restore` needs to continue."""
-        return {"rest_first": self._first, "rest_angles": self._angles, "rest_still": self._still}
-
-    def restore(self, state: Mapping[str, NDArray[Any]]) -> None:
-        """Continue from a saved state."""
-        self._first = int(state["rest_first"])
-        self._angles, self._still = np.array(state["rest_angles"]), np.array(state["rest_still"])
+        drop = max(0, before - reach - now.first)
+        now.angles, now.still, now.first = (
+            now.angles[drop:],
+            now.still[drop:],
+            now.first + drop,
+        )

@@ -1,7 +1,7 @@
 """What an estimator knows at an instant, as one record: whatever is said of a session is a function of it.
 
 Taking it costs microseconds: what is large is shared, for the estimator writes such arrays once. It can be pickled, and
-says the same in another process. A session cannot be continued from it; `Estimator.state` is for that.
+says the same in another process. A session cannot be continued from it, but from a checkpoint.
 """
 
 from __future__ import annotations
@@ -27,10 +27,10 @@ from sms_online.pipeline.plain_rows import PlainRows
 from sms_online.pipeline.sensing import Sensing
 from sms_online.pipeline.synchronise import SyncCounters
 from sms_online.smoother.session import SmootherStatistics
+from sms_online.state import snapshot, state_copy
 from sms_online.stream import Array
 from sms_online.threads import one_blas_thread
-from sms_online.trackers.interface import Estimate, Prior, State
-from sms_online.trackers.square_root import session_tracker
+from sms_online.trackers.interface import Estimate, Prior, Tracker
 
 if TYPE_CHECKING:
     from sms_online.pipeline.estimator import Estimator
@@ -78,14 +78,14 @@ def _setup(packed: bytes) -> Setup:
 class MomentumStatistics:
     """Of the momentum balance.
 
-    tracker, bias: states of the tracker and of what noise in its columns does. rows: unwhitened rows and their misfit.
+    tracker: its rows so far; bias: what noise in its columns does. rows: unwhitened rows and their misfit.
     started: weights are known. tested: there are rows enough for a test of what they leave. alarm: type of the rows
     that the sequential test finds more than noise in. scale_free: what gives the estimate where rows leave more than
     noise. latency: source that is late against the others, if one is.
     """
 
-    tracker: State
-    bias: dict[str, Any]
+    tracker: Tracker
+    bias: NoiseBias
     rows: PlainRows
     started: bool
     tested: bool
@@ -98,8 +98,8 @@ class MomentumStatistics:
 class Statistics:
     """Sufficient statistics, counts and events of a session up to now.
 
-    finished: no more samples come. periods (channels,): s a sample, NaN where unknown. energy: state of the energy
-    balance's tracker; shared: what errors that its rows share do. joints: sums behind the relative residual of each.
+    finished: no more samples come. periods (channels,): s a sample, NaN where unknown. energy: the energy balance's
+    tracker; shared: what errors that its rows share do. joints: sums behind the relative residual of each.
     """
 
     setup: Setup
@@ -111,7 +111,7 @@ class Statistics:
     counters: SyncCounters
     periods: Array
     events: tuple[Event, ...]
-    energy: State
+    energy: Tracker
     shared: SharedErrors
     joints: tuple[SquaredResidual, ...]
     momentum: MomentumStatistics | None
@@ -127,15 +127,15 @@ class Statistics:
             finished=estimator.finished,
             samples=estimator.samples,
             duration=estimator.duration,
-            dropped_rows=estimator.dropped_rows,
+            dropped_rows=estimator.state.dropped_rows,
             counters=SyncCounters(**vars(estimator.counters)),
             periods=estimator.periods.copy(),
             events=tuple(estimator.events),
-            energy=estimator.energy_tracker.state(),
-            shared=estimator.shared_errors.copy(),
-            joints=tuple([SquaredResidual(joint.gram, joint.signal) for joint in estimator.joint_residuals]),
+            energy=snapshot(estimator.energy_tracker),
+            shared=state_copy(estimator.shared_errors),
+            joints=tuple([state_copy(joint) for joint in estimator.joint_residuals]),
             momentum=None if momentum is None else momentum.statistics(),
-            smoother=None if smoother is None else smoother.statistics(),
+            smoother=None if smoother is None else smoother.known,
         )
 
     @one_blas_thread()
@@ -148,28 +148,18 @@ class Statistics:
         if self.method == "energy":
             return self.energy_estimate()
         assert self.momentum is not None
-        m = len(setup.nuisances)
-        tracker = session_tracker(setup.base.n, setup.current_prior, m)
-        tracker.restore(self.momentum.tracker)
-        rows, scale_free = tracker.estimate(), self.momentum.scale_free
-        joint = unbiased(rows, self._bias()) if scale_free is None else scale_free.estimate(rows)
-        return joint.without_nuisances(m)
-
-    def _bias(self) -> NoiseBias:
-        assert self.momentum is not None
-        bias = NoiseBias(len(self.setup.nuisances) + self.setup.base.n)
-        bias.restore(self.momentum.bias)
-        return bias
+        rows, scale_free = self.momentum.tracker.estimate(), self.momentum.scale_free
+        joint = unbiased(rows, self.momentum.bias) if scale_free is None else scale_free.estimate(rows)
+        return joint.without_nuisances(len(setup.nuisances))
 
     def shift(self, estimate: Estimate) -> Array:
         """By how much noise in the columns pulls the momentum balance's estimate (n,), as far as that is known."""
         m = len(self.setup.nuisances)
         determined = np.concatenate((np.isfinite(estimate.nuisances_std), estimate.determined))
-        return self._bias().correction(determined)[0][m:]
+        assert self.momentum is not None
+        return self.momentum.bias.correction(determined)[0][m:]
 
     @one_blas_thread()
     def energy_estimate(self) -> Estimate:
         """What the energy balance alone says."""
-        tracker = session_tracker(self.setup.described.n, self.setup.prior)
-        tracker.restore(self.energy)
-        return tracker.estimate()
+        return self.energy.estimate()

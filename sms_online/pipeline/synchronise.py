@@ -2,20 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, fields
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
 from itertools import pairwise
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from sms_online.pipeline.periods import LONGEST_HOLE, Periods
+from sms_online.state import Stage, State
 from sms_online.stream import Array, Block
 
 Indices = NDArray[np.int64]
 Mask = NDArray[np.bool_]
-StageState = dict[str, NDArray[Any]]
 
 # A sample this close to a grid point, in grid periods, lies on it. At 1 kHz that is 0.1 µs, in which 1 rad/s moves a
 # hundredth of a good encoder's noise; measured captures round their stamps to 0.03 µs.
@@ -77,7 +76,23 @@ class _Group:
     hit: Mask
 
 
-class Synchroniser:
+class SynchroniserState(State):
+    """What a synchroniser keeps.
+
+    time (B,), values (B, C): rows that are still needed, time in s after t0. last_time (C,): of each channel's last
+    sample. next: first grid point that is not decided yet; delivered: last one delivered.
+    """
+
+    time: Array
+    values: Array
+    last_time: Array
+    counters: SyncCounters
+    t0: float = np.nan
+    next: int = 0
+    delivered: int = -1
+
+
+class Synchroniser(Stage):
     """Uniform grid t0 + k / sample_rate from the first sample's time t0, the same for every channel.
 
     A sample on a grid point passes bit for bit. Elsewhere a channel is interpolated from its own samples by the
@@ -97,14 +112,14 @@ class Synchroniser:
         count = len(channels)
         self.channels = tuple(channels)
         self.sample_rate = sample_rate
-        self.counters = SyncCounters()
-        self._t0 = np.nan
-        self._time = np.empty(0)  # s after t0, of the rows still needed
-        self._values = np.empty((0, count))
-        self._last_time = np.full(count, -np.inf)  # of each channel's last sample
         self._periods = Periods(count, gap_limit)
-        self._next = 0  # first grid point not yet decided
-        self._delivered = -1  # last grid point delivered
+        nothing = np.empty(0), np.empty((0, count))
+        self.state = SynchroniserState(*nothing, np.full(count, -np.inf), SyncCounters())
+
+    @property
+    def counters(self) -> SyncCounters:
+        """What happened to the samples so far."""
+        return self.state.counters
 
     @property
     def periods(self) -> Array:
@@ -114,7 +129,7 @@ class Synchroniser:
     @property
     def start_time(self) -> float:
         """t0, the time of grid index 0, s; NaN before the first sample."""
-        return float(self._t0)
+        return float(self.state.t0)
 
     def push(self, block: Block) -> list[GridSamples]:
         """Take a block, in order of time, and return the grid points that it completes, a piece for each segment.
@@ -125,61 +140,40 @@ class Synchroniser:
             raise ValueError(f"block with channels {block.channels} pushed into a synchroniser of {self.channels}")
         if block.t.size == 0:
             return []
-        if np.isnan(self._t0):
-            self._t0 = float(block.t[0])
-        time = block.t - self._t0
+        if np.isnan(self.state.t0):
+            self.state.t0 = float(block.t[0])
+        time = block.t - self.state.t0
         if self._continues_complete(time, block.values):
             return self._pass(time, block.values)
         values = self._admit(time, block.values)
-        self._time = np.concatenate([self._time, time])
-        self._values = np.concatenate([self._values, values])
+        self.state.time = np.concatenate([self.state.time, time])
+        self.state.values = np.concatenate([self.state.values, values])
         return self._advance(final=False)
 
     def flush(self) -> list[GridSamples]:
         """End of the capture: return what can still be delivered."""
-        if self._time.size == 0:
+        if self.state.time.size == 0:
             return []
         pieces = self._advance(final=True)
-        self.counters.lost_samples += self._next - 1 - self._delivered
+        self.state.counters.lost_samples += self.state.next - 1 - self.state.delivered
         return pieces
-
-    def state(self) -> StageState:
-        """Everything that the next push depends on, as arrays."""
-        return {
-            "t0": np.array(self._t0),
-            "time": self._time.copy(),
-            "values": self._values.copy(),
-            "last_time": self._last_time.copy(),
-            **self._periods.state(),
-            "position": np.array([self._next, self._delivered]),
-            "counters": np.array([getattr(self.counters, field.name) for field in fields(SyncCounters)]),
-        }
-
-    def restore(self, state: Mapping[str, NDArray[Any]]) -> None:
-        """Continue from a saved state of a synchroniser with the same channels, rate and gap limit."""
-        self._t0 = float(state["t0"])
-        self._time, self._values = state["time"].copy(), state["values"].copy()
-        self._last_time = state["last_time"].copy()
-        self._periods.restore(state)
-        self._next, self._delivered = (int(k) for k in state["position"])
-        self.counters = SyncCounters(*(int(count) for count in state["counters"]))
 
     @property
     def _tolerance(self) -> float:
         """Distance within which two instants are one, s; epoch times are rounded to 0.2 µs."""
-        return ON_GRID / self.sample_rate + 4.0 * float(np.spacing(abs(self._t0)))
+        return ON_GRID / self.sample_rate + 4.0 * float(np.spacing(abs(self.state.t0)))
 
     def _continues_complete(self, time: Array, values: Array) -> bool:
         """Whether everything before is delivered and every row lies on the next grid point with all its cells."""
-        tail = self._values[-SIDE:]
+        tail = self.state.values[-SIDE:]
         return (
-            self._delivered == self._next - 1
+            self.state.delivered == self.state.next - 1
             and tail.shape[0] == SIDE
-            and self._on_consecutive_points(self._time[-SIDE:], self._next - SIDE)
+            and self._on_consecutive_points(self.state.time[-SIDE:], self.state.next - SIDE)
             and not np.isnan(self._periods.known).any()
             and not np.isnan(tail).any()
             and not np.isnan(values).any()
-            and self._on_consecutive_points(time, self._next)
+            and self._on_consecutive_points(time, self.state.next)
         )
 
     def _on_consecutive_points(self, time: Array, first: int) -> bool:
@@ -188,20 +182,20 @@ class Synchroniser:
 
     def _pass(self, time: Array, values: Array) -> list[GridSamples]:
         """The common case of `_advance`, 0.03 instead of 0.8 µs a sample: each row is its own grid point."""
-        k = np.arange(self._next, self._next + time.size, dtype=np.int64)
-        self.counters.samples += time.size
-        self._last_time[:] = time[-1]
-        self._next += time.size
-        self._time = np.concatenate([self._time[-SIDE:], time[-SIDE:]])[-SIDE:]
-        self._values = np.concatenate([self._values[-SIDE:], values[-SIDE:]])[-SIDE:]
+        k = np.arange(self.state.next, self.state.next + time.size, dtype=np.int64)
+        self.state.counters.samples += time.size
+        self.state.last_time[:] = time[-1]
+        self.state.next += time.size
+        self.state.time = np.concatenate([self.state.time[-SIDE:], time[-SIDE:]])[-SIDE:]
+        self.state.values = np.concatenate([self.state.values[-SIDE:], values[-SIDE:]])[-SIDE:]
         return self._deliver(k, values)
 
     def _admit(self, time: Array, values: Array) -> Array:
         """Count, drop duplicates (as NaN), and learn the period of each channel from its first intervals."""
         missing = np.isnan(values)
-        self.counters.samples += time.size
-        self.counters.missing_cells += int(np.count_nonzero(missing))
-        before = self._time[-1] if self._time.size else -np.inf
+        self.state.counters.samples += time.size
+        self.state.counters.missing_cells += int(np.count_nonzero(missing))
+        before = self.state.time[-1] if self.state.time.size else -np.inf
         apart = np.diff(time, prepend=before) > self._tolerance
         # Only among rows at one instant, the last ones before this block included, can a channel have two samples.
         starts = np.flatnonzero(apart)
@@ -213,26 +207,26 @@ class Synchroniser:
             values = values.copy()
             for channel in judged.tolist():
                 rows = np.flatnonzero(~missing[:, channel])
-                interval = np.diff(time[rows], prepend=self._last_time[channel])
+                interval = np.diff(time[rows], prepend=self.state.last_time[channel])
                 duplicate = interval <= self._tolerance
-                self.counters.duplicates += int(np.count_nonzero(duplicate))
+                self.state.counters.duplicates += int(np.count_nonzero(duplicate))
                 values[rows[duplicate], channel] = np.nan
                 self._periods.learn(channel, interval[~duplicate & np.isfinite(interval)])
         sampled = ~missing.all(axis=0)
         last_row = time.size - 1 - np.argmin(missing[::-1], axis=0)
-        self._last_time[sampled] = time[last_row[sampled]]
+        self.state.last_time[sampled] = time[last_row[sampled]]
         return values
 
     def _advance(self, final: bool) -> list[GridSamples]:
         """Decide grid points as far as the samples allow; deliver those that every channel has."""
-        silent = self._time[-1] - self._last_time > LONGEST_HOLE
+        silent = self.state.time[-1] - self.state.last_time > LONGEST_HOLE
         for channel in np.flatnonzero(np.isnan(self._periods.known) & (silent | final)).tolist():
             self._periods.settle(channel)
         k = self._candidates()
         decided = np.ones(k.size, dtype=bool)
         complete = np.ones(k.size, dtype=bool)
-        nearest = np.rint(self._time * self.sample_rate).astype(np.int64)
-        on_grid = np.abs(self._time - nearest / self.sample_rate) <= self._tolerance
+        nearest = np.rint(self.state.time * self.sample_rate).astype(np.int64)
+        on_grid = np.abs(self.state.time - nearest / self.sample_rate) <= self._tolerance
         row_index = np.where(on_grid, nearest, NOWHERE)
         groups = []
         for columns, rows in self._sampled_together():
@@ -244,22 +238,22 @@ class Synchroniser:
         chosen = np.flatnonzero(complete[:end])
         values = self._fill(k[chosen], chosen, groups)
         if end:
-            self._next = int(k[end - 1]) + 1
+            self.state.next = int(k[end - 1]) + 1
         self._forget(groups)
         return self._deliver(k[chosen], values)
 
     def _candidates(self) -> Indices:
         """Undecided grid points up to the latest row, leaving out those in holes of all channels together."""
         reach = self._tolerance
-        hole = np.flatnonzero(np.diff(self._time) > LONGEST_HOLE)
-        first = np.ceil((self._time[hole + 1] - reach) * self.sample_rate).astype(np.int64)
-        last = np.floor((self._time[[*hole, -1]] + reach) * self.sample_rate).astype(np.int64)
-        starts = np.maximum([self._next, *first], self._next)
+        hole = np.flatnonzero(np.diff(self.state.time) > LONGEST_HOLE)
+        first = np.ceil((self.state.time[hole + 1] - reach) * self.sample_rate).astype(np.int64)
+        last = np.floor((self.state.time[[*hole, -1]] + reach) * self.sample_rate).astype(np.int64)
+        starts = np.maximum([self.state.next, *first], self.state.next)
         return np.concatenate([np.arange(a, b + 1, dtype=np.int64) for a, b in zip(starts, last, strict=True)])
 
     def _sampled_together(self) -> Iterable[tuple[Indices, Indices]]:
         """Columns with samples in the same rows and with the same period, with those rows."""
-        present = ~np.isnan(self._values)
+        present = ~np.isnan(self.state.values)
         bits = np.packbits(present, axis=0)
         members: dict[tuple[bytes, bytes], list[int]] = {}
         for column in range(len(self.channels)):
@@ -270,7 +264,7 @@ class Synchroniser:
         self, k: Indices, columns: Indices, rows: Indices, row_index: Indices, final: bool
     ) -> tuple[_Group, Mask, Mask]:
         """Which grid points k of a group are decided, and which of those have a value."""
-        ts, now = self._time[rows], self._time[-1]
+        ts, now = self.state.time[rows], self.state.time[-1]
         grid = k / self.sample_rate
         late = grid + self._tolerance
         last = np.searchsorted(ts, late, side="right") - 1
@@ -310,44 +304,44 @@ class Synchroniser:
             last, hit = group.last[chosen], group.hit[chosen]
             if hit.any():
                 if group.columns.size == values.shape[1]:
-                    np.take(self._values, group.rows[last], axis=0, out=values)
+                    np.take(self.state.values, group.rows[last], axis=0, out=values)
                 else:
-                    values[:, group.columns] = self._values[group.rows[last][:, None], group.columns]
+                    values[:, group.columns] = self.state.values[group.rows[last][:, None], group.columns]
             between = np.flatnonzero(~hit)
             if between.size:
                 nodes = last[between, None] + np.arange(1 - SIDE, 1 + SIDE)
                 x = group.ts[nodes] - (k[between] / self.sample_rate)[:, None]
                 weight = _lagrange_weights_at_zero(x)
-                samples = weight.T[:, :, None] * self._values[group.rows[nodes.T][:, :, None], group.columns]
+                samples = weight.T[:, :, None] * self.state.values[group.rows[nodes.T][:, :, None], group.columns]
                 # One node after the other: a matrix product's bits depend on its shape.
                 values[between[:, None], group.columns] = np.add.reduce(samples, axis=0)
-                self.counters.interpolated_cells += samples[0].size
+                self.state.counters.interpolated_cells += samples[0].size
         return values
 
     def _forget(self, groups: list[_Group]) -> None:
         """Drop the rows that no undecided grid point can need; the last row stays, it tells how late it is."""
-        needed = self._time.size - 1
-        due = self._next / self.sample_rate
+        needed = self.state.time.size - 1
+        due = self.state.next / self.sample_rate
         for group in groups:
             if group.ts.size == 0:
                 continue
-            gone = group.ts[-1] < due - self._tolerance and self._time[-1] - group.ts[-1] > LONGEST_HOLE
+            gone = group.ts[-1] < due - self._tolerance and self.state.time[-1] - group.ts[-1] > LONGEST_HOLE
             if not gone:
                 oldest = int(np.searchsorted(group.ts, due + self._tolerance, side="right")) - SIDE
                 needed = min(needed, int(group.rows[max(oldest, 0)]))
-        self._time, self._values = self._time[needed:].copy(), self._values[needed:].copy()
+        self.state.time, self.state.values = self.state.time[needed:].copy(), self.state.values[needed:].copy()
 
     def _deliver(self, k: Indices, values: Array) -> list[GridSamples]:
         """Cut into segments and number them."""
         pieces = []
-        breaks = np.flatnonzero(np.diff(k, prepend=self._delivered) != 1)
+        breaks = np.flatnonzero(np.diff(k, prepend=self.state.delivered) != 1)
         bounds = sorted({0, k.size, *breaks.tolist()}) if k.size else []
         for a, b in pairwise(bounds):
-            skipped = int(k[a]) - self._delivered - 1
-            self.counters.lost_samples += skipped
-            self.counters.gaps += int(skipped > 0 and self._delivered >= 0)
-            self._delivered = int(k[b - 1])
-            pieces.append(GridSamples(k[a:b], values[a:b], self.counters.gaps))
+            skipped = int(k[a]) - self.state.delivered - 1
+            self.state.counters.lost_samples += skipped
+            self.state.counters.gaps += int(skipped > 0 and self.state.delivered >= 0)
+            self.state.delivered = int(k[b - 1])
+            pieces.append(GridSamples(k[a:b], values[a:b], self.state.counters.gaps))
         return pieces
 
 

@@ -8,18 +8,17 @@ for a second or two, and calls its rows independent of those before, which they 
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sms_online.pipeline.latency import LatencyColumns, SourceGroup
 from sms_online.pipeline.momentum_windows import Window
 from sms_online.pipeline.sensor_noise import SensorNoise
 from sms_online.pipeline.whitening import Whitener
 from sms_online.pipeline.window_noise import WindowNoise
+from sms_online.state import Stage, State
 from sms_online.stream import Array
 
 
@@ -39,7 +38,16 @@ class Weighed:
     covariance: Array
 
 
-class Weighing:
+class WeighingState(State):
+    """What weights were begun with.
+
+    misfit (n_v,): variance of what the model lacks in each row, over that of the noise.
+    """
+
+    misfit: Array
+
+
+class Weighing(Stage):
     """Whitens windows with the noise that parameters β (n,) and sensors give them, and a misfit (n_v,), see `begin`.
 
     noise: that of the windows. sources: whose latencies are told. width: of the rows, in columns, those of calibration
@@ -48,9 +56,14 @@ class Weighing:
 
     def __init__(self, noise: WindowNoise, width: int, sources: Sequence[SourceGroup] = ()) -> None:
         self.noise = noise
-        self.misfit = np.zeros(noise.n_v)
+        self.state = WeighingState(np.zeros(noise.n_v))
         self._late = LatencyColumns(sources)
         self._whitener = Whitener(width + len(sources) + noise.nuisances)
+
+    @property
+    def misfit(self) -> Array:
+        """Variance of what the model lacks in each row (n_v,), over that of the noise."""
+        return self.state.misfit
 
     @property
     def beta(self) -> Array | None:
@@ -62,7 +75,7 @@ class Weighing:
 
         misfit (n_v,): variance of what the model lacks in each row, over that of the noise.
         """
-        self.misfit = misfit
+        self.state.misfit = misfit
         self.noise.begin(beta, noise, instant)
         self._whitener.begin_segment()
 
@@ -77,7 +90,7 @@ class Weighing:
         own = noise.covariances[-1]
         of_noise = own.copy()
         diagonal = np.einsum("ii->i", own)
-        diagonal += self.misfit * diagonal
+        diagonal += self.state.misfit * diagonal
         width = rows.shape[1]
         calibrated = width + len(self._late)
         if len(self._late):
@@ -87,13 +100,3 @@ class Weighing:
         white = self._whitener.push(noise.covariances, rows)
         calibration = noise.calibration, white[:, calibrated:]
         return Weighed(white[:, :width], white[:, width:calibrated], calibration, of_noise, own)
-
-    def state(self) -> dict[str, Any]:
-        """What `restore` needs to continue."""
-        return {"weighed_misfit": self.misfit, **self.noise.state(), **self._whitener.state()}
-
-    def restore(self, state: Mapping[str, NDArray[Any]]) -> None:
-        """Continue from a saved state."""
-        self.misfit = np.array(state["weighed_misfit"])
-        self.noise.restore(state)
-        self._whitener.restore(state)

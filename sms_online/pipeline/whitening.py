@@ -8,24 +8,23 @@ it keeps those that the next one overlaps; the same rows of L whiten any further
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from typing import Any
+from collections.abc import Sequence
 
+import msgspec
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg.lapack import dtrtrs
 
+from sms_online.state import Stage, State
 from sms_online.stream import Array
 
 # Share of a row's variance that is added to it alone, for the rounding of the factorisation.
 ROUNDING = 1e-13
 
 
-class Factor:
+class Factor(State):
     """Cholesky factor of the windows' covariance, one window after the other."""
 
-    def __init__(self) -> None:
-        self.L = np.empty((0, 0))  # of the windows that the last one overlaps, and of itself
+    L: Array = msgspec.field(default_factory=lambda: np.empty((0, 0)))  # of the last window and those that overlap it
 
     def push(self, covariances: Sequence[Array], errors: Array | float = 0.0) -> Array:
         """The next window's rows of L (n_v, m n_v), its own block last.
@@ -54,7 +53,17 @@ def _solved(L: Array, right: Array) -> Array:
     return np.asarray(solution)
 
 
-class Whitener:
+class WhitenerState(State):
+    """What is kept of the windows that the next one may overlap.
+
+    white (·, width): whitened rows of the windows that the next one may overlap.
+    """
+
+    white: Array
+    factor: Factor
+
+
+class Whitener(Stage):
     """Whitens rows [Y b] as windows come."""
 
     def __init__(self, width: int) -> None:
@@ -63,25 +72,16 @@ class Whitener:
 
     def begin_segment(self) -> None:
         """The next window shares no noise with those before."""
-        self._factor = Factor()
-        self._white = np.empty((0, self._width))  # of the windows that the next one may overlap
+        self.state = WhitenerState(np.empty((0, self._width)), Factor())
 
     def push(self, covariances: Sequence[Array], rows: Array) -> Array:
         """Whitened rows (n_v, width) of the next window's (n_v, width), with covariances as `Factor` takes them."""
-        own = self._factor.push(covariances)
+        own = self.state.factor.push(covariances)
         seen = own.shape[1] - len(own)
-        white = self._white[len(self._white) - seen :]
+        white = self.state.white[len(self.state.white) - seen :]
         out = _solved(own[:, seen:], rows - own[:, :seen] @ white)
-        self._white = np.concatenate((white, out))
+        self.state.white = np.concatenate((white, out))
         return out
-
-    def state(self) -> dict[str, Array]:
-        """What `restore` needs to continue."""
-        return {"L": self._factor.L, "white": self._white}
-
-    def restore(self, state: Mapping[str, NDArray[Any]]) -> None:
-        """Continue from a saved state."""
-        self._factor.L, self._white = np.array(state["L"]), np.array(state["white"])
 
 
 class Whitening:

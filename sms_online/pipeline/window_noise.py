@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sms_online.calibration.columns import CalibrationColumns
 from sms_online.model.base_parameters import BaseParameters
@@ -17,7 +15,8 @@ from sms_online.pipeline.momentum_balance import MomentumBalance
 from sms_online.pipeline.momentum_windows import INSTANTS, Instants, Probes, Window
 from sms_online.pipeline.row_noise import RowNoise
 from sms_online.pipeline.sensitivity import Sensitivities
-from sms_online.pipeline.sensor_noise import SensorNoise, noise_from_state, noise_state
+from sms_online.pipeline.sensor_noise import SensorNoise
+from sms_online.state import Stage, State
 from sms_online.stream import Array
 
 
@@ -35,12 +34,21 @@ class PropagatedNoise:
     calibration: Array
 
 
-class WindowNoise:
+class WindowNoiseState(State):
+    """What the propagation of noise began with.
+
+    beta (n,): β, None before it has begun. sensor_noise: that of then.
+    """
+
+    beta: Array | None = None
+    sensor_noise: SensorNoise | None = None
+
+
+class WindowNoise(Stage):
     """Propagates the sensors' noise to the rows of windows, one after the other, with parameters β (n,), see `begin`.
 
     readings: x (K, n_x) to the displacements (K, n_v, sensors) that unit noise of each position sensor makes. clocks:
-    see `RowNoise`. calibration: makes the columns beside Y. beta: β, None before it has begun. n_v: rows of a window.
-    nuisances: columns of calibration.
+    see `RowNoise`. calibration: makes the columns beside Y. n_v: rows of a window. nuisances: columns of calibration.
     """
 
     def __init__(
@@ -59,12 +67,11 @@ class WindowNoise:
         self._noise = RowNoise(model.layout.theta_m, balance.span, clocks)
         self._calibration = calibration
         self.nuisances = 0 if calibration is None else calibration.count
-        self.beta: Array | None = None
-        self.sensor_noise: SensorNoise | None = None
+        self.state = WindowNoiseState()
 
     def begin(self, beta: Array, noise: SensorNoise, instant: int) -> None:
         """Begin with the window that starts at an instant, as if no window before shared samples with it."""
-        self.beta, self.sensor_noise = beta, noise
+        self.state = WindowNoiseState(beta, noise)
         self.begin_segment(instant)
 
     def begin_segment(self, instant: int = 0) -> None:
@@ -73,6 +80,16 @@ class WindowNoise:
         if self._calibration is not None:
             self._calibration.forget(instant)
         self._noise.begin_segment()
+
+    @property
+    def beta(self) -> Array | None:
+        """β, None before it has begun."""
+        return self.state.beta
+
+    @property
+    def sensor_noise(self) -> SensorNoise | None:
+        """Noise that β began with."""
+        return self.state.sensor_noise
 
     @property
     def probes(self) -> Probes:
@@ -86,8 +103,8 @@ class WindowNoise:
         """
         needed = self._sensitivities.next_instant
         fresh = needed - first
-        assert self.beta is not None
-        pi = self._rough.without(self._base.physical_values(self.beta))
+        assert self.state.beta is not None
+        pi = self._rough.without(self._base.physical_values(self.state.beta))
         probed = next((piece.probed for piece in instants if piece.number == needed), None)
         x, v, signals = x[fresh:], v[fresh:], signals[fresh:]
         self._sensitivities.tell(pi, x, v, signals, probed)
@@ -102,14 +119,14 @@ class WindowNoise:
 
     def push(self, window: Window, errors: Array) -> PropagatedNoise:
         """Of the next window; errors (n_v,): variance of each row that nothing propagates."""
-        assert self.sensor_noise is not None
-        assert self.beta is not None
-        pi = self._base.physical_values(self.beta)
+        assert self.state.sensor_noise is not None
+        assert self.state.beta is not None
+        pi = self._base.physical_values(self.state.beta)
         sensitivity = self._sensitivities.window(window.start)
         age = window.end / self._sample_rate
         rough = self._rough.kernel(window.rough, pi, sensitivity.displacements)
         kernel = self._noise.kernel(sensitivity) + rough
-        noise = self.sensor_noise
+        noise = self.state.sensor_noise
         free = self._rough.at_rest(window.rest, pi)
         covariances = self._noise.covariance(kernel, sensitivity.rates, noise.sensors, noise.torque, free, age)
         diagonal = np.einsum("ii->i", covariances[-1])
@@ -117,20 +134,3 @@ class WindowNoise:
         none = np.empty((self.n_v, 0))
         calibration = none if self._calibration is None else self._calibration.window(window.start, sensitivity, rough)
         return PropagatedNoise(covariances, kernel, self._noise.late, calibration)
-
-    def state(self) -> dict[str, Any]:
-        """What `restore` needs to continue."""
-        return {
-            "weights": np.empty(0) if self.beta is None else self.beta, **self._noise.state(),
-            **self._sensitivities.state(), **noise_state("weighed", self.sensor_noise),
-            **({} if self._calibration is None else self._calibration.state()),
-        }  # fmt: skip
-
-    def restore(self, state: Mapping[str, NDArray[Any]]) -> None:
-        """Continue from a saved state."""
-        self.beta = np.array(state["weights"]) if state["weights"].size else None
-        self._sensitivities.restore(state)
-        if self._calibration is not None:
-            self._calibration.restore(state)
-        self._noise.restore(state)
-        self.sensor_noise = noise_from_state("weighed", state)

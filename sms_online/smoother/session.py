@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from typing import Any, NamedTuple
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,6 +18,7 @@ from sms_online.pipeline.synchronise import GridSamples, Synchroniser
 from sms_online.sensor_set import Readings, readable_channels
 from sms_online.smoother.fit import DivergedError, SpanFit, SpanSmoother
 from sms_online.smoother.span import Span
+from sms_online.state import Stage, State
 from sms_online.stream import Array, Block
 from sms_online.trackers.factor import solve, triangular_factor
 from sms_online.trackers.interface import Estimate, Prior, prior_factor
@@ -67,33 +68,45 @@ class SmootherStatistics(NamedTuple):
         )
 
 
-class Smoother:
+class SmootherState(State):
+    """What a smoother keeps of the spans so far and to come.
+
+    known: from the spans so far. values (B, channels): readings at t (B,), s. torque (K, joints): at index (K, 2), grid
+    index and segment. motion (M, n_x + n_v): as the pipeline took it from the sensors, at grid indices `moved`.
+    """
+
+    known: SmootherStatistics
+    t: Array
+    values: Array
+    index: NDArray[np.int64]
+    torque: Array
+    moved: NDArray[np.int64]
+    motion: Array
+
+
+class Smoother(Stage):
     """Estimates the base parameters of a session from all its samples and the equations of motion.
 
     It works span by span: a span's rows of independent unit errors join those of the spans before it. channels: of the
-    readings that it uses, see `sensor_set.Readings`. failures: spans that were left out and why, a sentence each.
-    spans: how many it took. mean_square: of the last one, see `SpanFit`; level: the largest of all. prior: what it was
-    told beforehand, or None.
+    readings that it uses, see `sensor_set.Readings`. prior: what is known beforehand, or None.
     """
 
     def __init__(self, model: Model, base: BaseParameters, sensing: Sensing, available: Sequence[str]) -> None:
         self._model, self._base, self._sensing = model, base, sensing
         self._rate, joints = model.system.sample_rate, len(model.system.joints)
         self.channels = tuple(name for name in readable_channels(model) if name in available)
-        self.failures: list[str] = []
-        self.spans = 0
-        self.mean_square = self.level = np.nan
         self.prior: Prior | None = None
         self._synchroniser = Synchroniser([f"n_tau_{i}" for i in range(1, joints + 1)], self._rate)
-        # Of the spans so far.
-        self._factor = np.zeros((base.n + 1, base.n + 1))
-        self._beta = np.full(base.n, np.nan)
-        self._rows, self._rss, self._last_step, self._end = 0, 0.0, np.nan, -np.inf
-        # Of the spans to come: samples, torques on the grid, and the motion that the pipeline took from the sensors.
-        self._t, self._values = np.empty(0), np.empty((0, len(self.channels)))
-        self._index, self._torque = np.empty((0, 2), dtype=np.int64), np.empty((0, joints))  # grid index, segment
-        self._moved = np.empty(0, dtype=np.int64)
-        self._motion = np.empty((0, model.layout.n_x + model.layout.n_v))
+        nothing = np.zeros((base.n + 1, base.n + 1)), np.full(base.n, np.nan)
+        self.state = SmootherState(
+            known=SmootherStatistics((), 0, np.nan, np.nan, *nothing, 0, 0.0, np.nan, -np.inf),
+            t=np.empty(0),
+            values=np.empty((0, len(self.channels))),
+            index=np.empty((0, 2), dtype=np.int64),
+            torque=np.empty((0, joints)),
+            moved=np.empty(0, dtype=np.int64),
+            motion=np.empty((0, model.layout.n_x + model.layout.n_v)),
+        )
 
     def set_prior(self, prior: Prior) -> None:
         """Weigh the samples against what is known of the base parameters beforehand; before the first sample."""
@@ -102,22 +115,30 @@ class Smoother:
     @property
     def end(self) -> float:
         """Time of the newest sample behind the estimate, s; -inf where there is none."""
-        return self._end
+        return self.known.end
+
+    @property
+    def known(self) -> SmootherStatistics:
+        """From the spans so far."""
+        return self.state.known
 
     def push(self, t: Array, torque: Array, values: Array) -> None:
         """Take samples at t (B,), s, in order of time: n τ (B, joints), readings (B, channels), else NaN."""
-        self._t, self._values = np.concatenate((self._t, t)), np.concatenate((self._values, values))
+        now = self.state
+        now.t, now.values = np.concatenate((now.t, t)), np.concatenate((now.values, values))
         for piece in self._synchroniser.push(Block(t, self._synchroniser.channels, torque)):
             self._keep(piece)
 
     def _keep(self, piece: GridSamples) -> None:
+        now = self.state
         index = np.stack((piece.index, np.full(piece.index.size, piece.segment)), axis=1)
-        self._index, self._torque = np.concatenate((self._index, index)), np.concatenate((self._torque, piece.values))
+        now.index, now.torque = np.concatenate((now.index, index)), np.concatenate((now.torque, piece.values))
 
     def move(self, index: NDArray[np.int64], x: Array, v: Array) -> None:
         """Take the motion as the sensors alone tell it, at grid samples (B,): x (B, n_x), v (B, n_v)."""
-        self._moved = np.concatenate((self._moved, index))
-        self._motion = np.concatenate((self._motion, np.concatenate((x, v), axis=1)))
+        now = self.state
+        now.moved = np.concatenate((now.moved, index))
+        now.motion = np.concatenate((now.motion, np.concatenate((x, v), axis=1)))
 
     def work(self, first_fit: Callable[[], Estimate], last: bool = False) -> None:
         """Fit the spans that are complete; `last` at the end of the session.
@@ -128,8 +149,8 @@ class Smoother:
             for piece in self._synchroniser.flush():
                 self._keep(piece)
         while (count := self._complete(last)) > 0:
-            end = int(self._index[count - 1, 0])
-            if not last and not (self._moved.size and self._moved[-1] >= end):
+            end = int(self.state.index[count - 1, 0])
+            if not last and not (self.state.moved.size and self.state.moved[-1] >= end):
                 return
             if count > max(LEAST_SPAN * self._rate, FEWEST_SAMPLES):
                 self._fit(count, first_fit)
@@ -137,7 +158,7 @@ class Smoother:
 
     def _complete(self, last: bool) -> int:
         """Torque samples of the first span, 0 where more of them may come."""
-        segment = self._index[:, 1]
+        segment = self.state.index[:, 1]
         run = int(np.searchsorted(segment, segment[0], side="right")) if segment.size else 0
         longest = round(SPAN * self._rate) + 1
         if run >= longest:
@@ -149,47 +170,58 @@ class Smoother:
 
     def _forget(self, count: int) -> None:
         """Drop a span; the sample that ends it begins the next one, if there is no gap between them."""
-        goes_on = count < len(self._index) and self._index[count, 1] == self._index[count - 1, 1]
+        now = self.state
+        goes_on = count < len(now.index) and now.index[count, 1] == now.index[count - 1, 1]
         dropped = count - 1 if goes_on else count
-        end = self._index[count - 1, 0]
-        self._index, self._torque = self._index[dropped:], self._torque[dropped:]
-        kept = self._t > self._time(end)
-        self._t, self._values = self._t[kept], self._values[kept]
-        kept = self._moved >= end
-        self._moved, self._motion = self._moved[kept], self._motion[kept]
+        end = now.index[count - 1, 0]
+        now.index, now.torque = now.index[dropped:], now.torque[dropped:]
+        kept = now.t > self._time(end)
+        now.t, now.values = now.t[kept], now.values[kept]
+        kept = now.moved >= end
+        now.moved, now.motion = now.moved[kept], now.motion[kept]
 
     def _fit(self, count: int, first_fit: Callable[[], Estimate]) -> None:
-        torque_t = self._time(self._index[:count, 0])
+        now = self.state
+        torque_t = self._time(now.index[:count, 0])
         begin, end = torque_t[0], torque_t[-1]
-        inside = (self._t >= begin) & (self._t <= end)
-        moved = (self._moved >= self._index[0, 0]) & (self._moved <= self._index[count - 1, 0])
-        values, sigma, torque_density = self._weighed(self._t[inside], self._values[inside], self._torque[:count])
+        inside = (now.t >= begin) & (now.t <= end)
+        moved = (now.moved >= now.index[0, 0]) & (now.moved <= now.index[count - 1, 0])
+        values, sigma, torque_density = self._weighed(now.t[inside], now.values[inside], now.torque[:count])
         sensed = np.flatnonzero(np.isfinite(sigma))
         readings = Readings(self._model, [self.channels[k] for k in sensed])
-        guess_x, guess_v = np.split(self._motion[moved], [self._model.layout.n_x], axis=1)
+        guess_x, guess_v = np.split(now.motion[moved], [self._model.layout.n_x], axis=1)
         span = Span(
-            torque_t, self._torque[:count], self._t[inside], values[:, sensed],
-            self._time(self._moved[moved]), guess_x, guess_v,
+            torque_t, now.torque[:count], now.t[inside], values[:, sensed],
+            self._time(now.moved[moved]), guess_x, guess_v,
         )  # fmt: skip
         smoother = SpanSmoother(self._model, self._base, readings, sigma[sensed], torque_density)
         try:
             if not moved.any():
                 raise DivergedError("the sensors tell no motion to begin with")
-            beta = self._beta if self.spans else self._realisable(first_fit())
-            known = triangular_factor(prior_factor(self.prior, self._base.n), self._factor)
-            fit = smoother.fit(span, beta, known, self._last_step if self.spans else None)
+            past = now.known
+            beta = past.beta if past.spans else self._realisable(first_fit())
+            known = triangular_factor(prior_factor(self.prior, self._base.n), past.factor)
+            fit = smoother.fit(span, beta, known, past.last_step if past.spans else None)
         except DivergedError as error:
-            self.failures.append(f"{begin:.6g} … {end:.6g} s: {error}")
+            failures = (*now.known.failures, f"{begin:.6g} … {end:.6g} s: {error}")
+            now.known = now.known._replace(failures=failures)
             return
         self._take(fit, end)
 
     def _take(self, fit: SpanFit, end: float) -> None:
-        self._factor = triangular_factor(self._factor, fit.factor)
-        self._beta, self._last_step, self._end = fit.beta, fit.step, end
-        self._rows += fit.rows
-        self._rss += fit.rows * fit.mean_square
-        self.mean_square, self.level = fit.mean_square, float(np.fmax(self.level, fit.level))
-        self.spans += 1
+        past = self.state.known
+        self.state.known = SmootherStatistics(
+            failures=past.failures,
+            spans=past.spans + 1,
+            level=float(np.fmax(past.level, fit.level)),
+            mean_square=fit.mean_square,
+            factor=triangular_factor(past.factor, fit.factor),
+            beta=fit.beta,
+            rows=past.rows + fit.rows,
+            rss=past.rss + fit.rows * fit.mean_square,
+            last_step=fit.step,
+            end=end,
+        )
 
     def _realisable(self, estimate: Estimate) -> Array:
         """β (n,) of the real bodies nearest to an estimate."""
@@ -218,35 +250,4 @@ class Smoother:
 
     def estimate(self) -> Estimate:
         """The base parameters as known now, with the prior; only after the first span."""
-        return self.statistics().estimate(self.prior)
-
-    def statistics(self) -> SmootherStatistics:
-        """What is known now."""
-        return SmootherStatistics(
-            tuple(self.failures), self.spans, self.level, self.mean_square, self._factor, self._beta, self._rows,
-            self._rss, self._last_step, self._end,
-        )  # fmt: skip
-
-    def state(self) -> dict[str, dict[str, Any]]:
-        """Everything that `restore` needs to continue to the same bits."""
-        return {
-            "smoother": {
-                **self.statistics()._asdict(), "failures": np.array(self.failures, dtype=np.str_),
-                "t": self._t, "values": self._values, "index": self._index, "torque": self._torque,
-                "moved": self._moved, "motion": self._motion,
-            },
-            "smoother_torques": dict(self._synchroniser.state()),
-        }  # fmt: skip
-
-    def restore(self, saved: Mapping[str, Mapping[str, NDArray[Any]]]) -> None:
-        """Continue from a saved state."""
-        state = saved["smoother"]
-        self.failures, self.spans = [str(text) for text in state["failures"]], int(state["spans"])
-        self.mean_square, self.level = float(state["mean_square"]), float(state["level"])
-        self._factor, self._beta = np.array(state["factor"]), np.array(state["beta"])
-        self._rows, self._rss = int(state["rows"]), float(state["rss"])
-        self._last_step, self._end = float(state["last_step"]), float(state["end"])
-        self._t, self._values = np.array(state["t"]), np.array(state["values"])
-        self._index, self._torque = np.array(state["index"]), np.array(state["torque"])
-        self._moved, self._motion = np.array(state["moved"]), np.array(state["motion"])
-        self._synchroniser.restore(saved["smoother_torques"])
+        return self.known.estimate(self.prior)

@@ -2,7 +2,7 @@
 
 from sms_online.trackers.forgetting import Directional, Exponential, Forgetting, NoForgetting, SlidingWindow
 from sms_online.trackers.information import Information
-from sms_online.trackers.interface import Estimate, Prior, Rows, State, Tracker
+from sms_online.trackers.interface import Estimate, Prior, Rows, Tracker
 from sms_online.trackers.kalman import KalmanTracker
 from sms_online.trackers.square_root import RecursiveLeastSquares
 
@@ -18,6 +18,5 @@ __all__ = [
     "RecursiveLeastSquares",
     "Rows",
     "SlidingWindow",
-    "State",
     "Tracker",
 ]

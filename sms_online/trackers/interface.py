@@ -2,17 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from abc import ABC, abstractmethod
 from dataclasses import dataclass, field, replace
-from typing import Protocol
 
 import numpy as np
 
+from sms_online.state import Stage
 from sms_online.stream import Array
 from sms_online.trackers.information import Information
-
-# What a tracker saves: arrays and numbers only, so that any array format can hold it.
-State = dict[str, Array | float]
 
 
 @dataclass(frozen=True)
@@ -148,29 +145,30 @@ class Estimate:
         return None if self.covariance_robust is None else np.sqrt(np.diag(self.covariance_robust))
 
 
-class Tracker(Protocol):
-    """A recursive estimator of π. The result depends on the rows alone, never on how they were split into calls."""
+class Tracker(Stage, ABC):
+    """A recursive estimator of π. The result depends on the rows alone, never on how they were split into calls.
+
+    What its rows have changed lies in a `State`, whose arrays are replaced, never written: with it a session is saved.
+    """
 
     enabled: bool
     """While False, rows are ignored and the estimate stands still."""
 
+    @abstractmethod
     def update(self, rows: Rows) -> None:
         """Take in rows; ValueError where their width is not n."""
 
+    @abstractmethod
     def estimate(self) -> Estimate:
         """The estimate from all rows taken in so far; leaves the state as it is."""
 
+    @abstractmethod
     def reset(self) -> None:
         """Forget all rows; priors stay."""
 
+    @abstractmethod
     def begin(self, known: Information) -> None:
         """Forget all rows, and go on from what others say of π; priors stay. ValueError where it is not of n."""
-
-    def state(self) -> State:
-        """Everything needed to continue bit for bit, as copies."""
-
-    def restore(self, state: Mapping[str, Array | float]) -> None:
-        """Continue from a state saved by a tracker built with the same arguments; ValueError where it does not fit."""
 
 
 def checked(known: Information, n: int) -> Information:
@@ -178,21 +176,3 @@ def checked(known: Information, n: int) -> Information:
     if known.n != n:
         raise ValueError(f"information of {known.n} parameters; expected {n}")
     return known
-
-
-def saved_array(state: Mapping[str, Array | float], key: str, shape: tuple[int | None, ...]) -> Array:
-    """Copy of an array out of a saved state; None in `shape` stands for any length. ValueError if it does not fit."""
-    if key not in state:
-        raise ValueError(f"saved tracker state: no {key!r}; expected the state of a tracker of this kind")
-    value = np.array(state[key], dtype=np.float64)
-    fits = value.ndim == len(shape) and all(want in (None, have) for want, have in zip(shape, value.shape, strict=True))
-    if not fits or not np.isfinite(value).all():
-        raise ValueError(
-            f"saved tracker state: {key!r} has shape {value.shape}; expected finite values of shape {shape}"
-        )
-    return value
-
-
-def saved_number(state: Mapping[str, Array | float], key: str) -> float:
-    """A number out of a saved state; ValueError where it is missing or not finite."""
-    return float(saved_array(state, key, ()))

@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from sms_online.state import State
 from sms_online.stream import Array
 from sms_online.trackers.factor import RANK_TOLERANCE, masked_covariance, solve
 from sms_online.trackers.information import Information
-from sms_online.trackers.interface import Estimate, Prior, Rows, State, checked, saved_array, saved_number
+from sms_online.trackers.interface import Estimate, Prior, Rows, Tracker, checked
 
 if TYPE_CHECKING:
     from filterpy.kalman import KalmanFilter
@@ -20,7 +20,21 @@ if TYPE_CHECKING:
 INFORMED_VARIANCE = 0.5
 
 
-class KalmanTracker:
+class KalmanState(State):
+    """What the filter knows.
+
+    x (n, 1), P (n, n): deviation from the initial value and its covariance, in units of the initial std. nis: sum of
+    squared normalised innovations. newest: time of the newest row, s.
+    """
+
+    x: Array
+    P: Array
+    rows: int = 0
+    nis: float = 0.0
+    newest: float | None = None
+
+
+class KalmanTracker(Tracker):
     """Random walk of π, observed through Y π = b, one row at a time.
 
     process_std: (n,) how far each parameter wanders in one second, in its unit per √s. initial: value and std of every
@@ -40,13 +54,11 @@ class KalmanTracker:
         self._n = n
         self._initial = initial
         self._walk = (process_std / initial.std) ** 2  # scaled variance per second
+        self._filter = _scaled_filter(n)
         self._start()
 
     def _start(self) -> None:
-        self._filter = _scaled_filter(self._n)
-        self._rows = 0
-        self._nis = 0.0
-        self._newest: float | None = None
+        self.state = KalmanState(np.zeros((self._n, 1)), np.eye(self._n))
 
     def update(self, rows: Rows) -> None:
         """Take in rows; ValueError where their width is not n (filterpy itself would take any)."""
@@ -55,35 +67,37 @@ class KalmanTracker:
         whitened = rows.whitened(self._n)
         b = whitened[:, self._n] - whitened[:, : self._n] @ self._initial.value
         Y = whitened[:, : self._n] * self._initial.std
+        self._filter.x, self._filter.P = self.state.x, self.state.P
         for row in range(len(Y)):
             self._predict(float(rows.t[row]))
             # x is the deviation from the initial value in units of the initial std; the row's noise is one.
             self._filter.update(b[row : row + 1], R=1.0, H=Y[row : row + 1])
             self._filter.P = 0.5 * (self._filter.P + self._filter.P.T)
-            self._nis += float(self._filter.y[0, 0] ** 2 / self._filter.S[0, 0])
-        self._rows += len(Y)
+            self.state.nis += float(self._filter.y[0, 0] ** 2 / self._filter.S[0, 0])
+        self.state.x, self.state.P = self._filter.x, self._filter.P
+        self.state.rows += len(Y)
 
     def _predict(self, t: float) -> None:
-        if self._newest is not None and t > self._newest:
-            self._filter.predict(Q=np.diag(self._walk * (t - self._newest)))
+        if self.state.newest is not None and t > self.state.newest:
+            self._filter.predict(Q=np.diag(self._walk * (t - self.state.newest)))
             shrink = 1.0 / np.sqrt(np.maximum(np.diag(self._filter.P), 1.0))
-            self._filter.P *= np.outer(shrink, shrink)
-        self._newest = t if self._newest is None else max(t, self._newest)
+            self._filter.P = self._filter.P * np.outer(shrink, shrink)
+        self.state.newest = t if self.state.newest is None else max(t, self.state.newest)
 
     def estimate(self) -> Estimate:
         """The filtered π; leaves the state as it is."""
-        P = self._filter.P
+        P = self.state.P
         std = self._initial.std
         determined = np.diag(P) < INFORMED_VARIANCE
         return Estimate(
-            pi=self._initial.value + std * self._filter.x[:, 0],
+            pi=self._initial.value + std * self.state.x[:, 0],
             covariance=masked_covariance(P * np.outer(std, std), determined),
             covariance_robust=None,
             determined=determined,
             condition_number=_condition_number(P),
-            rows=self._rows,
-            rss=self._nis,
-            dof=self._rows,
+            rows=self.state.rows,
+            rss=self.state.nis,
+            dof=self.state.rows,
         )
 
     def reset(self) -> None:
@@ -93,7 +107,6 @@ class KalmanTracker:
     def begin(self, known: Information) -> None:
         """Forget all rows; start from the initial value and std together with what others say of π."""
         checked(known, self._n)
-        self._start()
         # In units of the initial std about the initial value, as the filter's own state.
         Y, b = (
             known.factor[:, :-1] * self._initial.std,
@@ -101,39 +114,14 @@ class KalmanTracker:
         )
         initial = np.eye(self._n, self._n + 1)
         solution = solve(np.concatenate((initial, np.column_stack((Y, b)))))
-        self._filter.x, self._filter.P = solution.pi[:, None], solution.covariance()
-        self._rows, self._nis = known.rows, solution.rss
-
-    def state(self) -> State:
-        """Everything needed to continue bit for bit."""
-        state: State = {
-            "enabled": float(self.enabled),
-            "x": self._filter.x[:, 0].copy(),
-            "P": self._filter.P.copy(),
-            "rows": float(self._rows),
-            "nis": self._nis,
-        }
-        if self._newest is not None:
-            state["newest"] = self._newest
-        return state
-
-    def restore(self, state: Mapping[str, Array | float]) -> None:
-        """Continue from a state saved by a tracker built with the same arguments; ValueError where it does not fit."""
-        x = saved_array(state, "x", (self._n,))
-        P = saved_array(state, "P", (self._n, self._n))
-        rows, nis, enabled = (saved_number(state, key) for key in ("rows", "nis", "enabled"))
-        self._filter.x, self._filter.P = x[:, None], P
-        self._rows, self._nis, self.enabled = int(rows), nis, bool(enabled)
-        self._newest = saved_number(state, "newest") if "newest" in state else None
+        self.state = KalmanState(solution.pi[:, None], solution.covariance(), known.rows, solution.rss)
 
 
 def _scaled_filter(n: int) -> KalmanFilter:
-    """filterpy's filter at x = 0, P = I: zero deviation from the initial value, in units of the initial std."""
+    """filterpy's filter of n parameters that stay as they are."""
     from filterpy.kalman import KalmanFilter  # 0.75 s, for those who use it
 
     out = KalmanFilter(dim_x=n, dim_z=1)
-    out.x = np.zeros((n, 1))
-    out.P = np.eye(n)
     out.F = np.eye(n)
     return out
 

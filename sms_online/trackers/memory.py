@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
-from collections import deque
-from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Protocol
 
+import msgspec
 import numpy as np
 
+from sms_online.state import Stage, State
 from sms_online.stream import Array
 from sms_online.trackers.factor import triangular_factor
 from sms_online.trackers.forgetting import FadingForgetting, Forgetting, NoForgetting, SlidingWindow
 from sms_online.trackers.information import Information
-from sms_online.trackers.interface import State, saved_array, saved_number
 from sms_online.trackers.robust import MAX_CLUSTERS, ClusterFactors, merge_neighbours
 
 # Rows of one internal block: the QR of 32 x 17 costs about as much as that of 17 x 17, so below it the overhead of the
@@ -31,7 +30,7 @@ class Content:
 
 
 class Memory(Protocol):
-    """Store of absorbed blocks; a block is (M, n + 1) whitened rows."""
+    """Store of absorbed blocks, a `State` or a `Stage`; a block is (M, n + 1) whitened rows."""
 
     def begin(self, known: Information) -> None:
         """Count what earlier rows say, before the first block."""
@@ -42,66 +41,62 @@ class Memory(Protocol):
     def with_pending(self, block: Array) -> Content:
         """What the memory would hold after a last, unfinished block (M ≥ 0 rows); the memory stays as it is."""
 
-    def state(self) -> State:
-        """What continues it bit for bit."""
 
-    def restore(self, state: Mapping[str, Array | float]) -> None:
-        """Continue from a saved state."""
-
-
-class FullMemory:
+class FullMemory(State):
     """All rows, as one factor and the factors of their clusters."""
 
-    def __init__(self, n: int) -> None:
-        self._factor = np.zeros((n + 1, n + 1))
-        self._rows = 0
-        self._clusters = ClusterFactors(n)
+    factor: Array
+    clusters: ClusterFactors
+    rows: int = 0
+
+    @staticmethod
+    def none(n: int) -> FullMemory:
+        """Of no rows of n parameters."""
+        return FullMemory(np.zeros((n + 1, n + 1)), ClusterFactors.none(n))
 
     def begin(self, known: Information) -> None:
         """See Memory; the rows behind it are in no cluster."""
-        self._factor, self._rows = known.factor, known.rows
+        self.factor, self.rows = known.factor, known.rows
 
     def absorb(self, block: Array) -> None:
         """See Memory."""
         factor = triangular_factor(block)
-        self._factor = triangular_factor(self._factor, factor)
-        self._rows += len(block)
-        self._clusters.add(factor)
+        self.factor = triangular_factor(self.factor, factor)
+        self.rows += len(block)
+        self.clusters.add(factor)
 
     def with_pending(self, block: Array) -> Content:
         """See Memory."""
         pending = triangular_factor(block)
-        return Content(triangular_factor(self._factor, pending), self._rows + len(block), self._clusters.stack(pending))
-
-    def state(self) -> State:
-        """See Memory."""
-        # The factor is replaced, never written.
-        return {"factor": self._factor, "rows": float(self._rows), **self._clusters.state()}
-
-    def restore(self, state: Mapping[str, Array | float]) -> None:
-        """See Memory."""
-        self._clusters.restore(state)
-        self._factor = saved_array(state, "factor", self._factor.shape)
-        self._rows = int(saved_number(state, "rows"))
+        return Content(triangular_factor(self.factor, pending), self.rows + len(block), self.clusters.stack(pending))
 
 
-class FadingMemory:
+class FadingState(State):
+    """What is left of rows that fade.
+
+    factor (n + 1, n + 1), of so many rows. peak (n,): greatest square-root information that each parameter had.
+    """
+
+    factor: Array
+    peak: Array
+    rows: float = 0.0
+
+
+class FadingMemory(Stage):
     """One factor in which older rows fade."""
 
     def __init__(self, n: int, forgetting: FadingForgetting) -> None:
         self._forgetting = forgetting
-        self._factor = np.zeros((n + 1, n + 1))
-        self._peak = np.zeros(n)  # greatest square-root information that each parameter ever had
-        self._rows = 0.0
+        self.state = FadingState(np.zeros((n + 1, n + 1)), np.zeros(n))
 
     def begin(self, known: Information) -> None:
         """See Memory."""
-        self._factor, self._rows = known.factor, float(known.rows)
-        self._peak = np.linalg.norm(known.factor[:, :-1], axis=0)
+        self.state.factor, self.state.rows = known.factor, float(known.rows)
+        self.state.peak = np.linalg.norm(known.factor[:, :-1], axis=0)
 
     def absorb(self, block: Array) -> None:
         """See Memory."""
-        self._factor, self._rows, self._peak = self._advanced(block)
+        self.state.factor, self.state.rows, self.state.peak = self._advanced(block)
 
     def with_pending(self, block: Array) -> Content:
         """See Memory."""
@@ -111,42 +106,32 @@ class FadingMemory:
     def _advanced(self, block: Array) -> tuple[Array, float, Array]:
         """Factor, effective rows and peak after a block."""
         if not len(block):
-            return self._factor, self._rows, self._peak
-        n = self._peak.size
+            return self.state.factor, self.state.rows, self.state.peak
+        n = self.state.peak.size
         weight = self._forgetting.factor ** len(block)
         row_weights = self._forgetting.row_weights(len(block))
         new = triangular_factor(block * row_weights[:, None])
-        attained = np.hypot(np.linalg.norm(self._factor[:n, :n], axis=0), np.linalg.norm(new[:, :n], axis=0))
-        peak = np.maximum(self._peak, attained)
-        faded = self._forgetting.fade(self._factor, np.where(peak > 0, peak, 1.0), new, weight)
-        return triangular_factor(faded, new), weight * self._rows + float(row_weights @ row_weights), peak
-
-    def state(self) -> State:
-        """See Memory."""
-        return {"faded_factor": self._factor.copy(), "faded_rows": self._rows, "peak": self._peak.copy()}
-
-    def restore(self, state: Mapping[str, Array | float]) -> None:
-        """See Memory."""
-        self._peak = saved_array(state, "peak", self._peak.shape)
-        self._factor = saved_array(state, "faded_factor", self._factor.shape)
-        self._rows = saved_number(state, "faded_rows")
+        attained = np.hypot(np.linalg.norm(self.state.factor[:n, :n], axis=0), np.linalg.norm(new[:, :n], axis=0))
+        peak = np.maximum(self.state.peak, attained)
+        faded = self._forgetting.fade(self.state.factor, np.where(peak > 0, peak, 1.0), new, weight)
+        return triangular_factor(faded, new), weight * self.state.rows + float(row_weights @ row_weights), peak
 
 
-class WindowMemory:
-    """The factors of the last blocks."""
+class WindowMemory(State):
+    """The factors of the last blocks (n + 1, n + 1), as many as the window has, and the rows of each."""
 
-    def __init__(self, n: int, rows: int) -> None:
-        self._n = n
-        self._blocks: deque[Array] = deque(maxlen=-(-rows // BLOCK_ROWS))
-        self._counts: deque[int] = deque(maxlen=self._blocks.maxlen)
+    n: int
+    most: int
+    blocks: list[Array] = msgspec.field(default_factory=list)
+    counts: list[int] = msgspec.field(default_factory=list)
 
     def begin(self, known: Information) -> None:
         """See Memory; it counts as one block, the first to leave."""
         self._append(known.factor, known.rows)
 
     def _append(self, factor: Array, rows: int) -> None:
-        self._blocks.append(factor)
-        self._counts.append(rows)
+        self.blocks = [*self.blocks, factor][-self.most :]
+        self.counts = [*self.counts, rows][-self.most :]
 
     def absorb(self, block: Array) -> None:
         """See Memory."""
@@ -154,32 +139,19 @@ class WindowMemory:
 
     def with_pending(self, block: Array) -> Content:
         """See Memory."""
-        factors = np.stack((*self._blocks, triangular_factor(block)))
+        factors = np.stack((*self.blocks, triangular_factor(block)))
         clusters = merge_neighbours(factors, -(-len(factors) // MAX_CLUSTERS))
         return Content(
-            triangular_factor(clusters.reshape(-1, self._n + 1)),
-            sum(self._counts) + len(block),
+            triangular_factor(clusters.reshape(-1, self.n + 1)),
+            sum(self.counts) + len(block),
             clusters,
         )
-
-    def state(self) -> State:
-        """See Memory."""
-        n1 = self._n + 1
-        window = np.stack(self._blocks) if self._blocks else np.zeros((0, n1, n1))
-        return {"window": window, "window_rows": np.array(self._counts, dtype=np.float64)}
-
-    def restore(self, state: Mapping[str, Array | float]) -> None:
-        """See Memory."""
-        window = saved_array(state, "window", (None, self._n + 1, self._n + 1))
-        counts = saved_array(state, "window_rows", (len(window),))
-        self._blocks = deque(window, maxlen=self._blocks.maxlen)
-        self._counts = deque((int(count) for count in counts), maxlen=self._blocks.maxlen)
 
 
 def memory_for(forgetting: Forgetting, n: int) -> Memory:
     """The empty memory of a kind of forgetting for n parameters."""
     if isinstance(forgetting, NoForgetting):
-        return FullMemory(n)
+        return FullMemory.none(n)
     if isinstance(forgetting, SlidingWindow):
-        return WindowMemory(n, forgetting.rows)
+        return WindowMemory(n, -(-forgetting.rows // BLOCK_ROWS))
     return FadingMemory(n, forgetting)

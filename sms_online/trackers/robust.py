@@ -16,71 +16,49 @@ noise, and no residual tells how far π has drifted. Errors must be uncorrelated
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-
+import msgspec
 import numpy as np
 
+from sms_online.state import State
 from sms_online.stream import Array
 from sms_online.trackers.factor import Solution, triangular_factor
-from sms_online.trackers.interface import State, saved_array, saved_number
 
 # Enough clusters for a 16 x 16 matrix of scores with 6 % scatter of its std; they cost 0.6 MB at n = 16. Even.
 MAX_CLUSTERS = 256
 
 
-class ClusterFactors:
-    """Factors of consecutive clusters of blocks; when they become too many, neighbours merge and the length doubles."""
+class ClusterFactors(State):
+    """Factors of consecutive clusters of blocks; when they become too many, neighbours merge and the length doubles.
 
-    def __init__(self, n: int) -> None:
-        # Written once and shared with saved states: those of a large arm are 14 MB, too much to be copied often.
-        self._closed = np.zeros((MAX_CLUSTERS, n + 1, n + 1))
-        self._count = 0
-        self._length = 1  # blocks per cluster
-        self._open = np.zeros((n + 1, n + 1))
-        self._open_blocks = 0
+    length: blocks of a cluster. unfinished: factor of the last one, of so many blocks so far.
+    """
+
+    unfinished: Array
+    closed: list[Array] = msgspec.field(default_factory=list)
+    length: int = 1
+    blocks: int = 0
+
+    @staticmethod
+    def none(n: int) -> ClusterFactors:
+        """Of no rows of n parameters."""
+        return ClusterFactors(np.zeros((n + 1, n + 1)))
 
     def add(self, factor: Array) -> None:
         """Take in the factor of the next block."""
-        self._open = factor if self._open_blocks == 0 else triangular_factor(self._open, factor)
-        self._open_blocks += 1
-        if self._open_blocks < self._length:
+        self.unfinished = factor if self.blocks == 0 else triangular_factor(self.unfinished, factor)
+        self.blocks += 1
+        if self.blocks < self.length:
             return
-        self._closed[self._count] = self._open
-        self._count += 1
-        self._open_blocks = 0
-        if self._count == MAX_CLUSTERS:
-            self._count //= 2
-            merged = merge_neighbours(self._closed, 2)
-            self._closed = np.zeros_like(self._closed)
-            self._closed[: self._count] = merged
-            self._length *= 2
+        self.closed.append(self.unfinished)
+        self.blocks = 0
+        if len(self.closed) == MAX_CLUSTERS:
+            self.closed = list(merge_neighbours(np.array(self.closed), 2))
+            self.length *= 2
 
     def stack(self, pending: Array) -> Array:
         """All clusters (C, n + 1, n + 1), the unfinished last one together with the factor of the pending rows."""
-        last = triangular_factor(self._open, pending) if self._open_blocks else pending
-        return np.concatenate((self._closed[: self._count], last[None]))
-
-    def state(self) -> State:
-        """What continues the clusters bit for bit; it does not change when they go on."""
-        return {
-            "clusters": self._closed[: self._count],
-            "cluster_blocks": float(self._length),
-            "open_cluster": self._open,
-            "open_cluster_blocks": float(self._open_blocks),
-        }
-
-    def restore(self, state: Mapping[str, Array | float]) -> None:
-        """Continue from a saved state."""
-        shape = self._open.shape
-        closed = saved_array(state, "clusters", (None, *shape))
-        if len(closed) >= MAX_CLUSTERS:
-            raise ValueError(f"saved tracker state: {len(closed)} clusters; expected fewer than {MAX_CLUSTERS}")
-        self._open = saved_array(state, "open_cluster", shape)
-        self._length = int(saved_number(state, "cluster_blocks"))
-        self._open_blocks = int(saved_number(state, "open_cluster_blocks"))
-        self._count = len(closed)
-        self._closed = np.zeros_like(self._closed)
-        self._closed[: self._count] = closed
+        last = triangular_factor(self.unfinished, pending) if self.blocks else pending
+        return np.array([*self.closed, last])
 
 
 def merge_neighbours(factors: Array, group: int) -> Array:

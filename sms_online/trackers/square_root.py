@@ -2,24 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-
 import numpy as np
 
+from sms_online.state import State
 from sms_online.stream import Array
 from sms_online.trackers.factor import solve, triangular_factor
 from sms_online.trackers.forgetting import Forgetting, NoForgetting
 from sms_online.trackers.information import Information
-from sms_online.trackers.interface import (
-    Estimate,
-    Prior,
-    Rows,
-    State,
-    checked,
-    prior_factor,
-    saved_array,
-    saved_number,
-)
+from sms_online.trackers.interface import Estimate, Prior, Rows, Tracker, checked, prior_factor
 from sms_online.trackers.memory import BLOCK_ROWS, Content, memory_for
 from sms_online.trackers.robust import cluster_covariance
 
@@ -27,7 +17,13 @@ from sms_online.trackers.robust import cluster_covariance
 FINEST_ROWS = 1e-9
 
 
-class RecursiveLeastSquares:
+class PendingRows(State):
+    """rows (M, n + 1): whitened, that wait for their block to be whole."""
+
+    rows: Array
+
+
+class RecursiveLeastSquares(Tracker):
     """Recursive solution of Y π = b, weighted by the rows' std; without forgetting it equals the batch solution (45).
 
     Rows are gathered into blocks of fixed size before they are absorbed, so that no bit of the result depends on how
@@ -50,28 +46,22 @@ class RecursiveLeastSquares:
         self._n = n
         self._forgetting = forgetting if forgetting is not None else NoForgetting()
         self._prior = prior_factor(prior, n)
-        self._pending = np.zeros((BLOCK_ROWS, n + 1))
-        self._fill = 0
+        self._pending = PendingRows(np.empty((0, n + 1)))
         self._memory = memory_for(self._forgetting, n)
 
     def update(self, rows: Rows) -> None:
         """Take in rows; ValueError where their width is not n."""
         if not self.enabled:
             return
-        whitened = rows.whitened(self._n)
-        start = 0
-        while start < len(whitened):
-            count = min(BLOCK_ROWS - self._fill, len(whitened) - start)
-            self._pending[self._fill : self._fill + count] = whitened[start : start + count]
-            self._fill += count
-            start += count
-            if self._fill == BLOCK_ROWS:
-                self._memory.absorb(self._pending)
-                self._fill = 0
+        pending = np.concatenate((self._pending.rows, rows.whitened(self._n)))
+        while len(pending) >= BLOCK_ROWS:
+            self._memory.absorb(pending[:BLOCK_ROWS])
+            pending = pending[BLOCK_ROWS:]
+        self._pending.rows = pending.copy()
 
     def estimate(self) -> Estimate:
         """The estimate from all rows so far and the prior; leaves the state as it is."""
-        content = self._memory.with_pending(self._pending[: self._fill])
+        content = self._memory.with_pending(self._pending.rows)
         scale = _residual_std(content) if self._scaled else 1.0
         solution = solve(triangular_factor(self._prior, content.factor / scale))
         robust = None
@@ -91,7 +81,7 @@ class RecursiveLeastSquares:
 
     def reset(self) -> None:
         """Forget all rows; the prior stays."""
-        self._fill = 0
+        self._pending = PendingRows(np.empty((0, self._n + 1)))
         self._memory = memory_for(self._forgetting, self._n)
 
     def begin(self, known: Information) -> None:
@@ -99,27 +89,6 @@ class RecursiveLeastSquares:
         checked(known, self._n)
         self.reset()
         self._memory.begin(known)
-
-    def state(self) -> State:
-        """Everything needed to continue bit for bit, pending rows included."""
-        return {
-            "enabled": float(self.enabled),
-            "pending": self._pending[: self._fill].copy(),
-            **self._memory.state(),
-        }
-
-    def restore(self, state: Mapping[str, Array | float]) -> None:
-        """Continue from a state saved by a tracker built with the same arguments; ValueError where it does not fit."""
-        pending = saved_array(state, "pending", (None, self._n + 1))
-        if len(pending) >= BLOCK_ROWS:
-            raise ValueError(f"saved tracker state: {len(pending)} pending rows; expected fewer than {BLOCK_ROWS}")
-        enabled = bool(saved_number(state, "enabled"))
-        memory = memory_for(self._forgetting, self._n)
-        memory.restore(state)
-        self._memory = memory
-        self._fill = len(pending)
-        self._pending[: self._fill] = pending
-        self.enabled = enabled
 
 
 def session_tracker(n: int, prior: Prior | None, nuisances: int = 0) -> RecursiveLeastSquares:

@@ -295,7 +295,7 @@ def test_a_day_at_full_speed(tmp_path: Path, balance: str) -> None:
             block = ours.advance(tick_time(tick), [[now[int(edges[-1]) :]]])
             if block is not None:
                 yield block
-            write_checkpoint(tmp_path / "checkpoint.npz", Checkpoint.of(estimator))
+            write_checkpoint(tmp_path / "checkpoint.msgpack", Checkpoint.of(estimator))
             if k % max(1, rounds // 24) == 0 or k == rounds - 1:
                 hours, pi, std = (k + 1) * ROUND / 3.6e6, estimator.estimate().pi, standard_deviation(estimator)
                 shown = ", ".join(f"{p:.6f} ± {2 * s:.6f}" for p, s in zip(pi, std, strict=True))

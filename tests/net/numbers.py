@@ -54,7 +54,7 @@ def numbers(session: Session) -> Numbers:
         estimator.push(piece)
     continued, online_continued = _begun(session)
     with TemporaryDirectory() as folder:
-        path = Path(folder) / "checkpoint.npz"
+        path = Path(folder) / "checkpoint.msgpack"
         write_checkpoint(path, Checkpoint.of(estimator))
         read_checkpoint(path).put_into(continued)
     out |= _results("whole", estimator, online, pieces[half:])

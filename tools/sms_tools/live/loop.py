@@ -25,7 +25,7 @@ from sms_tools.live.status import Leading, News, StatusWriter
 
 # A session that is killed loses no more of the estimate than this, s; its raw items are on disk all the same.
 CHECKPOINT_INTERVAL = 5.0
-CHECKPOINT = "checkpoint.npz"
+CHECKPOINT = "checkpoint.msgpack"
 # Devices are given so long to be opened before the session's first tick is worked off, s.
 OPENING = 2.0
 # News is made so often, s.
