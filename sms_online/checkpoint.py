@@ -12,7 +12,7 @@ from sms_online import __version__
 from sms_online.description.parse import describe
 from sms_online.errors import InputError
 from sms_online.pipeline.estimator import Estimator
-from sms_online.state import encode, put_back
+from sms_online.state import Stage, encode, put_back
 
 EXPECTED = "a checkpoint that a session of this system has saved"
 
@@ -30,10 +30,11 @@ class Head(msgspec.Struct, frozen=True):
 
 
 class _File(msgspec.Struct, frozen=True):
-    """What is written: the head and the estimator's encoded states."""
+    """What is written: the head, and the encoded states of the estimator and of its source."""
 
     head: Head
     estimator: bytes
+    source: bytes | None
 
 
 class _Versioned(msgspec.Struct):
@@ -48,43 +49,56 @@ class _AnyFile(msgspec.Struct):
 
 @dataclass(frozen=True)
 class Checkpoint:
-    """What a session of the same system and channels needs to go on, bit for bit. source: its name, for messages."""
+    """What a session of the same system and channels needs to go on, bit for bit. name: of the file, for messages."""
 
     head: Head
     estimator: bytes
-    source: str = "saved session"
+    source: bytes | None = None
+    name: str = "saved session"
 
     @staticmethod
-    def of(estimator: Estimator, begun: Mapping[str, Any] | None = None) -> Checkpoint:
-        """The state of now; takes milliseconds. begun: how the session was begun, as plain JSON types."""
+    def of(estimator: Estimator, begun: Mapping[str, Any] | None = None, source: Stage | None = None) -> Checkpoint:
+        """The state of now; takes milliseconds.
+
+        begun: how the session was begun, as plain JSON types. source: what its samples come from, where that keeps a
+        state.
+        """
         head = Head(__version__, describe(estimator.system), estimator.channels, dict(begun or {}))
-        return Checkpoint(head, encode(estimator))
+        return Checkpoint(head, encode(estimator), None if source is None else encode(source))
 
     def to_bytes(self) -> bytes:
         """As it is written to files, msgpack."""
-        return msgspec.msgpack.encode(_File(self.head, self.estimator))
+        return msgspec.msgpack.encode(_File(self.head, self.estimator, self.source))
 
     @staticmethod
-    def from_bytes(data: bytes, source: str) -> Checkpoint:
+    def from_bytes(data: bytes, name: str) -> Checkpoint:
         """Of `to_bytes`; InputError where it is none, or one of another version."""
         try:
             found = msgspec.msgpack.decode(data, type=_AnyFile).head.version
             if found != __version__:
-                raise InputError(source, "", f"a checkpoint of version {found}", f"one of version {__version__}")
+                raise InputError(name, "", f"a checkpoint of version {found}", f"one of version {__version__}")
             file = msgspec.msgpack.decode(data, type=_File)
         except msgspec.DecodeError as error:
-            raise _unusable(source, error) from None
-        return Checkpoint(file.head, file.estimator, source)
+            raise _unusable(name, error) from None
+        return Checkpoint(file.head, file.estimator, file.source, name)
 
     def put_into(self, estimator: Estimator) -> None:
         """Have an estimator of the same system and channels go on from here; InputError where it does not fit."""
         here = Head(self.head.version, describe(estimator.system), estimator.channels, self.head.begun)
         if self.head != here:
-            raise InputError(self.source, "", *_difference(self.head, here))
+            raise InputError(self.name, "", *_difference(self.head, here))
+        self._put(self.estimator, estimator)
+
+    def put_into_source(self, source: Stage) -> None:
+        """Have a source of the same system go on from here, if one was saved; InputError where it does not fit."""
+        if self.source is not None:
+            self._put(self.source, source)
+
+    def _put(self, encoded: bytes, stage: Stage) -> None:
         try:
-            put_back(estimator, self.estimator)
-        except (msgspec.DecodeError, ValueError) as error:
-            raise _unusable(self.source, error) from None
+            put_back(stage, encoded)
+        except (msgspec.DecodeError, ValueError, KeyError) as error:
+            raise _unusable(self.name, error) from None
 
 
 def _difference(saved: Head, here: Head) -> tuple[str, str]:
@@ -98,5 +112,5 @@ def _difference(saved: Head, here: Head) -> tuple[str, str]:
     return f"a checkpoint of system {names[0]}", f"system {names[1]}, which differs in {', '.join(keys)}"
 
 
-def _unusable(source: str, error: Exception) -> InputError:
-    return InputError(source, "", f"no usable checkpoint ({error})", EXPECTED)
+def _unusable(name: str, error: Exception) -> InputError:
+    return InputError(name, "", f"no usable checkpoint ({error})", EXPECTED)

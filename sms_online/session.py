@@ -24,6 +24,7 @@ from sms_online.pipeline.estimator import Estimator
 from sms_online.pipeline.statistics import Statistics
 from sms_online.priors import base_prior
 from sms_online.result import Result, result_of
+from sms_online.state import Stage
 from sms_online.stream import Array, Block, Source
 from sms_online.truth import true_values
 
@@ -156,9 +157,9 @@ class Session:
             throughput = self.estimator.samples / self.busy if self.busy else 0.0
         return result_of(self.evaluation(), true, bound, warnings, self.diagnosis.document(), throughput)
 
-    def checkpoint(self) -> Checkpoint:
-        """The state of now, to go on from; takes milliseconds."""
-        return Checkpoint.of(self.estimator, self._begun)
+    def checkpoint(self, source: Stage | None = None) -> Checkpoint:
+        """The state of now, to go on from; takes milliseconds. source: of the samples, where that keeps a state too."""
+        return Checkpoint.of(self.estimator, self._begun, source)
 
     def save(self) -> bytes:
         """The state of now, for `restore`; the system, its channels and options are part of it."""

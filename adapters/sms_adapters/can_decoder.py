@@ -8,9 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sms_adapters.can_signals import WantedMessage, decode_signal, raw_word
-from sms_adapters.conversion import Conversions, FrameCounter, counters_state, restore_counters
+from sms_adapters.conversion import Conversions, FrameCounter
 from sms_adapters.increments import increments
-from sms_adapters.raw import ERROR_FRAME, REMOTE_FRAME, CanFrames, DecodedSamples, DecoderState, Raw, concatenate_frames
+from sms_adapters.raw import ERROR_FRAME, REMOTE_FRAME, CanFrames, DecodedSamples, Raw, concatenate_frames
 from sms_online.description.schema import Signal
 
 # Unknown identifiers that are remembered, to name them.
@@ -35,6 +35,7 @@ class CanDecoder:
         self._conversions = [
             Conversions([signals[column] for column in message.columns], self.counters) for message in messages
         ]
+        self.turns = {channel: turns for each in self._conversions for channel, turns in each.turns.items()}
         self._sequences = [
             None if message.counter is None else FrameCounter(1 << message.counter.length, self.counters)
             for message in messages
@@ -94,21 +95,3 @@ class CanDecoder:
             counts = raw_word(message.counter, message.words(raw.data, admitted)).astype(np.int64)
             admitted = admitted[sequence.admit(counts)]
         return admitted
-
-    def state(self) -> DecoderState:
-        """Turns, counts, last stamps and counters."""
-        state: DecoderState = {f"turns.{k}": conversion.state() for k, conversion in enumerate(self._conversions)}
-        state |= {f"sequence.{k}": s.state() for k, s in enumerate(self._sequences) if s is not None}
-        state |= {"last_stamp": self._last_stamp.copy(), "unknown_ids": np.array(self.unknown_ids, dtype=np.uint32)}
-        return state | counters_state(self.counters)
-
-    def restore(self, state: DecoderState) -> None:
-        """Go on from a saved state."""
-        for k, conversion in enumerate(self._conversions):
-            conversion.restore(state[f"turns.{k}"])
-        for k, sequence in enumerate(self._sequences):
-            if sequence is not None:
-                sequence.restore(state[f"sequence.{k}"])
-        self._last_stamp = state["last_stamp"].copy()
-        self.unknown_ids = state["unknown_ids"].tolist()
-        restore_counters(self.counters, state)

@@ -16,9 +16,11 @@ import numpy as np
 from sms_adapters.can_signals import WantedMessage, raw_word
 from sms_adapters.clock_line import DeviceClock
 from sms_adapters.clock_samples import CountedTime, NumberedTime
+from sms_adapters.conversion import TurnsState
 from sms_adapters.faults import sentences
 from sms_adapters.raw import CanFrames, DecodedSamples, Decoder, Raw, concatenate_frames
 from sms_adapters.stuck import StuckGuard
+from sms_online.state import Stage, State
 from sms_online.stream import Array, Block
 
 # Items are taken so often, µs: the tick adds half of itself to the latency.
@@ -167,7 +169,13 @@ def _arrivals(item: Raw) -> tuple[float, float]:
     return item.arrival, item.arrival
 
 
-class Merger:
+class MergerState(State):
+    """What a resumed session goes on with: the turns of every channel that wraps. Clocks are fitted anew."""
+
+    turns: dict[str, TurnsState]
+
+
+class Merger(Stage):
     """Rows of all sources in order of time, from raw items by the tick.
 
     lanes: the sources; their channels, one after the other, are those of the blocks. start: time of the session's clock
@@ -178,6 +186,8 @@ class Merger:
     def __init__(self, lanes: Sequence[SourceLane], start: float = 0.0, steps: Steps | None = None) -> None:
         self.lanes = tuple(lanes)
         self.channels = tuple(channel for lane in lanes for channel in lane.decoder.channels)
+        self._turns = {channel: turns for lane in lanes for channel, turns in lane.decoder.turns.items()}
+        self.state = MergerState({channel: turns.state for channel, turns in self._turns.items()})
         self.late = [0 for _ in lanes]
         self.silences = [0 for _ in lanes]
         self._heard = [np.inf for _ in lanes]  # tick of the last item of each source
@@ -192,6 +202,11 @@ class Merger:
         self._lag = [np.inf for _ in lanes]  # from the newest sample of each source to its last item
         self._items: list[list[Raw]] = [[] for _ in lanes]
         self._waiting = [(np.empty(0), np.empty((0, len(lane.decoder.channels)))) for lane in lanes]
+
+    def renew(self) -> None:
+        """See Stage."""
+        for channel, turns in self._turns.items():
+            turns.state = self.state.turns[channel]
 
     def advance(self, now: float, items: Sequence[Sequence[Raw]]) -> Block | None:
         """Take what arrived up to the tick `now`, s, of each source, and return the rows that are in order by now."""

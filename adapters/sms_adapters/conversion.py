@@ -8,48 +8,47 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sms_adapters.increments import increments
-from sms_adapters.raw import DecoderState
 from sms_online.description.schema import SerialField, Signal
+from sms_online.state import Stage, State
 from sms_online.stream import Array
 
 Counters = dict[str, int]
 
 
-class Turns:
+class TurnsState(State):
+    """The last number, NaN before the first, and the turn that it lies in."""
+
+    last: float = np.nan
+    turns: float = 0.0
+
+
+class Turns(Stage):
     """Undoes the wrapping of a number that counts modulo `wrap`: between two samples it moves by less than half of it.
 
-    The first sample lies in turn 0. Limitation: a hole in which it moves further loses whole turns.
+    The first sample of all lies in turn 0. Limitation: a hole in which it moves further loses whole turns.
     """
 
     def __init__(self, wrap: float) -> None:
         self.wrap = wrap
-        self._last = np.nan
-        self._turns = 0.0
+        self.state = TurnsState()
 
     def count(self, numbers: Array) -> Array:
         """(B,) turns of the numbers (B,), which are finite: whole numbers to be added times `wrap`."""
         if not numbers.size:
             return numbers
-        first = numbers[0] if np.isnan(self._last) else self._last
+        first = numbers[0] if np.isnan(self.state.last) else self.state.last
         # Whole numbers, so that the sum is exact and the same however the samples are grouped.
         steps = np.floor(increments(numbers, first) / self.wrap + 0.5)
-        turns = self._turns - np.cumsum(steps)
-        self._last, self._turns = float(numbers[-1]), float(turns[-1])
+        turns = self.state.turns - np.cumsum(steps)
+        self.state.last, self.state.turns = float(numbers[-1]), float(turns[-1])
         return turns
-
-    def state(self) -> Array:
-        """The last number and its turn."""
-        return np.array([self._last, self._turns])
-
-    def restore(self, state: Array) -> None:
-        """Go on from a saved state."""
-        self._last, self._turns = (float(x) for x in state)
 
 
 class Conversions:
     """A device's numbers to channels, as `Signal` describes each; what is not finite or not plausible becomes NaN.
 
-    signals: of K channels that are sampled together. counters: non_finite and out_of_range are counted there.
+    signals: of K channels that are sampled together. counters: non_finite and out_of_range are counted there. turns: of
+    the channels that wrap.
     """
 
     def __init__(self, signals: Sequence[Signal | SerialField], counters: Counters) -> None:
@@ -59,6 +58,7 @@ class Conversions:
         self._minimum = np.array([-np.inf if signal.minimum is None else signal.minimum for signal in signals])
         self._maximum = np.array([np.inf if signal.maximum is None else signal.maximum for signal in signals])
         self._turns = {k: Turns(signal.wrap) for k, signal in enumerate(signals) if signal.wrap is not None}
+        self.turns = {str(signals[k].channel): turns for k, turns in self._turns.items()}
 
     def __call__(self, numbers: Array) -> Array:
         """(B, K) channel values of the numbers (B, K) of consecutive samples."""
@@ -79,15 +79,6 @@ class Conversions:
             good = ~np.isnan(values[:, k])
             values[good, k] += turns.count(numbers[good, k]) * (turns.wrap * self._scale[k])
         return values
-
-    def state(self) -> Array:
-        """The state of the turns (channels that wrap, 2)."""
-        return np.array([turns.state() for turns in self._turns.values()]).reshape(-1, 2)
-
-    def restore(self, state: Array) -> None:
-        """Go on from a saved state."""
-        for turns, saved in zip(self._turns.values(), state, strict=True):
-            turns.restore(saved)
 
 
 class FrameCounter:
@@ -137,22 +128,3 @@ class FrameCounter:
             return False
         self._last, self._late = count, -1
         return True
-
-    def state(self) -> NDArray[np.int64]:
-        """The last counts."""
-        return np.array([self._last, self._late])
-
-    def restore(self, state: NDArray[np.int64]) -> None:
-        """Go on from a saved state."""
-        self._last, self._late = (int(x) for x in state)
-
-
-def counters_state(counters: Counters) -> DecoderState:
-    """Counters as entries of a decoder's state."""
-    return {f"counters.{kind}": np.array(count) for kind, count in counters.items()}
-
-
-def restore_counters(counters: Counters, state: DecoderState) -> None:
-    """Set counters to those of a saved state, in place, for others hold the same dictionary."""
-    for kind in counters:
-        counters[kind] = int(state[f"counters.{kind}"])

@@ -8,11 +8,12 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields
-from typing import Any, Protocol
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
+from sms_adapters.conversion import Turns
 from sms_online.stream import Array
 
 # Bit of CanFrames.id, as socketcan's CAN_EFF_FLAG: 0x123 and the extended 0x00000123 are two identifiers.
@@ -26,7 +27,6 @@ MOST_BYTES = 64
 Clock = Callable[[], float]
 # What a reader calls before it fetches what has come: it may wait a little, while somebody else needs the interpreter.
 Turn = Callable[[], None]
-DecoderState = dict[str, NDArray[Any]]
 
 
 def at_once() -> None:
@@ -127,17 +127,13 @@ class DecodedSamples:
 class Decoder(Protocol):
     """Raw items of one source to samples: the same items give the same samples, however they are grouped in pushes.
 
-    channels: C names. counters: what was skipped so far, by kind of fault; every kind is there from the start.
+    channels: C names. counters: what was skipped so far, by kind of fault; every kind is there from the start. turns:
+    of the channels whose numbers wrap, which a resumed session goes on with.
     """
 
     channels: tuple[str, ...]
     counters: dict[str, int]
+    turns: dict[str, Turns]
 
     def push(self, *items: Raw) -> DecodedSamples:
         """The samples that one or more items complete, M from 0 up. Whatever the bytes, it counts and never raises."""
-
-    def state(self) -> DecoderState:
-        """What later samples depend on, counters included, for a checkpoint."""
-
-    def restore(self, state: DecoderState) -> None:
-        """Go on from a saved state of a decoder of the same description."""

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
+from sms_adapters.checkpoint import read_checkpoint
 from sms_adapters.clock_lanes import merger
 from sms_adapters.clock_merge import TICK, TICK_MICROSECONDS
 from sms_adapters.raw import CanFrames, Raw
@@ -98,6 +99,8 @@ class Recording:
             for source in self._system.sources
         ]
         self._merger = ours = merger(self._system, self._system_directory, self._header.start)
+        if self.checkpoint is not None:
+            read_checkpoint(self.checkpoint).put_into_source(ours)
         recorded = [iter(items) for items in self._items]
         waiting: list[list[Raw]] = [[] for _ in recorded]
         number = 0

@@ -11,8 +11,8 @@ import numpy as np
 from cobs import cobs
 from numpy.typing import NDArray
 
-from sms_adapters.conversion import Conversions, FrameCounter, Turns, counters_state, restore_counters
-from sms_adapters.raw import DecodedSamples, DecoderState, Raw, SerialChunk
+from sms_adapters.conversion import Conversions, FrameCounter, Turns
+from sms_adapters.raw import DecodedSamples, Raw, SerialChunk
 from sms_online.description.schema import FrameField, SerialField, SerialFrames, SerialLines
 from sms_online.stream import Array
 
@@ -64,16 +64,6 @@ class Items:
         self._counters["too_long"] += len(pieces) - len(whole)
         return [piece for piece in whole if piece]
 
-    def state(self) -> DecoderState:
-        """The unfinished piece."""
-        flags = np.array([self._overlong, self._cut])
-        return {"tail": np.frombuffer(self._tail, np.uint8), "tail.flags": flags}
-
-    def restore(self, state: DecoderState) -> None:
-        """Go on from a saved state."""
-        self._tail = state["tail"].astype(np.uint8).tobytes()
-        self._overlong, self._cut = (bool(flag) for flag in state["tail.flags"])
-
 
 class Fields:
     """The numbers of consecutive frames or lines to samples: counter, device time, channels.
@@ -103,6 +93,7 @@ class Fields:
                 self._wraps.append((k, wrap))
         self.channels = tuple(field.channel for field in described if field.channel is not None)
         self._conversions = Conversions(described, counters)
+        self.turns = self._conversions.turns
 
     def samples(self, arrival: Array, numbers: Array) -> DecodedSamples:
         """Samples from numbers (M, fields) that came at (M,), s; a count that is no count is a bad_number."""
@@ -127,29 +118,12 @@ class Fields:
         used = ~np.isnan(values).all(axis=1)
         return DecodedSamples(arrival[used], t_device[used], values[used])
 
-    def state(self) -> DecoderState:
-        """Turns and counts."""
-        state: DecoderState = {"turns": self._conversions.state()}
-        if self._counter is not None:
-            state["sequence"] = self._counter[1].state()
-        if self._time is not None:
-            state["time"] = self._time[2].state()
-        return state
-
-    def restore(self, state: DecoderState) -> None:
-        """Go on from a saved state."""
-        self._conversions.restore(state["turns"])
-        if self._counter is not None:
-            self._counter[1].restore(state["sequence"])
-        if self._time is not None:
-            self._time[2].restore(state["time"])
-
 
 class _SerialDecoder(ABC):
     """What frames and lines have in common."""
 
     def __init__(self, items: Items, fields: Fields, counters: dict[str, int]) -> None:
-        self.channels = fields.channels
+        self.channels, self.turns = fields.channels, fields.turns
         self.counters = counters
         self._items = items
         self._fields = fields
@@ -170,16 +144,6 @@ class _SerialDecoder(ABC):
     @abstractmethod
     def _numbers(self, pieces: list[bytes]) -> tuple[list[int], Array]:
         """Which of the pieces are as described, and their numbers (M, fields); the others are counted."""
-
-    def state(self) -> DecoderState:
-        """The unfinished piece, turns, counts and counters."""
-        return self._items.state() | self._fields.state() | counters_state(self.counters)
-
-    def restore(self, state: DecoderState) -> None:
-        """Go on from a saved state."""
-        self._items.restore(state)
-        self._fields.restore(state)
-        restore_counters(self.counters, state)
 
 
 class FrameDecoder(_SerialDecoder):

@@ -155,7 +155,7 @@ class LiveSession:
         if now - self._saved >= CHECKPOINT_INTERVAL and not self._saving.is_alive():
             self._saved = now
             # Writing takes as long as two blocks may, so it is not the loop's.
-            state = self._session.checkpoint()
+            state = self._session.checkpoint(self._merger)
             self._saving = threading.Thread(target=self._write, args=(state,), name="checkpoint")
             self._saving.start()
 
@@ -176,7 +176,7 @@ class LiveSession:
         """Write a checkpoint, now."""
         if self._saving.ident is not None:
             self._saving.join()
-        self._write(self._session.checkpoint())
+        self._write(self._session.checkpoint(self._merger))
 
     @property
     def warnings(self) -> list[str]:

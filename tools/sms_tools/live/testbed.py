@@ -82,6 +82,8 @@ def open_testbed(
     sys.setswitchinterval(SWITCH_INTERVAL)
     feeds = [Feed(make_reader(source, clock, interpreter.await_free), recorder) for source in system.sources]
     merged = merger(system, folder, start)
+    if checkpoint is not None:
+        checkpoint.put_into_source(merged)
     live = LiveSession(clock, feeds, merged, session, start, directory, recorder, status, interpreter)
     return live, session, merged
 
