@@ -4,7 +4,8 @@ A stage is an object that samples or rows pass through. What changes in it while
 `State`, a record of arrays, numbers, and lists and records of these; whatever else it holds its constructor makes anew
 from the same arguments. Stages may hold stages. A new stage declares its record, and is saved with the session.
 
-No array in a state is written once it is there, it is replaced: so a copy shares all arrays, and takes microseconds.
+A snapshot shares the arrays of the stage, and takes microseconds: so whoever is taken a snapshot of replaces the arrays
+of its state, and never writes into them.
 Source: msgspec, which decodes into declared types and refuses what does not fit them.
 """
 
