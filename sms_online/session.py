@@ -241,9 +241,10 @@ def recorded_session(system: System, data: Data) -> Recorded:
     if isinstance(data, Capture):
         return Recorded(data, data.source, data.truth)
     if isinstance(data, str | Path):
-        from sms_adapters.recorded import open_recorded
+        from sms_adapters.recorded import recorded_at
+        from sms_adapters.sources import open_source
 
-        return open_recorded(Path(data), system)
+        return recorded_at(Path(data), open_source(Path(data), system))
     return Recorded(_Blocks(data), "blocks")
 
 

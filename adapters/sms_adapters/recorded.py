@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 
@@ -21,25 +20,18 @@ from sms_online.description.schema import System
 from sms_online.diagnosis.online import Immediate
 from sms_online.errors import InputError
 from sms_online.session import Recorded
+from sms_online.stream import Source
 
 
-def open_recorded(
-    path: Path,
-    system: System,
-    start: float | None = None,
-    stop: float | None = None,
-    on_bytes: Callable[[int], None] | None = None,
-    directory: Path | None = None,
-) -> Recorded:
-    """The recorded session at a path; see `open_source`, which says what is read and when InputError is raised."""
-    source = open_source(path, system, start, stop, on_bytes, directory)
+def recorded_at(path: Path, source: Source, whole: bool = True) -> Recorded:
+    """The recorded session of a source that `open_source` opened at a path; whole: it is all that was recorded."""
     checkpoint = source.checkpoint if isinstance(source, Recording) else None
     return Recorded(
         source,
         str(path),
         truth_beside(path),
         None if checkpoint is None else read_checkpoint(checkpoint),
-        partial(searcher_of, path) if start is stop is None else lambda adopt: Immediate(),
+        partial(searcher_of, path) if whole else lambda adopt: Immediate(),
     )
 
 
@@ -65,7 +57,7 @@ def read_capture(
         folder = Path(system).parent if Path(system).suffix == ".toml" else None
         system = load_system(system)
     if system is not None:
-        return captured(open_recorded(path, system, start, stop, None, folder))
+        return captured(recorded_at(path, open_source(path, system, start, stop, None, folder)))
     if not path.name.removesuffix(".gz").endswith(".csv"):
         raise InputError(str(path), "", "no system", "the system, to know which signals are which channels")
     return captured(Recorded(CaptureReader(path, start, stop), str(path), truth_beside(path)))

@@ -7,7 +7,8 @@ import math
 
 from rich.table import Table
 
-from sms_adapters.recorded import open_recorded
+from sms_adapters.recorded import recorded_at
+from sms_adapters.sources import open_source
 from sms_sim.bound import Bounds, bound
 from sms_tools.exit_codes import NOTHING_DETERMINED, OK
 from sms_tools.report import report_console, show
@@ -17,7 +18,8 @@ from sms_tools.session import described_system
 def run(args: argparse.Namespace) -> int:
     """Print the bound of every parameter; 0, 3 where the motion determines none."""
     system, folder = described_system(args)
-    recorded = None if args.capture is None else open_recorded(args.capture, system, directory=folder)
+    source = None if args.capture is None else open_source(args.capture, system, directory=folder)
+    recorded = None if source is None else recorded_at(args.capture, source)
     bounds = bound(system, recorded, grade=args.grade, each_sensor=args.each_sensor)
     console = report_console(args.json)
     if bounds.grade != args.grade:

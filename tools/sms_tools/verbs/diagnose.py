@@ -9,7 +9,8 @@ from pathlib import Path
 from rich.table import Table
 from rich.text import Text
 
-from sms_adapters.recorded import captured, open_recorded
+from sms_adapters.recorded import captured, recorded_at
+from sms_adapters.sources import open_source
 from sms_online.capture import Capture
 from sms_online.description.schema import System
 from sms_online.diagnosis.diagnosed import Diagnosis, diagnose
@@ -140,7 +141,7 @@ def _evidence(document: Document) -> dict[str, float]:
 
 
 def _samples(capture: Path, system: System, start: float | None, stop: float | None, folder: Path | None) -> Capture:
-    return captured(open_recorded(capture, system, start, stop, None, folder))
+    return captured(recorded_at(capture, open_source(capture, system, start, stop, None, folder)))
 
 
 def _effects(document: Document) -> Table:

@@ -11,7 +11,8 @@ from time import perf_counter
 from rich.console import Console
 from rich.progress import BarColumn, DownloadColumn, Progress, TextColumn, TimeRemainingColumn
 
-from sms_adapters.recorded import open_recorded
+from sms_adapters.recorded import recorded_at
+from sms_adapters.sources import open_source
 from sms_online.capture import PIECE
 from sms_online.cramer_rao import MotionRecord, session_bound
 from sms_online.session import Session
@@ -45,8 +46,8 @@ def run(args: argparse.Namespace) -> int:
                 def on_bytes(consumed: int) -> None:
                     progress.update(task, completed=consumed)
 
-            recorded = open_recorded(capture, system, args.start, args.stop, on_bytes, folder)
-            source = recorded.source
+            source = open_source(capture, system, args.start, args.stop, on_bytes, folder)
+            recorded = recorded_at(capture, source, whole=args.start is args.stop is None)
             session = Session(
                 system,
                 source.channels,
