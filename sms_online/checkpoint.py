@@ -12,7 +12,7 @@ from sms_online import __version__
 from sms_online.description.parse import describe
 from sms_online.errors import InputError
 from sms_online.pipeline.estimator import Estimator
-from sms_online.state import Stage, encode, put_back
+from sms_online.state import Saved, Stage, collect, encode, put_back
 
 EXPECTED = "a checkpoint that a session of this system has saved"
 
@@ -30,15 +30,14 @@ class Head(msgspec.Struct, frozen=True):
 
 
 class _File(msgspec.Struct, frozen=True):
-    """What is written: the head, and the encoded states of the estimator and of its source."""
+    """What is written: the head, and encoded states: of `ESTIMATOR` and, where it keeps some, of `SOURCE`."""
 
     head: Head
-    estimator: bytes
-    source: bytes | None
+    states: dict[str, msgspec.Raw]
 
 
 class _Versioned(msgspec.Struct):
-    """As much of a file as is the same in all versions."""
+    """As much of a head as is the same in all versions."""
 
     version: str
 
@@ -47,28 +46,34 @@ class _AnyFile(msgspec.Struct):
     head: _Versioned
 
 
+ESTIMATOR, SOURCE = "estimator", "source"
+
+
 @dataclass(frozen=True)
 class Checkpoint:
-    """What a session of the same system and channels needs to go on, bit for bit. name: of the file, for messages."""
+    """What a session of the same system and channels needs to go on, bit for bit.
+
+    states: of the estimator and, where that keeps some, of its source. name: of the file, for messages.
+    """
 
     head: Head
-    estimator: bytes
-    source: bytes | None = None
+    states: Mapping[str, Saved | msgspec.Raw]
     name: str = "saved session"
 
     @staticmethod
     def of(estimator: Estimator, begun: Mapping[str, Any] | None = None, source: Stage | None = None) -> Checkpoint:
-        """The state of now; takes milliseconds.
+        """The state of now, in a fraction of a millisecond: the estimator may go on before it is written.
 
         begun: how the session was begun, as plain JSON types. source: what its samples come from, where that keeps a
         state.
         """
         head = Head(__version__, describe(estimator.system), estimator.channels, dict(begun or {}))
-        return Checkpoint(head, encode(estimator), None if source is None else encode(source))
+        states = {ESTIMATOR: collect(estimator)}
+        return Checkpoint(head, states if source is None else states | {SOURCE: collect(source)})
 
     def to_bytes(self) -> bytes:
         """As it is written to files, msgpack."""
-        return msgspec.msgpack.encode(_File(self.head, self.estimator, self.source))
+        return encode({"head": self.head, "states": self.states})
 
     @staticmethod
     def from_bytes(data: bytes, name: str) -> Checkpoint:
@@ -80,23 +85,23 @@ class Checkpoint:
             file = msgspec.msgpack.decode(data, type=_File)
         except msgspec.DecodeError as error:
             raise _unusable(name, error) from None
-        return Checkpoint(file.head, file.estimator, file.source, name)
+        return Checkpoint(file.head, file.states, name)
 
     def put_into(self, estimator: Estimator) -> None:
         """Have an estimator of the same system and channels go on from here; InputError where it does not fit."""
         here = Head(self.head.version, describe(estimator.system), estimator.channels, self.head.begun)
         if self.head != here:
             raise InputError(self.name, "", *_difference(self.head, here))
-        self._put(self.estimator, estimator)
+        self._put(ESTIMATOR, estimator)
 
     def put_into_source(self, source: Stage) -> None:
         """Have a source of the same system go on from here, if one was saved; InputError where it does not fit."""
-        if self.source is not None:
-            self._put(self.source, source)
+        if SOURCE in self.states:
+            self._put(SOURCE, source)
 
-    def _put(self, encoded: bytes, stage: Stage) -> None:
+    def _put(self, name: str, stage: Stage) -> None:
         try:
-            put_back(stage, encoded)
+            put_back(stage, encode(self.states[name]))
         except (msgspec.DecodeError, ValueError, KeyError) as error:
             raise _unusable(self.name, error) from None
 

@@ -4,14 +4,13 @@ A stage is an object that samples or rows pass through. What changes in it while
 `State`, a record of arrays, numbers, and lists and records of these; whatever else it holds its constructor makes anew
 from the same arguments. Stages may hold stages. A new stage declares its record, and is saved with the session.
 
-A snapshot shares the arrays of the stage, and takes microseconds: so whoever is taken a snapshot of replaces the arrays
-of its state, and never writes into them.
+An array of a state is replaced, never written: so copies share it, and take microseconds however large it is.
 Source: msgspec, which decodes into declared types and refuses what does not fit them.
 """
 
 from __future__ import annotations
 
-from copy import copy
+from copy import copy, deepcopy
 from typing import Any, TypeVar, get_origin
 
 import msgspec
@@ -31,7 +30,8 @@ class Stage:
 
 
 StageT = TypeVar("StageT", bound=Stage)
-StateT = TypeVar("StateT", bound=State)
+# Copies of states, and of those of the stages within, by the names of the attributes.
+Saved = dict[str, Any]
 
 
 def snapshot(stage: StageT) -> StageT:
@@ -45,21 +45,44 @@ def snapshot(stage: StageT) -> StageT:
     return out
 
 
-def state_copy(state: StateT) -> StateT:
-    """The state as it is now, with arrays shared."""
-    out = copy(state)
-    for name in out.__struct_fields__:
-        value = getattr(out, name)
+def collect(stage: Stage) -> Saved:
+    """The states of a stage and of the stages within as they are now; a stage that several hold comes once."""
+    return _collect(stage, set())
+
+
+def _collect(stage: Stage, seen: set[int]) -> Saved:
+    seen.add(id(stage))
+    out: Saved = {}
+    for name, value in vars(stage).items():
         if isinstance(value, State):
-            setattr(out, name, state_copy(value))
-        elif isinstance(value, list | dict):
-            setattr(out, name, value.copy())
+            out[name] = state_copy(value)
+        elif isinstance(value, Stage) and id(value) not in seen:
+            out[name] = _collect(value, seen)
     return out
 
 
-def encode(stage: Stage) -> bytes:
-    """The states of a stage and of the stages within, by the names of the attributes."""
-    return msgspec.msgpack.encode(_states(stage, {}), enc_hook=_to_plain)
+ValueT = TypeVar("ValueT")
+
+
+def state_copy(value: ValueT) -> ValueT:
+    """A state, or what one holds, as it is now, with arrays shared."""
+    if isinstance(value, list):
+        return type(value)(map(state_copy, value))
+    if isinstance(value, dict):
+        return type(value)((key, state_copy(each)) for key, each in value.items())
+    if isinstance(value, np.random.Generator):
+        return deepcopy(value)  # it is written
+    if not isinstance(value, State):
+        return value
+    out = copy(value)
+    for name in out.__struct_fields__:
+        setattr(out, name, state_copy(getattr(out, name)))
+    return out
+
+
+def encode(saved: Any) -> bytes:
+    """Collected states, or what holds some, as msgpack."""
+    return msgspec.msgpack.encode(saved, enc_hook=_to_plain)
 
 
 def put_back(stage: Stage, encoded: bytes | msgspec.Raw) -> None:
@@ -87,18 +110,6 @@ def put_back(stage: Stage, encoded: bytes | msgspec.Raw) -> None:
         put_back(value, saved[name])
 
 
-def _states(stage: Stage, seen: dict[int, Stage]) -> dict[str, Any]:
-    """By attribute; a stage that several hold is saved with the first of them."""
-    seen[id(stage)] = stage
-    out: dict[str, Any] = {}
-    for name, value in vars(stage).items():
-        if isinstance(value, State):
-            out[name] = value
-        elif isinstance(value, Stage) and id(value) not in seen:
-            out[name] = _states(value, seen)
-    return out
-
-
 def _to_plain(value: Any) -> Any:
     """What msgspec does not know, in what it knows."""
     if isinstance(value, np.ndarray):
@@ -123,7 +134,7 @@ def _from_plain(kind: Any, plain: Any) -> Any:
     if kind is np.ndarray:
         dtype, shape, order, data = plain
         packed = np.ndarray([shape[axis] for axis in order], np.dtype(dtype), bytearray(data))
-        return packed.transpose(np.argsort(order))
+        return packed.transpose(sorted(range(len(order)), key=order.__getitem__))
     if kind is np.random.Generator:
         generator = np.random.default_rng(0)
         now = dict(generator.bit_generator.state)

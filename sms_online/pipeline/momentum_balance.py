@@ -7,7 +7,7 @@ of it (windows side by side cost fifteen times the error).
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import groupby
 from operator import itemgetter
 
@@ -77,8 +77,7 @@ def prompt_margin(width: int) -> int:
     return max(HALF_WIDTHS[0], min(half_widths(width)[-1], width // PROMPT_SHARE))
 
 
-@dataclass
-class _Smoothed:
+class _Smoothed(State):
     """Momenta and forces at every `step` th sample, of one half width, as far as windows have asked for them.
 
     first: number of the sample in the segment. columns (K, entries).

@@ -42,6 +42,7 @@ class Periods(Stage):
 
     def learn(self, channel: int, intervals: Array) -> None:
         """Take a channel's next intervals, s, until nine are known, or a hole ends those that are."""
+        self.state.intervals = self.state.intervals.copy()
         first = self.state.intervals[channel]
         for interval in intervals:
             if not np.isnan(self.state.known[channel]):
@@ -58,6 +59,7 @@ class Periods(Stage):
         """Take the period from the intervals so far, where there are any."""
         first = self.state.intervals[channel]
         if not np.isnan(first[0]):
+            self.state.known = self.state.known.copy()
             self.state.known[channel] = np.nanmedian(first)
 
     def is_gap(self, interval: Array, channel: int) -> NDArray[np.bool_]:

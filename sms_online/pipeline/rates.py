@@ -251,8 +251,9 @@ class RatesStage(Stage):
 
     def _estimate_noise(self, window: Array) -> None:
         estimate = np.isnan(self._stated)
-        self.state.sigma = self._stated.copy()
-        self.state.sigma[estimate] = noise_std(window[:, estimate])
+        sigma = self._stated.copy()
+        sigma[estimate] = noise_std(window[:, estimate])
+        self.state.sigma = sigma
 
     def _choose(self, window: Array) -> None:
         self.state.half_width = choose_half_width(window[:, self._deciding], self.state.sigma[self._deciding])

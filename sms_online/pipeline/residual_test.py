@@ -101,11 +101,11 @@ class SequentialTest(Stage):
         if self.state.alarm is not None:
             return
         ratios = self._log_likelihood(rows)
-        sums = np.maximum(0.0, self.state.sums[turn] + np.minimum(ratios, self.limit / LEAST_WINDOWS))
-        self.state.sums[turn] = sums
-        self.state.since[turn] = np.where(
-            (sums == 0.0) | (self.state.since[turn] < 0), rows.end, self.state.since[turn]
-        )
+        now, before = self.state, self.state.since[turn]
+        sums = np.maximum(0.0, now.sums[turn] + np.minimum(ratios, self.limit / LEAST_WINDOWS))
+        now.sums, now.since = now.sums.copy(), now.since.copy()
+        now.sums[turn] = sums
+        now.since[turn] = np.where((sums == 0.0) | (before < 0), rows.end, before)
         worst = int(np.argmax(sums))
         if sums[worst] > self.limit:
             row, speed = self._place(worst, turn)

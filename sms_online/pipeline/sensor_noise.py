@@ -80,6 +80,7 @@ class NoiseEstimate(Stage):
         t = np.concatenate([t for t, _ in self.state.fresh])
         values = np.concatenate([values for _, values in self.state.fresh])
         self.state.fresh, self.state.unsorted = [], 0
+        self.state.largest = self.state.largest.copy()
         for k, column in enumerate(values.T):
             fresh = np.stack((t, column))[:, np.isfinite(column)]
             last = self.state.samples[k][0, -1:] if self.state.samples[k].size else -np.inf

@@ -43,8 +43,7 @@ class GridSamples:
     segment: int
 
 
-@dataclass
-class SyncCounters:
+class SyncCounters(State):
     """What happened to the samples so far.
 
     samples: rows received. missing_cells: their cells without a value. duplicates: samples dropped because their
@@ -184,7 +183,7 @@ class Synchroniser(Stage):
         """The common case of `_advance`, 0.03 instead of 0.8 µs a sample: each row is its own grid point."""
         k = np.arange(self.state.next, self.state.next + time.size, dtype=np.int64)
         self.state.counters.samples += time.size
-        self.state.last_time[:] = time[-1]
+        self.state.last_time = np.full(len(self.channels), time[-1])
         self.state.next += time.size
         self.state.time = np.concatenate([self.state.time[-SIDE:], time[-SIDE:]])[-SIDE:]
         self.state.values = np.concatenate([self.state.values[-SIDE:], values[-SIDE:]])[-SIDE:]
@@ -214,7 +213,7 @@ class Synchroniser(Stage):
                 self._periods.learn(channel, interval[~duplicate & np.isfinite(interval)])
         sampled = ~missing.all(axis=0)
         last_row = time.size - 1 - np.argmin(missing[::-1], axis=0)
-        self.state.last_time[sampled] = time[last_row[sampled]]
+        self.state.last_time = np.where(sampled, time[last_row], self.state.last_time)
         return values
 
     def _advance(self, final: bool) -> list[GridSamples]:
