@@ -18,7 +18,8 @@ from sms_adapters.raw import MOST_BYTES, CanFrames, Raw, SerialChunk
 from sms_adapters.recording import split, tick_time
 from sms_adapters.serial_decoder import encode_frames, frame_layout
 from sms_adapters.system_file import load_system
-from sms_online.description.schema import SerialFrames, System
+from sms_online.description.schema import System
+from sms_online.description.sources import SerialFrames
 from sms_online.pipeline.estimator import Estimator
 from sms_online.stream import Array, Block
 

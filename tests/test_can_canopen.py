@@ -9,7 +9,7 @@ import pytest
 
 from sms_adapters.devices import make_can_decoder
 from sms_adapters.raw import EXTENDED, CanFrames
-from sms_online.description.schema import CanopenSource
+from sms_online.description.sources import CanopenSource
 from sms_online.errors import InputError
 
 pytest.importorskip("canopen", reason="the extra canopen is not installed")

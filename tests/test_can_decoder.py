@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from sms_adapters.can_decoder import CanDecoder
 from sms_adapters.devices import make_can_decoder, make_decoder
 from sms_adapters.raw import ERROR_FRAME, EXTENDED, REMOTE_FRAME, CanFrames, DecodedSamples, SerialChunk
-from sms_online.description.schema import CanSource, Signal
+from sms_online.description.sources import CanSource, Signal
 from sms_online.errors import InputError
 
 DBC = """VERSION ""

@@ -27,7 +27,7 @@ from sms_adapters.raw import (
     Reader,
     concatenate_frames,
 )
-from sms_online.description.schema import CanBus, CanSource
+from sms_online.description.sources import CanBus, CanSource
 from sms_online.errors import InputError
 
 DATA = Path(__file__).parents[2] / "shared" / "data" / "ak80_pendulum"

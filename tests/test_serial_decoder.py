@@ -14,7 +14,7 @@ from cobs import cobs
 from sms_adapters.devices import make_decoder
 from sms_adapters.raw import CanFrames, DecodedSamples, Decoder, SerialChunk
 from sms_adapters.serial_decoder import LONGEST_LINE, encode_frames, frame_layout
-from sms_online.description.schema import FrameField, SerialField, SerialFrames, SerialLines
+from sms_online.description.sources import FrameField, SerialField, SerialFrames, SerialLines
 
 FIELDS = (
     FrameField(type="u8"),

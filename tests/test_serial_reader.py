@@ -12,7 +12,7 @@ import pytest
 
 from sms_adapters.devices import make_decoder, make_reader
 from sms_adapters.raw import LostDevice, Reader, SerialChunk
-from sms_online.description.schema import SerialField, SerialLines
+from sms_online.description.sources import SerialField, SerialLines
 
 
 def reader(port: str) -> Reader:

@@ -24,7 +24,8 @@ from sms_adapters.raw import SerialChunk, concatenate_frames
 from sms_adapters.serial_decoder import FrameDecoder
 from sms_adapters.system_file import load_system
 from sms_online.description.parse import parse_system, shipped_text
-from sms_online.description.schema import CanSource, System
+from sms_online.description.schema import System
+from sms_online.description.sources import CanSource
 from sms_online.stream import Block
 from sms_sim.bus_encode import DeviceClock, devices
 from sms_sim.bus_layout import DBC, dbc_text, messages, serial_channels, source_tables

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from sms_online.description.parse import parse_system
-from sms_online.description.schema import CanSource, SerialFrames
+from sms_online.description.sources import CanSource, SerialFrames
 from sms_online.errors import InputError
 
 RIG = """

@@ -11,7 +11,7 @@ from sms_adapters.can_signals import WantedMessage, decode_signal, raw_word
 from sms_adapters.conversion import Conversions, FrameCounter
 from sms_adapters.increments import increments
 from sms_adapters.raw import ERROR_FRAME, REMOTE_FRAME, CanFrames, DecodedSamples, Raw, concatenate_frames
-from sms_online.description.schema import Signal
+from sms_online.description.sources import Signal
 
 # Unknown identifiers that are remembered, to name them.
 _SHOWN_IDS = 5

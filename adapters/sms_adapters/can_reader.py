@@ -27,7 +27,7 @@ from sms_adapters.raw import (
     at_once,
     one_line,
 )
-from sms_online.description.schema import CanBus
+from sms_online.description.sources import CanBus
 from sms_online.errors import InputError
 from sms_online.stream import Array
 

@@ -16,7 +16,8 @@ from sms_adapters.capture import BLOCK
 from sms_adapters.devices import make_can_decoder
 from sms_adapters.faults import sentences
 from sms_adapters.raw import EXTENDED
-from sms_online.description.schema import CanopenSource, CanSource, System
+from sms_online.description.schema import System
+from sms_online.description.sources import CanopenSource, CanSource
 from sms_online.errors import InputError
 from sms_online.stream import Array, Block
 

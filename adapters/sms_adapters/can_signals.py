@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from sms_adapters.raw import EXTENDED
 from sms_online.description.explain import nearest
-from sms_online.description.schema import CanSource
+from sms_online.description.sources import CanSource
 from sms_online.errors import InputError
 from sms_online.stream import Array
 

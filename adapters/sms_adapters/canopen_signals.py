@@ -15,7 +15,7 @@ from cantools.database.conversion import BaseConversion
 
 from sms_adapters.can_signals import WantedMessage
 from sms_adapters.raw import EXTENDED
-from sms_online.description.schema import CanopenSource
+from sms_online.description.sources import CanopenSource
 from sms_online.errors import InputError
 
 if TYPE_CHECKING:

@@ -9,7 +9,8 @@ from sms_adapters.can_signals import WantedMessage, wanted_messages
 from sms_adapters.canopen_signals import pdo_messages
 from sms_adapters.clock_merge import Merger, SourceLane, Steps, Stream
 from sms_adapters.devices import make_decoder
-from sms_online.description.schema import CanopenSource, CanSource, Source, System
+from sms_online.description.schema import System
+from sms_online.description.sources import CanopenSource, CanSource, Source
 from sms_online.errors import InputError
 from sms_online.pipeline.blocks import momentum_blocks
 

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sms_adapters.increments import increments
-from sms_online.description.schema import SerialField, Signal
+from sms_online.description.sources import SerialField, Signal
 from sms_online.state import Stage, State
 from sms_online.stream import Array
 

@@ -11,7 +11,7 @@ from sms_adapters.canopen_signals import pdo_messages
 from sms_adapters.raw import Clock, Decoder, Reader, Turn, at_once
 from sms_adapters.serial_decoder import FrameDecoder, LineDecoder
 from sms_adapters.serial_reader import SerialReader
-from sms_online.description.schema import CanopenSource, CanSource, SerialFrames, Source
+from sms_online.description.sources import CanopenSource, CanSource, SerialFrames, Source
 
 
 def make_reader(source: Source, clock: Clock, turn: Turn = at_once) -> Reader:

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from sms_adapters.conversion import Conversions, FrameCounter, Turns
 from sms_adapters.raw import DecodedSamples, Raw, SerialChunk
-from sms_online.description.schema import FrameField, SerialField, SerialFrames, SerialLines
+from sms_online.description.sources import FrameField, SerialField, SerialFrames, SerialLines
 from sms_online.stream import Array
 
 # Longest line that is kept, bytes: no described line comes near it, and a stream without ends must not fill the memory.

@@ -8,7 +8,7 @@ import select
 import serial
 
 from sms_adapters.raw import Clock, LostDevice, Raw, SerialChunk, Turn, at_once, one_line
-from sms_online.description.schema import SerialPort
+from sms_online.description.sources import SerialPort
 
 # Most bytes of one read, which bounds what a flooded port can keep in memory: a second at 10 Mbit/s.
 MOST_BYTES_READ = 1 << 20

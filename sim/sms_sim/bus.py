@@ -33,7 +33,8 @@ from sms_adapters.capture import CaptureReader
 from sms_adapters.raw import EXTENDED, CanFrames, LostDevice
 from sms_adapters.system_file import load_system
 from sms_online.description.channels import drive_channel
-from sms_online.description.schema import CanBus, CanSource, SerialPort, Signal, System
+from sms_online.description.schema import System
+from sms_online.description.sources import CanBus, CanSource, SerialPort, Signal
 from sms_online.errors import InputError
 from sms_online.stream import Array, Block
 from sms_online.threads import one_blas_thread

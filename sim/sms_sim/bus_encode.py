@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 from sms_adapters.can_signals import WantedMessage, wanted_messages
 from sms_adapters.raw import MOST_BYTES, CanFrames
 from sms_adapters.serial_decoder import FRAME_END, encode_frames, frame_layout
-from sms_online.description.schema import CanSource, SerialFrames, Signal, System
+from sms_online.description.schema import System
+from sms_online.description.sources import CanSource, SerialFrames, Signal
 from sms_online.errors import InputError
 from sms_online.stream import Array, Block
 

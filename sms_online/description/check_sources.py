@@ -6,7 +6,8 @@ import re
 from collections.abc import Iterator, Sequence
 
 from sms_online.description.explain import hint, nearest
-from sms_online.description.schema import (
+from sms_online.description.schema import System
+from sms_online.description.sources import (
     CanopenSource,
     CanSource,
     FrameField,
@@ -15,7 +16,6 @@ from sms_online.description.schema import (
     SerialLines,
     Signal,
     Source,
-    System,
 )
 from sms_online.errors import InputError
 

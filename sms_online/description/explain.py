@@ -9,7 +9,7 @@ from typing import Any
 from pydantic import BaseModel, ValidationError
 from pydantic_core import ErrorDetails
 
-from sms_online.description import schema
+from sms_online.description import schema, sources
 from sms_online.errors import InputError
 
 # Fields of `System` that are numbered tables, or lists of tables, in the file.
@@ -36,8 +36,8 @@ RECORDS: dict[str, type[BaseModel]] = {
 }
 # Records that a key of the table tells apart, by its values; a serial source needs two such keys.
 LINKS: dict[str, type[BaseModel]] = {"rigid": schema.RigidLink, "flexible": schema.FlexibleLink}
-SOURCES: dict[str, type[BaseModel]] = {"can": schema.CanSource, "canopen": schema.CanopenSource}
-SERIAL: dict[str, type[BaseModel]] = {"frames": schema.SerialFrames, "lines": schema.SerialLines}
+SOURCES: dict[str, type[BaseModel]] = {"can": sources.CanSource, "canopen": sources.CanopenSource}
+SERIAL: dict[str, type[BaseModel]] = {"frames": sources.SerialFrames, "lines": sources.SerialLines}
 TAGS = {"links": {"kind": tuple(LINKS)}, "sources": {"kind": (*SOURCES, "serial"), "format": tuple(SERIAL)}}
 INERTIAS = ("inertia", "stator_inertia")
 # Longest value that a message repeats; more would not fit a line.
@@ -166,9 +166,9 @@ def _keys_beside(loc: tuple[int | str, ...]) -> tuple[str, ...]:
     elif loc[0] == "links":
         record = LINKS[str(loc[2])]
     elif loc[0] == "sources" and "signals" in loc:
-        record = schema.Signal
+        record = sources.Signal
     elif loc[0] == "sources" and "fields" in loc:
-        record = schema.FrameField if "frames" in loc else schema.SerialField
+        record = sources.FrameField if "frames" in loc else sources.SerialField
     elif loc[0] == "sources":
         record = (SOURCES | SERIAL)[str(_tags(loc)[-1])]
     else:

@@ -9,22 +9,13 @@ from __future__ import annotations
 
 from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import Field, model_validator
+
+from sms_online.description.record import NonNegative, Positive, Record
+from sms_online.description.sources import Source
 
 Vector3 = tuple[float, float, float]
-Positive = Annotated[float, Field(gt=0)]
-NonNegative = Annotated[float, Field(ge=0)]
 Deformation = Literal["traction", "torsion", "bending_y", "bending_z"]
-
-
-class Record(BaseModel):
-    """A frozen record: unknown keys, infinities and NaN are errors.
-
-    The docstring of each record has a line `field: meaning, unit.` for each of its fields. The site's reference of
-    system files is made of these lines, and its build fails where one is missing.
-    """
-
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
 
 class Inertia(Record):
@@ -159,165 +150,6 @@ class Sensor(Record):
     resolution: NonNegative = 0.0
     noise: NonNegative = 0.0
     latency: NonNegative = 0.0
-
-
-class Signal(Record):
-    """Where a number of a device goes: channel value = scale · number + offset.
-
-    In a system file a mere channel name is short for { channel = name }.
-
-    channel: the channel that it becomes.
-    scale: the channel's unit for one count; a negative one turns the sign.
-    offset: in the channel's unit.
-    minimum, maximum: of the channel value before unwrapping, in its unit; what lies outside is dropped and counted.
-    wrap: an encoder counts modulo this, in the number's own unit; its turns are counted from the first sample on.
-    """
-
-    channel: str
-    scale: float = 1.0
-    offset: float = 0.0
-    minimum: float | None = None
-    maximum: float | None = None
-    wrap: Positive | None = None
-
-    @model_validator(mode="before")
-    @classmethod
-    def _from_name(cls, given: Any) -> Any:
-        return {"channel": given} if isinstance(given, str) else given
-
-
-class SourceRecord(Record):
-    """A device.
-
-    name: of the device, in messages and recordings.
-    latency: constant delay from the instant of a measurement to its stamp, s; it is corrected.
-    """
-
-    name: str
-    latency: NonNegative = 0.0
-
-
-class CanBus(SourceRecord):
-    """A CAN bus by the names of python-can.
-
-    interface: python-can's name of the interface: socketcan, pcan, kvaser, slcan, gs_usb, udp_multicast, …
-    channel: python-can's name of the channel: can0, PCAN_USBBUS1, …
-    bitrate: bit/s, where the interface sets it.
-    options: further options, passed to python-can as they are.
-    """
-
-    interface: str = "socketcan"
-    channel: str = "can0"
-    bitrate: Annotated[int, Field(gt=0)] | None = None
-    options: dict[str, bool | int | float | str] = {}
-
-
-class CanSource(CanBus):
-    """Messages that a DBC describes.
-
-    kind: `can`.
-    dbc: a file beside the system file, or a shipped one.
-    signals: `MESSAGE.SIGNAL` of the DBC to the channel that it becomes.
-    counters: the signals, at most one a message, in which a sender counts its frames; they show losses.
-    """
-
-    kind: Literal["can"]
-    dbc: str
-    signals: dict[str, Signal]
-    counters: tuple[str, ...] = ()
-
-
-class CanopenSource(CanBus):
-    """Process data of CANopen nodes, as their EDS maps them.
-
-    kind: `canopen`.
-    nodes: node id to EDS, a file beside the system file.
-    signals: `NODE.INDEX` or `NODE.INDEX:SUBINDEX`, the index in hexadecimal as in the EDS, to the channel that it
-    becomes: "1.6064" is the position of the drive that is node 1.
-    """
-
-    kind: Literal["canopen"]
-    nodes: dict[str, str]
-    signals: dict[str, Signal]
-
-
-class SerialField(Record):
-    """One number of a serial frame or line: a channel, the device's time, a counter of frames, or nothing of interest.
-
-    channel: the channel that it becomes, if any.
-    scale: the channel's unit for one count; a negative one turns the sign.
-    offset: in the channel's unit.
-    minimum, maximum: of the channel value before unwrapping, in its unit; what lies outside is dropped and counted.
-    wrap: of an encoder as for CAN signals; of tick or counter, where it starts again from 0. A word of a binary frame
-    does so at its width without saying.
-    tick: s a count, of the device's time, or of a counter of frames that are taken at a constant rate.
-    counter: whether it counts frames; losses then show.
-    """
-
-    channel: str | None = None
-    scale: float = 1.0
-    offset: float = 0.0
-    minimum: float | None = None
-    maximum: float | None = None
-    wrap: Positive | None = None
-    tick: Positive | None = None
-    counter: bool = False
-
-
-class FrameField(SerialField):
-    """A word of a binary frame, little-endian.
-
-    type: u (unsigned), i (signed) or f (IEEE float), and its bits.
-    """
-
-    type: Literal["u8", "i8", "u16", "i16", "u32", "i32", "u64", "i64", "f32", "f64"]
-
-
-class SerialPort(SourceRecord):
-    """A serial port.
-
-    kind: `serial`.
-    port: as pyserial names it, a URL such as socket://host:port included.
-    baudrate: bit/s.
-    """
-
-    kind: Literal["serial"]
-    port: str
-    baudrate: Annotated[int, Field(gt=0)] = 115200
-
-
-class SerialFrames(SerialPort):
-    """Binary frames: the words of `fields` without padding, then their CRC-32, COBS-encoded, a zero byte at the end.
-
-    The CRC-32 is that of Ethernet and zlib, little-endian. Source: Cheshire and Baker, IEEE/ACM Trans. Networking 7
-    (1999) 159.
-
-    format: `frames`.
-    fields: the words of a frame, in order.
-    """
-
-    format: Literal["frames"]
-    fields: Annotated[tuple[FrameField, ...], Field(min_length=1)]
-
-
-class SerialLines(SerialPort):
-    """Lines of decimal numbers in ASCII.
-
-    format: `lines`.
-    fields: the numbers of a line, in order.
-    separator: between the numbers; "" means blanks.
-    checksum: `xor` expects * and two hexadecimal digits at the end, the exclusive or of the bytes before, without a
-    leading $, as NMEA 0183 has it.
-    """
-
-    format: Literal["lines"]
-    fields: Annotated[tuple[SerialField, ...], Field(min_length=1)]
-    separator: str = ","
-    checksum: Literal["none", "xor"] = "none"
-
-
-SerialSource = Annotated[SerialFrames | SerialLines, Field(discriminator="format")]
-Source = Annotated[CanSource | CanopenSource | SerialSource, Field(discriminator="kind")]
 
 
 class Effect(Record):

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sms_online.description.schema import SerialFrames, SerialLines, Source
+from sms_online.description.sources import SerialFrames, SerialLines, Source
 from sms_online.effects.delay import late_keys
 from sms_online.pipeline.sensing import Sensing
 from sms_online.state import Stage, State

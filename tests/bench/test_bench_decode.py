@@ -16,7 +16,7 @@ from sms_adapters.can_replay import open_log
 from sms_adapters.devices import make_can_decoder, make_decoder
 from sms_adapters.raw import CanFrames, SerialChunk
 from sms_adapters.serial_decoder import encode_frames, frame_layout
-from sms_online.description.schema import CanBus, CanSource, FrameField, SerialField, SerialFrames, SerialLines
+from sms_online.description.sources import CanBus, CanSource, FrameField, SerialField, SerialFrames, SerialLines
 
 COUNT = 200_000
 # Four encoders and the torques, as on a testbed's bus.

@@ -11,9 +11,10 @@ from annotated_types import Ge, Gt, MinLen
 from markdown.extensions.toc import slugify
 from pydantic.fields import FieldInfo
 
-from sms_online.description import schema
+from sms_online.description import schema, sources
 from sms_online.description.parse import RENAMED
-from sms_online.description.schema import Record, System
+from sms_online.description.record import Record
+from sms_online.description.schema import System
 
 # Heading of each record's section; `System` comes first, the others in this order.
 HEADINGS: dict[type[Record], str] = {
@@ -33,13 +34,13 @@ HEADINGS: dict[type[Record], str] = {
     schema.Harmonic: "Harmonics of a trajectory",
     schema.Windows: "`[windows]`",
     schema.Tolerances: "`[tolerances]`",
-    schema.CanSource: '`[[source]]` of `kind = "can"`',
-    schema.CanopenSource: '`[[source]]` of `kind = "canopen"`',
-    schema.SerialFrames: '`[[source]]` of `kind = "serial"` and `format = "frames"`',
-    schema.SerialLines: '`[[source]]` of `kind = "serial"` and `format = "lines"`',
-    schema.Signal: "Signals of a CAN source",
-    schema.FrameField: "Fields of binary frames",
-    schema.SerialField: "Fields of lines",
+    sources.CanSource: '`[[source]]` of `kind = "can"`',
+    sources.CanopenSource: '`[[source]]` of `kind = "canopen"`',
+    sources.SerialFrames: '`[[source]]` of `kind = "serial"` and `format = "frames"`',
+    sources.SerialLines: '`[[source]]` of `kind = "serial"` and `format = "lines"`',
+    sources.Signal: "Signals of a CAN source",
+    sources.FrameField: "Fields of binary frames",
+    sources.SerialField: "Fields of lines",
 }
 ENTRY = re.compile(r"(\w+(?:, \w+)*): (.*)")
 

@@ -12,7 +12,7 @@ from sms_adapters.raw import CanFrames, LostDevice, Raw, Reader
 from sms_adapters.recorder import Recorder
 from sms_adapters.recording import split
 from sms_adapters.session_log import Kind, from_microseconds, number_of_items, quantised
-from sms_online.description.schema import SerialPort, Source
+from sms_online.description.sources import SerialPort, Source
 from sms_online.errors import InputError
 
 # Longest wait in a read, s: how late a reader notices that the session ends.

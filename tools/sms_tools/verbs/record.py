@@ -13,7 +13,7 @@ from can.util import cast_from_string
 from sms_adapters.devices import make_reader
 from sms_adapters.recorder import Recorder
 from sms_adapters.session_log import SessionHeader
-from sms_online.description.schema import CanSource, SerialField, SerialLines, SerialPort, Source
+from sms_online.description.sources import CanSource, SerialField, SerialLines, SerialPort, Source
 from sms_online.errors import InputError
 from sms_online.result import json_text
 from sms_tools.exit_codes import INTERRUPTED, NOTHING_RECEIVED, OK
