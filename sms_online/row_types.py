@@ -16,8 +16,10 @@ def joint_rows(joint: int) -> str:
 def row_types(layout: Layout) -> dict[str, list[int]]:
     """Generalized speeds by type of momentum rows: `joint_i`, `link_i` what moves with link i, `base`."""
     out = {joint_rows(i): [theta_m] for i, theta_m in enumerate(layout.theta_m)}
-    for i, (q, theta_m, q_f) in enumerate(zip(layout.q, layout.theta_m, layout.q_f, strict=True), start=1):
-        rows = [*range(q_f.start, q_f.stop), *([q] if q != theta_m else [])]
+    beside = [[q] if q != theta_m else [] for q, theta_m in zip(layout.q, layout.theta_m, strict=True)]
+    beside += [[]] * (len(layout.q_f) - len(beside))  # of fixed joints
+    for i, (q_f, q) in enumerate(zip(layout.q_f, beside, strict=True), start=1):
+        rows = [*range(q_f.start, q_f.stop), *q]
         if rows:
             out[f"link_{i}"] = rows
     if layout.n_base_speeds:

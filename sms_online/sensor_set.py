@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sms_online.description.channels import AXES, drive_channel, strain_channel
+from sms_online.description.channels import AXES, drive_channels, strain_channel
 from sms_online.errors import InputError
 from sms_online.model.model import Model
 from sms_online.pipeline.sensing import Sensing
@@ -100,15 +100,14 @@ def sensor_set(model: Model, channels: Sequence[str], sigma: Array, rate: Array)
         if not each > 0.0:
             place, expected = f"sensor of {name!r}", "noise or resolution above 0, or a grade"
             raise InputError(system.name, place, "no noise is stated", expected)
-    torque = np.empty(len(system.joints))
+    torque = np.zeros(len(system.joints))
     drives = []
-    for i, joint in enumerate(system.joints, start=1):
-        drive = drive_channel(system, i)
+    for drive, i in drive_channels(system).items():
         if drive not in channels:
-            raise InputError(system.name, "sensors", f"none of {drive!r}", "the drive of every joint measured")
+            raise InputError(system.name, "sensors", f"none of {drive!r}", "every drive measured")
         drives.append(channels.index(drive))
         # tau_i is measured before the gear.
-        ratio = joint.gear_ratio if drive.startswith("tau_") else 1.0
+        ratio = system.joints[i - 1].gear_ratio if drive.startswith("tau_") else 1.0
         torque[i - 1] = density[drives[-1]] * ratio**2
     others = [k for k in range(len(channels)) if k not in drives]
     return SensorSet(tuple(channels[k] for k in others), density[others], torque)

@@ -9,6 +9,7 @@ import numpy as np
 from sms_online.description.schema import (
     Deformation,
     Effect,
+    FixedJoint,
     FlexibleLink,
     Inertia,
     Joint,
@@ -111,12 +112,61 @@ def spatial(kinematics: str = "linear", free: bool = True) -> System:
     )
 
 
+def tree(kinematics: str = "exact", free: bool = True) -> System:
+    """Two arms and a panel on a base: brackets at both ends of flexible links, a universal joint, passive joints.
+
+    Joints 1 to 3: an arm with a flexible link between two brackets (link 7, with mass, at its end) and a cross. Joint
+    4: a flexible panel on a passive hinge. Joints 5 and 6: an arm on the base, its last link on a passive
+    slide. Link 8 is fixed to the base.
+    """
+    motor = Motor(mass=3.0, rotor_inertia=0.0075, stator_inertia=Inertia(xx=0.01, yy=0.02, zz=0.0075, xy=0.001))
+    bracket = {"root_position": (0.1, -0.05, 0.2), "root_rotation": (0.2, -0.3, 0.4)}
+    rigid = RigidLink(kind="rigid", mass=3, center_of_mass=(0.2, 0.1, -0.05), inertia=ASYMMETRIC, tip=(0.5, 0.1, 0.2))
+    flexible = spatial_link(kinematics).model_copy(update=bracket)
+    free_base = spatial(free=free)
+    return System(
+        name="tree",
+        gravity=(0.3, -0.5, -9.81),
+        spacecraft=free_base.spacecraft,
+        joints=(
+            Joint(gear_ratio=50, stiffness=1000, damping=75.85),
+            Joint(gear_ratio=30, axis=(0, 1, 0), transmission="rigid", parent="link_7"),
+            Joint(axis=(1, 0, 0), gear_ratio=20, stiffness=500, damping=7, mount_rotation=(0.0, 0.1, 0.0)),
+            Joint(axis=(0, 1, 0), passive=True, stiffness=30, damping=0.5, parent="base", mount_position=(-1, 1, 0)),
+            Joint(
+                gear_ratio=50, stiffness=800, damping=5, parent="base",
+                mount_position=(0.3, -1.2, 0.1), mount_rotation=(0.1, 0.2, 1.4),
+            ),
+            Joint(kind="prismatic", axis=(0, 0.6, 0.8), passive=True, transmission="rigid", mount_position=(0, 0.1, 0)),
+        ),
+        motors=(motor, motor, motor, None, motor, None),
+        fixed_joints=(
+            FixedJoint(kind="fixed", parent="link_1", mount_position=(0.05, 0.1, 0), mount_rotation=(0.3, 0, -0.5)),
+            FixedJoint(kind="fixed", parent="base", mount_position=(0, 0, -0.4)),
+        ),
+        links=(
+            flexible,
+            RigidLink(kind="cross"),
+            rigid,
+            spatial_link(kinematics, elements=1),
+            flexible,
+            rigid,
+            rigid.model_copy(update={"mass": 0.8}),
+            rigid,
+        ),
+        payload=RigidBody(mass=2.0, center_of_mass=(0.1, 0.2, 0.3), inertia=ASYMMETRIC),
+        effects=FRICTION,
+    )  # fmt: skip
+
+
 SYSTEMS = {
     "planar linear": paper("linear", effects=FRICTION),
     "planar exact": paper("exact", effects=FRICTION),
     "spatial linear": spatial("linear"),
     "spatial exact": spatial("exact"),
     "fixed base": spatial("exact", free=False),
+    "tree linear": tree("linear"),
+    "tree exact, fixed base": tree("exact", free=False),
 }
 
 

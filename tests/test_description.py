@@ -165,7 +165,7 @@ def test_a_description_survives_its_own_json() -> None:
         ("mass = 400", "mass = [4, 0]", "spacecraft.mass", "[4, 0]", "a number"),
         ('motion = "planar"', 'motion = "plana"', "motion", "'plana'", "did you mean 'planar'?"),
         ('kind = "flexible"', 'kind = "flexibel"', "link_1.kind", "'flexibel'", "did you mean 'flexible'?"),
-        ('kind = "flexible"', "", "link_1.kind", "missing", "'rigid' or 'flexible'"),
+        ('kind = "flexible"', "", "link_1.kind", "missing", "'rigid', 'cross' or 'flexible'"),
         ('["bending_z"]', '["bending"]', "link_1.deformations[1]", "'bending'", "'bending_y' or 'bending_z'"),
         ('["bending_z"]', "[]", "link_1.deformations", "[]", "at least 1"),
         ("tip = [0.5, 0.0, 0.0]", "tip = [0.5, 0.0]", "link_2.tip", "[0.5, 0.0]", "3 numbers"),
@@ -224,7 +224,7 @@ def test_an_empty_file_lacks_its_first_joint() -> None:
 
 
 def test_spatial_links_need_what_their_deformations_need() -> None:
-    spatial = changed('motion = "planar"', "")
+    spatial = changed('motion = "planar"', "", changed("zz = 65.0", "xx = 65.0, yy = 65.0, zz = 65.0"))
     assert parse_system(spatial, "bench.toml").motion == "spatial"
     torsion = changed('["bending_z"]', '["bending_z", "torsion"]\ntorsional_rigidity = 5.0', spatial)
     assert "link_1.polar_inertia_per_length: 0; expected an inertia" in message(torsion)

@@ -14,7 +14,7 @@ from scipy.integrate import simpson
 from scipy.interpolate import CubicHermiteSpline
 from scipy.spatial.transform import Rotation
 
-from sms_online.description.schema import FlexibleLink, Inertia, RigidBody, RigidLink, System
+from sms_online.description.schema import FlexibleLink, Inertia, Joint, Motor, RigidBody, System
 from sms_online.effects.build import build_model
 from sms_online.model.layout import Layout
 from sms_online.stream import Array
@@ -154,41 +154,71 @@ def energy(system: System, layout: Layout, x: Array, v: Array) -> tuple[float, f
     if system.spacecraft is not None:
         r = r - R @ np.array(system.spacecraft.tracked_point)
         out.body(system.spacecraft, r, R)
-    for i, (joint, motor, link) in enumerate(zip(system.joints, system.motors, system.links, strict=True)):
-        R = R @ turned(np.array(joint.mount_rotation))
-        axis = np.array(joint.axis)
-        q, theta_m = moved[:, layout.q[i] - n], moved[:, layout.theta_m[i] - n]
-        if motor is not None:
-            out.point(motor.mass, r)
-            out.tumble(tensor(motor.stator_inertia), R)
-            spin = (R[NOW] @ axis) @ angular_velocity(R) + joint.gear_ratio * rate(theta_m)
-            out.kinetic += 0.5 * motor.rotor_inertia * float(spin) ** 2
-        out.potential += 0.5 * joint.stiffness * float(theta_m[NOW] - q[NOW]) ** 2
-        if joint.kind == "prismatic":
-            r = r + q[:, None] * (R @ axis)
-        else:
-            R = R @ turned(q[:, None] * axis)
-        if isinstance(link, RigidLink):
-            out.body(link, r, R)
-            r = r + R @ np.array(link.tip)
+    ends = {"base": (r, R)}
+    payload = None if system.payload is None else f"link_{len(system.joints)}"
+    mounts = (*system.joints, *system.fixed_joints)
+    waiting = list(range(len(system.links)))
+    while waiting:
+        i = waiting.pop(0)
+        mount, link = mounts[i], system.links[i]
+        before = mount.parent or (f"link_{i}" if i else "base")
+        if before not in ends:
+            waiting.append(i)
             continue
-        q_f = moved[:, layout.q_f[i].start - n : layout.q_f[i].stop - n]
-        if link.kinematics == "linear":
-            points, sections, weights, tip, tip_turn, strain = linear_link(link, q_f)
+        r, R = ends[before]
+        r, R = r + R @ np.array(mount.mount_position), R @ turned(np.array(mount.mount_rotation))
+        if i < len(system.joints):
+            joint, motor = system.joints[i], system.motors[i]
+            r, R = beyond_joint(out, joint, motor, r, R, *(moved[:, k[i] - n] for k in (layout.q, layout.theta_m)))
+        if isinstance(link, FlexibleLink):
+            r, R = r + R @ np.array(link.root_position), R @ turned(np.array(link.root_rotation))
+            free_end = f"link_{i + 1}" not in (payload, *parents(system))
+            q_f = moved[:, layout.q_f[i].start - n : layout.q_f[i].stop - n]
+            ends[f"link_{i + 1}"] = beyond_link(out, link, r, R, q_f, free_end)
         else:
-            last = i == len(system.links) - 1 and system.payload is None
-            points, sections, weights, tip, tip_turn, strain = exact_rod(link, q_f, free_end=last)
-        out.potential += strain
-        inertial = r[:, None] + points @ np.swapaxes(R, 1, 2)
-        frames = R[:, None] @ sections
-        axial = np.einsum("ni,ni->n", frames[NOW, :, :, 0], angular_velocity(frames))
-        out.kinetic += 0.5 * link.mass_per_length * float((rate(inertial) ** 2).sum(axis=1) @ weights)
-        out.kinetic += 0.5 * link.polar_inertia_per_length * float(axial**2 @ weights)
-        out.potential -= link.mass_per_length * float(weights @ inertial[NOW] @ out.gravity)
-        r, R = r + (R @ tip[..., None])[..., 0], R @ tip_turn
-    if system.payload is not None:
-        out.body(system.payload, r, R)
+            out.body(link, r, R)
+            ends[f"link_{i + 1}"] = r + R @ np.array(link.tip), R
+    if system.payload is not None and payload is not None:
+        out.body(system.payload, *ends[payload])
     return out.kinetic, out.potential
+
+
+def parents(system: System) -> list[str]:
+    """What the joints are mounted on."""
+    every = enumerate((*system.joints, *system.fixed_joints))
+    return [mount.parent or (f"link_{i}" if i else "base") for i, mount in every]
+
+
+def beyond_joint(
+    out: Bodies, joint: Joint, motor: Motor | None, r: Array, R: Array, q: Array, theta_m: Array
+) -> tuple[Array, Array]:
+    """From a mount over its motor and joint."""
+    axis = np.array(joint.axis)
+    if motor is not None:
+        out.point(motor.mass, r)
+        out.tumble(tensor(motor.stator_inertia), R)
+        spin = (R[NOW] @ axis) @ angular_velocity(R) + joint.gear_ratio * rate(theta_m)
+        out.kinetic += 0.5 * motor.rotor_inertia * float(spin) ** 2
+    out.potential += 0.5 * joint.stiffness * float(q[NOW] if joint.passive else theta_m[NOW] - q[NOW]) ** 2
+    if joint.kind == "prismatic":
+        return r + q[:, None] * (R @ axis), R
+    return r, R @ turned(q[:, None] * axis)
+
+
+def beyond_link(out: Bodies, link: FlexibleLink, r: Array, R: Array, q_f: Array, free_end: bool) -> tuple[Array, Array]:
+    """From the root of a flexible link to its end."""
+    if link.kinematics == "linear":
+        points, sections, weights, tip, tip_turn, strain = linear_link(link, q_f)
+    else:
+        points, sections, weights, tip, tip_turn, strain = exact_rod(link, q_f, free_end)
+    out.potential += strain
+    inertial = r[:, None] + points @ np.swapaxes(R, 1, 2)
+    frames = R[:, None] @ sections
+    axial = np.einsum("ni,ni->n", frames[NOW, :, :, 0], angular_velocity(frames))
+    out.kinetic += 0.5 * link.mass_per_length * float((rate(inertial) ** 2).sum(axis=1) @ weights)
+    out.kinetic += 0.5 * link.polar_inertia_per_length * float(axial**2 @ weights)
+    out.potential -= link.mass_per_length * float(weights @ inertial[NOW] @ out.gravity)
+    return r + (R @ tip[..., None])[..., 0], R @ tip_turn
 
 
 @pytest.mark.parametrize("system", SYSTEMS.values(), ids=SYSTEMS.keys())

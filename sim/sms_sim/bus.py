@@ -32,7 +32,7 @@ from sms_adapters.can_signals import wanted_messages
 from sms_adapters.capture import CaptureReader
 from sms_adapters.raw import EXTENDED, CanFrames, LostDevice
 from sms_adapters.system_file import load_system
-from sms_online.description.channels import drive_channel
+from sms_online.description.channels import drive_channels
 from sms_online.description.schema import System
 from sms_online.description.sources import CanBus, CanSource, SerialPort, Signal
 from sms_online.errors import InputError
@@ -98,14 +98,14 @@ class CommandListener:
         source = next((source for source in system.sources if isinstance(source, CanSource)), None)
         if source is None:
             raise InputError(system.name, "source", "no CAN bus to take commands from", "a source of kind can")
-        drives = [drive_channel(system, i) for i in range(1, len(system.joints) + 1)]
-        signals = {name: Signal(channel=channel) for name, channel in commands(drives).items()}
+        drives = drive_channels(system)
+        signals = {name: Signal(channel=channel) for name, channel in commands(list(drives)).items()}
         described = source.model_copy(update={"signals": signals, "counters": ()})
         self._decoder = CanDecoder(wanted_messages(described, directory), tuple(signals.values()))
-        self._joints = [drives.index(signal.channel) for signal in signals.values()]
+        self._joints = [drives[signal.channel] - 1 for signal in signals.values()]
         # A command is the torque at the motor shaft, before the gear.
-        gears = [joint.gear_ratio for joint in system.joints]
-        self._gears = np.where([drive.startswith("tau_") for drive in drives], gears, 1.0)
+        self._gears = np.array([joint.gear_ratio for joint in system.joints])
+        self._gears[[i - 1 for drive, i in drives.items() if not drive.startswith("tau_")]] = 1.0
         self._reader = CanReader(source, time.monotonic, COMMANDED)
         self._reader.open()
         self._held = held

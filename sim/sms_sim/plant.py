@@ -6,7 +6,7 @@ from functools import cached_property
 
 import numpy as np
 
-from sms_online.description.channels import drive_channel, sensed_channels
+from sms_online.description.channels import drive_channels, sensed_channels
 from sms_online.description.schema import System
 from sms_online.effects.build import build_model
 from sms_online.model.effect import Inputs
@@ -81,7 +81,7 @@ class Plant:
     @cached_property
     def channels(self) -> tuple[str, ...]:
         """Channels that the exact motion gives: drives, then positions of base, joints and markers."""
-        model, joints = self.model, range(1, len(self.system.joints) + 1)
+        model = self.model
         rigid = len(model.layout.position_names) - sum(s.stop - s.start for s in model.layout.q_f)
         markers = [
             f"link_{i}.{name}"
@@ -89,7 +89,7 @@ class Plant:
             if kinematics is not None
             for name in kinematics.marker_names
         ]
-        return (*(drive_channel(self.system, i) for i in joints), *model.layout.position_names[:rigid], *markers)
+        return (*drive_channels(self.system), *model.layout.position_names[:rigid], *markers)
 
     @cached_property
     def further_channels(self) -> tuple[str, ...]:
@@ -111,9 +111,11 @@ class Plant:
     def channel_values(self, torque: Array, x: Array) -> Array:
         """Exact values (B, channels) at torques after the gear n τ (B, joints) and positions x (B, n_x)."""
         model = self.model
-        gears = np.array([joint.gear_ratio for joint in self.system.joints])
-        at_shaft = np.array([channel.startswith("tau_") for channel in self.channels[: gears.size]])
-        parts = [torque / np.where(at_shaft, gears, 1.0)]
+        drives = drive_channels(self.system)
+        joints = [i - 1 for i in drives.values()]
+        gears = np.array([self.system.joints[i].gear_ratio for i in joints])
+        at_shaft = np.array([channel.startswith("tau_") for channel in drives])
+        parts = [torque[:, joints] / np.where(at_shaft, gears, 1.0)]
         parts.append(x[:, : model.layout.n_x - sum(s.stop - s.start for s in model.layout.q_f)])
         for i, kinematics in enumerate(model.chain.flexible):
             if kinematics is not None:

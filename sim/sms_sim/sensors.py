@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sms_online.description.channels import drive_channel, sensed_channels
+from sms_online.description.channels import drive_channels, sensed_channels
 from sms_online.description.schema import Sensor, System
 from sms_online.effects.catalogue import channel_effects
 from sms_online.errors import InputError
@@ -44,7 +44,7 @@ class Sensors:
     def __init__(self, system: System, measurable: tuple[str, ...], grade: str | None, seed: int) -> None:
         if grade is not None and grade not in GRADES:
             raise InputError("simulation", "grade", repr(grade), f"one of {', '.join(GRADES)}")
-        drives = tuple(drive_channel(system, i) for i in range(1, len(system.joints) + 1))
+        drives = drive_channels(system)
         filled = {channel: sensor for sensor in system.sensors for channel in sensed_channels(system, sensor)}
         self.channels = tuple(c for c in measurable if c in drives or not system.sensors or c in filled)
         ideal = Sensor(channels=("*",))
@@ -82,10 +82,10 @@ def _latencies(system: System, channels: tuple[str, ...]) -> Array:
     return out
 
 
-def _grade_noise(system: System, channel: str, drives: tuple[str, ...], grade: Grade) -> float:
+def _grade_noise(system: System, channel: str, drives: dict[str, int], grade: Grade) -> float:
     """σ of a channel in its own unit."""
     if channel in drives:
-        gear = system.joints[drives.index(channel)].gear_ratio
+        gear = system.joints[drives[channel] - 1].gear_ratio
         return grade.torque / gear if channel.startswith("tau_") else grade.torque
     if channel in EULER_PARAMETERS:
         # Euler parameters turn by half the angle.

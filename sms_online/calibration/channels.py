@@ -67,7 +67,7 @@ def position_families(sensing: Sensing, tolerances: Tolerances) -> list[Family]:
 def torque_families(sensing: Sensing, tolerances: Tolerances) -> list[TorqueFamily]:
     """Those of torques that have a tolerance, but for what the system file declares as effects."""
     declared = {(ENTRIES[e.name].traits.calibrates, e.where) for e in sensing.model.system.effects}
-    joints = range(len(sensing.model.layout.q))
+    joints = [i for i, joint in enumerate(sensing.model.system.joints) if not joint.passive]
     units = ["N" if joint.kind == "prismatic" else "N m" for joint in sensing.model.system.joints]
     offset = np.inf if tolerances.drive_offset is None else tolerances.drive_offset
     gained = [i for i in joints if i > 0 and ("drive_gain", f"joint_{i + 1}") not in declared]

@@ -4,13 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from sms_online.calibration.nuisance import Nuisance
 from sms_online.description.channels import AXES
-from sms_online.description.schema import FlexibleLink, Joint, System
+from sms_online.description.schema import FlexibleLink, Joint, Mount, System
+from sms_online.description.tree import mounts, tree_of
 from sms_online.model.beam import LinearLink
 from sms_online.model.dynamics import Dynamics
 from sms_online.model.model import Model
@@ -48,10 +50,12 @@ class Geometry:
     states: States = same_readings
 
 
-def own_axis(joint: Joint) -> int | None:
+def own_axis(joint: Mount) -> int | None:
     """Axis of the mount that a joint turns about, of which its encoders' readings say all; None where there is none."""
+    if not isinstance(joint, Joint) or joint.kind != "revolute":
+        return None
     turning = np.flatnonzero(np.abs(joint.axis) == 1.0)
-    return int(turning[0]) if joint.kind == "revolute" and turning.size else None
+    return int(turning[0]) if turning.size else None
 
 
 def geometries(system: System) -> Iterator[Geometry]:
@@ -59,21 +63,26 @@ def geometries(system: System) -> Iterator[Geometry]:
 
     Not those that other readings stand for: see `channels`.
     """
-    planar, tolerances = system.motion == "planar", system.tolerances
+    planar, tolerances, tree = system.motion == "planar", system.tolerances, tree_of(system)
     for i, link in enumerate(system.links):
         if tolerances.length == 0.0:
             break
         if isinstance(link, FlexibleLink):
             yield Geometry(Nuisance("length", f"link_{i + 1}", "m", tolerances.length), _longer(i))
-        elif i + 1 < len(system.links) or system.payload is not None:
+        elif i in tree.parents or (i == tree.last and system.payload is not None):
             for axis in range(2 if planar else 3):
                 nuisance = Nuisance("length", f"link_{i + 1}", "m", tolerances.length, AXES[axis])
-                yield Geometry(nuisance, _tip_moved(i, axis))
-    for i, joint in enumerate(system.joints):
+                yield Geometry(nuisance, partial(_displaced, "links", i, "tip", axis))
+    for i, mount in enumerate(mounts(system)):
+        where = ("joints", i) if i < len(system.joints) else ("fixed_joints", i - len(system.joints))
+        if any(mount.mount_position) and tolerances.length > 0.0:
+            for axis in range(2 if planar else 3):
+                nuisance = Nuisance("length", f"joint_{i + 1}", "m", tolerances.length, AXES[axis])
+                yield Geometry(nuisance, partial(_displaced, *where, "mount_position", axis))
         for axis in (2,) if planar else (0, 1, 2):
-            if tolerances.axis > 0.0 and axis != own_axis(joint):
+            if tolerances.axis > 0.0 and axis != own_axis(mount):
                 nuisance = Nuisance("axis", f"joint_{i + 1}", "rad", tolerances.axis, AXES[axis])
-                yield Geometry(nuisance, _mount_turned(i, axis))
+                yield Geometry(nuisance, partial(_mount_turned, *where, axis))
     if system.spacecraft is not None and tolerances.base_angle > 0.0 and not planar:
         for axis in range(3):
             nuisance = Nuisance("base_angle", "base", "rad", tolerances.base_angle, AXES[axis])
@@ -100,23 +109,17 @@ def _longer(i: int) -> Callable[[System, float], System]:
     return moved
 
 
-def _tip_moved(i: int, axis: int) -> Callable[[System, float], System]:
-    def moved(system: System, by: float) -> System:
-        link = system.links[i]
-        assert not isinstance(link, FlexibleLink)
-        tip = np.array(link.tip) + by * np.eye(3)[axis]
-        return system.model_copy(update={"links": _with(system.links, i, tip=tuple(tip.tolist()))})
-
-    return moved
+def _displaced(records: str, i: int, point: str, axis: int, system: System, by: float) -> System:
+    """A point of the i-th (from 0) of some records of a system, along an axis."""
+    every = getattr(system, records)
+    moved = np.array(getattr(every[i], point)) + by * np.eye(3)[axis]
+    return system.model_copy(update={records: _with(every, i, **{point: tuple(moved.tolist())})})
 
 
-def _mount_turned(i: int, axis: int) -> Callable[[System, float], System]:
-    def moved(system: System, by: float) -> System:
-        mount = Rotation.from_rotvec(system.joints[i].mount_rotation) * Rotation.from_rotvec(by * np.eye(3)[axis])
-        turned = tuple(mount.as_rotvec().tolist())
-        return system.model_copy(update={"joints": _with(system.joints, i, mount_rotation=turned)})
-
-    return moved
+def _mount_turned(records: str, i: int, axis: int, system: System, by: float) -> System:
+    every = getattr(system, records)
+    mount = Rotation.from_rotvec(every[i].mount_rotation) * Rotation.from_rotvec(by * np.eye(3)[axis])
+    return system.model_copy(update={records: _with(every, i, mount_rotation=tuple(mount.as_rotvec().tolist()))})
 
 
 def _tilted(about: Array) -> Callable[[System, float], System]:

@@ -23,6 +23,17 @@ def is_directly_driven(joint: Joint) -> bool:
     return joint.kind == "prismatic" or (joint.transmission == "rigid" and joint.gear_ratio == 1.0)
 
 
+def has_motor_side(joint: Joint) -> bool:
+    """Whether a joint has a θ_m apart from q; the spring of a passive joint acts between its parent and q."""
+    return joint.transmission == "flexible" and not joint.passive
+
+
+def drive_channels(system: System) -> dict[str, int]:
+    """Channels of all drives, joint by joint, with the number of the joint (from 1); a passive joint has none."""
+    driven = (i for i, joint in enumerate(system.joints, start=1) if not joint.passive)
+    return {drive_channel(system, i): i for i in driven}
+
+
 def drive_channel(system: System, i: int) -> str:
     """Channel of the drive of joint i (from 1): `tau_i` at the motor shaft, N m, or `force_i` at the axis, N or N m."""
     return f"force_{i}" if is_directly_driven(system.joints[i - 1]) else f"tau_{i}"
@@ -35,22 +46,22 @@ def strain_channel(system: System, i: int) -> str | None:
     where the joint is no such spring.
     """
     joint = system.joints[i - 1]
-    bends = joint.transmission == "flexible" and joint.kind == "revolute"
+    bends = has_motor_side(joint) and joint.kind == "revolute"
     return f"link_{i}.strain_angle" if bends and not isinstance(system.links[i - 1], FlexibleLink) else None
 
 
 def channels(system: System) -> tuple[str, ...]:
     """Every channel that a capture of this system may hold: drives, joints, base, then the markers of each link."""
     joints = range(1, len(system.joints) + 1)
-    names = [drive_channel(system, i) for i in joints]
-    names += [f"theta_m_{i}" for i in joints if system.joints[i - 1].transmission == "flexible"]
+    names = list(drive_channels(system))
+    names += [f"theta_m_{i}" for i in joints if has_motor_side(system.joints[i - 1])]
     names += [f"q_{i}" for i in joints]
     if system.spacecraft is not None:
         names += _base_channels(planar=system.motion == "planar")
     for i, link in enumerate(system.links, start=1):
         if isinstance(link, FlexibleLink):
             names += _link_channels(i, link, planar=system.motion == "planar")
-        elif (strain := strain_channel(system, i)) is not None:
+        elif i <= len(system.joints) and (strain := strain_channel(system, i)) is not None:
             names.append(strain)
     return tuple(names)
 

@@ -11,14 +11,17 @@ import numpy as np
 
 from sms_online.description.channels import channels, sensed_channels
 from sms_online.description.check_sources import check_sources
+from sms_online.description.check_tree import check_tips, check_tree
 from sms_online.description.explain import hint, nearest, quoted
 from sms_online.description.schema import Deformation, FlexibleLink, Inertia, Joint, Motor, RigidLink, System
 from sms_online.errors import InputError
 
 # A direction that is typed with ten decimals is a unit vector to 1e-10.
 UNIT_TOLERANCE = 1e-9
-# Negative principal moment, relative to the largest, that rounding of typed inertias may leave.
+# What rounding of typed inertias, four digits or more, may leave of a principal moment that is impossible, relative to
+# the largest.
 INERTIA_TOLERANCE = 1e-9
+TRIANGLE_TOLERANCE = 1e-3
 
 # Positions of joints, rotors and nodes. The regressor of a step holds their products with every parameter: 264 of them
 # (four links of 32 elements) take 290 MB to set up, 520 take 880 MB.
@@ -41,13 +44,15 @@ def check_system(system: System, source: str) -> None:
     if not system.name:
         raise InputError(source, "name", "an empty text", "a name")
     _check_size(system, source)
+    check_tree(system, source)
     for i, (joint, motor) in enumerate(zip(system.joints, system.motors, strict=True), start=1):
         _check_joint(i, joint, motor, system.motion == "planar", source)
     for i, link in enumerate(system.links, start=1):
         if isinstance(link, FlexibleLink):
             _check_flexible(f"link_{i}", link, system.motion == "planar", source)
+    check_tips(system, source)
     for place, inertia in _inertias(system):
-        _check_inertia(place, inertia, source)
+        _check_inertia(place, inertia, system.motion == "planar", source)
     if system.motion == "planar" and system.gravity[2] != 0.0:
         raise InputError(
             source, "gravity", f"{system.gravity[2]:g} m/s² along z", "gravity in the x-y plane, or motion = 'spatial'"
@@ -82,8 +87,16 @@ def _check_joint(i: int, joint: Joint, motor: Motor | None, planar: bool, source
     place = f"joint_{i}"
     length = math.hypot(*joint.axis)
     if abs(length - 1.0) > UNIT_TOLERANCE:
-        raise InputError(source, f"{place}.axis", f"{list(joint.axis)} of length {length:.10g}", "a unit vector")
-    if joint.transmission == "flexible":
+        found, unit = (
+            f"{list(joint.axis)} of length {length:.10g}",
+            [round(a / (length or 1.0), 12) for a in joint.axis],
+        )
+        expected = f"a unit vector, {unit}" if length > 0.0 else "a unit vector, for an axis has a direction"
+        raise InputError(source, f"{place}.axis", found, expected)
+    if joint.passive:
+        if motor is not None:
+            raise InputError(source, f"motor_{i}", f"a motor at {place}, which is passive", "no such table")
+    elif joint.transmission == "flexible":
         if joint.stiffness == 0.0:
             raise InputError(source, f"{place}.stiffness", "0", "a stiffness greater than 0, or transmission = 'rigid'")
         if motor is None or motor.rotor_inertia == 0.0:
@@ -100,15 +113,14 @@ def _check_joint(i: int, joint: Joint, motor: Motor | None, planar: bool, source
         raise InputError(source, f"{place}.axis", f"{list(joint.axis)}", "[0, 0, 1] or [0, 0, -1] in planar motion")
     if joint.kind == "prismatic" and joint.axis[2] != 0.0:
         raise InputError(source, f"{place}.axis", f"{list(joint.axis)}", "an axis in the x-y plane in planar motion")
-    if joint.mount_rotation[:2] != (0.0, 0.0):
-        raise InputError(
-            source, f"{place}.mount_rotation", f"{list(joint.mount_rotation)}", "a turn about z alone in planar motion"
-        )
 
 
 def _check_flexible(place: str, link: FlexibleLink, planar: bool, source: str) -> None:
     if len(set(link.deformations)) < len(link.deformations):
         raise InputError(source, f"{place}.deformations", f"{list(link.deformations)}", "each deformation once")
+    if planar and (link.root_rotation[:2] != (0.0, 0.0) or link.root_position[2] != 0.0):
+        expected = "a root in the x-y plane, turned about z alone, in planar motion"
+        raise InputError(source, place, f"{list(link.root_position)}, {list(link.root_rotation)}", expected)
     if planar and link.deformations != ("bending_z",):
         raise InputError(
             source, f"{place}.deformations", f"{list(link.deformations)}", "['bending_z'] in planar motion"
@@ -145,13 +157,17 @@ def _inertias(system: System) -> Iterable[tuple[str, Inertia]]:
         yield "payload.inertia", system.payload.inertia
 
 
-def _check_inertia(place: str, inertia: Inertia, source: str) -> None:
+def _check_inertia(place: str, inertia: Inertia, planar: bool, source: str) -> None:
+    """Principal moments that some body has; in the plane, where only one is stated, not more than its sign."""
     i = inertia
     moments = np.linalg.eigvalsh([[i.xx, i.xy, i.xz], [i.xy, i.yy, i.yz], [i.xz, i.yz, i.zz]])
     if moments[0] < -INERTIA_TOLERANCE * moments[2]:
         raise InputError(
             source, place, f"a negative principal moment, {moments[0]:.3g} kg m²", "a body's inertia: none below 0"
         )
+    if not planar and moments[2] - moments[0] - moments[1] > TRIANGLE_TOLERANCE * moments[2]:
+        found = f"principal moments {', '.join(f'{moment:.5g}' for moment in moments)} kg m²"
+        raise InputError(source, place, found, "a body's inertia: none above the sum of the other two")
 
 
 def _check_simulation(system: System, source: str) -> None:
@@ -165,6 +181,9 @@ def _check_simulation(system: System, source: str) -> None:
                     f"{len(gains)} value{'s' * (len(gains) != 1)}",
                     f"{n}, one for each joint",
                 )
+            for i, (joint, gain) in enumerate(zip(system.joints, gains, strict=True), start=1):
+                if joint.passive and gain > 0.0:
+                    raise InputError(source, f"controller.{key}", f"{gain:g} of joint_{i}", "0, for it is passive")
 
 
 def _check_sensors(system: System, names: tuple[str, ...], source: str) -> None:
@@ -186,10 +205,15 @@ def _check_sensors(system: System, names: tuple[str, ...], source: str) -> None:
             filled[channel] = k
 
 
+def _numbered(system: System) -> list[str]:
+    """Joints that move, and links, as places and owners of parameters."""
+    pairs = [f"{kind}_{i}" for i in range(1, len(system.joints) + 1) for kind in ("joint", "link")]
+    return pairs + [f"link_{i}" for i in range(len(system.joints) + 1, len(system.links) + 1)]
+
+
 def _check_effects(system: System, names: tuple[str, ...], source: str) -> None:
     """Places and repetitions; which effects there are and with what coefficients, the effects' catalogue says."""
-    numbered = [f"{kind}_{i}" for i in range(1, len(system.joints) + 1) for kind in ("joint", "link")]
-    places = ("base", *numbered, "tip")
+    places = ("base", *_numbered(system), "tip")
     seen: set[tuple[str, str]] = set()
     for k, effect in enumerate(system.effects, start=1):
         if effect.where not in places and not any(fnmatchcase(name, effect.where) for name in names):
@@ -209,10 +233,9 @@ def _check_effects(system: System, names: tuple[str, ...], source: str) -> None:
 
 def _check_parameter_names(system: System, source: str) -> None:
     """`known` and `prior`: the owner exists; whether it has the quantity, the model says."""
-    n = len(system.joints)
     owners = [] if system.spacecraft is None else ["spacecraft"]
-    owners += [f"{kind}_{i}" for i in range(1, n + 1) for kind in ("joint", "link")]
-    owners += [f"motor_{i}" for i in range(1, n + 1) if system.motors[i - 1] is not None]
+    owners += _numbered(system)
+    owners += [f"motor_{i}" for i, motor in enumerate(system.motors, start=1) if motor is not None]
     owners += ["payload"] if system.payload is not None else []
     owners += [f"{effect.name}@{effect.where}" for effect in system.effects]
     for table, parameters in (("known", system.known), ("prior", system.priors)):

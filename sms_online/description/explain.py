@@ -15,6 +15,7 @@ from sms_online.errors import InputError
 # Fields of `System` that are numbered tables, or lists of tables, in the file.
 TABLES = {
     "joints": "joint_{}",
+    "fixed_joints": "fixed joint {}",
     "motors": "motor_{}",
     "links": "link_{}",
     "sensors": "sensor {}",
@@ -25,6 +26,7 @@ RECORDS: dict[str, type[BaseModel]] = {
     "spacecraft": schema.Spacecraft,
     "payload": schema.RigidBody,
     "joints": schema.Joint,
+    "fixed_joints": schema.FixedJoint,
     "motors": schema.Motor,
     "sensors": schema.Sensor,
     "effects": schema.Effect,
@@ -35,7 +37,11 @@ RECORDS: dict[str, type[BaseModel]] = {
     "tolerances": schema.Tolerances,
 }
 # Records that a key of the table tells apart, by its values; a serial source needs two such keys.
-LINKS: dict[str, type[BaseModel]] = {"rigid": schema.RigidLink, "flexible": schema.FlexibleLink}
+LINKS: dict[str, type[BaseModel]] = {
+    "rigid": schema.RigidLink,
+    "cross": schema.RigidLink,
+    "flexible": schema.FlexibleLink,
+}
 SOURCES: dict[str, type[BaseModel]] = {"can": sources.CanSource, "canopen": sources.CanopenSource}
 SERIAL: dict[str, type[BaseModel]] = {"frames": sources.SerialFrames, "lines": sources.SerialLines}
 TAGS = {"links": {"kind": tuple(LINKS)}, "sources": {"kind": (*SOURCES, "serial"), "format": tuple(SERIAL)}}
@@ -112,6 +118,8 @@ def _expected(kind: str, first: ErrorDetails, context: dict[str, Any]) -> str:
             return "a text in quotes"
         case "literal_error":
             allowed = context["expected"].replace(" or ", ", ").replace("'", "").split(", ")
+            if first["loc"][0] == "joints" and first["loc"][-1] == "kind":
+                allowed.append("fixed")  # a record of its own, which this one was not taken for
             return quoted(allowed, nearest(str(first["input"]), allowed))
         case "too_short":
             return f"at least {context['min_length']} of them"

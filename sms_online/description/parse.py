@@ -1,7 +1,7 @@
 """From the text of a system file (TOML) to a checked `System`, and the texts that are shipped with the package.
 
-Tables of a file: [spacecraft], then [joint_i], [motor_i] (optional) and [link_i] for i = 1..N, [payload], [[sensor]],
-[[source]], [[effect]], [known], [prior], [controller], [trajectory], [windows],
+Tables of a file: [spacecraft], then [joint_i], [motor_i] (optional) and [link_i] for i = 1..N, those of fixed joints
+last, [payload], [[sensor]], [[source]], [[effect]], [known], [prior], [controller], [trajectory], [windows],
 [tolerances]; keys are the fields of `schema`.
 """
 
@@ -99,12 +99,36 @@ def _arrange(document: Mapping[str, Any], source: str) -> dict[str, Any]:
                 )
     record = {key: document[key] for key in (*PLAIN, "controller", "windows", "tolerances") if key in document}
     record |= {field: document[key] for key, field in RENAMED.items() if key in document}
-    record["joints"] = [document[f"joint_{i}"] for i in range(1, n + 1)]
+    joints = [document[f"joint_{i}"] for i in range(1, n + 1)]
+    moving = _moving(joints, document, source)
+    record["joints"], record["fixed_joints"] = joints[:moving], joints[moving:]
     record["links"] = [document[f"link_{i}"] for i in range(1, n + 1)]
-    record["motors"] = [document.get(f"motor_{i}") for i in range(1, n + 1)]
+    record["motors"] = [document.get(f"motor_{i}") for i in range(1, moving + 1)]
     if "trajectory" in document:
-        record["trajectory"] = _arrange_trajectory(document["trajectory"], n, source)
+        record["trajectory"] = _arrange_trajectory(document["trajectory"], moving, source)
     return record
+
+
+def _moving(joints: list[Any], document: Mapping[str, Any], source: str) -> int:
+    """Number of joints that move; InputError where a fixed one comes before them, or has a motor."""
+    for i, joint in enumerate(joints, start=1):
+        if isinstance(joint, dict) and isinstance(joint.get("parent"), list):
+            found = f"several, {joint['parent']}: a closed chain"
+            raise InputError(source, f"joint_{i}.parent", found, "one parent: links and joints make a tree")
+    fixed = [isinstance(joint, dict) and joint.get("kind") == "fixed" for joint in joints]
+    moving = fixed.index(True) if True in fixed else len(joints)
+    if moving == 0:
+        raise InputError(source, "joint_1", "a fixed joint, and none that moves", "at least one joint that moves")
+    if not all(fixed[moving:]):
+        after = moving + fixed[moving:].index(False) + 1
+        found = f"a fixed joint before joint_{after}, which moves"
+        raise InputError(
+            source, f"joint_{moving + 1}", found, "fixed joints numbered last; parent = 'link_i' places them"
+        )
+    for i in range(moving + 1, len(joints) + 1):
+        if f"motor_{i}" in document:
+            raise InputError(source, f"motor_{i}", f"a motor at joint_{i}, which is fixed", "no such table")
+    return moving
 
 
 def _arrange_trajectory(table: Any, n: int, source: str) -> Any:

@@ -69,35 +69,59 @@ class Motor(Record):
     stator_inertia: Inertia = Inertia()
 
 
-class Joint(Record):
+class Mount(Record):
+    """Where a joint is mounted.
+
+    parent: what it is mounted on, `base` or `link_i`; if not stated the link before, and the base for joint 1.
+    mount_position: of the mount frame's origin from the end of the parent, in the end's axes (of `base`: from the
+    origin of {0}), m.
+    mount_rotation: rotation vector from the end's axes to the mount frame, rad.
+    """
+
+    parent: str | None = None
+    mount_position: Vector3 = (0.0, 0.0, 0.0)
+    mount_rotation: Vector3 = (0.0, 0.0, 0.0)
+
+
+class Joint(Mount):
     """A joint; in brackets the units of a prismatic one.
 
     kind: whether the joint turns or slides.
     axis: unit vector of the joint's axis in the mount frame.
-    mount_rotation: rotation vector from the end of the link before to the mount frame, rad.
+    passive: without a motor: no torque but that of its own spring and damper, which act between the parent and q.
     gear_ratio: n, turns of the motor to one of the joint (rad/m).
-    transmission: `flexible`, a spring and a damper between θ_m and q; or `rigid`, q = θ_m.
+    transmission: `flexible`, a spring and a damper between θ_m and q; or `rigid`, q = θ_m, of a passive joint neither
+    spring nor damper.
     stiffness: k of the spring, N m/rad (N/m).
     damping: b of the damper, N m s/rad (N s/m).
     """
 
     kind: Literal["revolute", "prismatic"] = "revolute"
     axis: Vector3 = (0.0, 0.0, 1.0)
-    mount_rotation: Vector3 = (0.0, 0.0, 0.0)
+    passive: bool = False
     gear_ratio: Positive = 1.0
     transmission: Literal["flexible", "rigid"] = "flexible"
     stiffness: NonNegative = 0.0
     damping: NonNegative = 0.0
 
 
+class FixedJoint(Mount):
+    """A joint that does not move: link i is rigidly attached to its parent. Numbered after all those that move.
+
+    kind: `fixed`.
+    """
+
+    kind: Literal["fixed"]
+
+
 class RigidLink(RigidBody):
     """A rigid link; frame {i} has its origin in joint i.
 
-    kind: `rigid`.
+    kind: `rigid`; or `cross`, without mass and length, between the axes of a universal or spherical joint.
     tip: where the next joint, or the payload, is mounted, m.
     """
 
-    kind: Literal["rigid"]
+    kind: Literal["rigid", "cross"]
     tip: Vector3 = (0.0, 0.0, 0.0)
 
 
@@ -105,6 +129,8 @@ class FlexibleLink(Record):
     """A uniform flexible link along the x axis of its frame, with a marker at the end of each of its elements.
 
     kind: `flexible`.
+    root_position: of the link's root from joint i, in the joint's frame, m: a bracket without mass.
+    root_rotation: rotation vector from the joint's frame to the link's frame {i}, rad.
     length: L, m.
     elements: number of elements, and of markers, equally spaced; the last one is at the tip.
     mass_per_length: ρA, kg/m.
@@ -119,6 +145,8 @@ class FlexibleLink(Record):
     """
 
     kind: Literal["flexible"]
+    root_position: Vector3 = (0.0, 0.0, 0.0)
+    root_rotation: Vector3 = (0.0, 0.0, 0.0)
     length: Positive
     elements: Annotated[int, Field(ge=1)]
     mass_per_length: Positive
@@ -270,7 +298,7 @@ EXACT = Tolerances.model_validate("none")
 
 
 class System(Record):
-    """A whole testbed; joints, motors and links are in order from the base outwards.
+    """A whole testbed; joints, motors and links are in the order of their numbers.
 
     name: of the system.
     title: a line for reports.
@@ -281,8 +309,9 @@ class System(Record):
     spacecraft: the free-floating base; without it the base is fixed.
     joints: `[joint_1]`, `[joint_2]`, … in a system file.
     motors: `[motor_1]`, …; one without a table has neither mass nor inertia.
-    links: `[link_1]`, …, one for each joint.
-    payload: a rigid body at the tip of the last link, in that link's tip frame.
+    fixed_joints: the last `[joint_i]` of a system file, of kind `fixed`.
+    links: `[link_1]`, …, one for each joint, the fixed ones included.
+    payload: a rigid body at the tip of the link of the last joint that moves, in that link's tip frame.
     sensors: `[[sensor]]` tables.
     sources: `[[source]]` tables, the devices of a live session.
     effects: `[[effect]]` tables.
@@ -305,6 +334,7 @@ class System(Record):
     spacecraft: Spacecraft | None = None
     joints: Annotated[tuple[Joint, ...], Field(min_length=1)]
     motors: tuple[Motor | None, ...]
+    fixed_joints: tuple[FixedJoint, ...] = ()
     links: tuple[Link, ...]
     payload: RigidBody | None = None
     sensors: tuple[Sensor, ...] = ()

@@ -21,7 +21,9 @@ from sms_online.model.parameters import Parameter
 from sms_online.stream import Array
 
 Kind = Literal["force", "inertia", "channel", "kinematics"]
-Place = Literal["joint", "flexible joint", "later joint", "link", "linear link", "base", "tip", "angle", "position"]
+Place = Literal[
+    "joint", "driven joint", "flexible joint", "later joint", "link", "linear link", "base", "tip", "angle", "position",
+]  # fmt: skip
 # Speed below which an axis stands still, rad/s (m/s): an integrator cannot follow a jump, and encoders resolve no less.
 STANDSTILL = 1e-4
 # Kinds of events that effects are named after.

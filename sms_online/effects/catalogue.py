@@ -9,7 +9,7 @@ import math
 from collections.abc import Callable, Iterable, Mapping
 from fnmatch import fnmatchcase
 
-from sms_online.description.channels import channels, drive_channel, strain_channel
+from sms_online.description.channels import channels, drive_channels, has_motor_side, strain_channel
 from sms_online.description.explain import hint, nearest
 from sms_online.description.schema import Effect, FlexibleLink, System
 from sms_online.effects.base import Constant, Entry, Place, Site
@@ -62,14 +62,17 @@ BEGINNING = tuple(sorted(entry.name for entry in ENTRIES.values() if entry.trait
 def places(system: System, at: Place) -> tuple[str, ...]:
     """Where effects of a kind of place may sit in a system; for channels, the channels."""
     joints = [f"joint_{i}" for i in range(1, len(system.joints) + 1)]
+    driven = tuple(f"joint_{i}" for i in drive_channels(system).values())
     flexible = [(f"link_{i}", k) for i, k in enumerate(system.links, start=1) if isinstance(k, FlexibleLink)]
     match at:
         case "joint":
             return tuple(joints)
+        case "driven joint":
+            return driven
         case "later joint":
-            return tuple(joints[1:])
+            return tuple(name for name in driven if name != joints[0])
         case "flexible joint":
-            return tuple(n for n, j in zip(joints, system.joints, strict=True) if j.transmission == "flexible")
+            return tuple(n for n, j in zip(joints, system.joints, strict=True) if has_motor_side(j))
         case "link":
             return tuple(name for name, _ in flexible)
         case "linear link":
@@ -83,7 +86,7 @@ def places(system: System, at: Place) -> tuple[str, ...]:
             names = [f"{kind}_{i}" for i, turns in enumerate(revolute, start=1) if turns for kind in ("q", "theta_m")]
             return tuple(c for c in channels(system) if c in names)
         case "position":
-            drives = {drive_channel(system, i) for i in range(1, len(joints) + 1)}
+            drives = drive_channels(system)
             return tuple(c for c in channels(system) if c not in drives and not c.startswith(("v_S", "omega", "gyro")))
 
 

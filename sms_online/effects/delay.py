@@ -125,7 +125,7 @@ class TorqueDelay(Convolved):
     """
 
     entry = Entry(
-        "torque_delay", "channel", "joint", {"time": "s"}, "fast reversals of the torque",
+        "torque_delay", "channel", "driven joint", {"time": "s"}, "fast reversals of the torque",
         traits=Traits(least=SHORTEST_TORQUE_DELAY, most=LONGEST_FOUND),
     )  # fmt: skip
     linear = (Linear("time", "s", "torque rate", -1.0),)

@@ -32,7 +32,7 @@ class Cogging(MotorSide):
     """
 
     entry = Entry(
-        "cogging", "force", "joint", {"amplitude": "N m", "phase": "rad"},
+        "cogging", "force", "driven joint", {"amplitude": "N m", "phase": "rad"},
         "many motor turns, under little and much torque (ripple grows with it)",
         {"order": Shape("", 6.0, lambda ranges: ORDERS, counted=True)},
         traits=Traits(signed=True, curve=Curve("phase in the motor's turn")),
@@ -60,7 +60,7 @@ class TorqueRipple(MotorSide):
     """
 
     entry = Entry(
-        "torque_ripple", "force", "joint", {"amplitude": "", "phase": "rad"},
+        "torque_ripple", "force", "driven joint", {"amplitude": "", "phase": "rad"},
         "many motor turns, under little and much torque (cogging does not grow with it)",
         {"order": Shape("", 6.0, lambda ranges: ORDERS, counted=True)},
         traits=Traits(signed=True, least=LEAST_RATIO, most=LARGEST_RATIO),
@@ -90,7 +90,7 @@ class TorqueOffset(MotorSide):
     """
 
     entry = Entry(
-        "torque_offset", "force", "joint", {"torque": "N m"}, "standstill under a known torque",
+        "torque_offset", "force", "driven joint", {"torque": "N m"}, "standstill under a known torque",
         traits=Traits(signed=True, curve=Curve("motor speed"), begins=True, calibrates="drive_offset"),
     )  # fmt: skip
 

@@ -1,14 +1,15 @@
-"""Kinematics of the serial chain, (8)–(12), (16)–(22): frames, their twists, and the rates of these.
+"""Kinematics of the tree of links, (8)–(12), (16)–(22): frames, their twists, and the rates of these.
 
 One recursion carries m columns of generalized speeds at once: the actual speeds (m = 1) give velocities, the identity
 (m = n_v) gives Jacobians. Every twist is stacked as linear over angular velocity in the axes of its own frame.
 
-Frames, from the base outwards: 0 is {0} with origin in joint 1; mount i is the frame that holds stator i; link i is
-{i}; the last one is the end of the last link.
+Frames: 0 is {0} with origin in joint 1; 2 i - 1 is mount i, which holds stator i; 2 i is {i} of link i; the last one is
+the end of the link of the last joint that moves, where a payload is. What a joint is mounted on comes before it.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 
@@ -16,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sms_online.description.schema import FlexibleLink, Joint, RigidLink, System
+from sms_online.description.tree import BASE, Tree, mounts, tree_of
 from sms_online.model import so3
 from sms_online.model.beam import LinearLink
 from sms_online.model.flexible import LinkKinematics, Shape, ShapeRate
@@ -38,23 +40,64 @@ def link_kinematics(link: FlexibleLink, free_end: bool) -> LinkKinematics:
     return LinearLink(link) if link.kinematics == "linear" else ExactRod(link, free_end=free_end)
 
 
+@dataclass(frozen=True)
+class Bracket:
+    """A rigid displacement and turn, in the axes before the turn; None where there is none.
+
+    offset (3,) m; shift (3, 3): minus its cross-product matrix, which adds v + ω × arm.
+    """
+
+    offset: Array | None
+    shift: Array | None
+    rotation: Array | None
+
+    @classmethod
+    def of(cls, position: Sequence[float], rotation: Sequence[float]) -> Bracket:
+        """Bracket of a position, m, and a rotation vector, rad."""
+        offset = np.array(position) if any(position) else None
+        turn = so3.RotationVector(np.array(rotation)).matrix if any(rotation) else None
+        return cls(offset, None if offset is None else -so3.skew(offset), turn)
+
+    def pose(self, frame: Frame) -> Frame:
+        """The frame at its other end."""
+        origin = frame.origin if self.offset is None else frame.origin + frame.rotation @ self.offset
+        return Frame(origin, frame.rotation if self.rotation is None else frame.rotation @ self.rotation)
+
+    def carry(self, twist: Array) -> Array:
+        """Twists (B, 6, m), or their rates, of the frame at its other end."""
+        if self.shift is not None:
+            twist = _shift(twist, self.shift)
+        return twist if self.rotation is None else _turn_back(self.rotation, twist)
+
+    def carry_back(self, twist: Array) -> Array:
+        """Inverse of `carry`."""
+        if self.rotation is not None:
+            twist = _turn_back(self.rotation.T, twist)
+        return twist if self.shift is None else _shift(twist, -self.shift)
+
+
+NO_BRACKET = Bracket(None, None, None)
+
+
 class Chain:
     """The constant geometry of a system; `configure` gives it a configuration."""
 
     def __init__(self, system: System, layout: Layout) -> None:
         self.layout = layout
         self.joints: tuple[Joint, ...] = system.joints
+        self.tree: Tree = tree_of(system)
         self.axes = [np.array(joint.axis) for joint in system.joints]
-        # None where a mount is not turned at all.
-        self.mounts = [
-            so3.RotationVector(np.array(joint.mount_rotation)).matrix if any(joint.mount_rotation) else None
-            for joint in system.joints
+        every = mounts(system)
+        # From the end of the parent to each mount, and from each joint to its link's root.
+        self.mounts = [Bracket.of(mount.mount_position, mount.mount_rotation) for mount in every]
+        self.roots = [
+            Bracket.of(link.root_position, link.root_rotation) if isinstance(link, FlexibleLink) else NO_BRACKET
+            for link in system.links
         ]
         self.links = system.links
         self.flexible: list[LinkKinematics | None] = []
         for i, link in enumerate(system.links):
-            last = i == len(system.links) - 1
-            free_end = last and system.payload is None
+            free_end = i in self.tree.ending and (i != self.tree.last or system.payload is None)
             self.flexible.append(None if isinstance(link, RigidLink) else link_kinematics(link, free_end))
         tracked = system.spacecraft.tracked_point if system.spacecraft is not None else (0.0, 0.0, 0.0)
         self.joint_1_from_S = -np.array(tracked)
@@ -70,15 +113,35 @@ class Chain:
         # A_i(q) is a combination of these by (1, sin q, 1 - cos q).
         self.turn_basis = [so3.turn_basis(axis) for axis in self.axes]
 
-    def moves(self, frame: int, own: slice) -> NDArray[np.bool_]:
-        """Which speeds (n_v,) move a body in a frame that has speeds of its own besides."""
-        mask = np.zeros(self.layout.n_v, dtype=bool)
-        mask[: self.layout.n_base_speeds] = True
-        mask[own] = True
-        for i in range(len(self.joints)):
-            mask[self.layout.q[i]] |= frame >= 2 * i + 2
-            if frame > 2 * i + 2:
-                mask[self.layout.q_f[i]] = True
+    @property
+    def tip_frame(self) -> int:
+        """Frame at the end of the link of the last joint that moves."""
+        return 2 * len(self.links) + 1
+
+    def link_of(self, frame: int) -> int:
+        """Link (from 0) that a frame belongs to; BASE of {0}."""
+        return self.tree.last if frame == self.tip_frame else (frame - 1) // 2
+
+    def inwards(self, frame: int) -> tuple[int, int]:
+        """Sorts frames from the tips to the base: every run of links that follow one another stays together."""
+        link = self.link_of(frame)
+        place = len(self.links) if link == BASE else -self.tree.outwards.index(link)
+        return place, -frame
+
+    def moving(self, frames: Iterable[int]) -> NDArray[np.bool_]:
+        """Which speeds (n_v,) move what sits in some frames, but for speeds of its own."""
+        layout = self.layout
+        mask = np.zeros(layout.n_v, dtype=bool)
+        mask[: layout.n_base_speeds] = True
+        for frame in frames:
+            link = self.link_of(frame)
+            if link == BASE:
+                continue
+            before = self.tree.inwards(link)
+            turned = before if frame == 2 * link + 1 else (link, *before)
+            mask[[layout.q[i] for i in turned if i < len(layout.q)]] = True
+            for i in before if frame != self.tip_frame else (link, *before):
+                mask[layout.q_f[i]] = True
         return mask
 
     def configure(self, x: Array) -> Configuration:
@@ -125,21 +188,30 @@ class Configuration:
     def frames(self) -> list[Frame]:
         """Poses of all frames; velocities do not need them, gravity and pictures do."""
         chain = self.chain
-        end = Frame(self.r_S + self.T_0 @ chain.joint_1_from_S, self.T_0)
-        frames = [end]
-        for i, (turn, slide) in enumerate(zip(self.turns, self.slides, strict=True)):
-            C, description, shape = chain.mounts[i], chain.links[i], self.shape(i)
-            mount = end if C is None else Frame(end.origin, end.rotation @ C)
-            origin = mount.origin if slide is None else mount.origin + (mount.rotation @ slide[..., None])[..., 0]
-            link = Frame(origin, mount.rotation @ turn)
-            if shape is not None:
-                tip, rotation = shape.tip, link.rotation @ shape.tip_rotation
-            else:
-                assert isinstance(description, RigidLink)
-                tip, rotation = np.array(description.tip), link.rotation
-            end = Frame(link.origin + (link.rotation @ tip[..., None])[..., 0], rotation)
-            frames += [mount, link]
-        return [*frames, end]
+        base = Frame(self.r_S + self.T_0 @ chain.joint_1_from_S, self.T_0)
+        frames = [base] * (chain.tip_frame + 1)
+        for i in chain.tree.outwards:
+            parent = chain.tree.parents[i]
+            mount = chain.mounts[i].pose(base if parent == BASE else self.end(parent, frames[2 * parent + 2]))
+            link = mount
+            if i < len(chain.joints):
+                slide = self.slides[i]
+                origin = mount.origin if slide is None else mount.origin + (mount.rotation @ slide[..., None])[..., 0]
+                link = Frame(origin, mount.rotation @ self.turns[i])
+            frames[2 * i + 1 : 2 * i + 3] = [mount, chain.roots[i].pose(link)]
+        last = chain.tree.last
+        frames[-1] = self.end(last, frames[2 * last + 2])
+        return frames
+
+    def end(self, i: int, link: Frame) -> Frame:
+        """The end of link i (from 0), with its frame {i} given."""
+        shape, description = self.shape(i), self.chain.links[i]
+        if shape is not None:
+            tip, rotation = shape.tip, link.rotation @ shape.tip_rotation
+        else:
+            assert isinstance(description, RigidLink)
+            tip, rotation = np.array(description.tip), link.rotation
+        return Frame(link.origin + (link.rotation @ tip[..., None])[..., 0], rotation)
 
     @cached_property
     def jacobians(self) -> list[Array]:
@@ -148,26 +220,33 @@ class Configuration:
 
     def twists(self, rates: Array, frames: int | None = None) -> list[Array]:
         """Twists (B, 6, m) of all frames, or of the first few, for columns of speeds `rates` (B or 1, n_v, m)."""
-        chain, layout = self.chain, self.chain.layout
-        twist = _turn_back(self.T_0, chain.select_base @ rates)
-        twist[:, :3] += chain.base_arm @ twist[:, 3:]
-        out = [twist]
-        for i in range(len(chain.joints)):
-            C = chain.mounts[i]
-            mount = twist if C is None else _turn_back(C, twist)
-            slide = self.slides[i]
-            moved = mount if slide is None else _shift(mount, -so3.skew(slide))
-            link = _turn_back(self.turns[i], moved)
-            rows = slice(3, 6) if slide is None else slice(0, 3)
-            link[:, rows] += chain.axes[i][:, None] * rates[:, layout.q[i], None, :]
-            out += [mount, link]
-            if frames is not None and len(out) >= frames:
-                return out
-            twist = self._unturned_end(i, link, rates)
-            shape = self.shape(i)
-            if shape is not None:
-                twist = _turn_back(shape.tip_rotation, twist)
-        return [*out, twist]
+        chain = self.chain
+        base = _turn_back(self.T_0, chain.select_base @ rates)
+        base[:, :3] += chain.base_arm @ base[:, 3:]
+        count = chain.tip_frame + 1 if frames is None else frames
+        out = [base] * max(count, chain.tip_frame)
+        for i in chain.tree.outwards:
+            parent = chain.tree.parents[i]
+            mount = chain.mounts[i].carry(base if parent == BASE else self._end(parent, out[2 * parent + 2], rates))
+            link = self._joint(i, mount, rates) if i < len(chain.joints) else mount
+            out[2 * i + 1 : 2 * i + 3] = [mount, chain.roots[i].carry(link)]
+        if count > chain.tip_frame:
+            last = chain.tree.last
+            out[chain.tip_frame] = self._end(last, out[2 * last + 2], rates)
+        return out
+
+    def _joint(self, i: int, mount: Array, rates: Array) -> Array:
+        """Twists beyond joint i (from 0) for those of its mount."""
+        slide, q = self.slides[i], self.chain.layout.q[i]
+        link = _turn_back(self.turns[i], mount if slide is None else _shift(mount, -so3.skew(slide)))
+        rows = slice(3, 6) if slide is None else slice(0, 3)
+        link[:, rows] += self.chain.axes[i][:, None] * rates[:, q, None, :]
+        return link
+
+    def _end(self, i: int, link: Array, rates: Array) -> Array:
+        """Twists of the end of link i (from 0) for those of its frame {i}."""
+        twist, shape = self._unturned_end(i, link, rates), self.shape(i)
+        return twist if shape is None else _turn_back(shape.tip_rotation, twist)
 
     def _unturned_end(self, i: int, link: Array, rates: Array) -> Array:
         """Twists at the end of link i (from 0), still in the axes of {i}."""
@@ -205,26 +284,36 @@ class Configuration:
         # Undo the shift to joint 1 to reach the twist at S, whose inertial components are constant.
         at_S = twists[0].copy()
         at_S[:, :3] -= chain.base_arm @ at_S[:, 3:]
-        rate = -_spin(omega_body, at_S)
-        rate[:, :3] += chain.base_arm @ rate[:, 3:]
-        out = [rate]
-        for i in range(len(chain.joints)):
-            mount_twist, link_twist = twists[2 * i + 1], twists[2 * i + 2]
-            C = chain.mounts[i]
-            mount = rate if C is None else _turn_back(C, rate)
-            slide = self.slides[i]
-            q_dot = v[:, layout.q[i]]
-            spin = q_dot[:, None] * chain.axes[i]
-            if slide is None:
-                moved = link_twist.copy()
-                moved[:, 3:] -= chain.axes[i][:, None] * rates[:, layout.q[i], None, :]
-                link = _turn_back(self.turns[i], mount) - _spin(spin, moved)
-            else:
-                link = _shift(mount, -so3.skew(slide))
-                link[:, :3] -= so3.skew(spin) @ mount_twist[:, 3:]
-            out += [mount, link]
-            rate = self._end_rate(i, link, link_twist, rates, shape_rates[i])
-        return [*out, rate]
+        base = -_spin(omega_body, at_S)
+        base[:, :3] += chain.base_arm @ base[:, 3:]
+        out = [base] * (chain.tip_frame + 1)
+
+        def end(i: int) -> Array:
+            return self._end_rate(i, out[2 * i + 2], twists[2 * i + 2], rates, shape_rates[i])
+
+        for i in chain.tree.outwards:
+            parent = chain.tree.parents[i]
+            mount = chain.mounts[i].carry(base if parent == BASE else end(parent))
+            link = mount
+            if i < len(chain.joints):
+                link = self._joint_rate(i, mount, twists[2 * i + 1], twists[2 * i + 2], rates, v[:, layout.q[i]])
+            out[2 * i + 1 : 2 * i + 3] = [mount, chain.roots[i].carry(link)]
+        out[-1] = end(chain.tree.last)
+        return out
+
+    def _joint_rate(
+        self, i: int, mount: Array, mount_twist: Array, link_twist: Array, rates: Array, q_dot: Array
+    ) -> Array:
+        """Rates of the twists beyond joint i (from 0) for those of its mount."""
+        chain, slide = self.chain, self.slides[i]
+        spin = q_dot[:, None] * chain.axes[i]
+        if slide is None:
+            moved = chain.roots[i].carry_back(link_twist).copy()
+            moved[:, 3:] -= chain.axes[i][:, None] * rates[:, chain.layout.q[i], None, :]
+            return _turn_back(self.turns[i], mount) - _spin(spin, moved)
+        link = _shift(mount, -so3.skew(slide))
+        link[:, :3] -= so3.skew(spin) @ mount_twist[:, 3:]
+        return link
 
     def _end_rate(self, i: int, link: Array, link_twist: Array, rates: Array, shape_rate: ShapeRate | None) -> Array:
         """Rates of the twists at the end of link i (from 0), in the end's axes."""

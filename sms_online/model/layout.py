@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sms_online.description.channels import AXES, NODAL
+from sms_online.description.channels import AXES, NODAL, has_motor_side
 from sms_online.description.schema import FlexibleLink, System
 from sms_online.model import so3
 from sms_online.stream import Array
@@ -38,7 +38,7 @@ def strain_names(link: FlexibleLink) -> tuple[str, ...]:
 
 @dataclass(frozen=True)
 class Layout:
-    """Where each coordinate sits; theta_m[i] is q[i] on a rigid joint."""
+    """Where each coordinate sits; theta_m[i] is q[i] on a rigid or passive joint. Fixed joints have none."""
 
     planar: bool
     free: bool
@@ -113,7 +113,7 @@ def build_layout(system: System) -> Layout:
     q = tuple(len(base_speeds) + i for i in range(len(system.joints)))
     theta_m = list(q)
     for i, joint in enumerate(system.joints):
-        if joint.transmission == "flexible":
+        if has_motor_side(joint):
             theta_m[i] = len(base_speeds) + len(names)
             names.append(f"theta_m_{i + 1}")
     q_f = []

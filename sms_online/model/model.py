@@ -54,13 +54,14 @@ class Model:
         self._damping = QuadraticForms(self.dampers, self.layout.n_v)
         for inertia in inertias:
             self._add_inertia(parameters, inertia)
-        # Frames that something sits in: the last one, the end of the last link, holds the payload alone.
+        # Frames that something sits in: the last one, at the tip, holds the payload alone.
         self._frames = 1 + max(term.frame for term in (*self.bodies, *self.links))
-        # Kinetic terms from the tip to the base, the first of each one's columns then, and the columns' places in π.
+        # Kinetic terms from the tips to the base, the first of each one's columns then, and the columns' places in π.
         terms = (*self.bodies, *self.links)
+        self._moving = self.chain.moving(term.frame for term in terms)
         self._kinetic: list[int] = []
         self._kinetic_order: list[tuple[int, int]] = []
-        for k in sorted(range(len(terms)), key=lambda k: -terms[k].frame):
+        for k in sorted(range(len(terms)), key=lambda k: self.chain.inwards(terms[k].frame)):
             self._kinetic_order.append((k, len(self._kinetic)))
             self._kinetic += terms[k].parameters
         # Of each effect, its columns in π and its internal states in `Inputs.states`.
@@ -99,11 +100,10 @@ class Model:
         for i, (rotor, _) in motors.items():
             add([rotor], 2 * i - 1, speeds[i])
         for i, link in enumerate(system.links, start=1):
-            if isinstance(link, RigidLink):
+            if isinstance(link, RigidLink) and link.kind == "rigid":
                 add(rigid_body(f"link_{i}", str(i), link, planar, spacecraft=False), 2 * i, none)
         if system.payload is not None:
-            frame = 2 * len(system.joints) + 1
-            add(rigid_body("payload", "p", system.payload, planar, spacecraft=False), frame, none)
+            add(rigid_body("payload", "p", system.payload, planar, spacecraft=False), self.chain.tip_frame, none)
         # After the links: a motor that sits on a rigid link is lumped into that link, not the link into the motor.
         for i, (_, stator) in motors.items():
             add(stator, 2 * i - 1, speeds[i])
@@ -151,8 +151,9 @@ class Model:
                     if kind == "stiffness"
                     else ("N s/m" if joint.kind == "prismatic" else "N m s/rad")
                 )
-                ends = [self.layout.theta_m[i - 1], self.layout.q[i - 1]]
-                springs.append(Spring(len(parameters), ends, np.array([[1.0, -1.0], [-1.0, 1.0]])))
+                ends = [self.layout.q[i - 1]] if joint.passive else [self.layout.theta_m[i - 1], self.layout.q[i - 1]]
+                matrix = np.eye(1) if joint.passive else np.array([[1.0, -1.0], [-1.0, 1.0]])
+                springs.append(Spring(len(parameters), ends, matrix))
                 parameters.append(Parameter(f"joint_{i}.{kind}", f"{symbol}_{i}", unit, getattr(joint, kind)))
 
     def of_geometry(self, system: System) -> Model:
@@ -182,7 +183,7 @@ class Model:
     def generalized_force(self, joint_torque: Array) -> Array:
         """Q of (41), (B, n_v), for torques after the gear n τ (B, joints), N m (N)."""
         Q = np.zeros((joint_torque.shape[0], self.layout.n_v))
-        Q[:, list(self.layout.theta_m)] = joint_torque
+        Q[:, list(self.layout.theta_m)] = joint_torque  # of passive joints 0
         return Q
 
     def energy_columns(self, x: Array, v: Array) -> Array:
@@ -263,7 +264,7 @@ class Model:
         P, G = (np.zeros((x.shape[0], self.layout.n_v, self.n_pi)) for _ in range(2))
         configuration = self.chain.configure(x)
         self._add_forces(G, x, v, inputs)
-        if rows is not None and not self.chain.moves(self._frames - 1, slice(0, 0))[list(rows)].any():
+        if rows is not None and not self._moving[list(rows)].any():
             # Motor sides of flexible joints alone: no frame moves with them, their momentum is all there is.
             rates = v[:, :, None]
             twists = configuration.twists(rates, self._frames)

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from sms_online.description.schema import FlexibleLink, Joint, RigidLink, System, Tolerances
+from sms_online.description.schema import FlexibleLink, RigidLink, System, Tolerances
 from sms_online.stream import Array
 
 
@@ -33,18 +33,29 @@ def perturbed(system: System, rng: np.random.Generator) -> System:
     def moved(point: tuple[float, float, float], tolerance: float) -> tuple[float, ...]:
         return _vector(np.array(point) + tolerance * inside * rng.standard_normal(3))
 
-    def turned(joint: Joint) -> Joint:
-        described = Rotation.from_rotvec(joint.mount_rotation)
+    def turned(rotation: tuple[float, float, float]) -> tuple[float, ...]:
         draw = Rotation.from_rotvec(tolerances.axis * about * rng.standard_normal(3))
-        return joint.model_copy(update={"mount_rotation": _vector((described * draw).as_rotvec())})
+        return _vector((Rotation.from_rotvec(rotation) * draw).as_rotvec())
+
+    def mounted(mount: Any) -> Any:
+        update = {"mount_rotation": turned(mount.mount_rotation)}
+        if any(mount.mount_position):
+            update["mount_position"] = moved(mount.mount_position, tolerances.length)
+        return mount.model_copy(update=update)
 
     def resized(link: RigidLink | FlexibleLink) -> RigidLink | FlexibleLink:
         if isinstance(link, RigidLink):
             return link.model_copy(update={"tip": moved(link.tip, tolerances.length)})
-        return link.model_copy(update={"length": link.length + tolerances.length * rng.standard_normal()})
+        update: dict[str, Any] = {"length": link.length + tolerances.length * rng.standard_normal()}
+        if any(link.root_position):
+            update["root_position"] = moved(link.root_position, tolerances.length)
+        if any(link.root_rotation):
+            update["root_rotation"] = turned(link.root_rotation)
+        return link.model_copy(update=update)
 
     update: dict[str, Any] = {
-        "joints": tuple(turned(joint) for joint in system.joints),
+        "joints": tuple(mounted(joint) for joint in system.joints),
+        "fixed_joints": tuple(mounted(joint) for joint in system.fixed_joints),
         "links": tuple(resized(link) for link in system.links),
         "gravity": moved(system.gravity, tolerances.gravity * float(np.linalg.norm(system.gravity))),
     }

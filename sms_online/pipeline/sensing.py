@@ -39,11 +39,12 @@ def stated_period(system: System, channels: Sequence[str]) -> float:
 class Sensing:
     """Which of a source's channels give each coordinate and torque of a model.
 
-    channels: those it takes, in an order of its own. torque_columns: the torques' among them, joint by joint. unused:
-    the source's others. In place of q_i a flexible joint may have the strain of the strip that it stands for, an angle
-    beyond θ_m_i. A flexible link needs one marker at least; where it has fewer readings than coordinates its
+    channels: those it takes, in an order of its own. torque_columns: the torques' among them, drive by drive.
+    unused: the source's others. In place of q_i a flexible joint may have the strain of the strip that it stands for,
+    an angle beyond θ_m_i. A flexible link needs one marker at least; where it has fewer readings than coordinates its
     shape is the static one, and `missing` names what is not read. Not so on a spatial free base, where every marker is
-    needed. Raises InputError, naming the source, when a channel that the model needs is not there.
+    needed.
+    Raises InputError, naming the source, when a channel that the model needs is not there.
     """
 
     def __init__(self, model: Model, available: Sequence[str], source: str) -> None:
@@ -85,14 +86,16 @@ class Sensing:
             self._links[i - 1] = SensedShape(kinematics, read), [need(names[k]) for k in read]
             missing += [name for k, name in enumerate(names) if k not in read]
         self.missing = tuple(missing)
-        self.torque_columns = [need(f"tau_{i}", f"force_{i}") for i in joints]
-        # tau_i is measured at the motor shaft, before the gear; force_i acts on the joint.
+        driven = [i for i in joints if not model.system.joints[i - 1].passive]
+        self.torque_columns = [need(f"tau_{i}", f"force_{i}") for i in driven]
+        # n τ out of these columns: tau_i is measured at the motor shaft, before the gear; force_i acts on the joint.
         self._ratio = np.array(
             [
-                joint.gear_ratio if channels[column].startswith("tau_") else 1.0
-                for joint, column in zip(model.system.joints, self.torque_columns, strict=True)
+                model.system.joints[i - 1].gear_ratio if channels[column].startswith("tau_") else 1.0
+                for i, column in zip(driven, self.torque_columns, strict=True)
             ]
         )
+        self._driven = [i - 1 for i in driven]
         self.channels = tuple(channels)
         self.unused = tuple(name for name in available if name not in channels)
 
@@ -114,7 +117,7 @@ class Sensing:
             assert kinematics is not None
             own = isinstance(kinematics, LinearLink) and shape.complete
             markers.append(stated[columns] if own else np.full(kinematics.n_f, np.nan))
-        joints = stated[self.torque_columns] * self._ratio
+        joints = self._by_joint(stated[self.torque_columns])
         q = stated[self._q]
         for joint, motor in self._beyond:
             q[joint] = np.hypot(q[joint], stated[self._theta_m[motor]])
@@ -194,7 +197,16 @@ class Sensing:
 
     def joint_torque(self, values: Array) -> Array:
         """Torque after the gear n τ (B, joints), N m (N)."""
-        return np.asarray(values[:, self.torque_columns] * self._ratio)
+        return self._by_joint(values[:, self.torque_columns])
+
+    def _by_joint(self, drives: Array) -> Array:
+        """n τ (..., joints) of the drives' readings (..., drives)."""
+        torque = drives * self._ratio
+        if len(self._driven) == len(self.model.system.joints):
+            return np.asarray(torque)
+        out = np.zeros((*drives.shape[:-1], len(self.model.system.joints)))
+        out[..., self._driven] = torque
+        return out
 
     def signals(self, values: Array) -> Array:
         """n τ (B, joints), and what samples (B, channels + n_states) hold beyond the channels."""

@@ -30,7 +30,7 @@ class SensorNoise:
 
     sensors (n_x,), torque (joints,): densities σ² T_s of each position sensor, in the order of the coordinates, and of
     n τ. coordinates (n_x,): 1σ of the coordinates x a grid sample, had they white noise of those densities, and what
-    taking lags off adds. grid (n_x + joints,): the same of the readings of position sensors and of torques. exact:
+    taking lags off adds. grid (n_x + drives,): the same of the readings of position sensors and of torques. exact:
     positions have none, but for rounding.
     """
 
