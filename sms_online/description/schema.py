@@ -72,12 +72,14 @@ class Motor(Record):
 class Mount(Record):
     """Where a joint is mounted.
 
+    name: what it is called elsewhere, in a URDF for instance.
     parent: what it is mounted on, `base` or `link_i`; if not stated the link before, and the base for joint 1.
     mount_position: of the mount frame's origin from the end of the parent, in the end's axes (of `base`: from the
     origin of {0}), m.
     mount_rotation: rotation vector from the end's axes to the mount frame, rad.
     """
 
+    name: str = ""
     parent: str | None = None
     mount_position: Vector3 = (0.0, 0.0, 0.0)
     mount_rotation: Vector3 = (0.0, 0.0, 0.0)
@@ -117,10 +119,12 @@ class FixedJoint(Mount):
 class RigidLink(RigidBody):
     """A rigid link; frame {i} has its origin in joint i.
 
+    name: what it is called elsewhere, in a URDF for instance.
     kind: `rigid`; or `cross`, without mass and length, between the axes of a universal or spherical joint.
     tip: where the next joint, or the payload, is mounted, m.
     """
 
+    name: str = ""
     kind: Literal["rigid", "cross"]
     tip: Vector3 = (0.0, 0.0, 0.0)
 
@@ -128,6 +132,7 @@ class RigidLink(RigidBody):
 class FlexibleLink(Record):
     """A uniform flexible link along the x axis of its frame, with a marker at the end of each of its elements.
 
+    name: what it is called elsewhere, in a URDF for instance.
     kind: `flexible`.
     root_position: of the link's root from joint i, in the joint's frame, m: a bracket without mass.
     root_rotation: rotation vector from the joint's frame to the link's frame {i}, rad.
@@ -144,6 +149,7 @@ class FlexibleLink(Record):
     printed.
     """
 
+    name: str = ""
     kind: Literal["flexible"]
     root_position: Vector3 = (0.0, 0.0, 0.0)
     root_rotation: Vector3 = (0.0, 0.0, 0.0)

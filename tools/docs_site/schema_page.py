@@ -21,6 +21,7 @@ HEADINGS: dict[type[Record], str] = {
     schema.System: "Top level",
     schema.Spacecraft: "`[spacecraft]`",
     schema.Joint: "`[joint_i]`",
+    schema.FixedJoint: '`[joint_i]` of `kind = "fixed"`',
     schema.Motor: "`[motor_i]`",
     schema.RigidLink: '`[link_i]` of `kind = "rigid"`',
     schema.FlexibleLink: '`[link_i]` of `kind = "flexible"`',

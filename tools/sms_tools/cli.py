@@ -100,8 +100,8 @@ def _parser() -> Parser:
     parser.add_argument("--print-completion", action=Completion, choices=("bash", "zsh", "tcsh"), help=text)
     verbs = parser.add_subparsers(metavar="VERB", required=True)
     verb_parsers = (
-        _add_demo, _add_live, _add_record, _add_simulate, _add_replay, _add_diagnose, _add_import, _add_markers,
-        _add_bound,
+        _add_demo, _add_live, _add_record, _add_simulate, _add_replay, _add_diagnose, _add_import, _add_export,
+        _add_markers, _add_bound,
     )  # fmt: skip
     for add in verb_parsers:
         add(verbs)
@@ -147,8 +147,8 @@ def _add_noise(parser: Parser) -> None:
     parser.add_argument("--seed", metavar="N", type=_whole(0), default=0, help="of the noise, 0 by default")
 
 
-def _add_capture(parser: Parser) -> None:
-    parser.add_argument("--capture", metavar="FILE.csv", type=Path, required=True, help="the capture to write")
+def _add_capture(parser: Parser, required: bool = True) -> None:
+    parser.add_argument("--capture", metavar="FILE.csv", type=Path, required=required, help="the capture to write")
 
 
 def _add_demo(verbs: Verbs) -> None:
@@ -244,10 +244,23 @@ def _add_diagnose(verbs: Verbs) -> None:
 
 
 def _add_import(verbs: Verbs) -> None:
-    parser = _add_verb(verbs, "import", "import_data", "Turn a published measurement (.mat) into a capture.")
-    parser.add_argument("kind", metavar="KIND", choices=("quanser", "emps"), help="quanser or emps")
+    text = "Turn a published measurement (.mat) into a capture, or a URDF into a system file."
+    parser = _add_verb(verbs, "import", "import_data", text)
+    parser.add_argument("kind", metavar="KIND", choices=("quanser", "emps", "urdf"), help="quanser, emps or urdf")
     parser.add_argument("source", metavar="SOURCE", type=Path, help="the file as its owners published it")
-    _add_capture(parser)
+    _add_capture(parser, required=False)
+    text = "of a URDF: the system file to write, SOURCE with the ending .toml by default"
+    parser.add_argument("--out", metavar="FILE.toml", type=Path, help=text)
+
+
+def _add_export(verbs: Verbs) -> None:
+    text = "Put estimates into the URDF that a system file was imported from."
+    parser = _add_verb(verbs, "export", "export_urdf", text)
+    parser.add_argument("kind", metavar="KIND", choices=("urdf",), help="urdf")
+    parser.add_argument("source", metavar="SOURCE", type=Path, help="the URDF as it was imported")
+    text = "of a session whose system file was imported from it"
+    parser.add_argument("--results", metavar="results.json", type=Path, required=True, help=text)
+    parser.add_argument("--out", metavar="FILE.urdf", type=Path, required=True, help="the URDF to write")
 
 
 def _add_markers(verbs: Verbs) -> None:
