@@ -21,6 +21,14 @@ from sms_tools.live.signals import termination_interrupts
 PATIENCE = 40.0  # s, of a loaded machine
 
 
+@pytest.fixture(autouse=True)
+def hangup_is_heeded() -> Iterator[None]:
+    """Also where the tests themselves run under nohup, whose sessions heed none."""
+    before = signal.signal(signal.SIGHUP, signal.SIG_DFL)
+    yield
+    signal.signal(signal.SIGHUP, before)
+
+
 @pytest.fixture
 def terminal() -> Iterator[tuple[int, int]]:
     """Both ends of a terminal; the first one may be closed meanwhile."""
