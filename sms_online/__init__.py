@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from sms_adapters.recorded import read_capture, write_capture
+    from sms_adapters.runs import compare
     from sms_adapters.system_file import load_system
     from sms_online.capture import Capture
     from sms_online.description.parse import shipped_systems
@@ -17,6 +18,7 @@ if TYPE_CHECKING:
     from sms_online.diagnosis.diagnosed import Diagnosis, diagnose
     from sms_online.errors import InputError
     from sms_online.pipeline.events import Event
+    from sms_online.repeatability import Comparison
     from sms_online.result import Coefficient, Finding, Parameter, Parameters, Result
     from sms_online.session import Session, estimate
     from sms_online.stream import Block
@@ -32,6 +34,7 @@ _HOMES = {
     "Bounds": "sms_sim.bound",
     "Capture": "sms_online.capture",
     "Coefficient": "sms_online.result",
+    "Comparison": "sms_online.repeatability",
     "Diagnosis": "sms_online.diagnosis.diagnosed",
     "Event": "sms_online.pipeline.events",
     "Finding": "sms_online.result",
@@ -44,6 +47,7 @@ _HOMES = {
     "System": "sms_online.description.schema",
     "Trust": "sms_online.trust",
     "bound": "sms_sim.bound",
+    "compare": "sms_adapters.runs",
     "diagnose": "sms_online.diagnosis.diagnosed",
     "estimate": "sms_online.session",
     "load_system": "sms_adapters.system_file",
@@ -58,6 +62,7 @@ __all__ = [
     "Bounds",
     "Capture",
     "Coefficient",
+    "Comparison",
     "Diagnosis",
     "Event",
     "Finding",
@@ -71,6 +76,7 @@ __all__ = [
     "Trust",
     "__version__",
     "bound",
+    "compare",
     "diagnose",
     "estimate",
     "load_system",

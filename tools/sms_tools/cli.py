@@ -101,7 +101,7 @@ def _parser() -> Parser:
     verbs = parser.add_subparsers(metavar="VERB", required=True)
     verb_parsers = (
         _add_demo, _add_live, _add_record, _add_simulate, _add_replay, _add_diagnose, _add_import, _add_export,
-        _add_markers, _add_bound,
+        _add_markers, _add_bound, _add_compare,
     )  # fmt: skip
     for add in verb_parsers:
         add(verbs)
@@ -280,6 +280,14 @@ def _add_bound(verbs: Verbs) -> None:
     parser.add_argument("--grade", choices=("A", "B", "C"), help=text)
     text = "what the bounds would be without each of the described sensors"
     parser.add_argument("--each-sensor", action="store_true", help=text)
+
+
+def _add_compare(verbs: Verbs) -> None:
+    text = "Each parameter over sessions of one rig, and what has changed."
+    parser = _add_verb(verbs, "compare", "compare", text)
+    text = "results.json of a session, or the folder of its run"
+    parser.add_argument("runs", metavar="RUN", type=Path, nargs="+", help=text)
+    parser.add_argument("--out", metavar="DIR", type=Path, help="where the page goes, runs/<time> by default")
 
 
 def _seconds(positive: bool = False) -> Callable[[str], float]:

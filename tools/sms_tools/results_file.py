@@ -7,9 +7,9 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 from sms_adapters.recorder import being_recorded
+from sms_adapters.runs import NAME
 from sms_online.errors import InputError
 
-NAME = "results.json"
 RUNS = Path("runs")
 
 
