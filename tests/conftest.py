@@ -1,20 +1,36 @@
-"""Simulations that several tests share; each is made once a session."""
+"""Simulations that several tests share; each is made once a run."""
 
 from __future__ import annotations
 
+import os
+
 import numpy as np
 import pytest
+import simulations
 
 from sms_adapters.system_file import load_system
 from sms_online.description.schema import System
 from sms_online.stream import Block
-from sms_sim.simulate import Simulation, exact_states, simulate
+from sms_sim.simulate import Simulation, exact_states
+
+
+def pytest_configure() -> None:
+    """One thread of BLAS for each worker, which has a core of its own."""
+    for library in ("OMP", "OPENBLAS"):
+        os.environ.setdefault(f"{library}_NUM_THREADS", "1")
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _share_motions(tmp_path_factory: pytest.TempPathFactory, worker_id: str) -> None:
+    """The workers of a run integrate a motion once."""
+    if worker_id != "master":
+        simulations.folder = tmp_path_factory.getbasetemp().parent
 
 
 @pytest.fixture(scope="session")
 def planar_session() -> Simulation:
     """The paper's example (Table III) along (46) for 20 s."""
-    return simulate(load_system("paper-planar"), 20.0)
+    return simulations.planar()
 
 
 def noise_free_block(simulation: Simulation, system: System) -> Block:

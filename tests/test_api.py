@@ -53,6 +53,7 @@ def test_the_readme_holds_the_ten_lines() -> None:
     assert set(TEN_LINES.splitlines()) <= set(README.read_text(encoding="utf-8").splitlines())
 
 
+@pytest.mark.slow
 def test_the_ten_lines_run(ten: dict[str, Any]) -> None:
     assert ten["result"].trust.grave
     (finding,) = ten["found"].effects
@@ -65,6 +66,7 @@ def test_the_ten_lines_run(ten: dict[str, Any]) -> None:
             assert abs(parameter.value - parameter.true) < 5.0 * parameter.std
 
 
+@pytest.mark.slow
 def test_an_estimate_is_the_replay_of_the_written_capture(ten: dict[str, Any], tmp_path: Path) -> None:
     path = sms.write_capture(ten["data"], tmp_path / "run.csv")
     assert main(["replay", str(path), "--system", "paper-planar", "--out", str(tmp_path)]) == 0
@@ -75,6 +77,7 @@ def test_an_estimate_is_the_replay_of_the_written_capture(ten: dict[str, Any], t
     assert read.truth["effects"] == ten["data"].truth["effects"]
 
 
+@pytest.mark.slow
 def test_a_session_in_blocks_ends_as_the_estimate(ten: dict[str, Any]) -> None:
     session = ten["session"]
     session.finish()
@@ -85,6 +88,7 @@ def test_a_session_in_blocks_ends_as_the_estimate(ten: dict[str, Any]) -> None:
     assert without_timing(live) == without_timing(whole)
 
 
+@pytest.mark.slow
 def test_results_are_frozen_records(ten: dict[str, Any]) -> None:
     for record in (ten["result"], ten["result"].parameters["joint_1.stiffness"], ten["found"], ten["data"]):
         with pytest.raises(dataclasses.FrozenInstanceError):
@@ -112,6 +116,7 @@ print("same bits" if documents[0] == documents[1] else documents)
 """
 
 
+@pytest.mark.slow
 def test_one_sample_at_a_time_gives_the_same_bits(ten: dict[str, Any], tmp_path: Path) -> None:
     data = ten["data"]
     early = data.t <= 4.0
@@ -276,6 +281,7 @@ def test_results_read_as_tables(axis: sms.System, capture: sms.Capture) -> None:
         assert all(name in text for name in result.parameters)
 
 
+@pytest.mark.slow
 def test_a_recorded_motion_has_bounds() -> None:
     system = sms.load_system("paper-planar")
     bounds = sms.bound(system, sms.simulate(system, 4.0, "B"))

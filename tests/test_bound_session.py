@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from evaluated import results_document
 from numpy.testing import assert_allclose, assert_array_equal
+from simulations import planar
 
-from sms_adapters.system_file import load_system
 from sms_online.cramer_rao import STEP, MotionRecord, cramer_rao_bound, session_bound
 from sms_online.linearised import Motion
 from sms_online.pipeline.estimator import Estimator
@@ -15,7 +15,7 @@ from sms_online.sensor_set import sensor_set
 from sms_online.stream import Array
 from sms_online.trackers.interface import Prior
 from sms_sim.sensors import GRADES
-from sms_sim.simulate import ExactStates, Simulation, exact_states, sampled_blocks, simulate
+from sms_sim.simulate import ExactStates, Simulation, exact_states, sampled_blocks
 
 DURATION = 2.0  # s
 SEED = 12
@@ -23,7 +23,7 @@ SEED = 12
 
 @pytest.fixture(scope="module")
 def simulation() -> Simulation:
-    return simulate(load_system("paper-planar"), DURATION)
+    return planar(DURATION)
 
 
 @pytest.fixture(scope="module")

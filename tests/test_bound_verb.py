@@ -37,6 +37,7 @@ def rig(tmp_path: Path) -> Path:
     return path
 
 
+@pytest.mark.slow
 def test_bounds_rise_with_the_noise_and_without_a_sensor(rig: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["bound", "--system", str(rig), "--each-sensor", "--json"]) == 0
     document = json.loads(capsys.readouterr().out)
@@ -59,6 +60,7 @@ WITHOUT_NOISE = (
 )  # fmt: skip
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", WITHOUT_NOISE)
 def test_a_shipped_system_without_stated_noise_has_the_bounds_of_grade_b(
     name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]

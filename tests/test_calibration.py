@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from net.sessions import TOLERANCE
 from scipy.interpolate import make_interp_spline
+from simulations import planar
 
 from sms_adapters.system_file import load_system
 from sms_online.calibration.found import Calibration
@@ -19,7 +19,7 @@ from sms_online.pipeline.statistics import Statistics
 from sms_online.stream import Array, Block
 from sms_online.trackers.interface import Rows
 from sms_online.trackers.square_root import session_tracker
-from sms_sim.simulate import sampled_blocks, simulate
+from sms_sim.simulate import sampled_blocks
 
 EXACTLY = Tolerances.model_validate("none")
 # Two clocks and two parameters, of rows that tell all of them.
@@ -50,7 +50,7 @@ def test_nothing_is_known_of_a_nuisance_without_a_tolerance() -> None:
 @pytest.fixture(scope="module")
 def exact() -> Block:
     """8 s of the planar example without noise."""
-    blocks = list(sampled_blocks(simulate(load_system("paper-planar"), 8.0, position_tolerance=TOLERANCE), "0"))
+    blocks = list(sampled_blocks(planar(8.0), "0"))
     t, values = (np.concatenate([getattr(block, part) for block in blocks]) for part in ("t", "values"))
     return Block(t, blocks[0].channels, values)
 

@@ -78,6 +78,7 @@ def test_frames_come_as_they_were_sent(bus: tuple[CanReader, can.BusABC]) -> Non
     assert abs(frames.stamp[0] - time.time()) < 60.0
 
 
+@pytest.mark.realtime
 def test_a_frame_that_waited_for_its_reader_arrived_when_it_was_stamped(bus: tuple[CanReader, can.BusABC]) -> None:
     reader, node = bus
     sent = time.monotonic()
@@ -88,6 +89,7 @@ def test_a_frame_that_waited_for_its_reader_arrived_when_it_was_stamped(bus: tup
     assert frames.arrival[0] - sent < 0.2
 
 
+@pytest.mark.realtime
 def test_a_reader_that_is_interrupted_between_two_clocks_makes_no_frame_early(
     bus: tuple[CanReader, can.BusABC], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -118,6 +120,7 @@ def test_a_silent_bus_gives_nothing_and_a_flooded_one_bounded_pieces(bus: tuple[
     assert np.array_equal(concatenate_frames([first, rest]).id, np.arange(MOST_FRAMES + 100) & 0x7FF)
 
 
+@pytest.mark.realtime
 def test_frames_are_stamped_by_the_kernel_over_udp() -> None:
     source = CanBus(name="bus", **UDP)
     reader = CanReader(source, time.monotonic)
@@ -230,7 +233,7 @@ def played(source: CanSource, run: str, speed: float) -> NDArray[np.float64]:
 
 @pytest.mark.skipif(not DATA.is_dir(), reason="the AK80 pendulum's measurements are not at hand (shared/data)")
 @pytest.mark.parametrize("interface", [{"interface": "virtual", "channel": "ak80"}, UDP])
-@pytest.mark.parametrize("speed", [50.0, pytest.param(1.0, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("speed", [50.0, pytest.param(1.0, marks=pytest.mark.realtime)])
 def test_real_words_played_onto_a_bus_equal_the_published_numbers(interface: dict[str, object], speed: float) -> None:
     """The pendulum's candump, read and decoded live: every sample."""
     published = np.loadtxt(DATA / "energy_shaping.csv", delimiter=",", skiprows=1)

@@ -275,6 +275,7 @@ def test_the_demo_shows_the_papers_parameters_converge(bench: Path, capsys: pyte
     assert np.median([abs(p["estimate"] / p["true"] - 1.0) for p in parameters]) < 0.1
 
 
+@pytest.mark.slow
 def test_at_a_terminal_the_demo_draws_its_table_again_and_again(
     bench: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

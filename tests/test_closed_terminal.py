@@ -18,6 +18,7 @@ from test_killed_processes import described_testbed, kill
 from sms_tools.interruption import Interruption
 from sms_tools.live.signals import termination_interrupts
 
+pytestmark = pytest.mark.realtime
 PATIENCE = 40.0  # s, of a loaded machine
 
 

@@ -35,6 +35,9 @@ joint_1 = [{{ frequency = 4.0, sine = 2.0 }}, {{ frequency = 9.0, cosine = 1.0 }
 """
 
 
+pytestmark = pytest.mark.slow
+
+
 @pytest.fixture(scope="module")
 def runs(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
     """Folders of runs, in their order; the description is that of the first."""

@@ -90,6 +90,7 @@ def _identified(corner: float | None, coulomb: float, factor: float, prior: bool
     return estimator, estimator.estimate().pi / true - 1.0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("corner", [200.0, 100.0, 40.0])
 def test_a_slow_link_encoder_does_not_collapse_the_spring(corner: float) -> None:
     found = [_identified(corner, 0.0, factor) for factor in (0.5, 2.0)]
@@ -100,6 +101,7 @@ def test_a_slow_link_encoder_does_not_collapse_the_spring(corner: float) -> None
     np.testing.assert_allclose(found[0][1], found[1][1], atol=1e-3)
 
 
+@pytest.mark.slow
 def test_undeclared_friction_beside_a_slow_encoder_costs_four_percent() -> None:
     for factor in (0.5, 2.0):
         estimator, error = _identified(40.0, 0.01, factor)

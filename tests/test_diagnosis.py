@@ -62,6 +62,7 @@ def told(diagnosis: Diagnosis) -> dict[str, float]:
     return {name: value for name, (value, _) in coefficients(diagnosis, diagnosis.findings[0]).items()}
 
 
+@pytest.mark.slow
 def test_a_session_that_the_model_explains_is_clean() -> None:
     diagnosis = diagnosed()
     assert (diagnosis.verdict, keys(diagnosis)) == ("clean", [])
@@ -69,25 +70,26 @@ def test_a_session_that_the_model_explains_is_clean() -> None:
     assert diagnosis.after.system == diagnosis.before.system
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("text", "accuracy"),
     [
         # The sign of a noisy rate at standstill takes some of the friction away.
         ("coulomb_friction@joint_2:torque=1", 0.05),
-        pytest.param("cubic_stiffness@joint_1:stiffness=300", 0.01, marks=pytest.mark.slow),
+        ("cubic_stiffness@joint_1:stiffness=300", 0.01),
         # Without it the base's rows are best explained by an arm of no mass, whose rows have no noise.
         ("air_drag@base:damping=150", 0.01),
         # Its phase turns by 200 rad a radian: faster than the motion that the arm's own columns are taken from.
         ("cogging@joint_1:amplitude=30,phase=1,order=4", 0.02),
-        pytest.param("torsional_hysteresis@joint_1:torque=5,width=0.02", 0.02, marks=pytest.mark.slow),
-        pytest.param("tip_payload@tip:mass=0.5", 0.02, marks=pytest.mark.slow),
+        ("torsional_hysteresis@joint_1:torque=5,width=0.02", 0.02),
+        ("tip_payload@tip:mass=0.5", 0.02),
         ("sensor_lag@q_1:corner=40", 0.01),
         # Far beyond first order in the delay.
-        pytest.param("torque_delay@joint_2:time=0.03", 0.01, marks=pytest.mark.slow),
+        ("torque_delay@joint_2:time=0.03", 0.01),
         # It rings a hundred radians on: a frequency a few percent off would have nothing in common with it.
-        pytest.param("slosh@base:mass=3,stiffness=867", 0.02, marks=pytest.mark.slow),
-        pytest.param("encoder_offset@theta_m_2:offset=0.01", 0.02, marks=pytest.mark.slow),
-        pytest.param("table_tilt@base:gravity_x=0.003,gravity_y=-0.002", 0.01, marks=pytest.mark.slow),
+        ("slosh@base:mass=3,stiffness=867", 0.02),
+        ("encoder_offset@theta_m_2:offset=0.01", 0.02),
+        ("table_tilt@base:gravity_x=0.003,gravity_y=-0.002", 0.01),
     ],
 )
 def test_the_missing_effect_is_named_with_its_place_and_size(text: str, accuracy: float) -> None:
@@ -102,6 +104,7 @@ def test_the_missing_effect_is_named_with_its_place_and_size(text: str, accuracy
     assert not any(row.beyond for row in diagnosis.after.test.values())
 
 
+@pytest.mark.slow
 def test_two_effects_are_found_in_turn() -> None:
     texts = "viscous_friction@joint_1:damping=2", "cubic_stiffness@joint_2:stiffness=300"
     diagnosis = diagnosed(*texts)
@@ -109,6 +112,7 @@ def test_two_effects_are_found_in_turn() -> None:
     assert set(keys(diagnosis)) == {text.partition(":")[0] for text in texts}
 
 
+@pytest.mark.slow
 def test_an_effect_that_nobody_knows_is_unexplained_where_it_acts() -> None:
     """Cubic stiffness, struck from the catalogue with what resembles it: it depends on the deflection of its joint."""
     alike = ("cubic_stiffness", "backlash", "encoder_eccentricity", "torsional_hysteresis", "encoder_offset")
@@ -126,6 +130,7 @@ def test_an_effect_that_nobody_knows_is_unexplained_where_it_acts() -> None:
     assert diagnosis.unexplained.variable == "deflection of joint_1"
 
 
+@pytest.mark.slow
 def test_the_adopted_system_file_holds_what_was_found() -> None:
     diagnosis = diagnosed("table_tilt@base:gravity_x=0.003,gravity_y=-0.002")
     system = load_system("paper-planar")
@@ -142,6 +147,7 @@ def test_the_adopted_system_file_holds_what_was_found() -> None:
     assert abs(value - 0.02) < 3.0 * std < 0.06 * value
 
 
+@pytest.mark.slow
 def test_the_document_holds_residuals_and_parameters_before_and_after() -> None:
     diagnosis = diagnosed("cubic_stiffness@joint_1:stiffness=300")
     document = diagnosis_document(diagnosis, [], None)

@@ -99,6 +99,7 @@ def test_what_was_found_has_no_nominal_value(diagnosis: Diagnosis, tmp_path: Pat
     assert "" in nominal
 
 
+@pytest.mark.slow
 def test_the_same_session_gives_the_same_page(diagnosis: Diagnosis, tmp_path: Path) -> None:
     assert page_of(diagnosis, tmp_path, [])[1] == page_of(diagnosed(COULOMB), tmp_path, [])[1]
 
@@ -122,6 +123,7 @@ def test_what_nothing_explains_is_marked_and_drawn(diagnosis: Diagnosis, tmp_pat
     assert "force in place of what is unknown" in page
 
 
+@pytest.mark.slow
 def test_diagnose_writes_the_page_beside_its_document(tmp_path: Path) -> None:
     system, capture, block = tmp_path / "axis.toml", tmp_path / "run.csv", axis_block(COULOMB)
     system.write_text(AXIS)

@@ -50,6 +50,7 @@ def session() -> tuple[Estimator, SessionRows]:
     return estimator, SessionRows(estimator.model, estimator.base, estimator.sensing, noise, record.segments(), beta)
 
 
+@pytest.mark.slow
 def test_columns_are_evaluated_as_the_balance_evaluates_them() -> None:
     """The parameters' own columns, through the windows of the diagnosis: to the rounding of sums."""
     _, rows = session()

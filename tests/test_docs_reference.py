@@ -72,6 +72,7 @@ def capture(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
+@pytest.mark.slow
 def test_results_json_has_the_keys_of_its_page(capture: Path, tmp_path: Path) -> None:
     described = tmp_path / "rig.toml"
     described.write_text(shipped_text("paper-planar") + "\n[tolerances]\n", encoding="utf-8")

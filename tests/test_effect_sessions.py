@@ -11,6 +11,7 @@ import pytest
 from numpy.testing import assert_allclose
 from saved import resumed
 from scipy.integrate import solve_ivp
+from simulations import planar
 
 from sms_adapters.truth import read_truth
 from sms_online.cramer_rao import cramer_rao_bound
@@ -87,7 +88,7 @@ def sampled(simulation: Simulation, grade: str = "0") -> tuple[Array, dict[str, 
 @pytest.fixture(scope="module")
 def clean_motion() -> Simulation:
     """Two and a half seconds without effects."""
-    return simulate(declaring(), 2.5)
+    return planar(2.5)
 
 
 # Motion
@@ -98,7 +99,7 @@ def test_the_power_of_all_effects_is_the_change_of_energy() -> None:
     simulation = simulate(declaring(*FORCES), 0.5)
     assert simulation.drift.energy < 1e-9
     assert simulation.drift.linear_momentum is None
-    clean = simulate(declaring(), 0.5)
+    clean = planar(0.5)
     assert np.abs(exact_states(simulation, np.array([0.5])).dissipated).item() > 0.01
     moved = exact_states(simulation, np.array([0.5])).x - exact_states(clean, np.array([0.5])).x
     assert np.abs(moved).max() > 0.01
@@ -188,6 +189,7 @@ def test_reported_coefficients_are_those_that_were_injected(session: tuple[Syste
                 assert 0.0 < std < 0.01 * abs(value)
 
 
+@pytest.mark.slow
 def test_friction_by_direction_and_by_speed_is_found_without_noise() -> None:
     """Within 1 %: reversals are resolved to a sample only."""
     names = "direction_friction@joint_2", "stribeck_friction@joint_1:velocity=0.3"
@@ -200,6 +202,7 @@ def test_friction_by_direction_and_by_speed_is_found_without_noise() -> None:
     assert_allclose(estimator.estimate().pi[-3:], [2.0, 1.5, 1.0], rtol=0.01)
 
 
+@pytest.mark.slow
 def test_effects_with_internal_states_are_identified_and_survive_a_restart() -> None:
     """Within 1 % at grade A (seed 1); saved and restored in the middle, the session ends with the same bits."""
     true = declaring("torsional_hysteresis@joint_1:torque=5,width=0.01", "slosh@base:mass=20,stiffness=500")
@@ -220,6 +223,7 @@ def test_effects_with_internal_states_are_identified_and_survive_a_restart() -> 
     assert told["slosh@base.stiffness"] == pytest.approx(500.0, rel=0.01)
 
 
+@pytest.mark.slow
 def test_a_tilt_is_found_with_masses_from_elsewhere() -> None:
     """Of 1 mm/s² within 1 % at grade A (seed 3), with every mass 0.1 % too large, by as much too small."""
     true = declaring("table_tilt@base:gravity_x=0.001,gravity_y=-0.002")

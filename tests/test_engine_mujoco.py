@@ -237,6 +237,7 @@ def test_noise_of_a_grade_comes_on_top() -> None:
 # The fit
 
 
+@pytest.mark.slow
 def test_the_estimator_finds_the_parameters_that_the_engine_was_built_with(engine_capture: Block) -> None:
     estimator = Estimator(exactly_known(SYSTEM), engine_capture.channels, "engine")
     estimator.push(engine_capture)

@@ -120,8 +120,9 @@ def test_no_wind_up_without_excitation(kind: Forgetting, quiet: str) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("quiet", QUIET)
 @pytest.mark.parametrize("kind", SELECTED, ids=lambda kind: type(kind).__name__)
-def test_no_wind_up_in_ten_million_rows_without_excitation(kind: Forgetting, quiet: str) -> None:
-    check_no_wind_up(kind, 10_000_000, QUIET[quiet])
+def test_no_wind_up_in_a_million_rows_without_excitation(kind: Forgetting, quiet: str) -> None:
+    """A weight of 0.999 a row is 5e-435 of itself by then, less than the smallest number above zero."""
+    check_no_wind_up(kind, 1_000_000, QUIET[quiet])
 
 
 def test_directional_forgetting_does_not_widen_error_bars_without_excitation() -> None:

@@ -21,6 +21,7 @@ from bus_streams import DBC, SOURCES
 from sms_tools.cli import main
 from sms_tools.live.simulated import GROUP, SimulatedArm
 
+pytestmark = pytest.mark.realtime
 PATIENCE = 40.0  # s, of a loaded machine
 LATENCY = 0.003  # s, of every source
 ENOUGH = 500  # samples of the encoder, for both parameters

@@ -39,6 +39,7 @@ def estimator_of(system: System, blocks: list[Block]) -> Estimator:
     return estimator
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("drive", "encoder", "source", "effect"),
     [
@@ -69,6 +70,7 @@ def test_nothing_is_reported_where_all_are_as_late_as_stated_or_later_by_the_sam
     assert estimator.momentum.latencies.found is None
 
 
+@pytest.mark.slow
 def test_what_is_known_of_latencies_is_saved_with_the_session(tmp_path: Path) -> None:
     system, blocks = session(tmp_path, 0.001, 0.0)
     half = len(blocks) // 2

@@ -61,6 +61,7 @@ class Late(Immediate):
         return super().outcome(block)
 
 
+@pytest.mark.realtime
 def test_a_live_session_and_the_replay_of_its_recording_give_the_same_document(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -87,6 +88,7 @@ def test_a_live_session_and_the_replay_of_its_recording_give_the_same_document(
     assert json.dumps(results_document(estimator, 0.0, source.warnings)) == json.dumps(live)
 
 
+@pytest.mark.slow
 def test_answers_that_came_late_are_used_as_late_in_the_repetition(tmp_path: Path) -> None:
     """Not so at once, as without notes of the session: then the effect is taken up earlier."""
     block = axis_block(cogging, BEGIN, seconds=14.0)
@@ -106,6 +108,7 @@ def test_answers_that_came_late_are_used_as_late_in_the_repetition(tmp_path: Pat
     assert told[0] == told[1] != told[2]
 
 
+@pytest.mark.slow
 def test_what_falls_due_while_a_search_runs_is_searched_right_after_it(tmp_path: Path) -> None:
     """An answer that takes two seconds skips one search that is due; the next one does not wait for another to be."""
     block = axis_block(cogging, BEGIN, seconds=14.0)

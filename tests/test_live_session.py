@@ -158,6 +158,7 @@ def test_readers_leave_the_interpreter_to_the_loop_while_it_computes_but_not_for
         fetch()
 
 
+@pytest.mark.realtime
 def test_a_live_session_and_the_replay_of_its_recording_give_the_same_document(tmp_path: Path, system: System) -> None:
     bench = Bench(tmp_path, system)
     live = bench.run(21.0)
@@ -168,6 +169,7 @@ def test_a_live_session_and_the_replay_of_its_recording_give_the_same_document(t
     assert json.dumps(bench.replayed()) == json.dumps(live)
 
 
+@pytest.mark.realtime
 def test_a_device_that_was_unplugged_is_named_opened_again_and_pi_goes_on(tmp_path: Path, system: System) -> None:
     bench = Bench(tmp_path, system)
     bench.readers[1].unplugged = (8.0, 10.0)
@@ -179,6 +181,7 @@ def test_a_device_that_was_unplugged_is_named_opened_again_and_pi_goes_on(tmp_pa
     assert json.dumps(bench.replayed()) == json.dumps(live)
 
 
+@pytest.mark.realtime
 def test_ten_times_the_rate_drops_and_counts_and_replays_what_was_used(
     tmp_path: Path, system: System, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -202,6 +205,7 @@ def test_ten_times_the_rate_drops_and_counts_and_replays_what_was_used(
     assert json.dumps(bench.replayed()) == json.dumps(live)
 
 
+@pytest.mark.realtime
 def test_a_display_that_never_reads_blocks_nobody(tmp_path: Path, system: System) -> None:
     reader, writer = os.pipe()
     os.set_blocking(writer, False)
@@ -228,6 +232,7 @@ def test_health_tells_the_latency_and_the_clocks(tmp_path: Path, system: System)
     assert health["clocks"].keys() == {"drive", "encoder"}
 
 
+@pytest.mark.realtime
 def test_a_checkpoint_is_there_while_the_session_runs_and_goes_on_to_the_same_bits(
     tmp_path: Path, system: System, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -305,6 +310,7 @@ def test_a_reader_that_never_comes_back_is_not_waited_for_for_ever(monkeypatch: 
     feed.stop()
 
 
+@pytest.mark.realtime
 def test_a_driver_that_raises_anything_is_a_lost_device() -> None:
     class Broken(Played):
         def read(self, timeout: float) -> list[Raw]:

@@ -218,6 +218,7 @@ def test_a_session_restored_at_any_time_gives_the_same_bits(cut: float) -> None:
     assert results_document(second, 0.0, []) == results_document(fitted(block), 0.0, [])
 
 
+@pytest.mark.slow
 def test_a_session_restored_while_new_weights_are_told_windows_gives_the_same_bits(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:

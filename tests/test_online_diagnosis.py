@@ -51,6 +51,7 @@ def document(estimator: Estimator, online: OnlineDiagnosis) -> str:
     return json.dumps([results_document(estimator, 0.0, []), online.document()])
 
 
+@pytest.mark.slow
 def test_an_effect_of_the_base_that_begins_in_mid_session_is_named_and_disturbs_nothing(
     planar_session: Simulation,
 ) -> None:
@@ -146,6 +147,7 @@ def test_a_change_that_an_event_explains_is_named_by_it() -> None:
     assert "viscous_friction@joint_1.damping" in online.notices[0]
 
 
+@pytest.mark.slow
 def test_what_no_effect_explains_is_said_to_be_unexplained() -> None:
     """A torque that depends on time alone, from the start."""
     _, online = watched(SYSTEM, _with_torque(axis_block(nothing, seconds=20.0)))

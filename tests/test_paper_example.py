@@ -52,7 +52,7 @@ def exact_rows(simulation: Simulation, t: Array) -> tuple[Array, Array]:
     return energy[1:] - energy[0] + dissipated, exact.work[1:].sum(axis=1)
 
 
-@pytest.mark.parametrize("name", ["paper-planar", "paper-planar-table-v"])
+@pytest.mark.parametrize("name", ["paper-planar", pytest.param("paper-planar-table-v", marks=pytest.mark.slow)])
 def test_batch_of_100_exact_rows_gives_all_sixteen(name: str, planar_session: Simulation) -> None:
     simulation = planar_session if name == "paper-planar" else simulate(load_system(name), 10.0)
     base = find_base_parameters(simulation.plant.model)
@@ -81,6 +81,7 @@ def test_streamed_positions_and_torques_give_all_but_one_to_a_hundredth_percent(
     assert abs(estimate.pi[weak] - truth[weak]) < 4.0 * standard_deviation(estimator)[weak]
 
 
+@pytest.mark.slow
 def test_recursive_equals_batch(planar_block: Block) -> None:
     """Of the parameters alone, without tolerances."""
     exactly = {"tolerances": Tolerances.model_validate("none")}
@@ -101,6 +102,7 @@ def noisy(block: Block, sigma: float) -> Block:
     return Block(block.t, block.channels, block.values + sigma * rng.standard_normal(block.values.shape))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("sigma", [0.0, 1e-4])
 def test_result_does_not_depend_on_how_samples_arrive(
     sigma: float, planar_block: Block, tmp_path_factory: pytest.TempPathFactory
@@ -124,6 +126,7 @@ def test_result_does_not_depend_on_how_samples_arrive(
     assert first == second
 
 
+@pytest.mark.slow
 def test_identified_dynamics_move_an_unseen_trajectory_to_a_tenth_of_a_millimetre(planar_block: Block) -> None:
     estimator = streamed("paper-planar", planar_block)
     document = json.loads(json.dumps(results_document(estimator, 0.0, [])))

@@ -23,6 +23,7 @@ def test_a_bus_has_the_options_of_its_interface() -> None:
     assert source.options == {"fd": True, "receive_own_messages": False, "data_bitrate": 2000000, "app": "lab"}
 
 
+@pytest.mark.realtime
 def test_options_reach_the_interface(tmp_path: Path) -> None:
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
         probe.bind(("", 0))

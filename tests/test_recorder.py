@@ -126,6 +126,7 @@ def test_what_the_estimator_was_too_slow_for_is_recorded_and_left_out_of_the_rep
     np.testing.assert_array_equal(np.concatenate(back), frames.arrival[kept])
 
 
+@pytest.mark.realtime
 def test_after_a_kill_at_most_a_second_is_missing_and_the_rest_is_replayed(tmp_path: Path) -> None:
     program = f"""
 import sys, time
@@ -256,6 +257,7 @@ def test_nothing_else_goes_into_a_running_sessions_folder(tmp_path: Path) -> Non
     assert results_directory(tmp_path / "run") == tmp_path / "run"
 
 
+@pytest.mark.realtime
 def test_a_killed_sessions_folder_is_free(tmp_path: Path) -> None:
     program = (
         "import time; from pathlib import Path; from sms_adapters.recorder import Recorder; "

@@ -36,8 +36,15 @@ def started(tmp_path: Path) -> Iterator[list[subprocess.Popen[Any]]]:
         kill(process)
 
 
+def tier(verb: str, mode: str) -> tuple[pytest.MarkDecorator, ...]:
+    """Of a verb with a view: live sessions and served pages, whose ports are the usual ones, are for themselves."""
+    if verb == "live" or mode == "serve":
+        return (pytest.mark.realtime,)
+    return () if (verb, mode) == ("demo", "save") else (pytest.mark.slow,)
+
+
 MODES = [
-    pytest.param(verb, mode, marks=[] if (verb, mode) == ("demo", "save") else pytest.mark.slow)
+    pytest.param(verb, mode, marks=tier(verb, mode))
     for verb in ARGUMENTS
     for mode in ("off", "save", "serve", "spawn", "connect")
 ]

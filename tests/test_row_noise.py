@@ -43,13 +43,13 @@ ROUGH = (
     Effect(name="cubic_stiffness", where="joint_1", coefficients={"stiffness": 5e6}),
 )
 # With the number of draws: fewer where rows are dear.
-SYSTEMS = {
-    "planar": (paper(), 120),
-    "planar, rough forces": (paper(effects=ROUGH), 240),
-    "planar, exact links": (paper("exact"), 30),
-    "spatial": (load_system("spatial-two-link"), 60),
-    "spatial, prismatic joint, gravity, effects": (spatial(free=False), 60),
-}
+SYSTEMS = [
+    pytest.param(paper(), 120, id="planar"),
+    pytest.param(paper(effects=ROUGH), 240, id="planar, rough forces", marks=pytest.mark.slow),
+    pytest.param(paper("exact"), 30, id="planar, exact links"),
+    pytest.param(load_system("spatial-two-link"), 60, id="spatial"),
+    pytest.param(spatial(free=False), 60, id="spatial, prismatic joint, gravity, effects", marks=pytest.mark.slow),
+]
 
 
 @dataclass(frozen=True)
@@ -126,7 +126,7 @@ def scatter(system: System, draws: int, seed: int) -> Scatter:
     return Scatter(errors, block_matrix(covariances), np.concatenate(white), n_v)
 
 
-@pytest.mark.parametrize(("system", "draws"), SYSTEMS.values(), ids=SYSTEMS.keys())
+@pytest.mark.parametrize(("system", "draws"), SYSTEMS)
 def test_rows_of_noisy_readings_scatter_as_predicted(system: System, draws: int) -> None:
     """Variance of each row, its correlation with itself in the windows that overlap, and what whitening leaves. Seed 3.
 

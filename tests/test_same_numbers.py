@@ -16,7 +16,12 @@ ESTIMATE = re.compile(r"(whole|continued)\.parameters\[.*\]\.estimate$")
 ELSEWHERE = 1e-3
 
 
-@pytest.mark.parametrize("name", QUICK)
+QUICKEST = ("recording", "smoother", "axis-undescribed", "quanser-2dsfl")
+
+
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=() if name in QUICKEST else pytest.mark.slow) for name in QUICK]
+)
 def test_no_number_of_a_session_moves(name: str) -> None:
     recorded, now = json.loads(RECORDED.read_text()), numbers(SESSIONS[name]())
     before = recorded["sessions"][name]

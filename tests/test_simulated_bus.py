@@ -148,6 +148,7 @@ def document(directory: Path) -> dict[str, Any]:
     return found
 
 
+@pytest.mark.realtime
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_a_live_session_that_is_stopped_has_saved_everything_and_replays_to_the_same_results(
     arm: tuple[SimulatedArm, Path], tmp_path: Path, number: signal.Signals
@@ -169,6 +170,7 @@ def test_a_live_session_that_is_stopped_has_saved_everything_and_replays_to_the_
     assert document(tmp_path / "run")["samples"] > 1000
 
 
+@pytest.mark.realtime
 def test_after_a_kill_the_recording_is_readable_and_a_new_session_resumes(
     arm: tuple[SimulatedArm, Path], tmp_path: Path
 ) -> None:
@@ -198,6 +200,7 @@ def test_after_a_kill_the_recording_is_readable_and_a_new_session_resumes(
     assert document(tmp_path / "again") == whole
 
 
+@pytest.mark.realtime
 def test_record_needs_no_system_file_and_its_recording_is_replayed_with_one(
     arm: tuple[SimulatedArm, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -234,6 +237,7 @@ def test_live_needs_sources(tmp_path: Path, capsys: pytest.CaptureFixture[str]) 
     assert "[[source]] for each device" in capsys.readouterr().err
 
 
+@pytest.mark.realtime
 def test_frames_reach_another_node_of_the_bus(arm: tuple[SimulatedArm, Path]) -> None:
     moving, file = arm
     source = load_system(str(file)).sources[0]
@@ -245,6 +249,7 @@ def test_frames_reach_another_node_of_the_bus(arm: tuple[SimulatedArm, Path]) ->
     assert [message.dlc for message in received if message is not None] == [8] * 50
 
 
+@pytest.mark.realtime
 def test_an_arm_on_the_bus_obeys_torque_commands(tmp_path: Path) -> None:
     (tmp_path / "axis.toml").write_text(AXIS)
     file = write_testbed(str(tmp_path / "axis.toml"), load_system(str(tmp_path / "axis.toml")), "0", tmp_path)

@@ -69,6 +69,7 @@ def first(simulation: Simulation) -> Estimator:
     return session(one_link("linear"), recorded(simulation, 0))
 
 
+@pytest.mark.slow
 def test_errors_agree_with_error_bars_and_error_bars_with_the_bound(simulation: Simulation, first: Estimator) -> None:
     assert first.sensing.missing == MISSING
     sessions = [first, *(session(one_link("linear"), recorded(simulation, seed)) for seed in range(1, SEEDS))]
@@ -165,6 +166,7 @@ def test_a_gap_of_the_torque_begins_a_new_span_and_holes_of_other_channels_do_no
         assert np.all(np.abs(normalised(estimator)) < 4.0)
 
 
+@pytest.mark.slow
 def test_friction_that_the_model_lacks_widens_the_error_bars() -> None:
     friction = '\n[[effect]]\nname = "coulomb_friction"\nwhere = "joint_1"\ncoefficients = { torque = 0.5 }\n'
     block = recorded(simulate(one_link("linear", friction)), 2)
@@ -196,6 +198,7 @@ def test_samples_that_no_motion_explains_leave_the_first_fit_with_a_warning(simu
     assert any("bent statically" in warning for warning in document["warnings"])
 
 
+@pytest.mark.slow
 def test_exact_links_and_one_marker_alone_are_enough() -> None:
     block = recorded(simulate(one_link("exact")), 4)
     alone = [k for k, name in enumerate(block.channels) if "marker_1" not in name]

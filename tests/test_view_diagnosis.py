@@ -13,6 +13,7 @@ from recordings import columns, scalars
 from sms_adapters.capture import CaptureWriter
 from sms_tools.cli import main
 
+pytestmark = pytest.mark.slow
 COULOMB = 0.2  # N m
 
 

@@ -16,6 +16,7 @@ import pytest
 from axis import AXIS, capture_lines
 from test_killed_processes import kill, until
 
+pytestmark = pytest.mark.realtime
 STAYS = "the view stays until Ctrl-C"
 
 

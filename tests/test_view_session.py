@@ -108,6 +108,7 @@ def test_events_are_told_when_they_happen(recorded: Path) -> None:
     assert told >= {p["name"] for p in results(recorded)["parameters"] if p["identifiable"]}
 
 
+@pytest.mark.slow
 def test_watching_changes_no_bit(recorded: Path, capture: Path, tmp_path: Path) -> None:
     main(["replay", str(capture), "--system", "paper-planar", "--out", str(tmp_path)])
     unseen, seen = results(tmp_path), results(recorded)
@@ -115,6 +116,7 @@ def test_watching_changes_no_bit(recorded: Path, capture: Path, tmp_path: Path) 
     assert unseen["residual"] == seen["residual"]
 
 
+@pytest.mark.slow
 def test_statistics_stay_those_of_when_they_were_taken(samples: Block) -> None:
     system = load_system("paper-planar")
     estimator = Estimator(system, samples.channels, "test")
@@ -127,6 +129,7 @@ def test_statistics_stay_those_of_when_they_were_taken(samples: Block) -> None:
     assert results_document(estimator, 0.0, []) != then
 
 
+@pytest.mark.slow
 def test_health_of_a_live_source_is_recorded(samples: Block, tmp_path: Path) -> None:
     estimator = Estimator(load_system("paper-planar"), samples.channels, "test")
     told = {"latency": {"p99": 12.5}, "clocks": {"can": -0.25}}
@@ -148,6 +151,7 @@ def deaf_viewer() -> Iterator[int]:
         yield int(listening.getsockname()[1])
 
 
+@pytest.mark.realtime
 def test_an_absent_viewer_is_named_and_the_session_goes_on(capture: Path, tmp_path: Path) -> None:
     with socket.socket() as taken:
         taken.bind(("127.0.0.1", 0))  # nobody listens there
@@ -159,6 +163,7 @@ def test_an_absent_viewer_is_named_and_the_session_goes_on(capture: Path, tmp_pa
     assert any("no viewer at" in warning for warning in results(tmp_path)["warnings"])
 
 
+@pytest.mark.realtime
 def test_a_viewer_that_never_reads_is_given_up(
     deaf_viewer: int, samples: Block, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -176,6 +181,7 @@ def test_a_viewer_that_never_reads_is_given_up(
     np.testing.assert_array_equal(estimator.estimate().pi, alone.estimate().pi)
 
 
+@pytest.mark.realtime
 def test_a_full_disk_ends_the_recording_alone(capture: Path, tmp_path: Path) -> None:
     largest = 300_000  # bytes of any file; the recording needs twice as many
 
@@ -195,6 +201,7 @@ def test_a_full_disk_ends_the_recording_alone(capture: Path, tmp_path: Path) -> 
     assert any("cannot be written any further" in warning for warning in results(tmp_path)["warnings"])
 
 
+@pytest.mark.realtime
 def test_a_view_that_dies_is_named(samples: Block, tmp_path: Path) -> None:
     estimator = Estimator(load_system("paper-planar"), samples.channels, "test")
     with open_view("save", estimator, samples.channels, tmp_path) as view:
@@ -206,6 +213,7 @@ def test_a_view_that_dies_is_named(samples: Block, tmp_path: Path) -> None:
     assert "its process ended" in view.status
 
 
+@pytest.mark.realtime
 def test_a_killed_session_leaves_a_whole_recording(capture: Path, tmp_path: Path) -> None:
     arguments = ["replay", str(capture), "--system", "paper-planar", "--out", str(tmp_path), "--rerun", "save"]
     session = subprocess.Popen(

@@ -1,6 +1,7 @@
 """What the model's columns cost per sample, alone and beside Pinocchio's regressors on a rigid arm.
 
-Run on demand: pytest tests/bench/test_bench_model.py. Each benchmark notes microseconds per sample in its `extra_info`.
+Run on demand: pytest tests/bench/test_bench_model.py --override-ini addopts=
+Each benchmark notes microseconds per sample in its `extra_info`.
 """
 
 from __future__ import annotations

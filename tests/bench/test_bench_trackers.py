@@ -1,4 +1,7 @@
-"""Cost of a row in each tracker, 16 parameters, beside filterpy, padasip and numpy; run: pytest tests/bench -s."""
+"""Cost of a row in each tracker, 16 parameters, beside filterpy, padasip and numpy; run on demand:
+
+pytest tests/bench/test_bench_trackers.py --override-ini addopts= -s
+"""
 
 from __future__ import annotations
 
