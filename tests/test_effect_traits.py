@@ -82,7 +82,7 @@ def test_what_an_effect_extends_is_one_at_the_same_place() -> None:
 
 def test_a_session_is_searched_for_what_may_begin_at_any_joint() -> None:
     assert BEGINNING == ("coulomb_friction", "torque_offset", "viscous_friction")
-    assert {ENTRIES[name].at for name in BEGINNING} == {"joint"}
+    assert {ENTRIES[name].at for name in BEGINNING} == {"joint", "driven joint"}
 
 
 # Who names whom

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from itertools import pairwise
 
+import msgspec
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -51,7 +52,7 @@ def test_a_clean_capture_passes_bit_for_bit(start: float) -> None:
     assert np.array_equal(out, values)
     assert not segment.any()
     assert stage.start_time == start
-    assert vars(stage.counters) == {
+    assert msgspec.structs.asdict(stage.counters) == {
         "samples": 3000,
         "missing_cells": 0,
         "duplicates": 0,

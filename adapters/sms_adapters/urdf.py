@@ -18,6 +18,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from sms_online.description.parse import parse_system
+from sms_online.effects.friction import URDF_DYNAMICS
 from sms_online.errors import InputError
 from sms_online.model.parameters import SYMMETRIC
 from sms_online.stream import Array
@@ -234,8 +235,8 @@ def _friction(placed: Iterable[Placed]) -> list[str]:
         dynamics = each.joint.dynamics
         if dynamics is None or each.joint.type not in MOVING:
             continue
-        stated = (("viscous_friction", "damping", dynamics.damping), ("coulomb_friction", "torque", dynamics.friction))
-        for name, coefficient, value in stated:
+        for attribute, (name, coefficient) in URDF_DYNAMICS.items():
+            value = getattr(dynamics, attribute)
             if float(value or 0.0) > 0.0:
                 lines += ["", "[[effect]]", f'name = "{name}"', f'where = "joint_{i}"']
                 lines.append(f"coefficients = {{ {coefficient} = {float(value)!r} }}")

@@ -14,6 +14,7 @@ from sms_adapters.urdf import read_xml
 from sms_online.description.schema import RigidLink, System
 from sms_online.description.tree import mounts
 from sms_online.effects.build import build_model
+from sms_online.effects.friction import URDF_DYNAMICS
 from sms_online.errors import InputError
 from sms_online.model.base_parameters import find_base_parameters
 from sms_online.model.model import Model
@@ -22,10 +23,7 @@ from sms_online.model.so3 import skew
 from sms_online.stream import Array
 
 # Where <dynamics> of a joint has a place for a parameter of joint_i.
-DYNAMICS = {
-    "viscous_friction@joint_{}.damping": "damping",
-    "coulomb_friction@joint_{}.torque": "friction",
-}
+DYNAMICS = {f"{name}@joint_{{}}.{part}": attribute for attribute, (name, part) in URDF_DYNAMICS.items()}
 
 
 @dataclass(frozen=True)

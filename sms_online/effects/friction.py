@@ -16,6 +16,9 @@ from sms_online.model.effect import Inputs
 from sms_online.model.layout import Layout
 from sms_online.stream import Array
 
+# Effects and their coefficients that stand for the attributes of <dynamics> in a URDF, friction of a joint as they are.
+URDF_DYNAMICS = {"damping": ("viscous_friction", "damping"), "friction": ("coulomb_friction", "torque")}
+
 
 def sign(rate: Array) -> Array:
     """Sign of a rate as tanh(rate / STANDSTILL), so that one definition serves rows and integration."""
