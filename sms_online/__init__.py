@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from sms_online.trust import Residual, Trust
     from sms_sim.bound import Bounds, bound
     from sms_sim.capture import simulate
+    from sms_tools.view.described import show
 
     __version__: str
 
@@ -53,6 +54,7 @@ _HOMES = {
     "load_system": "sms_adapters.system_file",
     "read_capture": "sms_adapters.recorded",
     "shipped_systems": "sms_online.description.parse",
+    "show": "sms_tools.view.described",
     "simulate": "sms_sim.capture",
     "write_capture": "sms_adapters.recorded",
 }
@@ -82,6 +84,7 @@ __all__ = [
     "load_system",
     "read_capture",
     "shipped_systems",
+    "show",
     "simulate",
     "write_capture",
 ]

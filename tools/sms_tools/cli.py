@@ -101,7 +101,7 @@ def _parser() -> Parser:
     verbs = parser.add_subparsers(metavar="VERB", required=True)
     verb_parsers = (
         _add_demo, _add_live, _add_record, _add_simulate, _add_replay, _add_diagnose, _add_import, _add_export,
-        _add_markers, _add_bound, _add_compare,
+        _add_markers, _add_bound, _add_compare, _add_show,
     )  # fmt: skip
     for add in verb_parsers:
         add(verbs)
@@ -128,10 +128,11 @@ def _add_out(parser: Parser) -> None:
     parser.add_argument("--out", metavar="DIR", type=Path, help="where results.json goes, runs/<time> by default")
 
 
-def _add_view(parser: Parser) -> None:
-    text = "view in rerun: a file in DIR, a page in the browser, a viewer started or running already; off by default"
+def _add_view(parser: Parser, default: str = "off") -> None:
+    places = "a file in DIR, a page in the browser, a viewer started or running already"
+    text = f"view in rerun: {places}; {default} by default"
     names = "off|save|serve[=ADDRESS]|spawn|connect=URL"
-    parser.add_argument("--rerun", metavar=names, type=_rerun, default="off", help=text)
+    parser.add_argument("--rerun", metavar=names, type=_rerun, default=default, help=text)
     text = "factor on the deflections that the view draws, 1 by default"
     parser.add_argument("--exaggerate", metavar="FACTOR", type=_factor, default=1.0, help=text)
 
@@ -268,6 +269,14 @@ def _add_markers(verbs: Verbs) -> None:
     _add_system(parser)
     text = "how many modes the markers have to tell apart, 2 by default"
     parser.add_argument("--modes", metavar="N", type=_whole(1), default=2, help=text)
+
+
+def _add_show(verbs: Verbs) -> None:
+    text = "Draw a described arm in rerun, with its frames, joints, markers and channels, before there are any data."
+    parser = _add_verb(verbs, "show", "show", text)
+    _add_system(parser)
+    _add_out(parser)
+    _add_view(parser, default="spawn")
 
 
 def _add_bound(verbs: Verbs) -> None:

@@ -97,7 +97,9 @@ class ArmLog:
         send(TIP, index, rr.Points3D.columns(positions=drawing.tip))
         M = len(self._scene.markers)
         if M:
-            colors = style.residual_colors(residual[:, [i - 1 for i, _ in self._scene.markers]])
+            # A link on a fixed joint has no rows of a joint.
+            known = np.pad(residual, ((0, 0), (0, self._links - residual.shape[1])), constant_values=np.nan)
+            colors = style.residual_colors(known[:, [i - 1 for i, _ in self._scene.markers]])
             columns = rr.Points3D.columns(
                 positions=drawing.markers.reshape(-1, 3), colors=colors.reshape(-1, 3)
             ).partition(np.full(B, M))

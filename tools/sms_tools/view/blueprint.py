@@ -53,7 +53,7 @@ def layout(
     log = rrb.TextLogView(origin=number_log.LOG, name="Events and verdicts", columns=shown)
     table = rrb.TextDocumentView(origin=number_log.TABLE, name="Parameters")
     told = rrb.Tabs(table, log, active_tab=int(diagnosed))
-    left = rrb.Vertical(_arm(scene, first), told, row_shares=[11, 9])
+    left = rrb.Vertical(arm_view(scene, first), told, row_shares=[11, 9])
     below = rrb.Tabs(plots.residual(), plots.evidence(), plots.health(live), active_tab=int(diagnosed))
     right = rrb.Vertical(plots.parameters(parameters), below, row_shares=[7, 3])
     session = rrb.Horizontal(left, right, column_shares=[2, 3])
@@ -79,7 +79,8 @@ def _judgement() -> rrb.Horizontal:
     return rrb.Horizontal(lamp, words, column_shares=[1, 15])
 
 
-def _arm(scene: Scene, first: Drawing) -> rrb.Spatial3DView:
+def arm_view(scene: Scene, first: Drawing) -> rrb.Spatial3DView:
+    """The arm as it is first seen in `first`, all of it and its base."""
     planar = scene.model.layout.planar
     center, half = scene.box
     if planar:

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from sms_online.description.schema import FlexibleLink, RigidLink
+from sms_online.description.tree import BASE, mounts
 from sms_online.model.chain import Configuration
 from sms_online.model.model import Model
 from sms_online.stream import Array
@@ -31,7 +32,7 @@ class Drawing:
     S (B, 3); base_rotation (B, 3, 3); base_origin (B, 3): joint 1, the origin of {0}. joints (B, joints, 3). links:
     for each link its line (B, P, 3), from joint to end, of a prismatic joint from where it is mounted. A rigid link
     without a stated tip ends in its centre of mass. ghost (B, G, 3): the same arm if it were rigid. markers (B, M, 3).
-    tip (B, 3): the end of the last link's line.
+    tip (B, 3): the end of the line of the link of the last joint that moves.
     """
 
     S: Array
@@ -57,7 +58,7 @@ class Scene:
         self.exaggeration = exaggeration
         system = model.system
         self._ends = [_extent(link) for link in system.links]
-        self.reach = float(np.linalg.norm(self._ends, axis=1).sum()) or UNKNOWN_REACH
+        self.reach = self._longest() or UNKNOWN_REACH
         if system.spacecraft is None:
             self.box = (np.zeros(3), np.full(3, PEDESTAL * self.reach))
         else:
@@ -67,9 +68,10 @@ class Scene:
             if model.layout.planar:
                 center[2], half[2] = -PLATE_DEPTH * self.reach, 0.0
             self.box = (center, half)
-        if not self._ends[-1].any() and system.joints[-1].kind == "revolute":
-            # Across the axis, so that its turning is seen.
-            self._ends[-1] = STUB * self.reach * np.eye(3)[np.argmin(np.abs(system.joints[-1].axis))]
+        for i in model.chain.tree.ending:
+            if not self._ends[i].any() and i < len(system.joints) and system.joints[i].kind == "revolute":
+                # Across the axis, so that its turning is seen.
+                self._ends[i] = STUB * self.reach * np.eye(3)[np.argmin(np.abs(system.joints[i].axis))]
         self.markers = tuple(
             (i, j)
             for i, link in enumerate(system.links, start=1)
@@ -89,18 +91,40 @@ class Scene:
         frames = configuration.frames
         n = len(self.model.system.joints)
         rigid = self.model.chain.configure(self._with_deflections(x, 0.0))
-        links = tuple(self._line(configuration, i) for i in range(n))
-        ghost = [*(rigid.frames[2 * i + 2].origin for i in range(n)), self._line(rigid, n - 1)[:, -1]]
+        links = tuple(self._line(configuration, i) for i in range(len(self._ends)))
         return Drawing(
             S=configuration.r_S,
             base_origin=frames[0].origin,
             base_rotation=frames[0].rotation,
             joints=np.stack([frames[2 * i + 2].origin for i in range(n)], axis=1),
             links=links,
-            ghost=np.stack(ghost, axis=1),
+            ghost=np.stack(self._skeleton(rigid), axis=1),
             markers=self._markers(configuration),
-            tip=links[-1][:, -1],
+            tip=links[self.model.chain.tree.last][:, -1],
         )
+
+    def _longest(self) -> float:
+        """Length of the longest way from the base to the end of a link, stretched, m."""
+        system, tree = self.model.system, self.model.chain.tree
+        every = mounts(system)
+
+        def length(i: int) -> float:
+            link = system.links[i]
+            root = link.root_position if isinstance(link, FlexibleLink) else (0.0, 0.0, 0.0)
+            # Where {0} lies in the base is no length of an arm on it.
+            offset = every[i].mount_position if tree.parents[i] != BASE else (0.0, 0.0, 0.0)
+            return float(np.linalg.norm(self._ends[i]) + np.linalg.norm(root) + np.linalg.norm(offset))
+
+        return max(sum(length(k) for k in (i, *tree.inwards(i))) for i in range(len(system.links)))
+
+    def _skeleton(self, configuration: Configuration) -> list[Array]:
+        """Points (B, 3) of one line through all links: to each end of the tree, and back where there are several."""
+        tree = self.model.chain.tree
+        out: list[Array] = []
+        for end in tree.ending:
+            way = [configuration.frames[2 * i + 2].origin for i in (*tree.inwards(end)[::-1], end)]
+            out += [*way, self._line(configuration, end)[:, -1], *(way[::-1] if len(tree.ending) > 1 else ())]
+        return out
 
     def _with_deflections(self, x: Array, factor: float) -> Array:
         """The same motor angles with every deflection, of links and of joints, multiplied."""
@@ -111,14 +135,17 @@ class Scene:
 
     def _line(self, configuration: Configuration, i: int) -> Array:
         """Axis of link i (from 0): its ends, and between them the points at which the model integrates its shape."""
-        mount, link, end = configuration.frames[2 * i + 1 : 2 * i + 4]
-        start = [mount.origin] if self.model.system.joints[i].kind == "prismatic" else []
+        joints = self.model.system.joints
+        mount, link = configuration.frames[2 * i + 1 : 2 * i + 3]
+        # A slide, or the bracket of a flexible link.
+        apart = self.model.chain.roots[i].offset is not None
+        start = [mount.origin] if apart or (i < len(joints) and joints[i].kind == "prismatic") else []
         shape = configuration.shape(i)
         if shape is None:
             return np.stack((*start, link.origin, link.origin + link.rotation @ self._ends[i]), axis=1)
         inner = link.origin[:, None] + np.einsum("bij,bgj->bgi", link.rotation, shape.points)
         ends = np.stack((*start, link.origin), axis=1)
-        return np.concatenate((ends, inner, end.origin[:, None]), axis=1)
+        return np.concatenate((ends, inner, configuration.end(i, link).origin[:, None]), axis=1)
 
     def _markers(self, configuration: Configuration) -> Array:
         """Markers (B, M, 3): their displacements from the straight link, turned to inertial axes."""

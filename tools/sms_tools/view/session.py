@@ -68,8 +68,8 @@ class View:
         self._handover: Handover | None = None
         self._done = Flag()
         self._serving = start is not None and start.choice.kind == "serve"
-        if start is not None and start.choice.kind == "connect" and (absent := _absent(start.choice)):
-            self._trouble(absent)
+        if start is not None and start.choice.kind == "connect" and (missing := absent(start.choice)):
+            self._trouble(missing)
         elif start is not None:
             # A session of its own: Ctrl-C is for the estimator, which then ends the view in order.
             self._process = subprocess.Popen(
@@ -239,7 +239,7 @@ def open_view(
     return View(estimator, start, patient, health)
 
 
-def _absent(choice: Choice) -> str:
+def absent(choice: Choice) -> str:
     """Why there is no viewer at the address, or nothing."""
     try:
         socket.create_connection((choice.host.strip("[]"), choice.port), PROBE_TIMEOUT).close()

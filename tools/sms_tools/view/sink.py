@@ -41,6 +41,7 @@ class Sink:
         self.stream = rr.RecordingStream(APPLICATION, make_default=False)
         self.stream.send_recording_name(title)
         self._file = recording
+        self._server: subprocess.Popen[bytes] | None = None
 
     def open(self, blueprint: rrb.Blueprint) -> str:
         """Connect with this layout; returns where the view is to be found, a sentence."""
@@ -74,7 +75,7 @@ class Sink:
         open_to_others = not ip_address(address).is_loopback
         if open_to_others:
             command += ["--cors-allow-origin", f"http://*:{page}"]  # pages that are asked for by this machine's name
-        server = subprocess.Popen(
+        self._server = server = subprocess.Popen(
             command, stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
         )
         reached = LOOPBACK if address == "0.0.0.0" else address
@@ -105,6 +106,17 @@ class Sink:
                 "spawn": "the viewer is gone or does not read",
             }
             raise TroubleError(whats_wrong.get(self.choice.kind, "the server does not take data")) from None
+
+    @property
+    def serving(self) -> bool:
+        """Whether a server of this sink runs."""
+        return self._server is not None and self._server.poll() is None
+
+    def end_server(self) -> None:
+        """Stop serving."""
+        if self._server is not None:
+            self._server.terminate()
+            self._server.wait()
 
     def close(self) -> None:
         """Complete a recording's file; only after a flush that worked, for this waits without a limit."""
