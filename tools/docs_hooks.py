@@ -14,6 +14,7 @@ from docs_site.command_page import command_page
 from docs_site.conventions import link_conventions, spatial_frames
 from docs_site.notebooks import page_of_notebook
 from docs_site.schema_page import schema_tables
+from docs_site.sign_drawings import euler_parameters, inertia_signs
 
 ROOT = Path(__file__).resolve().parents[1]
 # Pages with a line `<!-- made: NAME -->`, which what is made replaces.
@@ -24,7 +25,12 @@ MAKERS = {
     "command-line": command_page,
     "system-file": schema_tables,
 }
-DRAWINGS = {"how-to/spatial-frames.svg": spatial_frames, "how-to/link-conventions.svg": link_conventions}
+DRAWINGS = {
+    "how-to/spatial-frames.svg": spatial_frames,
+    "how-to/link-conventions.svg": link_conventions,
+    "how-to/inertia-signs.svg": inertia_signs,
+    "how-to/euler-parameters.svg": euler_parameters,
+}
 
 
 def on_files(files: Files, config: MkDocsConfig) -> Files:

@@ -38,18 +38,18 @@ def spatial_frames() -> str:
     _base(axes, model, configuration, frames)
     _links(axes, model, configuration)
     for k, name, offset in ((2, "{1}", (16, -22)), (4, "{2}", (20, -12)), (5, "tip", (22, 4))):
-        _triad(axes, frames[k], name, offset)
+        triad(axes, frames[k], name, offset)
     for i, reach in ((1, 0.75), (2, -0.75)):
         mount, axis = frames[2 * i - 1], model.chain.axes[i - 1]
-        _line(
+        paper_line(
             axes,
             mount.origin[0] + np.outer((-0.4 * reach, reach), mount.rotation[0] @ axis),
             color=GREY,
             linestyle="-.",
         )
-        _text(axes, mount.origin[0] + reach * mount.rotation[0] @ axis, f"axis of joint {i}")
+        paper_text(axes, mount.origin[0] + reach * mount.rotation[0] @ axis, f"axis of joint {i}")
     axes.set_aspect("equal")
-    return _svg(figure)
+    return svg(figure)
 
 
 # Nodal coordinates of both links at the first marker; four times as much at the second, the tip.
@@ -61,8 +61,8 @@ def _base(axes: Axes, model: Model, configuration: Configuration, frames: list[F
     spacecraft = model.system.spacecraft
     assert spacecraft is not None
     origin, rotation = frames[0].origin[0], frames[0].rotation[0]
-    _triad(axes, Frame(np.zeros((1, 3)), np.eye(3)[None]), "inertial", (-34, -4))
-    _triad(axes, frames[0], "{0}", (-12, -14))
+    triad(axes, Frame(np.zeros((1, 3)), np.eye(3)[None]), "inertial", (-34, -4))
+    triad(axes, frames[0], "{0}", (-12, -14))
     S = configuration.r_S[0]
     center = np.array(spacecraft.center_of_mass)
     low, high = center - np.abs(center), center + np.abs(center)
@@ -72,13 +72,13 @@ def _base(axes: Axes, model: Model, configuration: Configuration, frames: list[F
             ends[1, a] = high[a]
             for b, bit in zip([k for k in range(3) if k != a], (corner & 1, corner >> 1), strict=True):
                 ends[:, b] = high[b] if bit else low[b]
-            _line(axes, origin + ends @ rotation.T, color=GREY, linewidth=0.8)
-    _line(axes, np.array([origin, S]), color=GREY, linestyle=":")
-    _line(axes, np.array([np.zeros(3), S]), color="black", linewidth=0.9)
-    _text(axes, 0.45 * S, "r$_S$")
-    _text(axes, 0.35 * S + 0.65 * origin, "tracked_point")
+            paper_line(axes, origin + ends @ rotation.T, color=GREY, linewidth=0.8)
+    paper_line(axes, np.array([origin, S]), color=GREY, linestyle=":")
+    paper_line(axes, np.array([np.zeros(3), S]), color="black", linewidth=0.9)
+    paper_text(axes, 0.45 * S, "r$_S$")
+    paper_text(axes, 0.35 * S + 0.65 * origin, "tracked_point")
     axes.plot(*_seen(S), "ko", markersize=5)
-    _triad(axes, Frame(S[None], frames[0].rotation), "S", (-8, 4))
+    triad(axes, Frame(S[None], frames[0].rotation), "S", (-8, 4))
 
 
 def _links(axes: Axes, model: Model, configuration: Configuration) -> None:
@@ -91,8 +91,8 @@ def _links(axes: Axes, model: Model, configuration: Configuration) -> None:
         frame = configuration.frames[2 * i + 2]
         origin, rotation = frame.origin[0], frame.rotation[0]
         points = np.vstack((np.zeros(3), shape.points[0], shape.tip[0]))
-        _line(axes, origin + np.outer(np.array([0.0, link.length]), rotation[:, 0]), color=GREY, linestyle="--")
-        _line(axes, origin + points @ rotation.T, color="black", linewidth=2.5)
+        paper_line(axes, origin + np.outer(np.array([0.0, link.length]), rotation[:, 0]), color=GREY, linestyle="--")
+        paper_line(axes, origin + points @ rotation.T, color="black", linewidth=2.5)
         readings = dict(
             zip(kinematics.marker_names, kinematics.markers(model.chain.elastic(configuration.x, i))[0], strict=True)
         )
@@ -101,7 +101,7 @@ def _links(axes: Axes, model: Model, configuration: Configuration) -> None:
             at = origin + rotation @ np.array([straight, *(readings[f"marker_{j}.{u}"] for u in ("u_y", "u_z"))])
             axes.plot(*_seen(at), "o", color="#d68910", markersize=7, zorder=5)
             if j < link.elements:
-                _text(axes, at, f"marker_{j} of link_{i + 1}", color="#9c640c", offset=((-24, -26), (6, -14))[i])
+                paper_text(axes, at, f"marker_{j} of link_{i + 1}", color="#9c640c", offset=((-24, -26), (6, -14))[i])
 
 
 def link_conventions() -> str:
@@ -134,7 +134,7 @@ def link_conventions() -> str:
         axes.annotate(u, (L + 0.03, 0.45 * tip), color=COLORS[up])
         out = "y into the paper" if plane == 1 else "z out of the paper"
         axes.annotate(f"{theta} turns about {out}", (0.5 * L, -0.14), ha="center", color=GREY, fontsize=9)
-    return _svg(figure)
+    return svg(figure)
 
 
 def _plane(axes: Axes, length: float, points: Array, tip: Array, tangent: Array) -> None:
@@ -177,15 +177,17 @@ def _seen(point: Array) -> tuple[float, float]:
     return float(right), float(up)
 
 
-def _line(axes: Axes, points: Array, **style: object) -> None:
+def paper_line(axes: Axes, points: Array, **style: object) -> None:
+    """A line through points (n, 3), seen from VIEW."""
     axes.plot(*(points @ VIEW.T).T, **({"linewidth": 1.0} | style))  # type: ignore[arg-type]
 
 
-def _text(axes: Axes, at: Array, text: str, color: str = "black", offset: tuple[int, int] = (4, 2)) -> None:
+def paper_text(axes: Axes, at: Array, text: str, color: str = "black", offset: tuple[int, int] = (4, 2)) -> None:
+    """A text beside a point (3,)."""
     axes.annotate(text, _seen(at), xytext=offset, textcoords="offset points", color=color, fontsize=9)
 
 
-def _triad(axes: Axes, frame: Frame, name: str, offset: tuple[int, int]) -> None:
+def triad(axes: Axes, frame: Frame, name: str, offset: tuple[int, int]) -> None:
     """The axes of a frame, red x, green y, blue z, and its name so far from its origin, points."""
     origin = frame.origin[0]
     for a, color in enumerate(COLORS):
@@ -205,7 +207,8 @@ def _triad(axes: Axes, frame: Frame, name: str, offset: tuple[int, int]) -> None
     )
 
 
-def _svg(figure: Figure) -> str:
+def svg(figure: Figure) -> str:
+    """Text of a figure, the same whenever it is made."""
     text = io.StringIO()
     # Text stays text, in the reader's own font; no dates, so that the same code makes the same file.
     with rc_context({"svg.fonttype": "none", "svg.hashsalt": "sms-online", "font.family": "sans-serif"}):
