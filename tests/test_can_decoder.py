@@ -197,3 +197,61 @@ def test_bytes_are_no_frames(tmp_path: Path) -> None:
     source = CanSource(kind="can", name="bus", dbc="ak80.dbc", signals={"AK80_REPLY.POSITION": Signal(channel="q")})
     with pytest.raises(TypeError, match="SerialChunk"):
         make_decoder(source, tmp_path).push(SerialChunk(0.0, b"x"))
+
+
+MULTIPLEXED = """VERSION ""
+
+BS_:
+
+BU_: RIG
+
+BO_ 291 DRIVE: 8 RIG
+ SG_ PAGE M : 0|4@1+ (1,0) [0|0] "" RIG
+ SG_ COUNT : 4|4@1+ (1,0) [0|0] "" RIG
+ SG_ ANGLE : 8|16@1- (0.001,0) [0|0] "rad" RIG
+ SG_ TORQUE m0 : 24|16@1- (0.01,0) [0|0] "N m" RIG
+ SG_ SPEED m1 : 24|16@1- (0.1,0) [0|0] "rad/s" RIG
+ SG_ DEEP m2M : 24|8@1+ (1,0) [0|0] "" RIG
+ SG_ TEMPERATURE m7 : 32|8@1+ (1,0) [0|0] "" RIG
+
+SG_MUL_VAL_ 291 TORQUE PAGE 0-0;
+SG_MUL_VAL_ 291 SPEED PAGE 1-1;
+SG_MUL_VAL_ 291 DEEP PAGE 2-3;
+SG_MUL_VAL_ 291 TEMPERATURE DEEP 7-7;
+"""
+
+
+def test_multiplexed_signals_are_read_from_their_frames(tmp_path: Path) -> None:
+    (tmp_path / "rig.dbc").write_text(MULTIPLEXED)
+    names = {"ANGLE": "q_1", "TORQUE": "tau_1", "SPEED": "omega_0_z", "TEMPERATURE": "r_S_x"}
+    table = {f"DRIVE.{name}": Signal(channel=channel) for name, channel in names.items()}
+    source = CanSource(kind="can", name="bus", dbc="rig.dbc", signals=table, counters=("DRIVE.COUNT",))
+    decode = make_can_decoder(source, tmp_path)
+    # Random pages, 7 and DEEP among them. Seed 6.
+    data = np.random.default_rng(6).integers(0, 256, (4000, 8), dtype=np.uint8)
+    data[:, 0] = (np.arange(4000) % 16 << 4) | np.random.default_rng(7).integers(0, 5, 4000)
+    data[::3, 3] = 7
+    sampled = decode.push(frames(ENCODER, data))
+    assert decode.counters["lost_counter"] == 0  # the counter counts all pages
+    database = cantools.database.load_string(MULTIPLEXED, "dbc")
+    assert isinstance(database, Database)
+    wanted = np.full((4000, 4), np.nan)
+    for row, word in zip(wanted, data, strict=True):
+        try:
+            decoded = database.get_message_by_name("DRIVE").decode(word.tobytes(), decode_choices=False)
+        except cantools.database.DecodeError:  # a page that the DBC does not describe
+            decoded = {"ANGLE": int.from_bytes(word[1:3].tobytes(), "little", signed=True) * 0.001}
+        assert isinstance(decoded, dict)
+        row[:] = [decoded.get(name, np.nan) for name in names]
+    np.testing.assert_array_equal(sampled.values, wanted)
+    assert all(np.isfinite(column).sum() > 200 for column in wanted.T)
+
+
+def test_a_multiplexed_counter_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "rig.dbc").write_text(
+        MULTIPLEXED.replace(" COUNT ", " COUNT m0 ") + "SG_MUL_VAL_ 291 COUNT PAGE 0-0;\n"
+    )
+    table = {"DRIVE.ANGLE": Signal(channel="q_1")}
+    source = CanSource(kind="can", name="bus", dbc="rig.dbc", signals=table, counters=("DRIVE.COUNT",))
+    with pytest.raises(InputError, match=r"counters, DRIVE.COUNT: a multiplexed signal; expected one that every frame"):
+        make_can_decoder(source, tmp_path)

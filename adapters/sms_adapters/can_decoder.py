@@ -31,9 +31,9 @@ class CanDecoder:
         self.unknown_ids: list[int] = []  # the first of them
         self.messages = tuple(messages)
         self._ids = np.array([message.id for message in messages], dtype=np.uint32)
-        self._columns = [list(message.columns) for message in messages]
+        self._parts = [(k, part) for k, message in enumerate(messages) for part in message.parts]
         self._conversions = [
-            Conversions([signals[column] for column in message.columns], self.counters) for message in messages
+            Conversions([signals[column] for column in part.columns], self.counters) for _, part in self._parts
         ]
         self.turns = {channel: turns for each in self._conversions for channel, turns in each.turns.items()}
         self._sequences = [
@@ -53,13 +53,20 @@ class CanDecoder:
         values = np.full((len(raw), len(self.channels)), np.nan)
         used = np.zeros(len(raw), dtype=np.bool_)
         plain = self._plain(raw)
-        for k, message in enumerate(self.messages):
-            rows = self._admitted(k, message, raw, np.flatnonzero(plain & (raw.id == message.id)))
+        admitted = [
+            self._admitted(k, message, raw, np.flatnonzero(plain & (raw.id == message.id)))
+            for k, message in enumerate(self.messages)
+        ]
+        for (k, part), convert in zip(self._parts, self._conversions, strict=True):
+            rows = admitted[k]
+            words = self.messages[k].words(raw.data, rows)
+            if part.condition:
+                held = part.held(words)
+                rows, words = rows[held], words[held]
             if not rows.size:
                 continue
-            words = message.words(raw.data, rows)
-            numbers = np.stack([decode_signal(signal, words) for signal in message.signals], axis=1)
-            values[rows[:, None], self._columns[k]] = self._conversions[k](numbers)
+            numbers = np.stack([decode_signal(signal, words) for signal in part.signals], axis=1)
+            values[rows[:, None], list(part.columns)] = convert(numbers)
             used[rows] = True
         # A frame whose every value was refused is no sample.
         used &= ~np.isnan(values).all(axis=1)

@@ -28,12 +28,33 @@ _MOST_BITS = 32  # of a counter
 _FLOATS = {16: np.float16, 32: np.float32, 64: np.float64}
 
 
+# Multiplexers and the values of each, all of which must hold in a frame.
+Condition = tuple[tuple[Signal, tuple[int, ...]], ...]
+
+
+@dataclass(frozen=True)
+class Part:
+    """Signals of a message that come in the same frames, and their columns in a block."""
+
+    signals: tuple[Signal, ...]
+    columns: tuple[int, ...]
+    condition: Condition
+
+    def held(self, frames: NDArray[np.uint8]) -> NDArray[np.bool_]:
+        """(B,) mask of the frames (B, bytes) of the message that hold these signals."""
+        held = np.ones(len(frames), dtype=np.bool_)
+        for multiplexer, values in self.condition:
+            held &= np.isin(raw_word(multiplexer, frames), np.array(values, dtype=np.uint64))
+        return held
+
+
 @dataclass(frozen=True)
 class WantedMessage:
     """A message that channels come from.
 
     id: with EXTENDED set for 29 bits. length: bytes. signals: those wanted of it, and their columns in a block.
-    counter: the signal in which the sender counts its frames, if it does.
+    counter: the signal in which the sender counts its frames, if it does. conditions: of each signal, where some are
+    multiplexed.
     """
 
     name: str
@@ -42,6 +63,18 @@ class WantedMessage:
     signals: tuple[Signal, ...]
     columns: tuple[int, ...]
     counter: Signal | None = None
+    conditions: tuple[Condition, ...] = ()
+
+    @property
+    def parts(self) -> list[Part]:
+        """The signals in groups that come in the same frames."""
+        groups: dict[Condition, list[int]] = {}
+        for k, condition in enumerate(self.conditions or [()] * len(self.signals)):
+            groups.setdefault(condition, []).append(k)
+        return [
+            Part(tuple(self.signals[k] for k in group), tuple(self.columns[k] for k in group), condition)
+            for condition, group in groups.items()
+        ]
 
     def words(self, frames: NDArray[np.uint8], rows: NDArray[np.intp]) -> NDArray[np.uint8]:
         """Bytes of those rows of frames (N, 64) that are this message's: a classic frame's whole word at least."""
@@ -51,8 +84,8 @@ class WantedMessage:
 def wanted_messages(source: CanSource, directory: Path | None) -> list[WantedMessage]:
     """The messages of source.signals, columns in its order; the DBC from the system's directory or among those shipped.
 
-    Raises InputError for a DBC that is missing or unreadable, a message or signal it does not hold, a multiplexed
-    signal, and a counter of a message that no channel comes from or that is not a plain unsigned number.
+    Raises InputError for a DBC that is missing or unreadable, a message or signal it does not hold, and a counter of a
+    message that no channel comes from, that is not a plain unsigned number, or that not every frame holds.
     """
     place = f"source {source.name}"
     database = _read_dbc(place, source.dbc, directory)
@@ -68,6 +101,9 @@ def wanted_messages(source: CanSource, directory: Path | None) -> list[WantedMes
         if signal.is_signed or signal.is_float or signal.scale != 1 or signal.offset != 0 or signal.length > _MOST_BITS:
             expected = f"an unsigned whole number of at most {_MOST_BITS} bits"
             raise InputError(place, f"counters, {name}", "a number with sign or scale, or a longer one", expected)
+        if signal.multiplexer_ids:
+            expected = "one that every frame of its message holds"
+            raise InputError(place, f"counters, {name}", "a multiplexed signal", expected)
         counters[message_name] = signal
     return [
         WantedMessage(
@@ -77,6 +113,7 @@ def wanted_messages(source: CanSource, directory: Path | None) -> list[WantedMes
             tuple(signal for _, signal in pairs),
             tuple(column for column, _ in pairs),
             counters.get(name),
+            tuple(_condition(messages[name], signal) for _, signal in pairs),
         )
         for name, pairs in wanted.items()
     ]
@@ -154,7 +191,7 @@ def _pieces(signal: Signal) -> list[tuple[int, int, int]]:
 
 
 def _find(place: str, key: str, name: str, messages: dict[str, Message]) -> Signal:
-    """The signal MESSAGE.SIGNAL; InputError where there is none, or where not every frame of the message holds it."""
+    """The signal MESSAGE.SIGNAL; InputError where there is none."""
     message_name, signal_name = name.split(".")
     if message_name not in messages:
         raise _unknown(place, key, name, [f"{m.name}.{s.name}" for m in messages.values() for s in m.signals])
@@ -162,9 +199,15 @@ def _find(place: str, key: str, name: str, messages: dict[str, Message]) -> Sign
     found = [signal for signal in message.signals if signal.name == signal_name]
     if not found:
         raise _unknown(place, key, name, [f"{message_name}.{signal.name}" for signal in message.signals])
-    if found[0].multiplexer_ids:
-        raise InputError(place, f"{key}, {name}", "a multiplexed signal", "one that every frame of its message holds")
     return found[0]
+
+
+def _condition(message: Message, signal: Signal) -> Condition:
+    """Which frames of a message hold a signal: a multiplexer may itself be multiplexed."""
+    if not signal.multiplexer_ids:
+        return ()
+    multiplexer = message.get_signal_by_name(signal.multiplexer_signal)
+    return (*_condition(message, multiplexer), (multiplexer, tuple(signal.multiplexer_ids)))
 
 
 def _read_dbc(place: str, name: str, directory: Path | None) -> cantools.database.can.Database:

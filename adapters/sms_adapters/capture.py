@@ -168,7 +168,7 @@ class CaptureWriter:
 
     def __init__(self, path: Path, channels: tuple[str, ...]) -> None:
         if path.suffix != ".csv":
-            raise InputError(str(path), "", f"a capture named {path.name}", "a name ending in .csv")
+            raise InputError(str(path), "", f"a capture named {path.name}", "a name ending in .csv or .mcap")
         self._path = path
         self._part = path.with_name(path.name + ".part")
         self._names = ("t", *channels)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from fnmatch import fnmatchcase
 from pathlib import Path
 
@@ -10,7 +11,7 @@ from sms_adapters.canopen_signals import pdo_messages
 from sms_adapters.clock_merge import Merger, SourceLane, Steps, Stream
 from sms_adapters.devices import make_decoder
 from sms_online.description.schema import System
-from sms_online.description.sources import CanopenSource, CanSource, Source
+from sms_online.description.sources import CanopenSource, CanSource, Device
 from sms_online.errors import InputError
 from sms_online.pipeline.blocks import momentum_blocks
 
@@ -18,11 +19,11 @@ from sms_online.pipeline.blocks import momentum_blocks
 def lanes(system: System, directory: Path | None) -> list[SourceLane]:
     """A lane for each source of the system; directory: where its file stands, with the files that it names.
 
-    Raises InputError for a system without sources, and as the decoders do.
+    Raises InputError for a system without devices, and as the decoders do.
     """
-    if not system.sources:
+    if not system.devices:
         raise InputError(system.name, "source", "no such table", "a table [[source]] for each device of the testbed")
-    return [_lane(system, source, directory) for source in system.sources]
+    return [_lane(system, source, directory) for source in system.devices]
 
 
 def merger(system: System, directory: Path | None, start: float = 0.0) -> Merger:
@@ -42,13 +43,19 @@ def period(system: System, channel: str) -> float:
     return 1.0 / (next((rate for rate in rates if rate is not None), None) or system.sample_rate)
 
 
-def _lane(system: System, source: Source, directory: Path | None) -> SourceLane:
+def _message_period(system: System, channels: Sequence[str], message: WantedMessage) -> float:
+    """Nominal period of a message, s: multiplexed parts without signals in every frame come one after the other."""
+    periods = {part.condition: period(system, channels[part.columns[0]]) for part in message.parts}
+    return periods[()] if () in periods else 1.0 / sum(1.0 / each for each in periods.values())
+
+
+def _lane(system: System, source: Device, directory: Path | None) -> SourceLane:
     decoder = make_decoder(source, directory)
     messages: list[WantedMessage] = []
     if isinstance(source, CanSource):
         messages = wanted_messages(source, directory)
     elif isinstance(source, CanopenSource):
         messages = pdo_messages(source, directory)
-    streams = [Stream(m.columns, period(system, decoder.channels[m.columns[0]]), m) for m in messages]
+    streams = [Stream(m.columns, _message_period(system, decoder.channels, m), m) for m in messages]
     everything = Stream(tuple(range(len(decoder.channels))), period(system, decoder.channels[0]))
     return SourceLane(source.name, decoder, streams or [everything], source.latency)

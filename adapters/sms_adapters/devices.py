@@ -11,17 +11,17 @@ from sms_adapters.canopen_signals import pdo_messages
 from sms_adapters.raw import Clock, Decoder, Reader, Turn, at_once
 from sms_adapters.serial_decoder import FrameDecoder, LineDecoder
 from sms_adapters.serial_reader import SerialReader
-from sms_online.description.sources import CanopenSource, CanSource, SerialFrames, Source
+from sms_online.description.sources import CanopenSource, CanSource, Device, SerialFrames
 
 
-def make_reader(source: Source, clock: Clock, turn: Turn = at_once) -> Reader:
+def make_reader(source: Device, clock: Clock, turn: Turn = at_once) -> Reader:
     """The reader of a source's device, not yet open; clock: of the session. turn: called before each fetch."""
     if isinstance(source, CanSource | CanopenSource):
         return CanReader(source, clock, turn=turn)
     return SerialReader(source, clock, turn)
 
 
-def make_decoder(source: Source, directory: Path | None) -> Decoder:
+def make_decoder(source: Device, directory: Path | None) -> Decoder:
     """The decoder of a source's raw items; directory: where the system file stands, with its DBC or EDS beside it.
 
     Raises InputError where those do not fit the source.

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import zlib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +11,7 @@ import numpy as np
 from scipy.io import loadmat
 from scipy.io.matlab import MatReadError
 
-from sms_adapters.capture import CaptureWriter
+from sms_adapters.mcap_capture import capture_writer
 from sms_online.errors import InputError
 from sms_online.stream import Array, Block
 
@@ -28,7 +28,7 @@ def import_emps(source: Path, capture: Path) -> int:
     published drive gain, 35.15 N/V, not a measurement. The reference qg is left out.
     Raises InputError where a variable is missing or of another size.
     """
-    data = _load(source)
+    data = load_matlab(source)
     gain = _numbers(source, data, "gtau", ())
     t = _numbers(source, data, "t", (None,))
     values = np.column_stack(
@@ -49,7 +49,7 @@ def import_quanser(source: Path, capture: Path) -> int:
     the signals, shows no grid.
     Raises InputError where a variable is missing, of another size, or not on the instants of the first current.
     """
-    data = _load(source)
+    data = load_matlab(source)
     t = _numbers(source, data, "data_Im1", (None, 3))[:, 0]
     channels: list[str] = []
     columns: list[Array] = []
@@ -64,10 +64,12 @@ def import_quanser(source: Path, capture: Path) -> int:
     return _write(source, capture, np.round(t - t[0], _TIME_DECIMALS), tuple(channels), np.column_stack(columns))
 
 
-def _load(source: Path) -> Mapping[str, Any]:
+def load_matlab(source: Path, names: Sequence[str] | None = None) -> Mapping[str, Any]:
+    """Variables of a .mat file up to version 7, structs as dictionaries; InputError where it is none. names: which."""
     try:
         with source.open("rb") as file:
-            return loadmat(file, squeeze_me=True)  # type: ignore[arg-type]  # its stubs know names only
+            # Its stubs know names only.
+            return loadmat(file, simplify_cells=True, variable_names=names)  # type: ignore[arg-type]
     except OSError as error:
         raise InputError(str(source), "", error.strerror or str(error), "a readable .mat file") from None
     except (MatReadError, ValueError, TypeError, NotImplementedError, zlib.error) as error:
@@ -102,6 +104,6 @@ def _measured(source: Path, data: Mapping[str, Any], name: str, t: Array) -> Arr
 def _write(source: Path, capture: Path, t: Array, channels: tuple[str, ...], values: Array) -> int:
     if not (t.size and (np.diff(t) > 0).all()):
         raise InputError(str(source), "", "times that do not increase", "one sample after the other")
-    with CaptureWriter(capture, channels) as writer:
+    with capture_writer(capture, channels) as writer:
         writer.write(Block(t, channels, values))
     return t.size

@@ -7,8 +7,9 @@ from pathlib import Path
 
 import numpy as np
 
-from sms_adapters.capture import CaptureReader, CaptureWriter
+from sms_adapters.capture import CaptureReader
 from sms_adapters.checkpoint import read_checkpoint
+from sms_adapters.mcap_capture import capture_writer
 from sms_adapters.recording import Recording
 from sms_adapters.searches import searcher_of
 from sms_adapters.session_log import SESSION
@@ -46,10 +47,10 @@ def read_capture(
     start: float | None = None,
     stop: float | None = None,
 ) -> Capture:
-    """Read a capture (.csv), a CAN log or a live session's recording into memory.
+    """Read a capture (.csv), a CAN log, a table, a bag or a live session's recording into memory.
 
-    system: described, or its name or file; a log or recording needs it, and finds a DBC of its own beside the system's
-    file where that is given. start, stop: s after the first sample. InputError where it cannot be read, line and place
+    system: described, or its name or file; all but a capture need it, and a log finds its DBC beside the system's file
+    where that is given. start, stop: s after the first sample. InputError where it cannot be read, line and place
     named.
     """
     path, folder = Path(path), None
@@ -74,9 +75,12 @@ def captured(recorded: Recorded) -> Capture:
 
 
 def write_capture(capture: Capture, path: str | Path) -> Path:
-    """Write a capture as .csv, to the same bits, and the truth of a simulation beside it. InputError where it fails."""
+    """Write a capture as .csv, to the same bits, or .mcap for Foxglove; the truth of a simulation goes beside it.
+
+    InputError where it fails.
+    """
     path = Path(path)
-    with CaptureWriter(path, capture.channels) as writer:
+    with capture_writer(path, capture.channels) as writer:
         for block in capture:
             writer.write(block)
     if capture.truth is not None:

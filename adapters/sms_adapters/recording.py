@@ -57,7 +57,7 @@ class Recording:
         self._start = -math.inf if start is None else start
         self._stop = math.inf if stop is None else stop
         self._system, self._system_directory = system, system_directory
-        names = [source.name for source in system.sources]
+        names = [source.name for source in system.devices]
         if set(names) != set(self._header.sources):
             found = ", ".join(self._header.sources) or "none"
             expected = f"those of the system: {', '.join(names) or 'none'}; --system {directory / SYSTEM} has its own"
@@ -96,7 +96,7 @@ class Recording:
         """Yield the blocks from the beginning."""
         self._items = [
             RecordedItems(self._directory, source.name, self._header.sources[source.name], self._header.epoch)
-            for source in self._system.sources
+            for source in self._system.devices
         ]
         self._merger = ours = merger(self._system, self._system_directory, self._header.start)
         if self.checkpoint is not None:

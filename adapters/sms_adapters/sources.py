@@ -9,10 +9,14 @@ from sms_adapters.can_logs import CSV_HEADER
 from sms_adapters.can_replay import CanLogReader
 from sms_adapters.capture import CaptureReader
 from sms_adapters.lines import LineReader
+from sms_adapters.log_bags import is_bag
+from sms_adapters.log_reader import LogReader
+from sms_adapters.log_tables import ARRAY_ENDINGS, PARQUET_ENDINGS
 from sms_adapters.recording import Recording
 from sms_adapters.session_log import SESSION
 from sms_online.description.channels import channels
 from sms_online.description.schema import System
+from sms_online.description.sources import TableSource
 from sms_online.errors import InputError
 from sms_online.stream import Source
 
@@ -25,19 +29,29 @@ def open_source(
     on_bytes: Callable[[int], None] | None = None,
     directory: Path | None = None,
 ) -> Source:
-    """The reader of a capture (.csv), a CAN log (.log of candump, .asc, .blf, .trc, .mf4, .csv of python-can) or a live
-    session's recording (its directory).
+    """The reader of a capture (.csv), a CAN log (.log of candump, .asc, .blf, .trc, .mf4, .csv of python-can), a table
+    (.csv, .parquet, .h5, .mat), a bag (.bag, .db3, .mcap or its directory) or a live session's recording (directory).
 
-    Text may be compressed (.gz). start, stop: seconds after the file's first sample or frame, or the session's start.
+    A .csv is a capture where its header says so, or the system has no source of kind `table`. Text may be compressed
+    (.gz). start, stop: seconds after the file's first sample or frame, or the session's start.
     on_bytes: called with the bytes of the file consumed so far. directory: where the system file stands, to find its
     DBC. Raises InputError for another ending, a channel that the system does not have, and as the readers do.
     """
     if (path / SESSION).is_file():
         return Recording(path, system, directory, start, stop)
     name = path.name.removesuffix(".gz")
-    if name.endswith(".csv") and LineReader(path).first_line().strip() != CSV_HEADER:
-        return CaptureReader(path, start, stop, on_bytes=on_bytes, known=channels(system))
+    if is_bag(path) or path.suffix in (*PARQUET_ENDINGS, *ARRAY_ENDINGS):
+        return LogReader(path, system, start, stop, on_bytes)
+    if name.endswith(".csv") and (header := LineReader(path).first_line().strip()) != CSV_HEADER:
+        known = channels(system)
+        captured = set(header.split(",")) <= {"t", *known}
+        if not captured and any(isinstance(source, TableSource) for source in system.sources):
+            return LogReader(path, system, start, stop, on_bytes)
+        return CaptureReader(path, start, stop, on_bytes=on_bytes, known=known)
     if name.endswith((".csv", ".log", ".asc", ".trc")) or path.suffix in (".blf", ".mf4"):
         return CanLogReader(path, system, start, stop, on_bytes=on_bytes, directory=directory)
-    expected = "a name ending in .csv, .log, .asc, .trc (or .gz of those), .blf or .mf4, or a recording"
+    expected = (
+        "a capture or table (.csv, .parquet, .h5, .mat), a CAN log (.log, .asc, .trc, .blf, .mf4), a bag (.mcap, .bag, "
+        ".db3) or a recording"
+    )
     raise InputError(str(path), "", f"a file named {path.name}", expected)

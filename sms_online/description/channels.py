@@ -89,6 +89,22 @@ def _link_channels(i: int, link: FlexibleLink, planar: bool) -> list[str]:
     ]
 
 
+def channel_unit(system: System, channel: str) -> str:
+    """SI unit of a channel of the system; "" for the parts of a quaternion."""
+    name = channel.rpartition(".")[2]
+    stem, _, number = name.rpartition("_")
+    if stem in ("tau", "force", "q", "theta_m"):
+        slides = system.joints[int(number) - 1].kind == "prismatic"
+        if stem in ("tau", "force"):
+            return "N" if slides else "N m"
+        return "m" if slides else "rad"
+    if name.startswith(("v_S", "omega", "gyro")):
+        return "m/s" if name.startswith("v_S") else "rad/s"
+    if name.startswith("eps") or name == "eta":
+        return ""
+    return "rad" if name.startswith(("theta", "strain")) else "m"
+
+
 def sensed_channels(system: System, sensor: Sensor) -> tuple[str, ...]:
     """Channels of the system that a sensor's shell patterns select, in the order of `channels`."""
     return tuple(c for c in channels(system) if any(fnmatchcase(c, pattern) for pattern in sensor.channels))

@@ -8,9 +8,11 @@ from collections.abc import Iterator, Sequence
 from sms_online.description.explain import hint, nearest
 from sms_online.description.schema import System
 from sms_online.description.sources import (
+    BagSource,
     CanopenSource,
     CanSource,
     FrameField,
+    LogSource,
     SerialField,
     SerialFrames,
     SerialLines,
@@ -23,6 +25,9 @@ from sms_online.errors import InputError
 NAME = re.compile(r"[A-Za-z0-9_-]+")
 CAN_SIGNAL = re.compile(r"\w+\.\w+")
 CANOPEN_SIGNAL = re.compile(r"(?P<node>\d+)\.[0-9A-Fa-f]{4}(:[0-9A-Fa-f]{1,2})?")
+# A topic, and the path of a number in its messages: names and, in brackets, a number or a name.
+BAG_SIGNAL = re.compile(r"[^.\[\]]+(\.\w+(\[[^\[\].]+\])*)+")
+STAMP = re.compile(r"\w+(\.\w+)*")
 MOST_NODES = 127  # CiA 301
 # One character between numbers that no number holds; "" means blanks.
 SEPARATOR = re.compile(r"[!-~\t]?")
@@ -48,6 +53,8 @@ def check_sources(system: System, names: Sequence[str], source: str) -> None:
             _check_can(device, place, source)
         elif isinstance(device, CanopenSource):
             _check_canopen(device, place, source)
+        elif isinstance(device, LogSource):
+            _check_log(device, place, source)
         else:
             _check_serial(device, place, source)
         for where, signal in _signals(device, place):
@@ -55,7 +62,7 @@ def check_sources(system: System, names: Sequence[str], source: str) -> None:
 
 
 def _signals(device: Source, place: str) -> Iterator[tuple[str, Signal | SerialField]]:
-    if isinstance(device, CanSource | CanopenSource):
+    if isinstance(device, CanSource | CanopenSource | LogSource):
         for name, signal in device.signals.items():
             yield f"{place}.signals.{name}", signal
     else:
@@ -109,6 +116,23 @@ def _check_canopen(device: CanopenSource, place: str, source: str) -> None:
         if node not in device.nodes:
             expected = f"a node of [{place}.nodes]{hint(nearest(node, tuple(device.nodes)))}"
             raise InputError(source, f"{place}.signals.{name}", f"node {node}", expected)
+
+
+def _check_log(device: LogSource, place: str, source: str) -> None:
+    """A log's paths; what lies at them the file alone can say."""
+    if not device.signals:
+        raise InputError(
+            source, f"{place}.signals", "an empty table", '"column or topic path" = "channel", at least once'
+        )
+    if isinstance(device, BagSource):
+        if not STAMP.fullmatch(device.stamp):
+            raise InputError(
+                source, f"{place}.stamp", repr(device.stamp), 'the path of a field, such as "header.stamp"'
+            )
+        for name in device.signals:
+            if not BAG_SIGNAL.fullmatch(name):
+                expected = 'a topic and a path, such as "/joint_states.position[0]", in quotes'
+                raise InputError(source, f"{place}.signals", repr(name), expected)
 
 
 def _check_keys(device: CanSource | CanopenSource, place: str, form: re.Pattern[str], shown: str, source: str) -> None:

@@ -42,7 +42,12 @@ LINKS: dict[str, type[BaseModel]] = {
     "cross": schema.RigidLink,
     "flexible": schema.FlexibleLink,
 }
-SOURCES: dict[str, type[BaseModel]] = {"can": sources.CanSource, "canopen": sources.CanopenSource}
+SOURCES: dict[str, type[BaseModel]] = {
+    "can": sources.CanSource,
+    "canopen": sources.CanopenSource,
+    "table": sources.TableSource,
+    "bag": sources.BagSource,
+}
 SERIAL: dict[str, type[BaseModel]] = {"frames": sources.SerialFrames, "lines": sources.SerialLines}
 TAGS = {"links": {"kind": tuple(LINKS)}, "sources": {"kind": (*SOURCES, "serial"), "format": tuple(SERIAL)}}
 INERTIAS = ("inertia", "stator_inertia")
@@ -174,7 +179,7 @@ def _keys_beside(loc: tuple[int | str, ...]) -> tuple[str, ...]:
     elif loc[0] == "links":
         record = LINKS[str(loc[2])]
     elif loc[0] == "sources" and "signals" in loc:
-        record = sources.Signal
+        record = sources.LogSignal if loc[2] in ("table", "bag") else sources.Signal
     elif loc[0] == "sources" and "fields" in loc:
         record = sources.FrameField if "frames" in loc else sources.SerialField
     elif loc[0] == "sources":

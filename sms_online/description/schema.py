@@ -12,7 +12,7 @@ from typing import Annotated, Any, Literal
 from pydantic import Field, model_validator
 
 from sms_online.description.record import NonNegative, Positive, Record
-from sms_online.description.sources import Source
+from sms_online.description.sources import Device, LogSource, Source
 
 Vector3 = tuple[float, float, float]
 Deformation = Literal["traction", "torsion", "bending_y", "bending_z"]
@@ -319,7 +319,7 @@ class System(Record):
     links: `[link_1]`, …, one for each joint, the fixed ones included.
     payload: a rigid body at the tip of the link of the last joint that moves, in that link's tip frame.
     sensors: `[[sensor]]` tables.
-    sources: `[[source]]` tables, the devices of a live session.
+    sources: `[[source]]` tables, the devices of a live session and what the columns or topics of a log mean.
     effects: `[[effect]]` tables.
     known: parameters that are known exactly, name to value in the parameter's unit; they leave the unknowns.
     priors: parameters that are known with a standard deviation, a table `[prior]`.
@@ -353,6 +353,11 @@ class System(Record):
     windows: Windows = Windows()
     tolerances: Tolerances = EXACT
     balance: Literal["both", "energy", "momentum", "smoother"] = "both"
+
+    @property
+    def devices(self) -> tuple[Device, ...]:
+        """The sources that a live session listens to."""
+        return tuple(source for source in self.sources if not isinstance(source, LogSource))
 
     @property
     def nominal(self) -> dict[str, float]:

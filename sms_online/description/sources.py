@@ -1,4 +1,4 @@
-"""The devices of a testbed as a system file describes them: on a CAN bus, or on a serial port."""
+"""The devices of a testbed as a system file describes them, on a CAN bus or a serial port, and what its logs mean."""
 
 from __future__ import annotations
 
@@ -164,5 +164,60 @@ class SerialLines(SerialPort):
     checksum: Literal["none", "xor"] = "none"
 
 
+class LogSignal(Signal):
+    """Where a number of a log goes: channel value = scale · number / gear + offset, the number in its unit.
+
+    In a system file a mere channel name is short for { channel = name }.
+
+    scale: factor on the number; a negative one turns the sign.
+    unit: of the number, as pint names it: "deg", "mN m", "rpm"; not stated: the channel's own, in SI.
+    gear: divides what was measured on the other side of the gear: an angle at the motor, or a torque at the axis.
+    """
+
+    unit: str | None = None
+    gear: Positive = 1.0
+
+
+class LogSource(SourceRecord):
+    """What a log holds, stamped by one clock. It is read by `replay`, `diagnose` and `import`; nothing is listened to.
+
+    stamp_unit: of stamps that are mere numbers: "s", "ms", "µs" or "ns".
+    signals: where each number of the log goes.
+    """
+
+    stamp_unit: Literal["s", "ms", "µs", "us", "ns"] = "s"
+    signals: dict[str, LogSignal]
+
+
+class TableSource(LogSource):
+    """Columns with common instants, of a CSV, Parquet, HDF5 or MATLAB file.
+
+    The keys of signals name columns. In HDF5 and .mat files a key is the path of an array, such as "motors/torque";
+    "torque[2]" is column 2 of an array of several, counted from 0.
+
+    kind: `table`.
+    stamp: the column of the instants.
+    """
+
+    kind: Literal["table"]
+    stamp: str = "t"
+
+
+class BagSource(LogSource):
+    """Topics of a ROS 1 or ROS 2 bag, or of an MCAP file with ROS 2 or JSON messages.
+
+    The keys of signals are a topic and the path of a number in its messages: "/joint_states.position[0]", counted from
+    0, or "/joint_states.position[elbow]", the place that the message's list `name` has for it.
+
+    kind: `bag`.
+    stamp: path of the instant in each message; messages without it have the time at which they were recorded, as all
+    have with `recorded`.
+    """
+
+    kind: Literal["bag"]
+    stamp: str = "header.stamp"
+
+
+Device = CanSource | CanopenSource | SerialFrames | SerialLines
 SerialSource = Annotated[SerialFrames | SerialLines, Field(discriminator="format")]
-Source = Annotated[CanSource | CanopenSource | SerialSource, Field(discriminator="kind")]
+Source = Annotated[CanSource | CanopenSource | SerialSource | TableSource | BagSource, Field(discriminator="kind")]

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sms_online.description.sources import SerialFrames, SerialLines, Source
+from sms_online.description.sources import LogSource, SerialFrames, SerialLines, Source
 from sms_online.effects.delay import late_keys
 from sms_online.pipeline.sensing import Sensing
 from sms_online.state import Stage, State
@@ -80,10 +80,10 @@ def source_groups(sensing: Sensing) -> tuple[SourceGroup, ...]:
 
 
 def clock_groups(sensing: Sensing) -> tuple[SourceGroup, ...]:
-    """What has a clock of its own: the senders on a bus, each with messages of its name, and serial devices."""
+    """What has a clock of its own: the senders on a bus, each with messages of its name, other devices, logs."""
     members: dict[tuple[str, str], list[str]] = {}
     for source in sensing.model.system.sources:
-        if isinstance(source, SerialFrames | SerialLines):
+        if isinstance(source, SerialFrames | SerialLines | LogSource):
             members[source.name, ""] = source_channels(source)
         else:
             for key, signal in source.signals.items():

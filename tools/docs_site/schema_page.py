@@ -39,9 +39,12 @@ HEADINGS: dict[type[Record], str] = {
     sources.CanopenSource: '`[[source]]` of `kind = "canopen"`',
     sources.SerialFrames: '`[[source]]` of `kind = "serial"` and `format = "frames"`',
     sources.SerialLines: '`[[source]]` of `kind = "serial"` and `format = "lines"`',
+    sources.TableSource: '`[[source]]` of `kind = "table"`',
+    sources.BagSource: '`[[source]]` of `kind = "bag"`',
     sources.Signal: "Signals of a CAN source",
     sources.FrameField: "Fields of binary frames",
     sources.SerialField: "Fields of lines",
+    sources.LogSignal: "Signals of a log",
 }
 ENTRY = re.compile(r"(\w+(?:, \w+)*): (.*)")
 

@@ -149,7 +149,8 @@ def _add_noise(parser: Parser) -> None:
 
 
 def _add_capture(parser: Parser, required: bool = True) -> None:
-    parser.add_argument("--capture", metavar="FILE.csv", type=Path, required=required, help="the capture to write")
+    text = "the capture to write: .csv, or .mcap for Foxglove and PlotJuggler"
+    parser.add_argument("--capture", metavar="FILE", type=Path, required=required, help=text)
 
 
 def _add_demo(verbs: Verbs) -> None:
@@ -205,7 +206,7 @@ def _add_simulate(verbs: Verbs) -> None:
 def _add_replay(verbs: Verbs) -> None:
     parser = _add_verb(verbs, "replay", "replay", "Estimate the parameters of a system from a recorded session.")
     parser.add_argument(
-        "capture", metavar="CAPTURE", type=Path, help="a capture (.csv) or a candump log (.log), or .gz"
+        "capture", metavar="CAPTURE", type=Path, help="a capture (.csv), CAN log, bag, table or recording"
     )
     _add_system(parser)
     _add_out(parser)
@@ -245,10 +246,13 @@ def _add_diagnose(verbs: Verbs) -> None:
 
 
 def _add_import(verbs: Verbs) -> None:
-    text = "Turn a published measurement (.mat) into a capture, or a URDF into a system file."
+    text = "Turn a log, or a published measurement, into a capture, or a URDF into a system file."
     parser = _add_verb(verbs, "import", "import_data", text)
-    parser.add_argument("kind", metavar="KIND", choices=("quanser", "emps", "urdf"), help="quanser, emps or urdf")
-    parser.add_argument("source", metavar="SOURCE", type=Path, help="the file as its owners published it")
+    text = "log: a bag, table, CAN log or recording; quanser, emps: a published measurement (.mat); urdf"
+    parser.add_argument("kind", metavar="KIND", choices=("log", "quanser", "emps", "urdf"), help=text)
+    parser.add_argument("source", metavar="SOURCE", type=Path, help="the file as it is")
+    text = "of a log: the system file, whose [[source]] tables say what the log's numbers are"
+    parser.add_argument("--system", metavar="FILE|NAME", help=text)
     _add_capture(parser, required=False)
     text = "of a URDF: the system file to write, SOURCE with the ending .toml by default"
     parser.add_argument("--out", metavar="FILE.toml", type=Path, help=text)

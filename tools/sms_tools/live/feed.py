@@ -12,7 +12,7 @@ from sms_adapters.raw import CanFrames, LostDevice, Raw, Reader
 from sms_adapters.recorder import Recorder
 from sms_adapters.recording import split
 from sms_adapters.session_log import Kind, from_microseconds, number_of_items, quantised
-from sms_online.description.sources import SerialPort, Source
+from sms_online.description.sources import Device, SerialPort
 from sms_online.errors import InputError
 
 # Longest wait in a read, s: how late a reader notices that the session ends.
@@ -62,7 +62,7 @@ class SessionClock:
         return from_microseconds((time.monotonic_ns() - self._zero) // 1000)
 
 
-def kind_of(source: Source) -> Kind:
+def kind_of(source: Device) -> Kind:
     """What its recording holds: frames or bytes."""
     return "serial" if isinstance(source, SerialPort) else "can"
 

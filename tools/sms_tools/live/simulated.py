@@ -31,7 +31,7 @@ def write_testbed(name: str, system: System, grade: str | None, folder: Path) ->
 
     name: shipped name or path. Raises InputError as for the simulated sensors.
     """
-    if system.sources:
+    if system.devices:
         if name in shipped_systems():
             raise InputError(name, "source", "a device of a real testbed", "a system without [[source]] to simulate")
         return Path(name)

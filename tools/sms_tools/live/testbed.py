@@ -74,13 +74,13 @@ def open_testbed(
     session = Session(system, channels, adopt=adopt, source=name, checkpoint=checkpoint)
     clock = SessionClock()
     start = 0.0 if resume is None else resumed_start(resume, session, clock.epoch)
-    header = SessionHeader(clock.epoch, {source.name: kind_of(source) for source in system.sources}, start, versions())
+    header = SessionHeader(clock.epoch, {source.name: kind_of(source) for source in system.devices}, start, versions())
     recorder = Recorder(directory, header, system_files(name, system))
     if resume is not None:
         shutil.copyfile(resume / CHECKPOINT, directory / RESUMED_FROM)
     interpreter = Interpreter()
     sys.setswitchinterval(SWITCH_INTERVAL)
-    feeds = [Feed(make_reader(source, clock, interpreter.await_free), recorder) for source in system.sources]
+    feeds = [Feed(make_reader(source, clock, interpreter.await_free), recorder) for source in system.devices]
     merged = merger(system, folder, start)
     if checkpoint is not None:
         checkpoint.put_into_source(merged)

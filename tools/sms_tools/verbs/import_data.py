@@ -1,18 +1,25 @@
-"""import: a published measurement as a capture."""
+"""import: a published measurement, or any log that a system file describes, as a capture."""
 
 from __future__ import annotations
 
 import argparse
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
 
 from sms_adapters.importers import import_emps, import_quanser
+from sms_adapters.mcap_capture import capture_writer
+from sms_adapters.sources import open_source
 from sms_adapters.truth import truth_path
 from sms_online.errors import InputError
 from sms_online.result import json_text
 from sms_tools.exit_codes import OK
 from sms_tools.report import report_console, show
+from sms_tools.session import described_system
 from sms_tools.verbs import import_urdf
 
-IMPORTERS = {"emps": import_emps, "quanser": import_quanser}
+# Writes the capture of a source; number of its samples, and what was skipped.
+Importer = Callable[[argparse.Namespace], tuple[int, list[str]]]
 
 
 def run(args: argparse.Namespace) -> int:
@@ -20,11 +27,38 @@ def run(args: argparse.Namespace) -> int:
     if args.kind == "urdf":
         return import_urdf.run(args)
     if args.capture is None:
-        raise InputError(f"import {args.kind}", "", "no --capture", "--capture FILE.csv, the capture to write")
-    samples = IMPORTERS[args.kind](args.source, args.capture)
+        raise InputError(f"import {args.kind}", "", "no --capture", "--capture FILE, the capture to write")
+    samples, warnings = KINDS[args.kind](args)
     # What a simulation of the same name left would pass for the truth of a measurement.
     truth_path(args.capture).unlink(missing_ok=True)
-    show(report_console(args.json), f"capture: {args.capture}, {samples} samples")
+    lines = [f"warning: {warning}" for warning in warnings]
+    show(report_console(args.json), f"capture: {args.capture}, {samples} samples", *lines)
     if args.json:
-        print(json_text({"schema": "sms-online/import/1", "capture": str(args.capture), "samples": samples}))
+        document = {"schema": "sms-online/import/1", "capture": str(args.capture), "samples": samples}
+        print(json_text({**document, "warnings": warnings}))
     return OK
+
+
+def _published(convert: Callable[[Path, Path], int], args: argparse.Namespace) -> tuple[int, list[str]]:
+    return convert(args.source, args.capture), []
+
+
+def _log(args: argparse.Namespace) -> tuple[int, list[str]]:
+    """Any log that `replay` reads."""
+    if args.system is None:
+        raise InputError("import log", "", "no --system", "the system file, which says what the log's numbers are")
+    system, folder = described_system(args)
+    source = open_source(args.source, system, directory=folder)
+    samples = 0
+    with capture_writer(args.capture, tuple(source.channels)) as writer:
+        for block in source:
+            writer.write(block)
+            samples += block.t.size
+    return samples, list(source.warnings)
+
+
+KINDS: dict[str, Importer] = {
+    "emps": partial(_published, import_emps),
+    "quanser": partial(_published, import_quanser),
+    "log": _log,
+}

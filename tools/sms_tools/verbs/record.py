@@ -13,7 +13,7 @@ from can.util import cast_from_string
 from sms_adapters.devices import make_reader
 from sms_adapters.recorder import Recorder
 from sms_adapters.session_log import SessionHeader
-from sms_online.description.sources import CanSource, SerialField, SerialLines, SerialPort, Source
+from sms_online.description.sources import CanSource, Device, SerialField, SerialLines, SerialPort
 from sms_online.errors import InputError
 from sms_online.result import json_text
 from sms_tools.exit_codes import INTERRUPTED, NOTHING_RECEIVED, OK
@@ -34,7 +34,7 @@ LINE_INTERVAL = 5.0
 
 def run(args: argparse.Namespace) -> int:
     """Record until interrupted (130) or for --duration (0); 1 where nothing came."""
-    sources: list[Source] = [*(_can(text) for text in args.can), *(_serial(text) for text in args.serial)]
+    sources: list[Device] = [*(_can(text) for text in args.can), *(_serial(text) for text in args.serial)]
     if not sources:
         raise InputError("record", "", "no device", "--can or --serial, once for each device")
     sources = _named_apart(sources)
@@ -82,7 +82,7 @@ def run(args: argparse.Namespace) -> int:
     return INTERRUPTED if interruption.requested else OK
 
 
-def _device(source: Source) -> str:
+def _device(source: Device) -> str:
     if isinstance(source, SerialPort):
         return f"{source.port} at {source.baudrate} bit/s"
     options = [f"{name} {value}" for name, value in source.options.items()]
@@ -138,7 +138,7 @@ def _name(text: str) -> str:
     return re.sub(r"[^A-Za-z0-9_-]+", "-", Path(text).name).strip("-") or "device"
 
 
-def _named_apart(sources: list[Source]) -> list[Source]:
+def _named_apart(sources: list[Device]) -> list[Device]:
     """Two devices of one name get numbers."""
     names = [source.name for source in sources]
     apart = [f"{name}-{names[:k].count(name) + 1}" if names.count(name) > 1 else name for k, name in enumerate(names)]

@@ -10,7 +10,7 @@ from pathlib import Path
 from rich.console import Console
 from rich.progress import Progress, TextColumn, TimeElapsedColumn
 
-from sms_adapters.capture import CaptureWriter
+from sms_adapters.mcap_capture import capture_writer
 from sms_adapters.truth import truth_path, write_truth
 from sms_online.effects.build import build_model
 from sms_online.result import json_text
@@ -38,7 +38,7 @@ def run(args: argparse.Namespace) -> int:
     session = Simulated.of(described, args.effect, args.duration, args.grade, args.seed)
     capture: Path = args.capture
     # The writer comes first: a name that cannot be written is known before a long simulation.
-    with CaptureWriter(capture, session.channels) as writer:
+    with capture_writer(capture, session.channels) as writer:
         with _solving(report_console(args.json)) as progress:
             simulation = session.solve(progress)
         samples = 0

@@ -1,0 +1,17 @@
+"""Packages of the optional extras, imported where they are needed."""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import Any
+
+from sms_online.errors import InputError
+
+
+def installed(module: str, source: str, place: str = "") -> Any:
+    """A module of the extra `logs`; InputError, with how to install it, where it is missing. source: what needs it."""
+    try:
+        return import_module(module)
+    except ImportError:
+        found = f"the package {module.partition('.')[0]} is not installed"
+        raise InputError(source, place, found, "it: pip install 'sms-online[logs]'") from None
