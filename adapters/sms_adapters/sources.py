@@ -50,8 +50,6 @@ def open_source(
         return CaptureReader(path, start, stop, on_bytes=on_bytes, known=known)
     if name.endswith((".csv", ".log", ".asc", ".trc")) or path.suffix in (".blf", ".mf4"):
         return CanLogReader(path, system, start, stop, on_bytes=on_bytes, directory=directory)
-    expected = (
-        "a capture or table (.csv, .parquet, .h5, .mat), a CAN log (.log, .asc, .trc, .blf, .mf4), a bag (.mcap, .bag, "
-        ".db3) or a recording"
-    )
+    text, binary = ".csv, .log, .asc, .trc (or .gz of those)", ".blf, .mf4, .parquet, .h5, .mat, .mcap, .bag or .db3"
+    expected = f"a name ending in {text}, {binary}, or a recording"
     raise InputError(str(path), "", f"a file named {path.name}", expected)
