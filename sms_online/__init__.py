@@ -9,6 +9,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from sms_adapters.data_check import Check, check
     from sms_adapters.recorded import read_capture, write_capture
     from sms_adapters.runs import compare
     from sms_adapters.system_file import load_system
@@ -34,6 +35,7 @@ _HOMES = {
     "Block": "sms_online.stream",
     "Bounds": "sms_sim.bound",
     "Capture": "sms_online.capture",
+    "Check": "sms_adapters.data_check",
     "Coefficient": "sms_online.result",
     "Comparison": "sms_online.repeatability",
     "Diagnosis": "sms_online.diagnosis.diagnosed",
@@ -48,6 +50,7 @@ _HOMES = {
     "System": "sms_online.description.schema",
     "Trust": "sms_online.trust",
     "bound": "sms_sim.bound",
+    "check": "sms_adapters.data_check",
     "compare": "sms_adapters.runs",
     "diagnose": "sms_online.diagnosis.diagnosed",
     "estimate": "sms_online.session",
@@ -63,6 +66,7 @@ __all__ = [
     "Block",
     "Bounds",
     "Capture",
+    "Check",
     "Coefficient",
     "Comparison",
     "Diagnosis",
@@ -78,6 +82,7 @@ __all__ = [
     "Trust",
     "__version__",
     "bound",
+    "check",
     "compare",
     "diagnose",
     "estimate",

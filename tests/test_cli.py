@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import json
 import math
+import re
 import signal
 import subprocess
 import sys
@@ -144,8 +145,9 @@ def test_channels_that_the_model_does_not_use_are_named(bench: Path) -> None:
     assert "channels not used: gyro_0_z" in document(bench / "done")["warnings"]
 
 
-def test_a_terminal_shows_the_progress_of_a_long_file(
-    bench: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+@pytest.mark.parametrize("small", [0, 20_000_000])
+def test_a_terminal_has_a_bar_for_what_takes_more_than_a_moment(
+    bench: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], small: int
 ) -> None:
     replay = ["replay", "run.csv", "--system", "axis.toml", "--out", "done"]
     assert main(replay) == 0
@@ -153,9 +155,13 @@ def test_a_terminal_shows_the_progress_of_a_long_file(
     monkeypatch.setenv("FORCE_COLOR", "1")  # rich takes it for a terminal
     assert main(replay) == 0
     assert capsys.readouterr().err == ""
-    monkeypatch.setattr("sms_tools.verbs.replay.LONG_FILE", 1000)
-    assert main(replay) == 0
-    assert "run.csv" in capsys.readouterr().err
+    monkeypatch.setattr("sms_tools.waiting.MOMENT", 0.0)
+    monkeypatch.setattr("sms_tools.waiting.SMALL", small)
+    for verb in (replay, ["check", "run.csv", "--system", "axis.toml"]):
+        assert main(verb) == 0
+        shown = capsys.readouterr().err
+        assert "run.csv" in shown
+        assert re.search(r"\d:\d\d:\d\d", shown)  # the time left
 
 
 @pytest.mark.parametrize(("presses", "written"), [(1, True), (2, False)])

@@ -206,6 +206,7 @@ def _condition(message: Message, signal: Signal) -> Condition:
     """Which frames of a message hold a signal: a multiplexer may itself be multiplexed."""
     if not signal.multiplexer_ids:
         return ()
+    assert signal.multiplexer_signal is not None  # as it has values of one
     multiplexer = message.get_signal_by_name(signal.multiplexer_signal)
     return (*_condition(message, multiplexer), (multiplexer, tuple(signal.multiplexer_ids)))
 

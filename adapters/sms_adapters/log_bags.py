@@ -143,8 +143,8 @@ class McapBag(Bag):
         if not whole:
             self.cut = f"{Path(file.name).name}: its end is missing"
         try:
-            reader = self._mcap.make_reader(file) if whole else self._mcap.NonSeekingReader(file)
-            yield from reader.iter_messages(topics, log_time_order=False)
+            # In the order of the file: the library's reader by index queues all chunks' messages in that order.
+            yield from self._mcap.NonSeekingReader(file).iter_messages(topics, log_time_order=False)
         except exceptions.EndOfFile as error:
             if whole:
                 raise self._broken(error) from None

@@ -92,16 +92,16 @@ def _parser() -> Parser:
     parser = Parser(
         prog=PROGRAM,
         description="Online parameter estimation for flexible space manipulators.",
-        epilog="Exit codes: 0 done, 1 nothing was received to record, 2 bad input, 3 nothing is determined (results "
-        "are written), 130 interrupted.",
+        epilog="Exit codes: 0 done, 1 nothing was received to record or a capture is not fit, 2 bad input, 3 nothing "
+        "is determined (results are written), 130 interrupted.",
     )
     parser.add_argument("--version", action=Version, nargs=0, help="which version this is")
     text = "how bash, zsh or tcsh complete what is typed, to be written where the shell looks for it"
     parser.add_argument("--print-completion", action=Completion, choices=("bash", "zsh", "tcsh"), help=text)
     verbs = parser.add_subparsers(metavar="VERB", required=True)
     verb_parsers = (
-        _add_demo, _add_live, _add_record, _add_simulate, _add_replay, _add_diagnose, _add_import, _add_export,
-        _add_markers, _add_bound, _add_compare, _add_show,
+        _add_demo, _add_live, _add_record, _add_simulate, _add_check, _add_replay, _add_diagnose, _add_import,
+        _add_export, _add_markers, _add_bound, _add_compare, _add_show,
     )  # fmt: skip
     for add in verb_parsers:
         add(verbs)
@@ -243,6 +243,14 @@ def _add_diagnose(verbs: Verbs) -> None:
     )
     parser.add_argument("--holdout", metavar="CAPTURE", type=Path, help=text)
     _add_view(parser)
+
+
+def _add_check(verbs: Verbs) -> None:
+    text = "What is the matter with a capture, and what its motion determines: before it is estimated from."
+    parser = _add_verb(verbs, "check", "check", text)
+    parser.add_argument("capture", metavar="CAPTURE", type=Path, help="a capture, log or recording, as for replay")
+    _add_system(parser)
+    parser.add_argument("--out", metavar="DIR", type=Path, help="where check.json goes; none is written by default")
 
 
 def _add_import(verbs: Verbs) -> None:

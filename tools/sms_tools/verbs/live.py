@@ -6,6 +6,7 @@ import argparse
 import math
 from contextlib import closing
 
+from sms_adapters.data_check import ChannelChecks, Checked
 from sms_tools.exit_codes import INTERRUPTED
 from sms_tools.interruption import Interruption
 from sms_tools.live.searches import SearchProcess
@@ -30,16 +31,17 @@ def run(args: argparse.Namespace) -> int:
             closing(SearchProcess(directory, args.adopt)) as searches,
         ):
             session.diagnosis.searcher = searches
-            live.notices = lambda: [*session.diagnosis.notices, *shown.notices]
+            checked = Checked(ChannelChecks(system, session.channels))
+            live.notices = lambda: [*session.diagnosis.notices, *shown.notices, *checked.warnings]
             shown.follow()
             blocks = live.blocks(interruption, math.inf if args.duration is None else args.duration)
-            for block in shown.watch(blocks):
+            for block in shown.watch(checked.watch(blocks)):
                 session.update(block)
             session.finish()
         live.close()
         status.close()
         throughput = session.estimator.samples / live.busy if live.busy else 0.0
-        warnings = [*merger.warnings, *live.warnings, *shown.warnings]
+        warnings = [*merger.warnings, *live.warnings, *checked.warnings, *shown.warnings]
         warnings += [] if searches.problem is None else [searches.problem]
         result = session.evaluate(None, None, warnings, throughput)
         write_named(args, session, directory)

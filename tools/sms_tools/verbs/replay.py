@@ -4,13 +4,11 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Iterable, Iterator
-from contextlib import nullcontext
+from functools import partial
 from pathlib import Path
 from time import perf_counter
 
-from rich.console import Console
-from rich.progress import BarColumn, DownloadColumn, Progress, TextColumn, TimeRemainingColumn
-
+from sms_adapters.data_check import ChannelChecks, Checked
 from sms_adapters.recorded import recorded_at
 from sms_adapters.sources import open_source
 from sms_online.capture import PIECE
@@ -22,9 +20,8 @@ from sms_tools.live.signals import termination_interrupts
 from sms_tools.results_file import results_directory
 from sms_tools.session import check_part, conclude, described_system, feed, write_named
 from sms_tools.showing import showing
+from sms_tools.waiting import watched
 
-# A progress bar appears from this size on, bytes: a second of work.
-LONG_FILE = 20_000_000
 # In step with the clock, a push holds so much of the session, s.
 PACE = 0.05
 
@@ -36,17 +33,10 @@ def run(args: argparse.Namespace) -> int:
     directory = results_directory(args.out)
     capture: Path = args.capture
     opened = perf_counter()
-    progress = _progress(capture, always=args.speed == "1")
     with Interruption() as interruption, termination_interrupts():
-        with progress or nullcontext():
-            on_bytes = None
-            if progress is not None:
-                task = progress.add_task(capture.name, total=capture.stat().st_size)
-
-                def on_bytes(consumed: int) -> None:
-                    progress.update(task, completed=consumed)
-
-            source = open_source(capture, system, args.start, args.stop, on_bytes, folder)
+        part = (args.start, args.stop)
+        with watched(capture, lambda moved: open_source(capture, system, *part, moved, folder)) as reading:
+            source = reading.source
             recorded = recorded_at(capture, source, whole=args.start is args.stop is None)
             session = Session(
                 system,
@@ -62,30 +52,21 @@ def run(args: argparse.Namespace) -> int:
                 session.estimator.observers.append(record)
             patient = args.speed == "max"
             rows = PIECE if patient else max(1, round(PACE * system.sample_rate))
-            pieces = (piece for block in source for piece in block.pieces(rows))
+            pieces = (piece for block in reading for piece in block.pieces(rows))
             blocks = pieces if patient else _paced(pieces, interruption)
-            # A bar of progress stays below what is told.
-            console = Console(stderr=True, highlight=False) if progress is None else progress.console
+            say = partial(reading.console.print, markup=False, soft_wrap=True)
+            checked = Checked(ChannelChecks(system, source.channels), lambda line: say(f"check: {line}"))
             with showing(args, session, directory, recorded.truth, patient) as shown:
-                shown.follow(lambda text: console.print(text, markup=False, soft_wrap=True))
-                feed(session, shown.watch(blocks), interruption)
+                shown.follow(say)
+                feed(session, shown.watch(checked.watch(blocks)), interruption)
                 wall = perf_counter() - opened
         bound = None if record is None else session_bound(session.estimator, record)
-        warnings = [*source.warnings, *shown.warnings]
+        warnings = [*source.warnings, *checked.warnings, *shown.warnings]
         result = session.evaluate(recorded.truth, bound, warnings, session.estimator.samples / wall)
         write_named(args, session, directory)
         code = conclude(args, result, directory, interruption.requested)
         shown.report(result, interruption)
     return code
-
-
-def _progress(capture: Path, always: bool) -> Progress | None:
-    """A bar by bytes, for a person at a terminal and where there is time to watch it."""
-    console = Console(stderr=True)
-    if not console.is_terminal or not capture.is_file() or not (always or capture.stat().st_size >= LONG_FILE):
-        return None
-    text = TextColumn("{task.description}")
-    return Progress(text, BarColumn(), DownloadColumn(), TimeRemainingColumn(), console=console, transient=True)
 
 
 def _paced(blocks: Iterable[Block], interruption: Interruption) -> Iterator[Block]:

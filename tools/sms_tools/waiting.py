@@ -1,0 +1,104 @@
+"""A bar with the time left on what takes longer than a moment, for a person at a terminal."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from time import monotonic
+
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
+
+from sms_online.capture import PIECE
+from sms_online.stream import Block, Source
+
+# What is over before this many seconds needs no bar.
+MOMENT = 2.0
+# Bytes of a file up to which its samples are held in memory and counted; a larger one is as far as its bytes are read.
+# Of less, a reader takes too large a part at once to say how far the estimator is.
+SMALL = 20_000_000
+
+OnBytes = Callable[[int], None]
+
+
+@dataclass(frozen=True)
+class Watched:
+    """A source whose blocks move a bar when they are worked off. console: where to write above the bar."""
+
+    source: Source
+    blocks: Iterable[Block]
+    console: Console
+
+    @property
+    def channels(self) -> tuple[str, ...]:
+        """See `Source`."""
+        return self.source.channels
+
+    @property
+    def warnings(self) -> Sequence[str]:
+        """See `Source`."""
+        return self.source.warnings
+
+    def __iter__(self) -> Iterator[Block]:
+        return iter(self.blocks)
+
+
+@contextmanager
+def watched(path: Path, opened: Callable[[OnBytes | None], Source]) -> Iterator[Watched]:
+    """Open a recorded session with a bar on stderr while the context lasts, where that is a terminal.
+
+    opened: opens it, from whom to call with the bytes consumed so far.
+    """
+    console = Console(stderr=True, highlight=False)
+    if not console.is_terminal:
+        source = opened(None)
+        yield Watched(source, source, console)
+        return
+    size = _size(path)
+    columns = (TextColumn("{task.description}"), BarColumn(), TextColumn("{task.percentage:.0f} %"))
+    bar = Progress(*columns, TimeRemainingColumn(), console=console, transient=True)
+    try:
+        if size > SMALL:
+            on_bytes = _mover(bar, path.name, size)
+            source = opened(on_bytes)
+            yield Watched(source, source, console)
+        else:
+            source = opened(None)
+            blocks = list(source)
+            move = _mover(bar, path.name, sum(block.t.size for block in blocks))
+            yield Watched(source, _counted(blocks, move), console)
+    finally:
+        bar.stop()
+
+
+def _size(path: Path) -> int:
+    """Bytes of a file, or of those in a directory."""
+    files = path.iterdir() if path.is_dir() else [path]
+    return sum(file.stat().st_size for file in files if file.is_file())
+
+
+def _mover(bar: Progress, name: str, total: int) -> OnBytes:
+    """Function that moves the bar to how much is done of the total; the bar appears once it has been a moment."""
+    task = bar.add_task(name, total=total)
+    began, shown = monotonic(), False
+
+    def move(done: int) -> None:
+        nonlocal shown
+        bar.update(task, completed=done)
+        if not shown and monotonic() > began + MOMENT:
+            shown = True
+            bar.start()
+
+    return move
+
+
+def _counted(blocks: Iterable[Block], move: OnBytes) -> Iterator[Block]:
+    done = 0
+    for block in blocks:
+        # In portions, so that the bar moves: a block may be all of a capture.
+        for piece in block.pieces(PIECE):
+            yield piece
+            done += piece.t.size
+            move(done)
