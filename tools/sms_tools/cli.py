@@ -101,7 +101,7 @@ def _parser() -> Parser:
     verbs = parser.add_subparsers(metavar="VERB", required=True)
     verb_parsers = (
         _add_demo, _add_live, _add_record, _add_simulate, _add_check, _add_replay, _add_diagnose, _add_import,
-        _add_export, _add_markers, _add_bound, _add_compare, _add_show,
+        _add_export, _add_markers, _add_bound, _add_compare, _add_archive, _add_show,
     )  # fmt: skip
     for add in verb_parsers:
         add(verbs)
@@ -309,6 +309,20 @@ def _add_compare(verbs: Verbs) -> None:
     text = "results.json of a session, or the folder of its run"
     parser.add_argument("runs", metavar="RUN", type=Path, nargs="+", help=text)
     parser.add_argument("--out", metavar="DIR", type=Path, help="where the page goes, runs/<time> by default")
+
+
+def _add_archive(verbs: Verbs) -> None:
+    text = "Identify and diagnose every capture under a folder, in one table; go on where an earlier run ended."
+    parser = _add_verb(verbs, "archive", "archive", text)
+    parser.add_argument("folder", metavar="DIR", type=Path, help="the folder with captures, logs and recordings")
+    _add_system(parser)
+    text = "where rows, table and results go, runs/archive-<name of DIR> by default"
+    parser.add_argument("--out", metavar="DIR", type=Path, help=text)
+    where = parser.add_mutually_exclusive_group()
+    text = "processes of this machine, one for each core by default"
+    where.add_argument("--workers", metavar="N", type=_whole(1), help=text)
+    text = "address of a Dask scheduler, whose workers see the same files under the same names"
+    where.add_argument("--scheduler", metavar="ADDRESS", help=text)
 
 
 def _seconds(positive: bool = False) -> Callable[[str], float]:
