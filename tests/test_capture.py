@@ -235,7 +235,7 @@ def test_the_name_chooses_the_reader(tmp_path: Path) -> None:
     path = write(tmp_path / "run.csv", "t,q_1\n0,1\n")
     assert isinstance(open_source(path, SYSTEM), CaptureReader)
     with pytest.raises(InputError, match=r"ending in \.csv, \.log, \.asc"):
-        open_source(tmp_path / "run.mat", SYSTEM)
+        open_source(tmp_path / "run.xyz", SYSTEM)
 
 
 def test_truth_survives_and_its_absence_is_no_error(tmp_path: Path) -> None:
