@@ -10,6 +10,7 @@ the end of the link of the last joint that moves, where a payload is. What a joi
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from copy import copy
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 
@@ -44,7 +45,8 @@ def link_kinematics(link: FlexibleLink, free_end: bool) -> LinkKinematics:
 class Bracket:
     """A rigid displacement and turn, in the axes before the turn; None where there is none.
 
-    offset (3,) m; shift (3, 3): minus its cross-product matrix, which adds v + ω × arm.
+    offset (3,) m; shift (3, 3): minus its cross-product matrix, which adds v + ω × arm. All may have one more axis in
+    front, another bracket at every position of a batch.
     """
 
     offset: Array | None
@@ -60,7 +62,7 @@ class Bracket:
 
     def pose(self, frame: Frame) -> Frame:
         """The frame at its other end."""
-        origin = frame.origin if self.offset is None else frame.origin + frame.rotation @ self.offset
+        origin = frame.origin if self.offset is None else frame.origin + _turned(frame.rotation, self.offset)
         return Frame(origin, frame.rotation if self.rotation is None else frame.rotation @ self.rotation)
 
     def carry(self, twist: Array) -> Array:
@@ -72,8 +74,19 @@ class Bracket:
     def carry_back(self, twist: Array) -> Array:
         """Inverse of `carry`."""
         if self.rotation is not None:
-            twist = _turn_back(self.rotation.T, twist)
+            twist = _turn_back(self.rotation.swapaxes(-1, -2), twist)
         return twist if self.shift is None else _shift(twist, -self.shift)
+
+    @classmethod
+    def stacked(cls, brackets: Sequence[Bracket], repeats: int) -> Bracket:
+        """Each of some brackets at so many positions of a batch, one after the other."""
+        first = brackets[0]
+        if all(_same(each.offset, first.offset) and _same(each.rotation, first.rotation) for each in brackets[1:]):
+            return first
+        offset = np.array([np.zeros(3) if each.offset is None else each.offset for each in brackets])
+        rotation = np.array([np.eye(3) if each.rotation is None else each.rotation for each in brackets])
+        offset, rotation = np.repeat(offset, repeats, axis=0), np.repeat(rotation, repeats, axis=0)
+        return cls(offset, -so3.skew(offset), rotation)
 
 
 NO_BRACKET = Bracket(None, None, None)
@@ -94,6 +107,10 @@ class Chain:
             Bracket.of(link.root_position, link.root_rotation) if isinstance(link, FlexibleLink) else NO_BRACKET
             for link in system.links
         ]
+        # A rigid link is a bracket from its frame to its end.
+        self.rigid = [
+            Bracket.of(link.tip, (0.0, 0.0, 0.0)) if isinstance(link, RigidLink) else None for link in system.links
+        ]
         self.links = system.links
         self.flexible: list[LinkKinematics | None] = []
         for i, link in enumerate(system.links):
@@ -105,13 +122,21 @@ class Chain:
         self.select_base = np.zeros((6, layout.n_v))
         rows = [*layout.base_linear, *(3 + axis for axis in layout.base_angular)]
         self.select_base[rows, range(len(rows))] = 1.0
-        # Arms that never change, as the matrices that add their moment to a linear velocity, v + ω × arm.
+        # As the matrix that adds its moment to a linear velocity, v + ω × arm.
         self.base_arm = -so3.skew(self.joint_1_from_S)
-        self.rigid_arms = [
-            -so3.skew(np.array(link.tip)) if isinstance(link, RigidLink) else None for link in system.links
-        ]
         # A_i(q) is a combination of these by (1, sin q, 1 - cos q).
         self.turn_basis = [so3.turn_basis(axis) for axis in self.axes]
+
+    def stacked(self, others: Sequence[Chain], repeats: int) -> Chain:
+        """This chain with the brackets and rigid links of others, each at so many positions of a batch in turn.
+
+        The others differ in these alone.
+        """
+        out = copy(self)
+        for name in ("mounts", "roots", "rigid"):
+            every = zip(*(getattr(other, name) for other in others), strict=True)
+            setattr(out, name, [None if each[0] is None else Bracket.stacked(each, repeats) for each in every])
+        return out
 
     @property
     def tip_frame(self) -> int:
@@ -205,13 +230,11 @@ class Configuration:
 
     def end(self, i: int, link: Frame) -> Frame:
         """The end of link i (from 0), with its frame {i} given."""
-        shape, description = self.shape(i), self.chain.links[i]
-        if shape is not None:
-            tip, rotation = shape.tip, link.rotation @ shape.tip_rotation
-        else:
-            assert isinstance(description, RigidLink)
-            tip, rotation = np.array(description.tip), link.rotation
-        return Frame(link.origin + (link.rotation @ tip[..., None])[..., 0], rotation)
+        shape, rigid = self.shape(i), self.chain.rigid[i]
+        if shape is None:
+            assert rigid is not None
+            return rigid.pose(link)
+        return Frame(link.origin + _turned(link.rotation, shape.tip), link.rotation @ shape.tip_rotation)
 
     @cached_property
     def jacobians(self) -> list[Array]:
@@ -250,9 +273,10 @@ class Configuration:
 
     def _unturned_end(self, i: int, link: Array, rates: Array) -> Array:
         """Twists at the end of link i (from 0), still in the axes of {i}."""
-        shape, arm = self.shape(i), self.chain.rigid_arms[i]
-        if shape is None or arm is not None:
-            return _shift(link, arm)
+        shape, rigid = self.shape(i), self.chain.rigid[i]
+        if shape is None:
+            assert rigid is not None
+            return rigid.carry(link)
         end = _shift(link, -so3.skew(shape.tip))
         elastic = rates[:, self.chain.layout.q_f[i]]
         end[:, :3] += shape.tip_J @ elastic
@@ -317,9 +341,10 @@ class Configuration:
 
     def _end_rate(self, i: int, link: Array, link_twist: Array, rates: Array, shape_rate: ShapeRate | None) -> Array:
         """Rates of the twists at the end of link i (from 0), in the end's axes."""
-        shape, arm = self.shape(i), self.chain.rigid_arms[i]
-        if shape is None or shape_rate is None or arm is not None:
-            return _shift(link, arm)
+        shape, rigid = self.shape(i), self.chain.rigid[i]
+        if shape is None or shape_rate is None:
+            assert rigid is not None
+            return rigid.carry(link)
         elastic = rates[:, self.chain.layout.q_f[i]]
         end = _shift(link, -so3.skew(shape.tip))
         end[:, :3] += shape_rate.tip_J @ elastic - so3.skew(shape_rate.tip) @ link_twist[:, 3:]
@@ -337,9 +362,17 @@ def _turn_back(R: Array, twist: Array) -> Array:
     return turned.reshape(-1, 6, m)
 
 
-def _shift(twist: Array, arm: Array | None) -> Array:
+def _turned(R: Array, vector: Array) -> Array:
+    """Vectors (3,) or (B, 3) turned by R (B, 3, 3)."""
+    return np.asarray((R @ vector[..., None])[..., 0])
+
+
+def _same(one: Array | None, other: Array | None) -> bool:
+    return one is other or (one is not None and other is not None and np.array_equal(one, other))
+
+
+def _shift(twist: Array, arm: Array) -> Array:
     """Twists (B, 6, m) of a point displaced in the same axes; arm is minus the displacement's cross-product matrix."""
-    assert arm is not None
     out = twist.copy()
     out[:, :3] += arm @ twist[:, 3:]
     return out

@@ -95,9 +95,7 @@ class Dynamics:
             assert rate is not None
             force = M @ link.local(bias, none) + motion.bias_force(nu, rate) @ pi[:, None]
             C += (W.transpose(0, 2, 1) @ force)[..., 0]
-        for effect, columns, own in model.acting(inputs):
-            C -= effect.force(model.layout, x, v, own) @ self.pi[columns]
-        return H, C
+        return H, C - self.effect_force(x, v, inputs)
 
     def momentum_and_force(self, x: Array, v: Array, inputs: Inputs | None = None) -> tuple[Array, Array]:
         """P π and G π (B, n_v) of `Model.momentum_columns`, without the columns."""
@@ -110,9 +108,14 @@ class Dynamics:
             loads.append((term, 0, p @ weigh, g @ weigh))
         p, g = project(configuration, v, shape_rates, loads, 1)[..., 0]
         g -= model._spring_coordinates(x) @ self.stiffness + v @ self.damping
-        for effect, columns, own in model.acting(inputs):
-            g += effect.force(model.layout, x, v, own) @ self.pi[columns]
-        return p, g
+        return p, g + self.effect_force(x, v, inputs)
+
+    def effect_force(self, x: Array, v: Array, inputs: Inputs | None = None) -> Array:
+        """Generalized forces (B, n_v) of the effects."""
+        out = np.zeros_like(v)
+        for effect, columns, own in self.model.acting(inputs):
+            out += effect.force(self.model.layout, x, v, own) @ self.pi[columns]
+        return out
 
     def acceleration(self, x: Array, v: Array, Q: Array, inputs: Inputs | None = None) -> Array:
         """v̇ (B, n_v) under generalized forces Q (B, n_v)."""

@@ -7,6 +7,7 @@ One set of kinetic terms serves the energy balance (43), (44), the weak form of 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from copy import copy
 from dataclasses import replace
 
 import numpy as np
@@ -160,11 +161,27 @@ class Model:
         """Model of a system that differs from this one's in lengths and directions alone: the same parameters."""
         return Model(system, self._effects_of, self.reference)
 
+    def stacked(self, others: Sequence[Model], repeats: int) -> Model:
+        """This model with the geometry of others, each at so many positions of a batch in turn; without effects.
+
+        The others are `of_geometry` with the same flexible links.
+        """
+        out = copy(self)
+        out.chain = self.chain.stacked([other.chain for other in others], repeats)
+        out.gravity = np.repeat([other.gravity for other in others], repeats, axis=0)
+        out.effects, out.effect_slices, out.state_slices = (), [], []
+        return out
+
     @property
     def dissipative(self) -> list[int]:
         """Parameters that take power out: indices whose column in `power_columns` is not always zero."""
         effects = [k for columns in self.effect_slices for k in range(columns.start, columns.stop)]
         return self._damping.parameters + effects
+
+    @property
+    def inertial(self) -> tuple[int, ...]:
+        """Which physical parameters have a part in the momenta."""
+        return tuple(self._kinetic)
 
     @property
     def n_pi(self) -> int:
@@ -302,10 +319,9 @@ class Model:
             yield link, p, g
 
     def _fall(self, configuration: Configuration, term: Term, g: Array) -> Array:
-        """Local speeds (B, d) of free fall: a gravity vector g (3,) in the frame's axes."""
-        local = g @ configuration.frames[term.frame].rotation
+        """Local speeds (B, d) of free fall: gravity g (3,) or (B, 3), in inertial axes, in the frame's."""
         fall = np.zeros((configuration.size, 6 + term.speeds.stop - term.speeds.start))
-        fall[:, :3] = local
+        fall[:, :3] = (np.atleast_2d(g)[:, None] @ configuration.frames[term.frame].rotation)[:, 0]
         return fall
 
     def weight(self, x: Array) -> Array:

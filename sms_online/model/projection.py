@@ -120,7 +120,7 @@ class _Recursion:
         """From the end of link i (from 0) to its frame {i}."""
         if i == self._chain.tree.last:
             self._add(self._chain.tip_frame)
-        shape, rate, arm = self._configuration.shape(i), self._shape_rates[i], self._chain.rigid_arms[i]
+        shape, rate, rigid = self._configuration.shape(i), self._shape_rates[i], self._chain.rigid[i]
         n = self._load.shape[4]
         if n and shape is not None and rate is not None:
             turn, tip, tip_rate = so3.skew(np.stack((rate.tip_angular, shape.tip, rate.tip)))
@@ -134,8 +134,8 @@ class _Recursion:
             own[1] += rate.tip_spin.swapaxes(1, 2) @ angular[0]
             angular[1] += tip_rate @ linear[0]
             self._shift(tip)
-        elif n and arm is not None:
-            self._shift(arm.T)
+        elif n and rigid is not None:
+            self._pass_bracket(rigid)
         self._add(2 * i + 2)
         self._pass_bracket(self._chain.roots[i])
 
@@ -144,7 +144,7 @@ class _Recursion:
         if bracket.rotation is not None:
             self._turn(bracket.rotation)
         if bracket.shift is not None:
-            self._shift(bracket.shift.T)
+            self._shift(bracket.shift.swapaxes(-1, -2))
 
     def pass_joint(self, i: int) -> None:
         """From joint i (from 0) to its mount."""
