@@ -8,25 +8,28 @@ from sms_online.description.explain import hint, nearest
 from sms_online.description.schema import System
 from sms_online.errors import InputError
 from sms_online.model.base_parameters import BaseParameters
+from sms_online.stream import Array
 from sms_online.trackers.interface import Prior
 
 # --prior trusts a maker's nominal value to a tenth.
 NOMINAL_RELATIVE_STD = 0.1
+# Quantities that are components of a whole.
+VECTORS = ("first_moment_", "inertia_")
 
 
 def base_prior(system: System, base: BaseParameters, nominal: bool) -> Prior:
     """Prior of the base parameters β = π_independent + mixture π_dependent, NaN where nothing is known.
 
     Physical parameters have the priors that the system file states; with `nominal`, the others their nominal value ±
-    10 %; a combination that is nominally 0 has none, for that only says that it is not described. A combination has a
-    prior where every parameter in it has one; their errors count as independent. Raises InputError for a prior of a
-    parameter that there is not.
+    10 %, components of a first moment or an inertia ± 10 % of the whole; what is nominally 0 otherwise has none, for
+    that only says that it is not described. A combination has a prior where every parameter in it has one; their errors
+    count as independent. Raises InputError for a prior of a parameter that does not exist.
     """
     names = [parameter.name for parameter in base.physical]
     value, std = np.full((2, len(names)), np.nan)
     if nominal:
         value[:] = [parameter.nominal for parameter in base.physical]
-        std = NOMINAL_RELATIVE_STD * np.abs(value)
+        std = NOMINAL_RELATIVE_STD * _sizes(base)
     for name, prior in system.priors.items():
         if name not in names:
             expected = f"the name of a parameter of this system{hint(nearest(name, names))}"
@@ -38,3 +41,16 @@ def base_prior(system: System, base: BaseParameters, nominal: bool) -> Prior:
     mixing[:, list(base.dependent)] = base.mixture
     variance = np.where(mixing != 0.0, mixing**2 * std**2, 0.0).sum(axis=1)
     return Prior(mixing @ value, np.sqrt(np.where(variance > 0.0, variance, np.nan)))
+
+
+def _sizes(base: BaseParameters) -> Array:
+    """Nominal sizes of physical parameters, of vectors and matrices as a whole; NaN where nothing is described."""
+    wholes = [
+        parameter.name.rsplit("_", 1)[0] if parameter.quantity.startswith(VECTORS) else parameter.name
+        for parameter in base.physical
+    ]
+    squares: dict[str, float] = {}
+    for whole, parameter in zip(wholes, base.physical, strict=True):
+        squares[whole] = squares.get(whole, 0.0) + parameter.nominal**2
+    sizes = np.sqrt([squares[whole] for whole in wholes])
+    return np.where(sizes > 0.0, sizes, np.nan)
