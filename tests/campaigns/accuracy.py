@@ -26,7 +26,7 @@ from sms_online.evaluation import NORMAL_95
 from sms_online.model.base_parameters import find_base_parameters
 from sms_online.pipeline.estimator import Estimator
 from sms_online.stream import Array, Block
-from tests.campaigns.sessions import disguised, exact_session, noisy_session, true_parameters
+from tests.campaigns.sessions import EXACT, disguised, exact_session, noisy_session, true_parameters
 
 SYSTEM = "paper-planar"
 GRADES = ("A", "B", "C")
@@ -65,7 +65,8 @@ def run(results: Path, cache: Path, runs: int, grades: list[str]) -> None:
 def one_session(block: Block) -> Record:
     """Estimate of one session, as of 4 s and at its end."""
     start = process_time()
-    estimator = Estimator(disguised(load_system(SYSTEM)), block.channels, "campaign")
+    exact = disguised(load_system(SYSTEM)).model_copy(update={"tolerances": EXACT})
+    estimator = Estimator(exact, block.channels, "campaign")
     split = int(np.searchsorted(block.t, EARLY, side="right"))
     estimator.push(Block(block.t[:split], block.channels, block.values[:split]))
     early = estimator.estimate().pi.tolist()

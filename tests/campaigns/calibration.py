@@ -166,7 +166,7 @@ def one_session(folder: Path, kind: str, tolerances: str, seed: int) -> Record:
         distort(described, block, random)
     block = noisy_session(described, block, GRADE, seed)
     stated = Tolerances() if tolerances == "default" else Tolerances.model_validate(tolerances)
-    system = disguised(described).model_copy(update={"tolerances": stated})
+    system = disguised(described, random).model_copy(update={"tolerances": stated})
     start = process_time()
     estimator = Estimator(system, block.channels, "campaign")
     for piece in block.pieces(PIECE):

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from sms_online.description.parse import describe
-from sms_online.description.schema import System
+from sms_online.description.schema import System, Tolerances
 from sms_online.effects.build import build_model
 from sms_online.model.base_parameters import find_base_parameters
 from sms_online.stream import Array, Block
@@ -22,6 +22,8 @@ DISGUISED = (
     *("stiffness", "damping", "axial_rigidity", "torsional_rigidity", "flexural_rigidity_y", "flexural_rigidity_z"),
 )
 DISGUISE = 2.0
+ROUGH = (1 / 1.4, 1.4)
+EXACT = Tolerances.model_validate("none")
 
 
 def exact_session(system: System, cache: Path, position_tolerance: float = POSITION_TOLERANCE) -> Block:
@@ -50,14 +52,18 @@ def true_parameters(system: System) -> Array:
     return find_base_parameters(model).values(model.nominal)
 
 
-def disguised(system: System) -> System:
-    """The system with nominal values that are not the true ones, so that no estimator can have read them."""
+def disguised(system: System, random: np.random.Generator | None = None) -> System:
+    """The system with nominal values that are not the true ones, so that no estimator can have read them.
+
+    All are twice the true ones, or with `random` each is off by a factor of its own of 1.4 at most, as drawings are.
+    """
 
     def other(key: str, value: Any) -> Any:
         if isinstance(value, dict):
             return {name: other(name, part) for name, part in value.items()}
         if isinstance(value, list):
             return [other("", part) for part in value]
-        return DISGUISE * value if key in DISGUISED else value
+        factor = DISGUISE if random is None else random.uniform(*ROUGH)
+        return factor * value if key in DISGUISED else value
 
     return System.model_validate(other("", describe(system)))
