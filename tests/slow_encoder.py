@@ -66,10 +66,14 @@ def _motion(coulomb: float) -> tuple[Array, Array]:
     return t, np.stack((torque(t, y[0], y[2]) / GEAR, y[0], y[1]), axis=1)
 
 
-def session(corner: float | None, coulomb: float = 0.0, seed: int = 0) -> Block:
-    """Samples; corner: Hz, of the low-pass behind which the link encoder is read. coulomb: friction, N m."""
+def session(corner: float | None, coulomb: float = 0.0, once: float = 0.0, seed: int = 0) -> Block:
+    """Samples; corner: Hz, of the low-pass behind which the link encoder is read; once: its error once per turn, rad.
+
+    coulomb: friction, N m.
+    """
     t, exact = _motion(coulomb)
     values = exact.copy()
+    values[:, 2] += once * np.sin(values[:, 2] + 0.4)
     if corner is not None:
         values[:, 2] = lfilter(*butter(2, corner / (RATE / 2.0)), values[:, 2])
     values += NOISE * np.random.default_rng(seed).standard_normal(values.shape)

@@ -7,12 +7,18 @@ import pytest
 from evaluated import judged, standard_deviation
 from slow_encoder import GEAR, I_L, I_M, B, F, K, bench, session
 
-from sms_online.pipeline.criterion import OVERLAP, RowGrams, minimum
+from sms_online.pipeline.beforehand import Beforehand, Penalty
+from sms_online.pipeline.criterion import OVERLAP, Columns, RowGrams, minimum
 from sms_online.pipeline.estimator import Estimator
 from sms_online.stream import Array
 from sms_online.trackers.interface import Prior
 
-NOTHING = np.zeros((0, 3))
+
+def _alone(n: int) -> tuple[Columns, Beforehand]:
+    """n parameters, none of them inertial, of which nothing is known beside the rows."""
+    return Columns(0, (), np.zeros(n, dtype=np.bool_)), Beforehand.none(n)
+
+
 TORQUE = np.array([True, False])
 TRUE = np.array([2.0, 3.0])
 
@@ -37,18 +43,18 @@ def _rows(windows: int, noise: float, lack: float, seed: int = 0) -> RowGrams:
 @pytest.mark.parametrize("scale", [0.01, 0.5, 2.0, 100.0])
 def test_every_start_meets_at_one_minimum(scale: float) -> None:
     grams = _rows(1000, 1e-3, lack=0.3)
-    found = minimum(grams, np.array([False, True]), TORQUE, [scale * TRUE], NOTHING).beta
+    found = minimum(grams, np.array([False, True]), TORQUE, [scale * TRUE], *_alone(2)).beta
     np.testing.assert_allclose(found, TRUE, rtol=2e-3)
 
 
 def test_the_slope_vanishes_at_the_minimum_but_for_priors() -> None:
     grams = _rows(400, 1e-2, lack=0.3)
     lacking = np.array([True, True])
-    free = minimum(grams, lacking, TORQUE, [TRUE], NOTHING)
+    free = minimum(grams, lacking, TORQUE, [TRUE], *_alone(2))
     size = np.sqrt(np.diag(free.covariance))
     assert np.all(np.abs(free.slopes.sum(axis=0) * size) < 1e-3)
     prior = np.array([[10.0, 0.0, 10.0 * 1.5]])  # 1.5 ± 0.1
-    held = minimum(grams, lacking, TORQUE, [TRUE], prior)
+    held = minimum(grams, lacking, TORQUE, [TRUE], _alone(2)[0], Beforehand(prior, np.zeros((0, 3))))
     pull = prior[:, :-1].T @ (prior @ np.append(held.beta, -1.0))
     np.testing.assert_allclose(held.slopes.sum(axis=0) * size, -pull * size, atol=1e-3)
     assert 1.5 < held.beta[0] < free.beta[0]
@@ -61,7 +67,7 @@ def test_noise_of_rows_without_a_torque_does_not_shrink_the_parameters() -> None
         whole = grams.signal.sum(axis=0)
         shrunk = np.linalg.solve(whole[:-1, :-1], whole[:-1, -1])
         squares.append(shrunk / TRUE - 1.0)
-        errors.append(minimum(grams, np.array([False, False]), TORQUE, [shrunk], NOTHING).beta / TRUE - 1.0)
+        errors.append(minimum(grams, np.array([False, False]), TORQUE, [shrunk], *_alone(2)).beta / TRUE - 1.0)
     assert np.all(np.mean(squares, axis=0) < -0.05)
     assert np.all(np.abs(np.mean(errors, axis=0)) < 0.015)
 
@@ -73,13 +79,48 @@ def test_a_badly_explained_torque_does_not_enlarge_the_parameters() -> None:
         x, other = random.standard_normal(2)
         rows, added = np.array([[x, 2.0 * x + 6.0 * other]]), np.array([[1e-4, 0.0]])
         grams.add(rows, np.stack((rows + added, rows - added)))
-    found = minimum(grams, np.array([True]), np.array([True]), [np.array([1.0])], np.zeros((0, 2)))
+    found = minimum(
+        grams,
+        np.array([True]),
+        np.array([True]),
+        [np.array([1.0])],
+        Columns(0, (), np.zeros(1, dtype=np.bool_)),
+        Beforehand.none(1),
+    )
     assert found.beta[0] == pytest.approx(2.0, abs=0.3)
     assert found.covariance[0, 0] == pytest.approx(36.0 * OVERLAP / 4000.0, rel=0.1)
 
 
-def _identified(corner: float | None, coulomb: float, factor: float, prior: bool = False) -> tuple[Estimator, Array]:
-    block = session(corner, coulomb)
+def test_a_nuisance_beyond_its_tolerance_does_not_shrink_the_parameters() -> None:
+    """Rows u (π_2 + ν π_2) = 0 of a nuisance ν of 100 tolerances, whose column was evaluated with the true π."""
+    random = np.random.default_rng(0)
+    offset, tolerance = 0.05, 5e-4
+    grams = RowGrams.none(2, 3)
+    for _ in range(1000):
+        x, y, u, v = random.standard_normal(4)
+        exact = np.array([[0.0, x, y, TRUE @ (x, y)], [3.0 * v, u, -u * TRUE[0] / TRUE[1] - offset * v, 0.0]])
+        added = 1e-4 * random.standard_normal((2, 4)) * np.array([[0.0, 0.0, 0.0, 1.0], [0.0, 1.0, 1.0, 0.0]])
+        grams.add(exact + added, np.stack((exact + 2.0 * added, exact)))
+    columns = Columns(1, (), np.zeros(3, dtype=np.bool_))
+    known = Beforehand(np.zeros((0, 4)), np.array([[1.0 / tolerance, 0.0, 0.0, 0.0]]))
+    found = minimum(grams, np.array([False, True]), TORQUE, [np.array([0.0, *TRUE])], columns, known)
+    np.testing.assert_allclose(found.beta, [offset, *TRUE], rtol=2e-3)
+
+
+def test_the_slope_of_the_penalty_is_its_difference() -> None:
+    known = Beforehand(np.array([[0.0, 3.0, 0.0, 1.0]]), np.array([[20.0, 0.0, 0.0, 0.0]]))
+    penalty = Penalty(known, 1, np.array([[1.0, 2.0, 3.0, 1.0]]), np.array([0.0, 1.0, 2.0, -1.0]))
+    for w in (np.array([0.01, 1.1, 1.8, -1.0]), np.array([3.0, 0.5, 2.5, -1.0])):
+        slope = penalty.derivatives(w)[0]
+        moved = [1e-6 * np.eye(4)[k] for k in range(3)]
+        expected = [(penalty.value(w + by) - penalty.value(w - by)) / 2e-6 for by in moved]
+        np.testing.assert_allclose(slope, expected, rtol=1e-6, atol=1e-6)
+
+
+def _identified(
+    corner: float | None, coulomb: float, factor: float, prior: bool = False, once: float = 0.0
+) -> tuple[Estimator, Array]:
+    block = session(corner, coulomb, once)
     estimator = Estimator(bench(factor), block.channels, "bench")
     if prior:
         nominal = estimator.base.values(estimator.model.nominal)
@@ -91,9 +132,9 @@ def _identified(corner: float | None, coulomb: float, factor: float, prior: bool
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("corner", [200.0, 100.0, 40.0])
-def test_a_slow_link_encoder_does_not_collapse_the_spring(corner: float) -> None:
-    found = [_identified(corner, 0.0, factor) for factor in (0.5, 2.0)]
+@pytest.mark.parametrize(("corner", "once"), [(200.0, 0.0), (100.0, 0.0), (40.0, 0.0), (None, 0.02)])
+def test_a_wrong_link_encoder_does_not_collapse_the_spring(corner: float | None, once: float) -> None:
+    found = [_identified(corner, 0.0, factor, once=once) for factor in (0.5, 2.0)]
     for estimator, error in found:
         assert np.all(np.abs(error[:3]) < 0.02)
         assert judged(estimator).grave
@@ -110,6 +151,13 @@ def test_undeclared_friction_beside_a_slow_encoder_costs_four_percent() -> None:
         # Its bars allow for what it is off by.
         std = standard_deviation(estimator)[:3] / np.array([I_M / GEAR**2, I_L, K])
         assert np.all(np.abs(error[:3]) < 3.0 * std)
+
+
+@pytest.mark.parametrize(("corner", "once"), [(40.0, 0.0), (None, 0.02)])
+def test_priors_do_not_bend_what_a_wrong_encoder_leaves(corner: float | None, once: float) -> None:
+    estimator, error = _identified(corner, 0.0, 1.0, prior=True, once=once)
+    assert np.all(np.abs(error[:3]) < 0.02)
+    assert judged(estimator).grave
 
 
 def test_a_prior_that_is_wrong_is_said_to_be() -> None:

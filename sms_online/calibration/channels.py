@@ -94,16 +94,21 @@ def _one_torque(joints: Sequence[int], motion: Motion) -> Array:
 
 
 def _clocks(sensing: Sensing, names: Sequence[str], tolerance: float) -> Iterator[Family]:
-    """Later than the torques; without devices of their own, encoders, base and markers have one clock each."""
+    """Later than the torques; from one device, encoders, base and markers have one clock each.
+
+    So have encoders behind flexible joints, beside those of the motors: they come from other electronics.
+    """
     groups: dict[str, list[int]] = {}
-    if sensing.model.system.sources:
-        devices = clock_groups(sensing)
+    if devices := clock_groups(sensing):
         reference = next((device for device in devices if device.joints), None)
         groups = {device.name: list(device.sensors) for device in devices if device is not reference}
     else:
         base = sensing.model.layout.n_base_positions
         for k, name in enumerate(names):
-            kind = "base" if k < base else "markers" if MARKER.fullmatch(name) else "encoders"
+            second = name.startswith("q_") and f"theta_m_{name[2:]}" in names
+            encoders = "link encoders" if second else "encoders"
+            others = "gauges" if name.endswith("strain_angle") else encoders
+            kind = "base" if k < base else "markers" if MARKER.fullmatch(name) else others
             groups.setdefault(kind, []).append(k)
     chosen = {name: sensors for name, sensors in groups.items() if sensors}
     select = np.zeros((len(names), len(chosen)))

@@ -10,8 +10,8 @@ import numpy as np
 from sms_online.calibration.nuisance import Nuisance
 from sms_online.trackers.interface import Estimate
 
-# A nuisance is a result where its deviation is below this share of its tolerance, or, without one, below this share of
-# its size.
+# A nuisance is a result where its deviation is below this share of its tolerance, or, without one and beyond it, below
+# this share of its size.
 IMPROVED, OF_ITS_SIZE = 0.7, 1.0 / 3.0
 # And beyond this many tolerances the description is wrong there: what else bends to it, no error bar says.
 BEYOND = 3.0
@@ -110,7 +110,8 @@ def found(nuisances: Sequence[Nuisance], estimate: Estimate, scale: float = 1.0)
         nuisances, estimate.nuisances.tolist(), (scale * estimate.nuisances_std).tolist(), strict=True
     ):
         known = np.isfinite(nuisance.tolerance)
-        if std < (IMPROVED * nuisance.tolerance if known else OF_ITS_SIZE * abs(value)):
+        better = known and std < IMPROVED * nuisance.tolerance
+        if better or ((not known or abs(value) > BEYOND * nuisance.tolerance) and std < OF_ITS_SIZE * abs(value)):
             tolerance = nuisance.tolerance if known else None
             out.append(Calibration(nuisance.name, nuisance.where, nuisance.part, nuisance.unit, value, std, tolerance))
     return out

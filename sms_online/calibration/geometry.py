@@ -14,7 +14,6 @@ from sms_online.description.channels import AXES
 from sms_online.description.schema import FlexibleLink, Joint, Mount, System
 from sms_online.description.tree import mounts, tree_of
 from sms_online.model.beam import LinearLink
-from sms_online.model.dynamics import Dynamics
 from sms_online.model.model import Model
 from sms_online.stream import Array
 
@@ -144,24 +143,37 @@ def _base_turned(axis: int) -> States:
 
 
 class GeometryDerivatives:
-    """Derivatives of momentum P π and force G π by each of some geometries, at states that the readings give."""
+    """Derivatives of momentum P π and force G π by each of some geometries, at states that the readings give.
+
+    NumPy's calls cost more than the few states of a window: geometries with the same flexible links pass as one batch.
+    """
 
     def __init__(self, model: Model, chosen: list[Geometry]) -> None:
         self._model = model
-        self._pi: Array | None = None
-        self._dynamics: list[Dynamics] = []  # of the last π: the described geometry, then the others
-        self._moved = [(model.of_geometry(each.moved(model.system, DIFFERENCE)), each.states) for each in chosen]
+        self._models = [model, *(model.of_geometry(each.moved(model.system, DIFFERENCE)) for each in chosen)]
+        self._states = [each.states for each in chosen]
+        flexible = [[id(link) for link in each.chain.flexible] for each in self._models]
+        same = [each == flexible[0] for each in flexible]
+        self._groups = [np.flatnonzero(same), *(np.array([k]) for k, stacked in enumerate(same) if not stacked)]
 
     def at(self, pi: Array, x: Array, v: Array, signals: Array) -> tuple[Array, Array]:
         """∂Pπ and ∂Gπ (K, n_v, c) at x (K, n_x), v (K, n_v), signals as in `Instants`; readings stay as they are."""
-        out = np.zeros((2, len(x), v.shape[1], len(self._moved)))
-        if self._moved and len(x):
-            if self._pi is None or not np.array_equal(pi, self._pi):
-                self._pi = pi
-                self._dynamics = [each.dynamics(pi) for each in (self._model, *(moved for moved, _ in self._moved))]
-            inputs = self._model.inputs(signals)
-            described = self._dynamics[0].momentum_and_force(x, v, inputs)
-            for k, ((moved, states), dynamics) in enumerate(zip(self._moved, self._dynamics[1:], strict=True)):
-                there = dynamics.momentum_and_force(*states(self._model, moved, x, v, DIFFERENCE), inputs)
-                out[..., k] = (np.array(there) - np.array(described)) / DIFFERENCE
-        return out[0], out[1]
+        if not self._states or not len(x):
+            none = np.zeros((len(x), v.shape[1], len(self._states)))
+            return none, none
+        moved = [
+            states(self._model, model, x, v, DIFFERENCE)
+            for states, model in zip(self._states, self._models[1:], strict=True)
+        ]
+        xs, vs = (np.array(every) for every in zip((x, v), *moved, strict=True))
+        there = np.empty((2, *vs.shape))
+        for group in self._groups:
+            models = [self._models[k] for k in group]
+            stacked = models[0].stacked(models, len(x)).dynamics(pi)
+            found = stacked.momentum_and_force(np.concatenate(xs[group]), np.concatenate(vs[group]))
+            there[:, group] = np.reshape(found, (2, len(group), *v.shape))
+        inputs = self._model.inputs(signals)
+        for k, model in enumerate(self._models if self._model.effects else []):
+            there[1, k] += model.dynamics(pi).effect_force(xs[k], vs[k], inputs)
+        change = (there[:, 1:] - there[:, :1]) / DIFFERENCE
+        return change[0].transpose(1, 2, 0), change[1].transpose(1, 2, 0)

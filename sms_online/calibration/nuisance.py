@@ -11,6 +11,10 @@ from sms_online.stream import Array
 from sms_online.trackers.factor import triangular_factor
 from sms_online.trackers.information import Information
 
+# What is measured out with a rule is wrong by so many tolerances at most, whatever samples seem to say.
+BOUNDED = ("tracked_point", "length", "axis", "gravity", "marker_station", "camera_scale", "base_angle")
+BOUND = 30.0
+
 
 @dataclass(frozen=True)
 class Nuisance:
@@ -25,6 +29,14 @@ class Nuisance:
     unit: str
     tolerance: float
     part: str = ""
+
+    @property
+    def may_give_way(self) -> bool:
+        """Whether its tolerance gives way to samples that contradict it clearly; else it counts as stated.
+
+        A gain sets the scale of what a torque explains: it could make the torque zero.
+        """
+        return self.name not in ("drive_gain", "drive_offset")
 
 
 def known_beforehand(nuisances: Sequence[Nuisance], n: int) -> Information:
@@ -44,4 +56,13 @@ def prior_rows(nuisances: Sequence[Nuisance], n: int) -> Array:
     finite = np.flatnonzero(np.isfinite(tolerance))
     rows = np.zeros((finite.size, tolerance.size + n + 1))
     rows[np.arange(finite.size), finite] = 1.0 / tolerance[finite]
+    return rows
+
+
+def bound_rows(nuisances: Sequence[Nuisance], n: int) -> Array:
+    """What `BOUNDED` says, as rows [N Y b] (k, m + n + 1) of unit variance."""
+    rows = np.zeros((0, len(nuisances) + n + 1))
+    for k, each in enumerate(nuisances):
+        if each.name in BOUNDED and np.isfinite(each.tolerance):
+            rows = np.vstack((rows, np.eye(1, rows.shape[1], k) / (BOUND * each.tolerance)))
     return rows

@@ -259,16 +259,16 @@ class Tolerances(Record):
     """How well a testbed is measured out and its sensors are calibrated, 1σ each; 0 means exactly.
 
     Within them the estimator corrects its description as the samples ask for, and error bars count what they leave
-    unknown. A system file asks for that by a table [tolerances], whose keys have the values below where they are not
-    stated; `tolerances = "none"`, which holds without such a table, is short for 0 everywhere.
+    unknown. A table [tolerances] of a system file states them; what it does not state has the values below.
+    `tolerances = "none"` is short for 0 everywhere.
 
     tracked_point: of S, along each axis of the base, m.
     length: of a link, and of a joint's place along each axis, m.
     axis: direction of a joint's axis and mount, rad.
     gravity: direction of gravity, rad.
     marker_station: place of a marker along its link, m.
-    clock: a device's clock against that of the torques, s; where no [[source]] is described, of encoders, base and
-    markers.
+    clock: a device's clock against that of the torques, s; where all channels come from one, of encoders, base,
+    gauges and markers.
     encoder_zero: zero of an encoder, rad (m).
     once_per_turn: sine and cosine of an encoder's error once a turn, rad.
     base_angle: zero of the base's measured attitude, rad.
@@ -298,9 +298,6 @@ class Tolerances(Record):
     @classmethod
     def _from_none(cls, given: Any) -> Any:
         return dict.fromkeys(cls.model_fields, 0.0) if given == "none" else given
-
-
-EXACT = Tolerances.model_validate("none")
 
 
 class System(Record):
@@ -351,7 +348,7 @@ class System(Record):
     controller: Controller | None = None
     trajectory: Trajectory | None = None
     windows: Windows = Windows()
-    tolerances: Tolerances = EXACT
+    tolerances: Tolerances = Tolerances()
     balance: Literal["both", "energy", "momentum", "smoother"] = "both"
 
     @property

@@ -9,12 +9,15 @@ and G that of what sensors' noise adds to them, the estimate is the minimum of
 
 the first sum over the types that leave more than noise, the second over the others. The quotient of a homogeneous type
 is the same for every scale of π, so nothing draws π to zero, and only rows with a torque fix its scale. e² M is what
-the model lacks beside noise: an error of each column in proportion to its size, the same share e of all of them, M the
-diagonal of A - G. e follows from the residual. G in the denominators also frees the minimum of what noise in the
-columns does to least squares. Of rows that hold a joint's torque all error counts as that of the torque, and no G is in
-their denominators: along columns that are little more than noise, which nothing else determines, these would grow as
-fast as the residual, and π without end. ρ makes the variance of
-whitened rows one at the weights' own π, whatever else these hold as noise.
+the model lacks beside noise: an error of each force in proportion to its size, the same share e of all of them. M is
+the diagonal of A - G, but for the inertial forces, which count as one: they may nearly cancel each other, and then the
+error of their sum is as small. e follows from the residual. G in the denominators also frees the minimum of what noise
+in the columns does to least squares. Of rows that hold a joint's torque all error counts as that of the torque, and no
+G is in their denominators: along columns that are little more than noise, which nothing else determines, these would
+grow as fast as the residual, and π without end. ρ makes the variance of whitened rows one at the weights' own π,
+whatever else these hold as noise.
+
+What is known beside the rows enters as `beforehand` says.
 
 Reading: the concentrated likelihood of the functional errors-in-variables model, one variance factor a row type.
 """
@@ -26,6 +29,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from sms_online.pipeline.beforehand import WIDENED, Beforehand, Penalty
 from sms_online.pipeline.momentum_windows import EXPONENT, HOPS
 from sms_online.pipeline.weak_form import test_function
 from sms_online.state import State
@@ -86,6 +90,35 @@ class RowGrams(State):
 
 
 @dataclass(frozen=True)
+class Columns:
+    """What the columns [N Y b] of rows belong to. nuisances: how many columns N has. gains: which are torques' gains.
+
+    inertial (m + n,): which are of inertial parameters.
+    """
+
+    nuisances: int
+    gains: tuple[int, ...]
+    inertial: NDArray[np.bool_]
+
+    @property
+    def of_motion(self) -> NDArray[np.bool_]:
+        """Which columns (m + n + 1, m + n + 1) share their error where no torque is: those of inertial forces.
+
+        All inertial forces follow from the same accelerations, and may cancel each other. Nuisances have none.
+        """
+        inertial = np.append(self.inertial, False)
+        forces = np.arange(inertial.size) >= self.nuisances
+        return np.asarray(np.outer(inertial, inertial) | np.diag(forces & ~inertial))
+
+    @property
+    def of_torque(self) -> NDArray[np.bool_]:
+        """The same where a torque is: it is all that is wrong, with its gain."""
+        own = np.zeros(self.inertial.size + 1, dtype=np.bool_)
+        own[[*self.gains, -1]] = True
+        return np.outer(own, own)
+
+
+@dataclass(frozen=True)
 class Minimum:
     """beta (n,): where the criterion is least. covariance (n, n): inverse of its curvature, rows as independent as they
     count; of directions without information zero. slopes (n_v, n): of each speed's part of it, which add up to what
@@ -102,19 +135,20 @@ class Minimum:
 class ScaleFree:
     """What the criterion needs of a session's rows; see `minimum`. weights (n,): values behind the rows' whitening.
 
-    alone: nothing is known of β beside the rows.
+    alone: nothing is known of π beside the rows.
     """
 
     grams: RowGrams
     lacking: NDArray[np.bool_]
     torque: NDArray[np.bool_]
     weights: Array
-    prior: Array
+    columns: Columns
+    known: Beforehand
     alone: bool
 
     def minimum(self) -> Minimum:
         """The minimum next to the weights."""
-        return minimum(self.grams, self.lacking, self.torque, [self.weights], self.prior)
+        return minimum(self.grams, self.lacking, self.torque, [self.weights], self.columns, self.known)
 
     def estimate(self, squares: Estimate) -> Estimate:
         """That minimum; squares: the estimate by least squares, whose robust covariance stays.
@@ -135,13 +169,20 @@ class _Criterion:
     """The criterion of some rows; lacking, torque (n_v,): which leave more than noise, and which hold a torque."""
 
     def __init__(
-        self, grams: RowGrams, lacking: NDArray[np.bool_], torque: NDArray[np.bool_], prior: Array, start: Array
+        self,
+        grams: RowGrams,
+        lacking: NDArray[np.bool_],
+        torque: NDArray[np.bool_],
+        columns: Columns,
+        start: Array,
     ) -> None:
-        self._A, self._lacking, self._prior = grams.signal, lacking, prior
+        self._A, self._lacking = grams.signal, lacking
         self._count = np.where(lacking, grams.windows / OVERLAP, float(grams.windows))
-        own = np.maximum(np.einsum("vii->vi", grams.signal - grams.noise), 0.0)
-        own[torque, :-1] = 0.0
-        self._M = own
+        beyond = grams.signal - grams.noise
+        same = np.where(torque[:, None, None], columns.of_torque, columns.of_motion)
+        self._M = np.where(same, beyond, 0.0)
+        diagonal = np.einsum("vii->vi", self._M)
+        diagonal[:] = np.maximum(diagonal, 0.0)
         # Rows without noise have a constant deviation: one.
         noise = self._quadratic(grams.noise, start)
         noisy = ~lacking & ~torque & (noise > grams.windows * LEAST_NOISE)
@@ -167,35 +208,39 @@ class _Criterion:
     def errors(self, w: Array) -> Array:
         """e² (n_v,) that explains what the residual holds beyond noise."""
         beyond = np.maximum(self.squares(w) - self._quadratic(self._G, w), 0.0)
-        size = np.maximum(self._M @ w**2, self._least(w))
+        size = np.maximum(self._quadratic(self._M, w), self._least(w))
         return np.where(self._lacking, beyond / size, 0.0)
 
     def predicted(self, w: Array, errors: Array) -> Array:
         """Expected sums of squares (n_v,)."""
-        noise = self._quadratic(self._G, w) + errors * (self._M @ w**2) + self._constant
+        noise = self._quadratic(self._G, w) + errors * (self._quadratic(self._M, w)) + self._constant
         return np.asarray(np.maximum(noise, self._least(w)))
 
     def value(self, w: Array, errors: Array) -> float:
         """Of the criterion, with e² (n_v,) given."""
         ratio = self.squares(w) / self.predicted(w, errors)
         each = np.where(self._lacking, np.log(ratio), ratio)
-        return 0.5 * float(self._count @ each) + 0.5 * float(np.sum((self._prior @ w) ** 2))
+        return 0.5 * float(self._count @ each)
 
-    def relative(self, w: Array) -> float:
-        """Sum of the logarithms of the residuals' shares of their rows, by which different starts compare."""
-        share = self.squares(w) / np.einsum("vii,i->v", self._A, w**2)
-        return 0.5 * float(self._count @ np.log(share)) + 0.5 * float(np.sum((self._prior @ w) ** 2))
+    def relative(self, w: Array, nuisances: int) -> float:
+        """Sum of the logarithms of the residuals' shares of their rows, by which different starts compare.
+
+        Columns of nuisances are left out of the rows' size: they may be large and cancel.
+        """
+        own = slice(nuisances, None)
+        share = self.squares(w) / np.einsum("vii,i->v", self._A[:, own, own], w[own] ** 2)
+        return 0.5 * float(self._count @ np.log(share))
 
     def slopes(self, w: Array, errors: Array) -> tuple[Array, Array, Array]:
-        """By speed: slopes (n_v, n + 1), curvature of the squares and of the whole (n + 1, n + 1), priors left out."""
+        """By speed: slopes (n_v, n + 1), curvature of the squares and of the whole (n + 1, n + 1)."""
         S, D, n = self.squares(w), self.predicted(w, errors), self._count
         a = self._A @ w
-        g = self._G @ w + errors[:, None] * self._M * w
+        g = self._G @ w + errors[:, None] * (self._M @ w)
         inside = np.where(self._lacking, n / S, n / D)  # weight of the squares
         outside = np.where(self._lacking, n / D, n * S / D**2)  # and of what is expected
         slopes = inside[:, None] * a - outside[:, None] * g
         squares = np.einsum("v,vij->ij", inside, self._A)
-        whole = squares - np.einsum("v,vij->ij", outside, self._G) - np.diag((outside * errors) @ self._M)
+        whole = squares - np.einsum("v,vij->ij", outside, self._G) - np.einsum("v,vij->ij", outside * errors, self._M)
         log, plain = np.where(self._lacking, n, 0.0), np.where(self._lacking, 0.0, n)
         whole += np.einsum("v,vi,vj->ij", -2.0 * log / S**2, a, a)
         cross = np.einsum("v,vi,vj->ij", -2.0 * plain / D**2, a, g)
@@ -204,19 +249,32 @@ class _Criterion:
 
 
 def minimum(
-    grams: RowGrams, lacking: NDArray[np.bool_], torque: NDArray[np.bool_], starts: list[Array], prior: Array
+    grams: RowGrams,
+    lacking: NDArray[np.bool_],
+    torque: NDArray[np.bool_],
+    starts: list[Array],
+    columns: Columns,
+    known: Beforehand,
 ) -> Minimum:
-    """The minimum of the criterion that is nearest to the best of some starts β (n,).
+    """The minimum of the criterion that is lowest of those next to some starts β (n,).
 
-    lacking, torque (n_v,): which speeds' rows leave more than noise, and which hold a torque. prior (k, n + 1): what
-    else is known of β, as rows [Y b] of unit variance.
+    lacking, torque (n_v,): which speeds' rows leave more than noise, and which hold a torque. The first start holds the
+    weights behind the rows. known: what is known of β beside the rows.
     """
     w = np.append(starts[0], -1.0)
-    criterion = _Criterion(grams, lacking, torque, prior, w)
-    found = [_descended(criterion, np.append(start, -1.0), prior) for start in starts]
-    w = min(found, key=criterion.relative)
-    slopes, squares, _ = criterion.slopes(w, criterion.errors(w))
-    basis = _basis(squares[:-1, :-1] + prior[:, :-1].T @ prior[:, :-1])
+    criterion = _Criterion(grams, lacking, torque, columns, w)
+    squares = np.einsum("vii->vi", grams.signal)
+    penalties = [Penalty(known, columns.nuisances, squares, w, widened) for widened in WIDENED]
+    penalty = penalties[-1]
+    found = [_descended(criterion, np.append(start, -1.0), penalty) for start in starts]
+    if len(known.doubtful):
+        freed = found[0]
+        for wider in penalties:
+            freed = _descended(criterion, freed, wider)
+        found.append(freed)
+    w = min(found, key=lambda each: criterion.relative(each, columns.nuisances) + penalty.value(each))
+    slopes, curvature, _ = criterion.slopes(w, criterion.errors(w))
+    basis = _basis(curvature[:-1, :-1] + penalty.derivatives(w)[1])
     return Minimum(w[:-1], basis @ basis.T, slopes[:, :-1], np.sqrt(criterion.errors(w)))
 
 
@@ -229,24 +287,24 @@ def _basis(information: Array) -> Array:
     return np.asarray(scale[:, None] * vectors[:, kept] / np.sqrt(values[kept]))
 
 
-def _descended(criterion: _Criterion, w: Array, prior: Array) -> Array:
+def _descended(criterion: _Criterion, w: Array, penalty: Penalty) -> Array:
     """Newton steps from w; e follows from step to step."""
     for _ in range(MOST_STEPS):
         errors = criterion.errors(w)
         slopes, squares, whole = criterion.slopes(w, errors)
-        known = prior[:, :-1].T @ prior[:, :-1]
+        pull, known = penalty.derivatives(w)
         basis = _basis(squares[:-1, :-1] + known)
-        slope = basis.T @ (slopes.sum(axis=0)[:-1] + prior[:, :-1].T @ (prior @ w))
+        slope = basis.T @ (slopes.sum(axis=0)[:-1] + pull)
         values, vectors = np.linalg.eigh(basis.T @ (whole[:-1, :-1] + known) @ basis)
         step = -vectors @ ((vectors.T @ slope) / np.maximum(np.abs(values), LEAST_CURVATURE))
         gain = -float(slope @ step)
         if gain < CONVERGED:
             break
-        before, length = criterion.value(w, errors), 1.0
+        before, length = criterion.value(w, errors) + penalty.value(w), 1.0
         for _ in range(HALVINGS):
             moved = w.copy()
             moved[:-1] += length * (basis @ step)
-            if criterion.value(moved, errors) <= before - SUFFICIENT * length * gain:
+            if criterion.value(moved, errors) + penalty.value(moved) <= before - SUFFICIENT * length * gain:
                 break
             length *= 0.5
         else:

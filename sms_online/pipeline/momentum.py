@@ -9,9 +9,11 @@ import msgspec
 import numpy as np
 
 from sms_online.calibration.columns import CalibrationColumns, nuisances
-from sms_online.calibration.nuisance import prior_rows
+from sms_online.calibration.nuisance import bound_rows, prior_rows
+from sms_online.calibration.release import released
 from sms_online.model.base_parameters import BaseParameters
 from sms_online.model.model import Model
+from sms_online.pipeline.beforehand import Beforehand
 from sms_online.pipeline.changes import Adoption, Changes
 from sms_online.pipeline.criterion import RowGrams, ScaleFree
 from sms_online.pipeline.errors_in_variables import NoiseBias, unbiased
@@ -104,7 +106,7 @@ class Momentum(Stage):
         self.latencies = Latencies(self._sources, base.n)
         self.fit = MomentumFit(
             model, base, self._balance, self._new_noise, self._solved, self._sources, self._calibration,
-            self._prior_rows,
+            self._beforehand, [k for k, each in enumerate(self.nuisances) if each.name == "drive_gain"],
         )  # fmt: skip
         self.tracker = self._new_tracker()
         self.test = SequentialTest(model.layout, self._balance.span / HOPS)
@@ -157,7 +159,9 @@ class Momentum(Stage):
     def _joint(self) -> Estimate:
         """The nuisances, then the base parameters."""
         estimate, scale_free = self.tracker.estimate(), self.scale_free
-        return unbiased(estimate, self.bias) if scale_free is None else scale_free.estimate(estimate)
+        if scale_free is not None:
+            return scale_free.estimate(estimate)
+        return released(unbiased(estimate, self.bias), self.nuisances)
 
     @property
     def scale_free(self) -> ScaleFree | None:
@@ -165,15 +169,19 @@ class Momentum(Stage):
         if not self.misfit or self.grams.windows == 0:
             return None
         assert self.fit.weights is not None
-        prior = np.concatenate((self._prior_rows(), self.state.known))
         weights = np.pad(self.fit.weights, (len(self.nuisances), 0))
         lacking = self.fit.plain.misfit > 0.0
-        return ScaleFree(copy(self.grams), lacking, self.fit.torque, weights, prior, self.prior is None)
+        fit, known = self.fit, self._beforehand()
+        return ScaleFree(copy(self.grams), lacking, fit.torque, weights, fit.columns, known, self.prior is None)
 
-    def _prior_rows(self) -> Array:
-        """What is known beforehand of nuisances and parameters, as rows [N Y b] (k, m + n + 1) of unit variance."""
-        known = prior_factor(self.current_prior, self.changes.base.n)
-        return np.concatenate((self._calibration, np.pad(known, ((0, 0), (len(self.nuisances), 0)))))
+    def _beforehand(self) -> Beforehand:
+        """What is known of nuisances and parameters beside the rows; tolerances may give way, within bounds."""
+        m, prior = len(self.nuisances), self.current_prior
+        known = np.pad(prior_factor(prior, self.changes.base.n), ((0, 0), (m, 0)))
+        may = np.array([each.may_give_way for each in self.nuisances if np.isfinite(each.tolerance)], dtype=np.bool_)
+        bounds = bound_rows(self.nuisances, self.changes.base.n)
+        certain = np.concatenate((self.state.known, self._calibration[~may], bounds, known))
+        return Beforehand(certain, self._calibration[may])
 
     def _solved(self) -> Array:
         """Nuisances and β where the rows determine them, else NaN."""

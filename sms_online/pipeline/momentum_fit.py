@@ -23,7 +23,8 @@ from numpy.typing import NDArray
 
 from sms_online.model.base_parameters import BaseParameters
 from sms_online.model.model import Model
-from sms_online.pipeline.criterion import RowGrams, minimum
+from sms_online.pipeline.beforehand import Beforehand, fitted
+from sms_online.pipeline.criterion import Columns, RowGrams, minimum
 from sms_online.pipeline.latency import SourceGroup
 from sms_online.pipeline.momentum_balance import MomentumBalance
 from sms_online.pipeline.momentum_windows import (
@@ -71,6 +72,8 @@ LATEST_RENEWAL = 4.0
 # take some of that for information.
 SAME_ROWS = 2e-3
 SAME_NOISE = 0.25
+# Parameters with which a speed's rows are smaller than this share of what they were explain nothing.
+SHRUNK = 0.5
 # A chain begins anew where what rows leave beyond noise changes by this share of their variance.
 SAME_MISFIT = 0.1
 # Time that new weights are told windows before their rows are taken, s: see `weighing`.
@@ -129,8 +132,8 @@ class MomentumFit(Stage):
 
     new_noise: makes what propagates noise, for the same model, base and balance. solve: gives the estimate so far of
     nuisances and β (m + n,), NaN where nothing is known of it. sources: whose latencies are told. calibration: rows
-    [N Y b] (k, m + n + 1) of what is known of the nuisances beforehand. prior: gives these and whatever else is known
-    beforehand, likewise. weighing: who weighs now.
+    [N Y b] (k, m + n + 1) of what is known of the nuisances beforehand. beforehand: gives all that is known beside the
+    rows. weighing: who weighs now.
     """
 
     def __init__(
@@ -142,15 +145,20 @@ class MomentumFit(Stage):
         solve: Callable[[], Array],
         sources: Sequence[SourceGroup] = (),
         calibration: Array | None = None,
-        prior: Callable[[], Array] | None = None,
+        beforehand: Callable[[], Beforehand] | None = None,
+        gains: Sequence[int] = (),
     ) -> None:
         self.model = model
         self.base = base
         self._calibration = np.zeros((0, base.n + 1)) if calibration is None else calibration
         self._nuisances = self._calibration.shape[1] - base.n - 1
+        inertial = np.isin(
+            np.arange(-self._nuisances, base.n), np.flatnonzero(np.isin(base.independent, model.inertial))
+        )
+        self.columns = Columns(self._nuisances, tuple(gains), inertial)
         self._balance = balance
         self._solve = solve
-        self._prior = prior if prior is not None else lambda: self._calibration
+        self._beforehand = beforehand if beforehand is not None else lambda: Beforehand.none(self._nuisances + base.n)
         self._new_noise, self._sources = new_noise, sources
         self.weighing = self._new_weighing()
         self._next: Weighing | None = None  # with new weights, that takes over when it has been told enough windows
@@ -275,7 +283,7 @@ class MomentumFit(Stage):
 
         Noise that follows a parameter which rows do not determine may be any.
         """
-        found = minimum(grams, lacking, self.torque, starts, self._prior())
+        found = minimum(grams, lacking, self.torque, starts, self.columns, self._beforehand())
         determined = np.abs(found.beta) > DETERMINED * np.sqrt(np.diag(found.covariance))
         determined[: self._nuisances] = True
         return np.where(determined, found.beta, np.pad(self.base.values(self.model.nominal), (self._nuisances, 0)))
@@ -316,7 +324,10 @@ class MomentumFit(Stage):
         beta = np.where(np.isnan(beta), self._known_weights, beta)
         self.state.since = 0
         self.state.renewal = min(2 * self.state.renewal, self._count(LATEST_RENEWAL))
-        self.plain.judge(np.concatenate((nuisances, beta)))
+        joint = np.concatenate((nuisances, beta))
+        self.plain.judge(joint)
+        if self.plain.misfit.any() and self._nuisances:
+            beta = self._calibrated(joint)[self._nuisances :]
         used, misfit = self.weighing, self.plain.misfit
         if np.any(np.abs(misfit - used.misfit) > SAME_MISFIT * (1.0 + used.misfit)):
             self._next = self.state.warm = None
@@ -324,6 +335,20 @@ class MomentumFit(Stage):
         elif self._next is None and self._matters(beta, noise):
             self._next, self.state.warm = self._new_weighing(), 0
             self._next.begin(beta, noise, self.plain.misfit, window.start)
+
+    def _calibrated(self, joint: Array) -> Array:
+        """Nuisances and β (m + n,) that leave no more than noise, where tolerances allow that; or the same.
+
+        Rows that were whitened as if the model lacked something determine large nuisances too roughly to show it.
+        """
+        m, squares = self._nuisances, np.einsum("vii->vi", self.plain.gram)[:, self._nuisances : -1]
+        found = fitted(self.plain.gram.sum(axis=0), self._beforehand(), m, joint)
+        # Rows without a torque leave less where π shrinks.
+        shrunk = np.any(squares @ found[m:] ** 2 < SHRUNK**2 * (squares @ joint[m:] ** 2))
+        if not shrunk and not self.plain.excess(found).any():
+            self.plain.judge(found)
+            return found
+        return joint
 
     def _matters(self, beta: Array, noise: SensorNoise) -> bool:
         """Whether β (n,) and the noise of now would weigh rows otherwise."""

@@ -56,8 +56,13 @@ class PlainRows(State):
             return None
         return float(np.sqrt(max(0.0, self._squares(beta)[rows].mean() / self.windows)))
 
+    def excess(self, beta: Array) -> Array:
+        """By how much the mean square of β's (n,) residual is above one (n_v,), zero where it may be chance."""
+        if not self.windows:
+            return self.misfit
+        ratio = self._squares(beta) / self.windows
+        return np.where(ratio > LARGEST_RATIO, ratio - 1.0, 0.0)
+
     def judge(self, beta: Array) -> None:
-        """Tell the misfit of β (n,) from the windows so far."""
-        if self.windows:
-            ratio = self._squares(beta) / self.windows
-            self.misfit = np.where(ratio > LARGEST_RATIO, ratio - 1.0, 0.0)
+        """Take the misfit of β (n,) from the windows so far."""
+        self.misfit = self.excess(beta)

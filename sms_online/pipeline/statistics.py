@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 
 from sms_online.calibration.nuisance import Nuisance
+from sms_online.calibration.release import released
 from sms_online.description.schema import System
 from sms_online.model.base_parameters import BaseParameters
 from sms_online.model.model import Model
@@ -149,7 +150,10 @@ class Statistics:
             return self.energy_estimate()
         assert self.momentum is not None
         rows, scale_free = self.momentum.tracker.estimate(), self.momentum.scale_free
-        joint = unbiased(rows, self.momentum.bias) if scale_free is None else scale_free.estimate(rows)
+        if scale_free is None:
+            joint = released(unbiased(rows, self.momentum.bias), setup.nuisances)
+        else:
+            joint = scale_free.estimate(rows)
         return joint.without_nuisances(len(setup.nuisances))
 
     def shift(self, estimate: Estimate) -> Array:

@@ -1,0 +1,57 @@
+"""Tolerances with heavy tails: what the samples contradict clearly gives way, and is not paid for by all else.
+
+A description that is wrong by many tolerances in one number would otherwise be corrected by a part of it, and π bent by
+the rest. The tails are those of Student's t, see `pipeline.beforehand`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from sms_online.calibration.nuisance import Nuisance
+from sms_online.pipeline.beforehand import TAIL
+from sms_online.trackers.interface import Estimate
+
+# Within this many tolerances, which chance may explain, a tolerance counts as stated.
+NORMAL = 2.0
+# Weights and estimate follow each other; so many times at most, until no weight changes by more than this.
+PASSES, SAME = 20, 1e-6
+# A tolerance counts at least this share of its information: what else determines a nuisance must do so by itself.
+LEAST = 1e-9
+
+
+def released(estimate: Estimate, nuisances: Sequence[Nuisance]) -> Estimate:
+    """The estimate (nuisances first) as if each tolerance beyond `NORMAL` were one of heavier tails.
+
+    Its information on a nuisance ν is replaced by h / tolerance², with h = (1 + NORMAL² / TAIL) / (1 + (ν / tolerance)²
+    / TAIL): a change of low rank (Woodbury). Those of torques keep theirs.
+    """
+    m = len(nuisances)
+    tolerance = np.array([each.tolerance for each in nuisances])
+    may = np.array([np.isfinite(each.tolerance) and each.may_give_way for each in nuisances], dtype=np.bool_)
+    known = np.flatnonzero(may & estimate.determined[:m])
+    far = known[np.abs(estimate.pi[known]) > NORMAL * tolerance[known]]
+    if not far.size:
+        return estimate
+    # Beside a prior all rows were weighed with one factor, these among them.
+    unit = tolerance[far] * (1.0 if estimate.scale is None else estimate.scale)
+    C, start = estimate.covariance[:, far] / unit, estimate.pi[far] / unit
+    # Corrections for noise may make a variance larger than that of the tolerance alone, which is part of it.
+    size, axes = np.linalg.eigh(C[far] / unit[:, None])
+    block = (axes * np.minimum(size, 1.0)) @ axes.T
+    value, weight = start, np.ones(far.size)
+    gain = np.zeros((far.size, far.size))
+    for _ in range(PASSES):
+        before = weight
+        weight = np.clip((1.0 + NORMAL**2 / TAIL) / (1.0 + value**2 / TAIL), LEAST, 1.0)
+        # Information that the tolerances lose, and what is left of the system without it.
+        lost = 1.0 - weight
+        gain = np.linalg.solve(np.eye(far.size) - lost[:, None] * block, np.diag(lost))
+        value = start + block @ (gain @ start)
+        if np.max(np.abs(weight - before)) < SAME:
+            break
+    covariance = estimate.covariance + C @ gain @ C.T
+    return replace(estimate, pi=estimate.pi + C @ (gain @ start), covariance=covariance)
