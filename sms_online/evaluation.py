@@ -209,6 +209,7 @@ class Evaluation:
                 distance=0.0 if projection is None else projection.distance,
                 comparison=self.comparison,
                 lost=lost / max(1, lost + now.samples),
+                outliers={channel: count / of for channel, (count, of) in now.outliers.items()},
                 discrepancies=self._discrepancies,
                 miscalibrated=tuple(self._miscalibrated()),
                 troubles=(*self._troubles, *self._weaknesses()),
@@ -347,6 +348,7 @@ class Evaluation:
             out.append(f"{now.counters.gaps} gaps too long to bridge; each begins a new window of the balance")
         if now.counters.interpolated_cells:
             out.append(f"{now.counters.interpolated_cells} cells interpolated")
+        out += [f"{channel}: {count} outliers left out" for channel, (count, _) in now.outliers.items()]
         out += self.unstated_latency
         if now.setup.unused:
             out.append(f"channels not used: {', '.join(now.setup.unused)}")

@@ -6,7 +6,7 @@ judgement, so that none of them is calmer than another.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 from sms_online.nominal import AS_STATED, Comparison
@@ -24,6 +24,8 @@ NOISE_RESIDUAL = 0.1
 JUST_NOISE = 1.05
 # Share of the samples that may be lost before the rest is no fair part of the motion.
 LARGEST_LOSS = 0.01
+# Share of a channel's samples that may be outliers before its sensor is at fault.
+MANY_OUTLIERS = 1e-3
 # Further from the nearest real bodies than this, in standard deviations, no noise brings an estimate.
 LARGEST_DISTANCE = 3.0
 # Names in a sentence; the others are counted.
@@ -37,6 +39,7 @@ CHECK_TORQUE = "check sign, unit and gear ratio of that torque, then run `sms-on
 CHECK_ROWS = "check geometry, clocks and stated noise of the sensors in these rows, then run `sms-online diagnose`"
 CHECK_SCALE = "check unit and gear of the torques, or weigh one part and state it under [known]"
 CHECK_PRIOR = "check that prior, and run `sms-online diagnose` for what the model lacks in these rows"
+CHECK_OUTLIERS = "look at that sensor: reflections and swapped markers, a loose cable, bits that flip"
 CHECK_LOSSES = "look at the faults that the session counted: a bus that is too busy, a loose cable"
 MOVE = "move all joints, faster and over a larger range, and long enough"
 
@@ -77,8 +80,9 @@ class Facts:
     of the rows that the sequential test finds more than noise in, of a session without diagnosis. disputed: parameters
     that the data pull away from their prior. undecided: times, s, of changes that the session ended too early to decide
     on. distance: from the nearest real bodies, in standard deviations. comparison: with the values that the system file
-    states. lost: share of the samples. miscalibrated: what is off by more than the description's tolerances allow.
-    troubles: whatever else, a short sentence each, such as of the devices of a live session.
+    states. lost: share of the samples. outliers: by channel, the share of the samples that was left out. miscalibrated:
+    what is off by more than the description's tolerances allow. troubles: whatever else, a short sentence each, such as
+    of the devices of a live session.
     """
 
     determined: tuple[int, int]
@@ -93,6 +97,7 @@ class Facts:
     distance: float = 0.0
     comparison: Comparison = AS_STATED
     lost: float = 0.0
+    outliers: Mapping[str, float] = field(default_factory=dict)
     discrepancies: tuple[Discrepancy, ...] = ()
     miscalibrated: tuple[Reason, ...] = ()
     troubles: tuple[str, ...] = ()
@@ -117,7 +122,7 @@ def judge(facts: Facts) -> Trust:
         doubts += _negative(facts.negative)
         doubts += _disputed(facts.disputed)
     # What befell the samples comes before what that may have done to the estimate.
-    losses = _losses(facts.lost)
+    losses = [*_losses(facts.lost), *_outliers(facts.outliers)]
     if doubts:
         return Trust("doubt", (*losses, *doubts, *_cautions(facts)), grave=True)
     if facts.settling:
@@ -305,6 +310,16 @@ def _apart(comparison: Comparison) -> list[Reason]:
 def _losses(share: float) -> list[Reason]:
     lost = Reason(f"{100.0 * share:.0f} % of the samples are lost", False, then=CHECK_LOSSES)
     return [lost] if share > LARGEST_LOSS else []
+
+
+def _outliers(shares: Mapping[str, float]) -> list[Reason]:
+    many = {channel: share for channel, share in shares.items() if share > MANY_OUTLIERS}
+    if not many:
+        return []
+    worst = max(many, key=lambda channel: many[channel])
+    others = f" and of {len(many) - 1} more channels" if len(many) > 1 else ""
+    text = f"{100.0 * many[worst]:.1g} % of the samples of {worst}{others} are outliers, left out"
+    return [Reason(text, False, tuple(many), "outliers", then=CHECK_OUTLIERS)]
 
 
 def _grounds(facts: Facts) -> list[Reason]:

@@ -196,9 +196,10 @@ class Result:
     system: as described. parameters: by name; after an event they, and residuals, are those since then. residuals: by
     type of the rows, "energy", "joint_i", "link_i" or "base". events: changes while the session ran. findings: effects
     that the running diagnosis has named. trust: may the numbers be trusted, and why. warnings: a sentence each. method:
-    what the estimate comes from, "smoother", "momentum" or "energy" balance. samples, lost_samples: counts. duration:
-    s. condition_number: of the scaled information, inf without full rank. throughput: samples/s of computing time.
-    calibration: what the description is off by, told better than its tolerances.
+    what the estimate comes from, "smoother", "momentum" or "energy" balance. samples, lost_samples: counts. outliers:
+    how many samples were left out, by channel. duration: s. condition_number: of the scaled information, inf without
+    full rank. throughput: samples/s of computing time. calibration: what the description is off by, estimated better
+    than its tolerances.
     physical: None of a session that still runs. diagnosis: episodes of the running diagnosis, as in results.json.
     """
 
@@ -214,6 +215,7 @@ class Result:
     duration: float
     condition_number: float
     lost_samples: int
+    outliers: dict[str, int]
     throughput: float = 0.0
     calibration: tuple[Calibration, ...] = ()
     physical: Consistency | None = field(default=None, repr=False)
@@ -238,6 +240,7 @@ class Result:
             "condition_number": finite(self.condition_number),
             "throughput_samples_per_s": self.throughput,
             "lost_samples": self.lost_samples,
+            "outliers": self.outliers,
             "warnings": list(self.warnings),
             "diagnosis": [dict(episode) for episode in self.diagnosis],
         }
@@ -331,6 +334,7 @@ def result_of(
         duration=now.duration,
         condition_number=estimate.condition_number,
         lost_samples=now.counters.lost_samples,
+        outliers={channel: count for channel, (count, _) in now.outliers.items()},
         throughput=throughput,
         calibration=tuple(evaluation.calibration),
         physical=None if projection is None else Consistency(projection.distance, projection.active),

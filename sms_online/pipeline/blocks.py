@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from sms_online.description.schema import System
+from sms_online.pipeline import outliers
 from sms_online.pipeline.momentum_balance import half_hop, prompt_margin
 from sms_online.pipeline.momentum_windows import HOPS
 from sms_online.pipeline.synchronise import SIDE
@@ -24,9 +25,10 @@ def energy_blocks(system: System) -> tuple[float, float]:
 def momentum_blocks(system: System, slowest: float) -> tuple[float, float]:
     """Duration of the first block with momentum rows, but for whole blocks, and of the others, s.
 
-    A block ends with the last sample behind a window, and with those that interpolate the slowest channel there, which
-    has the period `slowest`, s.
+    A block ends with the last sample behind a window, with those that interpolate the slowest channel there, which has
+    the period `slowest`, s, and with those that show whether these are outliers.
     """
     hop = 2 * half_hop(system.sample_rate, system.windows.momentum)
     margin = prompt_margin(hop * HOPS)
-    return (margin % hop + BETWEEN) / system.sample_rate + SIDE * slowest, hop / system.sample_rate
+    after = SIDE * slowest + min(outliers.SIDE * slowest, outliers.PATIENCE)
+    return (margin % hop + BETWEEN) / system.sample_rate + after, hop / system.sample_rate

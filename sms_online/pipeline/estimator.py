@@ -30,6 +30,7 @@ from sms_online.pipeline.internal_states import FollowedStates
 from sms_online.pipeline.joint_balance import JointBalance, SquaredResidual
 from sms_online.pipeline.momentum import Momentum
 from sms_online.pipeline.observer import Observer
+from sms_online.pipeline.outliers import Outliers
 from sms_online.pipeline.rates import RateSamples, RatesStage
 from sms_online.pipeline.sensing import AttitudeContinuity, Sensing, stated_period
 from sms_online.pipeline.statistics import Method, Setup
@@ -90,6 +91,9 @@ class Estimator(Stage):
         self.channels = tuple(dict.fromkeys((*self.sensing.channels, *self._smoothed_channels)))
         self._columns = [channels.index(name) for name in self.channels]
         self._smoothed_columns = [self.channels.index(name) for name in self._smoothed_channels]
+        # A torque may jump for one sample.
+        sensors = [k for k, name in enumerate(self.channels) if not name.startswith(("tau_", "force_"))]
+        self._outliers = Outliers(len(self.channels), sensors)
         self._attitude = AttitudeContinuity()
         self._synchroniser = Synchroniser(self.sensing.channels, system.sample_rate)
         self._conditioning = Conditioning(system, self.sensing.channels)
@@ -237,6 +241,13 @@ class Estimator(Stage):
         return self._synchroniser.start_time
 
     @property
+    def outliers(self) -> dict[str, tuple[int, int]]:
+        """How many samples were left out as outliers, and of how many, of each channel with any."""
+        now = self._outliers.state
+        counts = zip(self.channels, now.left_out.tolist(), now.judged.tolist(), strict=True)
+        return {name: (left_out, of) for name, left_out, of in counts if left_out}
+
+    @property
     def counters(self) -> SyncCounters:
         """Counts of the synchroniser: missing and interpolated cells, gaps, lost samples."""
         return self._synchroniser.counters
@@ -263,8 +274,7 @@ class Estimator(Stage):
     def finish(self) -> None:
         """End of the session: process what is still pending."""
         self.finished = True
-        if self.state.pending_t.size:
-            self._synchronise(self.state.pending_t, self.state.pending)
+        self._synchronise(self.state.pending_t, self.state.pending, last=True)
         self.state.pending_t, self.state.pending = self.state.pending_t[:0], self.state.pending[:0]
         for piece in self._synchroniser.flush():
             self._condition(piece)
@@ -276,7 +286,8 @@ class Estimator(Stage):
         if self.smoother is not None:
             self.smoother.work(self._balanced, last=True)
 
-    def _synchronise(self, t: Array, values: Array) -> None:
+    def _synchronise(self, t: Array, values: Array, last: bool = False) -> None:
+        t, values = self._outliers.push(t, values, last)
         if self.smoother is not None:
             torque = self.sensing.joint_torque(values[:, : len(self.sensing.channels)])
             self.smoother.push(t, torque, values[:, self._smoothed_columns])

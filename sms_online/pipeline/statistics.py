@@ -99,8 +99,9 @@ class MomentumStatistics:
 class Statistics:
     """Sufficient statistics, counts and events of a session up to now.
 
-    finished: no more samples come. periods (channels,): s a sample, NaN where unknown. energy: the energy balance's
-    tracker; shared: what errors that its rows share do. joints: sums behind the relative residual of each.
+    finished: no more samples come. outliers: by channel, how many samples were left out, and of how many. periods
+    (channels,): s a sample, NaN where unknown. energy: the energy balance's tracker; shared: what errors that its rows
+    share do. joints: sums behind the relative residual of each.
     """
 
     setup: Setup
@@ -110,6 +111,7 @@ class Statistics:
     duration: float
     dropped_rows: int
     counters: SyncCounters
+    outliers: dict[str, tuple[int, int]]
     periods: Array
     events: tuple[Event, ...]
     energy: Tracker
@@ -130,6 +132,7 @@ class Statistics:
             duration=estimator.duration,
             dropped_rows=estimator.state.dropped_rows,
             counters=state_copy(estimator.counters),
+            outliers=estimator.outliers,
             periods=estimator.periods.copy(),
             events=tuple(estimator.events),
             energy=snapshot(estimator.energy_tracker),
