@@ -13,6 +13,7 @@ import numpy as np
 
 from sms_online.calibration.nuisance import Nuisance
 from sms_online.pipeline.beforehand import TAIL
+from sms_online.stream import Array
 from sms_online.trackers.interface import Estimate
 
 # Within this many tolerances, which chance may explain, a tolerance counts as stated.
@@ -23,11 +24,24 @@ PASSES, SAME = 20, 1e-6
 LEAST = 1e-9
 
 
+def release_gain(block: Array, weight: Array) -> Array:
+    """What a covariance gains where tolerances keep a share of their information: G (k, k) in P + C G Cᵀ.
+
+    block (k, k): covariance of k nuisances in units of their tolerances, whose information is part of it. weight (k,):
+    the shares. C (n, k): covariances with the nuisances in these units. Source: the identity of Woodbury.
+    """
+    lost = 1.0 - weight
+    # Corrections for noise may make a variance larger than that of the tolerance alone.
+    size, axes = np.linalg.eigh(block)
+    block = (axes * np.minimum(size, 1.0)) @ axes.T
+    return np.asarray(np.linalg.solve(np.eye(lost.size) - lost[:, None] * block, np.diag(lost)))
+
+
 def released(estimate: Estimate, nuisances: Sequence[Nuisance]) -> Estimate:
     """The estimate (nuisances first) as if each tolerance beyond `NORMAL` were one of heavier tails.
 
     Its information on a nuisance ν is replaced by h / tolerance², with h = (1 + NORMAL² / TAIL) / (1 + (ν / tolerance)²
-    / TAIL): a change of low rank (Woodbury). Those of torques keep theirs.
+    / TAIL), see `release_gain`. Those of torques keep theirs.
     """
     m = len(nuisances)
     tolerance = np.array([each.tolerance for each in nuisances])
@@ -39,17 +53,13 @@ def released(estimate: Estimate, nuisances: Sequence[Nuisance]) -> Estimate:
     # Beside a prior all rows were weighed with one factor, these among them.
     unit = tolerance[far] * (1.0 if estimate.scale is None else estimate.scale)
     C, start = estimate.covariance[:, far] / unit, estimate.pi[far] / unit
-    # Corrections for noise may make a variance larger than that of the tolerance alone, which is part of it.
-    size, axes = np.linalg.eigh(C[far] / unit[:, None])
-    block = (axes * np.minimum(size, 1.0)) @ axes.T
+    block = C[far] / unit[:, None]
     value, weight = start, np.ones(far.size)
     gain = np.zeros((far.size, far.size))
     for _ in range(PASSES):
         before = weight
         weight = np.clip((1.0 + NORMAL**2 / TAIL) / (1.0 + value**2 / TAIL), LEAST, 1.0)
-        # Information that the tolerances lose, and what is left of the system without it.
-        lost = 1.0 - weight
-        gain = np.linalg.solve(np.eye(far.size) - lost[:, None] * block, np.diag(lost))
+        gain = release_gain(block, weight)
         value = start + block @ (gain @ start)
         if np.max(np.abs(weight - before)) < SAME:
             break

@@ -109,7 +109,7 @@ class Momentum(Stage):
             self._beforehand, [k for k, each in enumerate(self.nuisances) if each.name == "drive_gain"],
         )  # fmt: skip
         self.tracker = self._new_tracker()
-        self.test = SequentialTest(model.layout, self._balance.span / HOPS)
+        self.test = SequentialTest(model.layout, self._balance.span / HOPS, self.nuisances)
 
     def _rebuild(self) -> None:
         """The same after an event."""

@@ -14,12 +14,15 @@ Sources: Page, Biometrika 41 (1954) 100; Lorden, Annals of Mathematical Statisti
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from sms_online.calibration.nuisance import BOUND, Nuisance
+from sms_online.calibration.release import release_gain
 from sms_online.model.layout import Layout
 from sms_online.pipeline.momentum_fit import WhiteRows
 from sms_online.pipeline.momentum_windows import HOPS
@@ -75,11 +78,15 @@ class TestState(State):
 class SequentialTest(Stage):
     """Tests the windows of a session, in order, until the first alarm.
 
-    hop: time from one window to the next, s. limit: h.
+    hop: time from one window to the next, s. limit: h. nuisances: those whose columns come before the parameters'.
+    Their tolerances count as `BOUND` times as wide: what they explain beyond their tolerances is reported as such.
     """
 
-    def __init__(self, layout: Layout, hop: float) -> None:
+    def __init__(self, layout: Layout, hop: float, nuisances: Sequence[Nuisance] = ()) -> None:
         self._layout = layout
+        tolerances = np.array([each.tolerance if each.may_give_way else np.inf for each in nuisances])
+        self._loose: NDArray[np.int64] = np.flatnonzero(np.isfinite(tolerances))
+        self._tolerances: Array = tolerances[self._loose]
         self._types = {name: speeds for name, speeds in row_types(layout).items() if len(speeds) > 1}
         tests = layout.n_v + len(self._types)
         self.limit = float(np.log(tests * 3600.0 / hop / FALSE_ALARMS))
@@ -121,6 +128,16 @@ class SequentialTest(Stage):
         self.state.root = Vt[:rank].T / s[:rank] / scale[:, None]
         self.state.beta = self.state.root @ (U[:, :rank].T @ factor[:, -1])
         self.state.null = Vt[rank:].T
+        if self._loose.size:
+            self._loosen()
+
+    def _loosen(self) -> None:
+        now, unit = self.state, self._tolerances
+        C = now.root @ now.root[self._loose].T / unit
+        gain = release_gain(C[self._loose] / unit[:, None], np.full(unit.size, BOUND**-2))
+        size, axes = np.linalg.eigh(0.5 * (gain + gain.T))
+        now.beta = now.beta + C @ (gain @ (now.beta[self._loose] / unit))
+        now.root = np.concatenate((now.root, C @ (axes * np.sqrt(np.maximum(size, 0.0)))), axis=1)
 
     def _log_likelihood(self, rows: WhiteRows) -> Array:
         """Of every test (tests,); what nothing is known of says nothing."""
