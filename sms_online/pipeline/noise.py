@@ -33,6 +33,16 @@ LEAST_LEVELS = 8
 # Steps are multiples of one quantum when none is further than this share of it from one. A thousand steps of a
 # continuous signal do not pass by accident; steps whose rounding could exceed it are not judged.
 QUANTUM_TOLERANCE = 1e-2
+# Noise is coloured when the density at f_s / 8 is so many times that at f_s / 2; of white noise it scatters by a tenth.
+COLOURED = 1.5
+# Natural logarithm of a ratio of densities within which it is that of first-order noise.
+CONSISTENT = 0.35
+# Samples in a mean, the first of them to ask whether there is any colour; and fewest means.
+MEANS = (4, 2, 8)
+FEWEST_MEANS = 60
+# Order of differences at which noise of such colour is told from a slower signal.
+TYPICAL_ORDER = 4
+_CORRELATIONS = np.linspace(0.0, 1.0, 1001)[:-1]
 
 
 def noise_std(values: Array, times: Array | None = None) -> Array:
@@ -65,6 +75,41 @@ def noise_std(values: Array, times: Array | None = None) -> Array:
     rounding = np.array([_quantum(values[:, c]) for c in range(values.shape[1])]) / np.sqrt(12.0)
     noise: Array = np.maximum(sigma, rounding)
     return noise
+
+
+def correlation(values: Array, sigma: float) -> float:
+    """Correlation a from one sample to the next of a channel's first-order noise, from its samples (B,); 0 if white.
+
+    sigma: what `noise_std` says of them. Differences of means of m samples see the noise's density near f_s / 2m. Those
+    of a first-order process, e_{k+1} = a e_k + white noise, stand in ratios that a alone decides. Where they do not,
+    the slower bands hold the signal, and nothing is known of the noise's colour there: 0.
+    """
+    if values.size < max(MEANS) * FEWEST_MEANS or sigma == 0.0:
+        return 0.0
+    ratios = np.zeros(len(MEANS))
+    for k, m in enumerate(MEANS):
+        means = values[: values.size // m * m].reshape(-1, m).mean(axis=1)
+        ratios[k] = m * (float(noise_std(means[:, None])[0]) / sigma) ** 2
+        if k == 0 and ratios[k] < COLOURED:
+            return 0.0
+    off = np.log(np.array([_seen_density(_CORRELATIONS, m) for m in MEANS]) / _seen_density(_CORRELATIONS, 1))
+    off -= np.log(ratios)[:, None]
+    best = int(np.argmin(np.sum(off**2, axis=0)))
+    return float(_CORRELATIONS[best]) if np.all(np.abs(off[:, best]) < CONSISTENT) else 0.0
+
+
+def density_gain(a: float, frequency: float) -> float:
+    """Density of first-order noise of correlation a at a frequency, in units of f_s, over that of `noise_std`."""
+    density = (1.0 - a**2) / (1.0 + a**2 - 2.0 * a * np.cos(2.0 * np.pi * frequency))
+    return float(density / _seen_density(np.array([a]), 1)[0])
+
+
+def _seen_density(a: Array, m: int) -> Array:
+    """What differences of means of m samples see of first-order noise of unit variance, with each correlation a."""
+    weight = np.repeat([(-1.0) ** k * comb(TYPICAL_ORDER, k) for k in range(TYPICAL_ORDER + 1)], m) / m
+    of_lag = np.correlate(weight, weight, mode="full")[weight.size - 1 :]
+    of_lag[1:] *= 2.0
+    return np.asarray(m * np.polynomial.polynomial.polyval(a, of_lag) / comb(2 * TYPICAL_ORDER, TYPICAL_ORDER))
 
 
 def _equal(times: Array) -> bool:

@@ -98,8 +98,11 @@ class SequentialTest(Stage):
         """None while all is noise."""
         return self.state.alarm
 
-    def push(self, rows: WhiteRows, factor: Array) -> None:
-        """Test a window; factor (n + 1, n + 1): information of the rows before it."""
+    def push(self, rows: WhiteRows, factor: Array, variance: float = 1.0) -> None:
+        """Test a window; factor (n + 1, n + 1): information of the rows before it.
+
+        variance: that noise may have at most, over the predicted one, beside `NOISE`.
+        """
         turn = self.state.windows % HOPS
         if turn == 0:
             self._know(factor if self.state.waiting is None else self.state.waiting)
@@ -107,7 +110,7 @@ class SequentialTest(Stage):
         self.state.windows += 1
         if self.state.alarm is not None:
             return
-        ratios = self._log_likelihood(rows)
+        ratios = self._log_likelihood(rows, variance)
         now, before = self.state, self.state.since[turn]
         sums = np.maximum(0.0, now.sums[turn] + np.minimum(ratios, self.limit / LEAST_WINDOWS))
         now.sums, now.since = now.sums.copy(), now.since.copy()
@@ -139,12 +142,12 @@ class SequentialTest(Stage):
         now.beta = now.beta + C @ (gain @ (now.beta[self._loose] / unit))
         now.root = np.concatenate((now.root, C @ (axes * np.sqrt(np.maximum(size, 0.0)))), axis=1)
 
-    def _log_likelihood(self, rows: WhiteRows) -> Array:
+    def _log_likelihood(self, rows: WhiteRows, variance: float) -> Array:
         """Of every test (tests,); what nothing is known of says nothing."""
         Y, n_v = rows.raw[:, :-1], self._layout.n_v
         e = rows.raw[:, -1] - Y @ self.state.beta
         spread = Y @ self.state.root
-        S = rows.noise + spread @ spread.T
+        S = variance * rows.noise + spread @ spread.T
         scaled = Y / self.state.scale
         tested = np.linalg.norm(scaled @ self.state.null, axis=1) <= KNOWN * np.linalg.norm(scaled, axis=1)
         out = np.zeros(n_v + len(self._types))

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import msgspec
 import numpy as np
 
 from sms_online.pipeline.conditioning import noise_gains
-from sms_online.pipeline.noise import noise_std
+from sms_online.pipeline.noise import correlation, density_gain, noise_std
 from sms_online.pipeline.sensing import Sensing
 from sms_online.state import Stage, State
 from sms_online.stream import Array
@@ -31,7 +31,8 @@ class SensorNoise:
     sensors (n_x,), torque (joints,): densities σ² T_s of each position sensor, in the order of the coordinates, and of
     n τ. coordinates (n_x,): 1σ of the coordinates x a grid sample, had they white noise of those densities, and what
     taking lags off adds. grid (n_x + drives,): the same of the readings of position sensors and of torques. exact:
-    positions have none, but for rounding.
+    positions have none, but for rounding. coloured: correlation time, s, of channels whose noise is not white; their
+    density is that in the pass band of the windows.
     """
 
     sensors: Array
@@ -39,6 +40,7 @@ class SensorNoise:
     coordinates: Array
     grid: Array
     exact: bool
+    coloured: dict[str, float] = field(default_factory=dict)
 
 
 class NoiseEstimateState(State):
@@ -57,11 +59,11 @@ class NoiseEstimateState(State):
 class NoiseEstimate(Stage):
     """Collects each channel's own samples, which are not interpolated, and tells the noise of all.
 
-    sample_rate: of the grid, Hz.
+    sample_rate: of the grid, Hz. pass_band: frequency that the windows let pass best, Hz.
     """
 
-    def __init__(self, sensing: Sensing, sample_rate: float) -> None:
-        self._sensing = sensing
+    def __init__(self, sensing: Sensing, sample_rate: float, pass_band: float) -> None:
+        self._sensing, self._pass_band = sensing, pass_band
         self._sample_rate = sample_rate
         count = len(sensing.channels)
         self.state = NoiseEstimateState([np.empty((2, 0)) for _ in range(count)], np.zeros(count))
@@ -107,10 +109,16 @@ class NoiseEstimate(Stage):
         exact = bool(np.all(sigma[positions] <= ROUGHLY_EXACT * floor[positions]))
         period = np.maximum(np.where(np.isnan(periods), 0.0, periods), 1.0 / self._sample_rate)
         density = np.maximum(sigma, floor) ** 2 * period
+        coloured: dict[str, float] = {}
+        for k in np.intersect1d(silent, positions).tolist() if not exact else ():
+            a = correlation(self.state.samples[k][1], sigma[k])
+            if a > 0.0:
+                density[k] *= density_gain(a, self._pass_band * period[k])
+                coloured[self._sensing.channels[k]] = -float(period[k] / np.log(a))
         sensors = density[positions]
         torque = self._sensing.joint_torque(np.sqrt(density)[None])[0] ** 2
         columns = [*positions, *self._sensing.torque_columns]
         gains = noise_gains(self._sensing.model.system, self._sensing.channels)
         grid = (gains * np.sqrt(density * self._sample_rate))[columns]
         coordinates = self._sensing.coordinate_noise(grid[: len(positions)])
-        return SensorNoise(sensors, torque, coordinates, grid, exact)
+        return SensorNoise(sensors, torque, coordinates, grid, exact, coloured)

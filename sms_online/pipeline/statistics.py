@@ -82,7 +82,7 @@ class MomentumStatistics:
     tracker: its rows so far; bias: what noise in its columns does. rows: unwhitened rows and their misfit.
     started: weights are known. tested: there are rows enough for a test of what they leave. alarm: type of the rows
     that the sequential test finds more than noise in. scale_free: what gives the estimate where rows leave more than
-    noise. latency: source that is late against the others, if one is.
+    noise. latency: source that is late against the others, if one is. coloured: see `SensorNoise`.
     """
 
     tracker: Tracker
@@ -93,6 +93,7 @@ class MomentumStatistics:
     alarm: str | None
     scale_free: ScaleFree | None
     latency: Latency | None
+    coloured: dict[str, float]
 
 
 @dataclass(frozen=True)
