@@ -212,6 +212,7 @@ class Evaluation:
                 lost=lost / max(1, lost + now.samples),
                 outliers={channel: count / of for channel, (count, of) in now.outliers.items()},
                 discrepancies=self._discrepancies,
+                coloured={} if momentum is None else momentum.coloured,
                 miscalibrated=tuple(self._miscalibrated()),
                 troubles=(*self._troubles, *self._weaknesses()),
             )

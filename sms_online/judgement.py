@@ -40,6 +40,7 @@ CHECK_ROWS = "check geometry, clocks and stated noise of the sensors in these ro
 CHECK_SCALE = "check unit and gear of the torques, or weigh one part and state it under [known]"
 CHECK_PRIOR = "check that prior, and run `sms-online diagnose` for what the model lacks in these rows"
 CHECK_OUTLIERS = "look at that sensor: reflections and swapped markers, a loose cable, bits that flip"
+CHECK_COLOUR = "look at what filters that sensor, or log its samples as they are"
 CHECK_LOSSES = "look at the faults that the session counted: a bus that is too busy, a loose cable"
 MOVE = "move all joints, faster and over a larger range, and long enough"
 
@@ -80,9 +81,9 @@ class Facts:
     of the rows that the sequential test finds more than noise in, of a session without diagnosis. disputed: parameters
     that the data pull away from their prior. undecided: times, s, of changes that the session ended too early to decide
     on. distance: from the nearest real bodies, in standard deviations. comparison: with the values that the system file
-    states. lost: share of the samples. outliers: by channel, the share of the samples that was left out. miscalibrated:
-    what is off by more than the description's tolerances allow. troubles: whatever else, a short sentence each, such as
-    of the devices of a live session.
+    states. lost: share of the samples. outliers: by channel, the share of the samples that was left out. coloured: by
+    channel, the correlation time of its noise, s. miscalibrated: what is off by more than the description's tolerances
+    allow. troubles: whatever else, a short sentence each, such as of the devices of a live session.
     """
 
     determined: tuple[int, int]
@@ -98,6 +99,7 @@ class Facts:
     comparison: Comparison = AS_STATED
     lost: float = 0.0
     outliers: Mapping[str, float] = field(default_factory=dict)
+    coloured: Mapping[str, float] = field(default_factory=dict)
     discrepancies: tuple[Discrepancy, ...] = ()
     miscalibrated: tuple[Reason, ...] = ()
     troubles: tuple[str, ...] = ()
@@ -116,9 +118,10 @@ def judge(facts: Facts) -> Trust:
         doubts += _loud_rows(facts.residual)
         doubts += [each for each in facts.miscalibrated if each.grave]
     doubts += _unnamed(facts.discrepancies)
+    alarms = []
     if facts.alarm is not None and not any(_open(discrepancy) for discrepancy in facts.discrepancies):
-        text = f"the residual of {facts.alarm} is more than noise"
-        doubts.append(Reason(text, True, (facts.alarm,), "more than noise", then=DIAGNOSE))
+        alarms = _more_than_noise(facts.alarm, facts.coloured)
+        doubts += [each for each in alarms if each.grave]
     if settled:
         doubts += _negative(facts.negative)
         doubts += _disputed(facts.disputed)
@@ -128,7 +131,7 @@ def judge(facts: Facts) -> Trust:
         return Trust("doubt", (*losses, *doubts, *_cautions(facts)), grave=True)
     if facts.settling:
         return Trust("not yet", (Reason(facts.settling, False, then=MOVE), *losses, *_cautions(facts)))
-    cautions = (*losses, *_cautions(facts))
+    cautions = (*losses, *alarms, *_cautions(facts))
     return Trust("doubt", cautions) if cautions else Trust("trust", tuple(_grounds(facts)))
 
 
@@ -314,6 +317,16 @@ def _apart(comparison: Comparison) -> list[Reason]:
 def _losses(share: float) -> list[Reason]:
     lost = Reason(f"{100.0 * share:.0f} % of the samples are lost", False, then=CHECK_LOSSES)
     return [lost] if share > LARGEST_LOSS else []
+
+
+def _more_than_noise(row: str, coloured: Mapping[str, float]) -> list[Reason]:
+    """What a sequential test says that takes windows for independent, which coloured noise makes them less."""
+    text = f"the residual of {row} is more than noise"
+    if not coloured:
+        return [Reason(text, True, (row,), "more than noise", then=DIAGNOSE)]
+    channel = max(coloured, key=lambda name: coloured[name])
+    text += f", where that of {channel} is correlated over {1e3 * coloured[channel]:.2g} ms"
+    return [Reason(text, False, (row,), "coloured noise", then=CHECK_COLOUR)]
 
 
 def _outliers(shares: Mapping[str, float]) -> list[Reason]:
