@@ -36,8 +36,8 @@ from sms_online.trackers.square_root import session_tracker
 SEED = 6
 # Motion, s, in which a lack that was there from the start is noticed as a rule: that of the first fit, and a second.
 TESTED = FIRST_MOTION + 1.0
-# Variance of rows over the predicted one, at most, where noise is not white: its density at low frequencies follows from
-# that at high ones.
+# Variance of rows over the predicted one, at most, where noise is not white: its density at low frequencies follows
+# from that at high ones.
 COLOURED_NOISE = 2.0
 # Frequency that a window lets pass best, times its length.
 PASS_BAND = 2.0
