@@ -18,6 +18,8 @@ from sms_online.judgement import Discrepancy, Dispute, Facts, judge
 from sms_online.model.parameters import Parameter
 from sms_online.nominal import Comparison, compare, unit_factors
 from sms_online.physical import PhysicalSet, Projection
+from sms_online.pipeline.latency import source_channels
+from sms_online.pipeline.periods import LONGEST_HOLE
 from sms_online.pipeline.statistics import Statistics
 from sms_online.row_types import ENERGY, joint_rows, row_types
 from sms_online.stream import Array
@@ -199,6 +201,7 @@ class Evaluation:
                 determined=(int(np.count_nonzero(flags)), flags.size),
                 undetermined=tuple(name for name, known in zip(names, flags, strict=True) if not known),
                 settling=self._settling(),
+                silent=self._silent(),
                 residual=self.residuals,
                 negative=tuple(
                     name for name, negative in zip(names, below, strict=True) if negative and name.endswith(POSITIVE)
@@ -214,7 +217,8 @@ class Evaluation:
                 discrepancies=self._discrepancies,
                 coloured={} if momentum is None else momentum.coloured,
                 miscalibrated=tuple(self._miscalibrated()),
-                troubles=(*self._troubles, *self._weaknesses()),
+                troubles=tuple(self._troubles),
+                weaknesses=tuple(self._weaknesses()),
             )
         )
 
@@ -254,11 +258,26 @@ class Evaluation:
             out.append(Dispute(self.parameters[k].name, float(off[k]), row))
         return out
 
+    def _silent(self) -> dict[str, float]:
+        """Since when, s, sources have been silent; channels where not all of a source is, or none is described."""
+        last = self.statistics.last_time
+        silent = {
+            name: time
+            for name, time in zip(self.statistics.setup.sensing.channels, last.tolist(), strict=True)
+            if np.isneginf(time) or last.max() - time > LONGEST_HOLE
+        }
+        names: dict[str, float] = {}
+        for source in self.statistics.setup.system.sources:
+            used = [name for name in source_channels(source) if name in self.statistics.setup.sensing.channels]
+            if used and all(name in silent for name in used):
+                names[source.name] = max(silent.pop(name) for name in used)
+        return names | silent
+
     def _settling(self) -> str:
         """Why the estimate will still move by more than its error bars."""
         now, estimate = self.statistics, self.estimate
         if not self.determined.any():
-            return "no parameter is determined, for want of motion"
+            return f"no parameter is determined by the motion of {now.duration:.3g} s"
         smoother, momentum = now.smoother, now.momentum
         if smoother is not None and smoother.spans == 0 and not smoother.failures:
             return "the smoother has not worked off its first span"
@@ -268,7 +287,7 @@ class Evaluation:
             few = estimate.dof < ROWS_A_PARAMETER * estimate.pi.size
             return "the energy balance has few rows yet" if few else ""
         if not momentum.started:
-            return "the first fit has no weights yet, for want of motion"
+            return f"the first fit has no weights after the motion of {now.duration:.3g} s"
         if momentum.tested or (now.events and now.events[-1].kind == "undecided"):
             return ""
         after = f" since the change at {now.events[-1].time:.1f} s" if now.events else ""

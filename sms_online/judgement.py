@@ -6,6 +6,7 @@ judgement, so that none of them is calmer than another.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
@@ -42,6 +43,8 @@ CHECK_PRIOR = "check that prior, and run `sms-online diagnose` for what the mode
 CHECK_OUTLIERS = "look at that sensor: reflections and swapped markers, a loose cable, bits that flip"
 CHECK_COLOUR = "look at what filters that sensor, or log its samples as they are"
 CHECK_LOSSES = "look at the faults that the session counted: a bus that is too busy, a loose cable"
+CHECK_DEVICE = "look at power, cable and address of what is silent, and at its table in the system file"
+CHECK_TROUBLE = "see to the devices, the recording and the machine first"
 MOVE = "move all joints, faster and over a larger range, and long enough"
 
 
@@ -76,19 +79,22 @@ class Facts:
     """What is known of a session for or against its estimate.
 
     determined: parameters that the data determine, and of how many. undetermined: names of the others. settling: why
-    the estimate will still move by more than its error bars, empty where it will not. negative: names of estimates that
-    are negative and must not be. pulled: names of those that noise in the columns pulls beyond their bars. alarm: type
+    the estimate will still move by more than its error bars, empty where it will not. silent: since when, s, nothing
+    has come of sources or channels; -inf where it never has. negative: names of estimates that are negative and must
+    not be. pulled: names of those that noise in the columns pulls beyond their bars. alarm: type
     of the rows that the sequential test finds more than noise in, of a session without diagnosis. disputed: parameters
     that the data pull away from their prior. undecided: times, s, of changes that the session ended too early to decide
     on. distance: from the nearest real bodies, in standard deviations. comparison: with the values that the system file
     states. lost: share of the samples. outliers: by channel, the share of the samples that was left out. coloured: by
     channel, the correlation time of its noise, s. miscalibrated: what is off by more than the description's tolerances
-    allow. troubles: whatever else, a short sentence each, such as of the devices of a live session.
+    allow. troubles: of the devices, the recording and the machine of a live session, a short sentence each. weaknesses:
+    of an estimate by the way it is made.
     """
 
     determined: tuple[int, int]
     undetermined: tuple[str, ...] = ()
     settling: str = ""
+    silent: Mapping[str, float] = field(default_factory=dict)
     residual: Residuals = field(default_factory=dict)
     negative: tuple[str, ...] = ()
     pulled: tuple[str, ...] = ()
@@ -103,6 +109,7 @@ class Facts:
     discrepancies: tuple[Discrepancy, ...] = ()
     miscalibrated: tuple[Reason, ...] = ()
     troubles: tuple[str, ...] = ()
+    weaknesses: tuple[str, ...] = ()
 
 
 def judge(facts: Facts) -> Trust:
@@ -129,8 +136,17 @@ def judge(facts: Facts) -> Trust:
     losses = [*_losses(facts.lost), *_outliers(facts.outliers)]
     if doubts:
         return Trust("doubt", (*losses, *doubts, *_cautions(facts)), grave=True)
+    if never := [name for name, since in facts.silent.items() if math.isinf(since)]:
+        text = f"nothing was received of {_listed(never)}"
+        return Trust("not yet", (Reason(text, False, then=CHECK_DEVICE), *losses, *_cautions(facts)))
     if facts.settling:
-        return Trust("not yet", (Reason(facts.settling, False, then=MOVE), *losses, *_cautions(facts)))
+        # What keeps samples from coming is to be mended before anybody moves more.
+        first = [Reason(trouble, False, then=CHECK_TROUBLE) for trouble in facts.troubles]
+        if facts.silent:
+            text = f"nothing has come of {_listed([*facts.silent])} since {min(facts.silent.values()):.1f} s"
+            first = [Reason(text, False, then=CHECK_DEVICE), *first]
+        rest = _cautions(replace(facts, troubles=()))
+        return Trust("not yet", (*first, Reason(facts.settling, False, then=MOVE), *losses, *rest))
     cautions = (*losses, *alarms, *_cautions(facts))
     return Trust("doubt", cautions) if cautions else Trust("trust", tuple(_grounds(facts)))
 
@@ -260,10 +276,8 @@ def _disputed(disputes: Sequence[Dispute]) -> list[Reason]:
 
 def _cautions(facts: Facts) -> list[Reason]:
     """What makes some of the numbers, or their bars, worse than they look."""
-    out = [
-        *(each for each in facts.miscalibrated if not each.grave),
-        *(Reason(trouble, False) for trouble in facts.troubles),
-    ]
+    out = [each for each in facts.miscalibrated if not each.grave]
+    out += [Reason(text, False) for text in (*facts.troubles, *facts.weaknesses)]
     out += [*_beyond_noise(facts.residual), *_apart(facts.comparison)]
     if vital := [name for name in facts.undetermined if name.endswith(VITAL)]:
         out.append(Reason(f"not determined: {_listed(vital)}", False, place_of(vital[0]), "not determined", then=MOVE))

@@ -189,6 +189,9 @@ class Merger(Stage):
         self._turns = {channel: turns for lane in lanes for channel, turns in lane.decoder.turns.items()}
         self.state = MergerState({channel: turns.state for channel, turns in self._turns.items()})
         self.late = [0 for _ in lanes]
+        self.missed = [0 for _ in lanes]  # late ones just after a silence
+        self._returned = [-np.inf for _ in lanes]  # tick at which the last silence of each ended
+        self._now = 0.0  # the last tick, s
         self.silences = [0 for _ in lanes]
         self._heard = [np.inf for _ in lanes]  # tick of the last item of each source
         self._start = start
@@ -210,6 +213,7 @@ class Merger(Stage):
 
     def advance(self, now: float, items: Sequence[Sequence[Raw]]) -> Block | None:
         """Take what arrived up to the tick `now`, s, of each source, and return the rows that are in order by now."""
+        self._now = now
         for k, raw in enumerate(items):
             if not raw:
                 # Counted once, when it has been too long.
@@ -217,6 +221,7 @@ class Merger(Stage):
                 self.silences[k] += int(too_long and not self._silent[k])
                 self._silent[k] = too_long
             else:
+                self._returned[k] = now if self._silent[k] else self._returned[k]
                 self._heard[k], self._silent[k] = now, False
                 self._first = min(self._first, _arrivals(raw[0])[0])
                 self._items[k] += raw
@@ -254,7 +259,10 @@ class Merger(Stage):
         """Put rows among those that wait, in order of time; those whose time has passed are late."""
         late = t <= self._given
         if late.any():
-            self.late[k] += int(np.count_nonzero(late))
+            # A device that returns sends first what it has kept, and its clock has to be found again.
+            returning = self._now - self._returned[k] < START_PATIENCE
+            counts = self.missed if returning else self.late
+            counts[k] += int(np.count_nonzero(late))
             t, values = t[~late], values[~late]
         if t.size == 0:
             return
@@ -311,8 +319,12 @@ class Merger(Stage):
         return offsets
 
     def silent(self, now: float) -> list[str]:
-        """Names of the sources that are silent at the tick `now`, s."""
-        return [lane.name for lane, heard in zip(self.lanes, self._heard, strict=True) if now - heard > SILENCE]
+        """Names of the sources that are silent at the tick `now`, s, or have been since the session began."""
+        return [
+            lane.name
+            for lane, heard in zip(self.lanes, self._heard, strict=True)
+            if now - heard > SILENCE or (math.isinf(heard) and now > START_PATIENCE)
+        ]
 
     @property
     def warnings(self) -> list[str]:
@@ -320,8 +332,12 @@ class Merger(Stage):
         found = []
         for k, (lane, guard) in enumerate(zip(self.lanes, self._guards, strict=True)):
             found += lane.warnings
+            if math.isinf(self._heard[k]) and self._now > START_PATIENCE:
+                found.append(f"{lane.name}: nothing was received")
             if self.silences[k]:
                 found.append(f"{lane.name}: silent for more than {SILENCE:g} s, {self.silences[k]} times")
+            if self.missed[k]:
+                found.append(f"{lane.name}: {self.missed[k]} samples skipped, they came late after it had been silent")
             if self.late[k]:
                 late = f"{self.late[k]} samples skipped, they came more than {PATIENCE:g} s late"
                 found.append(f"{lane.name}: {late}: the machine is too slow, or the source")

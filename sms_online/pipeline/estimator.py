@@ -116,6 +116,7 @@ class Estimator(Stage):
     def renew(self) -> None:
         """See Stage."""
         self._setup = None
+        self._synchroniser.resumed = self.end
 
     def _blocks(self) -> tuple[float, float]:
         """See `blocks`."""
@@ -251,6 +252,13 @@ class Estimator(Stage):
     def counters(self) -> SyncCounters:
         """Counts of the synchroniser: missing and interpolated cells, gaps, lost samples."""
         return self._synchroniser.counters
+
+    @property
+    def last_time(self) -> Array:
+        """Time of each channel's last sample (channels,), s; -inf where none has come yet."""
+        pending = self.state.pending[:, : len(self.sensing.channels)]
+        waiting = np.where(np.isnan(pending), -np.inf, self.state.pending_t[:, None])
+        return np.asarray(np.maximum(self._synchroniser.last_time, waiting.max(axis=0, initial=-np.inf)))
 
     def push(self, block: Block) -> None:
         """Take samples, in order of time; any number at a time."""

@@ -100,9 +100,10 @@ class MomentumStatistics:
 class Statistics:
     """Sufficient statistics, counts and events of a session up to now.
 
-    finished: no more samples come. outliers: by channel, how many samples were left out, and of how many. periods
-    (channels,): s a sample, NaN where unknown. energy: the energy balance's tracker; shared: what errors that its rows
-    share do. joints: sums behind the relative residual of each.
+    finished: no more samples come. outliers: by channel, how many samples were left out, and of how many. last_time
+    (channels,): of each one's last sample, s, -inf where none has come. periods (channels,): s a sample, NaN where
+    unknown. energy: the energy balance's tracker; shared: what errors that its rows share do. joints: sums behind the
+    relative residual of each.
     """
 
     setup: Setup
@@ -113,6 +114,7 @@ class Statistics:
     dropped_rows: int
     counters: SyncCounters
     outliers: dict[str, tuple[int, int]]
+    last_time: Array
     periods: Array
     events: tuple[Event, ...]
     energy: Tracker
@@ -134,6 +136,7 @@ class Statistics:
             dropped_rows=estimator.state.dropped_rows,
             counters=state_copy(estimator.counters),
             outliers=estimator.outliers,
+            last_time=estimator.last_time,
             periods=estimator.periods.copy(),
             events=tuple(estimator.events),
             energy=snapshot(estimator.energy_tracker),

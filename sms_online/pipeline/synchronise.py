@@ -49,7 +49,7 @@ class SyncCounters(State):
     samples: rows received. missing_cells: their cells without a value. duplicates: samples dropped because their
     channel already had one at that instant. interpolated_cells: cells delivered by interpolation. gaps: breaks
     between segments. lost_samples: grid points from the first sample to the last delivered one (after the flush: to
-    the last received) that were not delivered, in gaps or beside them.
+    the last received) that were not delivered, in gaps or beside them, but for the pause before a resumption.
     """
 
     samples: int = 0
@@ -112,8 +112,14 @@ class Synchroniser(Stage):
         self.channels = tuple(channels)
         self.sample_rate = sample_rate
         self._periods = Periods(count, gap_limit)
+        self.resumed = np.nan  # time of the last sample before the session was resumed, s
         nothing = np.empty(0), np.empty((0, count))
         self.state = SynchroniserState(*nothing, np.full(count, -np.inf), SyncCounters())
+
+    @property
+    def last_time(self) -> Array:
+        """Time of each channel's last sample (C,), s; -inf where there is none."""
+        return np.asarray(self.state.last_time + np.nan_to_num(self.state.t0))
 
     @property
     def counters(self) -> SyncCounters:
@@ -337,7 +343,10 @@ class Synchroniser(Stage):
         bounds = sorted({0, k.size, *breaks.tolist()}) if k.size else []
         for a, b in pairwise(bounds):
             skipped = int(k[a]) - self.state.delivered - 1
-            self.state.counters.lost_samples += skipped
+            # A session that was ended and resumed has not lost what it did not listen to.
+            last = np.rint((self.resumed - self.state.t0) * self.sample_rate)
+            paused = skipped > LONGEST_HOLE * self.sample_rate and self.state.delivered <= last < k[a]
+            self.state.counters.lost_samples += 0 if paused else skipped
             self.state.counters.gaps += int(skipped > 0 and self.state.delivered >= 0)
             self.state.delivered = int(k[b - 1])
             pieces.append(GridSamples(k[a:b], values[a:b], self.state.counters.gaps))

@@ -20,7 +20,7 @@ from sms_online.session import Session
 from sms_online.stream import Block
 from sms_tools.interruption import Interruption
 from sms_tools.live.feed import READ_TIMEOUT, Feed, Interpreter, SessionClock
-from sms_tools.live.latency import Latencies
+from sms_tools.live.latency import RECENT, Latencies
 from sms_tools.live.status import Leading, News, StatusWriter
 
 # A session that is killed loses no more of the estimate than this, s; its raw items are on disk all the same.
@@ -72,6 +72,7 @@ class LiveSession:
         self._status = status
         self._interpreter = Interpreter() if interpreter is None else interpreter
         self._tick = 0
+        self._away = ("", -np.inf)  # which devices were gone or silent last, and when, s
         self._looked = 0.0
         self._said = 0.0
         self._said_samples = 0
@@ -192,8 +193,11 @@ class LiveSession:
     @property
     def troubles(self) -> list[str]:
         """What is wrong with the devices, the recording or the machine just now."""
-        found = [f"{feed.name}: gone ({feed.lost}), tried again" for feed in self._feeds if feed.lost is not None]
-        found += [f"{name}: silent" for name in self._merger.silent(tick_time(self._tick))]
+        gone = {feed.name: f"{feed.name}: gone ({feed.lost}), tried again" for feed in self._feeds if feed.lost}
+        silent = {name: f"{name}: silent" for name in self._merger.silent(tick_time(self._tick))}
+        found = [*gone.values(), *silent.values()]
+        if gone or silent:
+            self._away = ", ".join(gone | silent), self._clock()
         if self._recorder is not None and self._recorder.problem is not None:
             found.append(f"not recorded: {self._recorder.problem}")
         late, behind = sum(self._merger.late), self.latencies.quantile(0.99)
@@ -203,7 +207,11 @@ class LiveSession:
         if late > LARGEST_LOSS * self._estimator.samples:
             found.append(f"{late} samples came too late to be used: the machine or a source is too slow")
         if behind is not None and behind > LARGEST_LATENCY:
-            found.append(f"estimates come {behind:.1f} s late: the machine is too slow")
+            who, when = self._away
+            # As long as the latencies remember.
+            recent = self._clock() - when < 2.0 * RECENT
+            why = f", for {who} had been away" if recent else ": the machine is too slow"
+            found.append(f"estimates come {behind:.1f} s late{why}")
         return found
 
     def _publish(self) -> None:
