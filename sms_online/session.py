@@ -16,6 +16,7 @@ from sms_online.capture import Capture, check_channels
 from sms_online.checkpoint import Checkpoint
 from sms_online.cramer_rao import MotionRecord, session_bound
 from sms_online.description.channels import channels as known_channels
+from sms_online.description.given import Given, given_system
 from sms_online.description.schema import System
 from sms_online.diagnosis.online import Immediate, OnlineDiagnosis, Searcher
 from sms_online.errors import InputError
@@ -32,17 +33,17 @@ from sms_online.truth import true_values
 class Session:
     """Estimates a system's parameters while samples come, and names effects that the system file lacks.
 
-    channels: names, in the order of the values to come. prior: start from the nominal values, each ± 10 %; priors that
-    the system file states hold without it too. adopt: go on with effects as soon as they are named. source: name of
-    what samples come from, for messages. searcher: who makes the diagnosis' searches, by default at once and here.
-    checkpoint: state to go on from.
-    The result depends on the samples alone, to the last bit, however they are cut into updates.
-    Raises InputError for a channel that the system does not have or one that is missing.
+    system: described, or its name or file. channels: names, in the order of the values to come. prior: start from the
+    nominal values, each ± 10 %; priors that the system file states hold without it too. adopt: go on with effects as
+    soon as they are named. source: name of what samples come from, for messages. searcher: who makes the diagnosis'
+    searches, by default at once and here. checkpoint: state to go on from. The result depends on the samples alone, to
+    the last bit, however they are cut into updates. Raises InputError for a channel that the system does not have or
+    one that is missing.
     """
 
     def __init__(
         self,
-        system: System,
+        system: Given,
         channels: Sequence[str],
         *,
         prior: bool = False,
@@ -51,6 +52,7 @@ class Session:
         searcher: Searcher | None = None,
         checkpoint: Checkpoint | None = None,
     ) -> None:
+        system, _ = given_system(system)
         self.channels = tuple(channels)
         check_channels(self.channels, known_channels(system), source)
         self.estimator = Estimator(system, self.channels, source)
@@ -200,7 +202,7 @@ Data = Capture | Recorded | str | Path | Iterable[Block]
 
 
 def estimate(
-    system: System,
+    system: Given,
     data: Data,
     *,
     prior: bool = False,
@@ -209,11 +211,12 @@ def estimate(
 ) -> Result:
     """Estimate the parameters of a system from recorded data; the same bits as a replay of them, or the live session.
 
-    data: a capture, the path of one, of a log or of a recording, or blocks of samples in order of time. prior, adopt:
-    as for `Session`. bound: the Cramér–Rao bound of every parameter too, as the yardstick of its standard deviation.
-    Raises InputError where the data cannot be read or do not fit the system.
+    system: described, or its name or file. data: a capture, the path of one, of a log or of a recording, or blocks of
+    samples in order of time. prior, adopt: as for `Session`. bound: the Cramér–Rao bound of every parameter too, as the
+    yardstick of its standard deviation. Raises InputError where the data cannot be read or do not fit the system.
     """
-    recorded = recorded_session(system, data)
+    system, folder = given_system(system)
+    recorded = recorded_session(system, data, folder)
     source = recorded.source
     session = Session(
         system,
@@ -234,8 +237,11 @@ def estimate(
     return session.evaluate(recorded.truth, least, source.warnings)
 
 
-def recorded_session(system: System, data: Data) -> Recorded:
-    """Data as a recorded session; InputError where a path cannot be read, or there are no blocks."""
+def recorded_session(system: System, data: Data, folder: Path | None = None) -> Recorded:
+    """Data as a recorded session; InputError where a path cannot be read, or there are no blocks.
+
+    folder: of the system's file, where a log finds its DBC.
+    """
     if isinstance(data, Recorded):
         return data
     if isinstance(data, Capture):
@@ -244,7 +250,7 @@ def recorded_session(system: System, data: Data) -> Recorded:
         from sms_adapters.recorded import recorded_at
         from sms_adapters.sources import open_source
 
-        return recorded_at(Path(data), open_source(Path(data), system))
+        return recorded_at(Path(data), open_source(Path(data), system, directory=folder))
     return Recorded(_Blocks(data), "blocks")
 
 

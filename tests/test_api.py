@@ -287,3 +287,31 @@ def test_a_recorded_motion_has_bounds() -> None:
     bounds = sms.bound(system, sms.simulate(system, 4.0, "B"))
     assert all(bound.std > 0.0 for bound in bounds.parameters.values())
     assert "joint_1.stiffness" in str(bounds)
+
+
+@pytest.mark.parametrize("kind", [str, Path])
+def test_a_system_may_be_given_by_the_path_of_its_file(tmp_path: Path, kind: type) -> None:
+    path, block = tmp_path / "axis.toml", axis_block(coulomb=0.0)
+    path.write_text(AXIS)
+    capture, system = sms.Capture(block.t, block.channels, block.values), sms.load_system(path)
+    ours, same = sms.estimate(kind(path), capture), sms.estimate(system, capture)
+    assert without_timing(ours.document()) == without_timing(same.document())
+    assert sms.Session(kind(path), block.channels).system == system
+    assert sms.check(kind(path), capture).system == system.name
+    assert sms.bound(kind(path), capture).parameters == sms.bound(system, capture).parameters
+
+
+@pytest.mark.parametrize(
+    ("system", "said"),
+    [("paper-plana", "no shipped system of this name"), ("none.toml", "no such file"), (3, "an object of type int")],
+)
+def test_a_system_that_is_none_is_one_clear_line(system: Any, said: str) -> None:
+    block = axis_block(coulomb=0.0)
+    capture = sms.Capture(block.t, block.channels, block.values)
+    for verb in (sms.estimate, sms.diagnose, sms.check, sms.bound):
+        with pytest.raises(sms.InputError, match=said):
+            verb(system, capture)
+    with pytest.raises(sms.InputError, match=said):
+        sms.simulate(system)
+    with pytest.raises(sms.InputError, match=said):
+        sms.Session(system, block.channels)

@@ -13,6 +13,7 @@ import numpy as np
 from sms_adapters.channel_check import ChannelCheck, Remark
 from sms_adapters.stuck import StuckGuard
 from sms_online.description.channels import channel_unit, sensed_channels
+from sms_online.description.given import Given, given_system
 from sms_online.description.schema import System
 from sms_online.errors import InputError
 from sms_online.pipeline.estimator import Estimator
@@ -211,14 +212,15 @@ class Checked:
                 self._say(line)
 
 
-def check(system: System, data: Data) -> Check:
+def check(system: Given, data: Data) -> Check:
     """Whether a capture is worth estimating from: what is the matter with its channels, what its motion determines.
 
-    data: a capture, the path of one, of a log or of a recording, or blocks of samples in order of time. Rates, stamps
-    and resolutions are compared with the description; stuck, saturated, wrapped and spiked channels are named, and
-    those that nobody reads. InputError where the data cannot be read.
+    system: described, or its name or file. data: a capture, the path of one, of a log or of a recording, or blocks of
+    samples in order of time. Rates, stamps and resolutions are compared with the description; stuck, saturated, wrapped
+    and spiked channels are named, and those that nobody reads. InputError where the data cannot be read.
     """
-    recorded = recorded_session(system, data)
+    system, folder = given_system(system)
+    recorded = recorded_session(system, data, folder)
     source = recorded.source
     checks = ChannelChecks(system, source.channels)
     remarks: list[Remark] = []

@@ -14,10 +14,9 @@ from sms_adapters.recording import Recording
 from sms_adapters.searches import searcher_of
 from sms_adapters.session_log import SESSION
 from sms_adapters.sources import open_source
-from sms_adapters.system_file import load_system
 from sms_adapters.truth import read_truth, write_truth
 from sms_online.capture import Capture
-from sms_online.description.schema import System
+from sms_online.description.given import Given, given_system
 from sms_online.diagnosis.online import Immediate
 from sms_online.errors import InputError
 from sms_online.session import Recorded
@@ -43,7 +42,7 @@ def truth_beside(path: Path) -> dict[str, object] | None:
 
 def read_capture(
     path: str | Path,
-    system: System | str | Path | None = None,
+    system: Given | None = None,
     start: float | None = None,
     stop: float | None = None,
 ) -> Capture:
@@ -53,11 +52,9 @@ def read_capture(
     where that is given. start, stop: s after the first sample. InputError where it cannot be read, line and place
     named.
     """
-    path, folder = Path(path), None
-    if isinstance(system, str | Path):
-        folder = Path(system).parent if Path(system).suffix == ".toml" else None
-        system = load_system(system)
+    path = Path(path)
     if system is not None:
+        system, folder = given_system(system)
         return captured(recorded_at(path, open_source(path, system, start, stop, None, folder)))
     if not path.name.removesuffix(".gz").endswith(".csv"):
         raise InputError(str(path), "", "no system", "the system, to know which signals are which channels")

@@ -11,6 +11,7 @@ import numpy as np
 
 from sms_online.cramer_rao import STEP, MotionRecord, cramer_rao_bound, session_bound
 from sms_online.description.channels import sensed_channels
+from sms_online.description.given import Given, given_system
 from sms_online.description.schema import System
 from sms_online.errors import InputError
 from sms_online.linearised import Motion
@@ -109,7 +110,7 @@ class Bounds:
 
 
 def bound(
-    system: System,
+    system: Given,
     data: Data | None = None,
     *,
     grade: str | None = None,
@@ -117,18 +118,18 @@ def bound(
 ) -> Bounds:
     """The least standard deviation of each parameter that a motion and its sensors allow (Cramér–Rao).
 
-    data: recorded samples, whose sensors are what they are; without them the described trajectory is simulated. grade:
-    noise in place of the described one, "A", "B" or "C"; "B" where a sensor's is not described. each_sensor: also
-    without each of the described sensors.
-    Raises InputError where there is no trajectory, a drive is not measured, or an effect needs more than a motion
-    holds.
+    system: described, or its name or file. data: recorded samples, whose sensors are what they are; without them the
+    described trajectory is simulated. grade: noise in place of the described one, "A", "B" or "C"; "B" where a sensor's
+    is not described. each_sensor: also without each of the described sensors. Raises InputError where there is no
+    trajectory, a drive is not measured, or an effect needs more than a motion holds.
     """
+    system, folder = given_system(system)
     if data is None:
         return _of_simulation(system, grade, each_sensor)
     if grade is not None or each_sensor:
         expected = "neither with a capture, whose sensors are what they are"
         raise InputError("bound", "--grade, --each-sensor", "given", expected)
-    recorded = recorded_session(system, data)
+    recorded = recorded_session(system, data, folder)
     estimator = Estimator(system, tuple(recorded.source.channels), recorded.name)
     if system.priors:
         estimator.set_prior(base_prior(system, estimator.base, nominal=False))

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from sms_online.capture import Capture
+from sms_online.description.given import Given, given_system
 from sms_online.description.schema import Effect, System
 from sms_online.effects.build import build_model
 from sms_online.effects.catalogue import check_effect, parse_effect
@@ -90,7 +91,7 @@ class Simulated:
 
 
 def simulate(
-    system: System,
+    system: Given,
     duration: float | None = None,
     grade: str | None = None,
     seed: int = 0,
@@ -98,11 +99,12 @@ def simulate(
 ) -> Capture:
     """Simulate a described system in closed loop, and record what its sensors see.
 
-    duration: s, the described trajectory's by default. grade: noise of all sensors in place of the described one, "0"
-    none, "A", "B", "C" ever more. seed: of the noise. effects: what the system file does not describe, as texts
-    "name@where:coefficient=value,…". The capture holds the truth, which no estimate uses.
-    InputError for an effect or a grade that there is not, or a motion that cannot be followed.
+    system: described, or its name or file. duration: s, the described trajectory's by default. grade: noise of all
+    sensors in place of the described one, "0" none, "A", "B", "C" ever more. seed: of the noise. effects: what the
+    system file does not describe, as texts "name@where:coefficient=value,…". The capture holds the truth, which no
+    estimate uses. InputError for an effect or a grade that there is not, or a motion that cannot be followed.
     """
+    system, _ = given_system(system)
     session = Simulated.of(system, effects, duration, grade, seed)
     channels = session.channels
     simulation = session.solve()

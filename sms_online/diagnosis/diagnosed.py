@@ -10,6 +10,7 @@ from typing import Any
 
 from sms_online.capture import check_channels
 from sms_online.description.channels import channels as known_channels
+from sms_online.description.given import Given, given_system
 from sms_online.description.schema import System
 from sms_online.diagnosis.diagnose import Diagnosis as Search
 from sms_online.diagnosis.diagnose import diagnose as search_for_effects
@@ -123,7 +124,7 @@ class Diagnosis:
 
 
 def diagnose(
-    system: System,
+    system: Given,
     data: Data,
     *,
     holdout: Data | None = None,
@@ -132,18 +133,19 @@ def diagnose(
 ) -> Diagnosis:
     """Find what recorded data hold that a system file does not describe, and describe it.
 
-    data: as for `estimate`. holdout: another capture of the same rig, to check on; without it the last third of the
-    data. prior: start from nominal values, each ± 10 %. progress: is called with what is being done, a few words.
+    system, data: as for `estimate`. holdout: another capture of the same rig, to check on; without it the last third of
+    the data. prior: start from nominal values, each ± 10 %. progress: is called with what is being done, a few words.
     Raises InputError where the data cannot be read or do not fit the system, a coordinate is not measured, parameters
     jump within the capture, or there is too little motion.
     """
-    recorded = recorded_session(system, data)
+    system, folder = given_system(system)
+    recorded = recorded_session(system, data, folder)
     check_channels(tuple(recorded.source.channels), known_channels(system), recorded.name)
     blocks = _samples(recorded.source, recorded.name)
     warnings = [*recorded.source.warnings]
     held: list[Block] = []
     if holdout is not None:
-        other = recorded_session(system, holdout)
+        other = recorded_session(system, holdout, folder)
         held = _samples(other.source, other.name)
         warnings += other.source.warnings
         if held[0].channels != blocks[0].channels:

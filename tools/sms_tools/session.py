@@ -10,6 +10,7 @@ from pathlib import Path
 from rich.table import Table
 
 from sms_adapters.system_file import load_system
+from sms_online.description.given import given_system
 from sms_online.description.schema import System
 from sms_online.errors import InputError
 from sms_online.result import Result
@@ -24,9 +25,7 @@ from sms_tools.results_file import write_results
 
 def described_system(args: argparse.Namespace) -> tuple[System, Path | None]:
     """The system asked for, and the directory of its file, where its DBC stands too; None for a shipped one."""
-    system = load_system(args.system)
-    path = Path(args.system)
-    return system, path.parent if path.suffix == ".toml" else None
+    return given_system(args.system)
 
 
 def check_part(args: argparse.Namespace) -> None:

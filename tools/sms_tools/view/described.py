@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from sms_online.description.channels import channels
+from sms_online.description.given import Given, given_system
 from sms_online.description.schema import System
 from sms_online.description.tree import mounts
 from sms_online.effects.build import build_model
@@ -52,7 +53,7 @@ def channel_table(system: System) -> list[Row]:
 
 
 def show(
-    system: System | str | Path,
+    system: Given,
     *,
     rerun: str = "spawn",
     directory: str | Path = "runs/show",
@@ -65,10 +66,7 @@ def show(
     Ctrl-C. exaggeration: factor on deflections. Raises InputError on an unknown choice, where no viewer is, and where
     nothing can be written.
     """
-    if not isinstance(system, System):
-        from sms_adapters.system_file import load_system
-
-        system = load_system(system)
+    system, _ = given_system(system)
     try:
         choice = parse_choice(rerun)
     except ValueError as error:
