@@ -158,10 +158,17 @@ def test_a_terminal_has_a_bar_for_what_takes_more_than_a_moment(
     assert capsys.readouterr().err == ""
     monkeypatch.setattr("sms_tools.waiting.MOMENT", 0.0)
     monkeypatch.setattr("sms_tools.waiting.SMALL", small)
-    for verb in (replay, ["check", "run.csv", "--system", "axis.toml"]):
-        assert main(verb) == 0
+    capture = ["run.csv", "--system", "axis.toml"]
+    simulated = ["--system", "moved.toml", "--capture", "new.csv", "--duration", "1"]
+    verbs = {
+        "run.csv": (replay, ["check", *capture], ["bound", *capture], ["diagnose", *capture, "--out", "done"]),
+        "solving the motion": (["simulate", *simulated], ["bound", "--system", "moved.toml"]),
+        "searching for effects": (["diagnose", *capture, "--out", "done"],),
+    }
+    for what, verb in ((what, verb) for what, every in verbs.items() for verb in every):
+        assert main(verb) in (0, 3)  # without noise there is no bound
         shown = capsys.readouterr().err
-        assert "run.csv" in shown
+        assert what in shown
         assert re.search(r"\d:\d\d:\d\d", shown)  # the time left
 
 

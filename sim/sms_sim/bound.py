@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -115,17 +115,19 @@ def bound(
     *,
     grade: str | None = None,
     each_sensor: bool = False,
+    progress: Callable[[str, float], None] = lambda what, share: None,
 ) -> Bounds:
     """The least standard deviation of each parameter that a motion and its sensors allow (Cramér–Rao).
 
     system: described, or its name or file. data: recorded samples, whose sensors are what they are; without them the
     described trajectory is simulated. grade: noise in place of the described one, "A", "B" or "C"; "B" where a sensor's
-    is not described. each_sensor: also without each of the described sensors. Raises InputError where there is no
-    trajectory, a drive is not measured, or an effect needs more than a motion holds.
+    is not described. each_sensor: also without each of the described sensors. progress: of a simulation, see
+    `Simulated.solve`. Raises InputError where there is no trajectory, a drive is not measured, or an effect needs more
+    than a motion holds.
     """
     system, folder = given_system(system)
     if data is None:
-        return _of_simulation(system, grade, each_sensor)
+        return _of_simulation(system, grade, each_sensor, progress)
     if grade is not None or each_sensor:
         expected = "neither with a capture, whose sensors are what they are"
         raise InputError("bound", "--grade, --each-sensor", "given", expected)
@@ -145,7 +147,9 @@ def bound(
     )
 
 
-def _of_simulation(system: System, grade: str | None, each_sensor: bool) -> Bounds:
+def _of_simulation(
+    system: System, grade: str | None, each_sensor: bool, progress: Callable[[str, float], None]
+) -> Bounds:
     plant = Plant(system)
     if grade is None and not _noise(Sensors(system, _readable(plant), None, seed=0)).all():
         grade = DEFAULT_GRADE
@@ -157,7 +161,7 @@ def _of_simulation(system: System, grade: str | None, each_sensor: bool) -> Boun
             others = tuple(other for j, other in enumerate(system.sensors) if j != k)
             reduced = system.model_copy(update={"sensors": others})
             without[", ".join(sensor.channels)] = _sensors(plant, reduced, grade)
-    simulation = Simulated.of(system).solve()
+    simulation = Simulated.of(system).solve(progress)
     instants = np.linspace(0.0, simulation.duration, max(1, round(simulation.duration / STEP)) + 1)
     exact = exact_states(simulation, instants)
     base, motion = find_base_parameters(plant.model), Motion(exact.t, exact.x, exact.v)

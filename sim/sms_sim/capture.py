@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any
 
 import numpy as np
@@ -66,10 +66,13 @@ class Simulated:
         """What the sensors record; InputError on an unknown grade."""
         return Sensors(self.system, Plant(self.system).recordable, self.grade, self.seed).channels
 
-    def solve(self, progress: Callable[[float], None] = lambda t: None) -> Simulation:
-        """The motion; InputError where nothing states how long it is, or where it cannot be followed."""
+    def solve(self, progress: Callable[[str, float], None] = lambda what, share: None) -> Simulation:
+        """The motion; InputError where nothing states how long it is, or where it cannot be followed.
+
+        progress: is called with what is being done, a few words, and the share of it that is done.
+        """
         try:
-            return solve(self.system, self.duration, progress=progress)
+            return solve(self.system, self.duration, progress=partial(progress, "solving the motion"))
         except ArithmeticError as error:
             expected = "a motion that the integrator can follow"
             raise InputError(self.described.name, "trajectory and controller", str(error), expected) from None

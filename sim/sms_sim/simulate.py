@@ -128,12 +128,12 @@ def simulate(
     parameters: Array | None = None,
     initial: tuple[Array, Array] | None = None,
     position_tolerance: float = POSITION_TOLERANCE,
-    progress: Callable[[float], None] = lambda t: None,
+    progress: Callable[[float], None] = lambda share: None,
 ) -> Simulation:
     """Integrate a described system in closed loop, to `position_tolerance` (m, rad) a step.
 
     duration: s, the reference's own by default. parameters: π (n_pi,) in place of the nominal ones. initial: x (n_x,)
-    and v (n_v,) in place of rest. progress: told how far it is, s, step by step. Raises InputError where
+    and v (n_v,) in place of rest. progress: told the share that is solved, step by step. Raises InputError where
     nothing states the duration, ArithmeticError where the motion cannot be followed.
     """
     if duration is None:
@@ -143,7 +143,10 @@ def simulate(
     plant = Plant(system, parameters)
     start = plant.rest if initial is None else plant.state(*initial)
     bounds = tolerance(plant, position_tolerance)
-    return Simulation(plant, solve(plant.rate, start, duration, bounds, longest=LONGEST_STEP, progress=progress))
+    solution = solve(
+        plant.rate, start, duration, bounds, longest=LONGEST_STEP, progress=lambda t: progress(t / duration)
+    )
+    return Simulation(plant, solution)
 
 
 def tolerance(plant: Plant, position: float = POSITION_TOLERANCE) -> Array:

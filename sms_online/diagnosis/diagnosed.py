@@ -129,14 +129,14 @@ def diagnose(
     *,
     holdout: Data | None = None,
     prior: bool = False,
-    progress: Callable[[str], None] | None = None,
+    progress: Callable[[str, float], None] = lambda what, share: None,
 ) -> Diagnosis:
     """Find what recorded data hold that a system file does not describe, and describe it.
 
     system, data: as for `estimate`. holdout: another capture of the same rig, to check on; without it the last third of
-    the data. prior: start from nominal values, each ± 10 %. progress: is called with what is being done, a few words.
-    Raises InputError where the data cannot be read or do not fit the system, a coordinate is not measured, parameters
-    jump within the capture, or there is too little motion.
+    the data. prior: start from nominal values, each ± 10 %. progress: is called with what is being done, a few words,
+    and the share of all that is done, roughly. Raises InputError where the data cannot be read or do not fit the
+    system, a coordinate is not measured, parameters jump within the capture, or there is too little motion.
     """
     system, folder = given_system(system)
     recorded = recorded_session(system, data, folder)
@@ -154,7 +154,7 @@ def diagnose(
     def known(estimator: Estimator) -> Prior | None:
         return base_prior(system, estimator.base, prior) if prior or system.priors else None
 
-    found = search_for_effects(system, blocks, recorded.name, known, held, progress or (lambda message: None))
+    found = search_for_effects(system, blocks, recorded.name, known, held, progress)
     true = None if recorded.truth is None else true_values(recorded.truth, system, found.after.system)
     document = diagnosis_document(found, warnings, true)
     return Diagnosis(

@@ -7,6 +7,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from time import monotonic
+from typing import Protocol
 
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
@@ -21,6 +22,12 @@ MOMENT = 2.0
 SMALL = 20_000_000
 
 OnBytes = Callable[[int], None]
+
+
+class Mover(Protocol):
+    """Moves a bar to how much is done; name: of what is being done, where that is new."""
+
+    def __call__(self, done: float, name: str | None = None) -> None: ...
 
 
 @dataclass(frozen=True)
@@ -57,8 +64,7 @@ def watched(path: Path, opened: Callable[[OnBytes | None], Source]) -> Iterator[
         yield Watched(source, source, console)
         return
     size = _size(path)
-    columns = (TextColumn("{task.description}"), BarColumn(), TextColumn("{task.percentage:.0f} %"))
-    bar = Progress(*columns, TimeRemainingColumn(), console=console, transient=True)
+    bar = _bar(console)
     try:
         if size > SMALL:
             on_bytes = _mover(bar, path.name, size)
@@ -73,20 +79,43 @@ def watched(path: Path, opened: Callable[[OnBytes | None], Source]) -> Iterator[
         bar.stop()
 
 
+@contextmanager
+def waiting() -> Iterator[Callable[[str, float], None]]:
+    """A bar on stderr for what people wait for while the context lasts, where that is a terminal.
+
+    Yields whom to call with what is being done, a few words, and the share of all that is done.
+    """
+    console = Console(stderr=True, highlight=False)
+    if not console.is_terminal:
+        yield lambda what, share: None
+        return
+    bar = _bar(console)
+    try:
+        move = _mover(bar, "", 1.0)
+        yield lambda what, share: move(share, what)
+    finally:
+        bar.stop()
+
+
+def _bar(console: Console) -> Progress:
+    columns = (TextColumn("{task.description}"), BarColumn(), TextColumn("{task.percentage:.0f} %"))
+    return Progress(*columns, TimeRemainingColumn(), console=console, transient=True)
+
+
 def _size(path: Path) -> int:
     """Bytes of a file, or of those in a directory."""
     files = path.iterdir() if path.is_dir() else [path]
     return sum(file.stat().st_size for file in files if file.is_file())
 
 
-def _mover(bar: Progress, name: str, total: int) -> OnBytes:
+def _mover(bar: Progress, name: str, total: float) -> Mover:
     """Function that moves the bar to how much is done of the total; the bar appears once it has been a moment."""
     task = bar.add_task(name, total=total)
     began, shown = monotonic(), False
 
-    def move(done: int) -> None:
+    def move(done: float, name: str | None = None) -> None:
         nonlocal shown
-        bar.update(task, completed=done)
+        bar.update(task, completed=done, description=name)
         if not shown and monotonic() > began + MOMENT:
             shown = True
             bar.start()
@@ -94,7 +123,7 @@ def _mover(bar: Progress, name: str, total: int) -> OnBytes:
     return move
 
 
-def _counted(blocks: Iterable[Block], move: OnBytes) -> Iterator[Block]:
+def _counted(blocks: Iterable[Block], move: Mover) -> Iterator[Block]:
     done = 0
     for block in blocks:
         # In portions, so that the bar moves: a block may be all of a capture.

@@ -28,6 +28,7 @@ from sms_tools.session import check_part, described_system
 from sms_tools.view.frames import Diagnosed
 from sms_tools.view.parameter_groups import MOST_LINES
 from sms_tools.view.session import View, open_view
+from sms_tools.waiting import waiting, watched
 
 NAME = "diagnosis.json"
 # Ambiguous candidates that people are shown.
@@ -51,10 +52,8 @@ def run(args: argparse.Namespace) -> int:
             start = args.stop
         holdout = _samples(args.holdout, system, start, None, folder)
 
-    def progress(message: str) -> None:
-        console.print(f"{message} …", markup=False, style="dim")
-
-    found = diagnose(system, capture, holdout=holdout, prior=args.prior, progress=progress)
+    with waiting() as progress:
+        found = diagnose(system, capture, holdout=holdout, prior=args.prior, progress=progress)
     document = found.document()
     view = None if args.rerun == "off" else _watched(args, system, found, capture, directory)
     if view is not None:
@@ -141,7 +140,8 @@ def _evidence(document: Document) -> dict[str, float]:
 
 
 def _samples(capture: Path, system: System, start: float | None, stop: float | None, folder: Path | None) -> Capture:
-    return captured(recorded_at(capture, open_source(capture, system, start, stop, None, folder)))
+    with watched(capture, lambda moved: open_source(capture, system, start, stop, moved, folder)) as reading:
+        return captured(recorded_at(capture, reading))
 
 
 def _effects(document: Document) -> Table:

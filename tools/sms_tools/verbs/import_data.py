@@ -17,6 +17,7 @@ from sms_tools.exit_codes import OK
 from sms_tools.report import report_console, show
 from sms_tools.session import described_system
 from sms_tools.verbs import import_urdf
+from sms_tools.waiting import watched
 
 # Writes the capture of a source; number of its samples, and what was skipped.
 Importer = Callable[[argparse.Namespace], tuple[int, list[str]]]
@@ -48,13 +49,15 @@ def _log(args: argparse.Namespace) -> tuple[int, list[str]]:
     if args.system is None:
         raise InputError("import log", "", "no --system", "the system file, which says what the log's numbers are")
     system, folder = described_system(args)
-    source = open_source(args.source, system, directory=folder)
     samples = 0
-    with capture_writer(args.capture, tuple(source.channels)) as writer:
-        for block in source:
+    with (
+        watched(args.source, lambda moved: open_source(args.source, system, None, None, moved, folder)) as reading,
+        capture_writer(args.capture, tuple(reading.channels)) as writer,
+    ):
+        for block in reading:
             writer.write(block)
             samples += block.t.size
-    return samples, list(source.warnings)
+    return samples, list(reading.warnings)
 
 
 KINDS: dict[str, Importer] = {

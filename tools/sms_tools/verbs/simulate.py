@@ -3,12 +3,7 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from pathlib import Path
-
-from rich.console import Console
-from rich.progress import Progress, TextColumn, TimeElapsedColumn
 
 from sms_adapters.mcap_capture import capture_writer
 from sms_adapters.truth import truth_path, write_truth
@@ -18,18 +13,7 @@ from sms_sim.capture import Simulated
 from sms_tools.exit_codes import OK
 from sms_tools.report import report_console, show
 from sms_tools.session import described_system
-
-
-@contextmanager
-def _solving(console: Console) -> Iterator[Callable[[float], None]]:
-    """Tells a person at a terminal how far the motion is solved, which may take longer than it lasts."""
-    if not console.is_terminal:
-        yield lambda t: None
-        return
-    told = Progress(TextColumn("{task.description}"), TimeElapsedColumn(), console=console, transient=True)
-    with told:
-        task = told.add_task("solving the motion")
-        yield lambda t: told.update(task, description=f"solving the motion, {t:.1f} s of it are known")
+from sms_tools.waiting import waiting
 
 
 def run(args: argparse.Namespace) -> int:
@@ -39,7 +23,7 @@ def run(args: argparse.Namespace) -> int:
     capture: Path = args.capture
     # The writer comes first: a name that cannot be written is known before a long simulation.
     with capture_writer(capture, session.channels) as writer:
-        with _solving(report_console(args.json)) as progress:
+        with waiting() as progress:
             simulation = session.solve(progress)
         samples = 0
         for block in session.blocks(simulation):
