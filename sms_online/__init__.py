@@ -26,6 +26,8 @@ if TYPE_CHECKING:
     from sms_online.trust import Residual, Trust
     from sms_sim.bound import Bounds, bound
     from sms_sim.capture import simulate
+    from sms_sim.excitation import Excitation, excite
+    from sms_sim.motion_limits import Limits
     from sms_tools.view.described import show
 
     __version__: str
@@ -40,8 +42,10 @@ _HOMES = {
     "Comparison": "sms_online.repeatability",
     "Diagnosis": "sms_online.diagnosis.diagnosed",
     "Event": "sms_online.pipeline.events",
+    "Excitation": "sms_sim.excitation",
     "Finding": "sms_online.result",
     "InputError": "sms_online.errors",
+    "Limits": "sms_sim.motion_limits",
     "Parameter": "sms_online.result",
     "Parameters": "sms_online.result",
     "Residual": "sms_online.trust",
@@ -54,6 +58,7 @@ _HOMES = {
     "compare": "sms_adapters.runs",
     "diagnose": "sms_online.diagnosis.diagnosed",
     "estimate": "sms_online.session",
+    "excite": "sms_sim.excitation",
     "load_system": "sms_adapters.system_file",
     "read_capture": "sms_adapters.recorded",
     "shipped_systems": "sms_online.description.parse",
@@ -71,8 +76,10 @@ __all__ = [
     "Comparison",
     "Diagnosis",
     "Event",
+    "Excitation",
     "Finding",
     "InputError",
+    "Limits",
     "Parameter",
     "Parameters",
     "Residual",
@@ -86,6 +93,7 @@ __all__ = [
     "compare",
     "diagnose",
     "estimate",
+    "excite",
     "load_system",
     "read_capture",
     "shipped_systems",

@@ -26,7 +26,7 @@ from sms_online.tables import html_table, text_table
 from sms_sim.capture import Simulated
 from sms_sim.plant import Plant
 from sms_sim.sensors import Sensors
-from sms_sim.simulate import exact_states
+from sms_sim.simulate import Simulation, exact_states
 
 # A bound needs every drive measured, so these are never left out.
 DRIVES = ("tau_", "force_")
@@ -151,17 +151,33 @@ def _of_simulation(
     system: System, grade: str | None, each_sensor: bool, progress: Callable[[str, float], None]
 ) -> Bounds:
     plant = Plant(system)
-    if grade is None and not _noise(Sensors(system, _readable(plant), None, seed=0)).all():
-        grade = DEFAULT_GRADE
     # Sensors come first: what is missing of them is known before a long simulation.
-    described = _sensors(plant, system, grade)
+    _, grade = noisy_sensors(plant, grade)
     without = {}
     for k, sensor in enumerate(system.sensors if each_sensor else ()):
         if not any(channel.startswith(DRIVES) for channel in sensed_channels(system, sensor)):
             others = tuple(other for j, other in enumerate(system.sensors) if j != k)
             reduced = system.model_copy(update={"sensors": others})
             without[", ".join(sensor.channels)] = _sensors(plant, reduced, grade)
-    simulation = Simulated.of(system).solve(progress)
+    return motion_bounds(Simulated.of(system).solve(progress), grade, without)
+
+
+def noisy_sensors(plant: Plant, grade: str | None) -> tuple[SensorSet, str | None]:
+    """The sensors that a system describes, or those of a grade, and that grade; DEFAULT_GRADE where none has noise.
+
+    Raises InputError where a drive is not measured, or a channel has no model of its reading.
+    """
+    if grade is None and not _noise(Sensors(plant.system, _readable(plant), None, seed=0)).all():
+        grade = DEFAULT_GRADE
+    return _sensors(plant, plant.system, grade), grade
+
+
+def motion_bounds(
+    simulation: Simulation, grade: str | None = None, without: Mapping[str, SensorSet] | None = None
+) -> Bounds:
+    """Bounds of a simulated motion. grade: see `noisy_sensors`. without: sensors that are left, by what is left out."""
+    plant = simulation.plant
+    described, grade = noisy_sensors(plant, grade)
     instants = np.linspace(0.0, simulation.duration, max(1, round(simulation.duration / STEP)) + 1)
     exact = exact_states(simulation, instants)
     base, motion = find_base_parameters(plant.model), Motion(exact.t, exact.x, exact.v)
@@ -169,8 +185,9 @@ def _of_simulation(
     def least(sensors: SensorSet) -> Array:
         return cramer_rao_bound(plant.dynamics, base, [motion], sensors)
 
-    reduced_bounds = {left: least(sensors) for left, sensors in without.items()}
-    return _bounds(system, base.parameters, base.values(plant.parameters), least(described), reduced_bounds, grade)
+    reduced = {left: least(sensors) for left, sensors in (without or {}).items()}
+    values = base.values(plant.parameters)
+    return _bounds(plant.system, base.parameters, values, least(described), reduced, grade)
 
 
 def _bounds(

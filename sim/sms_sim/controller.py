@@ -2,11 +2,19 @@
 
 from __future__ import annotations
 
+from typing import Protocol
+
 import numpy as np
 
 from sms_online.description.schema import Controller
 from sms_online.stream import Array
-from sms_sim.references import FourierReference
+
+
+class Reference(Protocol):
+    """What joints are to follow."""
+
+    def __call__(self, t: Array) -> tuple[Array, Array]:
+        """q_d and q̇_d (B, joints) at instants t (B,), s."""
 
 
 class JointPD:
@@ -15,7 +23,7 @@ class JointPD:
     On q and not on θ_m: that reproduces the size of the motion in the paper's figure 6 with its gains.
     """
 
-    def __init__(self, controller: Controller, reference: FourierReference) -> None:
+    def __init__(self, controller: Controller, reference: Reference) -> None:
         self.reference = reference
         self.stiffness = np.array(controller.stiffness)
         self.damping = np.array(controller.damping)

@@ -22,7 +22,7 @@ def adopted_text(described: str, before: System, after: System, remarks: Mapping
 
     remarks: what to say of an effect, by name@where, for people: a session estimates what is no shape constant anew.
     """
-    lines = _text(described).rstrip().splitlines()
+    lines = described_text(described).rstrip().splitlines()
     if after.gravity != before.gravity:
         stated = [k for k, line in enumerate(lines) if re.match(r"\s*gravity\s*=", line)]
         gravity = (
@@ -66,12 +66,14 @@ def cells_of(value: Mapping[str, Any]) -> list[str]:
 
 def added_lines(described: str, adopted: str) -> list[str]:
     """Lines of the TOML `adopted` that the text of `described`, file or name of a system, does not hold."""
-    pairs = ndiff(_text(described).rstrip().splitlines(), adopted.splitlines())
+    pairs = ndiff(described_text(described).rstrip().splitlines(), adopted.splitlines())
     return [line[2:] for line in pairs if line.startswith("+ ")]
 
 
-def _text(described: str) -> str:
-    return shipped_text(described) if described in shipped_systems() else Path(described).read_text(encoding="utf-8")
+def described_text(described: str) -> str:
+    """The text of a system file, or of a shipped system by its name."""
+    shipped = described in shipped_systems()
+    return shipped_text(described) if shipped else Path(described).read_text(encoding="utf-8")
 
 
 def write_adopted(directory: Path, text: str, name: str = NAME) -> Path:

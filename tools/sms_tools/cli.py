@@ -101,7 +101,7 @@ def _parser() -> Parser:
     verbs = parser.add_subparsers(metavar="VERB", required=True)
     verb_parsers = (
         _add_demo, _add_live, _add_record, _add_simulate, _add_check, _add_replay, _add_diagnose, _add_import,
-        _add_export, _add_markers, _add_bound, _add_compare, _add_archive, _add_show,
+        _add_export, _add_markers, _add_bound, _add_excite, _add_compare, _add_archive, _add_show,
     )  # fmt: skip
     for add in verb_parsers:
         add(verbs)
@@ -301,6 +301,36 @@ def _add_bound(verbs: Verbs) -> None:
     parser.add_argument("--grade", choices=("A", "B", "C"), help=text)
     text = "what the bounds would be without each of the described sensors"
     parser.add_argument("--each-sensor", action="store_true", help=text)
+
+
+def _add_excite(verbs: Verbs) -> None:
+    text = "Design the trajectory that parameters are best estimated from, within limits, by the Cramér-Rao bound."
+    parser = _add_verb(verbs, "excite", "excite", text)
+    _add_system(parser)
+    own = "the described motion's own by default"
+    units = {
+        "--angle": ("RAD", f"largest angle of a joint (m on a prismatic one), {own}"),
+        "--rate": ("RAD/S", f"largest rate of a joint, {own}"),
+        "--torque": ("NM", f"largest torque of a joint after its gear, {own}"),
+        "--base-rotation": ("RAD", f"how far the base may turn, {own}"),
+        "--deflection": ("M", f"largest deflection of a marker, {own}"),
+        "--duration": ("SECONDS", f"length of the motion, {own}"),
+    }
+    for name, (unit, text) in units.items():
+        read = _seconds(positive=True) if name == "--duration" else _factor
+        parser.add_argument(name, metavar=unit, type=read, help=text)
+    text = (
+        "two effects, NAME@WHERE:coefficient=value, that a diagnosis could not tell apart: the motion is designed for "
+        "their coefficients; all parameters count without it"
+    )
+    parser.add_argument("--separate", metavar="EFFECT", nargs=2, help=text)
+    text = "noise of all sensors in place of the described one: A, B, C ever more; B where none is described"
+    parser.add_argument("--grade", choices=("A", "B", "C"), help=text)
+    parser.add_argument("--seed", metavar="N", type=_whole(0), default=0, help="of the random draw, 0 by default")
+    text = "steps of the optimiser at most, 15 by default"
+    parser.add_argument("--iterations", metavar="N", type=_whole(1), default=15, help=text)
+    text = "where system.toml, reference.csv and excitation.json go, runs/<time> by default"
+    parser.add_argument("--out", metavar="DIR", type=Path, help=text)
 
 
 def _add_compare(verbs: Verbs) -> None:

@@ -1,0 +1,136 @@
+"""excite: motions within limits from which parameters are estimated better, written for the file and the controller."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from axis import AXIS, MOTION
+
+import sms_online as sms
+from sms_adapters.system_file import load_system
+from sms_online.description.parse import parse_system
+from sms_sim.ensemble import ensemble
+from sms_sim.excitation import Excitation, excite
+from sms_sim.motion_limits import Extremes, Limits
+from sms_sim.plant import Plant
+from sms_sim.references import FourierReference
+from sms_sim.simulate import exact_states, simulate
+from sms_tools.cli import main
+from sms_tools.trajectory_file import reference_lines, system_text
+
+MOVED = AXIS + MOTION
+ONE_SINE = MOVED.replace(", { frequency = 5.0, cosine = 0.3 }", "")
+FRICTION = ("coulomb_friction@joint_1:torque=0.05", "stribeck_friction@joint_1:torque=0.05")
+
+
+@pytest.fixture(scope="module")
+def designed() -> Excitation:
+    return excite(parse_system(MOVED, "axis.toml"), seed=1, iterations=4)
+
+
+def test_batched_motions_are_the_exact_ones() -> None:
+    system = parse_system(MOVED, "axis.toml")
+    assert system.trajectory is not None
+    exact = exact_states(simulation := simulate(system), np.linspace(0.0, simulation.duration, 301))
+    frequency = np.array([2.0, 5.0])
+    sine, cosine = np.array([[[1.0], [0.0]]]), np.array([[[0.0], [0.3]]])
+    both = ensemble(system, frequency, np.repeat(sine, 2, 0), np.repeat(cosine, 2, 0), simulation.duration, 0.02)
+    for k in range(2):
+        np.testing.assert_allclose(both.x[k], exact.x, atol=1e-3)
+        np.testing.assert_allclose(both.v[k], exact.v, atol=1e-2)
+        np.testing.assert_allclose(both.torque[k], exact.torque, atol=0.1)
+
+
+def test_a_batch_is_what_its_motions_are_alone() -> None:
+    system = parse_system(MOVED, "axis.toml")
+    sine, frequency = np.array([[[1.0]], [[0.4]]]), np.array([2.0])
+    both = ensemble(system, frequency, sine, 0.0 * sine, 1.0, 0.02)
+    alone = ensemble(system, frequency, sine[1:], 0.0 * sine[1:], 1.0, 0.02)
+    np.testing.assert_allclose(both.x[1], alone.x[0], atol=1e-4)
+
+
+def test_the_worst_bound_is_lower_within_the_described_extremes(designed: Excitation) -> None:
+    assert designed.before is not None
+    worst = [max(p.percent or 0.0 for p in bounds.parameters.values()) for bounds in (designed.before, designed.after)]
+    assert worst[1] < 0.9 * worst[0]
+    assert designed.weighed == tuple(designed.after.parameters)
+    plant = Plant(parse_system(MOVED, "axis.toml"))
+    simulation = simulate(designed.system)
+    exact = exact_states(simulation, np.linspace(0.0, simulation.duration, 6001))
+    largest = Extremes(plant)(exact.x, exact.v, exact.torque)
+    for value, each in zip(largest, designed.reached, strict=True):
+        assert each.limit is not None
+        assert value <= 1.0005 * each.limit, each.name
+
+
+def test_the_seed_decides_the_motion() -> None:
+    system = parse_system(MOVED, "axis.toml")
+    found = [excite(system, duration=2.0, seed=seed, iterations=1).system for seed in (1, 1, 2)]
+    assert found[0] == found[1]
+    assert found[0] != found[2]
+
+
+def test_a_stated_limit_holds_in_place_of_the_described_motions() -> None:
+    found = excite(parse_system(MOVED, "axis.toml"), limits=Limits(rate=0.8), duration=4.0, iterations=2)
+    (rate,) = [each for each in found.reached if each.name == "rate of q_1"]
+    assert rate.limit == 0.8
+    assert 0.5 < rate.largest <= 0.8
+    assert found.system.trajectory is not None
+    assert found.system.trajectory.duration == 4.0
+
+
+def test_without_a_described_motion_limits_are_enough() -> None:
+    system = parse_system(AXIS + MOTION.partition("[trajectory]")[0], "axis.toml")
+    found = excite(system, limits=Limits(angle=0.5), duration=4.0, iterations=1)
+    assert found.before is None
+    assert next(each.largest for each in found.reached if each.name == "q_1") <= 0.5
+    with pytest.raises(sms.InputError, match="both a duration and the largest joint angle"):
+        excite(system, limits=Limits(angle=0.5))
+
+
+def test_two_effects_are_separated() -> None:
+    system = parse_system(ONE_SINE, "axis.toml")
+    found = excite(system, separate=FRICTION, iterations=4)
+    assert found.weighed == ("coulomb_friction@joint_1.torque", "stribeck_friction@joint_1.torque")
+    gains = found.gains()
+    for name in found.weighed:
+        assert (gains[name] or 0.0) > 1.2
+    # The file keeps what it described: the effects are hypotheses.
+    assert found.system.effects == system.effects
+
+
+def test_an_effect_to_separate_needs_its_size() -> None:
+    with pytest.raises(sms.InputError, match="nominally zero; expected its size"):
+        excite(parse_system(MOVED, "axis.toml"), separate=(FRICTION[0], "stribeck_friction@joint_1"))
+
+
+def test_the_verb_writes_file_reference_and_table(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path, out = tmp_path / "moved.toml", tmp_path / "done"
+    path.write_text(MOVED)
+    assert main(["excite", "--system", str(path), "--iterations", "1", "--out", str(out)]) == 0
+    said = capsys.readouterr().out
+    assert "times lower" in said
+    assert "link_1.inertia" in said
+    system, document = load_system(out / "system.toml"), json.loads((out / "excitation.json").read_text())
+    assert system.trajectory is not None
+    assert json.loads(json.dumps(document["trajectory"])) == system.trajectory.model_dump(mode="json")
+    assert system.model_copy(update={"trajectory": None}) == load_system(path).model_copy(update={"trajectory": None})
+    table = np.loadtxt(out / "reference.csv", delimiter=",", skiprows=1)
+    q_d, rate = FourierReference(system.trajectory)(table[:, 0])
+    np.testing.assert_array_equal(table[:, 1:], np.column_stack((q_d, rate)))
+    assert table.shape[0] == round(system.trajectory.duration * system.sample_rate) + 1
+
+
+def test_another_trajectory_changes_nothing_else_of_a_file(tmp_path: Path) -> None:
+    trajectory = parse_system(MOVED, "axis.toml").trajectory
+    assert trajectory is not None
+    shipped = system_text("paper-planar", load_system("paper-planar").trajectory or trajectory)
+    assert parse_system(shipped, "x.toml") == load_system("paper-planar")
+    assert "# (46), for twice the paper's 10 s" in shipped
+    path = tmp_path / "axis.toml"
+    path.write_text(AXIS + MOTION.partition("[trajectory]")[0])
+    assert parse_system(system_text(str(path), trajectory), "axis.toml") == parse_system(MOVED, "axis.toml")
+    assert next(reference_lines(trajectory, 10.0)) == "t,q_d_1,q_d_dot_1"
