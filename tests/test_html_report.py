@@ -26,7 +26,7 @@ from sms_tools.html_report import history as history_module
 from sms_tools.html_report.arm_drawing import arm_drawings
 from sms_tools.html_report.figures import PALETTE, Series, chart
 from sms_tools.html_report.history import MOST_INSTANTS, Course, History
-from sms_tools.html_report.page import write_report
+from sms_tools.html_report.page import _residual, write_report
 from sms_tools.html_report.paper_example import figure_6
 from sms_tools.html_report.parameter_rows import error_bar
 from sms_tools.view.scene import Scene
@@ -211,6 +211,15 @@ def test_a_gap_interrupts_a_line() -> None:
     y = np.array([0.0, 1.0, np.nan, 1.0, 2.0, 4.0])
     (line,) = curves(chart("c", [Series("a", np.arange(6.0), y)], "x").svg, "blue")
     assert line.count("M") == 2
+
+
+def test_a_share_of_one_instant_is_no_chart() -> None:
+    empty = np.empty((3, 0))
+    shares = np.array([[np.nan, np.nan], [np.nan, 0.1], [0.2, 0.1]])
+    one, more = (Course(np.arange(3.0), empty, empty, each, empty) for each in (shares[:, :1], shares))
+    assert _residual(one) == []
+    (drawn,) = _residual(more)
+    assert [label for label, _, _ in drawn.key] == ["joint 2"]
 
 
 def test_an_axis_holds_the_lines_not_their_bounds() -> None:

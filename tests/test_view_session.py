@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 from evaluated import elsewhere, results_document
 from recordings import columns, scalars
+from rerun.blueprint import Corner2D
 
 from sms_adapters.capture import CaptureWriter
 from sms_adapters.system_file import load_system
@@ -28,6 +29,7 @@ from sms_online.stream import Block
 from sms_sim.sensors import Sensors
 from sms_sim.simulate import Simulation, sampled_blocks
 from sms_tools.cli import main
+from sms_tools.view.blueprint import _Plots
 from sms_tools.view.session import open_view, references
 
 # Of the example's motion: enough for its first weights, every marker moving, and a recording of a few batches' size.
@@ -258,3 +260,12 @@ def test_a_parameter_without_a_nominal_value_has_no_reference() -> None:
 def _channels() -> tuple[str, ...]:
     layout = build_model(load_system("paper-planar")).layout
     return (*layout.position_names, "tau_1", "tau_2")
+
+
+def test_a_legend_stands_over_time_to_come() -> None:
+    plot = _Plots(begin=None)._plot("a plot", ["a/**"])
+    legend, axis = plot.properties["PlotLegend"], plot.properties["TimeAxis"]
+    assert legend.corner.as_arrow_array().to_pylist() == [Corner2D.RightTop.value]
+    (shown,) = axis.view_range.as_arrow_array().to_pylist()
+    # A plot of a screen of 1400 pixels has 380 beside its axis, the longest legend 120 of them.
+    assert shown["end"] > 0.25 * (shown["end"] - shown["start"])

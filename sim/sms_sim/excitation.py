@@ -2,8 +2,8 @@
 
 The criterion is the Cramér–Rao bound of the motion that the controller makes of the series: a smooth maximum of the
 relative bounds, so that the worst counts most. Series of several harmonics are drawn at random, some of them about the
-described one, and scaled into the limits; the best is improved by sequential quadratic programming, all derivatives of
-a step from one batch of motions.
+described one, and scaled into the limits; the best is improved by quasi-Newton steps (BFGS), all derivatives of a step
+from one batch of motions.
 Source: Swevers, Ganseman, Tükel, De Schutter, Van Brussel, Optimal robot excitation and identification, IEEE Trans.
 Robotics and Automation 13 (1997) 730, for finite Fourier series and the optimisation by the bound.
 """
@@ -16,7 +16,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from scipy.optimize import NonlinearConstraint, minimize
+from scipy.optimize import minimize
 
 from sms_online.cramer_rao import cramer_rao_bound
 from sms_online.description.given import Given, given_system
@@ -49,10 +49,17 @@ MIXED = 0.5
 # Order of the norm of relative bounds: near their maximum, and smooth. The median takes so much of the criterion, or
 # nothing would keep the others from being spent for the worst.
 ORDER, MEDIAN_SHARE = 8, 0.3
+# Order of the norm over signals and instants in place of the largest load.
+PEAK_ORDER = 40
+# Unit of the optimiser's amplitudes, rad (m): its first step is about as long as the criterion's slope in it, which
+# then keeps a motion one that can be followed.
+UNIT = 0.1
 # Increment of a series' amplitudes, rad (m), for derivatives: the motions compared are good to 1e-3 of it.
 INCREMENT = 1e-3
-# Share of the limits that is used while motions are good to 1e-3, and how often the exact one is scaled until it fits.
-USED, CORRECTIONS = 0.995, 6
+# In place of what cannot be followed: more than any motion costs.
+FAR = 1e3
+# The exact motion is scaled to this share of the limits until it is within them, so often.
+USED, CORRECTIONS = 0.999, 6
 # Steps of the optimiser by default: the criterion then changes by less than a hundredth in a step.
 ITERATIONS = 15
 
@@ -273,16 +280,17 @@ class _Problem:
         angles = [signal.kind == "angle" and signal.stated for signal in self.extremes.signals]
         return float(self.bounds[angles].min())
 
-    def __call__(self, points: Array) -> tuple[Array, Array]:
-        """Criterion (P,), and loads (P, signals): extremes over their bounds, of points (P, size)."""
+    def __call__(self, points: Array) -> tuple[Array, Array, Array]:
+        """Of points (P, size): criterion, largest load (extreme over its bound), and a smooth maximum (P,)."""
         motions = ensemble(self.system, self.series.frequency, *self.series(points), self.duration, STEP)
-        cost, load = np.full(len(points), np.inf), np.full((len(points), self.bounds.size), np.inf)
+        cost, load, smooth = np.full((3, len(points)), np.inf)
         for p in range(len(points)):
             x, v = motions.x[p], motions.v[p]
             if np.isfinite(x).all() and np.isfinite(v).all():
-                load[p] = self.extremes(x, v, motions.torque[p]) / self.bounds
+                loads = self.extremes.magnitudes(x, v, motions.torque[p]) / self.bounds
+                load[p], smooth[p] = loads.max(), np.linalg.norm(loads.ravel(), PEAK_ORDER)
                 cost[p] = self._criterion(Motion(motions.t[::EVERY], x[::EVERY], v[::EVERY]))
-        return cost, load
+        return cost, load, smooth
 
     def _criterion(self, motion: Motion) -> float:
         std = cramer_rao_bound(self.plant.dynamics, self.base, [motion], self.sensors)[self.counted]
@@ -312,65 +320,50 @@ def _optimised(
         # Some are the described motion with more or less of something else; the first is itself.
         share = np.linspace(0.0, MIXED, DRAWN // 2)[:, None]
         points[: DRAWN // 2] = problem.series.nearest(problem.system.trajectory) + share * points[: DRAWN // 2]
-    cost, load = np.full(DRAWN, np.inf), np.ones((DRAWN, 1))
-    for k in range(SCALINGS + 1):
+    for k in range(SCALINGS):
         progress(what, k / total)
-        cost, load = problem(points)
-        if k < SCALINGS:
-            points = points * (USED / np.maximum(load.max(axis=1), 1e-3))[:, None]
-    inside = np.where(load.max(axis=1) <= 1.0 + INCREMENT * 20.0, cost, np.inf)
-    if not np.isfinite(inside).any():
+        _, load, _ = problem(points)
+        points = points / np.where(np.isfinite(load), load, 2.0)[:, None]
+    progress(what, SCALINGS / total)
+    cost, load, _ = problem(points)
+    scaled = cost + np.log(load)
+    if not np.isfinite(scaled).any():
         raise InputError(problem.system.name, "limits", "no random motion within them", "wider limits")
     steps = _Steps(problem, lambda n: progress(what, min(1.0, (SCALINGS + 1 + n) / total)))
-    minimize(
-        steps.cost,
-        points[int(np.argmin(inside))],
-        jac=steps.slope,
-        method="SLSQP",
-        constraints=NonlinearConstraint(steps.room, 0.0, np.inf, jac=steps.room_slope),
-        options={"maxiter": iterations},
-    )
+    begin = points[int(np.argmin(scaled))] / UNIT
+    minimize(steps.cost, begin, jac=steps.slope, method="BFGS", options={"maxiter": iterations})
     return steps.best
 
 
 class _Steps:
-    """Criterion, room below the limits, and their derivatives at a point, all from one batch of motions."""
+    """What is minimised, and its derivatives, at a point in UNIT, all from one batch of motions.
+
+    It is the criterion of the motion scaled to the limits: bounds fall as amplitudes rise. So no limit is in the way of
+    a step, and amplitudes stay where motions are close to their limits for the second term's sake.
+    """
 
     def __init__(self, problem: _Problem, on_step: Callable[[int], None]) -> None:
         self._problem, self._on_step = problem, on_step
-        self._limited = np.isfinite(problem.bounds)
-        self._known: dict[bytes, tuple[float, Array, Array, Array]] = {}
+        self._known: dict[bytes, tuple[float, Array]] = {}
         self.best, self._least = np.empty(0), math.inf
 
     def cost(self, point: Array) -> float:
-        """The criterion."""
+        """What is minimised."""
         return self._at(point)[0]
 
     def slope(self, point: Array) -> Array:
         """Its derivative (size,)."""
         return self._at(point)[1]
 
-    def room(self, point: Array) -> Array:
-        """What is free of each limit, as a share of it."""
-        return self._at(point)[2]
-
-    def room_slope(self, point: Array) -> Array:
-        """Its derivative (signals, size)."""
-        return self._at(point)[3]
-
-    def _at(self, point: Array) -> tuple[float, Array, Array, Array]:
-        key = point.tobytes()
+    def _at(self, scaled: Array) -> tuple[float, Array]:
+        key, point = scaled.tobytes(), UNIT * scaled
         if key not in self._known:
             near = np.concatenate((point[None], point + INCREMENT * np.eye(point.size)))
-            cost, load = self._problem(near)
-            room = np.where(np.isfinite(load), USED - load, -1e3)[:, self._limited]
-            cost = np.where(np.isfinite(cost), cost, 1e3)
-            slope, room_slope = (cost[1:] - cost[0]) / INCREMENT, (room[1:] - room[0]).T / INCREMENT
-            self._known[key] = float(cost[0]), slope, room[0], room_slope
-            # What is slightly outside is scaled into the limits afterwards, and loses as much of the criterion.
-            scaled = float(cost[0]) - math.log(min(1.0, USED / (USED - float(room[0].min(initial=0.0)))))
-            if scaled < self._least:
-                self.best, self._least = point.copy(), scaled
+            cost, load, smooth = self._problem(near)
+            value = np.nan_to_num(cost + np.log(smooth) + np.log(smooth) ** 2, nan=FAR, posinf=FAR)
+            self._known[key] = float(value[0]), (value[1:] - value[0]) * (UNIT / INCREMENT)
+            if cost[0] + math.log(load[0]) < self._least:
+                self.best, self._least = point, float(cost[0] + math.log(load[0]))
             self._on_step(len(self._known))
         return self._known[key]
 

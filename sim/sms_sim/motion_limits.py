@@ -69,6 +69,10 @@ class Extremes:
 
     def __call__(self, x: Array, v: Array, torque: Array) -> Array:
         """Extremes (signals,) of a motion x (N, n_x), v (N, n_v), n τ (N, joints)."""
+        return np.asarray(self.magnitudes(x, v, torque).max(axis=0))
+
+    def magnitudes(self, x: Array, v: Array, torque: Array) -> Array:
+        """Magnitudes (N, signals) along a motion."""
         layout = self._plant.model.layout
         parts = [x[:, : self._linear]]
         if layout.free:
@@ -77,7 +81,7 @@ class Extremes:
             turned = np.abs(x[:, 2] - x[0, 2]) if layout.planar else np.arccos(np.clip(cosine, -1.0, 1.0))
             parts.append(turned[:, None])
         parts += [layout.joint_positions(x), v, self._markers(x, v), torque]
-        return np.asarray(np.abs(np.concatenate(parts, axis=1)).max(axis=0))
+        return np.abs(np.concatenate(parts, axis=1))
 
     def bounds(self, limits: Limits, described: Array | None) -> Array:
         """Largest magnitude allowed of each signal (signals,); inf where there is none.

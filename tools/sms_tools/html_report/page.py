@@ -92,9 +92,11 @@ def _convergence(document: Document, nominal: Mapping[str, float], course: Cours
 
 
 def _residual(course: Course) -> list[Chart]:
-    series = [Series(f"joint {i}", course.t, share) for i, share in enumerate(course.residual.T, start=1)]
+    joints = enumerate(course.residual.T, start=1)
+    # One instant, of a short session, is no line; the table says it.
+    series = [Series(f"joint {i}", course.t, share) for i, share in joints if np.isfinite(share).sum() > 1]
     caption = "Unexplained share of the torque or force, over the last second"
-    return [chart(caption, series, "time, s", log=True)] if np.isfinite(course.residual).any() else []
+    return [chart(caption, series, "time, s", log=True)] if series else []
 
 
 def _evidence(episode: Document) -> list[Chart]:

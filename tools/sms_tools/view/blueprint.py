@@ -14,8 +14,8 @@ from sms_tools.view.number_log import ParameterLog
 from sms_tools.view.scene import Drawing, Scene
 
 # Plots show so much of the past, s: the whole of the example's motion, and of longer sessions what a person remembers;
-# and so much beyond now, or the last label of their axis would be cut.
-WINDOW, AHEAD = 20.0, 1.5
+# and so much beyond now, where nothing is drawn yet and the legend hides nothing: of 400 pixels it takes 60 to 130.
+WINDOW, AHEAD = 20.0, 8.0
 # Share of the height for the judgement: a heading and a line.
 BANNER = 0.125
 # The same across: room beyond the range of what is drawn.
@@ -131,8 +131,7 @@ class _Plots:
             contents=list(contents),
             name=name,
             axis_y=rrb.ScalarAxis(range=y) if y is not None else None,
-            # Over the past, of which the first seconds have no estimate yet.
-            plot_legend=rrb.PlotLegend(corner=rrb.Corner2D.LeftTop, visible=legend),
+            plot_legend=rrb.PlotLegend(corner=rrb.Corner2D.RightTop, visible=legend),
             axis_x=self._axis,
             time_ranges=self._ranges,
         )
