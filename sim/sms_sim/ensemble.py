@@ -21,8 +21,9 @@ from sms_sim.integrate import JACOBIAN_INCREMENT, radau
 from sms_sim.plant import Plant
 
 STAGES = 3
-# What Newton's iteration leaves of a stage, rad, m and, as of rates, 1/s: far below what is compared.
-POSITION_TOLERANCE, SPEED_TOLERANCE = 1e-4, 1e-2
+# What Newton's iteration leaves of a stage, rad, m and, as of rates, 1/s: far below the differences between
+# neighbouring references.
+POSITION_TOLERANCE, SPEED_TOLERANCE = 1e-6, 1e-4
 # More iterations than this: the Jacobians are too old. As many with new ones: the step is too long.
 ITERATIONS = 10
 # A step is halved no more often than this.

@@ -54,8 +54,8 @@ PEAK_ORDER = 40
 # Unit of the optimiser's amplitudes, rad (m): its first step is about as long as the criterion's slope in it, which
 # then keeps a motion one that can be followed.
 UNIT = 0.1
-# Increment of a series' amplitudes, rad (m), for derivatives: the motions compared are good to 1e-3 of it.
-INCREMENT = 1e-3
+# Increment of a series' amplitudes, rad (m), for derivatives: a thousand times what is left of the motions' equations.
+INCREMENT = 5e-3
 # In place of what cannot be followed: more than any motion costs.
 FAR = 1e3
 # The exact motion is scaled to this share of the limits until it is within them, so often.
