@@ -168,16 +168,16 @@ def test_what_a_system_file_gains_is_told_alone() -> None:
 
 def test_what_was_found_is_remarked_in_the_system_file() -> None:
     def told(name: str, estimate: float) -> dict[str, Any]:
-        value = {"estimate": estimate, "std": 0.5, "unit": "N m"}
+        value = {"estimate": estimate, "std": 0.005, "unit": "N m"}
         return {"name": name, "where": "joint_1", "coefficients": {"torque": value}}
 
     found = remarks([told("coulomb_friction", 20.0), told("coulomb_friction", 21.0), told("torque_delay", 0.02)])
-    assert found["coulomb_friction@joint_1"] == "torque 20 ± 0.5 N m"
+    assert found["coulomb_friction@joint_1"] == "torque 20 ± 0.005 N m"
     system = load_system("paper-planar")
     late = Effect(name="torque_delay", where="joint_1", coefficients={"time": 0.02})
     after = system.model_copy(update={"effects": (Effect(name="coulomb_friction", where="joint_1"), late)})
     text = adopted_text("paper-planar", system, after, found)
-    assert re.findall("# found: (.*)", text) == ["torque 20 ± 0.5 N m", "torque 0.02 ± 0.5 N m"]
+    assert re.findall("# found: (.*)", text) == ["torque 20 ± 0.005 N m", "torque 0.02 ± 0.005 N m"]
     assert parse_system(text, "adopted").effects == after.effects
 
 

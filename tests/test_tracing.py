@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from sms_online.description.schema import Effect
 from sms_online.diagnosis.candidate import Candidate, LeftOpen
+from sms_online.diagnosis.folds import Folds
 from sms_online.diagnosis.trace import Tracing
 from sms_online.diagnosis.weak_rows import WeakRows
 from sms_online.effects import catalogue
@@ -22,7 +23,7 @@ from sms_online.pipeline.momentum_windows import HOPS
 from sms_online.stream import Array
 
 WINDOWS, SPEEDS = 300, 2
-FITTED = np.arange(WINDOWS) < 200
+FOLDS = Folds.of(np.zeros(WINDOWS, dtype=np.int64), np.arange(WINDOWS, dtype=float))
 
 
 def made_up_rows(Y: Array, b: Array) -> WeakRows:
@@ -49,6 +50,9 @@ class Sticking:
     def at_rest(self, candidate: Candidate) -> float:
         return self.share
 
+    def reported(self, effect: Effect, beta: Array, coefficients: Array) -> dict[str, float]:
+        raise AssertionError("no law here has a limit")
+
 
 def _candidate(name: str, column: Array) -> Candidate:
     columns = np.zeros((WINDOWS, SPEEDS, 1))
@@ -63,7 +67,7 @@ def _found(candidates: list[Candidate], force: Array, seed: int) -> list[str]:
     Y = rng.standard_normal((WINDOWS, SPEEDS, 3))
     b = Y @ np.array([1.0, -2.0, 0.5]) + rng.standard_normal((WINDOWS, SPEEDS))
     b[:, 0] += force
-    tracing = Tracing(made_up_rows(Y, b), candidates, FITTED)
+    tracing = Tracing(made_up_rows(Y, b), candidates, FOLDS)
     return [tracing.candidates[k].effect.name for k in tracing.run(lambda chosen, k: None)]
 
 
@@ -72,9 +76,10 @@ def test_what_does_not_hold_on_other_windows_takes_no_place(seed: int) -> None:
     rng = np.random.default_rng(100 + seed)
     lasting, early = rng.standard_normal((2, WINDOWS))
     late = rng.standard_normal(WINDOWS)
-    # Something of the fitted windows alone, which gains more than what is there all the time.
-    passing = np.where(FITTED, early, 0.0)
-    column = np.where(FITTED, early, late)
+    # Something of one stretch alone, which gains more than what is there all the time.
+    stretch = np.arange(WINDOWS) < 90
+    passing = np.where(stretch, early, 0.0)
+    column = np.where(stretch, early, late)
     found = _found(
         [_candidate("torque_offset", column), _candidate("cogging", lasting)], 3.0 * passing + 1.5 * lasting, seed
     )
@@ -113,14 +118,14 @@ def test_an_effect_whose_own_noise_hides_what_it_takes_stays_and_what_stood_for_
     held = np.where(stuck, 30.0 * rng.uniform(0.2, 1.0, WINDOWS), 0.0)
     friction, ripple = (
         _candidate("stribeck_friction", np.where(stuck, 1.0, 0.0)),
-        _candidate("cogging", held + 5.0 * stuck * rng.standard_normal(WINDOWS)),
+        _candidate("cogging", held + 8.0 * stuck * rng.standard_normal(WINDOWS)),
     )
     Y = rng.standard_normal((WINDOWS, SPEEDS, 3))
     b = Y @ np.array([1.0, -2.0, 0.5]) + rng.standard_normal((WINDOWS, SPEEDS))
     b[:, 0] += held
 
     rows = made_up_rows(Y, b)
-    tracing = Tracing(rows, [friction, ripple], FITTED, laws=Sticking(stuck, 0.0, 10.0))
+    tracing = Tracing(rows, [friction, ripple], FOLDS, laws=Sticking(stuck, 0.0, 10.0))
     found = tracing.run(lambda chosen, k: None)
     assert [taken for taken, _ in tracing.path] == [1, 0]
     assert found == [0]
@@ -144,7 +149,7 @@ def test_friction_that_holds_an_axis_much_of_the_time_is_found_beside_what_fits_
     rows = made_up_rows(rng.standard_normal((WINDOWS, SPEEDS, 3)), b)
 
     def steps(share: float) -> list[list[int]]:
-        tracing = Tracing(rows, candidates, FITTED, laws=Sticking(stuck, share, 2.0))
+        tracing = Tracing(rows, candidates, FOLDS, laws=Sticking(stuck, share, 2.0))
         tracing.run(lambda chosen, k: None)
         return [chosen for _, chosen in tracing.path]
 
@@ -162,5 +167,5 @@ def test_what_another_effect_has_replaced_comes_back_for_what_that_leaves(times:
     b[:, 0] += 50.0 * friction + 5.0 * ripple
     candidates = [_candidate("coulomb_friction", friction), _candidate("cogging", ripple)]
     rows = made_up_rows(rng.standard_normal((WINDOWS, SPEEDS, 3)), b)
-    found = Tracing(rows, candidates, FITTED, laws=Sticking(stuck, 0.0, times)).run(lambda chosen, k: None)
+    found = Tracing(rows, candidates, FOLDS, laws=Sticking(stuck, 0.0, times)).run(lambda chosen, k: None)
     assert sorted(found) == [0, 1]

@@ -66,7 +66,8 @@ def position_families(sensing: Sensing, tolerances: Tolerances) -> list[Family]:
 
 def torque_families(sensing: Sensing, tolerances: Tolerances) -> list[TorqueFamily]:
     """Those of torques that have a tolerance, but for what the system file declares as effects."""
-    declared = {(ENTRIES[e.name].traits.calibrates, e.where) for e in sensing.model.system.effects}
+    effects = sensing.model.system.effects
+    declared = {(name, e.where) for e in effects for name in ENTRIES[e.name].traits.calibrates}
     joints = [i for i, joint in enumerate(sensing.model.system.joints) if not joint.passive]
     units = ["N" if joint.kind == "prismatic" else "N m" for joint in sensing.model.system.joints]
     offset = np.inf if tolerances.drive_offset is None else tolerances.drive_offset

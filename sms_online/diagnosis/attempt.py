@@ -5,18 +5,19 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from sms_online.description.schema import Effect, System
 from sms_online.diagnosis.candidate import Candidate
+from sms_online.diagnosis.candidate_rows import CandidateRows
 from sms_online.diagnosis.candidates import CandidateColumns
 from sms_online.diagnosis.constants import applied, corrected, is_constant
 from sms_online.diagnosis.evidence import together
+from sms_online.diagnosis.folds import Folds
 from sms_online.diagnosis.followed import least_samples
-from sms_online.diagnosis.hypothesis import FITTED, LARGEST_SHARE_LEFT, REWEIGHED, Hypothesis
+from sms_online.diagnosis.hypothesis import LARGEST_SHARE_LEFT, REWEIGHED, Hypothesis
 from sms_online.diagnosis.record import LONGEST, Segment, bounded, excerpts
 from sms_online.diagnosis.relative import RelativeResiduals
 from sms_online.diagnosis.residuals import ResidualTest, RowResidual, whitened
@@ -54,15 +55,15 @@ class Part:
 class State:
     """What a model, with or without the effects found, makes of the session.
 
-    system: with the effects. solution (n + c,): parameters and coefficients fitted to the fitted windows. residual (W,
-    n_v): of all windows, over each row's own predicted deviation; time (W,): their middles, s since grid index 0.
+    system: with the effects. solution (n + c,): parameters and coefficients. residual (W, n_v): of all windows, over
+    each row's own predicted deviation; time (W,): their middles, s since grid index 0. fit: of all of the capture.
+    holdout: of another capture, or of blocks of this one predicted from the others.
     """
 
     system: System
     solution: Array
     residual: Array
     time: Array
-    fitted: NDArray[np.bool_]
     fit: Part
     holdout: Part
     test: dict[str, RowResidual]
@@ -77,8 +78,8 @@ class State:
 class Step:
     """What a search had found when it took one more effect.
 
-    taken: its key, name@where; effects: all keys by then, what it replaced left out. relative: residual of held-out
-    rows by joint, over the measured torque or force, fitted to the others.
+    taken: its key, name@where; effects: all keys by then, what it replaced left out. relative: residual by joint over
+    the measured torque or force, blocks predicted from the others.
     """
 
     taken: str
@@ -86,13 +87,21 @@ class Step:
     relative: dict[str, float]
 
 
+# Is told what is being done, a few words, and the share of all that is done, roughly.
+Progress = Callable[[str, float], None]
+# Shares of the time of a diagnosis that are over when the described model is fitted, its residual traced, and searched;
+# what is found is fitted in the rest. Measured on the planar example of 20 s.
+FITTED_ONCE, TRACED, SEARCHED = 0.25, 0.6, 0.75
 # Gives what is known beforehand of the parameters of an estimator's model.
 PriorOf = Callable[[Estimator], Prior | None]
 
 
 @dataclass(frozen=True)
 class Case:
-    """A capture to be diagnosed: its session with the system as described, samples, and those held out."""
+    """A capture to be diagnosed: its session with the system as described, samples, and those held out.
+
+    progress: see `Progress`. stop: whether to end with what has been found.
+    """
 
     source: str
     session: Estimator
@@ -100,6 +109,8 @@ class Case:
     segments: Sequence[Segment]
     held: Sequence[Segment]
     prior: PriorOf
+    progress: Progress = lambda what, share: None
+    stop: Callable[[], bool] = lambda: False
 
 
 def _noise_behind(described: Estimator, case: Case) -> SensorNoise:
@@ -157,24 +168,20 @@ class Attempt(Hypothesis):
         # Corrections reach beyond a stretch.
         channels = session.sensing.channels
         whole = ([corrected(described, channels, segment) for segment in each] for each in (case.segments, case.held))
-        fitting, held = (
+        fitting, self._held = (
             [part for part in excerpts(each, length, longest) if part.index.size > least] for each in whole
         )
         rows = SessionRows(
-            estimator.model, estimator.base, estimator.sensing, noise, (*fitting, *held), second_order=second_order
+            estimator.model, estimator.base, estimator.sensing, noise, fitting, second_order=second_order
         )
         make = CandidateColumns(rows, described)
-        self._fitting = len(fitting)
-        first, last = rows.time[:1].sum(), rows.time[-1:].sum()
-        self._split = np.inf if held else first + FITTED * (last - first)
-        fitted = self._fitted(rows.time, rows.weak.windows.segment)
-        enough = min(int(fitted.sum()) * rows.model.layout.n_v // (2 * rows.base.n), int((~fitted).sum()))
-        if enough == 0:
-            # Windows begin a hop apart; those fitted give twice as many rows as there are parameters.
-            hops = 2 * rows.base.n / rows.model.layout.n_v / (1.0 if held else FITTED)
-            seconds = least / system.sample_rate + hops * span / HOPS
+        # Half of the windows, where there are two blocks, give twice as many rows as there are parameters.
+        wanted = 2 * (2 * rows.base.n // rows.model.layout.n_v + 1)
+        if rows.count < wanted:
+            seconds = least / system.sample_rate + wanted * span / HOPS
             expected = f"some {seconds:.1f} s without a gap, to fit and to check"
             raise InputError(case.source, "", f"too few windows of {span:g} s: {rows.count}", expected)
+        folds = Folds.of(rows.weak.windows.segment, rows.time)
         effects = list(make.effects()) if candidates is None else candidates
         self._lasting = [effect for effect in effects if is_constant(effect)]
         forces = [effect for effect in effects if not is_constant(effect)]
@@ -183,7 +190,8 @@ class Attempt(Hypothesis):
             _start(rows, made, prior)
         else:
             rows.weigh(beta)
-        super().__init__(make, [*make.seen(self._lasting), *made], fitted, prior, constants)
+        self._most_found = 0
+        super().__init__(make, [*make.seen(self._lasting), *made], folds, prior, constants)
 
     def trial(self, system: System, constants: Sequence[Effect], beta: Array, effects: Sequence[Effect]) -> Attempt:
         """A quick attempt with no candidates but some effects, on stretches of the session.
@@ -195,8 +203,12 @@ class Attempt(Hypothesis):
         states = build_model(system.model_copy(update={"effects": forces})).n_states
         return Attempt(self.case, system, constants, beta, effects, LONGEST if states else SOME, self.rows.second_order)
 
-    def _fitted(self, time: NDArray[np.floating[Any]], segment: NDArray[np.int64]) -> NDArray[np.bool_]:
-        return np.asarray((segment < self._fitting) & (time < self._split))
+    def watch(self, chosen: Sequence[int]) -> bool:
+        """See `Hypothesis`."""
+        if chosen and len(chosen) > self._most_found:
+            self._most_found = len(chosen)
+            self.case.progress(f"found so far: {', '.join(self.tracing.candidates[k].key for k in chosen)}", TRACED)
+        return self.case.stop()
 
     def search(self) -> list[int]:
         """Numbers of the candidates found, with rows weighed by what was found if it explains them."""
@@ -238,40 +250,63 @@ class Attempt(Hypothesis):
     def test(self, chosen: Sequence[int]) -> dict[str, RowResidual]:
         """Residuals of the model with the effects chosen, by row type, against noise."""
         self.tracing.settle(chosen)
-        return ResidualTest(self.rows).of(self.tracing.residual(chosen, self._checked(chosen)))
-
-    def _checked(self, chosen: Sequence[int]) -> Array:
-        """Parameters and coefficients fitted to the fitted windows alone."""
-        return self.tracing.solution(chosen, self.fitted)
+        return ResidualTest(self.rows).of(self.residual(chosen))
 
     def state(self, chosen: Sequence[int]) -> State:
         """Residuals of the model with the effects chosen."""
-        rows, tracing, joints = self.rows, self.tracing, self._joints
+        rows, tracing = self.rows, self.tracing
         tracing.settle(chosen)
-        fitted = self.fitted
-        solution = self._checked(chosen)
+        solution, without = self.solution(chosen), tracing.solutions(chosen)
         residual = tracing.residual(chosen, solution)
-        joints.declare([*self.constants, *(tracing.candidates[k].effect for k in chosen)])
-        early = self._fitted(joints.times, joints.segment)
+        effects = [tracing.candidates[k].effect for k in chosen]
+        self._joints.declare([*self.constants, *effects])
+        if self._held:
+            holdout = self._elsewhere(effects, solution)
+        else:
+            predicted = tracing.predicted(chosen, without)
+            holdout = Part(whitened(rows, predicted), self._joints.of(solution, self._blocks(without)))
         return State(
             system=self.adopted(chosen),
             solution=solution,
             residual=residual,
             time=rows.time,
-            fitted=fitted,
-            fit=Part(whitened(rows, residual, fitted), joints.of(solution, early)),
-            holdout=Part(whitened(rows, residual, ~fitted), joints.of(solution, ~early)),
+            fit=Part(whitened(rows, residual), self._joints.of(solution)),
+            holdout=holdout,
             test=ResidualTest(rows).of(residual),
         )
 
+    def _blocks(self, solutions: Array) -> list[tuple[NDArray[np.bool_], Array]]:
+        """Windows of the joints in each block, and the solution without it."""
+        block = self.folds.of_others(self._joints.segment, self._joints.times)
+        return [(block == k, solution) for k, solution in enumerate(solutions)]
+
+    def _elsewhere(self, effects: Sequence[Effect], solution: Array) -> Part:
+        """What the model with a solution (n + c,) leaves of the capture that is held out."""
+        own = self.rows
+        rows = SessionRows(
+            own.model, own.base, own.sensing, own.noise, self._held, own.beta, second_order=own.second_order
+        )
+        make = CandidateColumns(rows, self.make.system)
+        held = CandidateRows(
+            rows,
+            [make.of(effect) for effect in effects],
+            Folds.of(rows.weak.windows.segment, rows.time),
+            fixed=[make.of(effect) for effect in self.constants],
+            laws=make,
+            calibrated=rows.calibrated,
+        )
+        everything = range(len(effects))
+        held.settle(everything, solution)
+        joints = RelativeResiduals(rows, make)
+        joints.declare([*self.constants, *effects])
+        return Part(whitened(rows, held.residual(everything, solution)), joints.of(solution))
+
     def steps(self) -> list[Step]:
         """The way of the last search."""
-        joints = self._joints
-        held = ~self._fitted(joints.times, joints.segment)
         out = []
         for taken, chosen in self.tracing.path:
             effects = [self.tracing.candidates[k] for k in chosen]
-            joints.declare([*self.constants, *(candidate.effect for candidate in effects)])
-            relative = joints.of(self._checked(chosen), held)
+            self._joints.declare([*self.constants, *(candidate.effect for candidate in effects)])
+            relative = self._joints.of(self.solution(chosen), self._blocks(self.tracing.solutions(chosen)))
             out.append(Step(self.tracing.candidates[taken].key, tuple(c.key for c in effects), relative))
         return out

@@ -60,14 +60,25 @@ class Laws(Protocol):
     def at_rest(self, candidate: Candidate) -> float:
         """Share of the session in which the axis of a law of dry friction stands still."""
 
+    def reported(self, effect: Effect, beta: Array, coefficients: Array) -> dict[str, float]:
+        """Coefficients as a person reads them, for parameters β (n,) and an effect's own coefficients (c,)."""
+
+
+@dataclass(frozen=True)
+class Rival:
+    """The candidate that lost against one that was found: key, and by what share it lowers the same held-out rms."""
+
+    key: str
+    improvement: float
+
 
 @dataclass(frozen=True)
 class Finding:
     """An effect that the data show.
 
     gain: beside everything else that was found, whitened. limit: what the best of all absent candidates would reach.
-    improvement: share by which the rms of held-out rows that it acts on falls. ambiguous: keys of candidates that take
-    nearly as much in its place.
+    improvement: share by which the rms of held-out rows that it acts on falls. ambiguous: keys of candidates that
+    explain nearly as much in its place. rival: the best of the others in its place.
     """
 
     candidate: Candidate
@@ -75,16 +86,16 @@ class Finding:
     limit: float
     improvement: float
     ambiguous: tuple[str, ...]
+    rival: Rival | None = None
 
 
 @dataclass(frozen=True)
 class Ranked:
-    """A candidate in the first comparison: its gain, and share of the residual's excess that it alone takes away.
+    """A candidate in the first comparison: its gain alone, and the share of the whole residual that it explains.
 
-    explained: share of the whole residual, with its noise; 0 where the gain is no more than an absent candidate's.
+    explained: of the squares, noise included; 0 where the gain is no more than an absent candidate's.
     """
 
     candidate: Candidate
     gain: float
-    share: float
     explained: float

@@ -9,27 +9,25 @@ from functools import partial
 import numpy as np
 
 from sms_online.description.schema import Effect, System
-from sms_online.diagnosis.attempt import Attempt, Case, PriorOf, State, Step
+from sms_online.diagnosis.attempt import FITTED_ONCE, SEARCHED, TRACED, Attempt, Case, PriorOf, Progress, State, Step
 from sms_online.diagnosis.candidate import Finding, Ranked
 from sms_online.diagnosis.constants import stands
 from sms_online.diagnosis.hypothesis import corrections, share_left, verdict
 from sms_online.diagnosis.late_sensors import LateSensor, find_late
+from sms_online.diagnosis.mistakes import Corrected, Mistake, find_mistakes, wrong_clock
 from sms_online.diagnosis.record import SampleRecord
 from sms_online.diagnosis.trace import DECISIVE
 from sms_online.diagnosis.unexplained import Unexplained, describe_residual
 from sms_online.effects.catalogue import kinematic_candidates
 from sms_online.errors import InputError
+from sms_online.evaluation import Evaluation
 from sms_online.judgement import LARGEST_RESIDUAL
 from sms_online.pipeline.estimator import Estimator
 from sms_online.pipeline.momentum_windows import HOPS
+from sms_online.pipeline.statistics import Statistics
 from sms_online.stream import Array, Block
 from sms_online.threads import one_blas_thread
 
-# Is told what is being done, a few words, and the share of all that is done, roughly.
-Progress = Callable[[str, float], None]
-# Shares of the time of a diagnosis that are over when the described model is fitted, its residual traced, and searched;
-# what is found is fitted in the rest. Measured on the planar example of 20 s.
-FITTED_ONCE, TRACED, SEARCHED = 0.25, 0.6, 0.75
 # Exact links have to take this share of what straight ones leave beyond noise.
 STIFFENING_TAKES = 0.1
 
@@ -38,7 +36,9 @@ STIFFENING_TAKES = 0.1
 class Diagnosis:
     """What was found.
 
-    verdict: "clean", "named" or "unexplained". findings: constants first, then the effects that are unknowns of π.
+    verdict: "clean", "named" or "unexplained". partial: the search was ended before it was done, and parameters after
+    are those of its rows. mistakes: of wiring, units and signs, undone in all that follows.
+    findings: constants first, then the effects that are unknowns of π.
     late: sensors far behind the others, whose lag the description of the last attempt states. steps: of the last
     search, its effects one after the other.
     described, attempt: first and last description against the samples; chosen: of the last one's candidates.
@@ -46,6 +46,8 @@ class Diagnosis:
     """
 
     verdict: str
+    partial: bool
+    mistakes: tuple[Mistake, ...]
     findings: list[Finding]
     late: list[LateSensor]
     ranking: list[Ranked]
@@ -121,7 +123,7 @@ def _with_constants(
     """
     n = attempt.rows.base.n
     findings: list[Finding] = []
-    while any(attempt.tracing.candidates[k].constant for k in chosen):
+    while any(attempt.tracing.candidates[k].constant for k in chosen) and not case.stop():
         progress("improving constants", SEARCHED)
         findings += [attempt.tracing.finding(chosen, k) for k in chosen if attempt.tracing.candidates[k].constant]
         solution = attempt.solution(chosen)
@@ -152,21 +154,31 @@ def diagnose(
     prior: PriorOf,
     holdout: Sequence[Block] = (),
     progress: Progress = lambda what, share: None,
+    stop: Callable[[], bool] = lambda: False,
 ) -> Diagnosis:
     """Trace what a capture holds beyond its description, adopt it and fit again.
 
     blocks: samples of the capture; holdout: those of another one of the same rig, to check on. progress: see
-    `Progress`. Raises InputError where a channel is missing or there is too little motion for any row.
+    `Progress`. stop: whether to end with what has been found so far. Raises InputError where a channel is missing or
+    there is too little motion for any row.
     """
     what = "fitting the model as described"
+    clock = wrong_clock(system, np.concatenate([block.t for block in blocks]))
+    if clock is not None:
+        blocks, holdout = (_in_seconds(each, clock.before) for each in (blocks, holdout))
     before, record = _session(system, blocks, source, prior, lambda share: progress(what, FITTED_ONCE * share))
-    if before.momentum is None:
-        lacking = f"no {before.sensing.missing[0]}" if before.sensing.missing else 'balance = "energy"'
-        raise InputError(
-            source, "", f"{lacking}, so no momentum balance", "a system whose coordinates are all measured"
-        )
-    if before.momentum.sensor_noise is None:
-        raise InputError(source, "", "too few samples to tell the sensors' noise", "a longer capture")
+    _check_measured(before, source)
+    progress("looking for mistakes of units, signs and wiring", FITTED_ONCE)
+    corrected = find_mistakes(before, record.segments())
+    mistakes = (*([] if clock is None else [clock]), *corrected.mistakes)
+    if corrected.mistakes:
+        progress("; ".join(mistake.sentence for mistake in corrected.mistakes), FITTED_ONCE)
+        system = corrected.system
+        blocks, holdout = (_undone(each, corrected) for each in (blocks, holdout))
+        before, record = _session(system, blocks, source, prior)
+        _check_measured(before, source)
+    assert before.momentum is not None
+    assert before.momentum.sensor_noise is not None
     # Windows that nothing explained are a diagnosis's own affair; a change of parameters is not.
     changes = [event for event in before.events if event.parameters]
     if changes:
@@ -174,14 +186,14 @@ def diagnose(
         expected = "a part without it: -ss or -to"
         raise InputError(source, f"{event.time:.2f} s", f"an event ({event.kind}) within the capture", expected)
     held = _session(system, holdout, source, prior)[1].segments() if holdout else []
-    case = Case(source, before, before.momentum.sensor_noise, record.segments(), held, prior)
+    case = Case(source, before, before.momentum.sensor_noise, record.segments(), held, prior, progress, stop)
     progress("tracing what it leaves", FITTED_ONCE)
     try:
         attempt = described = Attempt(case, system)
     except np.linalg.LinAlgError as error:
         raise InputError(source, "", str(error), "the links' own markers, in their frames") from error
     late: list[LateSensor] = []
-    while _explains_little(before) and (found := find_late(attempt.rows, attempt.make, attempt.tracing.fitted)):
+    while _explains_little(before) and (found := find_late(attempt.rows, attempt.make, attempt.folds)):
         progress("taking off a sensor's lag", TRACED)
         late.append(found)
         lagging = attempt.system.model_copy(update={"effects": (*attempt.system.effects, found.effect)})
@@ -196,7 +208,7 @@ def diagnose(
     ranking = attempt.tracing.ranking()
     attempt.tracing.settle(chosen)
     attempt, chosen, constants = _with_constants(case, attempt, chosen, progress)
-    beyond = any(row.beyond for row in attempt.test(chosen).values())
+    beyond = not stop() and any(row.beyond for row in attempt.test(chosen).values())
     if beyond and kinematic_candidates(attempt.system):
         progress("comparing exact links", SEARCHED)
         exact = _stiffened(case, attempt, chosen)
@@ -207,21 +219,29 @@ def diagnose(
                 attempt, chosen, constants = beside
     after = attempt.state(chosen)
     findings = [*constants, *(attempt.tracing.finding(chosen, k) for k in chosen)]
-    named, again = after.system != system, "fitting the model with what was found"
+    named, partial = after.system != system, stop()
     estimator_after = before
-    if named:
-        rest = 1.0 - SEARCHED
+    if named and not partial:
+        what, rest = "fitting the model with what was found", 1.0 - SEARCHED
         estimator_after, _ = _session(
-            after.system, blocks, source, prior, lambda share: progress(again, SEARCHED + rest * share)
+            after.system, blocks, source, prior, lambda share: progress(what, SEARCHED + rest * share)
         )
     said = verdict(
         named, share_left(bare.excess, after.excess), after.test, bare.test, [each.candidate for each in findings]
     )
+    grave = said == "clean" and Evaluation(Statistics.of(before), before.estimate()).trust.grave
+    if said == "clean" and mistakes:
+        said = "named"
     unexplained = None
-    if said == "unexplained":
+    if grave:
+        # Rows at noise and a model that cannot be: none of it is clean.
+        said = "unexplained"
+    elif said == "unexplained":
         unexplained = describe_residual(attempt.rows, attempt.tracing.columns(chosen), after.residual, bare.test)
     return Diagnosis(
         verdict=said,
+        partial=partial,
+        mistakes=mistakes,
         findings=findings,
         late=late,
         ranking=ranking,
@@ -235,6 +255,29 @@ def diagnose(
         estimator_after=estimator_after,
         unexplained=unexplained,
     )
+
+
+def _check_measured(session: Estimator, source: str) -> None:
+    if session.momentum is None:
+        lacking = f"no {session.sensing.missing[0]}" if session.sensing.missing else 'balance = "energy"'
+        raise InputError(
+            source, "", f"{lacking}, so no momentum balance", "a system whose coordinates are all measured"
+        )
+    if session.momentum.sensor_noise is None:
+        raise InputError(source, "", "too few samples to estimate the sensors' noise", "a longer capture")
+
+
+def _in_seconds(blocks: Sequence[Block], unit: float) -> list[Block]:
+    """Blocks whose stamps were so many a second."""
+    return [Block(block.t / unit, block.channels, block.values) for block in blocks]
+
+
+def _undone(blocks: Sequence[Block], corrected: Corrected) -> list[Block]:
+    """Blocks without the mistakes found, as one: an encoder is unwrapped from its first sample on."""
+    if not blocks:
+        return []
+    t, values = (np.concatenate([getattr(block, part) for block in blocks]) for part in ("t", "values"))
+    return [Block(t, blocks[0].channels, corrected.samples(blocks[0].channels, values))]
 
 
 def _explains_little(estimator: Estimator) -> bool:

@@ -15,6 +15,7 @@ from sms_online.description.schema import System
 from sms_online.diagnosis.diagnose import Diagnosis as Search
 from sms_online.diagnosis.diagnose import diagnose as search_for_effects
 from sms_online.diagnosis.document import diagnosis_document, trust_of
+from sms_online.diagnosis.mistakes import Mistake
 from sms_online.errors import InputError
 from sms_online.pipeline.estimator import Estimator
 from sms_online.priors import base_prior
@@ -62,20 +63,21 @@ class Fit:
 
 @dataclass(frozen=True)
 class Candidate:
-    """An effect that was tried. gain: evidence, twice the log likelihood ratio, of the effect alone. share: of what is
-    beyond noise, that it takes."""
+    """An effect that was tried. gain: evidence, twice the log likelihood ratio, of the effect alone. explained: share
+    of the whole residual, noise included, that it explains alone."""
 
     name: str
     where: str
     gain: float
-    share: float
+    explained: float
 
 
 @dataclass(frozen=True)
 class Diagnosis:
     """What a capture holds that its system file does not describe.
 
-    verdict: "clean", "named" or "unexplained". summary: the same in a sentence. effects: what was found. before, after:
+    verdict: "clean", "named" or "unexplained". summary: the same in a sentence. mistakes: of units, signs and wiring,
+    undone in what follows. effects: what was found. before, after:
     fits of the system as described and with what was found. candidates: effects that were tried, the best first.
     system: with what was found, to estimate with. trust: may the parameters after, and the system file, be trusted.
     warnings: a sentence each.
@@ -83,6 +85,7 @@ class Diagnosis:
 
     verdict: str
     summary: str
+    mistakes: tuple[Mistake, ...]
     effects: tuple[Finding, ...]
     before: Fit
     after: Fit
@@ -130,13 +133,15 @@ def diagnose(
     holdout: Data | None = None,
     prior: bool = False,
     progress: Callable[[str, float], None] = lambda what, share: None,
+    stop: Callable[[], bool] = lambda: False,
 ) -> Diagnosis:
     """Find what recorded data hold that a system file does not describe, and describe it.
 
-    system, data: as for `estimate`. holdout: another capture of the same rig, to check on; without it the last third of
-    the data. prior: start from nominal values, each ± 10 %. progress: is called with what is being done, a few words,
-    and the share of all that is done, roughly. Raises InputError where the data cannot be read or do not fit the
-    system, a coordinate is not measured, parameters jump within the capture, or there is too little motion.
+    system, data: as for `estimate`. holdout: another capture of the same rig, to check on; without it blocks of the
+    data, each predicted from the others. prior: start from nominal values, each ± 10 %. progress: is called with what
+    is being done, a few words, and the share of all that is done, roughly. stop: is asked between steps whether to end
+    with a partial verdict. Raises InputError where the data cannot be read or do not fit the system, a coordinate is
+    not measured, parameters jump within the capture, or there is too little motion.
     """
     system, folder = given_system(system)
     recorded = recorded_session(system, data, folder)
@@ -154,12 +159,13 @@ def diagnose(
     def known(estimator: Estimator) -> Prior | None:
         return base_prior(system, estimator.base, prior) if prior or system.priors else None
 
-    found = search_for_effects(system, blocks, recorded.name, known, held, progress)
+    found = search_for_effects(system, blocks, recorded.name, known, held, progress, stop)
     true = None if recorded.truth is None else true_values(recorded.truth, system, found.after.system)
     document = diagnosis_document(found, warnings, true)
     return Diagnosis(
         verdict=found.verdict,
         summary=document["summary"],
+        mistakes=found.mistakes,
         effects=tuple(map(Finding.of, document["effects"])),
         before=Fit._of(document["before"]),
         after=Fit._of(document["after"]),

@@ -23,9 +23,11 @@ from sms_online.pipeline.statistics import Statistics
 from sms_online.result import residual_document, result_of
 from sms_online.stream import Array
 from sms_online.threads import one_blas_thread
-from sms_online.trust import Residual, Trust
+from sms_online.trust import Reason, Residual, Trust
 
 SCHEMA = "sms-online/diagnosis/1"
+# What was found by comparing whole descriptions competes with no columns.
+NO_RIVAL = {"next": None, "next_held_out_improvement": None}
 
 
 @one_blas_thread()
@@ -39,12 +41,23 @@ def diagnosis_document(
     before, after = diagnosis.before, diagnosis.after
     sessions = {"before": evaluation(diagnosis.estimator_before), "after": evaluation(diagnosis.estimator_after)}
     results = {name: result_of(session, truth).document() for name, session in sessions.items()}
-    unexplained, given = diagnosis.unexplained, diagnosis.attempt.prior is not None
+    unexplained, given = diagnosis.unexplained, _from_rows(diagnosis)
     return {
         "schema": SCHEMA,
         "verdict": diagnosis.verdict,
+        "partial": diagnosis.partial,
         "summary": summary(diagnosis),
         "judgement": trust_of(diagnosis, sessions["after"]).document(),
+        "mistakes": [
+            {
+                "name": mistake.name,
+                "where": mistake.where,
+                "sentence": mistake.sentence,
+                "next_step": mistake.step,
+                "or_else": list(mistake.or_else),
+            }
+            for mistake in diagnosis.mistakes
+        ],
         "effects": [_effect(diagnosis, finding) for finding in diagnosis.findings] + _by_comparison(diagnosis),
         "steps": [
             {"taken": step.taken, "effects": list(step.effects), "holdout": step.relative} for step in diagnosis.steps
@@ -54,7 +67,7 @@ def diagnosis_document(
                 "fit": residual_document(_part(state.fit)),
                 "holdout": residual_document(_part(state.holdout)),
                 "limit": {row: test.limit for row, test in state.test.items()},
-                "parameters": results[name]["parameters"] if attempt.prior is None else _posterior(attempt, chosen),
+                "parameters": _posterior(attempt, chosen) if _from_rows(diagnosis) else results[name]["parameters"],
             }
             for name, state, attempt, chosen in (
                 ("before", before, diagnosis.described, []),
@@ -76,7 +89,7 @@ def diagnosis_document(
                 "name": ranked.candidate.effect.name,
                 "where": ranked.candidate.effect.where,
                 "gain": ranked.gain,
-                "share": ranked.share,
+                "explained": ranked.explained,
             }
             for ranked in diagnosis.ranking
         ],
@@ -93,9 +106,14 @@ def evaluation(session: Estimator) -> Evaluation:
     return Evaluation(Statistics.of(session), session.estimate())
 
 
+def _from_rows(diagnosis: Diagnosis) -> bool:
+    """Whether parameters come from the rows of the diagnosis, not from a session."""
+    return diagnosis.attempt.prior is not None or diagnosis.partial
+
+
 def _after(diagnosis: Diagnosis, session: Evaluation) -> Trust:
     """May the parameters after be trusted?"""
-    if diagnosis.attempt.prior is None:
+    if not _from_rows(diagnosis):
         return session.trust
     # Parameters come from the rows of the diagnosis then, see `_posterior`.
     known = [p["identifiable"] for p in _posterior(diagnosis.attempt, diagnosis.chosen)]
@@ -110,13 +128,38 @@ def trust_of(diagnosis: Diagnosis, after: Evaluation | None = None) -> Trust:
     after = evaluation(diagnosis.estimator_after) if after is None else after
     effects = [f"{effect['name']}@{effect['where']}" for effect in _named(diagnosis)]
     row = None if diagnosis.unexplained is None else diagnosis.unexplained.row
-    return judge_diagnosis(diagnosis.verdict, effects, row, _after(diagnosis, after), _near(diagnosis))
+    rest = _after(diagnosis, after)
+    if not diagnosis.mistakes:
+        return judge_diagnosis(diagnosis.verdict, effects, row, rest, _near(diagnosis))
+    if effects or row is not None:
+        rest = judge_diagnosis(diagnosis.verdict, effects, row, rest, _near(diagnosis))
+    # The numbers are those of corrected samples: as recorded, or as described, they would be wrong without limit.
+    wrong = [Reason(m.sentence, True, tuple(m.where.split(", ")), "a mistake", then=m.step) for m in diagnosis.mistakes]
+    return Trust("doubt", (*wrong, *(rest.grounds if rest.level != "trust" else ())), grave=True)
 
 
 def summary(diagnosis: Diagnosis) -> str:
-    """The verdict in a sentence."""
+    """The verdict in a sentence, after one for each mistake."""
+    return f"Partial, the search was interrupted. {_whole(diagnosis)}" if diagnosis.partial else _whole(diagnosis)
+
+
+def _whole(diagnosis: Diagnosis) -> str:
+    mistakes = ["".join((m.sentence[:1].upper(), m.sentence[1:], ".")) for m in diagnosis.mistakes]
+    for k, mistake in enumerate(diagnosis.mistakes):
+        if mistake.or_else:
+            mistakes[k] = f"{mistakes[k][:-1]}, or {'; or '.join(mistake.or_else)}: these data cannot decide it."
+    if mistakes and diagnosis.verdict == "named" and not _named(diagnosis):
+        return " ".join((*mistakes, "With that undone nothing but noise is left."))
+    return " ".join((*mistakes, *(["With that undone:"] if mistakes else []), _of_effects(diagnosis)))
+
+
+def _of_effects(diagnosis: Diagnosis) -> str:
+    """What is missing in a sentence."""
     if diagnosis.verdict == "clean":
         return "Nothing but noise is left: the model explains the capture."
+    if diagnosis.verdict == "unexplained" and diagnosis.unexplained is None:
+        reason = _after(diagnosis, evaluation(diagnosis.estimator_after)).reasons[0]
+        return f"No effect of the catalogue is seen in what the rows leave, but {reason}."
     keys = [f"{effect['name']} at {effect['where']}" for effect in _named(diagnosis)]
     before, after = diagnosis.before.holdout.whitened, diagnosis.after.holdout.whitened
     row = max(before, key=lambda name: before[name] ** 2 - after[name] ** 2)
@@ -132,10 +175,12 @@ def summary(diagnosis: Diagnosis) -> str:
             f"What the model lacks comes near {', '.join(keys)}, but is more or something else: {falls}, and "
             f"what is left {rest}."
         )
-    tried = (
-        f" The nearest known effects ({', '.join(keys)}) leave {100.0 * diagnosis.left:.0f} % of it." if keys else ""
-    )
+    tried = f" The nearest known effects ({', '.join(keys)}) leave {_share(diagnosis.left)} of it." if keys else ""
     return f"The model lacks something that no known effect explains: it {rest}.{tried}"
+
+
+def _share(left: float) -> str:
+    return f"{100.0 * left:.0f} %" if left < 1.0 else "all"
 
 
 def _near(diagnosis: Diagnosis) -> bool:
@@ -159,21 +204,25 @@ def _part(part: Part) -> dict[str, Residual]:
 
 def _effect(diagnosis: Diagnosis, finding: Finding) -> dict[str, Any]:
     effect = finding.candidate.effect
-    units = declarable(ENTRIES[effect.name], diagnosis.after.system)
+    entry, found = ENTRIES[effect.name], coefficients(diagnosis, finding)
+    units = declarable(entry, diagnosis.after.system)
+    alike = [*([f"{effect.name}@{entry.relative_to}"] if entry.relative_to else []), *finding.ambiguous]
     units |= {p.quantity: p.unit for p in finding.candidate.parameters if p.quantity in units}
     return {
         "name": effect.name,
         "where": effect.where,
         "coefficients": {
-            name: {"estimate": value, "std": std, "unit": units.get(name, "")}
-            for name, (value, std) in coefficients(diagnosis, finding).items()
+            name: {"estimate": value, "std": std, "unit": units.get(name, "")} for name, (value, std) in found.items()
         },
-        "ambiguous_with": list(finding.ambiguous),
-        "separated_by": ENTRIES[effect.name].separated_by if finding.ambiguous else None,
+        "sentence": entry.said(effect.where, {name: value for name, (value, _) in found.items()}) if entry.said else "",
+        "ambiguous_with": alike,
+        "separated_by": entry.separated_by if alike else None,
         "evidence": {
             "gain": finding.gain.gain,
             "limit": finding.limit,
             "held_out_improvement": finding.improvement,
+            "next": None if finding.rival is None else finding.rival.key,
+            "next_held_out_improvement": None if finding.rival is None else finding.rival.improvement,
         },
     }
 
@@ -187,9 +236,15 @@ def _by_comparison(diagnosis: Diagnosis) -> list[dict[str, Any]]:
             "coefficients": {
                 "corner": {"estimate": found.effect.coefficients["corner"], "std": found.std, "unit": "Hz"}
             },
+            "sentence": "",
             "ambiguous_with": list(found.ambiguous),
             "separated_by": ENTRIES[found.effect.name].separated_by if found.ambiguous else None,
-            "evidence": {"gain": found.gain, "limit": found.limit, "held_out_improvement": found.improvement},
+            "evidence": {
+                "gain": found.gain,
+                "limit": found.limit,
+                "held_out_improvement": found.improvement,
+                **NO_RIVAL,
+            },
         }
         for found in diagnosis.late
     ]
@@ -199,12 +254,14 @@ def _by_comparison(diagnosis: Diagnosis) -> list[dict[str, Any]]:
             "name": effect.name,
             "where": effect.where,
             "coefficients": {},
+            "sentence": "",
             "ambiguous_with": [],
             "separated_by": None,
             "evidence": {
                 "gain": diagnosis.before.excess * (1.0 - diagnosis.left),
                 "limit": 0.0,
                 "held_out_improvement": None,
+                **NO_RIVAL,
             },
         }
         for effect in diagnosis.attempt.system.effects
@@ -273,6 +330,11 @@ def _batch(attempt: Attempt, chosen: Sequence[int]) -> _Batch:
     kept = [k for k, p in enumerate(parameters) if p.name not in constants]
     shapes, moved = slopes(attempt.tracing, attempt.make, chosen)
     covariance = attempt.tracing.covariance(chosen, moved)
+    # Rows that leave more than noise tell coefficients no better than the blocks of the session agree on them.
+    white, blocks = np.sqrt(np.diag(covariance)), np.zeros(len(covariance))
+    blocks[: len(parameters)] = attempt.tracing.spread(chosen)
+    wider = np.maximum(1.0, np.divide(blocks, white, out=np.ones_like(white), where=np.isfinite(white) & (white > 0.0)))
+    covariance = covariance * wider * wider[:, None]
     stds = np.sqrt(np.diag(covariance)[len(parameters) :]).tolist()
     told = {shape: std for shape, std in zip(shapes, stds, strict=True) if np.isfinite(std)}
     values = attempt.solution(chosen)[kept]

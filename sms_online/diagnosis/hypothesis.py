@@ -6,16 +6,18 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sms_online.description.schema import Effect
 from sms_online.diagnosis.candidate import Candidate
 from sms_online.diagnosis.candidates import CandidateColumns
 from sms_online.diagnosis.constants import improved
+from sms_online.diagnosis.folds import Folds
 from sms_online.diagnosis.residuals import RowResidual
 from sms_online.diagnosis.shape import refine
 from sms_online.diagnosis.trace import Tracing
 from sms_online.effects.traits import INEXACT
+from sms_online.evaluation import POSITIVE
+from sms_online.row_types import row_types
 from sms_online.stream import Array
 from sms_online.trackers.interface import Prior
 
@@ -23,8 +25,6 @@ from sms_online.trackers.interface import Prior
 SETTLED = 0.1
 # Times that constants are improved, each with samples corrected by those found before.
 CORRECTIONS = 3
-# Share of a session that coefficients are fitted to where no other capture is held out; the rest checks them.
-FITTED = 2.0 / 3.0
 # Times at most that rows are weighed anew by what was found, to search again.
 REWEIGHED = 2
 # A verdict names effects that take away all but this share of what is beyond noise: a wrong one that is 10° from the
@@ -44,25 +44,41 @@ class Hypothesis:
         self,
         make: CandidateColumns,
         candidates: Sequence[Candidate],
-        fitted: NDArray[np.bool_],
+        folds: Folds,
         prior: Prior | None,
         constants: Sequence[Effect] = (),
     ) -> None:
-        """fitted (W,): windows that tell coefficients; the others check them."""
+        """folds: blocks of the windows (W,) that are held out in turn."""
         self.make, self.rows = make, make.rows
-        self.prior, self.fitted = prior, fitted
+        self.prior, self.folds = prior, folds
         self.constants = list(constants)
         self.trace(candidates)
 
     def trace(self, candidates: Sequence[Candidate]) -> None:
         """Begin to search with the weights that the rows have now."""
         self.fixed = [self.make.of(effect) for effect in self.constants]
-        declared = (f"{effect.name}@{effect.where}" for effect in self.rows.model.system.effects)
-        self.tracing = Tracing(self.rows, candidates, self.fitted, self.prior, self.fixed, self.make, declared)
+        model = self.rows.model
+        self.tracing = Tracing(
+            self.rows,
+            candidates,
+            self.folds,
+            self.prior,
+            self.fixed,
+            self.make,
+            declared=(f"{effect.name}@{effect.where}" for effect in model.system.effects),
+            types=row_types(model.layout).values(),
+            of_effects=["@" in p.name for p in self.rows.base.parameters],
+            positive=[p.name.endswith(POSITIVE) for p in self.rows.base.parameters],
+            calibrated=self.rows.calibrated,
+        )
 
     def run(self) -> list[int]:
         """Numbers of the candidates found, with the rows' weights as they are."""
-        return self.tracing.run(lambda chosen, k: refine(self.tracing, self.make, chosen, k))
+        return self.tracing.run(lambda chosen, k: refine(self.tracing, self.make, chosen, k), self.watch)
+
+    def watch(self, chosen: Sequence[int]) -> bool:
+        """Whether to end the search with those chosen so far."""
+        return False
 
     @property
     def everything(self) -> range:
@@ -70,8 +86,8 @@ class Hypothesis:
         return range(len(self.tracing.candidates))
 
     def solution(self, chosen: Sequence[int]) -> Array:
-        """Parameters, what constants change by, and coefficients, from all windows."""
-        return self.tracing.solution(chosen, np.ones(self.rows.count, dtype=bool))
+        """Parameters, what constants change by, coefficients, and calibration, from all windows."""
+        return self.tracing.solution(chosen)
 
     def residual(self, chosen: Sequence[int]) -> Array:
         """What is left of every row (W, n_v) over its deviation."""

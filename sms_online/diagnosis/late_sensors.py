@@ -14,13 +14,13 @@ from dataclasses import dataclass, replace
 from fnmatch import fnmatchcase
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import minimize_scalar
 
 from sms_online.description.schema import Effect
 from sms_online.diagnosis.candidates import CandidateColumns
 from sms_online.diagnosis.constants import corrected
 from sms_online.diagnosis.evidence import RANK_TOLERANCE, threshold
+from sms_online.diagnosis.folds import Folds
 from sms_online.diagnosis.record import Segment
 from sms_online.diagnosis.rows import SessionRows
 from sms_online.diagnosis.weak_windows import Motion, WeakWindows
@@ -44,6 +44,8 @@ SAME_SHARE = 0.03
 TOLERANCE, EVALUATIONS = 3e-3, 15
 # Step of the logarithm of a corner to tell how sharp its optimum is.
 SHARPNESS_STEP = 0.05
+# One block in so many checks what the others say.
+CHECKED = 3
 # Windows in a row that are asked, of three times as many: a sensor that is so late shows everywhere.
 STRETCH = 3 * HOPS
 STIFFNESS = ("stiffness", "flexural_rigidity", "flexural_rigidity_y", "flexural_rigidity_z", "torsional_rigidity")
@@ -82,7 +84,8 @@ class LateSensor:
 class Motions:
     """Asks how well the masses can follow the springs, for readings with a lag taken off."""
 
-    def __init__(self, rows: SessionRows, make: CandidateColumns, fitted: NDArray[np.bool_]) -> None:
+    def __init__(self, rows: SessionRows, make: CandidateColumns, folds: Folds) -> None:
+        fitted = folds.block % CHECKED != CHECKED - 1
         some = np.arange(rows.count) // STRETCH % 3 == 0
         if min(np.count_nonzero(fitted[some]), np.count_nonzero(~fitted[some])) < STRETCH:
             some = np.ones(rows.count, dtype=bool)
@@ -159,12 +162,13 @@ class Motions:
         return float(2.0 * independent * np.log(before / max(after, np.finfo(np.float64).tiny)))
 
 
-def find_late(rows: SessionRows, make: CandidateColumns, fitted: NDArray[np.bool_]) -> LateSensor | None:
+def find_late(rows: SessionRows, make: CandidateColumns, folds: Folds) -> LateSensor | None:
     """The sensors whose lag, taken off, lets the masses follow the springs; None where no lag does so.
 
-    make: gives what declared effects need along a motion. fitted (W,): windows that tell; the others check.
+    make: gives what declared effects need along a motion. folds: blocks of the windows, one in
+    CHECKED of which checks the others.
     """
-    motions = Motions(rows, make, fitted)
+    motions = Motions(rows, make, folds)
     places = motions.places() if motions.asked else []
     if not places:
         return None

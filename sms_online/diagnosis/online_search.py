@@ -11,13 +11,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sms_online.description.schema import Effect, System
 from sms_online.diagnosis.candidate import Candidate, LeftOpen
 from sms_online.diagnosis.candidates import CandidateColumns
 from sms_online.diagnosis.constants import applied, corrected, improved, is_constant, stands
-from sms_online.diagnosis.hypothesis import FITTED, REWEIGHED, Hypothesis, corrections, share_left, verdict
+from sms_online.diagnosis.folds import Folds
+from sms_online.diagnosis.hypothesis import REWEIGHED, Hypothesis, corrections, share_left, verdict
 from sms_online.diagnosis.record import Segment, bounded, excerpts
 from sms_online.diagnosis.reported import of_constant, of_unknowns
 from sms_online.diagnosis.residuals import ResidualTest
@@ -34,7 +34,7 @@ from sms_online.stream import Array
 from sms_online.threads import one_blas_thread
 from sms_online.trackers.interface import Prior
 
-# Windows that the effect acts in, of which a third checks what the others say.
+# Windows that the effect acts in, in blocks of which each checks what the others say.
 LEAST_WINDOWS = 12
 # What takes less than this share of what the best effect takes is rather an error of that one's model, for real
 # friction has no corner; else it is found once the others have been taken up.
@@ -186,12 +186,10 @@ def _rows(request: Request, beta: Array, late: int = 0, constants: Sequence[Effe
     return SessionRows(request.model, request.base, request.sensing, request.noise, segments, beta)
 
 
-def _fitted(rows: SessionRows, late: int) -> NDArray[np.bool_]:
-    """All windows before, and so many of those that the effect acts in."""
-    acting = np.flatnonzero(rows.weak.windows.segment >= late)
-    fitted = np.ones(rows.count, dtype=bool)
-    fitted[acting[round(FITTED * acting.size) :]] = False
-    return fitted
+def _folds(rows: SessionRows, late: int) -> Folds:
+    """Blocks of the windows that the effect acts in; all those before are fitted always."""
+    segment = rows.weak.windows.segment
+    return Folds.of(segment, rows.time, segment >= late)
 
 
 def _trace(request: Request, rows: SessionRows, everything: Sequence[Candidate], late: int) -> Outcome:
@@ -199,7 +197,7 @@ def _trace(request: Request, rows: SessionRows, everything: Sequence[Candidate],
     system = request.model.system
     make = LateColumns(rows, system, late)
     limited = [make.limited(candidate) for candidate in everything]
-    some = Hypothesis(make, [c for c in limited if np.any(c.columns)], _fitted(rows, late), request.prior)
+    some = Hypothesis(make, [c for c in limited if np.any(c.columns)], _folds(rows, late), request.prior)
     tracing = some.tracing
     ranking = tracing.ranking()[:TOLD]
     chosen = some.run()
@@ -262,7 +260,7 @@ def _corrected(request: Request, some: Hypothesis, chosen: Sequence[int], late: 
     def trial(constants: Sequence[Effect], beta: Array) -> Hypothesis:
         rows = _rows(request, beta, late, constants)
         make = LateColumns(rows, applied(request.model.system, constants), late)
-        trial = Hypothesis(make, [make.of(force) for force in forces], _fitted(rows, late), request.prior, constants)
+        trial = Hypothesis(make, [make.of(force) for force in forces], _folds(rows, late), request.prior, constants)
         trial.tracing.settle(trial.everything)
         return trial
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,8 +18,7 @@ from sms_online.stream import Array
 class RelativeResiduals:
     """Rows of the joints over the session, of a model and of effects beside it.
 
-    A window belongs to the part of the session that its middle lies in: `times` (W,), s since grid index 0, and the
-    segment's number, `segment` (W,).
+    times (W,): the windows' middles, s since grid index 0. segment (W,): numbers of the segments that hold them.
     """
 
     def __init__(self, rows: SessionRows, make: CandidateColumns) -> None:
@@ -30,7 +29,8 @@ class RelativeResiduals:
         self._make = make.within(weak, resting=True)
         starts, segments = weak.windows.start, weak.windows.segment
         firsts = np.array([segment.index[0] for segment in rows.segments])
-        self.times = (firsts[segments] + starts + weak.windows.width / 2) / rows.model.system.sample_rate
+        middles = firsts[segments] + starts + weak.windows.width / 2
+        self.times = np.asarray(middles / rows.model.system.sample_rate, dtype=np.float64)
         self.segment = segments
 
         def model(motion: Motion) -> tuple[Array, Array]:
@@ -48,10 +48,16 @@ class RelativeResiduals:
         """Effects whose coefficients a solution holds after the model's parameters, in this order."""
         self._effects = [self._make.of(effect).columns[:, self._joints] for effect in effects]
 
-    def of(self, solution: Array, windows: NDArray[np.bool_]) -> dict[str, float]:
-        """By joint, over some of the windows (W,), for parameters and coefficients (n + c,)."""
-        columns = np.concatenate([self._Y, *self._effects], axis=2)[windows]
-        left = self._b[windows] - columns @ solution
-        size = np.linalg.norm(self._measured[windows], axis=0)
+    def of(self, solution: Array, held: Iterable[tuple[NDArray[np.bool_], Array]] = ()) -> dict[str, float]:
+        """By joint, for a solution (n + c + m,); held: windows (W,) that another solution predicts.
+
+        Calibration is left out: within its tolerances it is little beside a torque.
+        """
+        columns = np.concatenate([self._Y, *self._effects], axis=2)
+        c = columns.shape[2]
+        left = self._b - columns @ solution[:c]
+        for windows, other in held:
+            left[windows] = self._b[windows] - columns[windows] @ other[:c]
+        size = np.linalg.norm(self._measured, axis=0)
         ratio = np.divide(np.linalg.norm(left, axis=0), size, out=np.zeros_like(size), where=size > 0.0)
         return {joint_rows(i): float(r) for i, r in enumerate(ratio)}

@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.stats import chi2
 
 from sms_online.diagnosis.rows import SessionRows
@@ -53,9 +52,9 @@ class ResidualTest:
         return {name: RowResidual(rms(residual[:, speeds]), self.limit[name]) for name, speeds in self.types.items()}
 
 
-def whitened(rows: SessionRows, residual: Array, windows: NDArray[np.bool_]) -> dict[str, float]:
-    """rms by row type over some windows (W,)."""
-    return {name: rms(residual[windows][:, speeds]) for name, speeds in row_types(rows.model.layout).items()}
+def whitened(rows: SessionRows, residual: Array) -> dict[str, float]:
+    """rms of residuals (W, n_v) by row type."""
+    return {name: rms(residual[:, speeds]) for name, speeds in row_types(rows.model.layout).items()}
 
 
 def rms(values: Array | Sequence[float]) -> float:

@@ -11,6 +11,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from sms_online.calibration.columns import CalibrationColumns, nuisances
+from sms_online.diagnosis.calibrated import Calibrated
 from sms_online.diagnosis.followed import FollowedMotion
 from sms_online.diagnosis.record import Segment
 from sms_online.diagnosis.weak_rows import WeakRows
@@ -65,11 +67,13 @@ class SessionRows(WeakRows):
 
     time (W,): the windows' middles, s since grid index 0. weak: evaluates further columns. Once they are weighed: beta
     (n,), values behind their noise; second_order: variance of what noise does beyond first order; responses, name to
-    (W, n_v, sensors): of the rows to so much added to each position sensor's reading.
+    (W, n_v, sensors): of the rows to so much added to each position sensor's reading; calibrated: columns of what the
+    description may be off by.
     """
 
     beta: Array
     responses: dict[str, Array]
+    calibrated: Calibrated
 
     def __init__(
         self,
@@ -152,9 +156,19 @@ class SessionRows(WeakRows):
         self.beta = beta
         if self._given is None:
             self.second_order = self._second_order()
-        noise = WindowNoise(model, self.base, balance, self.sensing.displacements, clock_groups(self.sensing))
+        sensing = self.sensing
+        calibration = CalibrationColumns(model, sensing, balance.span)
+        noise = WindowNoise(
+            model,
+            self.base,
+            balance,
+            sensing.displacements,
+            clock_groups(sensing),
+            calibration if calibration.count else None,
+        )
         covariances: list[list[Array]] = []
         responses: list[Array] = []
+        columns: list[Array] = []
         for told in self._told:
             noise.begin(beta, self.noise, 0)
             self._tell(noise, told.instants)
@@ -162,11 +176,14 @@ class SessionRows(WeakRows):
             for window, own, added in zip(told.windows, rounding(largest), told.displacements, strict=True):
                 propagated = noise.push(window, self.second_order.variance(window.half_width) + own)
                 covariances.append(propagated.covariances)
+                columns.append(propagated.calibration)
                 # Sums over the steps, sensor by sensor.
                 by_sensor = propagated.kernel.transpose(2, 1, 0) * (balance.span / STEPS)
                 responses.append((by_sensor @ added.transpose(2, 1, 0)).transpose(2, 1, 0))
         stacked = np.array(responses).reshape(self.count, len(DISPLACEMENTS), model.layout.n_v, -1)
         self.responses = dict(zip(DISPLACEMENTS, np.moveaxis(stacked, 1, 0), strict=True))
+        of_calibration = np.array(columns).reshape(self.count, model.layout.n_v, calibration.count)
+        self.calibrated = Calibrated.of(nuisances(sensing), of_calibration)
         self.have_noise(covariances)
 
     def _second_order(self) -> SecondOrderNoise:

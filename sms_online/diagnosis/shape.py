@@ -41,8 +41,8 @@ def slopes(tracing: Tracing, make: CandidateColumns, chosen: Sequence[int]) -> t
     (W, n_v, shapes). What follows from coefficients is none of them.
     """
     names, found = [], [np.empty((*tracing.rows.b.shape, 0))]
-    solution = tracing.solution(chosen, np.ones(tracing.rows.count, dtype=bool))
-    at = len(solution) - sum(len(tracing.candidates[k].parameters) for k in chosen)
+    solution = tracing.solution(chosen)
+    at = tracing.n_model
     for candidate in (tracing.candidates[k] for k in chosen):
         effect, own = candidate.effect, solution[at : at + len(candidate.parameters)]
         at += own.size
@@ -76,9 +76,9 @@ def _settle(tracing: Tracing, make: CandidateColumns, chosen: Sequence[int], k: 
         return
     for _ in range(SETTLED):
         effect = tracing.candidates[k].effect
-        solution = tracing.solution(chosen, np.ones(tracing.rows.count, dtype=bool))
+        solution = tracing.solution(chosen)
         sizes = [len(tracing.candidates[other].parameters) for other in chosen]
-        first = len(solution) - sum(sizes[chosen.index(k) :])
+        first = tracing.n_model + sum(sizes[: chosen.index(k)])
         own = solution[first : first + sizes[chosen.index(k)]]
         told = make.reported(effect, solution[: tracing.rows.Y.shape[2]], own)
         moved = effect.coefficients | {name: told[name] for name in effect.coefficients.keys() & told.keys()}

@@ -17,6 +17,8 @@ from sms_online.stream import Array
 
 # Fixed-point steps from a reading back to the angle; the error falls by the amplitude (rad) each.
 INVERSIONS = 20
+# A disc's centre is off by a tenth of its radius at most.
+LARGEST_ECCENTRICITY = 0.1
 
 
 class Linear(NamedTuple):
@@ -75,7 +77,8 @@ class EncoderOffset(ChannelEffect):
     entry = Entry(
         "encoder_offset", "channel", "position", {"offset": "rad"},
         "the same motion about other positions of the joint",
-        traits=Traits(signed=True),
+        traits=Traits(signed=True, calibrates=("encoder_zero", "marker_zero", "marker_zero_angle")),
+        said=lambda where, given: f"{where} reads {given['offset']:.3g} too much: set its zero anew",
     )  # fmt: skip
     linear = (Linear("offset", "rad", "one", -1.0),)
 
@@ -100,7 +103,7 @@ class EncoderEccentricity(ChannelEffect):
     entry = Entry(
         "encoder_eccentricity", "channel", "angle", {"amplitude": "rad", "phase": "rad"},
         "whole turns of the joint, or large angles to both sides",
-        traits=Traits(signed=True),
+        traits=Traits(signed=True, most=LARGEST_ECCENTRICITY, calibrates=("once_per_turn",)),
     )  # fmt: skip
     linear = (Linear("sine", "rad", "sine", -1.0), Linear("cosine", "rad", "cosine", -1.0))
 
@@ -121,6 +124,11 @@ class EncoderEccentricity(ChannelEffect):
         for _ in range(INVERSIONS):
             angle = samples - self._error(angle)
         return angle
+
+    @classmethod
+    def possible(cls, given: Mapping[str, float], sample_rate: float) -> bool:
+        """Whether it is that of a disc."""
+        return given["amplitude"] <= LARGEST_ECCENTRICITY
 
     @classmethod
     def improved(cls, given: Mapping[str, float], increments: Array) -> dict[str, float]:

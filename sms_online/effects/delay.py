@@ -65,7 +65,7 @@ class SensorLag(Convolved):
     entry = Entry(
         "sensor_lag", "channel", "position", {"corner": "Hz"}, "motion at two frequencies, or fast vibration",
         {"corner": Shape("Hz", 30.0, _corners)},
-        traits=Traits(most=LONGEST_FOUND, behind=HELD),
+        traits=Traits(most=LONGEST_FOUND, behind=HELD, calibrates=("clock",)),
     )  # fmt: skip
     linear = (Linear("delay", "s", "rate", 1.0),)
     filtered = True
@@ -126,7 +126,7 @@ class TorqueDelay(Convolved):
 
     entry = Entry(
         "torque_delay", "channel", "driven joint", {"time": "s"}, "fast reversals of the torque",
-        traits=Traits(least=SHORTEST_TORQUE_DELAY, most=LONGEST_FOUND),
+        traits=Traits(least=SHORTEST_TORQUE_DELAY, most=LONGEST_FOUND, calibrates=("clock",)),
     )  # fmt: skip
     linear = (Linear("time", "s", "torque rate", -1.0),)
 

@@ -20,6 +20,8 @@ from sms_online.stream import Array
 # Torque sensors, and models of what a torque moves, are right to a thousandth at best: a gain or ripple below that is
 # no fault of theirs. With a gain of -1 a measured torque explains itself and the arm weighs nothing.
 LEAST_RATIO, LARGEST_RATIO = 1e-3, 0.5
+# Torque constants of two drives differ by a tenth or two; more is a mistake of unit or gear, or not of the drive.
+LARGEST_GAIN = 0.3
 # Orders that windings and poles of usual motors give, per motor turn.
 ORDERS = (1.0, 2.0, 3.0, 4.0, 6.0, 8.0, 12.0, 18.0, 24.0)
 
@@ -91,7 +93,8 @@ class TorqueOffset(MotorSide):
 
     entry = Entry(
         "torque_offset", "force", "driven joint", {"torque": "N m"}, "standstill under a known torque",
-        traits=Traits(signed=True, curve=Curve("motor speed"), begins=True, calibrates="drive_offset"),
+        traits=Traits(signed=True, curve=Curve("motor speed"), begins=True, calibrates=("drive_offset",)),
+        said=lambda where, given: f"the torque of {where} reads {given['torque']:.3g} too much: set its zero anew",
     )  # fmt: skip
 
     def __init__(self, site: Site, given: Mapping[str, float]) -> None:
@@ -103,6 +106,12 @@ class TorqueOffset(MotorSide):
         return np.full((v.shape[0], 1), -self.gear_ratio)
 
 
+def _gain_in_words(where: str, given: Mapping[str, float]) -> str:
+    ratio = given["ratio"]
+    reads = f"{where}'s torque reads {100.0 * abs(ratio):.2g} % {'low' if ratio > 0.0 else 'high'} against joint_1's"
+    return f"{reads}; which of them is right the data cannot decide"
+
+
 class TorqueGain(MotorSide):
     """The arm feels (1 + g) n τ where n τ is measured; g: `ratio`.
 
@@ -112,8 +121,9 @@ class TorqueGain(MotorSide):
     entry = Entry(
         "torque_gain", "force", "later joint", {"ratio": ""}, "motion of each joint alone, then of all",
         traits=Traits(
-            signed=True, least=LEAST_RATIO, most=LARGEST_RATIO, curve=Curve("torque"), calibrates="drive_gain"
+            signed=True, least=LEAST_RATIO, most=LARGEST_GAIN, curve=Curve("torque"), calibrates=("drive_gain",)
         ),
+        relative_to="joint_1", said=_gain_in_words,
     )  # fmt: skip
     needs_torque = True
 

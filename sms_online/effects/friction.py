@@ -117,7 +117,8 @@ class LoadFriction(MotorSide):
 
     entry = Entry(
         "load_friction", "force", "flexible joint", {"ratio": ""}, "the same speeds under little and much load",
-        traits=Traits(course="dry"),
+        # Gears lose up to a third of their load; one that loses more than half is locked by it.
+        traits=Traits(course="dry", limits={"ratio": (0.0, 0.5)}),
     )  # fmt: skip
 
     def __init__(self, site: Site, given: Mapping[str, float]) -> None:

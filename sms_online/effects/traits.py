@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from typing import Literal
 
 import numpy as np
@@ -41,8 +42,9 @@ class Traits:
     late may not. least, most: norm of the linear coefficients; a fit that needs others is of something else. behind: of
     a delay in s, the samples that it has to exceed. curve: None where the force is not a function of one variable.
     extends: name of a simpler effect that this one contains, which is tried first, as is everything else. begins:
-    whether it is tried where something changes while a session runs, at any joint. calibrates: the field of
-    `Tolerances` that a declaration at the same place replaces, for it is the same column; empty for none.
+    whether it is tried where something changes while a session runs, at any joint. calibrates: the
+    fields of `Tolerances` that a declaration at the same place says, for it is the same column. limits: of
+    coefficients as a person reads them, least and most, where what they are relative to decides.
     """
 
     signed: bool = False
@@ -53,7 +55,8 @@ class Traits:
     curve: Curve | None = None
     extends: str | None = None
     begins: bool = False
-    calibrates: str = ""
+    calibrates: tuple[str, ...] = ()
+    limits: Mapping[str, tuple[float, float]] = field(default_factory=dict)
 
     @property
     def reversing(self) -> bool:
@@ -77,3 +80,7 @@ class Traits:
         if self.behind is not None and coefficients[0] <= self.behind / sample_rate:
             return False
         return bool(self.least <= np.linalg.norm(coefficients) <= self.most)
+
+    def within(self, reported: Mapping[str, float]) -> bool:
+        """Whether coefficients as a person reads them are possible; not where any that has a limit is missing."""
+        return all(name in reported and least <= reported[name] <= most for name, (least, most) in self.limits.items())

@@ -17,6 +17,9 @@ from sms_online.model.effect import Inputs
 from sms_online.model.layout import Layout
 from sms_online.stream import Array
 
+# Gears are true to arc minutes; 0.1 rad would be seen by eye.
+LARGEST_ERROR = 0.1
+
 
 class Transmission(Force):
     """A generalized force pair along δ: what `along` gives acts on θ_m, and its opposite on q."""
@@ -135,7 +138,11 @@ class KinematicError(Transmission):
         "kinematic_error", "force", "flexible joint", {"amplitude": "rad", "phase": "rad"},
         "constant speeds that put the error's frequency below and above the joint's resonance",
         {"order": Shape("", 2.0, lambda ranges: (1.0, 2.0, 4.0), counted=True)},
-        traits=Traits(signed=True, curve=Curve("phase in the motor's turn", between=True)),
+        traits=Traits(
+            signed=True,
+            curve=Curve("phase in the motor's turn", between=True),
+            limits={"amplitude": (0.0, LARGEST_ERROR)},
+        ),
     )  # fmt: skip
 
     def __init__(self, site: Site, given: Mapping[str, float]) -> None:

@@ -11,6 +11,7 @@ from typing import Any
 from sms_online.description.parse import shipped_systems, shipped_text
 from sms_online.description.schema import System
 from sms_online.errors import InputError
+from sms_tools.found_effects import cells_of
 
 NAME = "system.toml"
 # Beside a recording, which holds the described system under that name.
@@ -33,6 +34,10 @@ def adopted_text(described: str, before: System, after: System, remarks: Mapping
         else:
             first_table = next((k for k, line in enumerate(lines) if line.startswith("[")), len(lines))
             lines[first_table:first_table] = [gravity, ""]
+    for i, (joint, found) in enumerate(zip(before.joints, after.joints, strict=True), start=1):
+        if joint.gear_ratio != found.gear_ratio:
+            said = f"gear_ratio = {found.gear_ratio:.4g} # found; the file said {joint.gear_ratio:g}"
+            _state(lines, f"joint_{i}", said)
     for effect in after.effects:
         if effect not in before.effects:
             lines += ["", "[[effect]]", f'name = "{effect.name}"', f'where = "{effect.where}"']
@@ -42,6 +47,19 @@ def adopted_text(described: str, before: System, after: System, remarks: Mapping
             if remark := remarks.get(f"{effect.name}@{effect.where}"):
                 lines.append(f"# found: {remark}")
     return "\n".join(lines) + "\n"
+
+
+def _state(lines: list[str], table: str, statement: str) -> None:
+    """Put a statement in place of that of the same key in a table of TOML lines."""
+    begin = lines.index(f"[{table}]")
+    key = statement.split()[0]
+    for k in range(begin + 1, len(lines)):
+        if lines[k].startswith("["):
+            break
+        if re.match(rf"\s*{key}\s*=", lines[k]):
+            lines[k] = statement
+            return
+    lines.insert(begin + 1, statement)
 
 
 def remarks(effects: Iterable[Mapping[str, Any]]) -> dict[str, str]:
@@ -56,12 +74,6 @@ def remarks(effects: Iterable[Mapping[str, Any]]) -> dict[str, str]:
 def _told(value: Mapping[str, Any]) -> list[str]:
     estimate, std, unit = cells_of(value)
     return [estimate, *([f"± {std}"] if std else []), *([unit] if unit else [])]
-
-
-def cells_of(value: Mapping[str, Any]) -> list[str]:
-    """A coefficient's estimate, its deviation, empty where it has none, and its unit."""
-    std = value["std"]
-    return [f"{value['estimate']:.5g}", "" if std is None else f"{std:.2g}", value["unit"]]
 
 
 def added_lines(described: str, adopted: str) -> list[str]:

@@ -20,8 +20,6 @@ BEFORE, AFTER, NOISE, LAW = "orange", "blue", "grey", "ink"
 CLOSE_UP = 5.0
 # Of the residuals drawn close up so many stay inside where noise is left far behind.
 SHOWN = 0.99
-# What is held out of another capture is drawn so far behind what was fitted, as a share of the latter.
-PAUSE = 0.02
 TIME = "time, s"
 
 
@@ -31,7 +29,7 @@ def residual_charts(diagnosis: Diagnosis) -> list[Chart]:
     rows, rows_after = diagnosis.described.rows, diagnosis.attempt.rows
     names, names_after = (each.model.layout.speed_names for each in (rows, rows_after))
     types_after = row_types(rows_after.model.layout)
-    (t, held), (t_after, _) = _time(before), _time(after)
+    t, t_after = before.time, after.time
     out = []
     for row, speeds in row_types(rows.model.layout).items():
         worst = _worst(before, speeds)
@@ -39,30 +37,21 @@ def residual_charts(diagnosis: Diagnosis) -> list[Chart]:
         changed = after.system != before.system
         noise, line = _noise(t), _residual(before, rows.weak.windows, t, worst, BEFORE if changed else AFTER)
         if not changed:
-            out.append(chart(f"{row}, {name}", [noise, line], TIME, shaded=held))
+            out.append(chart(f"{row}, {name}", [noise, line], TIME))
             continue
         # Exact links have coordinates of their own.
         same = names_after.index(name) if name in names_after else _worst(after, types_after[row])
         line_after = _residual(after, rows_after.weak.windows, t_after, same, AFTER)
-        out.append(chart(f"{row}, {name}", [noise, line, line_after], TIME, shaded=held))
+        out.append(chart(f"{row}, {name}", [noise, line, line_after], TIME))
         if before.test[row].beyond:
             half = max(CLOSE_UP, float(np.quantile(np.abs(line_after.y[np.isfinite(line_after.y)]), SHOWN)))
             caption = f"{row}, {names_after[same]}, close up"
-            out.append(chart(caption, [noise, line_after], TIME, (-half, half), shaded=held))
+            out.append(chart(caption, [noise, line_after], TIME, (-half, half)))
     return out
 
 
 def _worst(state: State, speeds: Sequence[int]) -> int:
     return max(speeds, key=lambda k: float(np.sum(state.residual[:, k] ** 2)))
-
-
-def _time(state: State) -> tuple[Array, list[tuple[float, float]]]:
-    """Times (W,) of windows and spans that are held out; what another capture holds is drawn behind the first."""
-    t, held = state.time.copy(), ~state.fitted
-    first = t[state.fitted]
-    if held.any() and first.size and t[held].min() < first.max():
-        t[held] += first.max() * (1.0 + PAUSE) - t[held].min()
-    return t, [(float(t[held].min()), float(t[held].max()))] if held.any() else []
 
 
 def _noise(t: Array) -> Series:

@@ -10,6 +10,7 @@ import numpy as np
 from markupsafe import Markup
 
 from sms_online.diagnosis.diagnose import Diagnosis
+from sms_tools.found_effects import cells_of, look_alikes, why
 from sms_tools.html_report.arm_drawing import marked_arm
 from sms_tools.html_report.diagnosis_charts import AFTER, BEFORE, law_charts, residual_charts
 from sms_tools.html_report.pages import write_page
@@ -19,8 +20,8 @@ from sms_tools.view.places import places_of
 from sms_tools.view.scene import Scene
 
 NAME = "diagnosis.html"
-# Candidates that are listed, and look-alikes that are named beside an effect.
-LISTED, LOOK_ALIKES = 12, 8
+# Candidates that are listed.
+LISTED = 12
 # Positions that the tip's way is drawn through.
 WAY_POINTS = 300
 
@@ -48,10 +49,12 @@ def write_diagnosis(
         source=source,
         seconds=sum(segment.index.size for segment in rows.segments) / rows.model.system.sample_rate,
         windows=rows.count,
-        held=int(np.count_nonzero(~diagnosis.after.fitted)),
+        blocks=diagnosis.attempt.folds.count,
         arm=_arm(document, diagnosis) if found else None,
         view="from above" if rows.model.layout.planar else "from one side",
-        look_alikes=LOOK_ALIKES,
+        cells=cells_of,
+        look_alikes=look_alikes,
+        why=why,
         laws=law_charts(diagnosis),
         residuals=residual_charts(diagnosis),
         colors={"before": BEFORE, "after": AFTER},
@@ -102,7 +105,7 @@ def _candidates(document: Document, diagnosis: Diagnosis) -> list[dict[str, Any]
             "rank": rank,
             "name": effect.name,
             "where": effect.where,
-            "share": 100.0 * ranked.explained,
+            "explained": 100.0 * ranked.explained,
             "found": numbers.get((effect.name, effect.where)),
             "like": like.get(ranked.candidate.key, []),
         }

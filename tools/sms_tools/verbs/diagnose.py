@@ -19,8 +19,9 @@ from sms_online.pipeline.estimator import Estimator
 from sms_online.priors import base_prior
 from sms_online.result import json_text
 from sms_online.truth import true_values
-from sms_tools.adopted_system import added_lines, adopted_text, cells_of, remarks, write_adopted
+from sms_tools.adopted_system import added_lines, adopted_text, remarks, write_adopted
 from sms_tools.exit_codes import NOTHING_DETERMINED, OK
+from sms_tools.found_effects import cells_of, look_alikes, why
 from sms_tools.interruption import Interruption
 from sms_tools.report import Document, parameter_table, report_console, show, verdict_text
 from sms_tools.results_file import results_directory, write_document
@@ -31,8 +32,6 @@ from sms_tools.view.session import View, open_view
 from sms_tools.waiting import waiting, watched
 
 NAME = "diagnosis.json"
-# Ambiguous candidates that people are shown.
-SHOWN = 8
 
 
 def run(args: argparse.Namespace) -> int:
@@ -52,15 +51,23 @@ def run(args: argparse.Namespace) -> int:
             start = args.stop
         holdout = _samples(args.holdout, system, start, None, folder)
 
-    with waiting() as progress:
-        found = diagnose(system, capture, holdout=holdout, prior=args.prior, progress=progress)
+    with waiting() as progress, Interruption() as interruption:
+        found = diagnose(
+            system,
+            capture,
+            holdout=holdout,
+            prior=args.prior,
+            progress=progress,
+            stop=lambda: interruption.requested,
+        )
     document = found.document()
     view = None if args.rerun == "off" else _watched(args, system, found, capture, directory)
     if view is not None:
         document["warnings"] = [*document["warnings"], *view.warnings]
     lines: list[Table | str | Text] = ["", found.summary, ""]
+    lines += [f"next: {mistake['next_step']}" for mistake in document["mistakes"]]
     if document["effects"]:
-        lines += [_effects(document), ""]
+        lines += [_effects(document), "", *filter(None, map(why, document["effects"])), ""]
     # See `diagnosis_document`.
     origin = "from the rows of the diagnosis" if found.search.attempt.prior is not None else "by a replay with it"
     title = f"parameters with what was found, {origin}"
@@ -152,10 +159,10 @@ def _effects(document: Document) -> Table:
         header_style="bold",
         pad_edge=False,
     )
-    for heading in ("effect", "coefficient", "estimate", "± std", "unit", "cannot be told from"):
+    for heading in ("effect", "coefficient", "estimate", "± std", "unit", "indistinguishable from"):
         table.add_column(heading, justify="right" if heading in ("estimate", "± std") else "left", overflow="fold")
     for effect in document["effects"]:
-        others = ", ".join(effect["ambiguous_with"][:SHOWN])
+        others = look_alikes(effect)
         first = True
         for name, value in effect["coefficients"].items() or [("", None)]:
             cells = ["", "", ""] if value is None else cells_of(value)
@@ -165,7 +172,7 @@ def _effects(document: Document) -> Table:
 
 
 def _residuals(document: Document) -> Table:
-    title = "residual on data not fitted"
+    title = "residual of data not fitted"
     table = Table(title=title, title_justify="left", box=None, header_style="bold", pad_edge=False)
     for heading in ("rows", "× noise before", "after", "share of torque before", "after"):
         table.add_column(heading, justify="left" if heading == "rows" else "right")

@@ -1,0 +1,131 @@
+"""Which effects a session supports: what they improve of held-out blocks, and what the joint fit makes of them."""
+
+from __future__ import annotations
+
+from collections.abc import Container, Sequence
+
+import numpy as np
+
+from sms_online.diagnosis.candidate_rows import CandidateRows
+from sms_online.diagnosis.folds import Fall, fall
+from sms_online.stream import Array
+
+# An effect must lower the rms of the held-out rows that it acts on by this share: on measured rigs laws that gained
+# less within a run were as likely to harm another run as to help it.
+LEAST_IMPROVEMENT = 0.10
+# Coefficients of effects that are correlated by more than this are those of one effect too many.
+ONE_TOO_MANY = 0.99
+# Rows that hold more than this multiple of their deviation leave more than noise.
+MOST_LEFT = 2.0
+# Blocks of which a coefficient's deviation can be told.
+LEAST_FOLDS = 4
+# A coefficient is significant beyond this multiple of its deviation.
+SIGNIFICANT = 2.0
+
+
+class Acceptance(CandidateRows):
+    """Asks of effects whether rows that were not fitted speak for them, and of a joint fit whether it can have them."""
+
+    def improves(self, chosen: Sequence[int], candidate: int) -> bool:
+        """Whether a candidate beside those chosen lowers the residual of held-out rows, and no type's rises."""
+        together = [*chosen, candidate]
+        acts = self._acts(candidate)
+        before, after = (self.fitted(each, chosen) for each in (chosen, together))
+        if fall(before[:, acts].sum(axis=1), after[:, acts].sum(axis=1)).share < LEAST_IMPROVEMENT:
+            return False  # not even of the rows that it is fitted to
+        before, after = (self.held_out(each, chosen) for each in (chosen, together))
+        own = fall(before[:, acts].sum(axis=1), after[:, acts].sum(axis=1))
+        types = (fall(before[:, each].sum(axis=1), after[:, each].sum(axis=1)) for each in self._types)
+        return own.share >= LEAST_IMPROVEMENT and own.certain and not any(each.rises for each in types)
+
+    def improvement(self, chosen: Sequence[int], candidate: int) -> Fall:
+        """Of the rms of the held-out rows that a candidate acts on, beside those chosen.
+
+        Of calibration the same is held before and after, so that the candidate alone makes the difference.
+        """
+        acts = self._acts(candidate)
+        before, after = (self.held_out(each, chosen) for each in (chosen, [*chosen, candidate]))
+        return fall(before[:, acts].sum(axis=1), after[:, acts].sum(axis=1))
+
+    def failing(self, chosen: Sequence[int], held: Container[int] = ()) -> int | None:
+        """The least of those chosen that the joint fit cannot have, does not determine, or does without; None if none.
+
+        held: friction that its likelihood has chosen. It takes any value while its axis is at rest, and is asked for
+        its sign alone where rows leave no more than noise.
+        """
+        left = self.residual(chosen, self.solution(chosen))
+        loud = np.mean(left**2, axis=0) > MOST_LEFT**2
+        asked = [k for k in chosen if k not in held or np.any(loud & self._acts(k))]
+        for fails in (self._impossible, self._one_too_many, self._insignificant, self._idle):
+            if failing := fails(chosen, asked):
+                return min(failing, key=lambda k: self.improvement([other for other in chosen if other != k], k).share)
+        return None
+
+    def _places(self, chosen: Sequence[int]) -> dict[int, slice]:
+        """Where a solution holds the coefficients of each of those chosen."""
+        sizes = [len(self.candidates[k].parameters) for k in chosen]
+        ends = (self.n_model + np.cumsum(sizes)).tolist()
+        return {k: slice(end - size, end) for k, size, end in zip(chosen, sizes, ends, strict=True)}
+
+    def _impossible(self, chosen: Sequence[int], asked: Sequence[int]) -> list[int]:
+        """Those that have coefficients that they cannot have, or without which a mass or spring were not negative."""
+        solution = self.solution(chosen)
+        impossible = [k for k, own in self._places(chosen).items() if not self._possible(k, solution, solution[own])]
+        if impossible or not self._negative(chosen):
+            return impossible
+        return [k for k in chosen if not self._negative([other for other in chosen if other != k])]
+
+    def _negative(self, chosen: Sequence[int]) -> bool:
+        """Whether the model has a negative mass, spring or damping, and that is no accident of a few blocks."""
+        n = self._positive.size
+        value = self.solution(chosen)[:n]
+        if not np.any(self._positive & (value < 0.0)):
+            return False
+        return bool(np.any(self._positive & (value < -SIGNIFICANT * self.spread(chosen)[:n])))
+
+    def _possible(self, k: int, solution: Array, own: Array) -> bool:
+        candidate = self.candidates[k]
+        if not candidate.traits.plausible(own, self.rows.sample_rate):
+            return False
+        if self._laws is None or not candidate.traits.limits:
+            return True
+        told = self._laws.reported(candidate.effect, solution[: self.rows.Y.shape[2]], own)
+        return candidate.traits.within(told)
+
+    def _one_too_many(self, chosen: Sequence[int], asked: Sequence[int]) -> list[int]:
+        """Those whose coefficients are correlated with those of another effect, declared or chosen."""
+        covariance = self.covariance(chosen)
+        std = np.sqrt(np.diag(covariance))
+        known = np.isfinite(std) & (std > 0.0)
+        correlation = np.where(known, covariance, 0.0) / np.where(known, std, 1.0) / np.where(known, std, 1.0)[:, None]
+        places = self._places(chosen)
+        effects = np.array([*self._of_effects, *np.ones(len(std) - self.n_model)], dtype=bool)
+        out = []
+        for k, own in places.items():
+            if k not in asked:
+                continue
+            others = effects.copy()
+            others[own] = False
+            if not np.all(known[own]) or np.any(np.abs(correlation[own][:, others]) > ONE_TOO_MANY):
+                out.append(k)
+        return out
+
+    def _insignificant(self, chosen: Sequence[int], asked: Sequence[int]) -> list[int]:
+        if self.folds.count < LEAST_FOLDS:
+            return []
+        """Those whose coefficients are no more than what the blocks differ by."""
+        solution, std = self.solution(chosen), self.spread(chosen)
+        places = self._places(chosen)
+        return [k for k in asked if np.all(np.abs(solution[places[k]]) < SIGNIFICANT * std[places[k]])]
+
+    def _idle(self, chosen: Sequence[int], asked: Sequence[int]) -> list[int]:
+        """Those whose blocks are predicted as well without them, weighed as without what they do not predict."""
+        idle = []
+        for k in asked:
+            others = [other for other in chosen if other != k]
+            if self.candidates[k].traits.dry:
+                self.settle(others)
+            if self.improvement(others, k).share < LEAST_IMPROVEMENT:
+                idle.append(k)
+            self.settle(chosen)
+        return idle

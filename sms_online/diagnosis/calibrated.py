@@ -1,0 +1,73 @@
+"""Calibration beside a search: what the description may be off by, in the columns and tolerances of a session.
+
+Within its tolerance a number of the description explains what it can, and no effect is needed for it. What the rows ask
+for beyond `LIMIT` tolerances is no matter of the tolerance. Where an effect of the catalogue says the same (a late
+sensor, an encoder's zero), the number is held at zero then and the effect competes for all of it. The others, of
+geometry and camera, pay for every tolerance.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from fnmatch import fnmatchcase
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sms_online.calibration.nuisance import Nuisance
+from sms_online.description.schema import Effect
+from sms_online.effects.catalogue import ENTRIES
+from sms_online.stream import Array
+
+# One number in eighty is further off than its tolerance says by chance.
+LIMIT = 2.5
+# A number that is held at zero counts as known to this share of its tolerance.
+HELD = 1e-6
+# Tolerances that effects of the catalogue say.
+SAYABLE = frozenset(name for entry in ENTRIES.values() for name in entry.traits.calibrates)
+
+
+@dataclass(frozen=True)
+class Calibrated:
+    """Nuisances (m) with their columns (W, n_v, m) in the rows, as `SessionRows` has them once it is weighed."""
+
+    nuisances: tuple[Nuisance, ...]
+    columns: Array
+
+    @classmethod
+    def of(cls, nuisances: Sequence[Nuisance], columns: Array) -> Calibrated:
+        """Those that have a tolerance: where nothing is known, as of a torque's zero, the effect alone says it."""
+        known = [k for k, each in enumerate(nuisances) if np.isfinite(each.tolerance)]
+        return cls(tuple(nuisances[k] for k in known), columns[..., known])
+
+    @property
+    def count(self) -> int:
+        """Number of nuisances m."""
+        return len(self.nuisances)
+
+    @property
+    def tolerance(self) -> Array:
+        """1σ of each (m,)."""
+        return np.array([each.tolerance for each in self.nuisances])
+
+    def information(self, held: NDArray[np.bool_]) -> Array:
+        """Rows (m, m) of unit variance of what is known of them; held (m,): those at zero."""
+        return np.diag(1.0 / (self.tolerance * np.where(held, HELD, 1.0)))
+
+    def said_by(self, effects: Iterable[Effect]) -> NDArray[np.bool_]:
+        """Which of them (m,) the effects stand for: an effect in the model leaves no second unknown for the same."""
+        effects = list(effects)
+        return np.array([any(_says(effect, each) for effect in effects) for each in self.nuisances], dtype=np.bool_)
+
+    def beyond(self, values: Array) -> NDArray[np.bool_]:
+        """Which of them (m,) an effect of the catalogue has to say, for estimates (m,)."""
+        sayable = np.array([each.name in SAYABLE for each in self.nuisances], dtype=np.bool_)
+        return np.asarray(sayable & (np.abs(values) > LIMIT * self.tolerance))
+
+
+def _says(effect: Effect, nuisance: Nuisance) -> bool:
+    """Whether an effect says the same; places of clocks are groups of channels."""
+    if nuisance.name not in ENTRIES[effect.name].traits.calibrates:
+        return False
+    return nuisance.name == "clock" or fnmatchcase(nuisance.where, effect.where)

@@ -1,0 +1,285 @@
+"""Rows weighed for a model and the candidates beside it: gains, solutions, predictions of held-out blocks."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sms_online.diagnosis.calibrated import Calibrated
+from sms_online.diagnosis.candidate import Candidate, Laws
+from sms_online.diagnosis.evidence import Gain, basis, free_of, gain, least_squares, together
+from sms_online.diagnosis.folds import Folds
+from sms_online.diagnosis.weak_rows import WeakRows
+from sms_online.pipeline.momentum_windows import HOPS
+from sms_online.stream import Array
+from sms_online.trackers.factor import solve
+from sms_online.trackers.interface import Prior, prior_factor
+
+# A row is acted on where a candidate's column has at least this share of its largest row's squares.
+ACTS = 0.01
+# Rows whose mean square exceeds their variance by more than this although everything that is known of has been
+# subtracted have an error of their own: friction is never quite its model.
+LARGEST_RATIO = 1.5
+# Share of a row's variance by which that of the effects chosen has to change for rows to be weighed anew.
+SMALL_CHANGE = 0.1
+
+
+class CandidateRows:
+    """Rows of a session beside a model and candidates for what it lacks, whitened together.
+
+    folds: blocks of the windows (W,) that are held out in turn.
+    """
+
+    def __init__(
+        self,
+        rows: WeakRows,
+        candidates: Sequence[Candidate],
+        folds: Folds,
+        prior: Prior | None = None,
+        fixed: Sequence[Candidate] = (),
+        laws: Laws | None = None,
+        declared: Iterable[str] = (),
+        types: Iterable[Sequence[int]] | None = None,
+        of_effects: Sequence[bool] | None = None,
+        positive: Sequence[bool] | None = None,
+        calibrated: Calibrated | None = None,
+    ) -> None:
+        """fixed: effects of the model already, whose columns come right after its parameters'. laws: without them
+        candidates leave nothing open. declared: keys of the effects that the model has. types: speeds of each type of
+        rows, each its own unless given. of_effects (n,): which of the model's parameters are coefficients of effects;
+        positive (n,): which cannot be negative. calibrated: what the description may be off by, nothing by default;
+        its m unknowns come last in a solution.
+        """
+        nothing = Calibrated((), np.empty((*rows.b.shape, 0)))
+        self.calibrated, self._fixed = nothing if calibrated is None else calibrated, list(fixed)
+        self.rows, self.candidates, self.folds = rows, list(candidates), folds
+        self._laws, self._prior = laws, prior
+        self._n, self._n_v = rows.Y.shape[2], rows.Y.shape[1]
+        self._declared = frozenset(declared)
+        self._types = [[speed] for speed in range(self._n_v)] if types is None else [list(each) for each in types]
+        self._of_effects = [*(of_effects or [False] * self._n), *(True for each in fixed for _ in each.parameters)]
+        self._positive = np.array([False] * self._n if positive is None else positive, dtype=bool)
+        self._model = np.concatenate([rows.Y, *(candidate.columns for candidate in fixed)], axis=2)
+        self.trials = len(self.candidates)
+        # What the effects chosen leave open.
+        self._own = np.zeros_like(rows.std)
+        self._free = np.zeros((len(rows.b), HOPS, self._n_v))
+        self.weigh()
+
+    def settle(self, chosen: Sequence[int], solution: Array | None = None) -> bool:
+        """Weigh the rows with what the laws of the effects chosen leave open too; whether that changes the weights.
+
+        solution (n + c,): from all windows unless given.
+        """
+        if self._laws is None:
+            return False
+        own, free = np.zeros_like(self._own), np.zeros_like(self._free)
+        at, solution = self._model.shape[2], self.solution(chosen) if solution is None else solution
+        for k in chosen:
+            c = len(self.candidates[k].parameters)
+            told = self._laws.left_open(self.candidates[k], solution[at : at + c])
+            own += told.own
+            free += told.free
+            at += c
+        used, wanted = self._own + self._free[:, 0], own + free[:, 0]
+        if not np.any(np.abs(wanted - used) > SMALL_CHANGE * (self.rows.std**2 + used)):
+            return False
+        self._own, self._free = own, free
+        self.weigh()
+        return True
+
+    def weigh(self) -> None:
+        """Weigh the rows, and whiten them, with what is left open by the effects settled last."""
+        rows = self.rows
+        self._zeroed: dict[frozenset[int], NDArray[np.bool_]] = {}
+        self.std = np.sqrt(rows.std**2 + self._own + self._free[:, 0])
+        self._plain_model = self._model / self.std[..., None]
+        self._plain_calibration = self.calibrated.columns / self.std[..., None]
+        self._plain = [candidate.columns / self.std[..., None] for candidate in self.candidates]
+        self.floor, lacking = self._floor()
+        # Where everything together leaves noise, a held-out row counts by its own deviation; where much more, as does
+        # every other of its coordinate: relative to the torque then.
+        self._scale = np.sqrt(self.std**2 + lacking)
+        # Windows that overlap share the noise of the effects chosen: as errors of their own they count it once.
+        own = self.floor * self.std**2 + HOPS * self._own
+        rows.whiten(own, self._free if np.any(self._free) else None)
+        # What is known beforehand are rows too: of parameters, and below them of calibration.
+        known = prior_factor(self._prior, self._n)
+        self._known = len(known) + self.calibrated.count
+        n, width, first = self._n, self._model.shape[2], self.rows.b.size
+        candidates = (candidate.columns for candidate in self.candidates)
+        parts = [self._model, rows.b[..., None], self.calibrated.columns, *candidates]
+        white = self._whitened(np.concatenate(parts, axis=2))
+        white[first : first + len(known), :n], white[first : first + len(known), width] = known[:, :-1], known[:, -1]
+        ends = np.cumsum([part.shape[2] for part in parts])
+        self._Y, b, self._N, *self._Z = np.split(white, ends[:-1], axis=1)
+        self._b = b[:, 0]
+
+    def _floor(self) -> tuple[Array, Array]:
+        """What all candidates together leave of each speed's rows beyond their variance, (n_v,).
+
+        As a share of that variance, and as a mean square; zero where it is little. Rows that leave more and hold no
+        torque are homogeneous in π: what makes π small makes their residual small, which counts against their terms.
+        """
+        left = self.rows.b / self.std
+        plain = np.concatenate([self._plain_model, *self._plain, self._plain_calibration], axis=2)
+        solution = together(plain, left, self._prior)
+        left = left - plain @ solution
+        ratio = np.mean(left**2, axis=0)
+        lacking = np.maximum(0.0, np.mean((left**2 - 1.0) * self.std**2, axis=0))
+        beyond = ratio > LARGEST_RATIO
+        self._homogeneous = beyond & ~np.any(self.rows.b, axis=0)
+        self._usual = self._terms([], solution)
+        return np.where(beyond, ratio - 1.0, 0.0), np.where(beyond, lacking, 0.0)
+
+    @property
+    def n_model(self) -> int:
+        """Unknowns of the model without those chosen."""
+        return int(self._model.shape[2])
+
+    def _columns(self, chosen: Sequence[int], beside: Sequence[int] | None = None) -> Array:
+        """White columns of the model, of those chosen and of calibration.
+
+        beside: those that say which of its numbers are held at zero; those chosen unless given.
+        """
+        if not self.calibrated.count:
+            return np.concatenate([self._Y, *(self._Z[k] for k in chosen)], axis=1)
+        return self._with_calibration(chosen, self.zeroed(chosen if beside is None else beside))
+
+    def _with_calibration(self, chosen: Sequence[int], held: NDArray[np.bool_]) -> Array:
+        self._N[-held.size :] = self.calibrated.information(held)
+        return np.concatenate([self._Y, *(self._Z[k] for k in chosen), self._N], axis=1)
+
+    def zeroed(self, chosen: Sequence[int]) -> NDArray[np.bool_]:
+        """Which numbers of calibration (m,) are held at zero beside those chosen: effects say them, or have to."""
+        m, key = self.calibrated.count, frozenset(chosen)
+        if key not in self._zeroed:
+            effects = (candidate.effect for candidate in (*self._fixed, *(self.candidates[k] for k in chosen)))
+            held = self.calibrated.said_by(effects)
+            while m:
+                solution = least_squares(self._with_calibration(chosen, held), self._b)
+                beyond = self.calibrated.beyond(solution[-m:]) & ~held
+                if not beyond.any():
+                    break
+                held = held | beyond
+            self._zeroed[key] = held
+        return self._zeroed[key]
+
+    def gains(self, chosen: Sequence[int]) -> list[Gain]:
+        """What each candidate would take beside those chosen."""
+        Q = basis(self._columns(chosen))
+        r = free_of(Q, self._b[:, None])[:, 0]
+        return [self._plausible(c, gain(Q, r, Z)) for c, Z in zip(self.candidates, self._Z, strict=True)]
+
+    def _plausible(self, candidate: Candidate, found: Gain) -> Gain:
+        """The gain, none where the effect cannot have the coefficients."""
+        possible = candidate.traits.plausible(found.coefficients, self.rows.sample_rate)
+        return found if possible else replace(found, gain=0.0)
+
+    def gain_of(self, candidate: Candidate, chosen: Sequence[int]) -> Gain:
+        """What any candidate would take beside those chosen."""
+        Q = basis(self._columns(chosen))
+        r = free_of(Q, self._b[:, None])[:, 0]
+        return self._plausible(candidate, gain(Q, r, self._whitened(candidate.columns)))
+
+    def put(self, k: int, candidate: Candidate) -> None:
+        """Put another form of an effect in the place of a candidate."""
+        self.candidates[k] = candidate
+        self._plain[k] = candidate.columns / self.std[..., None]
+        self._Z[k] = self._whitened(candidate.columns)
+        self._zeroed = {}
+
+    def _whitened(self, columns: Array) -> Array:
+        white = self.rows.white(columns)
+        return np.concatenate((white, np.zeros((self._known, white.shape[1]))))
+
+    def _acts(self, k: int) -> NDArray[np.bool_]:
+        """Speeds (n_v,) in whose rows a candidate acts."""
+        squares = np.sum(self._plain[k] ** 2, axis=(0, 2))
+        return np.asarray(squares > ACTS * squares.max())
+
+    def columns(self, chosen: Sequence[int]) -> Array:
+        """Columns (W, n_v, n + c) of the model with those chosen."""
+        return np.concatenate([self._model, *(self.candidates[k].columns for k in chosen)], axis=2)
+
+    def solution(
+        self, chosen: Sequence[int], windows: NDArray[np.bool_] | None = None, beside: Sequence[int] | None = None
+    ) -> Array:
+        """Parameters, coefficients and calibration (n + c + m,) of the model with those chosen.
+
+        windows (W,): fitted to, all unless given. beside: see `_columns`.
+        """
+        use = np.ones(len(self._b), dtype=bool)
+        if windows is not None:
+            use[: windows.size * self._n_v] = np.repeat(windows, self._n_v)
+        return least_squares(self._columns(chosen, beside)[use], self._b[use])
+
+    def solutions(self, chosen: Sequence[int], beside: Sequence[int] | None = None) -> Array:
+        """The same without each of the blocks in turn, (B, n + c + m)."""
+        return np.array([self.solution(chosen, self.folds.fitted(k), beside) for k in range(self.folds.count)])
+
+    def predicted(
+        self, chosen: Sequence[int], solutions: Array | None = None, beside: Sequence[int] | None = None
+    ) -> Array:
+        """What is left of every row (W, n_v) over its own deviation, blocks predicted from the others."""
+        solutions = self.solutions(chosen, beside) if solutions is None else solutions
+        left = self.residual(chosen, self.solution(chosen, beside=beside))
+        for k, solution in enumerate(solutions):
+            held = self.folds.held(k)
+            left[held] = self.residual(chosen, solution)[held]
+        return left
+
+    def held_out(self, chosen: Sequence[int], beside: Sequence[int] | None = None) -> Array:
+        """Sums of squares of held-out rows by block and speed, (B, n_v), relative where they leave more than noise."""
+        return self._by_block(chosen, self.predicted(chosen, beside=beside), beside)
+
+    def fitted(self, chosen: Sequence[int], beside: Sequence[int] | None = None) -> Array:
+        """The same sums of the fit to all rows."""
+        return self._by_block(chosen, self.residual(chosen, self.solution(chosen, beside=beside)), beside)
+
+    def _terms(self, chosen: Sequence[int], solution: Array) -> Array:
+        """Sums of squares (n_v,) of the terms of each speed's rows, over their deviations."""
+        plain = np.concatenate([self._plain_model, *(self._plain[k] for k in chosen)], axis=2)
+        return np.asarray(np.sum((plain * solution[: plain.shape[2]]) ** 2, axis=(0, 2)))
+
+    def _by_block(self, chosen: Sequence[int], left: Array, beside: Sequence[int] | None) -> Array:
+        squares = (left * self.std / self._scale) ** 2
+        if np.any(self._homogeneous):
+            terms = self._terms(chosen, self.solution(chosen, beside=beside))
+            shrunk = self._homogeneous & (terms > 0.0)
+            squares[:, shrunk] *= self._usual[shrunk] / terms[shrunk]
+        return np.array([squares[self.folds.held(k)].sum(axis=0) for k in range(self.folds.count)])
+
+    def spread(self, chosen: Sequence[int]) -> Array:
+        """Deviations (n + c,) of the solution by the jackknife over the blocks, whatever rows hold beside noise."""
+        solutions = self.solutions(chosen)
+        n = len(solutions)
+        squares = np.sum((solutions - solutions.mean(axis=0)) ** 2, axis=0)
+        return np.asarray(np.sqrt((n - 1) / n * squares))[: squares.size - self.calibrated.count]
+
+    def covariance(self, chosen: Sequence[int], further: Array | None = None) -> Array:
+        """Of the solution (n + c, n + c) from all windows, infinite where they tell nothing.
+
+        further (W, n_v, s): columns of unknowns beside it, which come last.
+        """
+        beside = np.empty((self._b.size, 0)) if further is None else self._whitened(further)
+        columns = self._columns(chosen)
+        known = columns.shape[1] - self.calibrated.count
+        covariance = solve(np.column_stack((columns, beside, self._b))).covariance()
+        told = np.delete(np.arange(len(covariance)), slice(known, columns.shape[1]))
+        return covariance[np.ix_(told, told)]
+
+    def calibration(self, chosen: Sequence[int]) -> tuple[Array, Array]:
+        """Numbers of calibration beside those chosen and their deviations, (m,) each."""
+        m = self.calibrated.count
+        covariance = solve(np.column_stack((self._columns(chosen), self._b))).covariance()
+        own = slice(len(covariance) - m, len(covariance))
+        return self.solution(chosen)[own], np.sqrt(np.diag(covariance)[own])
+
+    def residual(self, chosen: Sequence[int], solution: Array) -> Array:
+        """What is left of every row (W, n_v) over its own deviation, see `settle`."""
+        plain = [self._plain_model, *(self._plain[k] for k in chosen), self._plain_calibration]
+        return np.asarray(self.rows.b / self.std - np.concatenate(plain, axis=2) @ solution)

@@ -1,0 +1,110 @@
+"""Blocks of time that are held out in turn, and what they say of a residual: blocked cross-validation.
+
+Rows of neighbouring windows share samples, so windows are held out a block of time at once, and those that overlap it
+are not fitted either. What an effect improves is the fall of the rms of held-out rows; its standard error comes from
+leaving out one block after the other (jackknife), for windows of a block are no independent witnesses.
+Sources: Burman, Chow, Nolan, Biometrika 81 (1994) 351 (blocks); Efron, Stein, Annals of Statistics 9 (1981) 586
+(variance of the jackknife).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sms_online.pipeline.momentum_windows import HOPS
+from sms_online.stream import Array
+
+# Blocks that a session is cut into; fewer where each would hold fewer windows than overlap.
+BLOCKS = 10
+# What held-out rows rise by for one more coefficient that they do not need is below this share.
+LEAST_RISE = 0.02
+# Block number of windows that are fitted always.
+ALWAYS = -1
+
+
+class Folds:
+    """Blocks of the windows (W,) of a session.
+
+    block (W,): number of the block that holds a window out, ALWAYS where none does. segment, time (W,): of the windows,
+    in the order of time within a segment.
+    """
+
+    def __init__(self, block: NDArray[np.int64], segment: NDArray[np.int64], time: Array) -> None:
+        self.block, self._segment, self._time = block, segment, time
+        self.count = int(block.max(initial=ALWAYS)) + 1
+
+    @classmethod
+    def of(cls, segment: NDArray[np.int64], time: Array, tested: NDArray[np.bool_] | None = None) -> Folds:
+        """Blocks of as many windows each; tested (W,): those that are held out at all, all of them by default."""
+        held = np.arange(time.size) if tested is None else np.flatnonzero(tested)
+        count = max(2, min(BLOCKS, held.size // HOPS))
+        block = np.full(time.size, ALWAYS, dtype=np.int64)
+        block[held] = np.arange(held.size) * count // max(1, held.size)
+        return cls(block, segment, time)
+
+    def held(self, k: int) -> NDArray[np.bool_]:
+        """Windows (W,) of a block."""
+        return np.asarray(self.block == k)
+
+    def fitted(self, k: int) -> NDArray[np.bool_]:
+        """Windows (W,) that a block is predicted from: those that share no sample with it.
+
+        All but the block where few of those that are tested are left: in a session of a second all windows overlap.
+        """
+        held = self.held(k)
+        near = held.copy()
+        for hop in range(1, HOPS):
+            same = self._segment[hop:] == self._segment[:-hop]
+            near[hop:] |= held[:-hop] & same
+            near[:-hop] |= held[hop:] & same
+        tested = self.block != ALWAYS
+        return ~near if 2 * np.count_nonzero(tested & ~near) > np.count_nonzero(tested) else ~held
+
+    def of_others(self, segment: NDArray[np.int64], time: Array) -> NDArray[np.int64]:
+        """Block numbers (V,) of other windows of the same session: that of the nearest of these windows."""
+        out = np.full(time.size, ALWAYS, dtype=np.int64)
+        for number in np.unique(segment):
+            own, others = np.flatnonzero(self._segment == number), segment == number
+            if own.size:
+                edges = 0.5 * (self._time[own][1:] + self._time[own][:-1])
+                out[others] = self.block[own][np.searchsorted(edges, time[others])]
+        return out
+
+
+@dataclass(frozen=True)
+class Fall:
+    """Share by which an rms falls, and its standard error over the blocks."""
+
+    share: float
+    std: float
+
+    @property
+    def certain(self) -> bool:
+        """Whether it is no accident of a few blocks."""
+        return self.share > 2.0 * self.std
+
+    @property
+    def rises(self) -> bool:
+        """Whether the rms rises by more than any further coefficient makes it, and that is no accident."""
+        return self.share < -max(LEAST_RISE, 2.0 * self.std)
+
+
+def fall(before: Array, after: Array) -> Fall:
+    """Of sums of squares by block (B,)."""
+    used = before + after > 0.0
+    before, after = before[used], after[used]
+    if before.size == 0 or not before.sum() > 0.0:
+        return Fall(0.0, 0.0)
+
+    def share(b: Array, a: Array) -> Array:
+        return 1.0 - np.sqrt(a / np.maximum(b, np.finfo(np.float64).tiny))
+
+    n = before.size
+    if n == 1:
+        return Fall(float(share(before.sum(), after.sum())), np.inf)
+    left_out = share(before.sum() - before, after.sum() - after)
+    std = np.sqrt((n - 1) / n * np.sum((left_out - left_out.mean()) ** 2))
+    return Fall(float(share(before.sum(), after.sum())), float(std))

@@ -1,0 +1,264 @@
+"""Mistakes of wiring, units and signs, tried before any physics: what a person would check first.
+
+Each is undone in a copy of the samples and asked whether the system then explains them where it did not: by the share
+of every coordinate's rows that a rough fit leaves. Scales and signs of single torques show against the other rows.
+What scales everything alike leaves no residual; there the described nominal values decide.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from sms_online.description.channels import drive_channel
+from sms_online.description.schema import System
+from sms_online.diagnosis.record import Segment, excerpts
+from sms_online.diagnosis.rough_fit import RoughFit, RoughRows
+from sms_online.diagnosis.sample_mistakes import Undoing, scaled, shown, undoings, without_gaps
+from sms_online.nominal import is_geared
+from sms_online.pipeline.estimator import Estimator
+from sms_online.stream import Array
+
+# Seconds of a session, in stretches, that show a mistake: it is there all the time.
+SOME, STRETCH = 8.0, 4.0
+# A coordinate of whose rows less is left than this is explained as well as a rough fit can.
+EXPLAINED = 0.02
+# One of whose rows less is left than this lacks physics at most, no unit or sign of a position.
+PHYSICS = 0.1
+# Nominal values leave less: a data sheet is right to a quarter.
+AS_STATED = 0.3
+# A mistake is named where undoing it divides what is left by this at least, the factors of all coordinates multiplied.
+LEAST_RATIO = 10.0
+# Where samples show it by themselves, by this; where it scales everything alike, which nominal values alone show, by
+# that.
+LEAST_SHOWN, LEAST_COMMON = 1.2, 3.0
+# Mistakes whose ratios differ by less than this factor are not distinguishable.
+SAME_RATIO = 1.5
+# Torque constants and gears differ from their data sheets by less.
+LARGEST_GAIN = 1.3
+# Units of time by how many of them are a second. Several devices stamp samples more often, and some are lost.
+CLOCKS = {"ms": 1e3, "µs": 1e6, "ns": 1e9}
+SAME_CLOCK = 20.0
+# At most so many mistakes are looked for in turn.
+MOST = 3
+# Factors of a gear that are tried, from its inverse on, and how finely.
+LARGEST_GEAR, COARSE, FINE = 30.0, 41, 31
+
+
+@dataclass(frozen=True)
+class Mistake:
+    """A mistake that undone explains the samples.
+
+    name: its kind. where: a channel, a joint, or several, comma separated. sentence: what is wrong, in words. step:
+    what to do. before, after: how much more than what counts as explained a rough fit leaves, the factors of all
+    coordinates multiplied; equal where only nominal values show it. or_else: sentences of others that explain as much.
+    """
+
+    name: str
+    where: str
+    sentence: str
+    step: str
+    before: float
+    after: float
+    or_else: tuple[str, ...] = ()
+
+    @property
+    def key(self) -> str:
+        """name@where."""
+        return f"{self.name}@{self.where}"
+
+
+@dataclass(frozen=True)
+class Corrected:
+    """mistakes: what was found, one after the other; samples: undoes them in values (B, channels), in place of the
+    channels of a session. system: with what of it the description states."""
+
+    mistakes: tuple[Mistake, ...]
+    samples: Callable[[tuple[str, ...], Array], Array]
+    system: System
+
+
+def find_mistakes(session: Estimator, segments: Sequence[Segment]) -> Corrected:
+    """Undo one mistake after the other while that explains the samples far better.
+
+    session: that of the system as described; segments: its samples.
+    """
+    some = excerpts(segments, round(STRETCH * session.system.sample_rate), round(SOME * session.system.sample_rate))
+    search = _Search(session, some)
+    while len(search.found) < MOST and search.step():
+        pass
+    return Corrected(tuple(search.found), search.undo, search.system)
+
+
+def wrong_clock(system: System, t: Array) -> Mistake | None:
+    """Stamps (B,) in a unit other than seconds, by the description's sample rate."""
+    steps = np.diff(t)
+    steps = steps[steps > 0.0]
+    if not steps.size:
+        return None
+    ratio = float(np.median(steps)) * system.sample_rate
+    for unit, factor in CLOCKS.items():
+        if 1.0 / SAME_CLOCK < ratio / factor < SAME_CLOCK:
+            said = f"t is in {unit} in place of s"
+            return Mistake("clock_unit", "t", said, f"divide t by {factor:g}", factor, 1.0)
+    return None
+
+
+class _Search:
+    def __init__(self, session: Estimator, segments: Sequence[Segment]) -> None:
+        self.session, self.system = session, session.system
+        self.found: list[Mistake] = []
+        self._channels = session.sensing.channels
+        self._segments = list(segments)
+        self._undone: list[Undoing] = []
+        self._drives = [drive_channel(self.system, i) for i in range(1, len(self.system.joints) + 1)]
+
+    def undo(self, channels: tuple[str, ...], values: Array) -> Array:
+        """Samples without the mistakes found."""
+        for undoing in self._undone:
+            values = undoing.apply(channels, values)
+        return values
+
+    def step(self) -> bool:
+        """Look for one more; whether there is one."""
+        try:
+            rows = RoughRows(self.session, self._segments)
+        except np.linalg.LinAlgError:
+            return False
+        given = rows.fit()
+        found = [
+            each
+            for each in self._samples(shown(self._channels, self._segments))
+            if _left(given) / _left(each.fit) > LEAST_SHOWN
+        ]
+        if not found:
+            found = list(self._scaled(rows, given))
+            if _left(given, PHYSICS) > LEAST_RATIO:
+                moved = self._samples(undoings(self.system, self._channels))
+                found += [each for each in moved if _left(given, PHYSICS) / _left(each.fit, PHYSICS) > LEAST_RATIO]
+        if not found:
+            return False
+        left = [_left(each.fit) for each in found]
+        best = int(np.argmin(left))
+        others = [found[k] for k in range(len(found)) if k != best and left[k] < SAME_RATIO * left[best]]
+        self._take(found[best], _left(given), tuple(each.undoing.sentence for each in others))
+        return True
+
+    def _scaled(self, rows: RoughRows, given: RoughFit) -> Iterator[_Tried]:
+        """Factors of torques that explain the samples."""
+        before = _left(given)
+        if before > LEAST_COMMON:
+            for each in self._torques(rows):
+                if before / _left(each.fit) > (LEAST_COMMON if each.common else LEAST_RATIO):
+                    yield each
+
+    def _take(self, best: _Tried, before: float, others: tuple[str, ...]) -> None:
+        u = best.undoing
+        self._undone.append(u)
+        self.found.append(Mistake(u.name, u.where, u.sentence, u.step, before, _left(best.fit), others))
+        self._segments = self._corrected(u)
+        if u.system is not None:
+            self.system = u.system(self.system)
+            self.session = Estimator(self.system, self.session.sensing.channels, "")
+
+    def _corrected(self, undoing: Undoing) -> list[Segment]:
+        made = (replace(each, values=undoing.apply(self._channels, each.values)) for each in self._segments)
+        return [part for each in made for part in without_gaps(each)]
+
+    def _samples(self, tried: Iterable[Undoing]) -> Iterator[_Tried]:
+        for undoing in tried:
+            try:
+                fit = RoughRows(self.session, self._corrected(undoing)).fit()
+            except np.linalg.LinAlgError:
+                continue  # readings that no shape of the links gives
+            yield _Tried(undoing, fit)
+
+    def _torques(self, rows: RoughRows) -> Iterator[_Tried]:
+        """Known factors of each joint's torque and of all, and the gear ratio of each that explains most."""
+        joints = range(len(self._drives))
+
+        def times(which: Sequence[int], factor: float) -> Array:
+            factors = np.ones(len(joints))
+            factors[list(which)] = factor
+            return factors
+
+        def left(which: Sequence[int], factor: float) -> float:
+            return _left(rows.fit(times(which, factor)))
+
+        for which in dict.fromkeys(((*joints,), *((i,) for i in joints))):
+            for factor, undoing in self._causes(which):
+                yield _Tried(undoing, rows.fit(times(which, factor)), common=len(which) == len(joints))
+        for i in joints:
+            gear = self.system.joints[i].gear_ratio
+            if len(joints) == 1 or not is_geared(self.system.joints[i]):
+                continue
+            coarse = np.geomspace(1.0 / LARGEST_GEAR, LARGEST_GEAR, COARSE)
+            best = min(coarse.tolist(), key=lambda factor: left([i], factor))
+            step = coarse[1] / coarse[0]
+            near = (best * np.geomspace(1.0 / step, step, FINE)).tolist()
+            # Nominal values say which joint it is, but not to a percent.
+            best = min(near, key=lambda factor: float(np.sum(np.log(rows.fit(times([i], factor)).left))))
+            if not 1.0 / LARGEST_GAIN < best < LARGEST_GAIN:
+                where, ratio = f"joint_{i + 1}", gear * best
+                said = f"the gear ratio of {where} looks like {ratio:.3g}, described as {gear:g}"
+                then = f"check the gear ratio of {where}, then its torque constant"
+                yield _Tried(
+                    Undoing("gear_ratio", where, said, then, _same, _geared(i, best)), rows.fit(times([i], best))
+                )
+
+    def _causes(self, joints: Sequence[int]) -> Iterator[tuple[float, Undoing]]:
+        """What torques of some joints may be in place of what they should, with the factor that undoes it."""
+        names = [self._drives[i] for i in joints]
+        gears = {self.system.joints[i].gear_ratio for i in joints}
+        listed, where = _listed(names), ", ".join(names)
+        unit = "N" if all(self.system.joints[i].kind == "prismatic" for i in joints) else "N m"
+        look, are = ("look", "are") if len(names) > 1 else ("looks", "is")
+        causes = [
+            (-1.0, "torque_sign", f"{listed}: the other sign", f"turn the sign of {listed}"),
+            (1e-3, "torque_unit", f"{listed} {look} like m{unit} in place of {unit}", f"divide {listed} by 1000"),
+            (1e3, "torque_unit", f"{listed} {look} like k{unit} in place of {unit}", f"multiply {listed} by 1000"),
+        ]
+        if len(gears) == 1 and gears != {1.0} and names[0].startswith("tau"):
+            (n,) = gears
+            of = "the joint's torque in place of the motor shaft's"
+            once = f"{listed} {are} divided by the gear ratio {n:g} once more"
+            causes.append((1.0 / n, "joint_torque", f"{listed} {look} like {of}", f"divide {listed} by {n:g}"))
+            causes.append((n, "joint_torque", once, f"multiply {listed} by {n:g}"))
+        for factor, name, sentence, step in causes:
+            if len(joints) == len(self._drives) and factor > 0.0:
+                sentence = f"everything is {1.0 / factor:.3g} × its description: {sentence}"
+            yield factor, Undoing(name, where, sentence, step, scaled(names, factor))
+
+
+@dataclass(frozen=True)
+class _Tried:
+    """fit: with the mistake undone. common: whether it scales all torques alike."""
+
+    undoing: Undoing
+    fit: RoughFit
+    common: bool = False
+
+
+def _left(fit: RoughFit, explained: float = EXPLAINED) -> float:
+    """Product over the coordinates, as likelihoods compare; what is explained counts as such."""
+    fitted, stated = np.maximum(fit.left, explained) / explained, np.maximum(fit.nominal, AS_STATED) / AS_STATED
+    return float(np.exp(np.sum(np.log(fitted)) + np.sum(np.log(np.minimum(stated, 1.0 / AS_STATED)))))
+
+
+def _listed(names: Sequence[str]) -> str:
+    return names[0] if len(names) == 1 else f"{', '.join(names[:-1])} and {names[-1]}"
+
+
+def _same(channels: tuple[str, ...], values: Array) -> Array:
+    return values
+
+
+def _geared(i: int, factor: float) -> Callable[[System], System]:
+    def change(system: System) -> System:
+        joints = list(system.joints)
+        joints[i] = joints[i].model_copy(update={"gear_ratio": joints[i].gear_ratio * factor})
+        return system.model_copy(update={"joints": tuple(joints)})
+
+    return change

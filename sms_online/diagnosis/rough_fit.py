@@ -1,0 +1,135 @@
+"""How well a system can explain samples at all: least squares without weights, to compare corrected samples with given.
+
+Rows are those of the weak form. Each coordinate's rows count by their own size: of the torque where they hold one, else
+of the terms that nominal values make of them. So parameters that shrink to zero explain no torque, and samples that no
+parameters fit leave a large share. Friction and an offset that nobody described are allowed for at every joint.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sms_online.diagnosis.evidence import least_squares
+from sms_online.diagnosis.record import Segment
+from sms_online.diagnosis.weak_windows import Motion, WeakWindows, Windows
+from sms_online.effects.friction import sign
+from sms_online.model.effect import Inputs
+from sms_online.pipeline.estimator import Estimator
+from sms_online.pipeline.momentum_windows import EXPONENT
+from sms_online.pipeline.smoothing import HALF_WIDTHS, stride
+from sms_online.stream import Array
+
+# Windows overlap by half.
+HOPS = 2
+# Half filters in a window.
+FILTERS = 20
+# Rows of which nominal values make less than this share of the largest are of no motion.
+LEAST_SIZE = 1e-9
+# Parameters that explain less of the torques than this share explain nothing.
+SMALLEST = 1e-6
+# Laws of friction and offset that every joint may have.
+LAWS = 3
+
+
+@dataclass(frozen=True)
+class RoughFit:
+    """left (rows,): rms share of each coordinate's rows that is not explained. nominal (rows,): the same with nominal
+    values in place of those fitted."""
+
+    left: Array
+    nominal: Array
+
+
+class RoughRows:
+    """Rows of some samples as a session reads them, errors and all."""
+
+    def __init__(self, session: Estimator, segments: Sequence[Segment]) -> None:
+        """Raises numpy.linalg.LinAlgError where there is no window, or rows are no numbers."""
+        model, base = session.model, session.base
+        layout, rate = model.layout, model.system.sample_rate
+        width = round(model.system.windows.momentum * rate)
+        M = max((HALF_WIDTHS[0], *(half for half in HALF_WIDTHS if FILTERS * half <= width)))
+        starts = [
+            np.arange(M, each.index.size - M - width - 1, max(1, width // HOPS), dtype=np.int64) for each in segments
+        ]
+        count = sum(each.size for each in starts)
+        if count <= base.n:
+            raise np.linalg.LinAlgError("too few windows without a gap")
+        where = Windows(
+            segment=np.repeat(np.arange(len(starts)), [each.size for each in starts]),
+            start=np.concatenate(starts),
+            half_width=np.full(count, M),
+            width=width,
+            exponent=EXPONENT,
+            stride=lambda M: stride(M, width),
+        )
+        weak = WeakWindows(where, layout, session.sensing, segments, rate)
+        self._motors = list(layout.theta_m)
+
+        def inertia(motion: Motion) -> tuple[Array, Array]:
+            inputs = Inputs(motion.torque, np.zeros((len(motion.samples), model.n_states)))
+            return model.momentum_columns(motion.x, motion.v, inputs=inputs)
+
+        def drives(motion: Motion) -> tuple[None, Array]:
+            G = np.zeros((*motion.v.shape, 1 + LAWS * len(self._motors)))
+            for i, motor in enumerate(self._motors):
+                speed = motion.v[:, motor]
+                G[:, motor, 0] = -motion.torque[:, i]
+                own = slice(1 + LAWS * i, 1 + LAWS * (i + 1))
+                G[:, motor, own] = np.stack((sign(speed), speed, np.ones_like(speed)), axis=1)
+            return None, G
+
+        physical, driven = weak.columns(inertia), weak.columns(drives)
+        if not (np.all(np.isfinite(physical)) and np.all(np.isfinite(driven))):
+            raise np.linalg.LinAlgError("rows that are no numbers")
+        self._torque, self._friction = driven[..., 0], driven[..., 1:]
+        self._Y, self._known = base.columns(physical), base.known_part(physical)
+        self._nominal = base.values(model.nominal)
+        terms = np.sqrt(np.mean(np.sum((self._Y * self._nominal) ** 2, axis=2), axis=0))
+        torque = np.sqrt(np.mean(self._torque**2, axis=0))
+        self._homogeneous = torque == 0.0
+        self._expected = np.sqrt(np.mean((self._Y @ self._nominal) ** 2, axis=0))
+        stated: Array = np.asarray(np.where(torque > 0.0, torque, terms))
+        # Without nominal values nobody knows what counts as much.
+        largest = np.sqrt(np.mean(np.sum(self._Y**2, axis=2), axis=0))
+        self._size: Array = np.asarray(np.where(stated > 0.0, stated, largest))
+        self._used: NDArray[np.int64] = np.flatnonzero(self._size > LEAST_SIZE * self._size.max())
+        self._size = np.maximum(self._size, LEAST_SIZE * self._size.max())
+
+    def fit(self, factors: Array | None = None) -> RoughFit:
+        """The fit with the torques of the joints times factors (joints,), ones unless given."""
+        scale = np.ones(self._torque.shape[1])
+        if factors is not None:
+            scale[self._motors] = factors
+        size = self._size * np.abs(scale)
+        b = self._torque * scale - self._known
+        by_nominal = _left(self._friction, b - self._Y @ self._nominal, size)[1]
+        # A common factor of all torques is one of all parameters: rows without a torque count by theirs.
+        alike = self._ratio(size)
+        size[self._homogeneous] *= alike
+        solution, left = _left(np.concatenate((self._Y, self._friction), axis=2), b, size)
+        # Nor do they count less where the parameters have not followed, or those of other rows alone.
+        beta = solution[: self._nominal.size]
+        explained = np.sqrt(np.mean((self._Y @ beta) ** 2, axis=0))
+        terms = np.sqrt(np.mean(np.sum((self._Y * beta) ** 2, axis=2), axis=0))
+        smallest = SMALLEST * size
+        followed = size / np.maximum(terms, smallest)
+        followed = np.maximum(followed, alike / max(self._ratio(explained), SMALLEST * alike))
+        left[self._homogeneous] *= followed[self._homogeneous]
+        return RoughFit(left[self._used], by_nominal[self._used])
+
+    def _ratio(self, torques: Array) -> float:
+        """Geometric mean over the joints of torques (n_v,), rms, to those that nominal values make; 1 without these."""
+        driven = [motor for motor in self._motors if self._expected[motor] > 0.0 and torques[motor] > 0.0]
+        return float(np.exp(np.mean(np.log(torques[driven] / self._expected[driven])))) if driven else 1.0
+
+
+def _left(columns: Array, b: Array, size: Array) -> tuple[Array, Array]:
+    """Solution (n,) of columns (W, n_v, n) for b (W, n_v), and rms (n_v,) of what it leaves, over size (n_v,)."""
+    n = columns.shape[2]
+    solution = least_squares((columns / size[:, None]).reshape(-1, n), (b / size).ravel())
+    return solution, np.sqrt(np.mean(((b - columns @ solution) / size) ** 2, axis=0))

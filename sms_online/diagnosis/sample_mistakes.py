@@ -1,0 +1,296 @@
+"""Mistakes in what samples hold: units, signs and places of channels, each with what undoes it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from itertools import combinations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sms_online.description.schema import System
+from sms_online.diagnosis.record import Segment
+from sms_online.stream import Array
+
+DEGREE = math.pi / 180.0
+# A reading that steps by more than this multiple of its usual steps, every time by the same, is wrapped; steps are the
+# same within this share.
+JUMP, SAME_STEP = 20.0, 0.05
+# Values that repeat in runs of at least this length, most of which are equal, are those of a held command.
+HELD_RUN, MOST_RUNS = 3, 0.8
+# A reading that moves by this share of its usual step stops at once, and for so many samples says the same to the last
+# bit: it is stuck. An axis that comes to rest slows down first.
+STUCK, MOVING, BEFORE = 200, 0.3, 5
+
+
+@dataclass(frozen=True)
+class Undoing:
+    """A mistake and what undoes it.
+
+    name, where: its kind and place. sentence: what is wrong. step: what to do. apply: gives samples (B, channels)
+    without it. system: the description without it, where it is one of that.
+    """
+
+    name: str
+    where: str
+    sentence: str
+    step: str
+    apply: Callable[[tuple[str, ...], Array], Array]
+    system: Callable[[System], System] | None = None
+
+
+def shown(channels: Sequence[str], segments: Sequence[Segment]) -> Iterator[Undoing]:
+    """What samples of some channels show by themselves: encoders wrapped or stuck, steps of a held command."""
+    drives = [c for c in channels if _is_drive(c)]
+    positions = [c for c in channels if c not in drives]
+    stuck = list(_stuck(positions, channels, segments))
+    yield from stuck
+    # Where a stuck encoder goes on it jumps, too.
+    places = [each.where for each in stuck]
+    yield from _wrapped([c for c in positions if c not in places], channels, segments)
+    yield from _held(drives, channels, segments)
+
+
+def _is_drive(channel: str) -> bool:
+    return channel.startswith(("tau_", "force_"))
+
+
+def undoings(system: System, channels: Sequence[str]) -> Iterator[Undoing]:
+    """What may be wrong with samples of some channels, but for scales of torques."""
+    positions = [c for c in channels if not _is_drive(c)]
+    yield from _signs(positions)
+    yield from _units(system, positions)
+    yield from _geared(system, channels)
+    yield from _swaps(channels)
+
+
+def is_angle(system: System, channel: str) -> bool:
+    """Whether a channel of positions is an angle, in rad."""
+    field = channel.rpartition(".")[2]
+    if field.startswith(("theta", "strain_angle")) or channel == "theta_0":
+        return True
+    name, _, joint = channel.rpartition("_")
+    return name in ("q", "theta_m") and system.joints[int(joint) - 1].kind == "revolute"
+
+
+def _is_length(system: System, channel: str) -> bool:
+    return not is_angle(system, channel) and not channel.startswith("e")  # Euler parameters have no unit
+
+
+def scaled(names: Sequence[str], factor: float) -> Callable[[tuple[str, ...], Array], Array]:
+    """What multiplies samples of some channels."""
+
+    def apply(channels: tuple[str, ...], values: Array) -> Array:
+        out = values.copy()
+        out[:, [channels.index(name) for name in names if name in channels]] *= factor
+        return out
+
+    return apply
+
+
+def _groups(names: Sequence[str]) -> dict[str, list[str]]:
+    """Channels that one device gives: a link's markers, the base's position; every encoder is its own."""
+    groups: dict[str, list[str]] = {}
+    for name in names:
+        owner = name.partition(".")[0] if "." in name else "r_S_*" if name.startswith("r_S_") else name
+        groups.setdefault(f"{owner}.*" if "." in name else owner, []).append(name)
+    return groups
+
+
+def _signs(positions: Sequence[str]) -> Iterator[Undoing]:
+    single = {name: [name] for name in positions if not name.startswith("e")}
+    joints: dict[str, list[str]] = {}
+    for name in positions:
+        kind, _, joint = name.rpartition("_")
+        if kind in ("q", "theta_m"):
+            joints.setdefault(f"q_{joint}, theta_m_{joint}", []).append(name)
+    both = {where: names for where, names in joints.items() if len(names) == 2}
+    groups = {where: names for where, names in _groups(positions).items() if len(names) > 1}
+    for where, names in {**single, **both, **groups}.items():
+        if not where.startswith("e"):
+            yield Undoing(
+                "angle_sign", where, f"{where}: the other sign", f"turn the sign of {where}", scaled(names, -1.0)
+            )
+
+
+def _units(system: System, positions: Sequence[str]) -> Iterator[Undoing]:
+    angles = [name for name in positions if is_angle(system, name)]
+    lengths = [name for name in positions if _is_length(system, name)]
+    for name, text, factor, all_of, words in (
+        ("degrees", "is in degrees in place of rad", DEGREE, angles, "all angles"),
+        ("millimetres", "is in mm in place of m", 1e-3, lengths, "all lengths"),
+    ):
+        for where, names in {**{n: [n] for n in all_of}, **_groups(all_of)}.items():
+            yield Undoing(name, where, f"{where} {text}", f"multiply {where} by {factor:.4g}", scaled(names, factor))
+        if len(all_of) > 1:
+            said = f"{words} {text.replace('is', 'are', 1)}"
+            yield Undoing(name, words, said, f"multiply them by {factor:.4g}", scaled(all_of, factor))
+
+
+def _geared(system: System, channels: Sequence[str]) -> Iterator[Undoing]:
+    for i, joint in enumerate(system.joints, start=1):
+        name = f"theta_m_{i}"
+        if name in channels and joint.gear_ratio != 1.0:
+            n = joint.gear_ratio
+            said = f"{name} is the motor's angle before the gear, {n:g} × the angle after it"
+            yield Undoing("motor_angle", name, said, f"divide {name} by {n:g}", scaled([name], 1.0 / n))
+
+
+def _swaps(channels: Sequence[str]) -> Iterator[Undoing]:
+    kinds: dict[tuple[str, ...], list[str]] = {}
+    for name in channels:
+        stem, _, number = name.rpartition("_")
+        if number.isdigit() or stem == "r_S":
+            kinds.setdefault((stem,), []).append(name)
+        if "." in name:
+            kinds.setdefault((name.split(".")[0], name.rpartition(".")[2]), []).append(name)
+    pairs = [([a], [b]) for names in kinds.values() for a, b in combinations(names, 2)]
+    for name in channels:
+        if name.startswith("q_") and f"theta_m_{name[2:]}" in channels:
+            pairs.append(([name], [f"theta_m_{name[2:]}"]))
+    markers: dict[str, list[str]] = {}
+    for name in channels:
+        if ".marker_" in name:
+            markers.setdefault(name.rpartition(".")[0], []).append(name)
+    for (a, first), (b, second) in combinations(markers.items(), 2):
+        if len(first) == len(second) and a.split(".")[0] == b.split(".")[0]:
+            pairs.append((first, second))
+    links: dict[str, list[str]] = {}
+    for name, own in markers.items():
+        links.setdefault(name.partition(".")[0], []).extend(own)
+    for first, second in combinations(links.values(), 2):
+        if len(first) == len(second):
+            pairs.append((first, second))
+    for one, other in pairs:
+        if len(one) > 1 or len(pairs) > 0:
+            where = f"{_common(one)}, {_common(other)}"
+            said = f"{_common(one)} and {_common(other)} are swapped"
+            yield Undoing("swapped", where, said, f"swap {_common(one)} and {_common(other)}", _swapped(one, other))
+
+
+def _common(names: Sequence[str]) -> str:
+    if len(names) == 1:
+        return names[0]
+    owners = {name.rpartition(".")[0] for name in names}
+    return f"{owners.pop()}.*" if len(owners) == 1 else f"{names[0].partition('.')[0]}.*"
+
+
+def _swapped(one: Sequence[str], other: Sequence[str]) -> Callable[[tuple[str, ...], Array], Array]:
+    def apply(channels: tuple[str, ...], values: Array) -> Array:
+        out = values.copy()
+        a, b = ([channels.index(name) for name in names if name in channels] for names in (one, other))
+        if len(a) == len(b):
+            out[:, a], out[:, b] = values[:, b], values[:, a]
+        return out
+
+    return apply
+
+
+def _wrapped(positions: Sequence[str], channels: Sequence[str], segments: Sequence[Segment]) -> Iterator[Undoing]:
+    for name in positions:
+        k = list(channels).index(name)
+        steps = np.concatenate([np.diff(each.values[:, k]) for each in segments])
+        usual = float(np.quantile(np.abs(steps), 0.9))
+        jumps = np.abs(steps[np.abs(steps) > JUMP * max(usual, 1e-12)])
+        if jumps.size and jumps.min() > (1.0 - SAME_STEP) * jumps.max():
+            turn = float(np.median(jumps))
+            turn = next((t for t in (2.0 * math.pi, math.pi, 360.0) if abs(turn / t - 1.0) < SAME_STEP), turn)
+            said = f"{name} is wrapped at {turn:.4g}: it jumps {jumps.size} times"
+            yield Undoing("wrapped", name, said, f"state wrap for {name}, or unwrap it", _unwrapped(name, turn))
+
+
+def _unwrapped(name: str, turn: float) -> Callable[[tuple[str, ...], Array], Array]:
+    def apply(channels: tuple[str, ...], values: Array) -> Array:
+        out = values.copy()
+        if name in channels:
+            k = channels.index(name)
+            read = np.flatnonzero(np.isfinite(values[:, k]))
+            out[read, k] = np.unwrap(values[read, k], period=turn)
+        return out
+
+    return apply
+
+
+def _stuck_rows(values: Array) -> NDArray[np.bool_]:
+    """Where a reading (B,) says the same value for long although it moved right before."""
+    out = np.zeros(values.size, dtype=bool)
+    steps = np.diff(values)
+    # Without the jump to where a stuck reading goes on.
+    usual = float(np.sqrt(np.mean(np.sort(steps**2)[: -max(1, steps.size // 200)])))
+    moves = np.flatnonzero(steps != 0.0)
+    ends = np.concatenate((moves, [values.size - 1]))
+    starts = np.concatenate(([0], moves + 1))
+    for start, end in zip(starts.tolist(), ends.tolist(), strict=True):
+        before = steps[max(0, start - BEFORE) : start]
+        if end - start >= STUCK and before.size == BEFORE and abs(float(before.mean())) > MOVING * usual:
+            out[start : end + 1] = True
+    return out
+
+
+def _stuck(positions: Sequence[str], channels: Sequence[str], segments: Sequence[Segment]) -> Iterator[Undoing]:
+    for name in positions:
+        k = list(channels).index(name)
+        stuck = sum(int(_stuck_rows(each.values[:, k]).sum()) for each in segments)
+        if stuck:
+            said = f"{name} is stuck at one value for {stuck} samples while it moves before"
+            step = f"check encoder and cable of {name}; leave that time out with -ss and -to"
+            yield Undoing("stuck", name, said, step, _without_stuck(name))
+
+
+def _without_stuck(name: str) -> Callable[[tuple[str, ...], Array], Array]:
+    def apply(channels: tuple[str, ...], values: Array) -> Array:
+        out = values.copy()
+        if name in channels:
+            k = channels.index(name)
+            read = np.flatnonzero(np.isfinite(values[:, k]))
+            out[read[_stuck_rows(values[read, k])], k] = np.nan
+        return out
+
+    return apply
+
+
+def without_gaps(segment: Segment) -> list[Segment]:
+    """The parts of a segment whose samples are all numbers."""
+    known = np.all(np.isfinite(segment.values), axis=1)
+    edges = np.flatnonzero(np.diff(known)) + 1
+    parts = zip(np.split(segment.index, edges), np.split(segment.values, edges), np.split(known, edges), strict=True)
+    return [Segment(index, values) for index, values, fine in parts if fine[0]]
+
+
+def _held(drives: Sequence[str], channels: Sequence[str], segments: Sequence[Segment]) -> Iterator[Undoing]:
+    """A command that is held between its updates, where it should act in the middle of each hold."""
+    lengths = {}
+    for name in drives:
+        k = list(channels).index(name)
+        runs = np.concatenate(
+            [np.diff(np.flatnonzero(np.diff(each.values[:, k]) != 0.0)) for each in segments] or [np.zeros(0)]
+        )
+        if runs.size > 2:
+            most = int(np.median(runs))
+            if most >= HELD_RUN and np.mean(runs % most == 0) > MOST_RUNS:
+                lengths[name] = most
+    if lengths:
+        names = list(lengths)
+        where = ", ".join(names)
+        samples = ", ".join(str(each) for each in sorted(set(lengths.values())))
+        said = f"{where} changes every {samples} samples only: a command that is held, no measured torque"
+        step = f"record the measured torque or current for {where}"
+        yield Undoing("held_command", where, said, step, _joined(lengths))
+
+
+def _joined(lengths: dict[str, int]) -> Callable[[tuple[str, ...], Array], Array]:
+    """Straight lines between the held values, each at the middle of its hold."""
+
+    def apply(channels: tuple[str, ...], values: Array) -> Array:
+        out = values.copy()
+        for name in lengths:
+            k = channels.index(name)
+            read = np.flatnonzero(np.isfinite(values[:, k]))
+            column = values[read, k]
+            starts = np.concatenate(([0], np.flatnonzero(np.diff(column) != 0.0) + 1))
+            out[read, k] = np.interp(np.arange(column.size), starts, column[starts])
+        return out
+
+    return apply

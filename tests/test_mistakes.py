@@ -1,0 +1,158 @@
+"""Mistakes of units, signs and wiring: named in words, undone, and never seen where there is none.
+
+A session of the planar example of 6 s, noise of grade B (seed 4), nominal values up to 20 % off (seed 1).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import cache
+
+import numpy as np
+import pytest
+
+from sms_adapters.system_file import load_system
+from sms_online.description.schema import System
+from sms_online.diagnosis.diagnose import diagnose
+from sms_online.diagnosis.document import diagnosis_document
+from sms_online.diagnosis.mistakes import Corrected, find_mistakes, wrong_clock
+from sms_online.diagnosis.record import SampleRecord, Segment
+from sms_online.diagnosis.sample_mistakes import shown, without_gaps
+from sms_online.pipeline.estimator import Estimator
+from sms_online.stream import Array, Block
+from sms_sim.simulate import sampled_blocks, simulate
+from sms_tools.adopted_system import adopted_text
+from tests.campaigns.mistakes import described
+
+DURATION = 6.0
+Change = Callable[[dict[str, Array]], None]
+
+
+@cache
+def stated() -> System:
+    return described(load_system("paper-planar"), np.random.default_rng(1))
+
+
+@cache
+def session() -> Block:
+    blocks = list(sampled_blocks(simulate(load_system("paper-planar"), DURATION), "B", seed=4))
+    t, values = (np.concatenate([getattr(block, part) for block in blocks]) for part in ("t", "values"))
+    return Block(t, blocks[0].channels, values)
+
+
+def wrong(change: Change) -> Block:
+    block = session()
+    values = {c: column.copy() for c, column in zip(block.channels, block.values.T, strict=True)}
+    change(values)
+    return Block(block.t, block.channels, np.stack(list(values.values()), axis=1))
+
+
+def found(change: Change) -> Corrected:
+    block = wrong(change)
+    estimator, record = Estimator(stated(), block.channels, "test"), SampleRecord(stated().sample_rate)
+    estimator.observers.append(record)
+    estimator.push(block)
+    estimator.finish()
+    return find_mistakes(estimator, record.segments())
+
+
+def times(factor: float, *names: str) -> Change:
+    def change(values: dict[str, Array]) -> None:
+        for name in names:
+            values[name] *= factor
+
+    return change
+
+
+def swap(one: str, other: str) -> Change:
+    def change(values: dict[str, Array]) -> None:
+        values[one], values[other] = values[other], values[one]
+
+    return change
+
+
+def test_a_session_without_a_mistake_has_none() -> None:
+    assert found(lambda values: None).mistakes == ()
+
+
+@pytest.mark.parametrize(
+    ("change", "key", "words"),
+    [
+        (times(-1.0, "tau_2"), "torque_sign@tau_2", "the other sign"),
+        (times(50.0, "tau_1", "tau_2"), "joint_torque@tau_1, tau_2", "everything is 50 × its description"),
+        (times(180.0 / np.pi, "q_2"), "degrees@q_2", "q_2 is in degrees"),
+        (times(1e3, "r_S_x", "r_S_y"), "millimetres@r_S_*", "in mm in place of m"),
+        (times(50.0, "theta_m_1"), "motor_angle@theta_m_1", "before the gear"),
+        (swap("tau_1", "tau_2"), "swapped@tau_1, tau_2", "are swapped"),
+    ],
+)
+def test_a_mistake_is_named_and_nothing_else(change: Change, key: str, words: str) -> None:
+    corrected = found(change)
+    assert [mistake.key for mistake in corrected.mistakes] == [key]
+    assert words in corrected.mistakes[0].sentence
+    assert corrected.mistakes[0].step
+    block = wrong(change)
+    np.testing.assert_allclose(corrected.samples(block.channels, block.values), session().values, rtol=1e-9)
+
+
+def test_a_wrong_gear_is_corrected_in_the_system() -> None:
+    corrected = found(times(1.6, "tau_2"))
+    assert [mistake.key for mistake in corrected.mistakes] == ["gear_ratio@joint_2"]
+    ratio = corrected.system.joints[1].gear_ratio
+    assert ratio == pytest.approx(50.0 / 1.6, rel=0.05)
+    text = adopted_text("paper-planar", stated(), corrected.system, {})
+    assert f"gear_ratio = {ratio:.4g} # found; the file said 50" in text
+
+
+def test_a_diagnosis_goes_on_with_the_mistake_undone() -> None:
+    diagnosis = diagnose(stated(), [wrong(times(-1.0, "tau_2"))], "test", lambda estimator: None)
+    document = diagnosis_document(diagnosis)
+    assert document["verdict"] == "named"
+    assert document["summary"].startswith("Tau_2: the other sign.")
+    assert document["effects"] == []
+    assert document["judgement"]["grave"]
+    assert document["judgement"]["next_step"] == "turn the sign of tau_2"
+    assert max(rows["whitened"] for rows in document["after"]["fit"].values()) < 1.4
+
+
+def one(column: Array) -> list[Segment]:
+    return [Segment(np.arange(column.size), column[:, None])]
+
+
+def test_stamps_in_milliseconds_are_seen() -> None:
+    t = np.arange(1000) / 1000.0
+    assert wrong_clock(stated(), t) is None
+    mistake = wrong_clock(stated(), 1e3 * t)
+    assert mistake is not None
+    assert mistake.sentence == "t is in ms in place of s"
+
+
+def test_a_wrapped_encoder_is_unwrapped() -> None:
+    angle = 4.0 * np.sin(np.linspace(0.0, 20.0, 5000))
+    (undoing,) = shown(["q_1"], one(np.mod(angle, 2.0 * np.pi)))
+    assert undoing.name == "wrapped"
+    values = undoing.apply(("q_1",), np.mod(angle, 2.0 * np.pi)[:, None])[:, 0]
+    np.testing.assert_allclose(values - values[0], angle - angle[0], atol=1e-9)
+
+
+def test_a_stuck_encoder_is_left_out_and_one_at_rest_is_not() -> None:
+    rng = np.random.default_rng(3)
+    t = np.linspace(0.0, 20.0, 5000)
+    stuck = np.sin(t) + 1e-5 * rng.standard_normal(t.size)
+    stuck[2500:3500] = stuck[2500]
+    (undoing,) = shown(["q_1"], one(stuck))
+    assert undoing.name == "stuck"
+    (segment,) = one(undoing.apply(("q_1",), stuck[:, None])[:, 0])
+    assert [part.index.size for part in without_gaps(segment)] == [2500, 1500]
+    # Slows down, stands still, to the last bit of its encoder, and starts again.
+    resting = np.round(np.where(t < 5.0 * np.pi / 2.0, np.sin(t), 1.0) / 1e-4) * 1e-4
+    assert list(shown(["q_1"], one(resting))) == []
+
+
+def test_a_held_command_is_joined_where_it_changes() -> None:
+    t = np.arange(4000) / 1000.0
+    held = np.repeat(np.sin(3.0 * t)[::20], 20)
+    (undoing,) = shown(["tau_1"], one(held))
+    assert undoing.name == "held_command"
+    joined = undoing.apply(("tau_1",), held[:, None])[:, 0]
+    assert np.abs(joined - np.sin(3.0 * t))[:-20].max() < 1e-3
