@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from sms_online.session import Session, estimate
     from sms_online.stream import Block
     from sms_online.trust import Residual, Trust
+    from sms_online.validation import Validation, validate
     from sms_sim.bound import Bounds, bound
     from sms_sim.capture import simulate
     from sms_sim.excitation import Excitation, excite
@@ -53,6 +54,7 @@ _HOMES = {
     "Session": "sms_online.session",
     "System": "sms_online.description.schema",
     "Trust": "sms_online.trust",
+    "Validation": "sms_online.validation",
     "bound": "sms_sim.bound",
     "check": "sms_adapters.data_check",
     "compare": "sms_adapters.runs",
@@ -64,6 +66,7 @@ _HOMES = {
     "shipped_systems": "sms_online.description.parse",
     "show": "sms_tools.view.described",
     "simulate": "sms_sim.capture",
+    "validate": "sms_online.validation",
     "write_capture": "sms_adapters.recorded",
 }
 
@@ -87,6 +90,7 @@ __all__ = [
     "Session",
     "System",
     "Trust",
+    "Validation",
     "__version__",
     "bound",
     "check",
@@ -99,6 +103,7 @@ __all__ = [
     "shipped_systems",
     "show",
     "simulate",
+    "validate",
     "write_capture",
 ]
 

@@ -100,8 +100,8 @@ def _parser() -> Parser:
     parser.add_argument("--print-completion", action=Completion, choices=("bash", "zsh", "tcsh"), help=text)
     verbs = parser.add_subparsers(metavar="VERB", required=True)
     verb_parsers = (
-        _add_demo, _add_live, _add_record, _add_simulate, _add_check, _add_replay, _add_diagnose, _add_import,
-        _add_export, _add_markers, _add_bound, _add_excite, _add_compare, _add_archive, _add_show,
+        _add_demo, _add_live, _add_record, _add_simulate, _add_check, _add_replay, _add_diagnose, _add_validate,
+        _add_import, _add_export, _add_markers, _add_bound, _add_excite, _add_compare, _add_archive, _add_show,
     )  # fmt: skip
     for add in verb_parsers:
         add(verbs)
@@ -239,10 +239,21 @@ def _add_diagnose(verbs: Verbs) -> None:
     _add_part(parser)
     text = (
         "check what is found on this capture; the same one stands for what comes after -to. "
-        "Without it the last third of the capture is held out"
+        "Without it blocks of time are held out in turn"
     )
     parser.add_argument("--holdout", metavar="CAPTURE", type=Path, help=text)
     _add_view(parser)
+
+
+def _add_validate(verbs: Verbs) -> None:
+    text = "Predict another run with everything fixed, and measure what is left of its torques."
+    parser = _add_verb(verbs, "validate", "validate", text)
+    parser.add_argument("capture", metavar="CAPTURE", type=Path, help="a capture, log or recording, as for replay")
+    text = "results.json of a session or the folder of its run; or a system file, whose nominal values are taken"
+    parser.add_argument("--system", metavar="FILE|NAME", required=True, help=text)
+    parser.add_argument("--out", metavar="DIR", type=Path, help="where validation.json goes, runs/<time> by default")
+    parser.add_argument("-ss", dest="start", metavar="SECONDS", type=_seconds(), help="leave out what is before")
+    parser.add_argument("-to", dest="stop", metavar="SECONDS", type=_seconds(positive=True), help="and what is after")
 
 
 def _add_check(verbs: Verbs) -> None:

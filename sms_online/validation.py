@@ -1,0 +1,159 @@
+"""Validation: what known parameters leave of the torques of a run that they were not estimated from."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from html import escape
+from typing import Any
+
+import numpy as np
+
+from sms_online.capture import check_channels
+from sms_online.description.channels import channels as known_channels
+from sms_online.description.schema import System
+from sms_online.diagnosis.evidence import RANK_TOLERANCE
+from sms_online.errors import InputError
+from sms_online.model.base_parameters import BaseParameters
+from sms_online.pipeline.estimator import Estimator
+from sms_online.pipeline.joint_balance import SquaredResidual
+from sms_online.result import Parameters, json_text
+from sms_online.row_types import joint_rows
+from sms_online.session import Data, recorded_session
+from sms_online.stream import Array
+from sms_online.tables import html_table, text_table
+
+SCHEMA = "sms-online/validation/1"
+# Parameters that predict another run within this multiple of what any parameters leave there hold for both.
+HOLDS = 1.15
+# And less than this share of a torque is none.
+NEGLIGIBLE = 0.01
+
+
+@dataclass(frozen=True)
+class Predicted:
+    """What is left of the torque or force of a joint, rms over its rms.
+
+    left: with everything fixed. least: with parameters fitted to this run, what the description itself lacks and noise.
+    """
+
+    left: float
+    least: float
+
+    @property
+    def ratio(self) -> float:
+        """How many times as much is left as has to be."""
+        return self.left / self.least if self.least > 0.0 else np.inf
+
+    @property
+    def holds(self) -> bool:
+        """Whether parameters fitted to this run would not be worth it."""
+        return self.left <= max(NEGLIGIBLE, HOLDS * self.least)
+
+
+@dataclass(frozen=True)
+class Validation:
+    """A run predicted with everything fixed.
+
+    system: with which description. duration: of the run, s. joints: `joint_i` to what is left of its torque; those
+    without a torque are left out. warnings: of the source.
+    """
+
+    system: str
+    duration: float
+    joints: Mapping[str, Predicted]
+    warnings: tuple[str, ...] = ()
+
+    @property
+    def holds(self) -> bool:
+        """Whether the parameters hold on this run too, at every joint."""
+        return all(each.holds for each in self.joints.values())
+
+    @property
+    def sentence(self) -> str:
+        """The worst joint, in a sentence."""
+        failing = {name: each for name, each in self.joints.items() if not each.holds}
+        if not failing:
+            name, worst = max(self.joints.items(), key=lambda item: item[1].left)
+            return f"The parameters hold on this run: at most {100.0 * worst.left:.2g} % of a torque is left ({name})."
+        name, worst = max(failing.items(), key=lambda item: item[1].ratio)
+        left = f"{100.0 * worst.left:.2g} % of the torque of {name} is left"
+        return f"The parameters do not hold on this run: {left}, {worst.ratio:.3g} times what others would leave."
+
+    def document(self) -> dict[str, Any]:
+        """validation.json as plain dictionaries and numbers."""
+        return {
+            "schema": SCHEMA,
+            "system": self.system,
+            "duration_s": self.duration,
+            "holds": self.holds,
+            "sentence": self.sentence,
+            "joints": {name: {"left": each.left, "least": each.least} for name, each in self.joints.items()},
+            "warnings": list(self.warnings),
+        }
+
+    def to_json(self) -> str:
+        """The text of validation.json."""
+        return json_text(self.document())
+
+    def rows(self) -> tuple[list[str], list[list[str]]]:
+        """Headings and cells of a table."""
+        cells = [[name, f"{e.left:.3g}", f"{e.least:.3g}", f"{e.ratio:.2f}"] for name, e in self.joints.items()]
+        return ["joint", "share of torque left", "fitted to this run", "ratio"], cells
+
+    def __str__(self) -> str:
+        return f"{text_table(*self.rows())}\n\n{self.sentence}"
+
+    __repr__ = __str__
+
+    def _repr_html_(self) -> str:
+        return f"{html_table(*self.rows())}<p><b>{escape(self.sentence)}</b></p>"
+
+
+def validate(system: System, data: Data, parameters: Parameters | Mapping[str, float] | None = None) -> Validation:
+    """Predict the torques of recorded data with everything fixed, and measure what is left.
+
+    data: as for `estimate`. parameters: values by name, or those of a `Result`; the nominal ones of the system file
+    unless given. Nothing is estimated from the data but for comparison.
+    Raises InputError where the data do not fit the system, a parameter is missing, or there is no torque to predict.
+    """
+    recorded = recorded_session(system, data)
+    check_channels(tuple(recorded.source.channels), known_channels(system), recorded.name)
+    # The rows of the joints' torques depend on no estimate; without a momentum balance no event changes the model.
+    session = Estimator(system.model_copy(update={"balance": "energy"}), recorded.source.channels, recorded.name)
+    for block in recorded.source:
+        session.push(block)
+    session.finish()
+    beta = _values(session.base, system, parameters)
+    sums = {joint_rows(i): each for i, each in enumerate(session.joint_residuals) if each.signal > 0.0}
+    if not sums:
+        raise InputError(recorded.name, "", "no torque, or too few samples", "a run with measured torques")
+    fitted = _fitted(list(sums.values()), beta.size)
+    joints = {name: Predicted(_share(each, beta), _share(each, fitted)) for name, each in sums.items()}
+    return Validation(system.name, session.duration, joints, tuple(recorded.source.warnings))
+
+
+def _share(sums: SquaredResidual, beta: Array) -> float:
+    share = sums.relative(beta)
+    assert share is not None
+    return share
+
+
+def _values(base: BaseParameters, system: System, parameters: Parameters | Mapping[str, float] | None) -> Array:
+    """β (n,) of the parameters that are given by name."""
+    if parameters is None:
+        return base.values(np.array([parameter.nominal for parameter in base.physical]))
+    values = {name: each if isinstance(each, float) else each.value for name, each in parameters.items()}
+    missing = [parameter.name for parameter in base.parameters if parameter.name not in values]
+    if missing:
+        raise InputError(system.name, missing[0], "no value", "a value of every parameter of this system")
+    return np.array([values[parameter.name] for parameter in base.parameters])
+
+
+def _fitted(sums: list[SquaredResidual], n: int) -> Array:
+    """β (n,) that leaves least of all joints' torques, each relative to its own."""
+    gram = np.sum([each.gram / each.signal for each in sums], axis=0)
+    size = np.sqrt(np.diag(gram))[:n]
+    size[size == 0.0] = 1.0
+    scaled = gram[:n, :n] / np.outer(size, size)
+    return np.asarray(np.linalg.lstsq(scaled, gram[:n, n] / size, rcond=RANK_TOLERANCE)[0] / size)

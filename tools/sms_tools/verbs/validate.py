@@ -1,0 +1,54 @@
+"""validate: what known parameters leave of the torques of another run."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from rich.table import Table
+
+from sms_adapters.recorded import captured, recorded_at
+from sms_adapters.runs import read_results
+from sms_adapters.sources import open_source
+from sms_online.description.schema import System
+from sms_online.validation import validate
+from sms_tools.exit_codes import OK
+from sms_tools.report import report_console, show
+from sms_tools.results_file import results_directory, write_document
+from sms_tools.session import check_part, described_system
+
+NAME = "validation.json"
+
+
+def run(args: argparse.Namespace) -> int:
+    """Validate; 0, whether or not the parameters hold."""
+    check_part(args)
+    system, parameters, folder = _described(args)
+    directory = results_directory(args.out)
+    capture = captured(
+        recorded_at(args.capture, open_source(args.capture, system, args.start, args.stop, None, folder))
+    )
+    found = validate(system, capture, parameters)
+    path = write_document(directory / NAME, found.to_json())
+    headings, rows = found.rows()
+    table = Table(box=None, header_style="bold", pad_edge=False)
+    for heading in headings:
+        table.add_column(heading, justify="left" if heading == "joint" else "right")
+    for row in rows:
+        table.add_row(*row)
+    warnings = [f"warning: {warning}" for warning in found.warnings]
+    show(report_console(args.json), table, "", *warnings, f"validation: {path}", "", found.sentence)
+    if args.json:
+        print(found.to_json())
+    return OK
+
+
+def _described(args: argparse.Namespace) -> tuple[System, dict[str, float] | None, Path | None]:
+    """System and parameters of a results.json or of the folder of a run; of a system file its nominal values."""
+    path = Path(args.system)
+    if path.suffix != ".json" and not path.is_dir():
+        system, folder = described_system(args)
+        return system, None, folder
+    document = read_results(path)
+    values = {parameter["name"]: float(parameter["estimate"]) for parameter in document["parameters"]}
+    return System.model_validate(document["system"]), values, None
