@@ -21,9 +21,11 @@ from sms_online.physical import PhysicalSet, Projection
 from sms_online.pipeline.latency import source_channels
 from sms_online.pipeline.periods import LONGEST_HOLE
 from sms_online.pipeline.statistics import Statistics
+from sms_online.pipeline.tracker_bank import Reading, rows_per_second
 from sms_online.row_types import ENERGY, joint_rows, row_types
 from sms_online.stream import Array
 from sms_online.threads import one_blas_thread
+from sms_online.tracker_results import Consistency, Drift, Tracked, TrackerResult
 from sms_online.trackers.interface import Estimate
 from sms_online.trust import Reason, Residual, Trust
 
@@ -93,7 +95,11 @@ class Evaluation:
         energy window share, which least squares absorbs and no residual shows; it is known while no row is forgotten.
         Where rows have been weighed against a prior, the posterior's own covariance holds.
         """
-        now, estimate = self.statistics, self.estimate
+        return self._reported(self.estimate)
+
+    def _reported(self, estimate: Estimate) -> Array:
+        """See `std`; of any tracker's estimate."""
+        now = self.statistics
         std = np.full(estimate.pi.shape, np.inf)
         if estimate.dof <= 0.0:
             return std
@@ -124,7 +130,7 @@ class Evaluation:
     @one_blas_thread()
     def residuals(self) -> dict[str, Residual]:
         """By type of the rows."""
-        now, beta = self.statistics, self.estimate.pi
+        now, beta = self.statistics, self._joint[len(self.statistics.setup.nuisances) :]
         relative = {joint_rows(i): joint.relative(beta) for i, joint in enumerate(now.joints)}
         out = {ENERGY: Residual(None, None)}
         for name, speeds in row_types(self.model.layout).items():
@@ -136,9 +142,39 @@ class Evaluation:
 
     @property
     def _joint(self) -> Array:
-        """Nuisances and parameters; zeros for the nuisances where another balance gives the estimate."""
+        """Nuisances and parameters that residuals are for; zeros for the nuisances where another balance gives it.
+
+        Where parameters have moved, sums of rows are free of that, and so are these.
+        """
+        momentum = self.statistics.momentum
+        if self.statistics.method == "momentum" and momentum is not None and momentum.reference is not None:
+            return momentum.reference
         estimate, m = self.estimate, len(self.statistics.setup.nuisances)
         return estimate.joint if estimate.nuisances.size == m else np.concatenate((np.zeros(m), estimate.pi))
+
+    @cached_property
+    @one_blas_thread()
+    def trackers(self) -> tuple[TrackerResult, ...]:
+        """What each chosen tracker says, the judged one first; empty where no momentum balance gives the estimate."""
+        now = self.statistics
+        if now.method != "momentum" or now.momentum is None:
+            return ()
+        readings = now.momentum.trackers
+        if not readings:
+            rate = rows_per_second(self.model.layout.n_v, self.model.system.windows.momentum)
+            readings = (Reading(now.setup.system.trackers[0].label, self.estimate, self.estimate.rows / rate),)
+        out = []
+        for k, reading in enumerate(readings):
+            estimate = self.estimate if k == 0 else reading.estimate
+            std = self.std if k == 0 else self._reported(estimate)
+            numbers = (estimate.pi.tolist(), std.tolist(), identifiable(estimate.pi, std).tolist())
+            tracked = {p.name: Tracked(*each) for p, *each in zip(self.parameters, *numbers, strict=True)}
+            consistency = Consistency.of(estimate)
+            moving = [(self.parameters[drift.column], drift) for drift in reading.drifts]
+            drifts = tuple(Drift(p.name, p.unit, drift.since, drift.rate, drift.std) for p, drift in moving)
+            memory = min(reading.memory, now.duration)
+            out.append(TrackerResult(reading.label, k == 0, tracked, consistency, memory, drifts))
+        return tuple(out)
 
     @cached_property
     def calibration(self) -> list[Calibration]:

@@ -181,7 +181,7 @@ def judge_diagnosis(verdict: str, effects: Sequence[str], row: str | None, after
 
 def _open(discrepancy: Discrepancy) -> bool:
     """Whether an alarm is this episode's. A test that alarms after an effect was taken up tells of something else."""
-    return not discrepancy.adopted and discrepancy.verdict != "change"
+    return not discrepancy.adopted and discrepancy.verdict not in ("change", "drift")
 
 
 def _named(discrepancies: Iterable[Discrepancy]) -> list[Reason]:

@@ -20,6 +20,7 @@ from sms_online.pipeline.events import Event
 from sms_online.pipeline.statistics import Method
 from sms_online.stream import Array
 from sms_online.tables import formatter, html_table, text_table
+from sms_online.tracker_results import Drift, TrackerResult
 from sms_online.trust import Residual, Residuals, Trust
 
 if TYPE_CHECKING:
@@ -199,7 +200,8 @@ class Result:
     what the estimate comes from, "smoother", "momentum" or "energy" balance. samples, lost_samples: counts. outliers:
     how many samples were left out, by channel. duration: s. condition_number: of the scaled information, inf without
     full rank. throughput: samples/s of computing time. calibration: what the description is off by, estimated better
-    than its tolerances.
+    than its tolerances. trackers: what each says, the judged one, whose estimate `parameters` holds, first; empty where
+    no momentum balance gives the estimate.
     physical: None of a session that still runs. diagnosis: episodes of the running diagnosis, as in results.json.
     """
 
@@ -218,8 +220,14 @@ class Result:
     outliers: dict[str, int]
     throughput: float = 0.0
     calibration: tuple[Calibration, ...] = ()
+    trackers: tuple[TrackerResult, ...] = field(default=(), repr=False)
     physical: Consistency | None = field(default=None, repr=False)
     diagnosis: tuple[Mapping[str, Any], ...] = field(default=(), repr=False)
+
+    @property
+    def drifts(self) -> tuple[Drift, ...]:
+        """Parameters that the judged tracker has found to drift."""
+        return tuple(drift for tracker in self.trackers if tracker.judged for drift in tracker.drifts)
 
     def document(self) -> dict[str, Any]:
         """results.json as plain lists, dictionaries and numbers."""
@@ -232,6 +240,7 @@ class Result:
             "verdict": self.trust.document(),
             "parameters": [parameter.document() for parameter in self.parameters.values()],
             "calibration": [each.document() for each in self.calibration],
+            "trackers": [each.document() for each in self.trackers],
             "events": [event_document(event) for event in self.events],
             "residual": residual_document(self.residuals),
             "physical": None
@@ -337,6 +346,7 @@ def result_of(
         outliers={channel: count for channel, (count, _) in now.outliers.items()},
         throughput=throughput,
         calibration=tuple(evaluation.calibration),
+        trackers=evaluation.trackers,
         physical=None if projection is None else Consistency(projection.distance, projection.active),
         diagnosis=tuple(episodes),
     )

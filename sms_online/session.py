@@ -17,7 +17,8 @@ from sms_online.checkpoint import Checkpoint
 from sms_online.cramer_rao import MotionRecord, session_bound
 from sms_online.description.channels import channels as known_channels
 from sms_online.description.given import Given, given_system
-from sms_online.description.schema import System
+from sms_online.description.schema import System, TrackerChoice
+from sms_online.description.tracker import parse_tracker
 from sms_online.diagnosis.online import Immediate, OnlineDiagnosis, Searcher
 from sms_online.errors import InputError
 from sms_online.evaluation import Evaluation
@@ -29,16 +30,29 @@ from sms_online.state import Stage
 from sms_online.stream import Array, Block, Source
 from sms_online.truth import true_values
 
+# One or several trackers, as texts or records; None for those of the system file.
+Trackers = str | TrackerChoice | Sequence[str | TrackerChoice] | None
+
+
+def with_trackers(system: System, tracker: Trackers) -> System:
+    """The system with these trackers in place of its own, if any; InputError for a text that is none."""
+    if tracker is None:
+        return system
+    asked = [tracker] if isinstance(tracker, str | TrackerChoice) else list(tracker)
+    chosen = tuple(parse_tracker(each) if isinstance(each, str) else each for each in asked)
+    return system.model_copy(update={"trackers": chosen}) if chosen else system
+
 
 class Session:
     """Estimates a system's parameters while samples come, and names effects that the system file lacks.
 
     system: described, or its name or file. channels: names, in the order of the values to come. prior: start from the
     nominal values, each ± 10 %; priors that the system file states hold without it too. adopt: go on with effects as
-    soon as they are named. source: name of what samples come from, for messages. searcher: who makes the diagnosis'
-    searches, by default at once and here. checkpoint: state to go on from. The result depends on the samples alone, to
-    the last bit, however they are cut into updates. Raises InputError for a channel that the system does not have or
-    one that is missing.
+    soon as they are named. tracker: in place of the system file's, "rls:forgetting=exponential,memory=5" or
+    "kalman:drift=learned" for instance, or several, of which the first gives the estimate. source: name of what samples
+    come from, for messages. searcher: who makes the diagnosis' searches, by default at once and here. checkpoint: state
+    to go on from. The result depends on the samples alone, to the last bit, however they are cut into updates. Raises
+    InputError for a channel that the system does not have or one that is missing.
     """
 
     def __init__(
@@ -48,11 +62,12 @@ class Session:
         *,
         prior: bool = False,
         adopt: bool = False,
+        tracker: Trackers = None,
         source: str = "session",
         searcher: Searcher | None = None,
         checkpoint: Checkpoint | None = None,
     ) -> None:
-        system, _ = given_system(system)
+        system = with_trackers(given_system(system)[0], tracker)
         self.channels = tuple(channels)
         check_channels(self.channels, known_channels(system), source)
         self.estimator = Estimator(system, self.channels, source)
@@ -208,12 +223,14 @@ def estimate(
     prior: bool = False,
     adopt: bool = False,
     bound: bool = False,
+    tracker: Trackers = None,
 ) -> Result:
     """Estimate the parameters of a system from recorded data; the same bits as a replay of them, or the live session.
 
     system: described, or its name or file. data: a capture, the path of one, of a log or of a recording, or blocks of
-    samples in order of time. prior, adopt: as for `Session`. bound: the Cramér–Rao bound of every parameter too, as the
-    yardstick of its standard deviation. Raises InputError where the data cannot be read or do not fit the system.
+    samples in order of time. prior, adopt, tracker: as for `Session`. bound: the Cramér–Rao bound of every parameter
+    too, as the yardstick of its standard deviation. Raises InputError where the data cannot be read or do not fit the
+    system.
     """
     system, folder = given_system(system)
     recorded = recorded_session(system, data, folder)
@@ -223,6 +240,7 @@ def estimate(
         source.channels,
         prior=prior,
         adopt=adopt,
+        tracker=tracker,
         source=recorded.name,
         searcher=recorded.searcher(adopt),
         checkpoint=recorded.checkpoint,

@@ -16,6 +16,7 @@ from sms_online.effects.build import build_model
 from sms_online.effects.catalogue import check_effect, parse_effect
 from sms_online.errors import InputError
 from sms_online.stream import Block
+from sms_sim.drifting import ParameterDrift, drifted, parsed
 from sms_sim.plant import Plant
 from sms_sim.sensors import Sensors
 from sms_sim.simulate import Simulation, sampled_blocks
@@ -26,7 +27,8 @@ from sms_sim.simulate import simulate as solve
 class Simulated:
     """A session to be simulated: the described system with effects that its file does not declare, and its sensors.
 
-    grade: noise in place of the described one. seed: of the noise. duration: s, None for the trajectory's own.
+    grade: noise in place of the described one. seed: of the noise. duration: s, None for the trajectory's own. drifts:
+    of its parameters.
     """
 
     described: System
@@ -34,6 +36,7 @@ class Simulated:
     duration: float | None = None
     grade: str | None = None
     seed: int = 0
+    drifts: tuple[ParameterDrift, ...] = ()
 
     @staticmethod
     def of(
@@ -42,8 +45,9 @@ class Simulated:
         duration: float | None = None,
         grade: str | None = None,
         seed: int = 0,
+        drift: Sequence[str | ParameterDrift] = (),
     ) -> Simulated:
-        """Effects as texts or records; InputError where one cannot act on the system."""
+        """Effects and drifts as texts or records; InputError where one cannot act on the system."""
         if isinstance(effects, str):
             raise InputError("effects", "", repr(effects), f"a list of effects, [{effects!r}]")
         injected: list[Effect] = []
@@ -54,7 +58,13 @@ class Simulated:
                 injected.append(effect)
             else:
                 injected.append(parse_effect(effect, whole))
-        return Simulated(system, tuple(injected), duration, grade, seed)
+        whole = system.model_copy(update={"effects": (*system.effects, *injected)})
+        drifts = parsed(drift)
+        model = build_model(whole) if drifts else None
+        for each in drifts:
+            assert model is not None
+            each.direction(model, model.nominal)
+        return Simulated(system, tuple(injected), duration, grade, seed, drifts)
 
     @cached_property
     def system(self) -> System:
@@ -72,7 +82,8 @@ class Simulated:
         progress: is called with what is being done, a few words, and the share of it that is done.
         """
         try:
-            return solve(self.system, self.duration, progress=partial(progress, "solving the motion"))
+            report = partial(progress, "solving the motion")
+            return solve(self.system, self.duration, progress=report, drifts=self.drifts)
         except ArithmeticError as error:
             expected = "a motion that the integrator can follow"
             raise InputError(self.described.name, "trajectory and controller", str(error), expected) from None
@@ -84,13 +95,21 @@ class Simulated:
     def truth(self, simulation: Simulation) -> dict[str, Any]:
         """True parameters of the described system, and how they came about."""
         return {
-            "parameters": {p.name: p.nominal for p in build_model(self.described).parameters},
+            "parameters": self._at_end(simulation),
             "system": self.system.name,
             "grade": self.grade,
             "seed": self.seed,
             "duration_s": simulation.duration,
             "effects": [effect.model_dump(mode="json") for effect in self.effects],
+            "drifts": [drift.document() for drift in self.drifts],
         }
+
+    def _at_end(self, simulation: Simulation) -> dict[str, float]:
+        """Parameters of the described system, with where drifts have brought them."""
+        model = build_model(self.described)
+        own = [drift for drift in self.drifts if any(drift.parameter in (p.name, p.owner) for p in model.parameters)]
+        end = drifted(model, model.nominal, own, np.array([simulation.duration]))[0]
+        return {p.name: float(value) for p, value in zip(model.parameters, end, strict=True)}
 
 
 def simulate(
@@ -99,16 +118,19 @@ def simulate(
     grade: str | None = None,
     seed: int = 0,
     effects: Sequence[str | Effect] = (),
+    drift: Sequence[str | ParameterDrift] = (),
 ) -> Capture:
     """Simulate a described system in closed loop, and record what its sensors see.
 
     system: described, or its name or file. duration: s, the described trajectory's by default. grade: noise of all
     sensors in place of the described one, "0" none, "A", "B", "C" ever more. seed: of the noise. effects: what the
-    system file does not describe, as texts "name@where:coefficient=value,…". The capture holds the truth, which no
-    estimate uses. InputError for an effect or a grade that there is not, or a motion that cannot be followed.
+    system file does not describe, as texts "name@where:coefficient=value,…". drift: parameters that change on the way,
+    "parameter:share=-0.1,over=60" for instance, or "parameter:half_life=20"; what is true is then the value at the end.
+    The capture holds the truth, which no estimate uses. InputError for an effect, a drift or a grade that there is not,
+    or a motion that cannot be followed.
     """
     system, _ = given_system(system)
-    session = Simulated.of(system, effects, duration, grade, seed)
+    session = Simulated.of(system, effects, duration, grade, seed, drift)
     channels = session.channels
     simulation = session.solve()
     blocks = list(session.blocks(simulation))

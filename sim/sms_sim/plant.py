@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import cached_property
 
 import numpy as np
@@ -13,6 +14,7 @@ from sms_online.model.effect import Inputs
 from sms_online.sensor_set import Readings, readable_channels
 from sms_online.stream import Array
 from sms_sim.controller import JointPD
+from sms_sim.drifting import ParameterDrift
 from sms_sim.references import FourierReference
 
 
@@ -22,14 +24,17 @@ class Plant:
     The state y is positions x, speeds v and the internal states z of declared effects in one array, (B, n_y). Euler
     parameters are integrated as plain states: their norm is an invariant of the equations, which the adaptive
     integrator keeps to its own accuracy; only a run of hours at a fixed step needs `normalised`. Declared effects are
-    part of the model's dynamics; those on channels are the sensors'.
+    part of the model's dynamics; those on channels are the sensors'. drifts: parameters that change with time. Mass
+    that is lost leaves with the velocity of its body, so that (40) holds with the parameters of the instant.
     """
 
-    def __init__(self, system: System, parameters: Array | None = None) -> None:
+    def __init__(self, system: System, parameters: Array | None = None, drifts: Sequence[ParameterDrift] = ()) -> None:
         self.model = build_model(system, parameters)
         self.system = self.model.system
         self.parameters = self.model.nominal if parameters is None else parameters
         self.dynamics = self.model.dynamics(self.parameters)
+        # Equations of motion are linear in π: what a drift adds to them are those of its direction.
+        self._drifts = [(drift, self.model.dynamics(drift.direction(self.model, self.parameters))) for drift in drifts]
         self.controller: JointPD | None = None
         if system.controller is not None and system.trajectory is not None:
             self.controller = JointPD(system.controller, FourierReference(system.trajectory))
@@ -126,10 +131,20 @@ class Plant:
         """ẏ (B, n_y) from H v̇ + C = Q, (40), and the effects' own laws."""
         x, v = self.split(y)
         inputs = self.inputs(t, y)
-        v_dot = self.dynamics.acceleration(x, v, self.model.generalized_force(inputs.torque), inputs)
+        Q = self.model.generalized_force(inputs.torque)
+        v_dot = self.dynamics.acceleration(x, v, Q, inputs) if not self._drifts else self._drifting(t, x, v, Q, inputs)
         return np.concatenate(
             (self.model.position_rate(x, v), v_dot, self.model.state_rate(x, v, inputs.states)), axis=1
         )
+
+    def _drifting(self, t: Array, x: Array, v: Array, Q: Array, inputs: Inputs) -> Array:
+        """v̇ (B, n_v) with the parameters of t (B,)."""
+        H, C = self.dynamics.mass_and_bias(x, v, inputs)
+        for drift, direction in self._drifts:
+            H_more, C_more = direction.mass_and_bias(x, v, inputs)
+            course = drift.course(t)
+            H, C = H + course[:, None, None] * H_more, C + course[:, None] * C_more
+        return np.asarray(np.linalg.solve(H, (Q - C)[..., None])[..., 0])
 
     def motor_power(self, t: Array, y: Array) -> Array:
         """Power of each motor n τ θ̇_m (B, joints), W: its integral is the left side of (42)."""

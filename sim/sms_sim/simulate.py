@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -13,6 +13,7 @@ from sms_online.errors import InputError
 from sms_online.stream import Array, Block
 from sms_online.threads import one_blas_thread
 from sms_sim.distortion import Distortion
+from sms_sim.drifting import ParameterDrift
 from sms_sim.integrate import Dense, solve
 from sms_sim.plant import Plant
 from sms_sim.sensors import Sensors
@@ -129,18 +130,19 @@ def simulate(
     initial: tuple[Array, Array] | None = None,
     position_tolerance: float = POSITION_TOLERANCE,
     progress: Callable[[float], None] = lambda share: None,
+    drifts: Sequence[ParameterDrift] = (),
 ) -> Simulation:
     """Integrate a described system in closed loop, to `position_tolerance` (m, rad) a step.
 
     duration: s, the reference's own by default. parameters: π (n_pi,) in place of the nominal ones. initial: x (n_x,)
-    and v (n_v,) in place of rest. progress: told the share that is solved, step by step. Raises InputError where
-    nothing states the duration, ArithmeticError where the motion cannot be followed.
+    and v (n_v,) in place of rest. progress: told the share that is solved, step by step. drifts: of parameters. Raises
+    InputError where nothing states the duration, ArithmeticError where the motion cannot be followed.
     """
     if duration is None:
         if system.trajectory is None:
             raise InputError(system.name, "trajectory", "no such table", "a trajectory, or a duration in seconds")
         duration = system.trajectory.duration
-    plant = Plant(system, parameters)
+    plant = Plant(system, parameters, drifts)
     start = plant.rest if initial is None else plant.state(*initial)
     bounds = tolerance(plant, position_tolerance)
     solution = solve(

@@ -21,6 +21,7 @@ TABLES = {
     "sensors": "sensor {}",
     "sources": "source {}",
     "effects": "effect {}",
+    "trackers": "tracker {}",
 }
 RECORDS: dict[str, type[BaseModel]] = {
     "spacecraft": schema.Spacecraft,
@@ -35,6 +36,7 @@ RECORDS: dict[str, type[BaseModel]] = {
     "trajectory": schema.Harmonic,
     "windows": schema.Windows,
     "tolerances": schema.Tolerances,
+    "trackers": schema.TrackerChoice,
 }
 # Records that a key of the table tells apart, by its values; a serial source needs two such keys.
 LINKS: dict[str, type[BaseModel]] = {

@@ -2,7 +2,7 @@
 
 Tables of a file: [spacecraft], then [joint_i], [motor_i] (optional) and [link_i] for i = 1..N, those of fixed joints
 last, [payload], [[sensor]], [[source]], [[effect]], [known], [prior], [controller], [trajectory], [windows],
-[tolerances]; keys are the fields of `schema`.
+[tolerances], [tracker]; keys are the fields of `schema`.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from sms_online.errors import InputError
 
 # Top-level keys of a file and the field of `System` that each fills; numbered tables come beside them.
 PLAIN = ("name", "title", "reference", "motion", "gravity", "sample_rate", "balance", "spacecraft", "payload", "known")
-RENAMED = {"sensor": "sensors", "source": "sources", "effect": "effects", "prior": "priors"}
+RENAMED = {"sensor": "sensors", "source": "sources", "effect": "effects", "prior": "priors", "tracker": "trackers"}
 WITHOUT_NUMBERS = (*PLAIN, *RENAMED, "controller", "trajectory", "windows", "tolerances")
 NUMBERED = re.compile(r"(joint|motor|link)_([1-9]\d*)")
 # Levels of tables and lists in a file: one more than a signal of a source or a harmonic of a joint needs.
@@ -99,6 +99,8 @@ def _arrange(document: Mapping[str, Any], source: str) -> dict[str, Any]:
                 )
     record = {key: document[key] for key in (*PLAIN, "controller", "windows", "tolerances") if key in document}
     record |= {field: document[key] for key, field in RENAMED.items() if key in document}
+    if isinstance(record.get("trackers"), dict):
+        record["trackers"] = [record["trackers"]]
     joints = [document[f"joint_{i}"] for i in range(1, n + 1)]
     moving = _moving(joints, document, source)
     record["joints"], record["fixed_joints"] = joints[:moving], joints[moving:]

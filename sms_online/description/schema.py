@@ -16,6 +16,8 @@ from sms_online.description.sources import Device, LogSource, Source
 
 Vector3 = tuple[float, float, float]
 Deformation = Literal["traction", "torsion", "bending_y", "bending_z"]
+Forgetting = Literal["none", "exponential", "window", "directional"]
+Drift = Literal["none", "random_walk", "trend", "learned"]
 
 
 class Inertia(Record):
@@ -300,6 +302,48 @@ class Tolerances(Record):
         return dict.fromkeys(cls.model_fields, 0.0) if given == "none" else given
 
 
+class TrackerChoice(Record):
+    """A tracker of the momentum balance's rows. Of several `[[tracker]]` tables the first gives the judged estimate.
+
+    kind: `rls`, recursive least squares, or `kalman`, a Kalman filter in which parameters may drift.
+    forgetting: of `rls`: `none`; `exponential`, old rows fade; `directional`, they fade as new rows replace them;
+    `window`, rows of the last `memory` s count alike.
+    memory: of a forgetting, s: the time in which a row's weight falls by 1/e, or the window's length.
+    drift: of `kalman`: for all parameters, or a table from a parameter, or from what owns several (`joint_1`), to its
+    drift. `none`; `random_walk`; `trend`, value and rate on knots; `learned`, a trend of those parameters that show
+    one.
+    std: process noise, a table of the same names: of a random walk in the parameter's unit per √s, of a trend's rate in
+    the unit per s per √s.
+    share: the same as a share of the parameter's stated value, where `std` does not name it.
+    """
+
+    kind: Literal["rls", "kalman"] = "rls"
+    forgetting: Forgetting = "none"
+    memory: Positive | None = None
+    drift: Drift | dict[str, Drift] = "none"
+    std: dict[str, Positive] = {}
+    share: Positive | None = None
+
+    @property
+    def label(self) -> str:
+        """Name for people, such as "rls", "rls exponential 5 s" or "kalman learned"."""
+        if self.kind == "rls":
+            return "rls" if self.memory is None else f"rls {self.forgetting} {self.memory:g} s"
+        if isinstance(self.drift, str):
+            return "kalman" if self.drift == "none" else f"kalman {self.drift.replace('_', ' ')}"
+        return f"kalman {', '.join(f'{name} {drift}' for name, drift in self.drift.items())}".replace("_", " ")
+
+    @property
+    def learns(self) -> bool:
+        """Whether it learns drifts of some parameters."""
+        return "learned" in ([self.drift] if isinstance(self.drift, str) else self.drift.values())
+
+    @property
+    def static(self) -> bool:
+        """Whether it is the session's own least squares, in which every row counts alike."""
+        return self == TrackerChoice()
+
+
 class System(Record):
     """A whole testbed; joints, motors and links are in the order of their numbers.
 
@@ -324,6 +368,7 @@ class System(Record):
     trajectory: of the simulator.
     windows: widths of the test functions.
     tolerances: of geometry, clocks and calibration.
+    trackers: `[tracker]`, or several `[[tracker]]` tables, of which the first gives the judged estimate.
     balance: which rows are fitted. `both`: the momentum balance, and the energy balance until its weights are known.
     `smoother`: state and parameters together, which links with too few sensors get unless it says `energy`.
     """
@@ -349,6 +394,7 @@ class System(Record):
     trajectory: Trajectory | None = None
     windows: Windows = Windows()
     tolerances: Tolerances = Tolerances()
+    trackers: Annotated[tuple[TrackerChoice, ...], Field(min_length=1)] = (TrackerChoice(),)
     balance: Literal["both", "energy", "momentum", "smoother"] = "both"
 
     @property

@@ -25,8 +25,10 @@ class Episode:
 
     noticed: s, samples up to then were there. row: type of the rows that leave most; began: s, None where it may have
     been there from the start. verdict: "noticed", "named", "unexplained", "passed" where the last samples show nothing
-    of it, or "change" where a jump of parameters, the event, explains it. named_at: s, when a search first named what
-    was found in the end, or when the event was decided. adopted: s, when what was named was taken up; refused: why not.
+    of it, "change" where a jump of parameters, the event, explains it, or "drift" where parameters drift, and the
+    judged tracker follows them. named_at: s, when a search first named what was found in the end, when the event was
+    decided, or when the tracker found the drift. adopted: s, when what was named was taken up; refused: why not.
+    drifting: names of parameters.
     """
 
     noticed: float
@@ -38,6 +40,7 @@ class Episode:
     adopted: float | None = None
     refused: str | None = None
     event: Event | None = None
+    drifting: tuple[str, ...] = ()
     evidence: list[Evidence] = field(default_factory=list)
 
 
@@ -59,6 +62,8 @@ def line(episode: Episode) -> str:
         return f"{where}, which no known effect explains{nearest}"
     if episode.verdict == "passed":
         return f"{where}, of which the last samples show nothing"
+    if episode.drifting:
+        return f"{where}: {', '.join(episode.drifting)} {'drifts' if len(episode.drifting) == 1 else 'drift'}"
     if episode.event is not None:
         jumps = zip(episode.event.parameters, episode.event.sizes, episode.event.units, strict=True)
         return f"{where}: {', '.join(f'{name} {size:+.4g} {unit}' for name, size, unit in jumps)}"

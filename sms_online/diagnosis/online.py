@@ -103,6 +103,7 @@ class OnlineDiagnosis(Observer):
         self._valid = 0  # grid index from which on the current model, or what it lacks, has been there
         self._blocks = 0
         self._events = len(estimator.events)
+        self._drifts = 0 if estimator.momentum is None else estimator.momentum.drifts  # that have been followed
         self._quiet = False  # what is lacking has been said, and not taken up
         self._onset: _Onset | None = None  # of the open episode
         self._due = 0  # searches of the open episode that were due so far
@@ -165,6 +166,7 @@ class OnlineDiagnosis(Observer):
         if self._estimator.momentum is None or not self._record:
             return
         self._follow_events()
+        self._follow_drifts()
         if done is not None and self._pending is not None and done[0] == self._pending[0]:
             time, self._pending = self._pending[1], None
             if done[1] is not None and self._onset is not None:
@@ -200,6 +202,18 @@ class OnlineDiagnosis(Observer):
             self.on_verdict(self._now, line(episode))
             index = round((event.time - self._estimator.start_time) * self._estimator.system.sample_rate)
             self._valid, self._quiet = index + self._unit // 2, False
+
+    def _follow_drifts(self) -> None:
+        """A drift that is followed explains what was noticed before it was found, or before its rate had changed."""
+        before, self._drifts = self._drifts, self._momentum.drifts
+        if self._drifts <= before or self._onset is None:
+            return
+        episode, drifting = self.episodes[-1], self._momentum.drifting
+        fresh = tuple(name for name in drifting if not any(name in each.drifting for each in self.episodes))
+        episode.verdict, episode.named, episode.named_at = "drift", (), self._now
+        episode.drifting = fresh or drifting
+        self._close()
+        self.on_verdict(self._now, line(episode))
 
     def _close(self) -> None:
         self._onset, self._pending = None, None

@@ -104,6 +104,8 @@ class Changes(Stage):
         self._renewed = renewed
         rate, span = self._system.sample_rate, self._system.windows.momentum
         self._half_hop = max(1, round(span * rate / INSTANTS))
+        # Where it may have been a drift, an event is decided on later.
+        self._remembered = 2 * REMEMBERED if model.system.trackers[0].learns else REMEMBERED
         self.detector = self._new_detector()
         columns = len(sensing.channels) + model.n_states
         self.state = ChangesState(np.empty(0, dtype=np.int64), np.empty((0, columns)))
@@ -128,7 +130,7 @@ class Changes(Stage):
 
     def _new_detector(self) -> ChangeDetector:
         n, hop = len(self._nuisances) + self.base.n, 2 * self._half_hop / self._system.sample_rate
-        detector = ChangeDetector(n, self.model.layout.n_v, hop)
+        detector = ChangeDetector(n, self.model.layout.n_v, hop, self._remembered)
         if self._nuisances:
             detector.begin(self.beforehand)
         return detector
@@ -152,7 +154,7 @@ class Changes(Stage):
         if piece.segment != self.state.segment:
             self.state.segment, self.state.clear = piece.segment, int(piece.index[0])
             self.state.index, self.state.values = self.state.index[:0], self.state.values[:0]
-        kept = 2 * REMEMBERED * self._half_hop + self.window_samples + 2 * MARGIN
+        kept = 2 * self._remembered * self._half_hop + self.window_samples + 2 * MARGIN
         self.state.index = np.concatenate((self.state.index, piece.index))[-kept:]
         self.state.values = np.concatenate((self.state.values, piece.values))[-kept:]
 
@@ -178,7 +180,7 @@ class Changes(Stage):
         names = additional(self._system, whole, self.base)
         base = extended(self._described, whole, [*self.state.added, *names])
         onset = self.detector.onset - MARGIN
-        before = self.detector.before(onset) or self.detector.history[0]
+        before = self.detector.before(onset)
         explanation = self._explain(whole, base, before, max(alarm, self.state.clear), noise)
         if not (explanation.explained and explanation.decisive) and self.windows_after < LONGEST_DECISION and not last:
             self.state.wanted = self.windows_after + DECISION
@@ -191,7 +193,7 @@ class Changes(Stage):
         if self.detector.alarm is None:
             return None
         onset = self.detector.onset - MARGIN
-        before = self.detector.before(onset) or self.detector.history[0]
+        before = self.detector.before(onset)
         time = start_time + 0.5 * (onset + self.detector.alarm) / self._system.sample_rate
         dropped = sum(seen.end > before.end for seen in self.detector.history)
         self.state.events.append(Event(time, "undecided", (), (), (), (), dropped))
@@ -243,13 +245,13 @@ class Changes(Stage):
             x, signals = self._sensing.coordinates(self.state.values), self._sensing.signals(self.state.values)
             between = (onset - self.window_samples // 2, alarm)
             instant = event_instant(
-                whole, by, explanation.beta, self.detector.history, self.state.index, x, signals, between,
+                whole, by, explanation.beta, self.detector.seen(), self.state.index, x, signals, between,
                 self._half_hop, self._system.sample_rate,
             )  # fmt: skip
         guard = GUARD * self._half_hop
         first, last = (onset, alarm) if instant is None else (int(instant) - guard, int(np.ceil(instant)) + guard)
         at = 0.5 * (first + last) if instant is None else instant
-        before = self.detector.before(first - MARGIN) or self.detector.history[0]
+        before = self.detector.before(first - MARGIN)
         fresh = [base.parameters[k].name for k in columns if k >= n]
         if fresh:
             self.state.added += fresh

@@ -64,6 +64,11 @@ class NoiseBias(State):
             self.last = np.zeros_like(self.last)
 
     @property
+    def windows(self) -> int:
+        """How many there were."""
+        return len(self.whole) * self.length + self.joined
+
+    @property
     def _clusters(self) -> Array:
         """All of them (C, n + 1, n + 1), in order of time."""
         return np.array(self.whole if self.joined == 0 else [*self.whole, self.last]).reshape(-1, *self.gram.shape)

@@ -105,6 +105,9 @@ class Estimator(Stage):
         # A balance of forces does not hold in a shape that is not the link's; energies bear it best.
         by_energy = system.balance == "energy" or self.sensing.missing
         self.momentum = None if by_energy else Momentum(model, base, self.sensing, self._begin_joints)
+        if by_energy and not all(choice.static for choice in system.trackers):
+            found = "a tracker of its own, and no momentum balance"
+            raise InputError(system.name, "tracker", found, "rls without forgetting, or all coordinates measured")
         self.energy_tracker: Tracker = session_tracker(base.n, None)
         self._begin_joints()
         self._first_block, self._block = self._blocks()
@@ -383,7 +386,7 @@ class Estimator(Stage):
     def _balanced(self) -> Estimate:
         """What the balances tell of the base parameters."""
         if self.momentum is not None and self.by_momentum:
-            return self.momentum.estimate()
+            return self.momentum.estimate(self.end)
         return self.energy_tracker.estimate()
 
 

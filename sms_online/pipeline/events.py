@@ -81,7 +81,7 @@ class DetectorState(State):
 
     known, history, alarm, onset: see `ChangeDetector`. tested: windows; levels: sum of their χ² / n_v, none for more
     than the cumulative sum counts it; level: what the next ones are measured by. sum: the cumulative sum. loud: windows
-    in a row beyond ALARM.
+    in a row beyond ALARM. moved (n,): drift that rows of now are free of, None where there is none.
     """
 
     known: Information
@@ -93,16 +93,17 @@ class DetectorState(State):
     levels: float = 0.0
     sum: float = 0.0
     loud: int = 0
+    moved: Array | None = None
 
 
 class ChangeDetector(Stage):
     """Sequential test of windows against the estimate before them.
 
-    hop: from one window to the next, s.
+    hop: from one window to the next, s. remembered: windows.
     """
 
-    def __init__(self, n: int, n_v: int, hop: float) -> None:
-        self._n_v = n_v
+    def __init__(self, n: int, n_v: int, hop: float, remembered: int = REMEMBERED) -> None:
+        self._n_v, self._remembered = n_v, remembered
         self._warm_up = round(WARM_UP / hop)
         self.begin(Information.none(n))
 
@@ -140,7 +141,7 @@ class ChangeDetector(Stage):
         if self.state.alarm is None:
             self.state.known = self.state.known.with_rows(rows.Y)
         seen = Seen(rows.end, rows.raw, rows.covariance, self.state.known)
-        self.state.history = [*self.state.history, seen][-REMEMBERED:]
+        self.state.history = [*self.state.history, seen][-self._remembered :]
         return self.state.alarm is None
 
     def _test(self, rows: WhiteRows, misfit: bool) -> None:
@@ -177,7 +178,24 @@ class ChangeDetector(Stage):
             None if self.state.level > LARGEST_LEVEL else float((chi2 / self._n_v / self.state.level - 1.0) / deviation)
         )
 
-    def before(self, end: int) -> Seen | None:
-        """The last window that ends at or before a grid index; None where it is forgotten."""
-        earlier = [seen for seen in self.state.history if seen.end <= end]
-        return earlier[-1] if earlier else None
+    def seen(self) -> list[Seen]:
+        """The last windows, oldest first, with the drift that was taken off their rows."""
+        moved = self.state.moved
+        if moved is None:
+            return list(self.state.history)
+        out = []
+        for seen in self.state.history:
+            raw = seen.raw.copy()
+            raw[:, -1] += raw[:, :-1] @ moved
+            out.append(Seen(seen.end, raw, seen.covariance, seen.known.shifted(moved)))
+        return out
+
+    def before(self, end: int) -> Seen:
+        """The last window that ends at or before a grid index, the oldest where that is forgotten."""
+        windows = self.seen()
+        earlier = [seen for seen in windows if seen.end <= end]
+        return earlier[-1] if earlier else windows[0]
+
+    def follow(self, known: Information, moved: Array) -> None:
+        """Test against what a tracker knows of parameters that drift, less the drift (n,) that rows are free of."""
+        self.state.known, self.state.moved = known, moved

@@ -16,19 +16,22 @@ from sms_online.model.model import Model
 from sms_online.pipeline.beforehand import Beforehand
 from sms_online.pipeline.changes import Adoption, Changes
 from sms_online.pipeline.criterion import RowGrams, ScaleFree
+from sms_online.pipeline.drift_line import DriftLine
 from sms_online.pipeline.errors_in_variables import NoiseBias, unbiased
 from sms_online.pipeline.latency import Latencies, clock_groups, source_groups
-from sms_online.pipeline.momentum_balance import MomentumBalance
+from sms_online.pipeline.momentum_balance import MomentumBalance, half_hop
 from sms_online.pipeline.momentum_fit import DETERMINED, FIRST_MOTION, MomentumFit, WhiteRows
-from sms_online.pipeline.momentum_windows import COPIES, HOPS
+from sms_online.pipeline.momentum_windows import COPIES, HOPS, INSTANTS
 from sms_online.pipeline.residual_test import SequentialTest
 from sms_online.pipeline.sensing import Sensing
 from sms_online.pipeline.sensor_noise import NoiseEstimate, SensorNoise
 from sms_online.pipeline.statistics import MomentumStatistics
 from sms_online.pipeline.synchronise import GridSamples
+from sms_online.pipeline.tracker_bank import Reading, TrackerBank
 from sms_online.pipeline.window_noise import WindowNoise
 from sms_online.state import Stage, State, snapshot, state_copy
 from sms_online.stream import Array
+from sms_online.trackers.information import Information
 from sms_online.trackers.interface import Estimate, Prior, Rows, Tracker, prior_factor
 from sms_online.trackers.square_root import session_tracker
 
@@ -51,7 +54,7 @@ class MomentumState(State):
     known (k, m + n + 1): what is known from before an event, as rows [N Y b] of unit variance. misfit (n_v,): behind
     the rows that came last. sensor_noise: as estimated at grid index `noise_told`. waiting: samples, until the noise is
     known. newest_row: time of the last window's end, s. start_time: of grid index 0, s. random: gives the synthetic
-    noise.
+    noise. drift: known to windows to come.
     """
 
     known: Array
@@ -64,17 +67,19 @@ class MomentumState(State):
     start_time: float = np.nan
     newest_row: float = -np.inf
     dropped_windows: int = 0
+    drift: DriftLine | None = None
 
 
 class Momentum(Stage):
-    """Balance, weights and tracker of one session.
+    """Balance, weights and trackers of one session.
 
-    tracker: fed with rows of unit variance. bias: what noise in the columns does to the estimate. grams: sums of rows
-    by generalized speed, for an estimate where they leave more than noise. fit: what makes rows independent, and its
-    sums. latencies: of the sources, since the last event. test: whether rows leave more than noise, likewise. changes:
-    events, and the model and parameters that the session goes on with after them. nuisances: what the description may
-    be wrong in. prior: what is known of the described ones beforehand. changed: called where others come to be
-    estimated.
+    tracker: fed with rows of unit variance, all of which count alike: weights follow from its estimate. bank: the
+    trackers that the person has chosen, fed with the same. bias: what noise in the columns does to the estimate. grams:
+    sums of rows by generalized speed, for an estimate where they leave more than noise. fit: what makes rows
+    independent, and its sums. latencies: of the sources, since the last event. test: whether rows leave more than
+    noise, likewise. changes: events, and the model and parameters that the session goes on with after them. nuisances:
+    what the description may be wrong in. prior: what is known of the described ones beforehand. changed: called where
+    others come to be estimated.
     """
 
     def __init__(self, model: Model, base: BaseParameters, sensing: Sensing, changed: Callable[[], None]) -> None:
@@ -107,13 +112,15 @@ class Momentum(Stage):
         """Empty stages for the current model and parameters."""
         model, base = self.changes.model, self.changes.base
         self._calibration = prior_rows(self.nuisances, base.n)
-        self._balance = MomentumBalance(model, base, self._sample_rate, self._span)
+        self.bank = self._new_bank()
+        self._balance = MomentumBalance(model, base, self._sample_rate, self._span, moments=self.bank.follows)
         self.latencies = Latencies(self._sources, base.n)
         self.fit = MomentumFit(
             model, base, self._balance, self._new_noise, self._solved, self._sources, self._calibration,
-            self._beforehand, [k for k, each in enumerate(self.nuisances) if each.name == "drive_gain"],
+            self._beforehand, [k for k, each in enumerate(self.nuisances) if each.name == "drive_gain"], self._drift_at,
         )  # fmt: skip
         self.tracker = self._new_tracker()
+        self.fit.plain.patient = self.bank.learned is not None
         self.test = SequentialTest(model.layout, self._balance.span / HOPS, self.nuisances)
 
     def _rebuild(self) -> None:
@@ -137,10 +144,29 @@ class Momentum(Stage):
             tracker.begin(self.changes.beforehand)
         return tracker
 
+    def _new_bank(self) -> TrackerBank:
+        model, base, nuisances = self.changes.model, self.changes.base, self.nuisances
+        prior, n_v = self.current_prior, model.layout.n_v
+        return TrackerBank(model.system, base.parameters, nuisances, prior, n_v, self._window)
+
+    @property
+    def _window(self) -> float:
+        """Length of a window, s."""
+        return INSTANTS * half_hop(self._sample_rate, self._span) / self._sample_rate
+
+    def _drift_at(self, end: int) -> DriftLine | None:
+        """The known drift in the window that ends at a grid index."""
+        drift = self.state.drift
+        return None if drift is None else drift.at(self._centre(end))
+
+    def _centre(self, end: int) -> float:
+        """Centre of the window that ends at a grid index, s."""
+        return self.state.start_time + end / self._sample_rate - 0.5 * self._window
+
     def set_prior(self, prior: Prior) -> None:
         """Weigh the rows against what is known of the base parameters beforehand; before the first sample."""
         self.prior = prior
-        self.tracker = self._new_tracker()
+        self.tracker, self.bank = self._new_tracker(), self._new_bank()
 
     @property
     def started(self) -> bool:
@@ -157,8 +183,19 @@ class Momentum(Stage):
         """Whether rows leave clearly more than the sensors' noise."""
         return bool(self.fit.plain.misfit.any())
 
-    def estimate(self) -> Estimate:
-        """The base parameters as known now, free of what noise in the columns does; with a prior, as the rows say."""
+    def estimate(self, t: float) -> Estimate:
+        """The base parameters as known now, free of what noise in the columns does; with a prior, as the rows say.
+
+        By the tracker that is chosen first. t: of the newest sample, s, for which parameters that drift hold.
+        """
+        own = self._own()
+        return self.bank.judged(own, self.bias, t) if self.bank.others else own
+
+    def readings(self, t: float) -> tuple[Reading, ...]:
+        """What each chosen tracker says, the judged one first; empty where that is the session's own alone."""
+        return self.bank.readings(self._own(), self.bias, t) if self.bank.others else ()
+
+    def _own(self) -> Estimate:
         return self._joint().without_nuisances(len(self.nuisances))
 
     def _joint(self) -> Estimate:
@@ -225,6 +262,7 @@ class Momentum(Stage):
             self._balance.begin_segment()
             self.state.segment = piece.segment
         self.changes.keep(piece)
+        self.bank.hold_until(self.state.start_time + int(piece.index[-1]) / self._sample_rate)
         self._process(piece, noise)
         self._decide(noise, last=False)
 
@@ -235,6 +273,8 @@ class Momentum(Stage):
 
     def _decide(self, noise: SensorNoise, last: bool) -> None:
         """Where rows are held back for an event: decide on it, when there is enough to tell, and go on."""
+        if not last and self._drift_decided():
+            return
         adoption = self.changes.decide(noise, self.state.start_time, last)
         if adoption is not None:
             self._adopt(adoption, noise)
@@ -249,9 +289,10 @@ class Momentum(Stage):
         n, n_v = len(self.nuisances) + adoption.base.n, adoption.model.layout.n_v
         self.bias.widen(n - self.bias.parameters)
         self.grams, self.state.misfit = RowGrams.none(n_v, n), np.zeros(n_v)
-        self.state.known = adoption.known.factor
+        self.state.known, self.state.drift = adoption.known.factor, None
         self._rebuild()
         self.tracker.begin(adoption.known)
+        self.bank.begin(adoption.known)
         self.fit.go_on(adoption.weights, noise)
         if adoption.samples.index.size:
             self._process(adoption.samples, noise)
@@ -287,10 +328,12 @@ class Momentum(Stage):
             if noise is not None and not noise.exact:
                 self.test.push(rows, detector.known.factor, COLOURED_NOISE if noise.coloured else 1.0)
             if not detector.push(rows, self.misfit):
+                self.bank.hold(self._for_trackers(rows))
                 continue
             t = self.state.start_time + rows.end / self._sample_rate
             M = rows.Y.shape[0]
             self.tracker.update(Rows(rows.Y[:, :-1], rows.Y[:, -1], np.ones(M), np.full(M, t)))
+            self._follow(rows)
             self.state.newest_row = t
             self.bias.add(rows.Y, rows.noisy)
             if np.any(rows.misfit != self.state.misfit):
@@ -299,11 +342,91 @@ class Momentum(Stage):
                 self.state.misfit = rows.misfit
             self.grams.add(rows.Y, rows.noisy)
             self.latencies.add(rows.Y[:, len(self.nuisances) :], rows.late)
+        if self.bank.follows and fresh:
+            self._renew_drift()
 
-    def statistics(self) -> MomentumStatistics:
-        """What is known now; nothing in it changes as the session goes on."""
+    def _follow(self, rows: WhiteRows) -> None:
+        """Hand rows to the chosen trackers."""
+        if not self.bank.others:
+            return
+        learned = self.bank.learned
+        before = 0 if learned is None else learned.state.accepted
+        self.bank.update(self._for_trackers(rows), not self.misfit)
+        if learned is not None:
+            self.fit.plain.patient = learned.patient
+            if learned.state.accepted > before:
+                self._begin_drift(learned.information)
+
+    def _for_trackers(self, rows: WhiteRows) -> Rows:
+        """Rows with the drift that was taken off them."""
+        m, centre, b, ramp = len(self.nuisances), self._centre(rows.end), rows.Y[:, -1], None
+        if self.bank.follows:
+            ramp = np.pad(rows.ramp, ((0, 0), (m, 0)))
+        if rows.drift is not None:
+            b = b + rows.Y[:, m:-1] @ rows.drift.moved + rows.ramp @ rows.drift.rate
+        return Rows(rows.Y[:, :-1], b, np.ones(b.size), np.full(b.size, centre), ramp)
+
+    def _drift_decided(self) -> bool:
+        """Whether rows held back need no event decided on: not yet, or they were those of a drift."""
+        detector, learned = self.changes.detector, self.bank.learned
+        if detector.alarm is None or learned is None:
+            return False
+        onset, alarm, newest = (
+            self.state.start_time + end / self._sample_rate
+            for end in (detector.onset, detector.alarm, detector.history[-1].end)
+        )
+        found = self.bank.drift_behind(onset - self._window, alarm, newest)
+        if found:
+            self._begin_drift(learned.information)
+        return found is not False
+
+    def _renew_drift(self) -> None:
+        """Have windows to come know of the drift so far; not those whose rows are made already."""
+        centre, m = self.state.newest_row - 0.5 * self._window, len(self.nuisances)
+        line = self.bank.drift(self.tracker.estimate, centre, self.state.drift)
+        if line is None or line is self.state.drift:
+            return
+        # What takes parameters for constant goes on from what the judged tracker knows of them, less the drift.
+        self.state.drift = line
+        moved = np.concatenate((np.zeros(m), line.moved))
+        known = self.bank.information.shifted(-moved)
+        self.tracker.begin(known)
+        self.changes.detector.follow(known, moved)
+
+    def _begin_drift(self, known: Information) -> None:
+        """Have what has judged rows by constant parameters begin anew."""
+        model, m = self.changes.model, len(self.nuisances)
+        n, n_v = m + self.changes.base.n, model.layout.n_v
+        self.changes.detector.begin(known)
+        self.bias, self.grams = NoiseBias.none(n, self._calibration), RowGrams.none(n_v, n)
+        self.fit.plain.clear()
+        self.test = SequentialTest(model.layout, self._balance.span / HOPS, self.nuisances)
+        self.bank.refer(known.solution().pi[m:])
+        self.state.known, self.state.drift = known.factor, None
+
+    @property
+    def drifts(self) -> int:
+        """How often the judged tracker has found one to begin or to change, since the last event."""
+        return 0 if self.bank.learned is None else self.bank.learned.state.accepted
+
+    @property
+    def drifting(self) -> tuple[str, ...]:
+        """Parameters that the judged tracker has found to drift."""
+        learned, m = self.bank.learned, len(self.nuisances)
+        columns = [] if learned is None else learned.columns
+        return tuple(self.changes.base.parameters[column - m].name for column in columns)
+
+    @property
+    def _reference(self) -> Array | None:
+        """Nuisances and parameters that the rows without the known drift have; None where nothing has moved."""
+        return None if self.state.drift is None else self._joint().pi
+
+    def statistics(self, t: float) -> MomentumStatistics:
+        """What is known now; nothing in it changes as the session goes on. t: of the newest sample, s."""
         alarm = self.test.alarm
         return MomentumStatistics(
+            trackers=self.readings(t),
+            reference=self._reference,
             tracker=snapshot(self.tracker),
             bias=state_copy(self.bias),
             rows=state_copy(self.fit.plain),

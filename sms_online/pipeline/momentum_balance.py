@@ -118,13 +118,15 @@ class MomentumBalance(Stage):
 
     prompt: windows end at multiples of a hop on the grid, whenever the segment began, and come after `margin` samples
     behind them, with a narrower filter at their end; else they begin with the segment and wait for the widest filter.
+    moments: windows hold what parameters that change evenly add to their rows, see `Window.moment`.
     rows, columns (nonzero,): places of the entries of Y that are not zero by the structure of the model. rough: forces
     that are summed from every sample, where all else is from a thinned motion.
     """
 
     def __init__(
-        self, model: Model, base: BaseParameters, sample_rate: float, span: float, prompt: bool = True
-    ) -> None:
+        self, model: Model, base: BaseParameters, sample_rate: float, span: float, prompt: bool = True,
+        moments: bool = False,
+    ) -> None:  # fmt: skip
         self.model = model
         self.base = base
         self.sample_rate = sample_rate
@@ -144,12 +146,19 @@ class MomentumBalance(Stage):
         self.margin = prompt_margin(self.width) if prompt else self.lead
         self._prompt = prompt
         self._choice = WidthChoice(self._widths)
+        self.with_moments = moments
         self._phi = {s: self._weights(s) for s in {1, *(stride(M, self.hop) for M in self._widths)}}
         self.begin_segment()
 
     def _weights(self, s: int) -> tuple[Array, Array]:
         phi, phi_dot, _ = test_function(self.width // s, self.span, EXPONENT)
         return phi * s / self.sample_rate, phi_dot * s / self.sample_rate
+
+    def _moment_weights(self, s: int) -> tuple[Array, Array]:
+        """The same of the test function (t - t_c) φ."""
+        phi, phi_dot = self._phi[s]
+        ahead = np.linspace(-0.5 * self.span, 0.5 * self.span, phi.size)
+        return ahead * phi, phi + ahead * phi_dot
 
     def begin_segment(self) -> None:
         """Forget the samples before a gap."""
@@ -254,7 +263,11 @@ class MomentumBalance(Stage):
             b = (phi @ values[:, 2 * width :]).reshape(COPIES, -1) - weak[:, entries:]
             last = grid + window + self.width + self.lead
             none = np.empty((STEPS + 1, 0)), np.empty((INSTANTS, 0))
-            out.append(Window(window // self.half_hop, last, weak[:, :entries], b, half_width, *none))
+            moment = np.empty(0)
+            if self.with_moments:
+                psi, psi_dot = self._moment_weights(s)
+                moment = -(psi_dot @ values[:, :entries] + psi @ values[:, width : width + entries])
+            out.append(Window(window // self.half_hop, last, weak[:, :entries], b, half_width, *none, moment))
         return out, probed
 
     def _with_rough(self, half_width: int, rows: list[Window]) -> list[Window]:
@@ -281,9 +294,12 @@ class MomentumBalance(Stage):
             weak = -np.tensordot(phi, columns, 1)
             Y = row.Y.copy()
             Y[:, self._rough] = weak[:, : self._rough.size]
+            moment = row.moment.copy()
+            if self.with_moments:
+                moment[self._rough] = -self._moment_weights(1)[0] @ columns[:, 0, : self._rough.size]
             told = responses(slopes, phi * self.sample_rate, half_width, self.sample_rate, STEPS)
             rest = open_at_rest(breaking, still, phi)
-            out.append(replace(row, Y=Y, b=row.b - weak[:, self._rough.size :], rough=told, rest=rest))
+            out.append(replace(row, Y=Y, b=row.b - weak[:, self._rough.size :], rough=told, rest=rest, moment=moment))
         return out
 
     def _kept(self, kept: dict[int, _Smoothed], half_width: int, step: int, first: int, entries: int) -> _Smoothed:
@@ -380,4 +396,11 @@ class MomentumBalance(Stage):
         rows = np.zeros((COPIES, self.model.layout.n_v, self.base.n + 1))
         rows[:, self.rows, self.columns] = window.Y
         rows[:, :, -1] = window.b
+        return rows
+
+    def moments(self, window: Window) -> Array:
+        """Rows (n_v, n) of a window by the rates of the parameters about its centre, see `Window.moment`."""
+        rows = np.zeros((self.model.layout.n_v, self.base.n))
+        if self.with_moments:
+            rows[self.rows, self.columns] = window.moment
         return rows

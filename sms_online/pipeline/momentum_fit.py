@@ -25,6 +25,7 @@ from sms_online.model.base_parameters import BaseParameters
 from sms_online.model.model import Model
 from sms_online.pipeline.beforehand import Beforehand, fitted
 from sms_online.pipeline.criterion import Columns, RowGrams, minimum
+from sms_online.pipeline.drift_line import DriftLine
 from sms_online.pipeline.latency import SourceGroup
 from sms_online.pipeline.momentum_balance import MomentumBalance
 from sms_online.pipeline.momentum_windows import (
@@ -90,7 +91,9 @@ class WhiteRows:
     with synthetic noise added and subtracted, but in N. raw (n_v, m + n + 1): the rows as they were,
     with their own covariance (n_v, n_v), of which noise is the part that the sensors make. end: grid index of the
     window's last sample. late (n_v, G): columns of the sources' latencies, independent like Y. misfit (n_v,): what the
-    model lacks in each row, over the variance of its noise, as far as it is in the covariance.
+    model lacks in each row, over the variance of its noise, as far as it is in the covariance. ramp (n_v, n):
+    columns of the parameters' rates about the window's centre, independent like Y; none where nobody asked. drift: the
+    known drift there, of which b is free.
     """
 
     Y: Array
@@ -101,6 +104,8 @@ class WhiteRows:
     end: int
     late: Array
     misfit: Array
+    ramp: Array
+    drift: DriftLine | None = None
 
 
 class MomentumFitState(State):
@@ -133,7 +138,7 @@ class MomentumFit(Stage):
     new_noise: makes what propagates noise, for the same model, base and balance. solve: gives the estimate so far of
     nuisances and β (m + n,), NaN where nothing is known of it. sources: whose latencies are told. calibration: rows
     [N Y b] (k, m + n + 1) of what is known of the nuisances beforehand. beforehand: gives all that is known beside the
-    rows. weighing: who weighs now.
+    rows. drift: gives the known drift in the window that ends at a grid index. weighing: who weighs now.
     """
 
     def __init__(
@@ -147,6 +152,7 @@ class MomentumFit(Stage):
         calibration: Array | None = None,
         beforehand: Callable[[], Beforehand] | None = None,
         gains: Sequence[int] = (),
+        drift: Callable[[int], DriftLine | None] = lambda end: None,
     ) -> None:
         self.model = model
         self.base = base
@@ -157,7 +163,7 @@ class MomentumFit(Stage):
         )
         self.columns = Columns(self._nuisances, tuple(gains), inertial)
         self._balance = balance
-        self._solve = solve
+        self._solve, self._drift = solve, drift
         self._beforehand = beforehand if beforehand is not None else lambda: Beforehand.none(self._nuisances + base.n)
         self._new_noise, self._sources = new_noise, sources
         self.weighing = self._new_weighing()
@@ -174,7 +180,12 @@ class MomentumFit(Stage):
         self._next = None if self.state.warm is None else self._new_weighing()
 
     def _new_weighing(self) -> Weighing:
-        return Weighing(self._new_noise(), COPIES * (self.base.n + 1), self._sources)
+        return Weighing(self._new_noise(), COPIES * (self.base.n + 1) + self._ramps, self._sources)
+
+    @property
+    def _ramps(self) -> int:
+        """Columns of the parameters' rates."""
+        return self.base.n if self._balance.with_moments else 0
 
     def end_segment(self, noise: SensorNoise) -> list[WhiteRows]:
         """Rows of the windows held back, if they tell enough for weights; the next ones share no samples with them."""
@@ -387,6 +398,9 @@ class MomentumFit(Stage):
     def _white(self, window: Window) -> WhiteRows:
         n_v = self.model.layout.n_v
         rows = self._balance.dense(window)
+        # Columns of parameters that change evenly, from the grid's beginning on.
+        moments, centre = self._balance.moments(window), self._centre(window)
+        ramp = (centre * rows[0, :, :-1] + moments)[:, : self._ramps]
         sample = beyond_first_order(rows, self._known_weights)
         M, means = window.half_width, self._second_order.means
         self.state.sampled[M] = min(self.state.sampled[M] + 1, MOST_SAMPLES)
@@ -394,9 +408,15 @@ class MomentumFit(Stage):
         self.state.largest = np.maximum(self.state.largest, size(rows[0], self._known_weights))
         errors = self._second_order.variance(M) + rounding(self.state.largest)
         misfit = self.weighing.misfit
-        weighed = self._weigh(window, rows.swapaxes(0, 1).reshape(n_v, -1), errors)
-        white = weighed.rows.reshape(n_v, COPIES, -1).swapaxes(0, 1)
-        raw = rows[0]
+        columns = np.concatenate((rows.swapaxes(0, 1).reshape(n_v, -1), ramp), axis=1)
+        weighed = self._weigh(window, columns, errors)
+        white, ramp = np.split(weighed.rows, [columns.shape[1] - self._ramps], axis=1)
+        white = white.reshape(n_v, COPIES, -1).swapaxes(0, 1)
+        ramp = ramp - centre * white[0, :, : self._ramps]
+        raw, drift = rows[0], self._drift(window.end)
+        if drift is not None:
+            # Behind the whitening, for what it subtracts of earlier windows must have the same reference.
+            white, raw = drift.removed(white, ramp), drift.removed(raw, moments)
         if self._nuisances:
             columns, white_columns = weighed.calibration
             raw = np.concatenate((columns, raw), axis=1)
@@ -405,8 +425,12 @@ class MomentumFit(Stage):
         unsteady = np.diag(UNSTEADY * sample**2)
         return WhiteRows(
             white[0], white[1:], raw, weighed.covariance + unsteady, weighed.noise + unsteady, window.end,
-            weighed.late, misfit,
+            weighed.late, misfit, ramp, drift,
         )  # fmt: skip
+
+    def _centre(self, window: Window) -> float:
+        """Centre of a window, s of the grid."""
+        return window.end / self._balance.sample_rate - 0.5 * self._balance.span
 
     def _weigh(self, window: Window, rows: Array, errors: Array) -> Weighed:
         """Rows (n_v, width) of the next window; the weighing to come is told them too, and then may take over."""

@@ -48,8 +48,10 @@ class Window:
     start: its first instant, in half hops since the segment began. end: grid index of its last sample. Y (copies,
     nonzero): columns of the base parameters where the model has any (`MomentumBalance.rows`, `.columns`); b (copies,
     n_v). The first copy is that of the samples as measured, the others those of the samples with noise added.
-    half_width: M of the filter. rough (STEPS + 1, E): what noise does by way of rough forces, see `RoughForces.kernel`.
-    rest (INSTANTS, D): see `RoughForces.at_rest`.
+    moment (nonzero,): Y of the first copy with the test function (t - t_c) φ, t_c the window's centre: what parameters
+    add that change evenly, by their rates; empty where nobody asked. half_width: M of the filter.
+    rough (STEPS + 1, E): what noise does by way of rough forces, see `RoughForces.kernel`. rest (INSTANTS, D): see
+    `RoughForces.at_rest`.
     """
 
     start: int
@@ -59,3 +61,4 @@ class Window:
     half_width: int
     rough: Array
     rest: Array
+    moment: Array

@@ -18,12 +18,14 @@ class PlainRows(State):
     """Sums over windows, by generalized speed.
 
     gram (n_v, n + 1, n + 1): Gram matrices of rows [Y b] over their deviations. windows: how many. misfit (n_v,):
-    excess over one of the mean square of such rows' residual, zero where it may be chance.
+    excess over one of the mean square of such rows' residual, zero where it may be chance. patient: excess
+    may be a drift that is yet to be learned, and is none so far.
     """
 
     gram: Array
     misfit: Array
     windows: int = 0
+    patient: bool = False
 
     @staticmethod
     def none(n_v: int, n: int) -> PlainRows:
@@ -61,7 +63,7 @@ class PlainRows(State):
         if not self.windows:
             return self.misfit
         ratio = self._squares(beta) / self.windows
-        return np.where(ratio > LARGEST_RATIO, ratio - 1.0, 0.0)
+        return np.where((ratio > LARGEST_RATIO) & (not self.patient), ratio - 1.0, 0.0)
 
     def judge(self, beta: Array) -> None:
         """Take the misfit of β (n,) from the windows so far."""

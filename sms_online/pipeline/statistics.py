@@ -27,6 +27,7 @@ from sms_online.pipeline.latency import Latency
 from sms_online.pipeline.plain_rows import PlainRows
 from sms_online.pipeline.sensing import Sensing
 from sms_online.pipeline.synchronise import SyncCounters
+from sms_online.pipeline.tracker_bank import Reading
 from sms_online.smoother.session import SmootherStatistics
 from sms_online.state import snapshot, state_copy
 from sms_online.stream import Array
@@ -79,12 +80,17 @@ def _setup(packed: bytes) -> Setup:
 class MomentumStatistics:
     """Of the momentum balance.
 
-    tracker: its rows so far; bias: what noise in its columns does. rows: unwhitened rows and their misfit.
-    started: weights are known. tested: there are rows enough for a test of what they leave. alarm: type of the rows
-    that the sequential test finds more than noise in. scale_free: what gives the estimate where rows leave more than
-    noise. latency: source that is late against the others, if one is. coloured: see `SensorNoise`.
+    trackers: what each chosen tracker says, the judged one first; empty where that is the session's own least squares
+    alone. reference: nuisances and parameters of the rows without what the judged tracker knows of a drift, None where
+    nothing has moved. tracker: its rows so far; bias: what noise in its columns does. rows: unwhitened rows and their
+    misfit. started: weights are known. tested: there are rows enough for a test of what they leave. alarm: type of the
+    rows that the sequential test finds more than noise in. scale_free: what gives the estimate where rows leave more
+    than noise. latency: source that is late against the others, if one is. coloured: see
+    `SensorNoise`.
     """
 
+    trackers: tuple[Reading, ...]
+    reference: Array | None
     tracker: Tracker
     bias: NoiseBias
     rows: PlainRows
@@ -142,7 +148,7 @@ class Statistics:
             energy=snapshot(estimator.energy_tracker),
             shared=state_copy(estimator.shared_errors),
             joints=tuple(state_copy(estimator.joint_residuals)),
-            momentum=None if momentum is None else momentum.statistics(),
+            momentum=None if momentum is None else momentum.statistics(estimator.end),
             smoother=None if smoother is None else smoother.known,
         )
 
@@ -156,6 +162,8 @@ class Statistics:
         if self.method == "energy":
             return self.energy_estimate()
         assert self.momentum is not None
+        if not setup.system.trackers[0].static:
+            return self.momentum.trackers[0].estimate
         rows, scale_free = self.momentum.tracker.estimate(), self.momentum.scale_free
         if scale_free is None:
             joint = released(unbiased(rows, self.momentum.bias), setup.nuisances)

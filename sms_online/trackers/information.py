@@ -39,6 +39,12 @@ class Information:
         """The least-squares solution."""
         return solve(self.factor)
 
+    def shifted(self, by: Array) -> Information:
+        """Of parameters that are larger by so much (n,)."""
+        factor = self.factor.copy()
+        factor[:, -1] += factor[:, :-1] @ by
+        return Information(factor, self.rows)
+
     def without(self, columns: Iterable[int]) -> Information:
         """What is left when nothing is known of some parameters any more."""
         columns, factor = list(columns), self.factor

@@ -17,6 +17,7 @@ class Rows:
     """M rows of a balance, Y π = b, in order of time.
 
     Y: (M, n). b: (M,). std: (M,) standard deviation of each row's error, in the unit of b. t: (M,) seconds.
+    ramp: (M, n) what is added to b by parameters that change by one in a second, zero at t; None for nothing.
     Raises ValueError naming the first row that is not finite or whose std is not positive, or shapes that do not fit.
     """
 
@@ -24,6 +25,7 @@ class Rows:
     b: Array
     std: Array
     t: Array
+    ramp: Array | None = None
 
     def __post_init__(self) -> None:
         if self.Y.ndim != 2 or not self.b.shape == self.std.shape == self.t.shape == self.Y.shape[:1]:

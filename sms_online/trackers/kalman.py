@@ -100,6 +100,16 @@ class KalmanTracker(Tracker):
             dof=self.state.rows,
         )
 
+    @property
+    def information(self) -> Information:
+        """What is known of π now, initial values included."""
+        root = np.linalg.inv(np.linalg.cholesky(self.state.P)) / self._initial.std
+        factor = np.zeros((self._n + 1, self._n + 1))
+        factor[:-1, :-1] = root
+        factor[:-1, -1] = root @ (self._initial.value + self._initial.std * self.state.x[:, 0])
+        factor[-1, -1] = np.sqrt(self.state.nis)
+        return Information(factor, self.state.rows)
+
     def reset(self) -> None:
         """Forget all rows; start again from the initial value and std."""
         self._start()

@@ -79,6 +79,12 @@ class RecursiveLeastSquares(Tracker):
             scale=scale if self._scaled else None,
         )
 
+    @property
+    def information(self) -> Information:
+        """What rows and prior say."""
+        content = self._memory.with_pending(self._pending.rows)
+        return Information(triangular_factor(self._prior, content.factor), int(content.rows))
+
     def reset(self) -> None:
         """Forget all rows; the prior stays."""
         self._pending = PendingRows(np.empty((0, self._n + 1)))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +14,7 @@ from sms_online.description.schema import System, Tolerances
 from sms_online.effects.build import build_model
 from sms_online.model.base_parameters import find_base_parameters
 from sms_online.stream import Array, Block
+from sms_sim.drifting import ParameterDrift
 from sms_sim.sensors import Sensors
 from sms_sim.simulate import POSITION_TOLERANCE, sampled_blocks, simulate
 
@@ -26,14 +28,25 @@ ROUGH = (1 / 1.4, 1.4)
 EXACT = Tolerances.model_validate("none")
 
 
-def exact_session(system: System, cache: Path, position_tolerance: float = POSITION_TOLERANCE) -> Block:
-    """Exact samples of the system's own trajectory, read from `cache` or else simulated and written there."""
+def exact_session(
+    system: System,
+    cache: Path,
+    position_tolerance: float = POSITION_TOLERANCE,
+    duration: float | None = None,
+    drifts: Sequence[ParameterDrift] = (),
+) -> Block:
+    """Exact samples of the system's own trajectory, read from `cache` or else simulated and written there.
+
+    duration: s, the trajectory's own by default. drifts: of its parameters.
+    """
     description = json.dumps(describe(system))
+    if duration is not None or drifts:
+        description += json.dumps([duration, *(drift.document() for drift in drifts)])
     if cache.exists():
         with np.load(cache) as saved:
             if str(saved["system"]) == description:
                 return Block(saved["t"], tuple(saved["channels"].tolist()), saved["values"])
-    blocks = list(sampled_blocks(simulate(system, position_tolerance=position_tolerance), "0"))
+    blocks = list(sampled_blocks(simulate(system, duration, None, None, position_tolerance, drifts=drifts), "0"))
     t, values = (np.concatenate([getattr(block, name) for block in blocks]) for name in ("t", "values"))
     cache.parent.mkdir(parents=True, exist_ok=True)
     np.savez(cache, system=np.array(description), t=t, channels=np.array(blocks[0].channels), values=values)
@@ -52,10 +65,11 @@ def true_parameters(system: System) -> Array:
     return find_base_parameters(model).values(model.nominal)
 
 
-def disguised(system: System, random: np.random.Generator | None = None) -> System:
+def disguised(system: System, random: np.random.Generator | None = None, factor: float = DISGUISE) -> System:
     """The system with nominal values that are not the true ones, so that no estimator can have read them.
 
-    All are twice the true ones, or with `random` each is off by a factor of its own of 1.4 at most, as drawings are.
+    factor: of every value; beyond 1.5 the verdict is doubt, for so far a rig is not from its description. random: draws
+    a factor of 1.4 at most for each value instead.
     """
 
     def other(key: str, value: Any) -> Any:
@@ -63,7 +77,7 @@ def disguised(system: System, random: np.random.Generator | None = None) -> Syst
             return {name: other(name, part) for name, part in value.items()}
         if isinstance(value, list):
             return [other("", part) for part in value]
-        factor = DISGUISE if random is None else random.uniform(*ROUGH)
-        return factor * value if key in DISGUISED else value
+        own = factor if random is None else random.uniform(*ROUGH)
+        return own * value if key in DISGUISED else value
 
     return System.model_validate(other("", describe(system)))

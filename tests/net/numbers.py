@@ -34,8 +34,18 @@ from sms_online.stream import Block
 Value = float | int | bool | str | None
 Numbers = dict[str, Value]
 
-# Keys of the documents that hold what was put in, or sentences.
-LEFT_OUT = ("schema", "system", "summary", "warnings", "throughput_samples_per_s", "unit", "symbol", "separated_by")
+# Keys of the documents that hold what was put in, sentences, or estimates once more.
+LEFT_OUT = (
+    "schema",
+    "system",
+    "trackers",
+    "summary",
+    "warnings",
+    "throughput_samples_per_s",
+    "unit",
+    "symbol",
+    "separated_by",
+)
 PIECE = 1024  # samples
 
 

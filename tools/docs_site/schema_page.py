@@ -35,6 +35,7 @@ HEADINGS: dict[type[Record], str] = {
     schema.Harmonic: "Harmonics of a trajectory",
     schema.Windows: "`[windows]`",
     schema.Tolerances: "`[tolerances]`",
+    schema.TrackerChoice: "`[tracker]`",
     sources.CanSource: '`[[source]]` of `kind = "can"`',
     sources.CanopenSource: '`[[source]]` of `kind = "canopen"`',
     sources.SerialFrames: '`[[source]]` of `kind = "serial"` and `format = "frames"`',
@@ -172,7 +173,7 @@ def _default(field: FieldInfo) -> str:
     value = field.default
     if value is None or value == () or value == {}:
         return "none"
-    if isinstance(value, Record):
+    if isinstance(value, Record) or (isinstance(value, tuple) and isinstance(value[0], Record)):
         return "its defaults"
     text = {True: "true", False: "false"}.get(value) if isinstance(value, bool) else None
     if isinstance(value, tuple):

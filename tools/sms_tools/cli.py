@@ -142,6 +142,14 @@ def _add_adopt(parser: Parser) -> None:
     parser.add_argument("--adopt", action="store_true", help=text)
 
 
+def _add_tracker(parser: Parser) -> None:
+    text = (
+        "in place of the system file's: rls, rls:forgetting=KIND,memory=SECONDS or "
+        "kalman:drift=KIND,PARAMETER=KIND/STD; may be repeated, the first gives the estimate"
+    )
+    parser.add_argument("--tracker", metavar="TRACKER", action="append", help=text)
+
+
 def _add_noise(parser: Parser) -> None:
     text = "noise of all sensors in place of the described one: 0 none, A, B, C ever more"
     parser.add_argument("--grade", choices=("0", "A", "B", "C"), help=text)
@@ -160,6 +168,7 @@ def _add_demo(verbs: Verbs) -> None:
     # Less noise than that of the devices' clocks would leave residuals that the sensors do not explain.
     parser.set_defaults(grade="B")
     _add_out(parser)
+    _add_tracker(parser)
     _add_view(parser)
 
 
@@ -171,6 +180,7 @@ def _add_live(verbs: Verbs) -> None:
     text = "go on from the last checkpoint of an earlier session"
     parser.add_argument("--resume", metavar="DIR", type=Path, help=text)
     _add_session_length(parser)
+    _add_tracker(parser)
     _add_view(parser)
 
 
@@ -200,6 +210,11 @@ def _add_simulate(verbs: Verbs) -> None:
     parser.add_argument("--duration", metavar="SECONDS", type=_seconds(positive=True), help=text)
     text = "an effect that the system file does not declare, NAME@WHERE:coefficient=value,…; may be repeated"
     parser.add_argument("--effect", metavar="EFFECT", action="append", default=[], help=text)
+    text = (
+        "a parameter that changes on the way: PARAMETER:share=-0.1,over=60, PARAMETER:by=5,over=60 or "
+        "PARAMETER:half_life=20, and begin=SECONDS; may be repeated"
+    )
+    parser.add_argument("--drift", metavar="DRIFT", action="append", default=[], help=text)
     _add_noise(parser)
 
 
@@ -216,6 +231,7 @@ def _add_replay(verbs: Verbs) -> None:
     text = "as fast as it goes, or in step with the recorded time"
     parser.add_argument("--speed", choices=("max", "1"), default="max", help=text)
     _add_adopt(parser)
+    _add_tracker(parser)
     _add_view(parser)
 
 

@@ -79,6 +79,41 @@ def parameter_table(document: Document, width: int, title: str | Text | None = N
     return table
 
 
+def tracker_table(document: Document) -> Table | None:
+    """What each tracker says of each parameter, where there are several; None where there is one."""
+    trackers = document.get("trackers", [])
+    if len(trackers) < 2:
+        return None
+    table = Table(
+        title="trackers on the same rows", title_justify="left", box=None, header_style="bold", pad_edge=False
+    )
+    table.add_column("parameter", overflow="fold")
+    table.add_column("unit")
+    for tracker in trackers:
+        table.add_column(tracker["name"] + (", judged" if tracker["judged"] else ""), justify="right", no_wrap=True)
+    for p, *row in zip(document["parameters"], *(tracker["parameters"] for tracker in trackers), strict=True):
+        table.add_row(p["name"], p["unit"], *map(value_cell, row))
+    for heading, cells in tracker_facts(trackers).items():
+        table.add_row(heading, "", *cells, style="dim")
+    return table
+
+
+def value_cell(parameter: Document) -> str:
+    """A tracker's value ± std of a parameter."""
+    if not parameter["identifiable"]:
+        return NOT_DETERMINED
+    return f"{formatter(parameter['estimate'], parameter['std'])(parameter['estimate'])} ± {parameter['std']:.2g}"
+
+
+def tracker_facts(trackers: list[Document]) -> dict[str, list[str]]:
+    """Normalised innovations squared with their band, and the memory in effect, of each tracker."""
+    nis = [
+        "–" if t["nis"] is None else f"{t['nis']:.3f} ({t['nis_lower95']:.2f} … {t['nis_upper95']:.2f})"
+        for t in trackers
+    ]
+    return {"innovations squared": nis, "memory": [f"{t['memory_s']:.3g} s" for t in trackers]}
+
+
 def _in_doubt(p: Document) -> str:
     """What the data say of a parameter that they do not determine: enough to see why, too little to copy down."""
     return "" if p["std"] is None else f"({p['estimate']:.2g} ± {p['std']:.1g})"
@@ -96,13 +131,22 @@ def event_line(event: Document) -> str:
     return f"event at {event['time']:.3f} s: {event['kind']} {', '.join(jumps)}".rstrip()
 
 
+def drift_lines(document: Document) -> list[str]:
+    """Parameters that the judged tracker has found to drift, a line each."""
+    drifts = [drift for tracker in document.get("trackers", []) if tracker["judged"] for drift in tracker["drifts"]]
+    return [
+        f"drift since {d['since']:.1f} s: {d['parameter']} {d['rate']:+.4g} ± {d['rate_std']:.2g} {d['unit']} per s"
+        for d in drifts
+    ]
+
+
 def _calibration(document: Document) -> list[Calibration]:
     return [Calibration(**entry) for entry in document.get("calibration", [])]
 
 
 def trust_lines(document: Document) -> list[str]:
     """Events, calibration, residual, condition number, amount of data, throughput and warnings, a line each."""
-    lines = [event_line(event) for event in document["events"]]
+    lines = [event_line(event) for event in document["events"]] + drift_lines(document)
     lines += [f"diagnosis: {episode['summary']}" for episode in document.get("diagnosis", [])]
     lines += [f"calibration: {each}" for each in _calibration(document) if each.certain]
     for rows, residual in document["residual"].items():

@@ -14,18 +14,19 @@ from sms_online.description.given import given_system
 from sms_online.description.schema import System
 from sms_online.errors import InputError
 from sms_online.result import Result
-from sms_online.session import Session
+from sms_online.session import Session, with_trackers
 from sms_online.stream import Block
 from sms_tools.adopted_system import ONLINE_NAME, adopted_text, remarks, write_adopted
 from sms_tools.exit_codes import INTERRUPTED, NOTHING_DETERMINED, OK
 from sms_tools.interruption import Interruption
-from sms_tools.report import parameter_table, report_console, show, trust_lines
+from sms_tools.report import parameter_table, report_console, show, tracker_table, trust_lines
 from sms_tools.results_file import write_results
 
 
 def described_system(args: argparse.Namespace) -> tuple[System, Path | None]:
     """The system asked for, and the directory of its file, where its DBC stands too; None for a shipped one."""
-    return given_system(args.system)
+    system, folder = given_system(args.system)
+    return with_trackers(system, getattr(args, "tracker", None)), folder
 
 
 def check_part(args: argparse.Namespace) -> None:
@@ -50,6 +51,9 @@ def conclude(args: argparse.Namespace, result: Result, directory: Path, interrup
     document = result.document()
     console = report_console(args.json)
     parts: list[Table | str] = [parameter_table(document, console.width), "", *trust_lines(document)]
+    trackers = tracker_table(document)
+    if trackers is not None:
+        parts[1:1] = ["", trackers]
     try:
         path = write_results(directory, result.to_json())
     except InputError:
@@ -67,7 +71,7 @@ def conclude(args: argparse.Namespace, result: Result, directory: Path, interrup
 def write_named(args: argparse.Namespace, session: Session, directory: Path) -> None:
     """With --adopt, the system file with what was named, if anything was."""
     system = session.diagnosis.system
-    described = load_system(args.system)
+    described = with_trackers(load_system(args.system), args.tracker)
     if args.adopt and system != described:
         found = [effect for episode in session.diagnosis.document() for effect in episode["effects"]]
         path = write_adopted(directory, adopted_text(args.system, described, system, remarks(found)), ONLINE_NAME)

@@ -13,7 +13,7 @@ from sms_tools.html_report.figures import Chart, Series, chart
 from sms_tools.html_report.history import Course
 from sms_tools.html_report.pages import write_page
 from sms_tools.html_report.parameter_rows import parameter_rows, with_subscripts
-from sms_tools.report import METHODS, Document, event_line
+from sms_tools.report import METHODS, Document, drift_lines, event_line
 from sms_tools.view.frames import Reference
 from sms_tools.view.known import BOUNDS
 from sms_tools.view.parameter_groups import HALF_RANGES, Basis, half_range, parameter_groups
@@ -40,7 +40,7 @@ def write_report(
         title=f"{document['system']['name']}: parameters",
         document=document,
         facts=_facts(document),
-        events=[event_line(event) for event in document["events"]],
+        events=[*map(event_line, document["events"]), *drift_lines(document)],
         parameters=parameter_rows({"estimate": (document["parameters"], "blue")}, nominal),
         convergence=_convergence(document, nominal, course),
         residual=_residual(course),

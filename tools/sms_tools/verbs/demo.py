@@ -19,7 +19,7 @@ from rich.text import Text
 from sms_adapters.session_log import SESSION
 from sms_adapters.system_file import load_system
 from sms_adapters.truth import write_truth
-from sms_online.session import Session
+from sms_online.session import Session, with_trackers
 from sms_tools.interruption import Interruption
 from sms_tools.live.searches import SearchProcess
 from sms_tools.live.signals import termination_interrupts
@@ -53,7 +53,7 @@ def run(args: argparse.Namespace) -> int:
 
 def _watch(args: argparse.Namespace, arm: SimulatedArm, file: Path, directory: Path) -> int:
     """Estimate while the arm moves."""
-    system = load_system(str(file))
+    system = with_trackers(load_system(str(file)), args.tracker)
     live, session, merger = open_testbed(str(file), system, file.parent, directory)
     # The simulated arm has the nominal values.
     truth = {"parameters": {parameter.name: parameter.nominal for parameter in session.estimator.base.physical}}

@@ -1,0 +1,35 @@
+"""What is known of a drift while rows are made: a straight line for each parameter that moves.
+
+What takes parameters for constant (the session's least squares, sums behind residuals, the detector of changes) gets
+rows without the known part of the drift, that of the judged tracker's last estimate. Whitened rows are combinations of
+windows at several times, in which a parameter that drifts was another: a ramp's own column, t Y and the first moment of
+the test function, goes through the whitening with them, so that a ramp is removed exactly.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from sms_online.stream import Array
+
+
+@dataclass(frozen=True)
+class DriftLine:
+    """moved (n,): by how much parameters have moved at t, s, from a reference; rate (n,): per s, from there on."""
+
+    moved: Array
+    rate: Array
+    t: float
+
+    def at(self, t: float) -> DriftLine:
+        """The same at another instant."""
+        return DriftLine(self.moved + (t - self.t) * self.rate, self.rate, t)
+
+    def removed(self, rows: Array, ramp: Array) -> Array:
+        """Rows [Y b] (…, n_v, n + 1) of a window centred at t as if nothing had moved.
+
+        ramp (n_v, n): what rates add to b about t.
+        """
+        out = rows.copy()
+        out[..., -1] -= rows[..., :-1] @ self.moved + ramp @ self.rate
+        return out

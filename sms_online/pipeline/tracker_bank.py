@@ -1,0 +1,234 @@
+"""The trackers that a person has chosen, on the same rows: the first is judged, the others are read beside it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import msgspec
+import numpy as np
+
+from sms_online.calibration.nuisance import Nuisance
+from sms_online.description.schema import System, TrackerChoice
+from sms_online.model.parameters import Parameter
+from sms_online.pipeline.drift_line import DriftLine
+from sms_online.pipeline.errors_in_variables import NoiseBias
+from sms_online.pipeline.momentum_windows import HOPS
+from sms_online.state import Stage, State
+from sms_online.stream import Array
+from sms_online.trackers.build import Tracked, build_tracker
+from sms_online.trackers.drift import Found, LearnedTrend
+from sms_online.trackers.information import Information
+from sms_online.trackers.interface import Estimate, Prior, Rows, Tracker
+from sms_online.trackers.random_walk import RandomWalk
+from sms_online.trackers.square_root import RecursiveLeastSquares
+
+# Path of a judged tracker that is no learned trend: from one look at it to the next, s.
+LOOKED = 1.0
+# Times behind an alarm when it is asked whether it was a drift, s, where the judged tracker is a learned trend: the
+# first shows nothing but a fast drift, the second a step too, and the last is for what is unclear till then.
+WAITED = (3.0, 4.4, 6.5)
+
+
+@dataclass(frozen=True)
+class Reading:
+    """What one tracker says at an instant.
+
+    label: its name for people. memory: s of rows that the estimate rests on. drifts: learned so far, by column of the
+    estimate.
+    """
+
+    label: str
+    estimate: Estimate
+    memory: float
+    drifts: tuple[Found, ...] = ()
+
+
+@dataclass(frozen=True)
+class _Chosen:
+    """A tracker with its choice; None where it is the session's own least squares."""
+
+    choice: TrackerChoice
+    tracker: Tracker | None
+
+
+def rows_per_second(rows_a_window: int, span: float) -> float:
+    """Rows of windows of `span` s that come in a second."""
+    return rows_a_window * HOPS / span
+
+
+class BankState(State):
+    """reference (n,): parameters from which a drift counts, None where nothing has moved. held: rows since an alarm.
+
+    asked: how often it was asked what that was.
+    """
+
+    reference: Array | None = None
+    held: list[Rows] = msgspec.field(default_factory=list)
+    asked: int = 0
+
+
+class TrackerBank(Stage):
+    """The chosen trackers of one session, from one event to the next.
+
+    system: with its choice. parameters (n,): columns of the rows behind those of the nuisances. prior: of the
+    parameters. span: of a window, s. InputError where a choice does not fit the parameters.
+    """
+
+    def __init__(
+        self,
+        system: System,
+        parameters: Sequence[Parameter],
+        nuisances: Sequence[Nuisance],
+        prior: Prior | None,
+        rows_a_window: int,
+        span: float,
+    ) -> None:
+        self._nuisances, self._rows_a_window = len(nuisances), rows_a_window
+        tolerance = np.array([each.tolerance for each in nuisances])
+        nothing = np.full(len(parameters), np.nan)
+        known = Prior(
+            np.concatenate((np.zeros(tolerance.size), nothing if prior is None else prior.value)),
+            np.concatenate(
+                (np.where(np.isfinite(tolerance), tolerance, np.nan), nothing if prior is None else prior.std)
+            ),
+        )
+        self._rows_per_second = rows_per_second(rows_a_window, span)
+        rate = self._rows_per_second
+        tracked = Tracked(parameters, tolerance.size, known, prior is not None, rate, system.name)
+        self._chosen = [
+            _Chosen(choice, None if choice.static and system.trackers[0].static else build_tracker(choice, tracked))
+            for choice in system.trackers
+        ]
+        # By name, for each is saved as a stage within.
+        for k, chosen in enumerate(self._chosen):
+            if chosen.tracker is not None:
+                setattr(self, f"tracker_{k}", chosen.tracker)
+        self.state = BankState()
+
+    @property
+    def others(self) -> list[Tracker]:
+        """Those beside the session's own least squares."""
+        return [chosen.tracker for chosen in self._chosen if chosen.tracker is not None]
+
+    def begin(self, known: Information) -> None:
+        """Forget all rows, and go on from what is known of nuisances and parameters after an event."""
+        self.state.held, self.state.asked = [], 0
+        for tracker in self.others:
+            # What is known beforehand of the nuisances is each tracker's own already.
+            tracker.begin(known.without(range(self._nuisances)))
+
+    @property
+    def learned(self) -> LearnedTrend | None:
+        """The judged tracker, if it learns drifts."""
+        judged = self._chosen[0].tracker
+        return judged if isinstance(judged, LearnedTrend) else None
+
+    def update(self, rows: Rows, quiet: bool) -> None:
+        """Take in rows of nuisances and parameters; quiet: they leave no more than noise."""
+        for tracker in self.others:
+            if isinstance(tracker, LearnedTrend):
+                tracker.state.quiet = quiet
+            tracker.update(rows)
+
+    def hold(self, rows: Rows) -> None:
+        """Keep rows from behind an alarm until it is known what that was."""
+        if self.learned is not None:
+            self.state.held = [*self.state.held, rows]
+
+    def drift_behind(self, onset: float, alarm: float, until: float) -> bool | None:
+        """Whether what changed between two instants, s, is a drift's rate; None while too little is known.
+
+        until: s of the newest sample in a row. If it is, trackers go on with the rows held back.
+        """
+        learned = self.learned
+        if learned is None:
+            return False
+        if until < alarm + WAITED[self.state.asked]:
+            return None
+        held = self.state.held
+        decided = learned.go_on_behind(onset, alarm, held)
+        self.state.asked += 1
+        if decided.drift is None and (self.state.asked == 1 or (decided.unclear and self.state.asked < len(WAITED))):
+            return None
+        self.state.held, self.state.asked = [], 0
+        if decided.drift is None:
+            return False
+        for tracker in self.others:
+            if tracker is not learned:
+                for rows in held:
+                    tracker.update(rows)
+        return True
+
+    def hold_until(self, t: float) -> None:
+        """Have estimates of parameters that drift hold at t, s."""
+        for tracker in self.others:
+            if isinstance(tracker, LearnedTrend):
+                tracker.state.until = t
+
+    @property
+    def follows(self) -> bool:
+        """Whether parameters may move in the judged estimate."""
+        return self._chosen[0].tracker is not None
+
+    def drift(self, own: Callable[[], Estimate], t: float, before: DriftLine | None) -> DriftLine | None:
+        """By how much parameters have moved, as the judged tracker has it at t, s; None where nothing has.
+
+        own: the estimate by the session's least squares. before: the last such line.
+        """
+        judged = self._chosen[0].tracker
+        if judged is None or (before is not None and t < before.t + LOOKED):
+            return before
+        if isinstance(judged, LearnedTrend) and not judged.moves.any():
+            return None
+        return self._line(judged, own, t) or before
+
+    def _line(self, judged: Tracker, own: Callable[[], Estimate], t: float) -> DriftLine | None:
+        m = self._nuisances
+        estimate = judged.estimate()
+        if not estimate.determined[m:].all():
+            return None
+        moves, rate = np.ones(estimate.pi.size, dtype=np.bool_), np.zeros(estimate.pi.size)
+        if isinstance(judged, LearnedTrend):
+            moves, rate = judged.moves, judged.rates()[0]
+        if self.state.reference is None:
+            self.state.reference = own().pi[m:]
+        moved = np.where(moves[m:], estimate.pi[m:] - self.state.reference, 0.0)
+        return DriftLine(moved, rate[m:], judged.instant if isinstance(judged, LearnedTrend) else t)
+
+    @property
+    def information(self) -> Information:
+        """What the judged tracker knows of nuisances and parameters as they are now."""
+        judged = self._chosen[0].tracker
+        assert isinstance(judged, LearnedTrend | RandomWalk | RecursiveLeastSquares)
+        return judged.information
+
+    def refer(self, pi: Array) -> None:
+        """Count what has moved from here on: parameters (n,)."""
+        self.state.reference = pi
+
+    def judged(self, own: Estimate, bias: NoiseBias, t: float) -> Estimate:
+        """The session's estimate, of the first choice; see `readings`."""
+        return self._reading(self._chosen[0], own, bias, t).estimate
+
+    def readings(self, own: Estimate, bias: NoiseBias, t: float) -> tuple[Reading, ...]:
+        """What each says of the parameters at t, s, in the order of the choice.
+
+        own: the estimate by the session's own least squares. bias: what noise in the columns does to it.
+        """
+        return tuple(self._reading(chosen, own, bias, t) for chosen in self._chosen)
+
+    def _reading(self, chosen: _Chosen, own: Estimate, bias: NoiseBias, t: float) -> Reading:
+        tracker = chosen.tracker
+        if tracker is None:
+            return Reading(chosen.choice.label, own, own.rows / self._rows_per_second)
+        estimate = tracker.estimate_at(t) if isinstance(tracker, LearnedTrend) else tracker.estimate()
+        if estimate.scale is None and estimate.rows > 0.0:
+            # Noise in the columns pulls every weighted mean of the rows alike; the scatter of that grows as rows fade.
+            shift, covariance = bias.correction(estimate.determined)
+            fewer = max(1.0, bias.windows * self._rows_a_window / estimate.rows)
+            estimate = replace(estimate, pi=estimate.pi + shift, covariance=estimate.covariance + fewer * covariance)
+        estimate = estimate.without_nuisances(self._nuisances)
+        found = tracker.found if isinstance(tracker, LearnedTrend) else ()
+        drifts = tuple(replace(drift, column=drift.column - self._nuisances) for drift in found)
+        return Reading(chosen.choice.label, estimate, estimate.rows / self._rows_per_second, drifts)

@@ -1,0 +1,134 @@
+"""From a choice in the system file to a tracker of rows: names to columns, seconds to rows."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sms_online.description.explain import hint, nearest
+from sms_online.description.schema import Drift, TrackerChoice
+from sms_online.errors import InputError
+from sms_online.model.parameters import Parameter
+from sms_online.stream import Array
+from sms_online.trackers.drift import LearnedTrend
+from sms_online.trackers.forgetting import Directional, Exponential, Forgetting, NoForgetting, SlidingWindow
+from sms_online.trackers.interface import Prior, Tracker
+from sms_online.trackers.random_walk import RandomWalk
+from sms_online.trackers.square_root import RecursiveLeastSquares
+
+# Bodies whose inertial parameters drift together, as propellant leaves them.
+TOGETHER = ("spacecraft", "payload")
+# Every parameter, as a name in a table.
+ALL = "*"
+Value = TypeVar("Value")
+
+
+@dataclass(frozen=True)
+class Tracked:
+    """What a tracker is built for.
+
+    parameters (n,): columns behind those of nuisances. prior: of nuisances and parameters (m + n,), where something is
+    known beforehand; scaled: rows are weighed against it, see `RecursiveLeastSquares`. rows_per_second: of the balance.
+    source: name of the system, for messages.
+    """
+
+    parameters: Sequence[Parameter]
+    nuisances: int
+    prior: Prior
+    scaled: bool
+    rows_per_second: float
+    source: str
+
+
+def build_tracker(choice: TrackerChoice, tracked: Tracked) -> Tracker:
+    """The empty tracker of a choice; InputError where it does not fit the system's parameters."""
+    n = tracked.nuisances + len(tracked.parameters)
+    _check(choice, tracked.source)
+    if choice.kind == "rls":
+        return RecursiveLeastSquares(n, _forgetting(choice, tracked.rows_per_second), tracked.prior, tracked.scaled)
+    drifts = drifts_of(choice, tracked)
+    std = process_std(choice, tracked, drifts)
+    if not {"trend", "learned"} & set(drifts):
+        return RandomWalk(n, std, tracked.prior)
+    trends = np.where(_columns(drifts, "trend", tracked.nuisances), std, 0.0)
+    walks = np.where(_columns(drifts, "random_walk", tracked.nuisances), std, 0.0)
+    return LearnedTrend(n, _groups(drifts, tracked), trends, walks, tracked.prior)
+
+
+def drifts_of(choice: TrackerChoice, tracked: Tracked) -> list[Drift]:
+    """The drift of each parameter; InputError for names that the system does not have."""
+    table: Mapping[str, Drift] = {ALL: choice.drift} if isinstance(choice.drift, str) else choice.drift
+    return [_of(p.name, table, "none") for p in _named(tracked, "drift", table)]
+
+
+def process_std(choice: TrackerChoice, tracked: Tracked, drifts: Sequence[Drift]) -> Array:
+    """Process noise (m + n,) of walks and trends, 0 of all else; InputError where a walk or trend states none."""
+    out = np.zeros(tracked.nuisances + len(drifts))
+    parameters = _named(tracked, "std", choice.std)
+    for k, (p, drift) in enumerate(zip(parameters, drifts, strict=True), start=tracked.nuisances):
+        if drift not in ("random_walk", "trend"):
+            continue
+        shared = None if choice.share is None or not p.nominal else choice.share * abs(p.nominal)
+        std = _of(p.name, choice.std, shared)
+        if std is None:
+            found = f"{drift} of {p.name} without std"
+            expected = "std of this parameter" + ("" if choice.share is None else ", whose stated value is zero")
+            raise InputError(tracked.source, "tracker", found, f"{expected}, or share of the stated values")
+        out[k] = std
+    return out
+
+
+def _columns(drifts: Sequence[Drift], kind: Drift, nuisances: int) -> NDArray[np.bool_]:
+    """Columns (m + n,) of parameters of one kind of drift."""
+    return np.concatenate((np.zeros(nuisances, dtype=np.bool_), [drift == kind for drift in drifts]))
+
+
+def _groups(drifts: Sequence[Drift], tracked: Tracked) -> list[tuple[int, ...]]:
+    """Columns that are learned: one each, but a body's inertial parameters, which its mass moves together."""
+    groups: dict[str, list[int]] = {}
+    for k, (p, drift) in enumerate(zip(tracked.parameters, drifts, strict=True), start=tracked.nuisances):
+        if drift == "learned":
+            groups.setdefault(p.owner if p.owner in TOGETHER else p.name, []).append(k)
+    return [tuple(columns) for columns in groups.values()]
+
+
+def _check(choice: TrackerChoice, source: str) -> None:
+    if choice.kind == "rls":
+        if choice.drift != "none" or choice.std or choice.share is not None:
+            raise InputError(source, "tracker", "drift of rls", 'kind = "kalman", or a forgetting')
+        if (choice.forgetting == "none") != (choice.memory is None):
+            found = "no memory" if choice.memory is None else f"a memory of {choice.memory:g} s and no forgetting"
+            raise InputError(source, "tracker", found, "forgetting and its memory in s, or neither")
+    elif choice.forgetting != "none" or choice.memory is not None:
+        raise InputError(source, "tracker", "forgetting of kalman", 'kind = "rls", or a drift')
+
+
+def _forgetting(choice: TrackerChoice, rows_per_second: float) -> Forgetting:
+    if choice.memory is None:
+        return NoForgetting()
+    rows = choice.memory * rows_per_second
+    if choice.forgetting == "window":
+        return SlidingWindow(max(1, round(rows)))
+    factor = float(np.exp(-1.0 / rows))
+    return Exponential(factor) if choice.forgetting == "exponential" else Directional(factor)
+
+
+def _named(tracked: Tracked, place: str, table: Mapping[str, object]) -> Sequence[Parameter]:
+    """The parameters; InputError where the table names something else."""
+    names = [p.name for p in tracked.parameters]
+    owners = [name.rsplit(".", 1)[0] for name in names]
+    for key in table:
+        if key not in (*names, *owners, ALL):
+            near = nearest(key, [*names, *owners])
+            raise InputError(tracked.source, f"tracker.{place}", repr(key), "an estimated parameter" + hint(near))
+    return tracked.parameters
+
+
+def _of(name: str, table: Mapping[str, Value], default: Value) -> Value:
+    """A parameter's entry: its own, that of what owns it, that of all, or the default."""
+    owner = name.rsplit(".", 1)[0]
+    return next((table[key] for key in (name, owner, ALL) if key in table), default)

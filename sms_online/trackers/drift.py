@@ -1,0 +1,340 @@
+"""Parameters that drift: value and rate on knots, in square-root information form, drifts learned from the rows.
+
+Between knots a moving parameter goes on a straight line, or on one that decays; at each knot its rate takes a step of
+random size: a random walk of the rate. Which parameters move is learned: a parameter starts to move where a ramp of it
+takes more off the rows' sum of squares than chance does, and more than any step. How freely its rate walks, and how
+fast it decays, is learned too: the choice under which the innovations of the last half minute are likeliest, neither
+unless they say more. So a steady parameter keeps the error bars of least squares.
+
+A rate begins with no information at all, and most parameters have none: a covariance filter needs a finite variance
+in its place, and loses the digits of what is well known to it. Information in square-root form has neither problem.
+Sources: Bierman, Factorization Methods for Discrete Sequential Estimation, 1977, chapters V and VI (time update of the
+information filter); Harvey, Forecasting, Structural Time Series Models and the Kalman Filter, 1989, section 2.3 (local
+linear trend) and 3.4 (likelihood of its innovations).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from sms_online.state import State
+from sms_online.stream import Array
+from sms_online.trackers.drift_filter import Block, DriftFilter, Moving, innovation_loss, reach
+from sms_online.trackers.drift_search import LARGEST_LEFT, Break, best_break, best_ramp
+from sms_online.trackers.factor import masked_covariance, solve, triangular_factor
+from sms_online.trackers.information import Information
+from sms_online.trackers.interface import Estimate, Prior, Rows, Tracker, checked, prior_factor
+
+# Time from one step of the filter to the next, s, and steps from one remembered knot to the next.
+STEP, KNOT = 0.2, 5
+# Knots that are looked back at, for ramps and for process noise.
+REMEMBERED = 32
+# From one search for ramps to the next, and from one choice of process noise to the next, knots.
+SEARCHED, CHOSEN = 2, 4
+# Knots before the first search: the first rows have weights that change.
+SETTLED = 3
+# Times in which a rate changes by its own size, s: what process noise is chosen from, none the first; and in which it
+# decays, for what warms up, runs in or empties approaches an end.
+TIMES = (np.inf, 1e4, 1000.0, 300.0, 100.0, 30.0, 10.0, 3.0)
+DECAYS = (np.inf, 300.0, 100.0, 50.0, 30.0, 20.0, 10.0)
+# Drifts that begin together, at most.
+MOST_AT_ONCE = 4
+# Knots from the beginning within which more than noise may be a drift yet to be found.
+PATIENCE = 12
+# Time behind a change within which whitened rows hold parameters of before it, s.
+WHITENED = 1.5
+# What process noise or decay must gain in twice the log likelihood of the innovations over none.
+COST = 4.0
+
+
+@dataclass(frozen=True)
+class Found:
+    """A drift that was learned, of the parameter in `column`, since when, s; its rate now and its deviation, per s."""
+
+    column: int
+    since: float
+    rate: float
+    std: float
+
+
+class DriftState(State):
+    """What a learned trend keeps of its rows.
+
+    anchor: the filter at the oldest remembered knot; now: at the newest step. blocks: from knot to knot. pending: rows
+    [Y, (t - knot) Y, b] since the last knot; fresh: how many of them are not in `now` yet. step: number of the open
+    one, from t = 0 on; knots: since the beginning. rows: so far; newest: time of the last, s. accepted: how often
+    drifts were. quiet: whether rows leave no more than noise, without which no drift is accepted. until: instant that
+    estimates hold for, s; no earlier than that of the newest row.
+    """
+
+    anchor: DriftFilter
+    now: DriftFilter
+    moving: list[Moving]
+    blocks: list[Block] = msgspec.field(default_factory=list)
+    pending: list[Array] = msgspec.field(default_factory=list)
+    fresh: int = 0
+    step: int = -1
+    knots: int = 0
+    rows: float = 0.0
+    newest: float = 0.0
+    accepted: int = 0
+    quiet: bool = True
+    until: float = -np.inf
+
+
+class LearnedTrend(Tracker):
+    """Least squares of π with those parameters on trends that show one.
+
+    groups: columns that may move, each group as one hypothesis. trends: columns that move from the start, with the
+    process noise (n,) of their rates, per √s; walks (n,): that of values on random walks, per √s. prior: of π.
+    """
+
+    def __init__(self, n: int, groups: Sequence[tuple[int, ...]], trends: Array, walks: Array, prior: Prior) -> None:
+        self._n, self._groups, self._prior = n, tuple(groups), prior_factor(prior, n)
+        self._trends, self._walks = trends, walks
+        self.enabled = True
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget all rows; the prior stays."""
+        self.begin(Information.none(self._n))
+
+    def begin(self, known: Information) -> None:
+        """Forget all rows, and go on from what others say of π; the prior stays. Drifts are learned anew."""
+        factor = triangular_factor(self._prior, checked(known, self._n).factor)
+        moving = [Moving((int(k),), -1, float(self._trends[k])) for k in np.flatnonzero(self._trends)]
+        anchor = DriftFilter.begin(factor, moving, self._walks, STEP)
+        self.state = DriftState(anchor, anchor, moving, rows=float(known.rows))
+
+    def update(self, rows: Rows) -> None:
+        """Take in rows; ValueError where their width is not n."""
+        if not self.enabled:
+            return
+        for row, t in zip(self._expanded(rows), rows.t.tolist(), strict=True):
+            step = int(np.floor(t / STEP))
+            if self.state.step < 0:
+                self.state.step = step
+            if step > self.state.step:
+                self._advance(step)
+            row[self._n : -1] += (t - self._knot * STEP) * row[: self._n]
+            self.state.pending.append(row)
+            self.state.fresh += 1
+            self.state.rows, self.state.newest = self.state.rows + 1.0, t
+
+    def _expanded(self, rows: Rows) -> Array:
+        """Whitened rows [Y, what rates add about t, b] (M, 2 n + 1)."""
+        whitened = rows.whitened(self._n)
+        rates = np.zeros_like(rows.Y) if rows.ramp is None else rows.ramp / rows.std[:, None]
+        return np.concatenate((whitened[:, :-1], rates, whitened[:, -1:]), axis=1)
+
+    def go_on_behind(self, onset: float, alarm: float, held: Sequence[Rows]) -> Break:
+        """Go on behind a change that lies between two instants, s, if it is that of a drift; what it is.
+
+        held: rows since the alarm, which are taken in then; those of the last knot before the onset are given up.
+        """
+        kept = [block for block in self.state.blocks if (block.knot + KNOT) * STEP <= onset]
+        begin = int(np.ceil((alarm + WHITENED) / STEP))
+        knot = begin // KNOT * KNOT
+        behind = [rows for rows in held if rows.t[0] >= begin * STEP]
+        if not kept or not behind:
+            return Break()
+        after = [self._expanded(rows) for rows in behind]
+        for rows, own in zip(behind, after, strict=True):
+            own[:, self._n : -1] += (rows.t - knot * STEP)[:, None] * own[:, : self._n]
+        before = self._through(kept, self.state.moving, knot)[0]
+        block = Block.of(np.concatenate(after), knot, behind[-1].t[-1] - begin * STEP)
+        decided = best_break(before, block, self._groups)
+        found = decided.drift
+        if found is None:
+            return decided
+        moving = [each.broken(found.columns, knot, found.rates) for each in self.state.moving]
+        if not any(each.columns == found.columns for each in moving):
+            moving.append(Moving(found.columns, knot, 0.0, tuple(found.rates.tolist()), breaks=(knot,), begun=onset))
+        now = self._through(kept, moving, begin)[0]
+        self.state.blocks, self.state.moving, self.state.now = kept, moving, now
+        self.state.anchor = self.state.anchor.with_moving(moving)
+        self.state.pending, self.state.fresh, self.state.step = [], 0, begin
+        for rows in behind:
+            self.update(rows)
+        self.state.accepted += 1
+        return decided
+
+    @property
+    def _knot(self) -> int:
+        """Step at which the open block began."""
+        return self.state.step // KNOT * KNOT
+
+    def _advance(self, step: int) -> None:
+        """End the open step, and go on at a later one."""
+        self.state.now = self.state.now.absorbed(self._open()).advanced(step)
+        knot, self.state.step, self.state.fresh = self._knot, step, 0
+        if self._knot > knot:
+            self._close(Block.of(self._rows(), knot, KNOT * STEP))
+
+    def _close(self, block: Block) -> None:
+        """Remember a block, and look back."""
+        self.state.blocks.append(block)
+        self.state.pending = []
+        self.state.knots += 1
+        while len(self.state.blocks) > REMEMBERED:
+            gone = self.state.blocks.pop(0)
+            following = self.state.blocks[0].knot
+            self.state.anchor = self.state.anchor.absorbed(gone).advanced(following)
+        if self.state.quiet and self.state.knots > SETTLED and self.state.knots % SEARCHED == 0:
+            self._search()
+        if any(each.learned for each in self.state.moving) and self.state.knots % CHOSEN == 0:
+            self._choose()
+
+    def _open(self) -> Block:
+        """The open step's rows."""
+        rows, n = self._rows()[len(self.state.pending) - self.state.fresh :], self._n
+        rows[:, n : 2 * n] -= (self.state.step - self._knot) * STEP * rows[:, :n]
+        return Block.of(rows, self.state.step, STEP)
+
+    def _rows(self) -> Array:
+        return np.array(self.state.pending).reshape(-1, 2 * self._n + 1)
+
+    def _filtered(self, moving: Sequence[Moving]) -> tuple[DriftFilter, float]:
+        """The filter behind the remembered blocks with these moving, and minus twice the log likelihood of those."""
+        return self._through(self.state.blocks, moving, self.state.step)
+
+    def _through(self, blocks: Sequence[Block], moving: Sequence[Moving], end: int) -> tuple[DriftFilter, float]:
+        state, loss = self.state.anchor.with_moving(moving), 0.0
+        for k, block in enumerate(blocks):
+            after = state.absorbed(block)
+            loss += innovation_loss(state, after)
+            state = after.advanced(blocks[k + 1].knot if k + 1 < len(blocks) else end)
+        return state, loss
+
+    def _search(self) -> None:
+        """Whether one more parameter moves."""
+        found = list(self.state.moving)
+        for _ in range(MOST_AT_ONCE):
+            taken = {column for moving in found for column in moving.columns}
+            free = [group for group in self._groups if not taken & set(group)]
+            ramp = best_ramp(self.state.anchor.with_moving(found), list(self.state.blocks), free)
+            if ramp is None:
+                break
+            begun = ramp.since * STEP
+            found.append(Moving(ramp.columns, ramp.since, 0.0, tuple(ramp.rates.tolist()), begun=begun))
+        if len(found) == len(self.state.moving):
+            return
+        # A lack of the model leaves more than noise, whatever ramps it is taken for.
+        state, _ = self._filtered(found)
+        before = self.state.anchor.factor[-1, -1] ** 2
+        if state.factor[-1, -1] ** 2 - before < LARGEST_LEFT * sum(block.rows for block in self.state.blocks):
+            self.state.moving = found
+            self._choose()
+            self.state.accepted += 1
+
+    def _choose(self) -> None:
+        """Process noise and decay of each that moves, those under which the innovations are likeliest."""
+        moving = list(self.state.moving)
+        chosen, least = self._filtered(moving)
+        least += sum(_cost(each) for each in moving)
+        for k, each in enumerate(moving):
+            # What decays steadily looks like process noise, so one is tried without the other first.
+            tried = [(0, fading) for fading in range(len(DECAYS))] + [
+                (each.level + step, each.fading) for step in (-1, 1)
+            ]
+            for level, fading in tried if each.learned else ():
+                if not 0 <= level < len(TIMES):
+                    continue
+                other = [*moving[:k], each.at(level, TIMES[level], fading, DECAYS[fading]), *moving[k + 1 :]]
+                found, loss = self._filtered(other)
+                loss += sum(_cost(one) for one in other)
+                if loss < least:
+                    chosen, least, moving = found, loss, other
+        self.state.moving, self.state.now = moving, chosen
+        self.state.anchor = self.state.anchor.with_moving(moving)
+
+    @property
+    def patient(self) -> bool:
+        """Whether more than noise may be a drift that is yet to be found."""
+        return self.state.knots < PATIENCE
+
+    @property
+    def instant(self) -> float:
+        """Time that estimates hold for, s."""
+        return max(self.state.newest, self.state.until)
+
+    @property
+    def information(self) -> Information:
+        """What is known of π as it is at the newest row."""
+        state = self.state.now.absorbed(self._open())
+        factor, ahead = state.factor.copy(), self.instant - self.state.step * STEP
+        for column, place, decay in state.places():
+            factor[:, place] -= reach(decay, ahead) * factor[:, column]
+        rates = range(self._n, state.size)
+        kept = Information(factor, int(self.state.rows)).without(rates).factor
+        return Information(triangular_factor(np.delete(kept, list(rates), axis=1)), int(self.state.rows))
+
+    @property
+    def found(self) -> tuple[Found, ...]:
+        """The drifts that were learned so far."""
+        rate, std = self.rates()
+        return tuple(
+            Found(column, each.begun, float(rate[column]), float(std[column]))
+            for each in self.state.moving
+            if each.learned
+            for column in each.columns
+        )
+
+    @property
+    def columns(self) -> list[int]:
+        """Columns of the drifts that were learned so far."""
+        return [column for each in self.state.moving if each.learned for column in each.columns]
+
+    @property
+    def moves(self) -> NDArray[np.bool_]:
+        """Which parameters (n,) move, by trend or walk."""
+        out = self._walks > 0.0
+        for each in self.state.moving:
+            out[list(each.columns)] = True
+        return out
+
+    def rates(self) -> tuple[Array, Array]:
+        """Rate of each parameter (n,) now, zero where it does not move, and standard deviation (n,)."""
+        state = self.state.now.absorbed(self._open())
+        solution = solve(state.factor)
+        rate, std = np.zeros(self._n), np.zeros(self._n)
+        covariance = solution.covariance()
+        for column, place, _ in state.places():
+            rate[column], std[column] = solution.pi[place], np.sqrt(covariance[place, place])
+        return rate, std
+
+    def estimate(self) -> Estimate:
+        """π at the instant that estimates hold for; leaves the state as it is."""
+        return self.estimate_at(-np.inf)
+
+    def estimate_at(self, t: float) -> Estimate:
+        """The same at a later instant, s."""
+        state = self.state.now.absorbed(self._open())
+        solution = solve(state.factor)
+        ahead = max(self.instant, t) - self.state.step * STEP
+        to_now = np.eye(self._n, state.size)
+        determined = solution.determined[: self._n].copy()
+        for column, place, decay in state.places():
+            to_now[column, place] = reach(decay, ahead)
+            determined[column] &= bool(solution.determined[place])
+        root = to_now @ solution.root
+        return Estimate(
+            pi=to_now @ solution.pi,
+            covariance=masked_covariance(root @ root.T, determined),
+            covariance_robust=None,
+            determined=determined,
+            condition_number=solution.condition_number,
+            rows=self.state.rows,
+            rss=solution.rss,
+            dof=max(self.state.rows + len(self._prior) - solution.rank, 0.0),
+        )
+
+
+def _cost(moving: Moving) -> float:
+    """What process noise and decay must gain over none."""
+    return COST * ((moving.level > 0) + (moving.fading > 0))

@@ -1,0 +1,199 @@
+"""The information filter of parameters of which some move: one step of time, one block of rows."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from sms_online.stream import Array
+from sms_online.trackers.factor import triangular_factor
+
+# A direction of less information than this share of its column's is none, in a likelihood.
+NO_INFORMATION = 1e-9
+
+
+@dataclass(frozen=True)
+class Block:
+    """Rows between two knots as one factor: columns [Y, (t - knot) Y, b], (2 n + 1, 2 n + 1). knot: its number.
+
+    rows: how many. span: s.
+    """
+
+    factor: Array
+    knot: int
+    rows: int
+    span: float
+
+    @staticmethod
+    def of(rows: Array, knot: int, span: float) -> Block:
+        """Of whitened rows [Y, (t - knot) Y, b] (M, 2 n + 1) of `span` s."""
+        return Block(triangular_factor(rows), knot, len(rows), span)
+
+
+def decaying(value: Array, ramp: Array, decay: float, span: float) -> Array:
+    """Column of a rate that decays: the best line through its reach over a block of `span` s, to second order."""
+    return np.asarray(np.exp(-0.5 * decay * span) * ramp + decay * span**2 / 12.0 * value)
+
+
+def reach(decay: float, time: float) -> float:
+    """How far a unit rate comes in a time, s, while it decays."""
+    return time if decay == 0.0 else float(-np.expm1(-decay * time) / decay)
+
+
+@dataclass(frozen=True)
+class Moving:
+    """Parameters that move together: their columns, since which knot, -1 from the start, and their process noise.
+
+    std: of each rate's walk, per √s. Where the drift was learned it is a share of the accepted `rates`. decay: of the
+    rates, 1/s, as of what approaches an end. level, fading: places of both in the choice. breaks: knots at which values
+    and rates begin anew, for they may have jumped. begun: when the drift did, s, as far as that is known.
+    """
+
+    columns: tuple[int, ...]
+    since: int
+    std: float
+    rates: tuple[float, ...] = ()
+    decay: float = 0.0
+    level: int = 0
+    fading: int = 0
+    breaks: tuple[int, ...] = ()
+    begun: float = 0.0
+
+    @property
+    def learned(self) -> bool:
+        """Whether it was found in the rows."""
+        return bool(self.rates)
+
+    def noise(self) -> list[float]:
+        """Process noise of each column's rate, per √s."""
+        return [self.std * abs(rate) for rate in self.rates] if self.learned else [self.std] * len(self.columns)
+
+    def broken(self, columns: tuple[int, ...], knot: int, rates: Array) -> Moving:
+        """With a break at a knot where it is of these columns, whose rates change there by so much."""
+        if self.columns != columns:
+            return self
+        largest = np.maximum(np.abs(self.rates), np.abs(rates)) if self.learned else ()
+        return replace(self, breaks=(*self.breaks, knot), rates=tuple(float(rate) for rate in largest))
+
+    def at(self, level: int, time: float, fading: int, decay_time: float) -> Moving:
+        """With a rate that changes by its own size in `time` s, and decays in `decay_time` s."""
+        return replace(self, level=level, std=1.0 / np.sqrt(time), fading=fading, decay=1.0 / decay_time)
+
+
+@dataclass(frozen=True)
+class DriftFilter:
+    """Information at a knot on π (n,) and on the rates of those that move, (size + 1, size + 1).
+
+    walks (n,): process noise of values, per √s. interval: s from knot to knot. knot: number, -1 before the first.
+    """
+
+    factor: Array
+    moving: tuple[Moving, ...]
+    walks: Array
+    interval: float
+    knot: int = -1
+
+    @staticmethod
+    def begin(known: Array, moving: Sequence[Moving], walks: Array, interval: float) -> DriftFilter:
+        """From a factor on π, nothing known of rates."""
+        return DriftFilter(known, (), walks, interval).with_moving(moving)
+
+    @property
+    def n(self) -> int:
+        """Number of parameters."""
+        return int(self.walks.size)
+
+    @property
+    def size(self) -> int:
+        """Number of states."""
+        return len(self.factor) - 1
+
+    def places(self) -> Iterator[tuple[int, int, float]]:
+        """Column of what has begun to move, place of its rate among the states, and the rate's decay, 1/s."""
+        place = self.n
+        for each in self.moving:
+            for column in each.columns:
+                if each.since <= self.knot:
+                    yield column, place, each.decay
+                place += 1
+
+    @property
+    def uneven(self) -> bool:
+        """Whether rates change: by process noise, because they decay, or at a break that is yet to come."""
+        walks = any(
+            each.decay > 0.0 or max(each.noise()) > 0.0 or max(each.breaks, default=-1) > self.knot
+            for each in self.moving
+        )
+        return bool(self.walks.any() or walks)
+
+    def all_moving(self) -> DriftFilter:
+        """With everything moving from now on that moves later."""
+        return replace(self, moving=tuple(replace(each, since=min(each.since, self.knot)) for each in self.moving))
+
+    def with_moving(self, moving: Sequence[Moving]) -> DriftFilter:
+        """With these moving, of which those that are there already come first; of further rates nothing is known."""
+        rates = sum(len(each.columns) for each in moving)
+        more = self.n + rates - self.size
+        if more == 0:
+            return replace(self, moving=tuple(moving))
+        wide = np.zeros((self.size + more + 1, self.size + more + 1))
+        wide[: self.size + 1, : self.size] = self.factor[:, :-1]
+        wide[: self.size + 1, -1] = self.factor[:, -1]
+        return replace(self, factor=triangular_factor(wide), moving=tuple(moving))
+
+    def absorbed(self, block: Block) -> DriftFilter:
+        """With a block's rows, of its knot."""
+        state = replace(self, knot=block.knot)
+        n = self.n
+        rows = np.zeros((len(block.factor), self.size + 1))
+        rows[:, :n], rows[:, -1] = block.factor[:, :n], block.factor[:, -1]
+        for column, place, decay in state.places():
+            rows[:, place] = decaying(block.factor[:, column], block.factor[:, n + column], decay, block.span)
+        return replace(state, factor=triangular_factor(self.factor, rows))
+
+    def advanced(self, knot: int) -> DriftFilter:
+        """At a later knot."""
+        time = (knot - self.knot) * self.interval
+        R = self.factor.copy()
+        noisy: list[tuple[int, float]] = [(int(k), float(self.walks[k])) for k in np.flatnonzero(self.walks)]
+        stds = [std for each in self.moving for std in each.noise()]
+        for column, place, decay in self.places():
+            # In terms of the later knot: rate before = rate / left, value before = value - rate before · reach.
+            R[:, place] = (R[:, place] - reach(decay, time) * R[:, column]) / np.exp(-decay * time)
+            if stds[place - self.n] > 0.0:
+                noisy.append((place, stds[place - self.n]))
+        noisy += [(place, np.inf) for place in self._broken(knot)]
+        if not noisy:
+            return replace(self, factor=R if not list(self.places()) else triangular_factor(R), knot=knot)
+        # States before = states after - noise; the noise's own information comes first, and is left behind.
+        p = len(noisy)
+        stacked = np.zeros((p + len(R), p + len(R)))
+        stacked[p:, p:] = R
+        for k, (place, std) in enumerate(noisy):
+            stacked[k, k] = 1.0 / (std * np.sqrt(time))
+            stacked[p:, k] = -R[:, place]
+        return replace(self, factor=triangular_factor(stacked)[p:, p:], knot=knot)
+
+    def _broken(self, knot: int) -> list[int]:
+        """Places among the states of values and rates that begin anew on the way to a knot."""
+        columns = {
+            column
+            for each in self.moving
+            if any(self.knot < at <= knot for at in each.breaks)
+            for column in each.columns
+        }
+        rates = [place for column, place, _ in self.places() if column in columns]
+        return [*columns, *rates]
+
+
+def innovation_loss(before: DriftFilter, after: DriftFilter) -> float:
+    """Minus twice the log likelihood of a block given what was before it, but for a constant of the block's own."""
+    logs = []
+    for state in (before, after):
+        own = np.abs(np.diag(state.factor)[:-1])
+        size = np.linalg.norm(after.factor[:, :-1], axis=0)
+        logs.append(float(np.sum(np.log(np.maximum(own, NO_INFORMATION * np.where(size > 0.0, size, 1.0))))))
+    squares = after.factor[-1, -1] ** 2 - before.factor[-1, -1] ** 2
+    return float(squares + 2.0 * (logs[1] - logs[0]))

@@ -1,0 +1,151 @@
+"""Which parameter has begun to drift: ramps of each from several starts, against steps, by what they explain."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from sms_online.stream import Array
+from sms_online.trackers.drift_filter import Block, DriftFilter, decaying
+from sms_online.trackers.factor import triangular_factor
+
+# Starts of a ramp that are tried, knots before now.
+STARTS = (4, 8, 16, 32)
+# What a ramp must take off the rows' sum of squares, for each parameter in it: 6.3 standard deviations of chance, of
+# some 1e5 that are tried in an hour.
+LEAST_GAIN = 40.0
+# And so much more than a step, and than a ramp of another parameter.
+DECISIVE = 10.0
+# Mean square of the whitened rows up to which they hold no more than noise.
+LARGEST_LEFT = 1.3
+# A column of which the others leave less than this share moves with them, and cannot be seen alone.
+FREE = 1e-6
+
+
+@dataclass(frozen=True)
+class Ramp:
+    """A drift that the rows show: columns that move together since a knot, at these rates."""
+
+    columns: tuple[int, ...]
+    since: int
+    rates: Array
+    gain: float
+
+
+def best_ramp(anchor: DriftFilter, blocks: Sequence[Block], groups: Sequence[tuple[int, ...]]) -> Ramp | None:
+    """The ramp that explains most of the last blocks, if it is no accident and no step.
+
+    anchor: what is known before the blocks.
+    """
+    n = anchor.n
+    ranked: list[Ramp] = []
+    steps = 0.0
+    # Everything from the anchor to each start, then everything after it.
+    state, before = replace(anchor, knot=blocks[0].knot), {}
+    for k, block in enumerate(blocks):
+        before[len(blocks) - k] = state
+        following = blocks[k + 1].knot if k + 1 < len(blocks) else block.knot + 1
+        state = state.absorbed(block).advanced(following)
+    for start in STARTS:
+        if start > len(blocks):
+            break
+        since = blocks[-start].knot
+        left, columns = _left(before[start].all_moving(), blocks[-start:], n)
+        for group in groups:
+            ramp, step = [n + k for k in group], list(group)
+            gain, rates = _explained(left, columns, ramp)
+            ranked.append(Ramp(group, since, rates, gain))
+            steps = max(steps, _explained(left, columns, step)[0])
+    ranked.sort(key=lambda each: each.gain - LEAST_GAIN * len(each.columns), reverse=True)
+    if not ranked:
+        return None
+    best = ranked[0]
+    others = max((each.gain for each in ranked if each.columns != best.columns), default=0.0)
+    enough = best.gain > LEAST_GAIN * len(best.columns)
+    return best if enough and best.gain > max(steps, others) + DECISIVE * len(best.columns) else None
+
+
+@dataclass(frozen=True)
+class Break:
+    """What rows behind a change show. drift: one that began or changed there, None where they show none.
+
+    unclear: a drift explains more than any step, but not yet so much that it could not be chance.
+    """
+
+    drift: Ramp | None = None
+    unclear: bool = False
+
+
+def best_break(before: DriftFilter, after: Block, groups: Sequence[tuple[int, ...]]) -> Break:
+    """Whether a change is that of a drift, or a step.
+
+    before: what is known up to the knot of the rows behind it, `after`; those in between are left out, for nobody knows
+    when within them it was. So a value may jump there beside its rate, and is compared with its step alone.
+    """
+    n = before.n
+    left, sizes = _left(before.all_moving(), [after], n)
+    steps = max((_explained(left, sizes, list(group))[0] for group in groups), default=0.0)
+    ranked: list[Ramp] = []
+    for group in groups:
+        gain, values = _explained(left, sizes, [*group, *(n + k for k in group)])
+        ranked.append(Ramp(group, after.knot, values[len(group) :], gain))
+    ranked.sort(key=lambda each: each.gain - LEAST_GAIN * len(each.columns), reverse=True)
+    if not ranked:
+        return Break()
+    best, others = ranked[0], max((each.gain for each in ranked[1:]), default=0.0)
+    size = len(best.columns)
+    rest = float(left[:, -1] @ left[:, -1]) - before.factor[-1, -1] ** 2 - best.gain
+    if rest > LARGEST_LEFT * after.rows:
+        return Break()
+    if best.gain - steps > (LEAST_GAIN + DECISIVE) * size and best.gain - others > DECISIVE * size:
+        return Break(best)
+    return Break(unclear=best.gain - steps > DECISIVE * size)
+
+
+def _left(state: DriftFilter, blocks: Sequence[Block], n: int) -> tuple[Array, Array]:
+    """What static parameters and those that move leave of [steps, ramps, b] since the state's knot; and columns' sizes.
+
+    Steps and ramps are carried through the filter like further right-hand sides, so what it leaves of them accounts for
+    its process noise.
+    """
+    size, since = state.size, state.knot
+    wide = np.zeros((size + 2 * n + 1, size + 2 * n + 1))
+    wide[: size + 1, :size], wide[: size + 1, -1] = state.factor[:, :-1], state.factor[:, -1]
+    state, squares = replace(state, factor=wide), np.zeros(2 * n)
+    runs = [[block] for block in blocks] if state.uneven else [list(blocks)]
+    for k, run in enumerate(runs):
+        own, begun = np.concatenate([_relative(block, run[0].knot, state) for block in run]), len(state.factor)
+        stacked = np.zeros((begun + len(own), wide.shape[1]))
+        stacked[:begun] = state.factor
+        stacked[begun:, :n] = own[:, :n]
+        for column, place, decay in state.places():
+            span = sum(block.span for block in run)
+            stacked[begun:, place] = decaying(own[:, column], own[:, n + column], decay, span)
+        stacked[begun:, size:] = own
+        # Ramps begin where all begins.
+        stacked[begun:, size + n : -1] += (run[0].knot - since) * state.interval * own[:, :n]
+        squares += np.sum(stacked[begun:, size:-1] ** 2, axis=0)
+        state = replace(state, factor=triangular_factor(stacked))
+        if k + 1 < len(runs):
+            state = state.advanced(runs[k + 1][0].knot)
+    return state.factor[size:, size:], np.sqrt(squares)
+
+
+def _relative(block: Block, knot: int, state: DriftFilter) -> Array:
+    """A block's factor with times relative to a knot."""
+    factor, n = block.factor.copy(), state.n
+    factor[:, n : 2 * n] += (block.knot - knot) * state.interval * factor[:, :n]
+    return factor
+
+
+def _explained(left: Array, sizes: Array, columns: Sequence[int]) -> tuple[float, Array]:
+    """What columns take off the sum of squares of the last one, and their coefficients."""
+    inside = left[:, columns]
+    norm = np.linalg.norm(inside, axis=0)
+    if not (norm > FREE * sizes[columns]).all():
+        return 0.0, np.zeros(len(columns))
+    coefficients, *_ = np.linalg.lstsq(inside / norm, left[:, -1], rcond=None)
+    rest = left[:, -1] - inside @ (coefficients / norm)
+    return float(left[:, -1] @ left[:, -1] - rest @ rest), coefficients / norm

@@ -1,0 +1,98 @@
+"""The Kalman tracker of a session: least squares until all is determined, then filterpy's filter."""
+
+from __future__ import annotations
+
+from sms_online.state import State
+from sms_online.stream import Array
+from sms_online.trackers.information import Information
+from sms_online.trackers.interface import Estimate, Prior, Rows, Tracker
+from sms_online.trackers.kalman import KalmanTracker
+from sms_online.trackers.square_root import RecursiveLeastSquares
+
+# From one look at whether all is determined to the next: rows for each parameter.
+ROWS_A_PARAMETER = 20
+# Initial deviation, in those of the least squares that it starts from: no more than 1e-6 of their information, and the
+# deviation beyond which no parameter walks.
+INITIAL = 1000.0
+
+
+class WalkState(State):
+    """taken: rows before the filter starts. value, std (n,): where it starts, None before."""
+
+    taken: int = 0
+    value: Array | None = None
+    std: Array | None = None
+
+
+class RandomWalk(Tracker):
+    """Random walk of π, process_std (n,) in units per √s, with a prior on some of it; see `KalmanTracker`.
+
+    A covariance filter needs a finite initial covariance, which nobody knows: until the rows determine all parameters
+    this is recursive least squares, in square-root information form, and the filter starts from its result. Where the
+    rows never determine a parameter it stays that. With scaled columns the paper's example has a condition number of
+    some 1e4, so 1e8 in a covariance, which Joseph's form holds; a trend would add rates of which nothing is known,
+    and is in square-root information form therefore, see `drift`.
+    """
+
+    def __init__(self, n: int, process_std: Array, prior: Prior) -> None:
+        self._n, self._process_std, self._prior = n, process_std, prior
+        self.enabled = True
+        self._filter: KalmanTracker | None = None
+        self.reset()
+
+    def update(self, rows: Rows) -> None:
+        """Take in rows; ValueError where their width is not n."""
+        if not self.enabled:
+            return
+        # One by one, for the start must not depend on how rows come.
+        for k in range(len(rows.t)):
+            row = Rows(rows.Y[k : k + 1], rows.b[k : k + 1], rows.std[k : k + 1], rows.t[k : k + 1])
+            if self._filter is not None:
+                self._filter.update(row)
+                continue
+            self._squares.update(row)
+            self.state.taken += 1
+            if self.state.taken % (ROWS_A_PARAMETER * self._n) == 0:
+                self._start()
+
+    def _start(self) -> None:
+        """Go on with the filter, if all is determined."""
+        known = self._squares.information
+        estimate = self._squares.estimate()
+        if not estimate.determined.all() or estimate.dof <= 0.0:
+            return
+        self._begin_filter(estimate.pi, INITIAL * estimate.std)
+        assert self._filter is not None
+        self._filter.begin(known)
+
+    def _begin_filter(self, value: Array, std: Array) -> None:
+        self.state.value, self.state.std = value, std
+        self.renew()
+
+    def renew(self) -> None:
+        """See Stage."""
+        value, std = self.state.value, self.state.std
+        self._filter = None if value is None or std is None else self._at(value, std)
+
+    def _at(self, value: Array, std: Array) -> KalmanTracker:
+        return KalmanTracker(self._n, self._process_std, Prior(value, std))
+
+    def estimate(self) -> Estimate:
+        """The estimate from all rows; leaves the state as it is."""
+        return self._squares.estimate() if self._filter is None else self._filter.estimate()
+
+    @property
+    def information(self) -> Information:
+        """What is known of π now."""
+        return self._squares.information if self._filter is None else self._filter.information
+
+    def reset(self) -> None:
+        """Forget all rows; the prior stays."""
+        self._squares = RecursiveLeastSquares(self._n, prior=self._prior)
+        self._filter = None
+        self.state = WalkState()
+
+    def begin(self, known: Information) -> None:
+        """Forget all rows, and go on from what others say of π; the prior stays."""
+        self.reset()
+        self._squares.begin(known)

@@ -1,0 +1,160 @@
+"""Drifts that are learned: the filter is the dense solution, ramps are found and followed, and nothing else is."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+from saved import resumed
+
+from sms_online.stream import Array
+from sms_online.trackers import Prior, RecursiveLeastSquares, Rows
+from sms_online.trackers.drift import STEP, LearnedTrend
+
+N = 4
+TRUE = np.array([3.0, -1.0, 2.0, 0.5])
+RATE = 20.0  # rows/s
+NOTHING = Prior(np.zeros(N), np.full(N, np.nan))
+
+
+def steady(t: Array) -> Array:
+    return np.zeros((t.size, N))
+
+
+def learned(groups: tuple[tuple[int, ...], ...] = ((0,), (1,), (2,), (3,))) -> LearnedTrend:
+    return LearnedTrend(N, groups, np.zeros(N), np.zeros(N), NOTHING)
+
+
+def rows(duration: float, change: Callable[[Array], Array] = steady, seed: int = 0, noise: float = 0.1) -> Rows:
+    """Instant rows of unit variance, of parameters that change from TRUE by `change` (t) (B, N)."""
+    rng = np.random.default_rng(seed)
+    t = np.arange(round(duration * RATE)) / RATE + 0.013
+    Y = rng.normal(size=(t.size, N)) / noise
+    b = np.sum(Y * (TRUE + change(t)), axis=1) + rng.normal(size=t.size)
+    return Rows(Y, b, np.ones(t.size), t)
+
+
+def only(column: int, values: Array) -> Array:
+    out = np.zeros((values.size, N))
+    out[:, column] = values
+    return out
+
+
+def part(whole: Rows, first: int, end: int) -> Rows:
+    return Rows(whole.Y[first:end], whole.b[first:end], whole.std[first:end], whole.t[first:end])
+
+
+def test_without_drift_it_is_least_squares_to_rounding() -> None:
+    squares, trend = RecursiveLeastSquares(N), learned()
+    given = rows(20.0)
+    squares.update(given)
+    trend.update(given)
+    expected, found = squares.estimate(), trend.estimate()
+    assert trend.found == ()
+    np.testing.assert_allclose(found.pi, expected.pi, rtol=1e-10)
+    np.testing.assert_allclose(found.covariance, expected.covariance, rtol=1e-8, atol=1e-12)
+    assert found.rss == pytest.approx(expected.rss)
+
+
+@pytest.mark.parametrize(("trend", "walk"), [(0.3, 0.0), (0.0, 0.2), (0.3, 0.2)])
+def test_trends_and_walks_are_the_dense_solution(trend: float, walk: float) -> None:
+    given, column = rows(6.0), 1
+    tracker = LearnedTrend(N, (), only(column, np.array([trend]))[0], only(column, np.array([walk]))[0], NOTHING)
+    tracker.update(given)
+    # Unknowns: parameters and a rate at the first step, then each later step's jumps of rate and value.
+    steps = np.floor(given.t / STEP).astype(int)
+    later = int(steps[-1])
+    design = np.zeros((given.t.size, N + 1 + 2 * later))
+    design[:, :N] = given.Y
+    design[:, N] = given.Y[:, column] * given.t
+    for k in range(1, later + 1):
+        since = np.maximum(given.t - k * STEP, 0.0)
+        design[:, N + k] = given.Y[:, column] * since
+        design[:, N + later + k] = given.Y[:, column] * (steps >= k)
+    jumps = np.concatenate((np.full(later, trend), np.full(later, walk))) * np.sqrt(STEP)
+    free = np.concatenate((np.ones(N), [float(trend > 0.0)], jumps))
+    used = free > 0.0
+    prior = np.zeros((jumps.size, design.shape[1]))
+    prior[:, N + 1 :] = np.eye(jumps.size)
+    A = np.concatenate((design * free, prior))[:, used]
+    x, *_ = np.linalg.lstsq(A, np.concatenate((given.b, np.zeros(jumps.size))), rcond=None)
+    to_now = np.eye(N, design.shape[1])
+    to_now[column, N] = given.t[-1]
+    to_now[column, N + 1 : N + 1 + later] = given.t[-1] - STEP * np.arange(1, later + 1)
+    to_now[column, N + 1 + later :] = 1.0
+    to_now = (to_now * free)[:, used]
+    estimate = tracker.estimate()
+    np.testing.assert_allclose(estimate.pi, to_now @ x, rtol=1e-9)
+    np.testing.assert_allclose(estimate.covariance, to_now @ np.linalg.inv(A.T @ A) @ to_now.T, rtol=1e-7, atol=1e-10)
+
+
+def test_a_ramp_is_found_and_followed_within_its_bars() -> None:
+    tracker, given = learned(), rows(60.0, lambda t: only(2, 0.02 * np.maximum(t - 10.0, 0.0)))
+    z, first = [], np.inf
+    for k in range(0, given.t.size, 10):
+        tracker.update(part(given, k, k + 10))
+        now = given.t[min(k + 9, given.t.size - 1)]
+        if tracker.found:
+            first = min(first, now)
+            estimate = tracker.estimate()
+            z.append((estimate.pi[2] - TRUE[2] - 0.02 * (now - 10.0)) / estimate.std[2])
+    assert [drift.column for drift in tracker.found] == [2]
+    assert 10.0 < first < 25.0
+    assert tracker.found[0].since == pytest.approx(10.0, abs=5.0)
+    assert tracker.found[0].rate == pytest.approx(0.02, abs=4.0 * tracker.found[0].std)
+    assert np.mean(np.abs(z) < 2.5) > 0.9
+
+
+def test_what_decays_is_followed_as_decaying() -> None:
+    tracker, given = learned(), rows(60.0, lambda t: only(0, 3.0 * (np.exp(-t / 30.0) - 1.0)), noise=0.02)
+    tracker.update(given)
+    tracker.state.until = 60.0
+    estimate = tracker.estimate()
+    assert [drift.column for drift in tracker.found] == [0]
+    assert tracker.state.moving[0].decay == pytest.approx(1.0 / 30.0, rel=0.5)
+    assert estimate.pi[0] == pytest.approx(3.0 * np.exp(-2.0), abs=4.0 * estimate.std[0])
+    assert tracker.found[0].rate == pytest.approx(-0.1 * np.exp(-2.0), rel=0.1)
+
+
+def test_a_step_is_no_drift() -> None:
+    tracker = learned()
+    tracker.update(rows(40.0, lambda t: only(1, 0.3 * (t > 20.0)), noise=0.02))
+    assert tracker.found == ()
+
+
+def test_what_moves_together_is_one_drift() -> None:
+    tracker = learned(((0, 1), (2,), (3,)))
+    tracker.update(rows(30.0, lambda t: np.outer(t, [0.02, -0.01, 0.0, 0.0])))
+    assert sorted(drift.column for drift in tracker.found) == [0, 1]
+    assert [each.columns for each in tracker.state.moving] == [(0, 1)]
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_ten_minutes_without_drift_move_nothing(seed: int) -> None:
+    tracker = learned()
+    tracker.update(rows(600.0, seed=seed))
+    assert tracker.found == ()
+    estimate = tracker.estimate()
+    assert np.max(np.abs(estimate.pi - TRUE) / estimate.std) < 4.0
+    assert len(tracker.state.blocks) <= 32
+
+
+def test_no_drift_is_named_where_rows_leave_more() -> None:
+    tracker = learned()
+    tracker.state.quiet = False
+    tracker.update(rows(30.0, lambda t: only(2, 0.02 * t)))
+    assert tracker.found == ()
+
+
+def test_drifts_do_not_depend_on_how_rows_come() -> None:
+    given = rows(30.0, lambda t: only(2, 0.02 * t))
+    whole, cut = learned(), learned()
+    whole.update(given)
+    for k in range(given.t.size):
+        cut.update(part(given, k, k + 1))
+        if k == given.t.size // 2:
+            cut = resumed(learned(), cut)
+    assert whole.found == cut.found != ()
+    assert np.array_equal(whole.estimate().pi, cut.estimate().pi)
+    assert np.array_equal(whole.estimate().covariance, cut.estimate().covariance)

@@ -1,0 +1,154 @@
+"""A tracker chosen in the system file, on the command line or in Python, and several on the same rows."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+import sms_online as sms
+from sms_online.description.parse import parse_system, shipped_text
+from sms_online.description.schema import TrackerChoice
+from sms_online.description.tracker import parse_tracker
+from sms_tools.cli import main
+
+FORGETTING = "rls:forgetting=exponential,memory=3"
+CHOICES = [
+    "rls",
+    FORGETTING,
+    "rls:forgetting=window,memory=3",
+    "rls:forgetting=directional,memory=3",
+    "kalman",
+    "kalman:drift=random_walk,share=1e-6",
+    "kalman:joint_1.stiffness=random_walk/0.5",
+]
+
+
+@pytest.fixture(scope="module")
+def data() -> sms.Capture:
+    return sms.simulate(sms.load_system("paper-planar"), duration=6.0, grade="B")
+
+
+@pytest.fixture(scope="module")
+def results(data: sms.Capture) -> dict[str, sms.Result]:
+    system = sms.load_system("paper-planar")
+    return {choice: sms.estimate(system, data, tracker=choice) for choice in CHOICES}
+
+
+def test_the_first_tracker_gives_the_estimate(data: sms.Capture, results: dict[str, sms.Result]) -> None:
+    several = sms.estimate(sms.load_system("paper-planar"), data, tracker=CHOICES)
+    assert [each.judged for each in several.trackers] == [True, *[False] * (len(CHOICES) - 1)]
+    assert several.parameters["joint_1.stiffness"] == results["rls"].parameters["joint_1.stiffness"]
+    for choice, tracker in zip(CHOICES, several.trackers, strict=True):
+        alone = results[choice].parameters
+        assert tracker.name == parse_tracker(choice).label
+        # Alone it is judged, and what noise in the columns does is estimated about its own path.
+        for here, there in zip(tracker.parameters.values(), alone.values(), strict=True):
+            assert here.value == pytest.approx(there.value, abs=0.1 * there.std)
+            assert here.std == pytest.approx(there.std, rel=0.02)
+
+
+def test_no_choice_is_least_squares_of_all_rows(data: sms.Capture, results: dict[str, sms.Result]) -> None:
+    plain = sms.estimate(sms.load_system("paper-planar"), data)
+    assert plain.parameters.values() is not None
+    assert list(plain.parameters.values()) == list(results["rls"].parameters.values())
+    (tracker,) = plain.trackers
+    assert tracker.name == "rls"
+    assert tracker.consistency.consistent
+
+
+def test_estimates_agree_with_the_truth_within_bars(results: dict[str, sms.Result]) -> None:
+    for choice, result in results.items():
+        errors = [(p.value - p.true) / p.std for p in result.parameters.values() if p.true is not None]
+        assert max(map(abs, errors)) < 4.5, choice
+        assert result.trackers[0].consistency.consistent, choice
+
+
+def test_kalman_without_drift_is_least_squares(results: dict[str, sms.Result]) -> None:
+    for squares, kalman in zip(results["rls"].parameters.values(), results["kalman"].parameters.values(), strict=True):
+        assert kalman.value == pytest.approx(squares.value, abs=0.05 * squares.std)
+        assert kalman.std == pytest.approx(squares.std, rel=1e-3)
+
+
+def test_forgetting_widens_error_bars_and_says_its_memory(results: dict[str, sms.Result]) -> None:
+    for choice in CHOICES[1:4]:
+        assert results[choice].parameters["joint_1.stiffness"].std > results["rls"].parameters["joint_1.stiffness"].std
+        assert results[choice].trackers[0].memory == pytest.approx(3.0, rel=0.25)
+
+
+@pytest.mark.parametrize("choice", CHOICES[1:6])
+def test_a_session_cut_by_a_checkpoint_gives_the_same_bits(
+    choice: str, data: sms.Capture, results: dict[str, sms.Result]
+) -> None:
+    session = sms.Session(sms.load_system("paper-planar"), data.channels, tracker=choice)
+    for k, block in enumerate(data):
+        if k == len(list(data)) // 2:
+            session = sms.Session.restore(session.save())
+        session.update(block)
+    session.finish()
+    found = [(p.value, p.std) for p in session.result.parameters.values()]
+    assert found == [(p.value, p.std) for p in results[choice].parameters.values()]
+
+
+def test_the_system_file_and_the_command_line_choose_alike(
+    tmp_path: Path, data: sms.Capture, results: dict[str, sms.Result]
+) -> None:
+    sms.write_capture(data, tmp_path / "run.csv")
+    text = shipped_text("paper-planar") + '\n[tracker]\nkind = "rls"\nforgetting = "exponential"\nmemory = 3.0\n'
+    (tmp_path / "system.toml").write_text(text, encoding="utf-8")
+    values = []
+    for name, options in (("system.toml", []), ("paper-planar", ["--tracker", FORGETTING])):
+        system = str(tmp_path / name) if name.endswith("toml") else name
+        out = tmp_path / name.replace(".", "_")
+        assert main(["replay", str(tmp_path / "run.csv"), "--system", system, "--out", str(out), *options]) == 0
+        document = json.loads((out / "results.json").read_text(encoding="utf-8"))
+        assert [tracker["name"] for tracker in document["trackers"]] == ["rls exponential 3 s"]
+        values.append([p["estimate"] for p in document["parameters"]])
+    assert values[0] == values[1]
+    assert values[0] == pytest.approx([p.value for p in results[FORGETTING].parameters.values()], rel=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("text", "place"),
+    [
+        ("lms", "lms"),
+        ("rls:memory=-1", "rls:memory=-1"),
+        ("rls:forgetting=slow", "rls:forgetting=slow"),
+        ("rls:drift=learned", "rls:drift=learned"),
+        ("kalman:drift=fast", "kalman:drift=fast"),
+    ],
+)
+def test_a_text_that_is_no_tracker_is_refused(text: str, place: str) -> None:
+    with pytest.raises(sms.InputError) as refused:
+        parse_tracker(text)
+    assert place in str(refused.value)
+
+
+@pytest.mark.parametrize(
+    "choice",
+    [
+        TrackerChoice(forgetting="exponential"),
+        TrackerChoice(memory=3.0),
+        TrackerChoice(drift="learned"),
+        TrackerChoice(kind="kalman", forgetting="window", memory=3.0),
+        TrackerChoice(kind="kalman", drift="random_walk"),
+        TrackerChoice(kind="kalman", drift={"joint_7.stiffness": "random_walk"}, share=1e-3),
+    ],
+)
+def test_a_choice_that_does_not_fit_the_system_is_refused(choice: TrackerChoice, data: sms.Capture) -> None:
+    with pytest.raises(sms.InputError, match="tracker"):
+        sms.Session(sms.load_system("paper-planar"), data.channels, tracker=choice)
+
+
+def test_a_system_without_momentum_rows_refuses_a_tracker(data: sms.Capture) -> None:
+    text = shipped_text("paper-planar").replace("sample_rate", 'balance = "energy"\nsample_rate', 1)
+    system = parse_system(text, "system.toml")
+    assert system.balance == "energy"
+    with pytest.raises(sms.InputError, match="no momentum balance"):
+        sms.Session(system, data.channels, tracker=FORGETTING)
+
+
+def test_two_tables_are_two_trackers_in_their_order() -> None:
+    text = shipped_text("paper-planar") + '\n[[tracker]]\nkind = "kalman"\n\n[[tracker]]\nkind = "rls"\n'
+    assert [choice.kind for choice in parse_system(text, "system.toml").trackers] == ["kalman", "rls"]
