@@ -164,7 +164,7 @@ def test_a_terminal_has_a_bar_for_what_takes_more_than_a_moment(
     verbs = {
         "run.csv": (replay, ["check", *capture], ["bound", *capture], ["diagnose", *capture, "--out", "done"]),
         "solving the motion": (["simulate", *simulated], ["bound", "--system", "moved.toml"]),
-        "searching for effects": (["diagnose", *capture, "--out", "done"],),
+        "fitting the model": (["diagnose", *capture, "--out", "done"],),
     }
     for what, verb in ((what, verb) for what, every in verbs.items() for verb in every):
         assert main(verb) in (0, 3)  # without noise there is no bound

@@ -37,8 +37,16 @@ def after(errors: Array, known: int = 40, seed: int = 1) -> SequentialTest:
         raw = np.column_stack((Y, Y @ beta + error))
         test.push(
             WhiteRows(
-                raw, np.stack((raw, raw)), raw, np.eye(n_v), np.eye(n_v), 40 * k, np.empty((n_v, 0)), np.zeros(n_v)
-            ),
+                raw,
+                np.stack((raw, raw)),
+                raw,
+                np.eye(n_v),
+                np.eye(n_v),
+                40 * k,
+                np.empty((n_v, 0)),
+                np.zeros(n_v),
+                np.empty((n_v, 0)),
+            ),  # fmt: skip
             factor,
         )
         factor = triangular_factor(factor, raw)
@@ -111,7 +119,8 @@ def test_a_saved_test_goes_on_as_if_it_had_not_been() -> None:
     for k, error in enumerate(errors):
         raw = np.column_stack((np.zeros((LAYOUT.n_v, N)), error))
         eye = np.eye(LAYOUT.n_v)
-        rows = WhiteRows(raw, np.stack((raw, raw)), raw, eye, eye, k, np.empty((LAYOUT.n_v, 0)), np.zeros(LAYOUT.n_v))
+        none = np.empty((LAYOUT.n_v, 0))
+        rows = WhiteRows(raw, np.stack((raw, raw)), raw, eye, eye, k, none, np.zeros(LAYOUT.n_v), none)
         whole.push(rows, factor)
         if k >= 70:
             continued.push(rows, factor)
