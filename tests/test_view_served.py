@@ -14,7 +14,11 @@ from urllib.parse import unquote, urlsplit
 
 import pytest
 from axis import AXIS, capture_lines
+from rerun.blueprint import Blueprint
 from test_killed_processes import kill, until
+
+from sms_tools.view.choice import Choice
+from sms_tools.view.sink import Sink
 
 pytestmark = pytest.mark.realtime
 STAYS = "the view stays until Ctrl-C"
@@ -69,6 +73,21 @@ def test_only_this_machine_reaches_a_view_unless_asked_for(
     started[0].send_signal(signal.SIGINT)
     assert started[0].wait(20.0) == 0
     until(lambda: not any(listens("127.0.0.1", port) for port in ports), lambda: "it is served still")
+
+
+def test_a_spawned_viewer_listens_to_this_machine_alone(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    class StartedError(Exception):
+        """Carries the command of a process in place of starting it."""
+
+    def start(command: list[str], **_: object) -> None:
+        raise StartedError(command)
+
+    monkeypatch.setenv("DISPLAY", ":0")
+    monkeypatch.setattr(subprocess, "Popen", start)
+    with pytest.raises(StartedError) as started:
+        Sink(Choice("spawn"), tmp_path / "none.rrd", "test").open(Blueprint())
+    command = started.value.args[0]
+    assert command[command.index("--bind") + 1] == "127.0.0.1"
 
 
 def test_nothing_serves_on_when_a_session_is_killed(tmp_path: Path, started: list[subprocess.Popen[Any]]) -> None:

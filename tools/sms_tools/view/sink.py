@@ -6,8 +6,10 @@ own log; a flush with a time limit after every batch finds out all of this.
 
 from __future__ import annotations
 
+import os
 import socket
 import subprocess
+import sys
 from ipaddress import ip_address
 from pathlib import Path
 from time import monotonic, sleep
@@ -29,6 +31,8 @@ SERVER_MEMORY = "512MiB"
 GRPC_PORT, WEB_PORT = 9876, 9090
 # The viewer and server itself; the script of that name starts it as a child, which would outlive its parent.
 RERUN = Path(rerun_cli.__file__).with_name("rerun")
+# Where a viewer finds a screen, on Linux.
+SCREENS = ("DISPLAY", "WAYLAND_DISPLAY", "WAYLAND_SOCKET")
 # A server listens within this time, s, also on a busy machine, and is tried so often, s.
 STARTING, TRY = 20.0, 0.05
 
@@ -53,15 +57,26 @@ class Sink:
             # Somebody listens there, or this would take seconds and then look like success.
             self.stream.connect_grpc(self.choice.url, default_blueprint=blueprint)
             return f"showing in the viewer at {self.choice.url}"
-        if kind == "spawn":
-            rr.spawn(
-                recording=self.stream,
-                port=_free_port(GRPC_PORT, LOOPBACK),
-                executable_path=str(RERUN),
-                default_blueprint=blueprint,
-            )
-            return "showing in a rerun viewer"
-        return self._serve(blueprint)
+        return self._spawn(blueprint) if kind == "spawn" else self._serve(blueprint)
+
+    def _spawn(self, blueprint: rrb.Blueprint) -> str:
+        """Start a viewer that outlives the session; rerun's own `spawn` lets it listen to the whole network."""
+        if sys.platform.startswith("linux") and not any(os.environ.get(name) for name in SCREENS):
+            # The viewer would listen, take the first data, and die.
+            raise TroubleError("no screen to open a viewer on; --rerun serve shows it in a browser")
+        port = _free_port(GRPC_PORT, LOOPBACK)
+        command = [str(RERUN), "--bind", LOOPBACK, "--port", str(port), "--expect-data-soon"]
+        viewer = subprocess.Popen(command, stdin=subprocess.DEVNULL, start_new_session=True)
+        self._await_listening(viewer, LOOPBACK, port, "rerun's viewer does not start")
+        self.stream.connect_grpc(f"rerun+http://{LOOPBACK}:{port}/proxy", default_blueprint=blueprint)
+        return "showing in a rerun viewer"
+
+    def _await_listening(self, process: subprocess.Popen[bytes], address: str, port: int, otherwise: str) -> None:
+        end = monotonic() + STARTING
+        while not _listens(address, port):
+            if process.poll() is not None or monotonic() > end:
+                raise TroubleError(otherwise)
+            sleep(TRY)
 
     def _serve(self, blueprint: rrb.Blueprint) -> str:
         """Start a server of pages and data, as a process of its own, for within this one it has no address to choose.
@@ -79,11 +94,7 @@ class Sink:
             command, stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
         )
         reached = LOOPBACK if address == "0.0.0.0" else address
-        end = monotonic() + STARTING
-        while not _listens(reached, port):
-            if server.poll() is not None or monotonic() > end:
-                raise TroubleError(f"rerun's server does not start on {address}")
-            sleep(TRY)
+        self._await_listening(server, reached, port, f"rerun's server does not start on {address}")
         data = f"rerun+http://{reached}:{port}/proxy"
         self.stream.connect_grpc(data, default_blueprint=blueprint)
         url = f"http://{reached}:{page}/?url={quote(data, safe='')}"
