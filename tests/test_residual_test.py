@@ -46,7 +46,7 @@ def after(errors: Array, known: int = 40, seed: int = 1) -> SequentialTest:
                 np.empty((n_v, 0)),
                 np.zeros(n_v),
                 np.empty((n_v, 0)),
-            ),  # fmt: skip
+            ),
             factor,
         )
         factor = triangular_factor(factor, raw)
