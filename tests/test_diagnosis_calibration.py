@@ -13,6 +13,7 @@ import pytest
 from sms_adapters.system_file import load_system
 from sms_online.description.schema import Effect
 from sms_online.diagnosis.diagnose import Diagnosis, diagnose
+from sms_online.diagnosis.document import diagnosis_document
 from sms_online.stream import Block
 from sms_sim.simulate import sampled_blocks, simulate
 from tests.campaigns.calibration import Samples, clock, torque_gain, tracked_point
@@ -63,3 +64,15 @@ def test_what_is_far_beyond_its_tolerance_is_an_effect() -> None:
     """A gain is known to 1 %; the torque of joint 2 is read 4 % wrong, which one of the joints is nobody can tell."""
     found = diagnosed(0.0, torque_gain(0.04))
     assert (found.verdict, keys(found)) == ("named", ["torque_gain@joint_2"])
+
+
+@pytest.mark.slow
+def test_geometry_far_beyond_its_tolerance_is_said_in_words() -> None:
+    """The tracked point is 5 mm elsewhere along both axes, ten tolerances; no effect of the catalogue says so."""
+    found = diagnosed(0.0, tracked_point(5e-3))
+    assert (found.verdict, keys(found)) == ("named", [])
+    assert {each.part for each in found.calibration} == {"x", "y"}
+    assert min(abs(each.estimate) for each in found.calibration) > 3e-3
+    document = diagnosis_document(found)
+    assert "tracked point" in document["summary"]
+    assert document["judgement"]["level"] == "doubt"

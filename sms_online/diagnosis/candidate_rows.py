@@ -272,13 +272,6 @@ class CandidateRows:
         told = np.delete(np.arange(len(covariance)), slice(known, columns.shape[1]))
         return covariance[np.ix_(told, told)]
 
-    def calibration(self, chosen: Sequence[int]) -> tuple[Array, Array]:
-        """Numbers of calibration beside those chosen and their deviations, (m,) each."""
-        m = self.calibrated.count
-        covariance = solve(np.column_stack((self._columns(chosen), self._b))).covariance()
-        own = slice(len(covariance) - m, len(covariance))
-        return self.solution(chosen)[own], np.sqrt(np.diag(covariance)[own])
-
     def residual(self, chosen: Sequence[int], solution: Array) -> Array:
         """What is left of every row (W, n_v) over its own deviation, see `settle`."""
         plain = [self._plain_model, *(self._plain[k] for k in chosen), self._plain_calibration]

@@ -8,8 +8,10 @@ from functools import partial
 
 import numpy as np
 
+from sms_online.calibration.found import Calibration
 from sms_online.description.schema import Effect, System
 from sms_online.diagnosis.attempt import FITTED_ONCE, SEARCHED, TRACED, Attempt, Case, PriorOf, Progress, State, Step
+from sms_online.diagnosis.calibrated import SAYABLE
 from sms_online.diagnosis.candidate import Finding, Ranked
 from sms_online.diagnosis.constants import stands
 from sms_online.diagnosis.hypothesis import corrections, share_left, verdict
@@ -38,6 +40,7 @@ class Diagnosis:
 
     verdict: "clean", "named" or "unexplained". partial: the search was ended before it was done, and parameters after
     are those of its rows. mistakes: of wiring, units and signs, undone in all that follows.
+    calibration: what the description is off by, beyond its tolerances, that no effect of the catalogue says.
     findings: constants first, then the effects that are unknowns of π.
     late: sensors far behind the others, whose lag the description of the last attempt states. steps: of the last
     search, its effects one after the other.
@@ -48,6 +51,7 @@ class Diagnosis:
     verdict: str
     partial: bool
     mistakes: tuple[Mistake, ...]
+    calibration: tuple[Calibration, ...]
     findings: list[Finding]
     late: list[LateSensor]
     ranking: list[Ranked]
@@ -230,7 +234,9 @@ def diagnose(
         named, share_left(bare.excess, after.excess), after.test, bare.test, [each.candidate for each in findings]
     )
     grave = said == "clean" and Evaluation(Statistics.of(before), before.estimate()).trust.grave
-    if said == "clean" and mistakes:
+    # What is left unexplained takes such numbers anywhere.
+    calibration = () if said == "unexplained" else _miscalibrated(estimator_after)
+    if said == "clean" and (mistakes or calibration):
         said = "named"
     unexplained = None
     if grave:
@@ -242,6 +248,7 @@ def diagnose(
         verdict=said,
         partial=partial,
         mistakes=mistakes,
+        calibration=calibration,
         findings=findings,
         late=late,
         ranking=ranking,
@@ -255,6 +262,12 @@ def diagnose(
         estimator_after=estimator_after,
         unexplained=unexplained,
     )
+
+
+def _miscalibrated(session: Estimator) -> tuple[Calibration, ...]:
+    """What a session's description is off by beyond its tolerances, and no effect of the catalogue says."""
+    every = Evaluation(Statistics.of(session), session.estimate()).calibration
+    return tuple(each for each in every if each.beyond and each.name not in SAYABLE)
 
 
 def _check_measured(session: Estimator, source: str) -> None:

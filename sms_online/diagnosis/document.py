@@ -58,6 +58,9 @@ def diagnosis_document(
             }
             for mistake in diagnosis.mistakes
         ],
+        "calibration": [
+            {**each.document(), "sentence": str(each), "next_step": each.advice} for each in diagnosis.calibration
+        ],
         "effects": [_effect(diagnosis, finding) for finding in diagnosis.findings] + _by_comparison(diagnosis),
         "steps": [
             {"taken": step.taken, "effects": list(step.effects), "holdout": step.relative} for step in diagnosis.steps
@@ -129,6 +132,9 @@ def trust_of(diagnosis: Diagnosis, after: Evaluation | None = None) -> Trust:
     effects = [f"{effect['name']}@{effect['where']}" for effect in _named(diagnosis)]
     row = None if diagnosis.unexplained is None else diagnosis.unexplained.row
     rest = _after(diagnosis, after)
+    if not diagnosis.mistakes and not effects and diagnosis.verdict == "named":
+        off = tuple(Reason(f"{each}: beyond its tolerance", False, then=each.advice) for each in diagnosis.calibration)
+        return rest if rest.level != "trust" else Trust("doubt", off)
     if not diagnosis.mistakes:
         return judge_diagnosis(diagnosis.verdict, effects, row, rest, _near(diagnosis))
     if effects or row is not None:
@@ -144,13 +150,14 @@ def summary(diagnosis: Diagnosis) -> str:
 
 
 def _whole(diagnosis: Diagnosis) -> str:
-    mistakes = ["".join((m.sentence[:1].upper(), m.sentence[1:], ".")) for m in diagnosis.mistakes]
+    wrong = ["".join((m.sentence[:1].upper(), m.sentence[1:], ".")) for m in diagnosis.mistakes]
     for k, mistake in enumerate(diagnosis.mistakes):
         if mistake.or_else:
-            mistakes[k] = f"{mistakes[k][:-1]}, or {'; or '.join(mistake.or_else)}: these data cannot decide it."
-    if mistakes and diagnosis.verdict == "named" and not _named(diagnosis):
-        return " ".join((*mistakes, "With that undone nothing but noise is left."))
-    return " ".join((*mistakes, *(["With that undone:"] if mistakes else []), _of_effects(diagnosis)))
+            wrong[k] = f"{wrong[k][:-1]}, or {'; or '.join(mistake.or_else)}: these data cannot decide it."
+    wrong += [f"The description is off beyond its tolerance: {each}." for each in diagnosis.calibration]
+    if wrong and diagnosis.verdict == "named" and not _named(diagnosis):
+        return " ".join((*wrong, "With that undone nothing but noise is left."))
+    return " ".join((*wrong, *(["With that undone:"] if wrong else []), _of_effects(diagnosis)))
 
 
 def _of_effects(diagnosis: Diagnosis) -> str:

@@ -65,7 +65,7 @@ def run(args: argparse.Namespace) -> int:
     if view is not None:
         document["warnings"] = [*document["warnings"], *view.warnings]
     lines: list[Table | str | Text] = ["", found.summary, ""]
-    lines += [f"next: {mistake['next_step']}" for mistake in document["mistakes"]]
+    lines += [f"next: {each['next_step']}" for each in (*document["mistakes"], *document["calibration"])]
     if document["effects"]:
         lines += [_effects(document), "", *filter(None, map(why, document["effects"])), ""]
     # See `diagnosis_document`.
