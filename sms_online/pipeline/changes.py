@@ -276,11 +276,14 @@ class Changes(Stage):
             dropped_windows=sum(first - MARGIN < seen.end <= reach for seen in self.detector.history),
         )
         self.state.events.append(event)
-        after = self.state.index >= max(last, self.state.clear)
-        samples = GridSamples(self.state.index[after], self.state.values[after], self.state.segment)
         self.detector = self._new_detector()
         self.detector.begin(known)
-        return Adoption(self.model, self.base, known, weights, samples)
+        return Adoption(self.model, self.base, known, weights, self.behind(last))
+
+    def behind(self, index: int) -> GridSamples:
+        """Samples from a grid index on, as far as they are remembered."""
+        after = self.state.index >= max(index, self.state.clear)
+        return GridSamples(self.state.index[after], self.state.values[after], self.state.segment)
 
     def adopt(
         self, effects: Sequence[Effect], event: Event, known: Information, weights: Array, samples: GridSamples

@@ -27,7 +27,7 @@ from sms_online.pipeline.sensing import Sensing
 from sms_online.pipeline.sensor_noise import NoiseEstimate, SensorNoise
 from sms_online.pipeline.statistics import MomentumStatistics
 from sms_online.pipeline.synchronise import GridSamples
-from sms_online.pipeline.tracker_bank import Reading, TrackerBank
+from sms_online.pipeline.tracker_bank import Change, Reading, TrackerBank
 from sms_online.pipeline.window_noise import WindowNoise
 from sms_online.state import Stage, State, snapshot, state_copy
 from sms_online.stream import Array
@@ -93,6 +93,7 @@ class Momentum(Stage):
         self._estimate = NoiseEstimate(sensing, system.sample_rate, PASS_BAND / self._span)
         self.prior: Prior | None = None
         self._sources, self._clocks = source_groups(sensing), clock_groups(sensing)
+        self.bank = self._new_bank()
         self._build()
         n, n_v = len(self.nuisances) + base.n, model.layout.n_v
         self.bias, self.grams = NoiseBias.none(n, self._calibration), RowGrams.none(n_v, n)
@@ -109,10 +110,9 @@ class Momentum(Stage):
         return self.state.sensor_noise
 
     def _build(self) -> None:
-        """Empty stages for the current model and parameters."""
+        """Empty stages for the current model and parameters, but for the trackers that were chosen."""
         model, base = self.changes.model, self.changes.base
         self._calibration = prior_rows(self.nuisances, base.n)
-        self.bank = self._new_bank()
         self._balance = MomentumBalance(model, base, self._sample_rate, self._span, moments=self.bank.follows)
         self.latencies = Latencies(self._sources, base.n)
         self.fit = MomentumFit(
@@ -124,7 +124,8 @@ class Momentum(Stage):
         self.test = SequentialTest(model.layout, self._balance.span / HOPS, self.nuisances)
 
     def _rebuild(self) -> None:
-        """The same after an event."""
+        """The same after an event, trackers included."""
+        self.bank = self._new_bank()
         self._build()
         self._changed()
 
@@ -273,7 +274,7 @@ class Momentum(Stage):
 
     def _decide(self, noise: SensorNoise, last: bool) -> None:
         """Where rows are held back for an event: decide on it, when there is enough to tell, and go on."""
-        if not last and self._drift_decided():
+        if not last and self._drift_decided(noise):
             return
         adoption = self.changes.decide(noise, self.state.start_time, last)
         if adoption is not None:
@@ -366,7 +367,7 @@ class Momentum(Stage):
             b = b + rows.Y[:, m:-1] @ rows.drift.moved + rows.ramp @ rows.drift.rate
         return Rows(rows.Y[:, :-1], b, np.ones(b.size), np.full(b.size, centre), ramp)
 
-    def _drift_decided(self) -> bool:
+    def _drift_decided(self, noise: SensorNoise) -> bool:
         """Whether rows held back need no event decided on: not yet, or they were those of a drift."""
         detector, learned = self.changes.detector, self.bank.learned
         if detector.alarm is None or learned is None:
@@ -375,10 +376,23 @@ class Momentum(Stage):
             self.state.start_time + end / self._sample_rate
             for end in (detector.onset, detector.alarm, detector.history[-1].end)
         )
-        found = self.bank.drift_behind(onset - self._window, alarm, newest)
-        if found:
-            self._begin_drift(learned.information)
-        return found is not False
+        change = Change(onset - self._window, alarm, newest)
+        drift = self.bank.drift_behind(change)
+        if isinstance(drift, bool):
+            return drift
+        samples, before = self.changes.behind(detector.alarm), state_copy(learned.state)
+        self.bank.go_on_behind(change, drift, held=True)
+        known = learned.information
+        self._build()
+        self._begin_drift(known)
+        self._renew_drift()
+        # Rows come again as behind an event, whitened among themselves: those held back hold parameters of before.
+        learned.state = before
+        self.bank.go_on_behind(change, drift, held=False)
+        self.bank.release()
+        self.fit.go_on(known.solution().pi[len(self.nuisances) :], noise)
+        self._process(samples, noise)
+        return True
 
     def _renew_drift(self) -> None:
         """Have windows to come know of the drift so far; not those whose rows are made already."""

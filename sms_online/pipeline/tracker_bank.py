@@ -18,6 +18,7 @@ from sms_online.state import Stage, State
 from sms_online.stream import Array
 from sms_online.trackers.build import Tracked, build_tracker
 from sms_online.trackers.drift import Found, LearnedTrend
+from sms_online.trackers.drift_search import Ramp
 from sms_online.trackers.information import Information
 from sms_online.trackers.interface import Estimate, Prior, Rows, Tracker
 from sms_online.trackers.random_walk import RandomWalk
@@ -55,6 +56,15 @@ class _Chosen:
 def rows_per_second(rows_a_window: int, span: float) -> float:
     """Rows of windows of `span` s that come in a second."""
     return rows_a_window * HOPS / span
+
+
+@dataclass(frozen=True)
+class Change:
+    """An alarm of the detector: between which instants parameters began to be others, and the newest sample's, s."""
+
+    onset: float
+    alarm: float
+    newest: float
 
 
 class BankState(State):
@@ -113,7 +123,7 @@ class TrackerBank(Stage):
 
     def begin(self, known: Information) -> None:
         """Forget all rows, and go on from what is known of nuisances and parameters after an event."""
-        self.state.held, self.state.asked = [], 0
+        self.release()
         for tracker in self.others:
             # What is known beforehand of the nuisances is each tracker's own already.
             tracker.begin(known.without(range(self._nuisances)))
@@ -136,29 +146,27 @@ class TrackerBank(Stage):
         if self.learned is not None:
             self.state.held = [*self.state.held, rows]
 
-    def drift_behind(self, onset: float, alarm: float, until: float) -> bool | None:
-        """Whether what changed between two instants, s, is a drift's rate; None while too little is known.
-
-        until: s of the newest sample in a row. If it is, trackers go on with the rows held back.
-        """
+    def drift_behind(self, change: Change) -> Ramp | bool:
+        """The drift that a change is; whether that is still to be seen, where it is none so far."""
         learned = self.learned
         if learned is None:
             return False
-        if until < alarm + WAITED[self.state.asked]:
-            return None
-        held = self.state.held
-        decided = learned.go_on_behind(onset, alarm, held)
+        if change.newest < change.alarm + WAITED[self.state.asked]:
+            return True
+        found = learned.break_between(change.onset, change.alarm, self.state.held)
         self.state.asked += 1
-        if decided.drift is None and (self.state.asked == 1 or (decided.unclear and self.state.asked < len(WAITED))):
-            return None
+        if found.drift is None and (self.state.asked == 1 or (found.unclear and self.state.asked < len(WAITED))):
+            return True
+        return False if found.drift is None else found.drift
+
+    def go_on_behind(self, change: Change, drift: Ramp, held: bool) -> None:
+        """Go on behind a change that is a drift; held: with the rows held back, or without them."""
+        assert self.learned is not None
+        self.learned.go_on_behind(change.onset, change.alarm, drift, self.state.held if held else ())
+
+    def release(self) -> None:
+        """Forget the rows held back."""
         self.state.held, self.state.asked = [], 0
-        if decided.drift is None:
-            return False
-        for tracker in self.others:
-            if tracker is not learned:
-                for rows in held:
-                    tracker.update(rows)
-        return True
 
     def hold_until(self, t: float) -> None:
         """Have estimates of parameters that drift hold at t, s."""

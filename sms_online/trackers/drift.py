@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from sms_online.state import State
 from sms_online.stream import Array
 from sms_online.trackers.drift_filter import Block, DriftFilter, Moving, innovation_loss, reach
-from sms_online.trackers.drift_search import LARGEST_LEFT, Break, best_break, best_ramp
+from sms_online.trackers.drift_search import LARGEST_LEFT, Break, Ramp, best_break, best_ramp
 from sms_online.trackers.factor import masked_covariance, solve, triangular_factor
 from sms_online.trackers.information import Information
 from sms_online.trackers.interface import Estimate, Prior, Rows, Tracker, checked, prior_factor
@@ -132,37 +132,41 @@ class LearnedTrend(Tracker):
         rates = np.zeros_like(rows.Y) if rows.ramp is None else rows.ramp / rows.std[:, None]
         return np.concatenate((whitened[:, :-1], rates, whitened[:, -1:]), axis=1)
 
-    def go_on_behind(self, onset: float, alarm: float, held: Sequence[Rows]) -> Break:
-        """Go on behind a change that lies between two instants, s, if it is that of a drift; what it is.
+    def break_between(self, onset: float, alarm: float, held: Sequence[Rows]) -> Break:
+        """Whether a change that lies between two instants, s, is that of a drift.
 
-        held: rows since the alarm, which are taken in then; those of the last knot before the onset are given up.
+        held: rows since the alarm, of which the first are left out, for they hold parameters of before.
         """
-        kept = [block for block in self.state.blocks if (block.knot + KNOT) * STEP <= onset]
-        begin = int(np.ceil((alarm + WHITENED) / STEP))
-        knot = begin // KNOT * KNOT
-        behind = [rows for rows in held if rows.t[0] >= begin * STEP]
-        if not kept or not behind:
+        knot = _knot(alarm)
+        behind = [rows for rows in held if rows.t[0] >= alarm + WHITENED]
+        before = self._before(onset)
+        if not before or not behind:
             return Break()
         after = [self._expanded(rows) for rows in behind]
         for rows, own in zip(behind, after, strict=True):
             own[:, self._n : -1] += (rows.t - knot * STEP)[:, None] * own[:, : self._n]
-        before = self._through(kept, self.state.moving, knot)[0]
-        block = Block.of(np.concatenate(after), knot, behind[-1].t[-1] - begin * STEP)
-        decided = best_break(before, block, self._groups)
-        found = decided.drift
-        if found is None:
-            return decided
-        moving = [each.broken(found.columns, knot, found.rates) for each in self.state.moving]
-        if not any(each.columns == found.columns for each in moving):
-            moving.append(Moving(found.columns, knot, 0.0, tuple(found.rates.tolist()), breaks=(knot,), begun=onset))
-        now = self._through(kept, moving, begin)[0]
-        self.state.blocks, self.state.moving, self.state.now = kept, moving, now
+        state = self._through(before, self.state.moving, knot)[0]
+        block = Block.of(np.concatenate(after), knot, behind[-1].t[-1] - knot * STEP)
+        return best_break(state, block, self._groups)
+
+    def go_on_behind(self, onset: float, alarm: float, drift: Ramp, held: Sequence[Rows]) -> None:
+        """Go on behind the break of a drift; rows of the last knot before it are given up. held: as before."""
+        knot, begin, before = _knot(alarm), int(np.ceil(alarm / STEP)), self._before(onset)
+        moving = [each.broken(drift.columns, knot, drift.rates) for each in self.state.moving]
+        if not any(each.columns == drift.columns for each in moving):
+            moving.append(Moving(drift.columns, knot, 0.0, tuple(drift.rates.tolist()), breaks=(knot,), begun=onset))
+        now = self._through(before, moving, begin)[0]
+        self.state.blocks, self.state.moving, self.state.now = before, moving, now
         self.state.anchor = self.state.anchor.with_moving(moving)
         self.state.pending, self.state.fresh, self.state.step = [], 0, begin
-        for rows in behind:
-            self.update(rows)
         self.state.accepted += 1
-        return decided
+        for rows in held:
+            if rows.t[0] >= alarm + WHITENED:
+                self.update(rows)
+
+    def _before(self, onset: float) -> list[Block]:
+        """Remembered blocks that end before an instant, s."""
+        return [block for block in self.state.blocks if (block.knot + KNOT) * STEP <= onset]
 
     @property
     def _knot(self) -> int:
@@ -333,6 +337,11 @@ class LearnedTrend(Tracker):
             rss=solution.rss,
             dof=max(self.state.rows + len(self._prior) - solution.rank, 0.0),
         )
+
+
+def _knot(t: float) -> int:
+    """Knot of the block that the next step behind an instant, s, is in."""
+    return int(np.ceil(t / STEP)) // KNOT * KNOT
 
 
 def _cost(moving: Moving) -> float:
