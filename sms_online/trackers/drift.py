@@ -46,8 +46,6 @@ DECAYS = (np.inf, 300.0, 100.0, 50.0, 30.0, 20.0, 10.0)
 MOST_AT_ONCE = 4
 # Knots from the beginning within which more than noise may be a drift yet to be found.
 PATIENCE = 12
-# Time behind a change within which whitened rows hold parameters of before it, s.
-WHITENED = 1.5
 # What process noise or decay must gain in twice the log likelihood of the innovations over none.
 COST = 4.0
 
@@ -138,7 +136,7 @@ class LearnedTrend(Tracker):
         held: rows since the alarm, of which the first are left out, for they hold parameters of before.
         """
         knot = _knot(alarm)
-        behind = [rows for rows in held if rows.t[0] >= alarm + WHITENED]
+        behind = _later_half(held, alarm)
         before = self._before(onset)
         if not before or not behind:
             return Break()
@@ -160,9 +158,8 @@ class LearnedTrend(Tracker):
         self.state.anchor = self.state.anchor.with_moving(moving)
         self.state.pending, self.state.fresh, self.state.step = [], 0, begin
         self.state.accepted += 1
-        for rows in held:
-            if rows.t[0] >= alarm + WHITENED:
-                self.update(rows)
+        for rows in _later_half(held, alarm):
+            self.update(rows)
 
     def _before(self, onset: float) -> list[Block]:
         """Remembered blocks that end before an instant, s."""
@@ -337,6 +334,11 @@ class LearnedTrend(Tracker):
             rss=solution.rss,
             dof=max(self.state.rows + len(self._prior) - solution.rank, 0.0),
         )
+
+
+def _later_half(held: Sequence[Rows], alarm: float) -> list[Rows]:
+    """Rows whose whitening holds the least of parameters before the alarm: for a second and a half, or two, it does."""
+    return [rows for rows in held if rows.t[0] >= 0.5 * (alarm + held[-1].t[0])]
 
 
 def _knot(t: float) -> int:

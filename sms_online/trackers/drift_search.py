@@ -20,6 +20,9 @@ LEAST_GAIN = 40.0
 DECISIVE = 10.0
 # Mean square of the whitened rows up to which they hold no more than noise.
 LARGEST_LEFT = 1.3
+# What a drift may leave beside noise behind a break, as a share of what it takes off beyond a step: whitened rows hold
+# some of the parameters of before it.
+UNEXPLAINED = 0.02
 # A column of which the others leave less than this share moves with them, and cannot be seen alone.
 FREE = 1e-6
 
@@ -71,7 +74,8 @@ def best_ramp(anchor: DriftFilter, blocks: Sequence[Block], groups: Sequence[tup
 class Break:
     """What rows behind a change show. drift: one that began or changed there, None where they show none.
 
-    unclear: a drift explains more than any step, but not yet so much that it could not be chance.
+    unclear: a drift explains more than any step, but not yet so much that it could not be chance, or more than noise is
+    left so far.
     """
 
     drift: Ramp | None = None
@@ -97,8 +101,8 @@ def best_break(before: DriftFilter, after: Block, groups: Sequence[tuple[int, ..
     best, others = ranked[0], max((each.gain for each in ranked[1:]), default=0.0)
     size = len(best.columns)
     rest = float(left[:, -1] @ left[:, -1]) - before.factor[-1, -1] ** 2 - best.gain
-    if rest > LARGEST_LEFT * after.rows:
-        return Break()
+    if rest > max(LARGEST_LEFT * after.rows, after.rows + UNEXPLAINED * (best.gain - steps)):
+        return Break(unclear=True)
     if best.gain - steps > (LEAST_GAIN + DECISIVE) * size and best.gain - others > DECISIVE * size:
         return Break(best)
     return Break(unclear=best.gain - steps > DECISIVE * size)
