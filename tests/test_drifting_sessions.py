@@ -84,6 +84,7 @@ def test_a_step_stays_an_event() -> None:
     assert result.events[0].time == pytest.approx(7.6, abs=0.05)
 
 
+@pytest.mark.slow
 def test_the_command_line_says_what_drifts(
     tmp_path: Path, data: sms.Capture, followed: sms.Result, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -13,7 +13,7 @@ from sms_tools.html_report.figures import Chart, Series, chart
 from sms_tools.html_report.history import Course
 from sms_tools.html_report.pages import write_page
 from sms_tools.html_report.parameter_rows import parameter_rows, with_subscripts
-from sms_tools.report import METHODS, Document, drift_lines, event_line
+from sms_tools.report import METHODS, Document, drift_lines, event_line, tracker_facts, value_cell
 from sms_tools.view.frames import Reference
 from sms_tools.view.known import BOUNDS
 from sms_tools.view.parameter_groups import HALF_RANGES, Basis, half_range, parameter_groups
@@ -42,6 +42,7 @@ def write_report(
         facts=_facts(document),
         events=[*map(event_line, document["events"]), *drift_lines(document)],
         parameters=parameter_rows({"estimate": (document["parameters"], "blue")}, nominal),
+        trackers=_trackers(document),
         convergence=_convergence(document, nominal, course),
         residual=_residual(course),
         episodes=[(episode["summary"], _evidence(episode)) for episode in document.get("diagnosis", [])],
@@ -49,6 +50,17 @@ def write_report(
         exaggeration=scene.exaggeration,
         arm=_arm(scene, course),
     )
+
+
+def _trackers(document: Document) -> list[list[str]]:
+    """Where there are several, a row of their names, then of each parameter's values, then of what they rest on."""
+    trackers = document.get("trackers", [])
+    if len(trackers) < 2:
+        return []
+    columns = zip(*(tracker["parameters"] for tracker in trackers), strict=True)
+    values = [[row[0]["name"], *map(value_cell, row)] for row in columns]
+    facts = [[heading, *cells] for heading, cells in tracker_facts(trackers).items()]
+    return [["parameter", *(tracker["name"] for tracker in trackers)], *values, *facts]
 
 
 def _facts(document: Document) -> dict[str, str]:
