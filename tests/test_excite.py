@@ -21,7 +21,7 @@ from sms_sim.simulate import exact_states, simulate
 from sms_tools.cli import main
 from sms_tools.trajectory_file import reference_lines, system_text
 
-MOVED = AXIS + MOTION
+MOVED = (AXIS + MOTION).replace("duration = 6.0", "duration = 3.0")
 ONE_SINE = MOVED.replace(", { frequency = 5.0, cosine = 0.3 }", "")
 FRICTION = ("coulomb_friction@joint_1:torque=0.05", "stribeck_friction@joint_1:torque=0.05")
 
@@ -34,7 +34,7 @@ def designed() -> Excitation:
 def test_batched_motions_are_the_exact_ones() -> None:
     system = parse_system(MOVED, "axis.toml")
     assert system.trajectory is not None
-    exact = exact_states(simulation := simulate(system), np.linspace(0.0, simulation.duration, 301))
+    exact = exact_states(simulation := simulate(system), np.linspace(0.0, simulation.duration, 151))
     frequency = np.array([2.0, 5.0])
     sine, cosine = np.array([[[1.0], [0.0]]]), np.array([[[0.0], [0.3]]])
     both = ensemble(system, frequency, np.repeat(sine, 2, 0), np.repeat(cosine, 2, 0), simulation.duration, 0.02)
@@ -59,7 +59,7 @@ def test_the_worst_bound_is_lower_within_the_described_extremes(designed: Excita
     assert designed.weighed == tuple(designed.after.parameters)
     plant = Plant(parse_system(MOVED, "axis.toml"))
     simulation = simulate(designed.system)
-    exact = exact_states(simulation, np.linspace(0.0, simulation.duration, 6001))
+    exact = exact_states(simulation, np.linspace(0.0, simulation.duration, 3001))
     largest = Extremes(plant)(exact.x, exact.v, exact.torque)
     for value, each in zip(largest, designed.reached, strict=True):
         assert each.limit is not None
@@ -74,26 +74,27 @@ def test_the_seed_decides_the_motion() -> None:
 
 
 def test_a_stated_limit_holds_in_place_of_the_described_motions() -> None:
-    found = excite(parse_system(MOVED, "axis.toml"), limits=Limits(rate=0.8), duration=4.0, iterations=2)
+    found = excite(parse_system(MOVED, "axis.toml"), limits=Limits(rate=0.8), duration=2.0, iterations=2)
     (rate,) = [each for each in found.reached if each.name == "rate of q_1"]
     assert rate.limit == 0.8
     assert 0.5 < rate.largest <= 0.8
     assert found.system.trajectory is not None
-    assert found.system.trajectory.duration == 4.0
+    assert found.system.trajectory.duration == 2.0
 
 
 def test_without_a_described_motion_limits_are_enough() -> None:
     system = parse_system(AXIS + MOTION.partition("[trajectory]")[0], "axis.toml")
-    found = excite(system, limits=Limits(angle=0.5), duration=4.0, iterations=1)
+    found = excite(system, limits=Limits(angle=0.5), duration=2.0, iterations=1)
     assert found.before is None
     assert next(each.largest for each in found.reached if each.name == "q_1") <= 0.5
     with pytest.raises(sms.InputError, match="both a duration and the largest joint angle"):
         excite(system, limits=Limits(angle=0.5))
 
 
+@pytest.mark.slow
 def test_two_effects_are_separated() -> None:
     system = parse_system(ONE_SINE, "axis.toml")
-    found = excite(system, separate=FRICTION, iterations=4)
+    found = excite(system, separate=FRICTION, iterations=2)
     assert found.weighed == ("coulomb_friction@joint_1.torque", "stribeck_friction@joint_1.torque")
     assert found.before is not None
     worst = [max(bounds.parameters[name].std for name in found.weighed) for bounds in (found.before, found.after)]

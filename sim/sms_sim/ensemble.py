@@ -26,8 +26,8 @@ STAGES = 3
 POSITION_TOLERANCE, SPEED_TOLERANCE = 1e-6, 1e-4
 # More iterations than this: the Jacobians are too old. As many with new ones: the step is too long.
 ITERATIONS = 10
-# A step is halved no more often than this.
-HALVINGS = 2
+# A step is halved no more often than this: friction reverses within a millisecond.
+HALVINGS = 6
 
 
 class References:

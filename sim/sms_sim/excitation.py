@@ -39,11 +39,11 @@ from sms_sim.simulate import Simulation, exact_states
 HARMONICS = 5
 # Periods of the slowest in a motion without a described one: several, of which each repeats what the others show.
 PERIODS = 5
-# Step of the motions that are compared, s, and every how many of them the bound works at: twice and four times that of
-# `cramer_rao`, which changes bounds alike for all motions.
-STEP, EVERY = 0.02, 2
+# Step of the motions that are compared and of their bounds, s: twice that of `cramer_rao`. The planar example's worst
+# bound then comes out a tenth low, which matters to no comparison; the bounds that are reported have the other step.
+STEP = 0.02
 # Random series that the best is chosen from, and how often they are scaled into the limits, which is not linear.
-DRAWN, SCALINGS = 24, 3
+DRAWN, SCALINGS = 24, 1
 # Share of a random series that is added to the described one, at most.
 MIXED = 0.5
 # Order of the norm of relative bounds: near their maximum, and smooth. The median takes so much of the criterion, or
@@ -289,7 +289,7 @@ class _Problem:
             if np.isfinite(x).all() and np.isfinite(v).all():
                 loads = self.extremes.magnitudes(x, v, motions.torque[p]) / self.bounds
                 load[p], smooth[p] = loads.max(), np.linalg.norm(loads.ravel(), PEAK_ORDER)
-                cost[p] = self._criterion(Motion(motions.t[::EVERY], x[::EVERY], v[::EVERY]))
+                cost[p] = self._criterion(Motion(motions.t, x, v))
         return cost, load, smooth
 
     def _criterion(self, motion: Motion) -> float:
@@ -328,7 +328,8 @@ def _optimised(
     cost, load, _ = problem(points)
     scaled = cost + np.log(load)
     if not np.isfinite(scaled).any():
-        raise InputError(problem.system.name, "limits", "no random motion within them", "wider limits")
+        found = "no random motion within them determines the parameters"
+        raise InputError(problem.system.name, "limits", found, "wider limits, or effects that such motions show")
     steps = _Steps(problem, lambda n: progress(what, min(1.0, (SCALINGS + 1 + n) / total)))
     begin = points[int(np.argmin(scaled))] / UNIT
     minimize(steps.cost, begin, jac=steps.slope, method="BFGS", options={"maxiter": iterations})
