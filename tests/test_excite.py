@@ -66,6 +66,14 @@ def test_the_worst_bound_is_lower_within_the_described_extremes(designed: Excita
         assert value <= 1.0005 * each.limit, each.name
 
 
+def test_a_motion_that_is_no_better_is_not_given_out(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("sms_sim.excitation._optimised", lambda problem, *_: np.full(problem.series.size, 1e-3))
+    system = parse_system(MOVED, "axis.toml")
+    found = excite(system)
+    assert found.system == system
+    assert set(found.gains().values()) == {1.0}
+
+
 def test_the_seed_decides_the_motion() -> None:
     system = parse_system(MOVED, "axis.toml")
     found = [excite(system, duration=2.0, seed=seed, iterations=1).system for seed in (1, 1, 2)]

@@ -45,6 +45,8 @@ def run(args: argparse.Namespace) -> int:
     console = report_console(args.json)
     if found.after.grade != args.grade:
         show(console, f"noise: grade {found.after.grade}, for {args.system} does not state that of every sensor")
+    if trajectory == system.trajectory:
+        show(console, "no better motion was found: the described one is kept; try more --iterations or another --seed")
     show(console, _table(found), "", _reached(found), "")
     show(console, f"system file with the motion: {file}", f"reference: {reference}", f"document: {document}")
     if args.json:
