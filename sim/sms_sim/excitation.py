@@ -40,7 +40,7 @@ HARMONICS = 5
 # Periods of the slowest in a motion without a described one: several, of which each repeats what the others show.
 PERIODS = 5
 # Step of the motions that are compared and of their bounds, s: twice that of `cramer_rao`. The planar example's worst
-# bound then comes out a tenth low, by what its first jolt shows, so that exact bounds decide in the end.
+# bound then comes out a tenth low, so that exact bounds decide in the end.
 STEP = 0.02
 # Random series that the best is chosen from, and how often they are scaled into the limits, which is not linear.
 DRAWN, SCALINGS = 24, 1
