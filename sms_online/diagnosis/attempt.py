@@ -38,6 +38,9 @@ SOME = 8.0
 STARTS = 2
 # Rows for a column at least, for all candidates to be fitted together.
 LEAST_ROWS = 4
+# Parameters with which a coordinate's rows without a torque are smaller than this share of what the described values
+# make of them, or as much larger, are none to weigh by: rows that hold more than noise have drawn them there.
+SHRUNK = 0.1
 # Weights are the same where the size of the rows' terms changes by less than this share.
 SAME_WEIGHTS = 0.1
 
@@ -136,6 +139,20 @@ def _start(rows: SessionRows, candidates: Sequence[Candidate], prior: Prior | No
     for _ in range(STARTS):
         rows.weigh(together(columns / std[..., None], rows.b / std, prior)[: rows.base.n])
         std = rows.std
+    _weigh(rows, rows.beta)
+
+
+def _weigh(rows: SessionRows, beta: Array) -> None:
+    """Weigh the rows with parameters beta (n,), or with the described ones where these cannot be."""
+    described = rows.base.values(rows.model.nominal)
+    sizes, expected = (_sizes(rows, each)[~np.any(rows.b, axis=0)] for each in (beta, described))
+    likely = np.all((expected == 0.0) | ((sizes >= SHRUNK * expected) & (SHRUNK * sizes <= expected)))
+    rows.weigh(beta if likely else described)
+
+
+def _sizes(rows: SessionRows, beta: Array) -> Array:
+    """Size (n_v,) of the terms of each speed's rows with parameters beta (n,)."""
+    return np.asarray(np.linalg.norm(rows.Y * beta, axis=(0, 2)))
 
 
 class Attempt(Hypothesis):
@@ -189,7 +206,7 @@ class Attempt(Hypothesis):
         if beta is None:
             _start(rows, made, prior)
         else:
-            rows.weigh(beta)
+            _weigh(rows, beta)
         self._most_found = 0
         super().__init__(make, [*make.seen(self._lasting), *made], folds, prior, constants)
 
@@ -227,7 +244,7 @@ class Attempt(Hypothesis):
 
     def _same_weights(self, beta: Array) -> bool:
         """Whether rows would be weighed alike with beta (n,): their noise goes with the size of their terms."""
-        sizes = [np.linalg.norm(self.rows.Y * values, axis=(0, 2)) for values in (beta, self.rows.beta)]
+        sizes = [_sizes(self.rows, values) for values in (beta, self.rows.beta)]
         return bool(np.all(np.abs(sizes[0] - sizes[1]) <= SAME_WEIGHTS * sizes[1]))
 
     def conclude(self, chosen: Sequence[int]) -> None:

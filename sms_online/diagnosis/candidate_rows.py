@@ -67,6 +67,8 @@ class CandidateRows:
         # What the effects chosen leave open.
         self._own = np.zeros_like(rows.std)
         self._free = np.zeros((len(rows.b), HOPS, self._n_v))
+        # Speeds of which nothing is counted as left open, for these chosen.
+        self._loud: tuple[frozenset[int], NDArray[np.bool_]] = frozenset(), np.zeros(self._n_v, dtype=np.bool_)
         self.weigh()
 
     def settle(self, chosen: Sequence[int], solution: Array | None = None) -> bool:
@@ -84,11 +86,20 @@ class CandidateRows:
             own += told.own
             free += told.free
             at += c
+        if self._loud[0] == frozenset(chosen):
+            own[:, self._loud[1]], free[..., self._loud[1]] = 0.0, 0.0
         used, wanted = self._own + self._free[:, 0], own + free[:, 0]
         if not np.any(np.abs(wanted - used) > SMALL_CHANGE * (self.rows.std**2 + used)):
             return False
         self._own, self._free = own, free
         self.weigh()
+        # Rows that leave more than noise even so are uncertain by that: what the laws leave open there would grow with
+        # their coefficients, and these with it.
+        loud = (self.floor > 0.0) & np.any(wanted, axis=0)
+        if np.any(loud):
+            own[:, loud], free[..., loud] = 0.0, 0.0
+            self._loud = frozenset(chosen), loud
+            self.weigh()
         return True
 
     def weigh(self) -> None:
