@@ -41,6 +41,8 @@ ROWS_A_PARAMETER = 10
 LARGEST_PULL = 1.0
 # An estimate further from its prior than this many of the prior's deviations agrees with it by no chance.
 LARGEST_DISPUTE = 3.0
+# A clock this many tolerances off may have moved on the way.
+MOVED = 1.5
 # Quantities that cannot be negative, as the ends of names.
 POSITIVE = ("mass", "mass_per_length", "stiffness", "damping", "rotor_inertia", "rigidity", "rigidity_y", "rigidity_z")
 # Effects of one cause that a warning names.
@@ -259,7 +261,11 @@ class Evaluation:
         )
 
     def _miscalibrated(self) -> list[Reason]:
-        """Where the description is wrong by more than its tolerances allow; corrections are linear, up to a bound."""
+        """Where the description is wrong by more than its tolerances allow; corrections are linear, up to a bound.
+
+        A clock that moves on the way looks like a change of parameters: beside one, less counts.
+        """
+        changed = any(event.parameters for event in self.statistics.events)
         return [
             Reason(
                 f"{each}: {abs(each.estimate / each.tolerance):.0f} tolerances",
@@ -268,7 +274,8 @@ class Evaluation:
                 then=each.advice,
             )
             for each in self.calibration
-            if each.tolerance is not None and each.beyond
+            if each.tolerance is not None
+            and (each.beyond or (changed and each.name == "clock" and abs(each.estimate) > MOVED * each.tolerance))
         ]
 
     def _disputes(self) -> list[Dispute]:

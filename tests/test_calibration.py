@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.interpolate import make_interp_spline
@@ -15,6 +17,7 @@ from sms_online.description.schema import Tolerances
 from sms_online.errors import InputError
 from sms_online.evaluation import Evaluation
 from sms_online.pipeline.estimator import Estimator
+from sms_online.pipeline.events import Event
 from sms_online.pipeline.statistics import Statistics
 from sms_online.stream import Array, Block
 from sms_online.trackers.interface import Rows
@@ -98,6 +101,14 @@ def test_a_late_camera_within_its_tolerance_is_said_and_corrected(exact: Block) 
         assert clock.std < 2e-5
         assert not clock.beyond
         assert str(clock).endswith("µs late")
+
+
+def test_a_change_beside_a_clock_that_may_have_moved_is_in_doubt(exact: Block) -> None:
+    statistics = evaluated(exact, Tolerances(), late(exact, 1e-4)).statistics
+    change = Event(4.0, "payload", ("payload.mass",), ("kg",), (1.0,), (0.1,), 0)
+    steady, changed = (Evaluation(replace(statistics, events=events)).trust for events in ((), (change,)))
+    assert not any("tolerances" in reason for reason in steady.reasons)
+    assert any("late: 2 tolerances" in reason for reason in changed.reasons)
 
 
 def test_a_camera_later_than_its_tolerance_is_not_trusted(exact: Block) -> None:
