@@ -60,8 +60,30 @@ def percent(std: float, value: float) -> float | None:
     return 100.0 * std / abs(value) if value and math.isfinite(std) else None
 
 
+class Tabled:
+    """A result that people see as a table, on a terminal and in a notebook."""
+
+    def rows(self) -> tuple[list[str], list[list[str]]]:
+        """Headings, and a row of cells for each line of the table."""
+        raise NotImplementedError
+
+    def document(self) -> dict[str, Any]:
+        """The same as plain lists, dictionaries and numbers."""
+        raise NotImplementedError
+
+    def to_json(self) -> str:
+        """The document as text; numbers that do not exist are null."""
+        return json_text(self.document())
+
+    def __str__(self) -> str:
+        return text_table(*self.rows(), left=2)
+
+    def _repr_html_(self) -> str:
+        return html_table(*self.rows())
+
+
 @dataclass(frozen=True)
-class Bounds:
+class Bounds(Tabled):
     """Cramér–Rao bounds of a system's parameters, for a motion and a set of sensors; parameters: by name.
 
     grade: of the noise, None where it is the described or recorded one.
@@ -97,16 +119,6 @@ class Bounds:
             for p in self.parameters.values()
         ]
         return {"schema": "sms-online/bound/1", "system": self.system, "grade": self.grade, "parameters": parameters}
-
-    def to_json(self) -> str:
-        """The document as text; numbers that do not exist are null."""
-        return json_text(self.document())
-
-    def __str__(self) -> str:
-        return text_table(*self.rows(), left=2)
-
-    def _repr_html_(self) -> str:
-        return html_table(*self.rows())
 
 
 def bound(

@@ -25,10 +25,8 @@ from sms_online.effects.catalogue import parse_effect
 from sms_online.errors import InputError
 from sms_online.linearised import Motion
 from sms_online.model.base_parameters import find_base_parameters
-from sms_online.result import json_text
 from sms_online.stream import Array
-from sms_online.tables import html_table, text_table
-from sms_sim.bound import Bounds, motion_bounds, noisy_sensors
+from sms_sim.bound import Bounds, Tabled, motion_bounds, noisy_sensors
 from sms_sim.capture import Simulated
 from sms_sim.ensemble import ensemble
 from sms_sim.motion_limits import Extremes, Limits
@@ -75,11 +73,12 @@ class Reached:
 
 
 @dataclass(frozen=True)
-class Excitation:
+class Excitation(Tabled):
     """A designed motion; the described one where none was found that is better at the worst parameter.
 
-    system: with it as its trajectory. before, after: bounds of the described motion, None where
-    there is none, and of this one. weighed: names of the parameters that it was designed for. reached: its extremes."""
+    system: with it as its trajectory. before, after: bounds of the described motion, None where there is none, and of
+    this one. weighed: names of the parameters that it was designed for. reached: its extremes.
+    """
 
     system: System
     before: Bounds | None
@@ -119,16 +118,6 @@ class Excitation:
             "times_lower": self.gains(),
             "reached": [vars(each) for each in self.reached],
         }
-
-    def to_json(self) -> str:
-        """The document as text; numbers that do not exist are null."""
-        return json_text(self.document())
-
-    def __str__(self) -> str:
-        return text_table(*self.rows(), left=2)
-
-    def _repr_html_(self) -> str:
-        return html_table(*self.rows())
 
 
 def excite(
