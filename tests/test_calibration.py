@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from exactly_known import EXACTLY
 from scipy.interpolate import make_interp_spline
 from simulations import planar
 
@@ -24,7 +25,6 @@ from sms_online.trackers.interface import Rows
 from sms_online.trackers.square_root import session_tracker
 from sms_sim.simulate import sampled_blocks
 
-EXACTLY = Tolerances.model_validate("none")
 # Two clocks and two parameters, of rows that tell all of them.
 NUISANCES = (Nuisance("clock", "a", "s", 0.5), Nuisance("clock", "b", "s", np.inf))
 

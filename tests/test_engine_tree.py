@@ -46,6 +46,23 @@ mass = 1.5
 rotor_inertia = 0.002
 stator_inertia = { xx = 0.01, yy = 0.011, zz = 0.012 }
 """
+# Of the first two joints, which begins and ends at rest.
+MOTION = """
+[trajectory]
+duration = 8.0
+joint_1 = [
+    { frequency = 2.0, sine = 0.6 },
+    { frequency = 4.0, sine = -0.3 },
+    { frequency = 7.0, cosine = 0.05 },
+    { frequency = 5.0, cosine = -0.098 },
+]
+joint_2 = [
+    { frequency = 3.0, sine = 0.5 },
+    { frequency = 5.0, sine = -0.3 },
+    { frequency = 8.0, cosine = 0.045 },
+    { frequency = 6.0, cosine = -0.08 },
+]
+"""
 BRACKETS = f"""
 name = "brackets"
 {BASE}
@@ -81,21 +98,7 @@ inertia = {{ xx = 0.1, yy = 0.12, zz = 0.15, xy = 0.01, xz = -0.01, yz = 0.02 }}
 [controller]
 stiffness = [200.0, 150.0]
 damping = [60.0, 40.0]
-[trajectory]
-duration = 8.0
-joint_1 = [
-    {{ frequency = 2.0, sine = 0.6 }},
-    {{ frequency = 4.0, sine = -0.3 }},
-    {{ frequency = 7.0, cosine = 0.05 }},
-    {{ frequency = 5.0, cosine = -0.098 }},
-]
-joint_2 = [
-    {{ frequency = 3.0, sine = 0.5 }},
-    {{ frequency = 5.0, sine = -0.3 }},
-    {{ frequency = 8.0, cosine = 0.045 }},
-    {{ frequency = 6.0, cosine = -0.08 }},
-]
-"""
+{MOTION}"""
 TREE = f"""
 name = "tree"
 {BASE}
@@ -155,21 +158,7 @@ inertia = {{ xx = 0.08, yy = 0.1, zz = 0.12, xy = 0.01 }}
 [controller]
 stiffness = [200.0, 150.0, 0.0, 80.0]
 damping = [60.0, 40.0, 0.0, 20.0]
-[trajectory]
-duration = 8.0
-joint_1 = [
-    {{ frequency = 2.0, sine = 0.6 }},
-    {{ frequency = 4.0, sine = -0.3 }},
-    {{ frequency = 7.0, cosine = 0.05 }},
-    {{ frequency = 5.0, cosine = -0.098 }},
-]
-joint_2 = [
-    {{ frequency = 3.0, sine = 0.5 }},
-    {{ frequency = 5.0, sine = -0.3 }},
-    {{ frequency = 8.0, cosine = 0.045 }},
-    {{ frequency = 6.0, cosine = -0.08 }},
-]
-joint_3 = []
+{MOTION}joint_3 = []
 joint_4 = [
     {{ frequency = 2.5, sine = 0.8 }},
     {{ frequency = 5.0, sine = -0.4 }},

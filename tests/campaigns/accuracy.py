@@ -17,7 +17,6 @@ from time import process_time
 from typing import Any
 
 import numpy as np
-from evaluated import standard_deviation
 
 from sms_adapters.system_file import load_system
 from sms_online.effects.build import build_model
@@ -26,7 +25,9 @@ from sms_online.evaluation import NORMAL_95
 from sms_online.model.base_parameters import find_base_parameters
 from sms_online.pipeline.estimator import Estimator
 from sms_online.stream import Array, Block
-from tests.campaigns.sessions import EXACT, disguised, exact_session, noisy_session, true_parameters
+from tests.campaigns.sessions import disguised, exact_session, noisy_session, true_parameters
+from tests.evaluated import standard_deviation
+from tests.exactly_known import exactly_known
 
 SYSTEM = "paper-planar"
 GRADES = ("A", "B", "C")
@@ -65,7 +66,7 @@ def run(results: Path, cache: Path, runs: int, grades: list[str]) -> None:
 def one_session(block: Block) -> Record:
     """Estimate of one session, as of 4 s and at its end."""
     start = process_time()
-    exact = disguised(load_system(SYSTEM)).model_copy(update={"tolerances": EXACT})
+    exact = exactly_known(disguised(load_system(SYSTEM)))
     estimator = Estimator(exact, block.channels, "campaign")
     split = int(np.searchsorted(block.t, EARLY, side="right"))
     estimator.push(Block(block.t[:split], block.channels, block.values[:split]))

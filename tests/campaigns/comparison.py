@@ -29,7 +29,8 @@ from sms_online.stream import Array, Block
 from sms_sim.sensors import GRADES
 from tests.batch_solution import batch_least_squares
 from tests.campaigns.output_error import OutputError
-from tests.campaigns.sessions import EXACT, disguised, exact_session, noisy_session, true_parameters
+from tests.campaigns.sessions import disguised, exact_session, noisy_session, true_parameters
+from tests.exactly_known import exactly_known
 from tests.keeping_tracker import KeepingTracker
 
 SYSTEM, GRADE = "paper-planar", "B"
@@ -158,7 +159,7 @@ METHODS: dict[str, Callable[[System, Block], Array]] = {
 
 def table(seeds: int, cache: Path) -> str:
     """Markdown: errors over all parameters and sessions, and processor time of a session."""
-    true_system = load_system(SYSTEM).model_copy(update={"tolerances": EXACT})
+    true_system = exactly_known(load_system(SYSTEM))
     truth, exact = true_parameters(true_system), exact_session(true_system, cache)
     names = [p.name for p in find_base_parameters(build_model(true_system)).parameters]
     blocks = [noisy_session(true_system, exact, GRADE, seed) for seed in range(seeds)]

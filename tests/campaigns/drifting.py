@@ -34,7 +34,8 @@ from sms_online.session import Session
 from sms_online.stream import Array, Block
 from sms_sim.drifting import drifted, parsed
 from tests.campaigns.accuracy import Record, flagged, read
-from tests.campaigns.sessions import EXACT, disguised, exact_session, noisy_session
+from tests.campaigns.sessions import disguised, exact_session, noisy_session
+from tests.exactly_known import exactly_known
 
 SYSTEM = "paper-planar"
 GRADE = "B"
@@ -129,7 +130,7 @@ def run(results: Path, runs: int, names: list[str]) -> None:
 def one_session(case: Case, block: Block) -> Record:
     """What the judged tracker said on the way, and what was found."""
     start = process_time()
-    system = disguised(described(case), factor=DISGUISE).model_copy(update={"tolerances": EXACT})
+    system = exactly_known(disguised(described(case), factor=DISGUISE))
     session, static = Session(system, block.channels, tracker=TRACKERS), Session(system, block.channels)
     samples = round(LOOKED * session.estimator.system.sample_rate)
     looks: dict[str, list[Any]] = {key: [] for key in ("t", "estimate", "std", "beside")}

@@ -18,7 +18,6 @@ from time import process_time
 from typing import Any
 
 import numpy as np
-from evaluated import standard_deviation
 
 from sms_online.description.schema import System
 from sms_online.effects.build import build_model
@@ -30,6 +29,7 @@ from sms_sim.sensors import Sensors
 from sms_sim.simulate import simulate
 from tests.campaigns.accuracy import Record, read
 from tests.campaigns.sessions import disguised, exact_session, true_parameters
+from tests.evaluated import standard_deviation
 from tests.plain_rig import bound_of, plain_rig
 
 # Asked of each parameter: an error within so many times the bound.

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from sms_online.description.parse import describe
-from sms_online.description.schema import System, Tolerances
+from sms_online.description.schema import System
 from sms_online.effects.build import build_model
 from sms_online.model.base_parameters import find_base_parameters
 from sms_online.stream import Array, Block
@@ -25,7 +25,6 @@ DISGUISED = (
 )
 DISGUISE = 2.0
 ROUGH = (1 / 1.4, 1.4)
-EXACT = Tolerances.model_validate("none")
 
 
 def exact_session(
