@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -61,8 +61,5 @@ def prior_rows(nuisances: Sequence[Nuisance], n: int) -> Array:
 
 def bound_rows(nuisances: Sequence[Nuisance], n: int) -> Array:
     """What `BOUNDED` says, as rows [N Y b] (k, m + n + 1) of unit variance."""
-    rows = np.zeros((0, len(nuisances) + n + 1))
-    for k, each in enumerate(nuisances):
-        if each.name in BOUNDED and np.isfinite(each.tolerance):
-            rows = np.vstack((rows, np.eye(1, rows.shape[1], k) / (BOUND * each.tolerance)))
-    return rows
+    wide = [BOUND * each.tolerance if each.name in BOUNDED else np.inf for each in nuisances]
+    return prior_rows([replace(each, tolerance=width) for each, width in zip(nuisances, wide, strict=True)], n)
