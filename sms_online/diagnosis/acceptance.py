@@ -17,7 +17,7 @@ LEAST_IMPROVEMENT = 0.10
 ONE_TOO_MANY = 0.99
 # Rows that hold more than this multiple of their deviation leave more than noise.
 MOST_LEFT = 2.0
-# Blocks of which a coefficient's deviation can be told.
+# Fewest blocks from which a coefficient's deviation is estimated.
 LEAST_FOLDS = 4
 # A coefficient is significant beyond this multiple of its deviation.
 SIGNIFICANT = 2.0

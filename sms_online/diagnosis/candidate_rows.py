@@ -64,15 +64,15 @@ class CandidateRows:
         self._positive = np.array([False] * self._n if positive is None else positive, dtype=bool)
         self._model = np.concatenate([rows.Y, *(candidate.columns for candidate in fixed)], axis=2)
         self.trials = len(self.candidates)
-        # What the effects chosen leave open.
+        # Covariance of what the laws of the chosen effects do not determine.
         self._own = np.zeros_like(rows.std)
         self._free = np.zeros((len(rows.b), HOPS, self._n_v))
-        # Speeds of which nothing is counted as left open, for these chosen.
+        # Speeds whose rows have no such covariance, with these effects chosen.
         self._loud: tuple[frozenset[int], NDArray[np.bool_]] = frozenset(), np.zeros(self._n_v, dtype=np.bool_)
         self.weigh()
 
     def settle(self, chosen: Sequence[int], solution: Array | None = None) -> bool:
-        """Weigh the rows with what the laws of the effects chosen leave open too; whether that changes the weights.
+        """Weigh the rows with what the laws of the chosen effects do not determine too; whether the weights change.
 
         solution (n + c,): from all windows unless given.
         """
@@ -93,8 +93,8 @@ class CandidateRows:
             return False
         self._own, self._free = own, free
         self.weigh()
-        # Rows that leave more than noise even so are uncertain by that: what the laws leave open there would grow with
-        # their coefficients, and these with it.
+        # Rows that leave more than noise even so are uncertain by that: what the laws do not determine there would grow
+        # with their coefficients, and these with it.
         loud = (self.floor > 0.0) & np.any(wanted, axis=0)
         if np.any(loud):
             own[:, loud], free[..., loud] = 0.0, 0.0
@@ -103,7 +103,7 @@ class CandidateRows:
         return True
 
     def weigh(self) -> None:
-        """Weigh the rows, and whiten them, with what is left open by the effects settled last."""
+        """Weigh the rows, and whiten them, with what the laws of the effects of the last `settle` do not determine."""
         rows = self.rows
         self._zeroed: dict[frozenset[int], NDArray[np.bool_]] = {}
         self.std = np.sqrt(rows.std**2 + self._own + self._free[:, 0])

@@ -307,7 +307,7 @@ def _session(
     prior: PriorOf,
     progress: Callable[[float], None] = lambda share: None,
 ) -> tuple[Estimator, SampleRecord]:
-    """A session of the blocks and their record; progress: is told the share of the samples that are worked off."""
+    """A session of the blocks and their record; progress: is called with the share of the samples processed."""
     estimator = Estimator(system, blocks[0].channels, source)
     record = SampleRecord(system.sample_rate)
     estimator.observers.append(record)

@@ -27,8 +27,8 @@ class Episode:
     been there from the start. verdict: "noticed", "named", "unexplained", "passed" where the last samples show nothing
     of it, "change" where a jump of parameters, the event, explains it, or "drift" where parameters drift, and the
     judged tracker follows them. named_at: s, when a search first named what was found in the end, when the event was
-    decided, or when the tracker found the drift. adopted: s, when what was named was taken up; refused: why not.
-    drifting: names of parameters.
+    decided, or when the tracker found the drift. adopted: s, when the model was updated with what was named; refused:
+    why not. drifting: names of parameters.
     """
 
     noticed: float

@@ -141,6 +141,7 @@ def _off(t: Array, samples: Array) -> Array:
     nodes = middle[:, None] + np.array([-2, -1, 1, 2])
     x = t[nodes] - t[middle][:, None]
     apart = x[:, :, None] - x[:, None, :]
+    # Not the synchroniser's weights: samples that came twice are still among these.
     ratio = -x[:, None, :] / np.where(apart == 0.0, 1.0, apart)
     own = np.arange(nodes.shape[1])
     ratio[:, own, own] = 1.0
