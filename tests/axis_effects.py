@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
-from axis import AXIS, DAMPING, INERTIA
 
 from sms_online.description.parse import parse_system
 from sms_online.stream import Array, Block
+from tests.axis import AXIS, DAMPING, INERTIA
 
 RATE = 200.0  # Hz
 SYSTEM = parse_system(AXIS, "axis.toml")

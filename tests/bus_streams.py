@@ -9,8 +9,6 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
-from axis import AXIS, DAMPING, INERTIA
-from evaluated import standard_deviation
 
 from sms_adapters.clock_lanes import merger
 from sms_adapters.clock_merge import Merger
@@ -22,6 +20,8 @@ from sms_online.description.schema import System
 from sms_online.description.sources import SerialFrames
 from sms_online.pipeline.estimator import Estimator
 from sms_online.stream import Array, Block
+from tests.axis import AXIS, DAMPING, INERTIA
+from tests.evaluated import standard_deviation
 
 RATE = 200.0  # Hz
 TORQUE_NOISE, ANGLE_NOISE = 0.01, 1e-4  # N m, rad: a fair torque sensor, a good encoder

@@ -6,12 +6,12 @@ import os
 
 import numpy as np
 import pytest
-import simulations
 
 from sms_adapters.system_file import load_system
 from sms_online.description.schema import System
 from sms_online.stream import Block
 from sms_sim.simulate import Simulation, exact_states
+from tests import simulations
 
 
 def pytest_configure() -> None:

@@ -8,11 +8,11 @@ from __future__ import annotations
 
 import mujoco
 import numpy as np
-from engine_mujoco import MERGED, ROTOR_SHARE, EngineArm, Motion, _empty, _hinges
 from scipy.spatial.transform import Rotation
 
 from sms_online.description.schema import FlexibleLink, Inertia, Joint, RigidBody, System
 from sms_online.stream import Array, Block
+from tests.engine_mujoco import MERGED, ROTOR_SHARE, EngineArm, Motion, _empty, _hinges
 
 AXES = np.eye(3)
 # What a marker reads in its link's frame, by the deformation that moves it.

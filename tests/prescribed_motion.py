@@ -5,10 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from model_systems import difference
 
 from sms_online.model.model import Model
 from sms_online.stream import Array
+from tests.model_systems import difference
 
 # Amplitudes: elastic coordinates and deflections of joints, rad and m; all others.
 ELASTIC, WIDE = 0.02, 0.4

@@ -13,10 +13,10 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 import pytest
-from axis import AXIS, axis_block
 
 import sms_online as sms
 from sms_tools.cli import main
+from tests.axis import AXIS, axis_block
 
 README = Path(__file__).parents[1] / "README.md"
 # What a notebook may rely on, word for word.

@@ -14,14 +14,14 @@ from pathlib import Path
 
 import pyarrow.parquet as pq
 import pytest
-from archive_tasks import square
-from axis import AXIS, MOTION
 
 import sms_online as sms
 from sms_tools.archive.captures import ROWS, TABLE, archive, captures_under
 from sms_tools.archive.rows import Row, RowFile
 from sms_tools.archive.runner import KILLED, finished
 from sms_tools.cli import main
+from tests.archive_tasks import square
+from tests.axis import AXIS, MOTION
 
 SESSIONS = 4
 
@@ -148,7 +148,7 @@ def scheduler(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
     """Address of a scheduler with two workers, each a process of its own."""
     folder = tmp_path_factory.mktemp("cluster")
     file = folder / "scheduler.json"
-    paths = os.pathsep.join([str(Path(__file__).parent), *filter(None, sys.path)])
+    paths = os.pathsep.join(filter(None, sys.path))
     common = {"cwd": folder, "env": {**os.environ, "PYTHONPATH": paths}, "stderr": subprocess.DEVNULL}
     begin = [sys.executable, "-m"]
     quiet = ["--no-dashboard"]

@@ -7,10 +7,10 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from axis import AXIS, DAMPING, INERTIA, capture_lines
 
 from sms_adapters.truth import truth_path
 from sms_tools.cli import main
+from tests.axis import AXIS, DAMPING, INERTIA, capture_lines
 
 FLEXIBLE_LINK = """
 [link_1]

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from model_systems import SYSTEMS, paper, random_states, rigid_chain, spatial
 
 from sms_adapters.system_file import load_system
 from sms_online.description.schema import Joint, Motor, RigidLink, System
@@ -12,6 +11,7 @@ from sms_online.effects.build import build_model
 from sms_online.model.base_parameters import BaseParameters, find_base_parameters
 from sms_online.model.model import Model
 from sms_online.stream import Array
+from tests.model_systems import SYSTEMS, paper, random_states, rigid_chain, spatial
 
 RELATIVE = 1e-9
 

@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from evaluated import results_document
 from numpy.testing import assert_allclose, assert_array_equal
-from simulations import planar
 
 from sms_online.cramer_rao import STEP, MotionRecord, cramer_rao_bound, session_bound
 from sms_online.linearised import Motion
@@ -16,6 +14,8 @@ from sms_online.stream import Array
 from sms_online.trackers.interface import Prior
 from sms_sim.sensors import GRADES
 from sms_sim.simulate import ExactStates, Simulation, exact_states, sampled_blocks
+from tests.evaluated import results_document
+from tests.simulations import planar
 
 DURATION = 2.0  # s
 SEED = 12

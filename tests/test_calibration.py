@@ -6,9 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from exactly_known import EXACTLY
 from scipy.interpolate import make_interp_spline
-from simulations import planar
 
 from sms_adapters.system_file import load_system
 from sms_online.calibration.found import Calibration
@@ -24,6 +22,8 @@ from sms_online.stream import Array, Block
 from sms_online.trackers.interface import Rows
 from sms_online.trackers.square_root import session_tracker
 from sms_sim.simulate import sampled_blocks
+from tests.exactly_known import EXACTLY
+from tests.simulations import planar
 
 # Two clocks and two parameters, of rows that tell all of them.
 NUISANCES = (Nuisance("clock", "a", "s", 0.5), Nuisance("clock", "b", "s", np.inf))

@@ -6,8 +6,6 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
-from model_systems import paper, spatial
-from prescribed_motion import prescribed
 from scipy.spatial.transform import Rotation
 
 from sms_adapters.system_file import load_system
@@ -25,6 +23,8 @@ from sms_online.pipeline.sensing import Sensing
 from sms_online.pipeline.sensitivity import Sensitivities
 from sms_online.stream import Array
 from sms_sim.plant import Plant
+from tests.model_systems import paper, spatial
+from tests.prescribed_motion import prescribed
 
 SPAN = 0.4  # s
 # m, rad, s and so on: rows are linear in it, and it is large against rounding.

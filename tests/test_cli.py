@@ -16,7 +16,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from axis import AXIS, DAMPING, INERTIA, MOTION, capture_lines
 from scipy.io import savemat
 
 from sms_adapters.system_file import load_system
@@ -28,6 +27,7 @@ from sms_online.pipeline.estimator import Estimator
 from sms_online.priors import base_prior
 from sms_online.stream import Block
 from sms_tools.cli import main
+from tests.axis import AXIS, DAMPING, INERTIA, MOTION, capture_lines
 
 MOVED = AXIS + MOTION
 TRUTH = {"link_1.inertia": INERTIA, "viscous_friction@joint_1.damping": DAMPING}

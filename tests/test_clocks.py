@@ -7,7 +7,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from bus_streams import AxisBus, axis_testbed, estimated, merged, ticks
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.optimize import linprog
@@ -19,6 +18,7 @@ from sms_adapters.clock_samples import CountedTime, NumberedTime
 from sms_adapters.recording import tick_time
 from sms_adapters.stuck import StuckGuard
 from sms_online.stream import Array
+from tests.bus_streams import AxisBus, axis_testbed, estimated, merged, ticks
 
 TICK = 0.02
 LATENCY, JITTER = 0.004, 0.002

@@ -12,11 +12,11 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from axis import AXIS, capture_lines
-from test_killed_processes import described_testbed, kill
 
 from sms_tools.interruption import Interruption
 from sms_tools.live.signals import termination_interrupts
+from tests.axis import AXIS, capture_lines
+from tests.test_killed_processes import described_testbed, kill
 
 pytestmark = pytest.mark.realtime
 PATIENCE = 40.0  # s, of a loaded machine

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from evaluated import judged, standard_deviation
-from slow_encoder import GEAR, I_L, I_M, B, F, K, bench, session
 
 from sms_online.pipeline.beforehand import Beforehand, Penalty
 from sms_online.pipeline.criterion import OVERLAP, Columns, RowGrams, minimum
 from sms_online.pipeline.estimator import Estimator
 from sms_online.stream import Array
 from sms_online.trackers.interface import Prior
+from tests.evaluated import judged, standard_deviation
+from tests.slow_encoder import GEAR, I_L, I_M, B, F, K, bench, session
 
 
 def _alone(n: int) -> tuple[Columns, Beforehand]:

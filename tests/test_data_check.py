@@ -8,12 +8,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from axis import AXIS, axis_block
 
 import sms_online as sms
 from sms_online.description.parse import parse_system
 from sms_online.stream import Array
 from sms_tools.cli import main
+from tests.axis import AXIS, axis_block
 
 SENSORS = """
 [[sensor]]

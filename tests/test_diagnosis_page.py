@@ -12,7 +12,6 @@ from xml.etree import ElementTree
 
 import numpy as np
 import pytest
-from axis import AXIS, axis_block
 
 from sms_adapters.capture import CaptureWriter
 from sms_adapters.system_file import load_system
@@ -32,6 +31,7 @@ from sms_tools.html_report.diagnosis_page import write_diagnosis
 from sms_tools.report import Document
 from sms_tools.view.places import places_of
 from sms_tools.view.scene import Scene
+from tests.axis import AXIS, axis_block
 
 COULOMB = 0.2  # N m
 # rad/s; where the axis turns, its filter's half width of 14 samples blurs the speed by up to 11 rad/s² times 0.07 s.

@@ -8,8 +8,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from evaluated import standard_deviation
-from exactly_known import exactly_known
 from numpy.testing import assert_allclose
 
 from sms_adapters.system_file import load_system
@@ -31,6 +29,8 @@ from sms_online.row_types import row_types
 from sms_online.stream import Array
 from sms_online.trackers.factor import solve
 from sms_sim.simulate import sampled_blocks, simulate
+from tests.evaluated import standard_deviation
+from tests.exactly_known import exactly_known
 
 
 @cache

@@ -7,10 +7,10 @@ import re
 from pathlib import Path
 
 import numpy as np
-from guide import fading
-from tracker_rows import PI_TRUE, N, exciting_rows, rows_of
 
 from sms_online.trackers import RecursiveLeastSquares, Rows
+from tests.guide import fading
+from tests.tracker_rows import PI_TRUE, N, exciting_rows, rows_of
 
 ROOT = Path(__file__).parents[1]
 LARGEST_README = 6000  # bytes

@@ -6,11 +6,11 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
-from saved import resumed
 
 from sms_online.stream import Array
 from sms_online.trackers import Prior, RecursiveLeastSquares, Rows
 from sms_online.trackers.drift import STEP, LearnedTrend
+from tests.saved import resumed
 
 N = 4
 TRUE = np.array([3.0, -1.0, 2.0, 0.5])

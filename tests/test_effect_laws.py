@@ -7,8 +7,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from guide import windage
-from model_systems import paper, random_states, spatial
 from numpy.testing import assert_allclose
 
 from sms_online.description.schema import Effect, Inertia, RigidBody, System
@@ -19,6 +17,8 @@ from sms_online.errors import InputError
 from sms_online.model.effect import Inputs
 from sms_online.model.model import Model
 from sms_online.stream import Array
+from tests.guide import windage
+from tests.model_systems import paper, random_states, spatial
 
 GEAR, K = 50.0, 1000.0  # of both joints of the planar example
 STATES = 12

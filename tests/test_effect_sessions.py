@@ -9,9 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
-from saved import resumed
 from scipy.integrate import solve_ivp
-from simulations import planar
 
 from sms_adapters.truth import read_truth
 from sms_online.cramer_rao import cramer_rao_bound
@@ -36,6 +34,8 @@ from sms_sim.plant import Plant
 from sms_sim.realtime import RealTimeStepper
 from sms_sim.simulate import Simulation, exact_states, sampled_blocks, simulate
 from sms_tools.cli import main
+from tests.saved import resumed
+from tests.simulations import planar
 
 FORCES = (
     "viscous_friction@joint_1:damping=2",

@@ -9,13 +9,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from model_systems import paper
 
 from sms_online.description.schema import Effect
 from sms_online.diagnosis.constants import is_constant
 from sms_online.effects import catalogue
 from sms_online.effects.build import build_model
 from sms_online.effects.catalogue import BEGINNING, CLASSES, ENTRIES, NAMES, candidates
+from tests.model_systems import paper
 
 ROOT = Path(__file__).parent.parent
 OUTSIDE = sorted(

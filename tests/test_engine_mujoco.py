@@ -8,7 +8,15 @@ import mujoco
 import numpy as np
 import pytest
 import scipy.linalg
-from engine_mujoco import (
+from numpy.testing import assert_allclose
+
+from sms_adapters.system_file import load_system
+from sms_online.description.schema import FlexibleLink, System
+from sms_online.pipeline.estimator import Estimator
+from sms_online.stream import Block
+from sms_sim.sensors import GRADES
+from sms_sim.simulate import sampled_blocks, simulate
+from tests.engine_mujoco import (
     CELLS,
     IMPLICIT_STEP,
     STEP,
@@ -19,15 +27,7 @@ from engine_mujoco import (
     mujoco_capture,
     with_noise,
 )
-from exactly_known import exactly_known
-from numpy.testing import assert_allclose
-
-from sms_adapters.system_file import load_system
-from sms_online.description.schema import FlexibleLink, System
-from sms_online.pipeline.estimator import Estimator
-from sms_online.stream import Block
-from sms_sim.sensors import GRADES
-from sms_sim.simulate import sampled_blocks, simulate
+from tests.exactly_known import exactly_known
 
 SYSTEM = load_system("paper-planar-exact")
 # Roots of the cantilever, Blevins, Formulas for Natural Frequency and Mode Shape (1979), table 8-1.

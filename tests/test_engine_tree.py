@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from engine_tree import tree_capture
-from exactly_known import exactly_known
 
 from sms_online.description.parse import parse_system
 from sms_online.pipeline.estimator import Estimator
 from sms_sim.simulate import sampled_blocks, simulate
+from tests.engine_tree import tree_capture
+from tests.exactly_known import exactly_known
 
 # Coarse links, whose static deflections are exact: the motion starts without a jolt and is slow against their modes.
 CELLS, STEP = 8, 1.25e-4

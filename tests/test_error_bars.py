@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from axis import AXIS, DAMPING, INERTIA
-from evaluated import standard_deviation
 
 from sms_online.description.parse import parse_system
 from sms_online.pipeline.estimator import Estimator
 from sms_online.stream import Array, Block
+from tests.axis import AXIS, DAMPING, INERTIA
+from tests.evaluated import standard_deviation
 
 SEEDS = 40
 SECONDS, RATE = 10.0, 200.0

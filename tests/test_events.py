@@ -6,10 +6,6 @@ from functools import cache
 
 import numpy as np
 import pytest
-from axis import AXIS, DAMPING, INERTIA
-from changed_session import changed_session, noisy
-from evaluated import judged, results_document, standard_deviation
-from saved import resumed
 
 from sms_adapters.system_file import load_system
 from sms_online.description.parse import parse_system
@@ -25,6 +21,10 @@ from sms_online.trackers.factor import solve, triangular_factor
 from sms_online.trackers.information import Information
 from sms_sim.simulate import Simulation
 from sms_tools.report import trust_lines
+from tests.axis import AXIS, DAMPING, INERTIA
+from tests.changed_session import changed_session, noisy
+from tests.evaluated import judged, results_document, standard_deviation
+from tests.saved import resumed
 
 PLANAR = load_system("paper-planar")
 CHANGE = 10.0  # s

@@ -7,7 +7,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from axis import AXIS, MOTION
 
 import sms_online as sms
 from sms_adapters.system_file import load_system
@@ -20,6 +19,7 @@ from sms_sim.references import FourierReference
 from sms_sim.simulate import exact_states, simulate
 from sms_tools.cli import main
 from sms_tools.trajectory_file import reference_lines, system_text
+from tests.axis import AXIS, MOTION
 
 MOVED = (AXIS + MOTION).replace("duration = 6.0", "duration = 3.0")
 ONE_SINE = MOVED.replace(", { frequency = 5.0, cosine = 0.3 }", "")

@@ -6,8 +6,6 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
-from batch_solution import batch_least_squares
-from tracker_rows import ALL_FORGETTING, PI_TRUE, TRACKERS, N, exciting_rows, ill_conditioned_rows, kalman, rows_of
 
 from sms_online.stream import Array
 from sms_online.trackers import (
@@ -21,6 +19,17 @@ from sms_online.trackers import (
     SlidingWindow,
 )
 from sms_online.trackers.memory import BLOCK_ROWS
+from tests.batch_solution import batch_least_squares
+from tests.tracker_rows import (
+    ALL_FORGETTING,
+    PI_TRUE,
+    TRACKERS,
+    N,
+    exciting_rows,
+    ill_conditioned_rows,
+    kalman,
+    rows_of,
+)
 
 
 def test_exponential_forgetting_is_least_squares_with_geometric_weights() -> None:

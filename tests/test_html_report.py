@@ -12,7 +12,6 @@ from xml.etree import ElementTree
 
 import numpy as np
 import pytest
-from evaluated import results_document
 
 from sms_adapters.capture import CaptureWriter
 from sms_adapters.system_file import load_system
@@ -30,6 +29,7 @@ from sms_tools.html_report.page import _residual, write_report
 from sms_tools.html_report.paper_example import figure_6
 from sms_tools.html_report.parameter_rows import error_bar
 from sms_tools.view.scene import Scene
+from tests.evaluated import results_document
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
 WARNING = "a warning with <angle brackets>"

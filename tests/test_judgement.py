@@ -5,14 +5,14 @@ from __future__ import annotations
 from dataclasses import replace
 
 import pytest
-from axis import AXIS, axis_block
-from evaluated import judged, results_document
 
 from sms_online.description.parse import parse_system
 from sms_online.judgement import CHECK_ROWS, Discrepancy, Dispute, Facts, judge, judge_diagnosis, place_of
 from sms_online.nominal import Apart, Comparison
 from sms_online.pipeline.estimator import Estimator
 from sms_online.trust import LONGEST_SENTENCE, Residual
+from tests.axis import AXIS, axis_block
+from tests.evaluated import judged, results_document
 
 QUIET = {"energy": Residual(None, None), "joint_1": Residual(0.01, 1.1), "joint_2": Residual(0.02, 0.9)}
 GOOD = Facts(determined=(15, 16), undetermined=("motor_2.stator_inertia",), residual=QUIET)

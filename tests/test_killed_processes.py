@@ -15,11 +15,11 @@ from typing import Any
 
 import pytest
 import rerun_cli
-from axis import AXIS, DAMPING, INERTIA, MOTION
-from bus_streams import DBC, SOURCES
 
 from sms_tools.cli import main
 from sms_tools.live.simulated import GROUP, SimulatedArm
+from tests.axis import AXIS, DAMPING, INERTIA, MOTION
+from tests.bus_streams import DBC, SOURCES
 
 pytestmark = pytest.mark.realtime
 PATIENCE = 40.0  # s, of a loaded machine

@@ -6,10 +6,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from axis import AXIS
-from bus_streams import AxisBus, axis_testbed, merged
-from evaluated import results_document
-from saved import resumed
 
 from sms_online.description.parse import parse_system
 from sms_online.description.schema import Sensor, System
@@ -20,6 +16,10 @@ from sms_online.pipeline.latency import Latencies, LatencyColumns, SourceGroup, 
 from sms_online.pipeline.sensing import Sensing
 from sms_online.pipeline.synchronise import GridSamples
 from sms_online.stream import Block
+from tests.axis import AXIS
+from tests.bus_streams import AxisBus, axis_testbed, merged
+from tests.evaluated import results_document
+from tests.saved import resumed
 
 
 def session(folder: Path, drive: float, encoder: float) -> tuple[System, list[Block]]:

@@ -8,15 +8,9 @@ from collections.abc import Callable
 from functools import cache
 from pathlib import Path
 
-import bus_streams
 import numpy as np
 import pytest
-from axis import AXIS
-from axis_effects import COGGING, SYSTEM, axis_block, cogging
-from bus_streams import axis_testbed
-from evaluated import results_document
 from rerun.chunk import RrdReader
-from test_live_session import Bench, patience
 
 from sms_adapters.capture import CaptureWriter
 from sms_adapters.searches import NAME, Repeated, searcher_of
@@ -30,6 +24,12 @@ from sms_online.pipeline.momentum_windows import HOPS
 from sms_online.stream import Array
 from sms_tools.cli import main
 from sms_tools.live.searches import SearchProcess
+from tests import bus_streams
+from tests.axis import AXIS
+from tests.axis_effects import COGGING, SYSTEM, axis_block, cogging
+from tests.bus_streams import axis_testbed
+from tests.evaluated import results_document
+from tests.test_live_session import Bench, patience
 
 BEGIN = 8.0  # s
 # Waiting for another process, s: rather a failure than a suite that hangs.

@@ -9,13 +9,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from axis import DAMPING, INERTIA
-from bus_streams import LINES, SOURCES, AxisBus, axis_testbed, estimated, in_order, merged
 from numpy.typing import NDArray
 
 from sms_adapters.can_reader import BUS_OFF
 from sms_adapters.raw import ERROR_FRAME, CanFrames, SerialChunk, concatenate_frames
 from sms_online.description.schema import System
+from tests.axis import DAMPING, INERTIA
+from tests.bus_streams import LINES, SOURCES, AxisBus, axis_testbed, estimated, in_order, merged
 
 SECONDS = 20.0
 

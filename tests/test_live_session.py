@@ -12,9 +12,6 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from axis import DAMPING, INERTIA
-from bus_streams import AxisBus, axis_testbed
-from evaluated import results_document, standard_deviation
 
 from sms_adapters.checkpoint import read_checkpoint
 from sms_adapters.clock_lanes import merger
@@ -34,6 +31,9 @@ from sms_tools.live.feed import Feed, Interpreter, SessionClock
 from sms_tools.live.latency import Latencies
 from sms_tools.live.loop import LiveSession
 from sms_tools.live.status import Leading, News, StatusWriter, line, screen
+from tests.axis import DAMPING, INERTIA
+from tests.bus_streams import AxisBus, axis_testbed
+from tests.evaluated import results_document, standard_deviation
 
 SPEED = 10.0
 

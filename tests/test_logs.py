@@ -10,7 +10,6 @@ import h5py
 import numpy as np
 import pandas as pd
 import pytest
-from bags import path_of, write_json_mcap, write_ros1, write_ros2
 from mcap.reader import make_reader
 from rosbags.rosbag2 import StoragePlugin
 from scipy.io import savemat
@@ -19,6 +18,7 @@ import sms_online as sms
 from sms_online.description.parse import parse_system, shipped_text
 from sms_online.errors import InputError
 from sms_tools.cli import main
+from tests.bags import path_of, write_json_mcap, write_ros1, write_ros2
 
 BAG, TABLE = "bag", "table"
 

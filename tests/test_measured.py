@@ -6,7 +6,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from evaluated import results_document, standard_deviation
 
 from sms_adapters.importers import import_emps, import_quanser
 from sms_adapters.sources import open_source
@@ -16,6 +15,7 @@ from sms_online.pipeline.estimator import Estimator
 from sms_online.pipeline.rates import smooth_and_differentiate
 from sms_online.stream import Array
 from sms_online.trackers.interface import Prior
+from tests.evaluated import results_document, standard_deviation
 
 DATA = Path(__file__).resolve().parents[1].parent / "shared" / "data"
 EMPS = DATA / "emps" / "DATA_EMPS.mat"

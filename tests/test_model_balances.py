@@ -6,13 +6,13 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
-from model_systems import SYSTEMS, difference, move, paper, random_states, spatial
 from scipy.integrate import solve_ivp
 
 from sms_online.description.schema import System
 from sms_online.effects.build import build_model
 from sms_online.model.model import Model
 from sms_online.stream import Array
+from tests.model_systems import SYSTEMS, difference, move, paper, random_states, spatial
 
 all_systems = pytest.mark.parametrize("system", SYSTEMS.values(), ids=SYSTEMS.keys())
 

@@ -6,12 +6,12 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
-from model_systems import paper, random_states
 
 from sms_online.description.schema import Effect
 from sms_online.effects.build import build_model
 from sms_online.errors import InputError
 from sms_online.stream import Array
+from tests.model_systems import paper, random_states
 
 LAWS: dict[str, tuple[str, Callable[[Array, float], Array]]] = {
     "viscous_friction": ("damping", lambda rate, n: -rate),

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from model_systems import DIFFERENCE, SYSTEMS, random_states
 from numpy.polynomial import Legendre
 from scipy.integrate import simpson
 from scipy.interpolate import CubicHermiteSpline
@@ -18,6 +17,7 @@ from sms_online.description.schema import FlexibleLink, Inertia, Joint, Motor, R
 from sms_online.effects.build import build_model
 from sms_online.model.layout import Layout
 from sms_online.stream import Array
+from tests.model_systems import DIFFERENCE, SYSTEMS, random_states
 
 # Instants of the differences, s. The step leaves 1e-16/STEP of rounding and STEP⁸ of truncation.
 STEP = 2e-3

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from model_systems import difference, paper, planar_link, spatial_link
 from scipy.interpolate import CubicHermiteSpline
 from scipy.linalg import expm
 from scipy.spatial.transform import Rotation
@@ -15,6 +14,7 @@ from sms_online.model.beam import LinearLink
 from sms_online.model.flexible import LinkKinematics
 from sms_online.model.rod import ExactRod
 from sms_online.stream import Array
+from tests.model_systems import difference, paper, planar_link, spatial_link
 
 LENGTH = 1.2
 # Rounding over the step of the differences.

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from model_systems import paper, random_states
 
 from sms_online.effects.build import build_model
 from sms_online.model.model import Model
 from sms_online.stream import Array
+from tests.model_systems import paper, random_states
 
 RELATIVE = 1e-12
 CASES = [(kinematics, free) for kinematics in ("linear", "exact") for free in (True, False)]

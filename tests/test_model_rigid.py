@@ -6,7 +6,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from model_systems import random_states, rigid_chain
 
 from sms_online.description.schema import Inertia, RigidBody, RigidLink, System
 from sms_online.effects.build import build_model
@@ -14,6 +13,7 @@ from sms_online.model.layout import Layout
 from sms_online.model.model import Model
 from sms_online.model.so3 import RotationVector
 from sms_online.stream import Array
+from tests.model_systems import random_states, rigid_chain
 
 pin: Any = pytest.importorskip("pinocchio", reason="Pinocchio (pip package `pin`) is the yardstick of the rigid case")
 

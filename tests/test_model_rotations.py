@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import numpy as np
-from model_systems import difference, random_states, spatial
 from scipy.spatial.transform import Rotation
 
 from sms_online.effects.build import build_model
 from sms_online.model import so3
 from sms_online.model.layout import build_layout
+from tests.model_systems import difference, random_states, spatial
 
 
 def test_exponential_and_logarithm_up_to_half_a_turn() -> None:

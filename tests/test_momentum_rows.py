@@ -4,11 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from axis import AXIS, DAMPING, INERTIA
-from evaluated import results_document
-from model_systems import FRICTION, paper, spatial
-from prescribed_motion import prescribed
-from saved import resumed
 
 from sms_adapters.system_file import load_system
 from sms_online.description.parse import parse_system
@@ -23,6 +18,11 @@ from sms_online.pipeline.smoothing import stride
 from sms_online.pipeline.weak_form import test_function as weak_test_function
 from sms_online.stream import Array, Block
 from sms_sim.simulate import Simulation, exact_states
+from tests.axis import AXIS, DAMPING, INERTIA
+from tests.evaluated import results_document
+from tests.model_systems import FRICTION, paper, spatial
+from tests.prescribed_motion import prescribed
+from tests.saved import resumed
 
 SPAN = 0.4  # s
 # Of positions of some rad differenced at 1 kHz, over the sum of the sizes of a row's terms: 4e-13 found.

@@ -6,12 +6,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from evaluated import judged
 
 import sms_online as sms
 from sms_online.nominal import compare, unit_factors
 from sms_online.pipeline.estimator import Estimator
 from sms_online.trust import Trust
+from tests.evaluated import judged
 
 GEAR = 100.0
 # One flexible joint and a rigid link, on a fixed base; noise stated, so that a session of 12 s is enough.

@@ -7,11 +7,6 @@ from functools import cache
 
 import numpy as np
 import pytest
-from axis import DAMPING, INERTIA
-from axis_effects import BARE, COGGING, PHASE, SYSTEM, axis_block, cogging, nothing
-from changed_session import changed_session, noisy
-from evaluated import elsewhere, results_document
-from saved import resumed
 
 from sms_adapters.system_file import load_system
 from sms_online.description.schema import Effect, System
@@ -22,6 +17,11 @@ from sms_online.pipeline.estimator import Estimator
 from sms_online.pipeline.statistics import Statistics
 from sms_online.stream import Block
 from sms_sim.simulate import Simulation
+from tests.axis import DAMPING, INERTIA
+from tests.axis_effects import BARE, COGGING, PHASE, SYSTEM, axis_block, cogging, nothing
+from tests.changed_session import changed_session, noisy
+from tests.evaluated import elsewhere, results_document
+from tests.saved import resumed
 
 PLANAR = load_system("paper-planar")
 BEGIN = 8.0  # s

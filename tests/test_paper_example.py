@@ -6,9 +6,6 @@ import json
 
 import numpy as np
 import pytest
-from batch_solution import batch_least_squares
-from evaluated import results_document, standard_deviation
-from keeping_tracker import KeepingTracker
 
 from sms_adapters.checkpoint import read_checkpoint, write_checkpoint
 from sms_adapters.system_file import load_system
@@ -19,6 +16,9 @@ from sms_online.model.base_parameters import find_base_parameters
 from sms_online.pipeline.estimator import Estimator
 from sms_online.stream import Array, Block
 from sms_sim.simulate import Simulation, exact_states, simulate
+from tests.batch_solution import batch_least_squares
+from tests.evaluated import results_document, standard_deviation
+from tests.keeping_tracker import KeepingTracker
 
 NAMES = (
     "spacecraft.inertia_about_joint_1",

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
-from plain_rig import bound_of, plain_rig
 
 from sms_online.pipeline.estimator import Estimator
 from sms_sim.simulate import exact_states, sampled_blocks, simulate
+from tests.plain_rig import bound_of, plain_rig
 
 SEED = 0
 

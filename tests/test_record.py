@@ -10,11 +10,11 @@ from time import monotonic
 
 import can
 import pytest
-from axis import AXIS
 
 from sms_tools.cli import main
 from sms_tools.live.simulated import GROUP
 from sms_tools.verbs.record import _can
+from tests.axis import AXIS
 
 
 def test_a_bus_has_the_options_of_its_interface() -> None:

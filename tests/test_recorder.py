@@ -14,7 +14,6 @@ from types import SimpleNamespace
 import can
 import numpy as np
 import pytest
-from bus_streams import AxisBus, axis_testbed, merged
 
 from sms_adapters import recorder as recorder_module
 from sms_adapters.raw import ERROR_FRAME, EXTENDED, FD_FRAME, MOST_BYTES, REMOTE_FRAME, CanFrames, SerialChunk
@@ -25,6 +24,7 @@ from sms_adapters.sources import open_source
 from sms_online.errors import InputError
 from sms_online.stream import Array
 from sms_tools.results_file import results_directory
+from tests.bus_streams import AxisBus, axis_testbed, merged
 
 EPOCH = 1_700_000_000_123_456
 HEADER = SessionHeader(EPOCH, {"drive": "can", "encoder": "serial"}, 0.0, {"numpy": np.__version__})

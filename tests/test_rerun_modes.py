@@ -11,8 +11,9 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from axis import AXIS, MOTION, capture_lines
-from test_killed_processes import described_testbed, kill, start_arm, start_viewer, until
+
+from tests.axis import AXIS, MOTION, capture_lines
+from tests.test_killed_processes import described_testbed, kill, start_arm, start_viewer, until
 
 PATIENCE = 60.0  # s, of a loaded machine
 STAYS = "the view stays until Ctrl-C"

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from axis import AXIS
-from saved import resumed
 from scipy.integrate import quad
 from scipy.stats import chi2
 
@@ -17,6 +15,8 @@ from sms_online.pipeline.momentum_windows import HOPS
 from sms_online.pipeline.residual_test import NOISE, SequentialTest, _ratio
 from sms_online.stream import Array
 from sms_online.trackers.factor import triangular_factor
+from tests.axis import AXIS
+from tests.saved import resumed
 
 LAYOUT = build_layout(load_system("paper-planar"))
 HOP = 0.04  # s

@@ -6,7 +6,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from bus_streams import SOURCES, AxisBus, axis_testbed, ticks
 
 from sms_adapters.checkpoint import write_checkpoint
 from sms_adapters.clock_lanes import merger
@@ -22,6 +21,7 @@ from sms_online.pipeline.estimator import Estimator
 from sms_online.stream import Array, Block
 from sms_tools.live.loop import CHECKPOINT
 from sms_tools.live.testbed import open_testbed
+from tests.bus_streams import SOURCES, AxisBus, axis_testbed, ticks
 
 TURN = 6.283185307179586
 TURNING = 3.0  # rad/s on average: eight seconds are nearly four turns

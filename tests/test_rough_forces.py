@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from model_systems import FRICTION, paper
-from prescribed_motion import prescribed
 
 from sms_online.description.schema import Effect
 from sms_online.effects.build import build_model
@@ -16,6 +14,8 @@ from sms_online.pipeline.momentum_windows import COPIES, STEPS, Window
 from sms_online.pipeline.standstill import Standstill
 from sms_online.stream import Array, Block
 from sms_sim.plant import Plant
+from tests.model_systems import FRICTION, paper
+from tests.prescribed_motion import prescribed
 
 SPAN = 0.4  # s
 RATE = 1000.0

@@ -6,9 +6,6 @@ from dataclasses import dataclass
 
 import numpy as np
 import pytest
-from axis import AXIS
-from model_systems import FRICTION, paper, spatial
-from prescribed_motion import prescribed
 
 from sms_adapters.system_file import load_system
 from sms_online.description.parse import parse_system
@@ -27,6 +24,9 @@ from sms_online.pipeline.weak_form import test_function as weak_test_function
 from sms_online.pipeline.whitening import ROUNDING, Whitener, Whitening
 from sms_online.stream import Array
 from sms_sim.plant import Plant
+from tests.axis import AXIS
+from tests.model_systems import FRICTION, paper, spatial
+from tests.prescribed_motion import prescribed
 
 SPAN = 0.4  # s
 # Small enough that rows are linear in it, large against rounding. rad and m; N m of the joint torque.

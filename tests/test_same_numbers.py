@@ -6,9 +6,10 @@ import json
 import re
 
 import pytest
-from net import RECORDED
-from net.numbers import Numbers, differences, environment, numbers
-from net.sessions import QUICK, SESSIONS
+
+from tests.net import RECORDED
+from tests.net.numbers import Numbers, differences, environment, numbers
+from tests.net.sessions import QUICK, SESSIONS
 
 ESTIMATE = re.compile(r"(whole|continued)\.parameters\[.*\]\.estimate$")
 # Where other libraries or another processor round differently: estimates agree to this share of their standard

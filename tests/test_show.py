@@ -12,14 +12,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from model_systems import tree
-from recordings import columns
 
 import sms_online as sms
 from sms_online.effects.build import build_model
 from sms_tools.cli import main
 from sms_tools.view.described import channel_table
 from sms_tools.view.scene import Scene
+from tests.model_systems import tree
+from tests.recordings import columns
 
 
 def test_a_tree_is_drawn_with_frames_and_channels(tmp_path: Path) -> None:

@@ -6,9 +6,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from axis import AXIS, axis_block
-from bus_streams import AxisBus, axis_testbed, merged
-from test_live_session import Bench
 
 import sms_online as sms
 from sms_adapters.raw import SerialChunk
@@ -17,6 +14,9 @@ from sms_online.description.parse import parse_system
 from sms_online.description.schema import System
 from sms_online.pipeline.estimator import Estimator
 from sms_online.stream import Block
+from tests.axis import AXIS, axis_block
+from tests.bus_streams import AxisBus, axis_testbed, merged
+from tests.test_live_session import Bench
 
 
 @pytest.fixture

@@ -15,7 +15,6 @@ from typing import Any
 import can
 import numpy as np
 import pytest
-from axis import AXIS, DAMPING, INERTIA, MOTION
 
 from sms_adapters.can_reader import frames_of, open_bus
 from sms_adapters.clock_lanes import lanes
@@ -34,6 +33,7 @@ from sms_sim.plant import Plant
 from sms_sim.simulate import sampled_blocks, simulate
 from sms_tools.cli import main
 from sms_tools.live.simulated import SimulatedArm, write_testbed
+from tests.axis import AXIS, DAMPING, INERTIA, MOTION
 
 MOVED = AXIS + MOTION
 

@@ -9,9 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from evaluated import elsewhere, results_document, standard_deviation
 from numpy.testing import assert_array_equal
-from one_link import TEXT, one_link
 
 from sms_adapters.capture import CaptureWriter
 from sms_adapters.checkpoint import read_checkpoint, write_checkpoint
@@ -32,6 +30,8 @@ from sms_sim.plant import Plant
 from sms_sim.sensors import Sensors
 from sms_sim.simulate import Simulation, exact_states, sampled_blocks, simulate
 from sms_tools.cli import main
+from tests.evaluated import elsewhere, results_document, standard_deviation
+from tests.one_link import TEXT, one_link
 
 SEEDS = 6
 MISSING = ("link_1.marker_1.theta_z", "link_1.marker_2.theta_z")

@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
-from one_link import one_link
 
 from sms_online.description.channels import channels
 from sms_online.description.parse import parse_system, shipped_text
@@ -19,6 +18,7 @@ from sms_online.smoother.collocation import Transitions, defects
 from sms_online.smoother.filter import FixedIntervalSmoother
 from sms_online.stream import Array
 from sms_sim.simulate import Simulation, exact_states, simulate
+from tests.one_link import one_link
 
 DISPLACEMENTS = [0, 2]  # of the two markers' u_y, theta_z
 

@@ -10,11 +10,11 @@ from typing import Any
 
 import numpy as np
 import pytest
-from axis import AXIS, axis_block
 
 import sms_online as sms
 from sms_adapters.raw import LostDevice, SerialChunk
 from sms_online.description.parse import parse_system
+from tests.axis import AXIS, axis_block
 
 HOW_TO = Path(__file__).parents[1] / "docs" / "how-to"
 RIG = '[joint_1]\nstiffness = 100.0\n[motor_1]\nrotor_inertia = 0.001\n[link_1]\nkind = "rigid"\n'

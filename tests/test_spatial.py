@@ -7,10 +7,6 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from campaigns.sessions import disguised, true_parameters
-from conftest import noise_free_block
-from evaluated import standard_deviation
-from simulations import simulated, until
 
 from sms_adapters.system_file import load_system
 from sms_online.cramer_rao import cramer_rao_bound
@@ -22,6 +18,10 @@ from sms_online.stream import Array
 from sms_sim.plant import Plant
 from sms_sim.sensors import Sensors
 from sms_sim.simulate import Simulation, exact_states, sampled_blocks, simulate
+from tests.campaigns.sessions import disguised, true_parameters
+from tests.conftest import noise_free_block
+from tests.evaluated import standard_deviation
+from tests.simulations import simulated, until
 
 GRADE = "A"
 ACCURACY = 1e-3

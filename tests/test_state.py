@@ -9,10 +9,7 @@ from typing import Any, NamedTuple
 import msgspec
 import numpy as np
 import pytest
-from axis import AXIS, axis_block
-from net.sessions import SESSIONS
 from numpy.typing import NDArray
-from saved import resumed
 
 from sms_online.checkpoint import Checkpoint
 from sms_online.description.parse import parse_system
@@ -21,6 +18,9 @@ from sms_online.errors import InputError
 from sms_online.pipeline.estimator import Estimator
 from sms_online.state import Saved, Stage, State, collect, encode, snapshot
 from sms_online.stream import Array
+from tests.axis import AXIS, axis_block
+from tests.net.sessions import SESSIONS
+from tests.saved import resumed
 
 
 @dataclass(frozen=True)

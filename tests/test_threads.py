@@ -10,7 +10,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 import scipy.linalg  # noqa: F401  # with its BLAS
-from axis_effects import BARE, axis_block, nothing
 from threadpoolctl import threadpool_info, threadpool_limits
 
 from sms_adapters.system_file import load_system
@@ -20,6 +19,7 @@ from sms_online.pipeline.estimator import Estimator
 from sms_online.pipeline.observer import Observer
 from sms_online.threads import one_blas_thread
 from sms_sim.simulate import sampled_blocks, simulate
+from tests.axis_effects import BARE, axis_block, nothing
 
 MORE = 2
 # A session of the seven-joint arm, whose matrices are large enough to be split; pushed whole or sample by sample.
@@ -29,7 +29,7 @@ import numpy as np
 from sms_adapters.system_file import load_system
 from sms_online.pipeline.estimator import Estimator
 from sms_online.pipeline.observer import Observer
-from evaluated import results_document
+from tests.evaluated import results_document
 from sms_online.stream import Block
 
 with np.load(sys.argv[1]) as saved:

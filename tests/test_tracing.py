@@ -6,8 +6,6 @@ from dataclasses import dataclass
 
 import numpy as np
 import pytest
-from guide import windage
-from model_systems import paper
 from numpy.typing import NDArray
 
 from sms_online.description.schema import Effect
@@ -21,6 +19,8 @@ from sms_online.effects.catalogue import ENTRIES
 from sms_online.model.parameters import Parameter
 from sms_online.pipeline.momentum_windows import HOPS
 from sms_online.stream import Array
+from tests.guide import windage
+from tests.model_systems import paper
 
 WINDOWS, SPEEDS = 300, 2
 FOLDS = Folds.of(np.zeros(WINDOWS, dtype=np.int64), np.arange(WINDOWS, dtype=float))

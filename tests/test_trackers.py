@@ -8,10 +8,7 @@ from functools import partial
 import msgspec
 import numpy as np
 import pytest
-from batch_solution import batch_least_squares
-from saved import resumed
 from scipy.signal import lfilter
-from tracker_rows import ALL_FORGETTING, PI_TRUE, TRACKERS, N, exciting_rows, ill_conditioned_rows, kalman, rows_of
 
 from sms_online.state import snapshot
 from sms_online.stream import Array
@@ -29,6 +26,18 @@ from sms_online.trackers import (
     Tracker,
 )
 from sms_online.trackers.memory import BLOCK_ROWS
+from tests.batch_solution import batch_least_squares
+from tests.saved import resumed
+from tests.tracker_rows import (
+    ALL_FORGETTING,
+    PI_TRUE,
+    TRACKERS,
+    N,
+    exciting_rows,
+    ill_conditioned_rows,
+    kalman,
+    rows_of,
+)
 
 
 def split(rows: Rows, seed: int, longest: int) -> Iterator[Rows]:

@@ -9,7 +9,6 @@ from xml.etree import ElementTree
 
 import numpy as np
 import pytest
-from model_systems import random_states
 
 from sms_adapters.urdf import import_urdf
 from sms_adapters.urdf_export import export_urdf
@@ -20,6 +19,7 @@ from sms_online.errors import InputError
 from sms_online.model.base_parameters import find_base_parameters
 from sms_online.stream import Array
 from sms_tools.cli import main
+from tests.model_systems import random_states
 
 pin: Any = pytest.importorskip("pinocchio", reason="Pinocchio (pip package `pin`) is the yardstick of URDFs")
 pytest.importorskip("yourdfpy", reason="URDFs are read by yourdfpy (the extra `urdf`)")

@@ -7,11 +7,11 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from axis import AXIS, axis_block
-from recordings import columns, scalars
 
 from sms_adapters.capture import CaptureWriter
 from sms_tools.cli import main
+from tests.axis import AXIS, axis_block
+from tests.recordings import columns, scalars
 
 pytestmark = pytest.mark.slow
 COULOMB = 0.2  # N m

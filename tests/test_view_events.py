@@ -8,9 +8,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from axis import AXIS, DAMPING, INERTIA
-from evaluated import elsewhere, results_document
-from recordings import scalars
 from rerun.chunk import RrdReader
 
 from sms_adapters.capture import CaptureWriter
@@ -19,6 +16,9 @@ from sms_online.pipeline.estimator import Estimator
 from sms_online.pipeline.statistics import Statistics
 from sms_online.stream import Block
 from sms_tools.cli import main
+from tests.axis import AXIS, DAMPING, INERTIA
+from tests.evaluated import elsewhere, results_document
+from tests.recordings import scalars
 
 RATE, CHANGE, SECONDS = 200.0, 10.0, 20.0
 SYSTEM = parse_system(AXIS, "axis.toml")

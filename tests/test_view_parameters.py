@@ -9,7 +9,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 import rerun as rr
-from recordings import columns
 
 from sms_adapters.system_file import load_system
 from sms_online.effects.build import build_model
@@ -25,6 +24,7 @@ from sms_tools.view.parameter_groups import MOST_LINES, Basis, parameter_groups,
 from sms_tools.view.residuals import RecentResidual
 from sms_tools.view.style import BAD, GOOD, residual_colors
 from sms_tools.view.table import markdown_table
+from tests.recordings import columns
 
 
 def about(parameters: Sequence[Parameter]) -> Basis:

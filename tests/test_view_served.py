@@ -13,12 +13,12 @@ from typing import Any
 from urllib.parse import unquote, urlsplit
 
 import pytest
-from axis import AXIS, capture_lines
 from rerun.blueprint import Blueprint
-from test_killed_processes import kill, until
 
 from sms_tools.view.choice import Choice
 from sms_tools.view.sink import Sink
+from tests.axis import AXIS, capture_lines
+from tests.test_killed_processes import kill, until
 
 pytestmark = pytest.mark.realtime
 STAYS = "the view stays until Ctrl-C"

@@ -14,8 +14,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from evaluated import elsewhere, results_document
-from recordings import columns, scalars
 from rerun.blueprint import Corner2D
 
 from sms_adapters.capture import CaptureWriter
@@ -31,6 +29,8 @@ from sms_sim.simulate import Simulation, sampled_blocks
 from sms_tools.cli import main
 from sms_tools.view.blueprint import _Plots
 from sms_tools.view.session import open_view, references
+from tests.evaluated import elsewhere, results_document
+from tests.recordings import columns, scalars
 
 # Of the example's motion: enough for its first weights, every marker moving, and a recording of a few batches' size.
 SECONDS = 8.0

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-from model_systems import paper
-from prescribed_motion import prescribed
 
 from sms_online.effects.build import build_model
 from sms_online.model.base_parameters import find_base_parameters
@@ -17,6 +15,8 @@ from sms_online.pipeline.weighing import Weighing
 from sms_online.pipeline.window_noise import WindowNoise
 from sms_online.stream import Array
 from sms_sim.plant import Plant
+from tests.model_systems import paper
+from tests.prescribed_motion import prescribed
 
 SPAN = 0.4  # s
 POSITION_NOISE, TORQUE_NOISE = 1e-4, 0.5  # rad and m, N m

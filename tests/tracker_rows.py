@@ -6,7 +6,6 @@ from collections.abc import Callable
 from functools import partial
 
 import numpy as np
-from guide import fading
 
 from sms_online.stream import Array
 from sms_online.trackers import (
@@ -21,6 +20,7 @@ from sms_online.trackers import (
     SlidingWindow,
     Tracker,
 )
+from tests.guide import fading
 
 ALL_FORGETTING: tuple[Forgetting, ...] = (NoForgetting(), Exponential(0.999), SlidingWindow(1000), Directional(0.999))
 N = 6

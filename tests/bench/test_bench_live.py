@@ -21,9 +21,6 @@ from time import perf_counter
 
 import numpy as np
 import pytest
-from axis import AXIS, DAMPING, INERTIA
-from changed_session import changed_session
-from evaluated import standard_deviation
 
 from sms_adapters.capture import CaptureWriter
 from sms_adapters.checkpoint import write_checkpoint
@@ -46,6 +43,9 @@ from sms_sim.sensors import Sensors
 from sms_sim.simulate import simulate
 from sms_tools.html_report.history import History
 from sms_tools.live.simulated import SimulatedArm, write_testbed
+from tests.axis import AXIS, DAMPING, INERTIA
+from tests.changed_session import changed_session
+from tests.evaluated import standard_deviation
 
 # Length of a repetition, s: 20 s of motion and a pause.
 PERIOD = 20.5

@@ -11,11 +11,11 @@ from typing import Any
 
 import numpy as np
 import pytest
-from model_systems import random_states, rigid_chain
-from test_model_rigid import Yardstick
 
 from sms_online.description.parse import parse_system, shipped_text
 from sms_online.effects.build import build_model
+from tests.model_systems import random_states, rigid_chain
+from tests.test_model_rigid import Yardstick
 
 pin: Any = pytest.importorskip("pinocchio", reason="Pinocchio (pip package `pin`) is the yardstick of the rigid case")
 

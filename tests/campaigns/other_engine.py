@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import sys
 from dataclasses import dataclass
 from pathlib import Path
 from time import process_time
@@ -27,10 +26,7 @@ from sms_online.pipeline.estimator import Estimator
 from sms_online.stream import Block
 from tests.campaigns.accuracy import read
 from tests.campaigns.sessions import disguised, noisy_session, true_parameters
-
-# The engine is described beside the tests that compare it with the model.
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
-from engine_mujoco import EngineEffects, mujoco_capture
+from tests.engine_mujoco import EngineEffects, mujoco_capture
 
 GRADE, SEED = "B", 3
 DURATION = 20.0  # s

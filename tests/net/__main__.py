@@ -9,15 +9,11 @@ from __future__ import annotations
 import argparse
 import json
 import sys
-from pathlib import Path
 from time import process_time
 
-# As pytest has it, where the sessions come from.
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
-
-from net import RECORDED
-from net.numbers import differences, environment, numbers
-from net.sessions import SESSIONS
+from tests.net import RECORDED
+from tests.net.numbers import differences, environment, numbers
+from tests.net.sessions import SESSIONS
 
 
 def main() -> int:

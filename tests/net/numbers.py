@@ -16,7 +16,6 @@ import scipy
 import scipy.linalg
 from threadpoolctl import threadpool_info
 
-from net.sessions import Session
 from sms_adapters.checkpoint import read_checkpoint, write_checkpoint
 from sms_online.checkpoint import Checkpoint
 from sms_online.description.schema import Tolerances
@@ -29,6 +28,7 @@ from sms_online.pipeline.statistics import Statistics
 from sms_online.priors import base_prior
 from sms_online.result import result_of
 from sms_online.stream import Block
+from tests.net.sessions import Session
 
 # Number, name, or None where there is none, by its path in the documents.
 Value = float | int | bool | str | None

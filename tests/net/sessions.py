@@ -9,11 +9,6 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 import numpy as np
-from axis import DAMPING
-from axis_effects import BARE, SYSTEM, axis_block, cogging, nothing
-from bus_streams import AxisBus, axis_testbed
-from changed_session import changed_session, noisy
-from one_link import one_link
 
 from sms_adapters.recorder import Recorder
 from sms_adapters.session_log import SessionHeader
@@ -24,6 +19,11 @@ from sms_online.description.schema import Effect, System
 from sms_online.effects.catalogue import parse_effect
 from sms_online.stream import Block
 from sms_sim.simulate import sampled_blocks, simulate
+from tests.axis import DAMPING
+from tests.axis_effects import BARE, SYSTEM, axis_block, cogging, nothing
+from tests.bus_streams import AxisBus, axis_testbed
+from tests.changed_session import changed_session, noisy
+from tests.one_link import one_link
 
 TOLERANCE = 1e-8  # m, rad: of the simulations, far below the noise
 QUANSER_MOTION = """

@@ -1,0 +1,1 @@
+"""Tests, and the campaigns, recorded sessions and benchmarks beside them."""
