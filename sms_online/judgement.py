@@ -11,7 +11,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 from sms_online.nominal import AS_STATED, Comparison
-from sms_online.trust import Reason, Residuals, Trust
+from sms_online.trust import Reason, Residual, Residuals, Trust
 
 # A joint whose unexplained torque reaches this share of the measured one lacks an effect, whatever the error bars say.
 LARGEST_RESIDUAL = 0.5
@@ -223,12 +223,29 @@ def _unexplained_torques(residual: Residuals) -> list[Reason]:
     shares = {name: share for name, rows in residual.items() if (share := rows.relative) is not None}
     out = []
     for name, share in sorted(shares.items(), key=lambda item: -item[1]):
-        if share > LARGEST_RESIDUAL:
+        if share > LARGEST_RESIDUAL and not _noise_alone(residual[name]):
             percent = f"{100.0 * share:.0f} % of the torque or force of {name} is not explained"
             means = "the model lacks an effect there, and the parameters bend to replace it"
             mark = f"{100.0 * share:.0f} % unexplained"
             out.append(Reason(percent, True, (name,), mark, f"{percent}: {means}", CHECK_TORQUE))
     return out
+
+
+def _noise_alone(rows: Residual) -> bool:
+    """Whether rows hold no more than their sensors' noise."""
+    return rows.whitened is not None and rows.whitened <= NOISE_WHITENED
+
+
+def _weak_torques(residual: Residuals) -> list[Reason]:
+    """Torques that are little more than their noise: the motion is too weak, and nothing is known to be missing."""
+    shares = {name: rows.relative for name, rows in residual.items() if rows.relative is not None}
+    weak = {name: share for name, share in shares.items() if share > LARGEST_RESIDUAL and _noise_alone(residual[name])}
+    if not weak:
+        return []
+    most = max(weak, key=lambda name: weak[name])
+    percent = 100.0 * min(1.0, weak[most])
+    text = f"weak data: {percent:.0f} % of the torque or force of {_listed(sorted(weak))} is noise"
+    return [Reason(text, False, tuple(weak), "weak data", then=MOVE)]
 
 
 def _loud_rows(residual: Residuals) -> list[Reason]:
@@ -278,6 +295,7 @@ def _cautions(facts: Facts) -> list[Reason]:
     """What makes some of the numbers, or their bars, worse than they look."""
     out = [each for each in facts.miscalibrated if not each.grave]
     out += [Reason(text, False) for text in (*facts.troubles, *facts.weaknesses)]
+    out = [*_weak_torques(facts.residual), *out]
     out += [*_beyond_noise(facts.residual), *_apart(facts.comparison)]
     if vital := [name for name in facts.undetermined if name.endswith(VITAL)]:
         out.append(Reason(f"not determined: {_listed(vital)}", False, place_of(vital[0]), "not determined", then=MOVE))

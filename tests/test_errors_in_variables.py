@@ -54,6 +54,38 @@ def test_the_shift_undoes_a_known_attenuation(sigma: float) -> None:
     assert abs(found + bias.correction(np.array([True]))[0][0] - TRUE) < 8.0 * error
 
 
+@pytest.mark.parametrize("sigma", [1.5, 5.0])
+def test_what_noise_hides_is_not_determined(sigma: float) -> None:
+    """Noise makes most of the column: its correction would be anything, and counts as a deviation. Seed 3."""
+    rows, noisy = scalar_problem(sigma, seed=3)
+    found = least_squares(rows)[0]
+    shift, covariance = gathered(rows, noisy).correction(np.array([True]))
+    std = np.sqrt(covariance[0, 0])
+    assert shift[0] == 0.0
+    assert found < 3.0 * std
+    assert abs(found - TRUE) < 2.0 * std
+
+
+def test_what_noise_hides_leaves_other_directions_corrected() -> None:
+    """The sum of two parameters is seen through noise of 0.3, their difference through 5. Seed 4."""
+    (sum_rows, sum_noisy), (rows, noisy) = scalar_problem(0.3, seed=4), scalar_problem(5.0, seed=5)
+    turn = np.array([[1.0, 1.0], [1.0, -1.0]])
+
+    def joined(first: Array, second: Array) -> Array:
+        """Rows of both, [Y b], of parameters whose sum and difference are 2 each: 2 and 0."""
+        every = np.concatenate((np.outer(first[:, 0], turn[0]), np.outer(second[:, 0], turn[1])))
+        return np.column_stack((every, np.concatenate((first[:, 1], second[:, 1]))))
+
+    every = joined(sum_rows, rows)
+    both = np.stack([joined(*each) for each in zip(sum_noisy, noisy, strict=True)])
+    mixed = np.random.default_rng(6).permutation(len(every))
+    shift, covariance = gathered(every[mixed], both[:, mixed]).correction(np.array([True, True]))
+    found = least_squares(every) + shift
+    assert abs(turn[0] @ found - 2.0) < 0.02
+    assert np.sqrt(turn[0] @ covariance @ turn[0]) < 0.02
+    assert abs(turn[1] @ found - 2.0) < 2.0 * np.sqrt(turn[1] @ covariance @ turn[1])
+
+
 @pytest.mark.parametrize("sigma", [0.1, 0.3])
 def test_the_covariance_is_that_of_the_second_order(sigma: float) -> None:
     """Noise u in the column adds -β u² to the score: 2 β² σ⁴ a row, and as much again from the shift. Seed 8.

@@ -7,7 +7,7 @@ from dataclasses import replace
 import pytest
 
 from sms_online.description.parse import parse_system
-from sms_online.judgement import CHECK_ROWS, Discrepancy, Dispute, Facts, judge, judge_diagnosis, place_of
+from sms_online.judgement import CHECK_ROWS, MOVE, Discrepancy, Dispute, Facts, judge, judge_diagnosis, place_of
 from sms_online.nominal import Apart, Comparison
 from sms_online.pipeline.estimator import Estimator
 from sms_online.trust import LONGEST_SENTENCE, Residual
@@ -31,11 +31,23 @@ def test_what_nothing_speaks_against_is_trusted_and_its_reach_is_told() -> None:
     assert judgement.others == ("not determined: motor_2.stator_inertia",)
 
 
+def test_a_torque_that_is_mostly_noise_is_weak_data() -> None:
+    """Nothing is known to be missing where the sensors' noise explains what is left."""
+    judgement = judge(with_row("joint_1", relative=0.96))
+    assert (judgement.level, judgement.grave) == ("doubt", False)
+    assert judgement.grounds[0].text == "weak data: 96 % of the torque or force of joint_1 is noise"
+    assert judgement.grounds[0].then == MOVE
+
+
 @pytest.mark.parametrize(
     ("facts", "said", "marks"),
     [
         (with_row("joint_2", whitened=62.0), "the residual of joint_2 is 62 × noise", {"joint_2": "62 × noise"}),
-        (with_row("joint_1", relative=0.96), "96 % of the torque or force of joint_1", {"joint_1": "96 % unexplained"}),
+        (
+            with_row("joint_1", relative=0.96, whitened=2.0),
+            "96 % of the torque or force of joint_1",
+            {"joint_1": "96 % unexplained"},
+        ),
         (replace(GOOD, discrepancies=(LACKING,)), "lacks coulomb_friction@joint_2", {"joint_2": "coulomb friction"}),
         (
             replace(GOOD, discrepancies=(Discrepancy("link_1", 3.0, "noticed"),)),
@@ -247,7 +259,7 @@ def test_a_judgement_is_plain_data_in_results() -> None:
 def test_beside_every_grave_doubt_stands_what_to_do_next() -> None:
     for facts in (
         with_row("joint_2", whitened=62.0),
-        with_row("joint_1", relative=0.96),
+        with_row("joint_1", relative=0.96, whitened=2.0),
         replace(GOOD, discrepancies=(LACKING,)),
         replace(GOOD, discrepancies=(Discrepancy("base", 3.0, "unexplained"),)),
         replace(GOOD, alarm="base"),

@@ -30,8 +30,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sms_online.pipeline.beforehand import WIDENED, Beforehand, Penalty
-from sms_online.pipeline.momentum_windows import EXPONENT, HOPS
-from sms_online.pipeline.weak_form import test_function
+from sms_online.pipeline.momentum_windows import OVERLAP
 from sms_online.state import State
 from sms_online.stream import Array
 from sms_online.trackers.factor import masked_covariance
@@ -49,16 +48,6 @@ LEAST_NOISE = 0.1
 ROUNDED = 16.0
 # A step is halved until it gains this share of what the slope promises, so many times at most.
 SUFFICIENT, HALVINGS = 1e-4, 30
-
-
-def _overlap() -> float:
-    """How many windows share one error that each row has of its own, hop by hop, as test functions overlap."""
-    phi, _, _ = test_function(100 * HOPS, 1.0, EXPONENT)
-    return float(phi.sum() ** 2 / (phi @ phi) / 100.0)
-
-
-# Whitening does not separate windows whose rows leave more than noise: so many of them count as one.
-OVERLAP = _overlap()
 
 
 class RowGrams(State):

@@ -24,9 +24,9 @@ from sms_online.trackers.interface import Estimate
 CLUSTER = 20
 # A shift counts from so many of its standard deviations on.
 EVIDENCE = 2.0
-# A column of whose square noise makes this share or more holds nothing that an expansion about its exact value could
-# correct.
-LARGEST_SHARE = 0.5
+# Along a direction of whose information noise makes this share or more nothing is corrected, for small errors of the
+# share would be large ones of the correction. What it would be counts as a deviation, with this share at most.
+LARGEST_SHARE, CAPPED_SHARE = 0.5, 0.99
 # When there are so many clusters, neighbours merge.
 MOST_CLUSTERS = 128
 
@@ -83,34 +83,42 @@ class NoiseBias(State):
         errors e = l + q of first and of second order, Yᵀ e holds Y₀ᵀ q + Lᵀ l besides Y₀ᵀ l, and the pair changes the
         score by the same function of a noise of the same law. Even orders of Gaussian noise do not correlate with odd
         ones, so the variances add: that of the second order to that of the first, and to both that of the shift.
-        Zero where nothing is determined, and for columns that are noise.
+        Where noise makes most of the information along a direction, the motion does not determine it: least squares
+        attenuate it by an unknown factor. There the shift is zero and its size a deviation. Zero where nothing is
+        determined.
         """
         shift, covariance = np.zeros(determined.size), np.zeros((determined.size, determined.size))
-        clusters = self._clusters
-        changed = np.diag(clusters.sum(axis=0))[:-1]
-        kept = np.flatnonzero(determined & (changed < LARGEST_SHARE * np.diag(self.gram)[:-1]))
-        rows = np.append(kept, determined.size)
+        known = np.flatnonzero(determined)
+        rows = np.append(known, determined.size)
         size = np.sqrt(np.diag(self.gram)[rows])
-        if kept.size == 0 or not (size > 0.0).all():
+        if known.size == 0 or not (size > 0.0).all():
             return shift, covariance
         scale = np.outer(size, size)
         gram = self.gram[np.ix_(rows, rows)] / scale
-        clusters = clusters[:, rows[:, None], rows] / scale
-        corrected = gram - clusters.sum(axis=0)
-        biased = np.linalg.solve(gram[:-1, :-1], gram[:-1, -1])
-        whole = np.linalg.solve(corrected[:-1, :-1], corrected[:-1, -1]) - biased
+        clusters = self._clusters[:, rows[:, None], rows] / scale
+        changed = clusters.sum(axis=0)
+        # Directions of unit information, and the share of it that noise makes.
+        root = np.linalg.inv(np.linalg.cholesky(gram[:-1, :-1])).T
+        share, axes = np.linalg.eigh(root.T @ changed[:-1, :-1] @ root)
+        directions = root @ axes
+        biased = directions @ (directions.T @ gram[:-1, -1])
+        free = (directions.T @ (gram - changed)[:-1, -1]) / (1.0 - np.minimum(share, CAPPED_SHARE))
+        moved = free - directions.T @ gram[:-1, -1]
+        lost = share >= LARGEST_SHARE
+        whole = directions @ np.where(lost, 0.0, moved)
         # Each cluster's part of it, to first order.
-        parts = np.linalg.solve(gram[:-1, :-1], (clusters[:, :-1] @ np.append(biased, -1.0)).T)
+        parts = directions @ (directions.T @ (clusters[:, :-1] @ np.append(biased, -1.0)).T)
         scatter = np.sum(parts**2, axis=1)
         doubt = EVIDENCE**2 * scatter
         certain = 1.0 - np.divide(doubt, whole**2, out=np.ones_like(doubt), where=whole**2 > doubt)
         unit = size[-1] / size[:-1]
-        shift[kept] = certain * whole * unit
+        shift[known] = certain * whole * unit
         count = parts.shape[1]
         if count > 1:
             parts = (parts - parts.mean(axis=1, keepdims=True)) * np.sqrt(count / (count - 1.0))
-        parts = np.concatenate((parts, certain[:, None] * parts), axis=1) * unit[:, None]
-        covariance[np.ix_(kept, kept)] = parts @ parts.T
+        parts = np.concatenate((parts, certain[:, None] * parts, directions[:, lost] * moved[lost]), axis=1)
+        parts *= unit[:, None]
+        covariance[np.ix_(known, known)] = parts @ parts.T
         return shift, covariance
 
     @property

@@ -16,11 +16,12 @@ from sms_online.model.model import Model
 from sms_online.pipeline.beforehand import Beforehand
 from sms_online.pipeline.changes import Adoption, Changes
 from sms_online.pipeline.criterion import RowGrams, ScaleFree
+from sms_online.pipeline.description import nearer
 from sms_online.pipeline.drift_line import DriftLine
 from sms_online.pipeline.errors_in_variables import NoiseBias, unbiased
 from sms_online.pipeline.latency import Latencies, clock_groups, source_groups
 from sms_online.pipeline.momentum_balance import MomentumBalance, half_hop
-from sms_online.pipeline.momentum_fit import DETERMINED, FIRST_MOTION, MomentumFit, WhiteRows
+from sms_online.pipeline.momentum_fit import FIRST_MOTION, MomentumFit, WhiteRows
 from sms_online.pipeline.momentum_windows import COPIES, HOPS, INSTANTS
 from sms_online.pipeline.residual_test import SequentialTest
 from sms_online.pipeline.sensing import Sensing
@@ -227,12 +228,8 @@ class Momentum(Stage):
         return Beforehand(certain, self._calibration[may])
 
     def _solved(self) -> Array:
-        """Nuisances and β where the rows determine them, else NaN."""
-        estimate, m = self._joint(), len(self.nuisances)
-        known = estimate.determined.copy()
-        if self.misfit:
-            known[m:] &= np.abs(estimate.pi[m:]) > DETERMINED * estimate.std[m:]
-        return np.where(known, estimate.pi, np.nan)
+        """Nuisances and β, of the rows and, where these say little, of the description."""
+        return nearer(self._joint(), *self.fit.described)
 
     def observe(self, t: Array, values: Array) -> None:
         """Take the channels' own samples (B, channels) at t (B,), NaN where there is none, to tell their noise."""

@@ -25,6 +25,7 @@ from sms_online.model.base_parameters import BaseParameters
 from sms_online.model.model import Model
 from sms_online.pipeline.beforehand import Beforehand, fitted
 from sms_online.pipeline.criterion import Columns, RowGrams, minimum
+from sms_online.pipeline.description import described
 from sms_online.pipeline.drift_line import DriftLine
 from sms_online.pipeline.latency import SourceGroup
 from sms_online.pipeline.momentum_balance import MomentumBalance
@@ -136,7 +137,7 @@ class MomentumFit(Stage):
     """Whitens the windows of a session, segment by segment.
 
     new_noise: makes what propagates noise, for the same model, base and balance. solve: gives the estimate so far of
-    nuisances and β (m + n,), NaN where nothing is known of it. sources: whose latencies are told. calibration: rows
+    nuisances and β (m + n,), which weights follow. sources: whose latencies are told. calibration: rows
     [N Y b] (k, m + n + 1) of what is known of the nuisances beforehand. beforehand: gives all that is known beside the
     rows. drift: gives the known drift in the window that ends at a grid index. weighing: who weighs now.
     """
@@ -162,6 +163,9 @@ class MomentumFit(Stage):
             np.arange(-self._nuisances, base.n), np.flatnonzero(np.isin(base.independent, model.inertial))
         )
         self.columns = Columns(self._nuisances, tuple(gains), inertial)
+        nuisances = np.zeros(self._nuisances)
+        value, size = described(model, base)
+        self.described = np.concatenate((nuisances, value)), np.concatenate((nuisances, size))
         self._balance = balance
         self._solve, self._drift = solve, drift
         self._beforehand = beforehand if beforehand is not None else lambda: Beforehand.none(self._nuisances + base.n)
@@ -330,12 +334,10 @@ class MomentumFit(Stage):
         """
         if self.state.since < self.state.renewal:
             return
-        estimate = self._solve()
-        nuisances, beta = np.nan_to_num(estimate[: self._nuisances]), estimate[self._nuisances :]
-        beta = np.where(np.isnan(beta), self._known_weights, beta)
+        joint = self._solve()
+        beta = joint[self._nuisances :]
         self.state.since = 0
         self.state.renewal = min(2 * self.state.renewal, self._count(LATEST_RENEWAL))
-        joint = np.concatenate((nuisances, beta))
         self.plain.judge(joint)
         if self.plain.misfit.any() and self._nuisances:
             beta = self._calibrated(joint)[self._nuisances :]
@@ -412,6 +414,7 @@ class MomentumFit(Stage):
         weighed = self._weigh(window, columns, errors)
         white, ramp = np.split(weighed.rows, [columns.shape[1] - self._ramps], axis=1)
         white = white.reshape(n_v, COPIES, -1).swapaxes(0, 1)
+        noisy = 0.5 * (rows[1] - rows[2])
         ramp = ramp - centre * white[0, :, : self._ramps]
         raw, drift = rows[0], self._drift(window.end)
         if drift is not None:
@@ -421,7 +424,10 @@ class MomentumFit(Stage):
             columns, white_columns = weighed.calibration
             raw = np.concatenate((columns, raw), axis=1)
             white = np.concatenate((np.broadcast_to(white_columns, (COPIES, *columns.shape)), white), axis=2)
-        self.plain.add(raw, np.diag(weighed.noise))
+        m = self._nuisances
+        self.plain.add(
+            raw, np.pad(noisy, ((0, 0), (m, 0))), np.diag(weighed.noise), np.pad(self._known_weights, (m, 0))
+        )
         unsteady = np.diag(UNSTEADY * sample**2)
         return WhiteRows(
             white[0], white[1:], raw, weighed.covariance + unsteady, weighed.noise + unsteady, window.end,

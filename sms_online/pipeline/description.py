@@ -1,0 +1,37 @@
+"""Described values as a loose prior of the values behind the weights.
+
+Weights need a value of every parameter, also of those that the motion does not determine. An estimate of these may be
+anything, and noise that is propagated with it hides everything else. Only weights know of this prior.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from sms_online.model.base_parameters import BaseParameters
+from sms_online.model.model import Model
+from sms_online.stream import Array
+from sms_online.trackers.interface import Estimate
+
+# Standard deviation of a described value, in units of its size.
+LOOSE = 1.0
+
+
+def described(model: Model, base: BaseParameters) -> tuple[Array, Array]:
+    """Nominal β (n,), and their sizes (n,), those of the physical parameters in them without their signs."""
+    pi = model.nominal
+    size = np.hypot(pi[list(base.independent)], np.linalg.norm(base.mixture * pi[list(base.dependent)], axis=1))
+    return base.values(pi), size
+
+
+def nearer(estimate: Estimate, value: Array, size: Array) -> Array:
+    """The estimate (n,) with described values (n,) as normal priors, LOOSE · size each; a size of zero is no prior."""
+    out = np.where(estimate.determined, estimate.pi, value)
+    known = np.flatnonzero(estimate.determined & (size > 0.0))
+    if not known.size:
+        return out
+    unit = LOOSE * size[known]
+    covariance = estimate.covariance[:, known] / unit
+    information = np.linalg.inv(covariance[known] / unit[:, None] + np.eye(known.size))
+    moved = covariance @ information @ ((value - estimate.pi)[known] / unit)
+    return np.where(estimate.determined, out + moved, out)
