@@ -251,7 +251,7 @@ class Evaluation:
                 distance=0.0 if projection is None else projection.distance,
                 comparison=self.comparison,
                 lost=lost / max(1, lost + now.samples),
-                outliers={channel: count / of for channel, (count, of) in now.outliers.items()},
+                outliers={channel: left.number / left.of for channel, left in now.outliers.items()},
                 discrepancies=self._discrepancies,
                 coloured={} if momentum is None else momentum.coloured,
                 miscalibrated=tuple(self._miscalibrated()),
@@ -414,7 +414,7 @@ class Evaluation:
             out.append(f"{now.counters.interpolated_cells} cells interpolated")
         coloured = {} if now.momentum is None else now.momentum.coloured
         out += [f"{channel}: noise is correlated over {1e3 * time:.2g} ms" for channel, time in coloured.items()]
-        out += [f"{channel}: {count} outliers left out" for channel, (count, _) in now.outliers.items()]
+        out += [f"{channel}: {left.number} outliers left out" for channel, left in now.outliers.items()]
         out += self.unstated_latency
         if now.setup.unused:
             out.append(f"channels not used: {', '.join(now.setup.unused)}")

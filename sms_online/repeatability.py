@@ -21,9 +21,8 @@ from numpy.typing import NDArray
 from scipy.stats import chi2, norm, t
 
 from sms_online.errors import InputError
-from sms_online.result import finite, json_text
 from sms_online.stream import Array
-from sms_online.tables import formatter, html_table, text_table
+from sms_online.tables import Tabled, finite, formatter, html_table, text_table
 
 SCHEMA = "sms-online/comparison/1"
 # Chance that a comparison without any change marks one, all its sessions and parameters together.
@@ -72,7 +71,7 @@ class Compared:
 
 
 @dataclass(frozen=True)
-class Comparison:
+class Comparison(Tabled):
     """Sessions of one rig, compared. sessions: their names. parameters, calibration: by name."""
 
     system: str
@@ -118,10 +117,6 @@ class Comparison:
             "parameters": [_document(each) for each in self.parameters.values()],
             "calibration": [_document(each) for each in self.calibration.values()],
         }
-
-    def to_json(self) -> str:
-        """The document as text; numbers that do not exist are null."""
-        return json_text(self.document())
 
     def __str__(self) -> str:
         return f"{text_table(*self.rows(), left=2)}\n\n{self.sentence}"

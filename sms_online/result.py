@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import difflib
-import json
-import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from html import escape
@@ -19,7 +17,7 @@ from sms_online.evaluation import NORMAL_95, Evaluation
 from sms_online.pipeline.events import Event
 from sms_online.pipeline.statistics import Method
 from sms_online.stream import Array
-from sms_online.tables import formatter, html_table, text_table
+from sms_online.tables import Documented, finite, formatter, html_table, text_table
 from sms_online.tracker_results import Drift, TrackerResult
 from sms_online.trust import Residual, Residuals, Trust
 
@@ -191,7 +189,7 @@ class Consistency:
 
 
 @dataclass(frozen=True)
-class Result:
+class Result(Documented):
     """What a session has identified, how well, and what was left over.
 
     system: as described. parameters: by name; after an event they, and residuals, are those since then. residuals: by
@@ -253,10 +251,6 @@ class Result:
             "warnings": list(self.warnings),
             "diagnosis": [dict(episode) for episode in self.diagnosis],
         }
-
-    def to_json(self) -> str:
-        """The text of results.json; numbers that do not exist are null."""
-        return json_text(self.document())
 
     def to_frame(self) -> pandas.DataFrame:
         """The parameters as a table of pandas, indexed by name; ImportError where pandas is not installed."""
@@ -343,7 +337,7 @@ def result_of(
         duration=now.duration,
         condition_number=estimate.condition_number,
         lost_samples=now.counters.lost_samples,
-        outliers={channel: count for channel, (count, _) in now.outliers.items()},
+        outliers={channel: left.number for channel, left in now.outliers.items()},
         throughput=throughput,
         calibration=tuple(evaluation.calibration),
         trackers=evaluation.trackers,
@@ -366,21 +360,3 @@ def event_document(event: Event) -> dict[str, Any]:
 def residual_document(residuals: Mapping[str, Residual]) -> dict[str, dict[str, float | None]]:
     """Residuals as the documents hold them."""
     return {rows: residual._asdict() for rows, residual in residuals.items()}
-
-
-def finite(value: float) -> float | None:
-    """A number as JSON knows it: None where it is infinite or none."""
-    return value if math.isfinite(value) else None
-
-
-def json_text(document: Any) -> str:
-    """A document as text; JSON knows no infinity and no NaN, which become null."""
-    return json.dumps(_finite(document), indent=2, ensure_ascii=False, allow_nan=False)
-
-
-def _finite(value: Any) -> Any:
-    if isinstance(value, dict):
-        return {key: _finite(item) for key, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [_finite(item) for item in value]
-    return finite(value) if isinstance(value, float) else value

@@ -1,10 +1,12 @@
-"""Numbers as people read them: digits by their standard deviation, and plain tables for a terminal and a notebook."""
+"""Results as people and programs read them: digits by their standard deviation, plain tables, JSON."""
 
 from __future__ import annotations
 
+import json
 import math
 from collections.abc import Callable, Sequence
 from html import escape
+from typing import Any
 
 # Significant digits of an estimate: as many as show two of its standard deviation, within these bounds.
 LEAST_DIGITS, MOST_DIGITS = 2, 7
@@ -41,3 +43,47 @@ def html_table(headings: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     head = "".join(f"<th>{escape(cell)}</th>" for cell in headings)
     body = "".join("<tr>" + "".join(f"<td>{escape(cell)}</td>" for cell in cells) + "</tr>" for cells in rows)
     return f"<table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table>"
+
+
+def finite(value: float) -> float | None:
+    """A number as JSON knows it: None where it is infinite or none."""
+    return value if math.isfinite(value) else None
+
+
+def json_text(document: Any) -> str:
+    """A document as text; JSON knows no infinity and no NaN, which become null."""
+    return json.dumps(_finite(document), indent=2, ensure_ascii=False, allow_nan=False)
+
+
+def _finite(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {key: _finite(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_finite(item) for item in value]
+    return finite(value) if isinstance(value, float) else value
+
+
+class Documented:
+    """A result that is written as a document of JSON."""
+
+    def document(self) -> dict[str, Any]:
+        """The same as plain lists, dictionaries and numbers."""
+        raise NotImplementedError
+
+    def to_json(self) -> str:
+        """The document as text; numbers that do not exist are null."""
+        return json_text(self.document())
+
+
+class Tabled(Documented):
+    """A result that is read as a table, on a terminal and in a notebook; its first two columns are aligned left."""
+
+    def rows(self) -> tuple[list[str], list[list[str]]]:
+        """Headings, and a row of cells for each line of the table."""
+        raise NotImplementedError
+
+    def __str__(self) -> str:
+        return text_table(*self.rows(), left=2)
+
+    def _repr_html_(self) -> str:
+        return html_table(*self.rows())

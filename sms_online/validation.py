@@ -17,11 +17,11 @@ from sms_online.errors import InputError
 from sms_online.model.base_parameters import BaseParameters
 from sms_online.pipeline.estimator import Estimator
 from sms_online.pipeline.joint_balance import SquaredResidual
-from sms_online.result import Parameters, json_text
+from sms_online.result import Parameters
 from sms_online.row_types import joint_rows
 from sms_online.session import Data, recorded_session
 from sms_online.stream import Array
-from sms_online.tables import html_table, text_table
+from sms_online.tables import Tabled, html_table, text_table
 
 SCHEMA = "sms-online/validation/1"
 # Parameters that predict another run within this multiple of what any parameters leave there hold for both.
@@ -52,7 +52,7 @@ class Predicted:
 
 
 @dataclass(frozen=True)
-class Validation:
+class Validation(Tabled):
     """A run predicted with everything fixed.
 
     system: with which description. duration: of the run, s. joints: `joint_i` to what is left of its torque; those
@@ -91,10 +91,6 @@ class Validation:
             "joints": {name: {"left": each.left, "least": each.least} for name, each in self.joints.items()},
             "warnings": list(self.warnings),
         }
-
-    def to_json(self) -> str:
-        """The text of validation.json."""
-        return json_text(self.document())
 
     def rows(self) -> tuple[list[str], list[list[str]]]:
         """Headings and cells of a table."""

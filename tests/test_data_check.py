@@ -60,8 +60,8 @@ def stuck(t: Array, q: Array) -> Array:
     return q
 
 
-def spiked(t: Array, q: Array) -> Array:
-    q[[500, 1800]] += (0.7, -0.5)
+def with_outliers(t: Array, q: Array) -> Array:
+    q[[500, 1000, 1800]] += (0.7, 0.1, -0.5)
     return q
 
 
@@ -82,7 +82,7 @@ def dropped(t: Array, q: Array) -> Array:
     ("change", "said"),
     [
         (stuck, "q_1: stuck at "),
-        (spiked, "q_1: 2 spikes, the first at 2.500 s"),
+        (with_outliers, "q_1: 3 outliers left out, the first at 2.500 s"),
         (wrapped, "q_1: wraps, "),
         (saturated, "q_1: saturated at "),
         (dropped, "q_1: 100 Hz, described as 200 Hz"),
@@ -146,9 +146,28 @@ def test_the_page_and_its_exit_codes(tmp_path: Path, capsys: pytest.CaptureFixtu
 
 def test_a_replay_begins_with_what_is_the_matter(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "axis.toml").write_text(AXIS + SENSORS)
-    sms.write_capture(capture(spiked), tmp_path / "run.csv")
+    sms.write_capture(capture(stuck), tmp_path / "run.csv")
     arguments = ["replay", str(tmp_path / "run.csv"), "--system", str(tmp_path / "axis.toml"), "--out", str(tmp_path)]
     assert main(arguments) == 0
-    assert "check: q_1: 1 spikes, the first at 2.500 s" in capsys.readouterr().err
+    assert "check: q_1: stuck at" in capsys.readouterr().err
     warnings = json.loads((tmp_path / "results.json").read_text())["warnings"]
-    assert "q_1: 2 spikes, the first at 2.500 s" in warnings
+    assert any(warning.startswith("q_1: stuck at") for warning in warnings)
+
+
+def test_the_check_and_the_estimate_count_the_same_outliers() -> None:
+    data = capture(with_outliers)
+    found, result = sms.check(SYSTEM, data), sms.estimate(SYSTEM, data)
+    assert result.outliers == {"q_1": 3}
+    assert "q_1: 3 outliers left out" in result.warnings
+    assert "q_1: 3 outliers left out, the first at 2.500 s" in found.lines
+
+
+def test_a_few_outliers_and_those_of_a_drive_are_no_reason_to_refuse() -> None:
+    block = axis_block(coulomb=0.0)
+    values = block.values.copy()
+    values[700, 1] += 0.3
+    values[900, 0] += 300.0
+    found = sms.check(SYSTEM, sms.Capture(block.t, block.channels, values))
+    assert found.passed
+    assert "force_1: 1 outliers, the first at 4.500 s" in found.lines
+    assert "q_1: 1 outliers left out, the first at 3.500 s" in found.lines

@@ -15,7 +15,8 @@ import numpy as np
 
 from sms_adapters.can_reader import frames_of
 from sms_adapters.candump import LoggedFrames
-from sms_adapters.lines import LineLog, LineReader
+from sms_adapters.files import reading
+from sms_adapters.lines import READABLE, LineLog, LineReader
 from sms_adapters.raw import MOST_BYTES, CanFrames, one_line
 from sms_online.errors import InputError
 
@@ -82,10 +83,8 @@ class BinaryLog:
     def __iter__(self) -> Iterator[LoggedFrames]:
         """The frames, some thousands at a time."""
         self._cut = ""
-        try:
+        with reading(self._path, READABLE):
             file = self._path.open("rb")
-        except OSError as error:
-            raise InputError(str(self._path), "", error.strerror or str(error), "a readable file") from None
         with file:
             reader = self._reader(file)
             size = self._path.stat().st_size

@@ -17,7 +17,7 @@ import numpy as np
 from cantools.database.can import Message, Signal
 from numpy.typing import NDArray
 
-from sms_adapters.raw import EXTENDED
+from sms_adapters.raw import EXTENDED, one_line
 from sms_online.description.explain import nearest
 from sms_online.description.sources import CanSource
 from sms_online.errors import InputError
@@ -224,7 +224,7 @@ def _read_dbc(place: str, name: str, directory: Path | None) -> cantools.databas
     try:
         database = cantools.database.load_string(text, "dbc")
     except (cantools.database.errors.Error, ValueError) as error:
-        raise InputError(place, f"dbc {name}", " ".join(str(error).split())[:120], "a readable DBC") from None
+        raise InputError(place, f"dbc {name}", one_line(error), "a readable DBC") from None
     assert isinstance(database, cantools.database.can.Database)  # what "dbc" always gives
     return database
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -58,7 +59,7 @@ class CandumpLog(LineLog):
         last = 0
         buses: dict[bytes, int] = {}
         for line, text in self._lines:
-            stamps, frames, bus = self._parse(line, text, buses)
+            stamps, frames, bus = parsed(self._path, line, text, buses)
             if not stamps.size:
                 continue
             back = np.diff(stamps, prepend=last) < 0
@@ -71,57 +72,63 @@ class CandumpLog(LineLog):
             timed = CanFrames(t, t, frames.id, frames.length, frames.data, frames.flags)
             yield LoggedFrames(timed, bus, tuple(name.decode("utf-8", "replace") for name in buses))
 
-    def _parse(
-        self, line: int, text: memoryview, buses: dict[bytes, int]
-    ) -> tuple[Places, CanFrames, NDArray[np.intp]]:
-        """Stamps (ns), frames without times, and buses of whole lines; new buses are put into `buses`."""
-        b = np.frombuffer(text, np.uint8)
-        end = np.flatnonzero(b == ord("\n"))
-        start = np.concatenate(([0], end[:-1] + 1)).astype(np.int64)
-        end = end - ((end > start) & (b[end - 1] == ord("\r")))
-        number = np.flatnonzero(end > start)
-        start, end = start[number], end[number]
-        directed = (b[end - 2] == ord(" ")) & ((b[end - 1] == ord("R")) | (b[end - 1] == ord("T")))
-        end = end - 2 * (directed & (end - start > 2))
 
-        # Where the parts of each line begin; where a line lacks one, the place lies outside of it.
-        point = _next(b, ".", start)
-        close = _next(b, ")", point)
-        space = _next(b, " ", np.minimum(close + 2, b.size - 1))
-        hash_ = _next(b, "#", space)
-        good = (b[start] == ord("(")) & (hash_ < end)
-        hash_ = np.minimum(hash_, b.size - 2)
-        good &= (b[np.minimum(close + 1, b.size - 1)] == ord(" ")) & (space > close + 2)
-        seconds, fits = _digits(b, start + 1, point, _SECONDS, 10)
-        good &= fits & (seconds <= _LATEST)
-        fraction, fits = _digits(b, point + 1, close, _FRACTION, 10)
-        good &= fits
-        fraction *= 10 ** (_FRACTION - np.clip(close - point - 1, 1, _FRACTION))
-        id_, fits = _digits(b, space + 1, hash_, _EXTENDED_DIGITS, 16)
-        long = hash_ - space - 1 == _EXTENDED_DIGITS
-        good &= fits & (long | (hash_ - space - 1 == _STANDARD_DIGITS))
-        fd = b[hash_ + 1] == ord("#")
-        after = np.minimum(hash_ + 1 + 2 * fd, b.size - 1)  # behind the flags of CAN FD, one digit
-        good &= ~fd | (_HEX[b[np.minimum(hash_ + 2, b.size - 1)]] != _NOT_HEX) & (after <= end)
-        remote = (b[after] == ord("R")) & (after < end)
-        good &= ~remote | (end - after == 1) | ((end - after == 2) & (_HEX[b[end - 1]] != _NOT_HEX))
-        length = np.where(remote, 0, (end - after) // 2)
-        good &= remote | ((end - after) % 2 == 0) & (length <= MOST_BYTES)
-        data, fits = _data(b, after, np.where(good, length, 0))
-        good &= fits
-        bus, fits = _names(b, close + 2, space, good, buses)
-        good &= fits
-        if not good.all():
-            k = int(number[good.argmin()])
-            found = repr(bytes(text).split(b"\n")[k][:60].decode("utf-8", "replace"))
-            expected = "(seconds) interface id#data, as candump -l writes"
-            raise InputError(str(self._path), f"line {line + k}", found, expected)
-        error = long & ((id_ & _ERROR_FLAG) != 0)
-        ids = np.where(long, id_ & (_ERROR_FLAG - 1) | EXTENDED, id_).astype(np.uint32)
-        flags = (error * ERROR_FRAME | remote * REMOTE_FRAME | fd * FD_FRAME).astype(np.uint8)
-        unknown = np.full(number.size, np.nan)
-        frames = CanFrames(unknown, unknown, ids, length.astype(np.uint8), data, flags)
-        return seconds * NANOSECONDS + fraction, frames, bus
+def parsed(
+    path: Path, line: int, text: memoryview, buses: dict[bytes, int]
+) -> tuple[Places, CanFrames, NDArray[np.intp]]:
+    """Stamps (N,), ns, frames without times, and buses (N,) of whole lines; new buses are put into `buses`.
+
+    path, line: of the file and of the first line, for the InputError of a malformed one.
+    """
+    b = np.frombuffer(text, np.uint8)
+    end = np.flatnonzero(b == ord("\n"))
+    start = np.concatenate(([0], end[:-1] + 1)).astype(np.int64)
+    end = end - ((end > start) & (b[end - 1] == ord("\r")))
+    number = np.flatnonzero(end > start)
+    start, end = start[number], end[number]
+    directed = (b[end - 2] == ord(" ")) & ((b[end - 1] == ord("R")) | (b[end - 1] == ord("T")))
+    end = end - 2 * (directed & (end - start > 2))
+
+    # Where the parts of each line begin; where a line lacks one, the place lies outside of it.
+    point = _next(b, ".", start)
+    close = _next(b, ")", point)
+    space = _next(b, " ", np.minimum(close + 2, b.size - 1))
+    hash_ = _next(b, "#", space)
+    good = (b[start] == ord("(")) & (hash_ < end)
+    hash_ = np.minimum(hash_, b.size - 2)
+    good &= (b[np.minimum(close + 1, b.size - 1)] == ord(" ")) & (space > close + 2)
+    seconds, fits = _digits(b, start + 1, point, _SECONDS, 10)
+    good &= fits & (seconds <= _LATEST)
+    fraction, fits = _digits(b, point + 1, close, _FRACTION, 10)
+    good &= fits
+    fraction *= 10 ** (_FRACTION - np.clip(close - point - 1, 1, _FRACTION))
+    id_, fits = _digits(b, space + 1, hash_, _EXTENDED_DIGITS, 16)
+    long = hash_ - space - 1 == _EXTENDED_DIGITS
+    good &= fits & (long | (hash_ - space - 1 == _STANDARD_DIGITS))
+    fd = b[hash_ + 1] == ord("#")
+    after = np.minimum(hash_ + 1 + 2 * fd, b.size - 1)  # behind the flags of CAN FD, one digit
+    good &= ~fd | (_HEX[b[np.minimum(hash_ + 2, b.size - 1)]] != _NOT_HEX) & (after <= end)
+    remote = (b[after] == ord("R")) & (after < end)
+    good &= ~remote | (end - after == 1) | ((end - after == 2) & (_HEX[b[end - 1]] != _NOT_HEX))
+    # A remote frame states how many bytes it asks for, and holds none.
+    asked = np.where(end - after == 2, _HEX[b[end - 1]], 0)
+    length = np.where(remote, asked, (end - after) // 2)
+    good &= remote | ((end - after) % 2 == 0) & (length <= MOST_BYTES)
+    data, fits = _data(b, after, np.where(good & ~remote, length, 0))
+    good &= fits
+    bus, fits = _names(b, close + 2, space, good, buses)
+    good &= fits
+    if not good.all():
+        k = int(number[good.argmin()])
+        found = repr(bytes(text).split(b"\n")[k][:60].decode("utf-8", "replace"))
+        expected = "(seconds) interface id#data, as candump -l writes"
+        raise InputError(str(path), f"line {line + k}", found, expected)
+    error = long & ((id_ & _ERROR_FLAG) != 0)
+    ids = np.where(long, id_ & (_ERROR_FLAG - 1) | EXTENDED, id_).astype(np.uint32)
+    flags = (error * ERROR_FRAME | remote * REMOTE_FRAME | fd * FD_FRAME).astype(np.uint8)
+    unknown = np.full(number.size, np.nan)
+    frames = CanFrames(unknown, unknown, ids, length.astype(np.uint8), data, flags)
+    return seconds * NANOSECONDS + fraction, frames, bus
 
 
 def _next(b: Bytes, character: str, start: Places) -> Places:

@@ -14,7 +14,8 @@ from cantools.database.can import Signal
 from cantools.database.conversion import BaseConversion
 
 from sms_adapters.can_signals import WantedMessage
-from sms_adapters.raw import EXTENDED
+from sms_adapters.files import reading
+from sms_adapters.raw import EXTENDED, one_line
 from sms_online.description.sources import CanopenSource
 from sms_online.errors import InputError
 
@@ -80,13 +81,13 @@ def _read_eds(place: str, name: str, node: int, directory: Path | None) -> Objec
         raise InputError(place, "kind", "the package canopen is not installed", expected) from None
     path = (directory or Path()) / name
     try:
-        return canopen.import_od(str(path), node)
-    except OSError as error:
-        raise InputError(str(path), "", error.strerror or str(error), "the EDS beside the system file") from None
+        with reading(path, "the EDS beside the system file"):
+            return canopen.import_od(str(path), node)
+    except InputError:
+        raise
     # Its parser lets through whatever a malformed entry raises.
     except Exception as error:
-        found = " ".join(str(error).split())[:120] or type(error).__name__
-        raise InputError(str(path), "", found, "a readable EDS") from None
+        raise InputError(str(path), "", one_line(error), "a readable EDS") from None
 
 
 def _pdos(od: ObjectDictionary, node: int) -> Iterator[_Pdo]:

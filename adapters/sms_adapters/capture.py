@@ -7,12 +7,12 @@ import re
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from types import TracebackType
 
 import numpy as np
 import pyarrow as pa
 import pyarrow.csv
 
+from sms_adapters.files import WholeFile
 from sms_adapters.lines import CHUNK, LineReader, sampled_line
 from sms_online.description.explain import nearest
 from sms_online.errors import InputError
@@ -159,7 +159,7 @@ class CaptureReader:
             raise InputError(str(self._path), f"line {number}", found, "times that do not go back")
 
 
-class CaptureWriter:
+class CaptureWriter(WholeFile):
     """Writes blocks as a capture; the file appears under its name when the context ends without an error.
 
     Floats are written as the shortest text that reads back to the same bits, NaN as an empty cell.
@@ -169,22 +169,14 @@ class CaptureWriter:
     def __init__(self, path: Path, channels: tuple[str, ...]) -> None:
         if path.suffix != ".csv":
             raise InputError(str(path), "", f"a capture named {path.name}", "a name ending in .csv or .mcap")
-        self._path = path
-        self._part = path.with_name(path.name + ".part")
+        super().__init__(path)
         self._names = ("t", *channels)
-        try:
-            self._file = self._part.open("wb")
-        except OSError as error:
-            raise InputError(str(path), "", error.strerror or str(error), "a file that can be written") from None
         self._file.write((",".join(self._names) + "\n").encode())
         self._csv = pyarrow.csv.CSVWriter(
             self._file,
             pa.schema([(name, pa.float64()) for name in self._names]),
             write_options=pyarrow.csv.WriteOptions(include_header=False, quoting_style="none"),
         )
-
-    def __enter__(self) -> CaptureWriter:
-        return self
 
     def write(self, block: Block) -> None:
         """Append the rows of a block; ValueError where its channels are not the file's."""
@@ -193,15 +185,8 @@ class CaptureWriter:
         columns = [pa.array(column, from_pandas=True) for column in (block.t, *block.values.T)]
         self._csv.write(pa.table(columns, names=list(self._names)))
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def _complete(self) -> None:
         self._csv.close()
-        self._file.close()
-        if kind is None:
-            self._part.replace(self._path)
-        else:
-            self._part.unlink()
 
 
 def _header(path: Path, line: str) -> tuple[str, ...]:

@@ -1,4 +1,4 @@
-"""One channel of a capture against its description: rate, holes, spikes, wraps, steps, and values that repeat."""
+"""One channel of a capture against its description: rate, holes, wraps, steps, and values that repeat."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 
 from sms_online.stream import Array
 
-# Samples that are judged together, with a scale of their own: enough for a median, less than a phase of a motion.
+# Samples that are judged together: enough for a median, less than a phase of a motion.
 CHUNK = 2048
 # First intervals whose median is the period.
 INTERVALS = 512
@@ -18,9 +18,6 @@ INTERVALS = 512
 RATE_TOLERANCE = 0.02
 # An interval of more periods than this is a hole, as for the synchroniser.
 HOLE = 5
-# A sample this many times further off its neighbours than half of its chunk's are is a spike, where they agree with
-# each other to RETURN of it. White noise goes no further than 9.
-SPIKE, RETURN = 20.0, 0.25
 # A step between two samples within this share of a whole turn is a turn.
 TURN, TURN_TOLERANCE = 2.0 * math.pi, 0.1
 # Steps are multiples of a resolution where they are so to this share of it, and no more of them fit the range.
@@ -62,18 +59,16 @@ class ChannelCheck:
     high: float = -math.inf
     longest: float = 0.0  # interval, s
     holes: int = 0
-    spikes: int = 0
     turns: int = 0
     held: dict[float, list[int]] = field(default_factory=dict)  # value: runs and samples in which the sensor hung at it
     _intervals: list[float] = field(default_factory=list)
     _first: float = math.nan
     _last: float = math.nan
-    _spike: float = math.nan  # time of the first, s
     _hole: float = math.nan
     _steps: float = math.inf  # smallest, while all are multiples of it
     _whole: bool = True
     _repeated: int = 0
-    _waiting: list[tuple[Array, Array]] = field(default_factory=list)
+    _waiting: list[Array] = field(default_factory=list)
     _held_at: float = math.nan
 
     def push(self, t: Array, values: Array) -> None:
@@ -95,8 +90,8 @@ class ChannelCheck:
         self._last = float(t[-1])
         self.samples += t.size
         self.low, self.high = min(self.low, float(values.min())), max(self.high, float(values.max()))
-        self._waiting.append((t, values))
-        if sum(part.size for part, _ in self._waiting) >= CHUNK:
+        self._waiting.append(values)
+        if sum(part.size for part in self._waiting) >= CHUNK:
             self._judge()
 
     def hung(self, values: Array) -> None:
@@ -117,32 +112,23 @@ class ChannelCheck:
         return float(np.median(self._intervals)) if len(self._intervals) >= LEAST else None
 
     def _judge(self) -> None:
-        """Look at the samples that wait, and keep the last two for the next ones."""
-        t, x = (np.concatenate(parts) for parts in zip(*self._waiting, strict=True))
-        self._waiting = [(t[-2:], x[-2:])]
-        steps = np.diff(x)
-        size = np.abs(steps)
+        """Look at the samples that wait, and keep the last one for the next ones."""
+        x = np.concatenate(self._waiting)
+        self._waiting = [x[-1:]]
+        size = np.abs(np.diff(x))
         if self.unit == "rad":
             usual = float(np.median(size))
             self.turns += int(np.count_nonzero(np.abs(size / TURN - 1.0) < TURN_TOLERANCE)) if usual < 0.1 * TURN else 0
-        off = np.abs(x[1:-1] - 0.5 * (x[:-2] + x[2:]))
         moved = size[size > 0.0]
-        smallest = float(moved.min(initial=math.inf))
-        scale = max(float(np.median(off)), smallest if math.isfinite(smallest) else 0.0)
-        # A turn is no spike: neighbours of a spike agree.
-        spikes = np.flatnonzero((off > SPIKE * scale) & (np.abs(x[2:] - x[:-2]) < RETURN * off))
-        self.spikes += spikes.size
-        if spikes.size and math.isnan(self._spike):
-            self._spike = float(t[spikes[0] + 1])
         self._repeated += int(np.count_nonzero(size == 0.0))
         if self._whole and moved.size:
-            self._steps = min(self._steps, smallest)
+            self._steps = min(self._steps, float(moved.min()))
             share = moved / self._steps
             self._whole = bool((np.abs(share - np.rint(share)) < WHOLE).all())
 
     def remarks(self) -> Iterator[Remark]:
         """What is the matter, by what has come so far."""
-        if sum(part.size for part, _ in self._waiting) > LEAST:
+        if sum(part.size for part in self._waiting) > LEAST:
             self._judge()
         if not self.samples:
             yield self._remark("no sample", True)
@@ -162,10 +148,6 @@ class ChannelCheck:
             yield self._remark(f"stuck at {value:.6g} {self.unit}, {count} samples", True)
         if self.turns:
             yield self._remark(f"wraps, {self.turns} steps of a whole turn: state `wrap` in its source", True)
-        if self.spikes:
-            # A drive may kick; a position cannot.
-            jumps = not self.unit.startswith("N")
-            yield self._remark(f"{self.spikes} spikes, the first at {self._spike:.3f} s", jumps)
         yield from self._of_steps()
 
     def _of_time(self) -> Iterator[Remark]:

@@ -2,18 +2,18 @@
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 
+from sms_adapters.files import part_of
 from sms_online.checkpoint import EXPECTED, Checkpoint
 from sms_online.errors import InputError
 
 
 def write_checkpoint(path: Path, checkpoint: Checkpoint) -> None:
     """Write a checkpoint; OSError where the disk refuses it."""
-    temporary = path.with_name(path.name + ".part")
-    temporary.write_bytes(checkpoint.to_bytes())
-    os.replace(temporary, path)
+    part = part_of(path)
+    part.write_bytes(checkpoint.to_bytes())
+    part.replace(path)
 
 
 def read_checkpoint(path: Path) -> Checkpoint:

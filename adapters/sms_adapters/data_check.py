@@ -12,15 +12,16 @@ import numpy as np
 
 from sms_adapters.channel_check import ChannelCheck, Remark
 from sms_adapters.stuck import StuckGuard
-from sms_online.description.channels import channel_unit, sensed_channels
+from sms_online.description.channels import channel_unit, drive_channels, sensed_channels
 from sms_online.description.given import Given, given_system
 from sms_online.description.schema import System
 from sms_online.errors import InputError
+from sms_online.judgement import MANY_OUTLIERS
 from sms_online.pipeline.estimator import Estimator
-from sms_online.result import json_text
+from sms_online.pipeline.outliers import LeftOut, Outliers
 from sms_online.session import Data, recorded_session
 from sms_online.stream import Array, Block
-from sms_online.tables import html_table, text_table
+from sms_online.tables import Tabled, html_table, text_table
 
 SCHEMA = "sms-online/check/1"
 UNDETERMINED = "not at all"
@@ -49,7 +50,7 @@ class CheckedChannel:
 
 
 @dataclass(frozen=True)
-class Check:
+class Check(Tabled):
     """What a capture is worth to a system, before it is estimated from.
 
     channels: by name. remarks: what is the matter. determined: how well the motion and its sensors determine each
@@ -102,10 +103,6 @@ class Check:
             "channels": [vars(channel) for channel in self.channels.values()],
             "determined_percent": dict(self.determined),
         }
-
-    def to_json(self) -> str:
-        """The document as text; numbers that do not exist are null."""
-        return json_text(self.document())
 
     def __str__(self) -> str:
         return "\n".join([text_table(*self.rows(), left=2), "", *self.lines, *self.motion()])
@@ -216,8 +213,9 @@ def check(system: Given, data: Data) -> Check:
     """Whether a capture is worth estimating from: what is the matter with its channels, what its motion determines.
 
     system: described, or its name or file. data: a capture, the path of one, of a log or of a recording, or blocks of
-    samples in order of time. Rates, stamps and resolutions are compared with the description; stuck, saturated, wrapped
-    and spiked channels are named, and those that nobody reads. InputError where the data cannot be read.
+    samples in order of time. Rates, stamps and resolutions are compared with the description; stuck, saturated
+    and wrapped channels are named, those with outliers, and those that nobody reads. InputError where the data cannot
+    be read.
     """
     system, folder = given_system(system)
     recorded = recorded_session(system, data, folder)
@@ -231,13 +229,20 @@ def check(system: Given, data: Data) -> Check:
     except InputError as error:
         remarks.append(Remark("", f"cannot be estimated from: {error.found}; expected {error.expected}", True))
     remarks += [Remark(name, "described, but not there", False) for name in checks.absent]
+    # A torque may jump for one sample: those of drives are counted here, the estimator leaves out the others.
+    drives = drive_channels(system)
+    outliers = Outliers(len(source.channels), [k for k, name in enumerate(source.channels) if name in drives])
     for block in source:
         checks.push(block)
+        outliers.push(block.t, block.values)
         if estimator is not None:
             estimator.push(block)
+    outliers.push(np.empty(0), np.empty((0, len(source.channels))), last=True)
     remarks += checks.remarks()
     remarks += [Remark("", warning, False) for warning in source.warnings]
     determined = {} if estimator is None else _determined(estimator)
+    remarks += _outlier_remarks({} if estimator is None else estimator.outliers, True)
+    remarks += _outlier_remarks(outliers.found(source.channels), False)
     if estimator is not None and not any(share < SIGN_UNKNOWN for share in determined.values()):
         remarks.append(Remark("", "the motion determines no parameter", True))
     channels = {
@@ -252,6 +257,14 @@ def check(system: Given, data: Data) -> Check:
         for each in checks.checks
     }
     return Check(system.name, recorded.name, checks.last - checks.first, channels, tuple(remarks), determined)
+
+
+def _outlier_remarks(outliers: Mapping[str, LeftOut], left_out: bool) -> Iterator[Remark]:
+    """What is to be said of them, by channel; left_out: of the estimate, which suffers where they are many."""
+    for channel, found in outliers.items():
+        what = "outliers left out" if left_out else "outliers"
+        many = left_out and found.number > MANY_OUTLIERS * found.of
+        yield Remark(channel, f"{found.number} {what}, the first at {found.first:.3f} s", many)
 
 
 def _determined(estimator: Estimator) -> dict[str, float]:

@@ -11,6 +11,7 @@ import numpy as np
 from scipy.io import loadmat
 from scipy.io.matlab import MatReadError
 
+from sms_adapters.files import reading
 from sms_adapters.mcap_capture import capture_writer
 from sms_online.errors import InputError
 from sms_online.stream import Array, Block
@@ -67,11 +68,9 @@ def import_quanser(source: Path, capture: Path) -> int:
 def load_matlab(source: Path, names: Sequence[str] | None = None) -> Mapping[str, Any]:
     """Variables of a .mat file up to version 7, structs as dictionaries; InputError where it is none. names: which."""
     try:
-        with source.open("rb") as file:
+        with reading(source, "a readable .mat file"), source.open("rb") as file:
             # Its stubs know names only.
             return loadmat(file, simplify_cells=True, variable_names=names)  # type: ignore[arg-type]
-    except OSError as error:
-        raise InputError(str(source), "", error.strerror or str(error), "a readable .mat file") from None
     except (MatReadError, ValueError, TypeError, NotImplementedError, zlib.error) as error:
         raise InputError(str(source), "", f"no MATLAB data ({error})", "a .mat file of version 7 or older") from None
 

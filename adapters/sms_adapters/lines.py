@@ -11,11 +11,13 @@ from pathlib import Path
 
 import numpy as np
 
+from sms_adapters.files import reading, unusable
 from sms_online.errors import InputError
 
 # Bytes of text parsed at once: from here on the cost of a parser call is lost in the cost of its lines, and the text
 # still fits a second-level cache. (Measured, 18 channels: 64 KiB 4.5 µs a row, 1 MiB 1.5, 4 MiB 2.3.)
 CHUNK = 1 << 20
+READABLE = "a readable file"
 
 
 class LineReader:
@@ -82,10 +84,8 @@ class LineReader:
     @contextmanager
     def _open(self) -> Iterator[tuple[BufferedReader, BufferedReader | gzip.GzipFile]]:
         """The file, and the stream of its text."""
-        try:
+        with reading(self.path, READABLE):
             raw = self.path.open("rb")
-        except OSError as error:
-            raise self._unreadable(error) from None
         with raw:
             yield raw, gzip.GzipFile(fileobj=raw) if self.path.suffix == ".gz" else raw
 
@@ -100,11 +100,8 @@ class LineReader:
         except (gzip.BadGzipFile, zlib.error) as error:
             raise InputError(str(self.path), "", f"damaged compression ({error})", "a file written by gzip") from None
         except OSError as error:
-            raise self._unreadable(error) from None
+            raise unusable(self.path, error, READABLE) from None
         return size
-
-    def _unreadable(self, error: OSError) -> InputError:
-        return InputError(str(self.path), "", error.strerror or str(error), "a readable file")
 
     def _empty(self) -> InputError:
         return InputError(str(self.path), "", "an empty file", "lines of text")

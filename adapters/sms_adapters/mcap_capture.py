@@ -6,12 +6,11 @@ import json
 import math
 from collections.abc import Iterable
 from pathlib import Path
-from types import TracebackType
 from typing import Any
 
 from sms_adapters.capture import CaptureWriter
 from sms_adapters.extras import installed
-from sms_online.errors import InputError
+from sms_adapters.files import WholeFile
 from sms_online.stream import Block
 
 ENDING = ".mcap"
@@ -26,7 +25,7 @@ def capture_writer(path: Path, channels: tuple[str, ...]) -> CaptureWriter | Mca
     return McapWriter(path, channels) if path.suffix == ENDING else CaptureWriter(path, channels)
 
 
-class McapWriter:
+class McapWriter(WholeFile):
     """Writes blocks as an MCAP file; it appears under its name when the context ends without an error.
 
     Times of the messages are those of the samples, to the nearest ns, from the first one where that is before 0.
@@ -35,22 +34,14 @@ class McapWriter:
 
     def __init__(self, path: Path, channels: tuple[str, ...]) -> None:
         writing = installed("mcap.writer", str(path))
-        self._path = path
-        self._part = path.with_name(path.name + ".part")
+        super().__init__(path)
         self._channels = channels
         self._paths = [channel.split(".") for channel in channels]
         self._zero = math.nan  # time of the messages' zero, s
-        try:
-            self._file = self._part.open("wb")
-        except OSError as error:
-            raise InputError(str(path), "", error.strerror or str(error), "a file that can be written") from None
         self._mcap = writing.Writer(self._file)
         self._mcap.start(profile="", library="sms-online")
         schema = self._mcap.register_schema(SCHEMA, "jsonschema", json.dumps(_schema(self._paths)).encode())
         self._topic = self._mcap.register_channel(TOPIC, "json", schema)
-
-    def __enter__(self) -> McapWriter:
-        return self
 
     def write(self, block: Block) -> None:
         """Append the rows of a block; ValueError where its channels are not the file's."""
@@ -66,15 +57,8 @@ class McapWriter:
             at = round((t - self._zero) * _SECOND)
             self._mcap.add_message(self._topic, at, json.dumps(message).encode(), at)
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def _complete(self) -> None:
         self._mcap.finish()
-        self._file.close()
-        if kind is None:
-            self._part.replace(self._path)
-        else:
-            self._part.unlink()
 
 
 def _schema(paths: Iterable[list[str]]) -> dict[str, Any]:

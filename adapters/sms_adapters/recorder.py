@@ -13,6 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
+from sms_adapters.files import reading
 from sms_adapters.raw import CanFrames, Raw
 from sms_adapters.session_log import (
     DROPPED,
@@ -114,7 +115,7 @@ class Recorder:
         self._waiting = 0
         self._lock = threading.Lock()
         self._closing = threading.Event()
-        try:
+        with reading(directory, "a directory to record in"):
             directory.mkdir(parents=True, exist_ok=True)
             if (directory / SESSION).exists():
                 raise InputError(str(directory), "", "a recording that is there already", "a new directory")
@@ -125,8 +126,6 @@ class Recorder:
             self._session.flush()
             for name, content in (files or {}).items():
                 (directory / name).write_bytes(content)
-        except OSError as error:
-            raise InputError(str(directory), "", error.strerror or str(error), "a directory to record in") from None
         self._tracks = {
             name: _Track(
                 _File(directory / (name + SUFFIXES[kind])),

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
+from sms_adapters.files import read_json
 from sms_online.errors import InputError
 from sms_online.repeatability import Comparison, compare_documents
 from sms_online.result import SCHEMA, Result
@@ -50,12 +50,7 @@ def _folder(path: Path) -> Path:
 def read_results(path: Path) -> dict[str, Any]:
     """The document of a results.json, or of the one in a folder; InputError where it is none."""
     file = path / NAME if path.is_dir() else path
-    try:
-        document = json.loads(file.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise InputError(str(file), "", error.strerror or str(error), "the results of a run") from None
-    except ValueError as error:
-        raise InputError(str(file), "", f"no JSON ({error})", "the results of a run") from None
+    document = read_json(file, "the results of a run")
     if not isinstance(document, dict) or document.get("schema") != SCHEMA:
         raise InputError(str(file), "schema", "no results of a session", f"{SCHEMA!r}")
     return document

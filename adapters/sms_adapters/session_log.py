@@ -16,13 +16,17 @@ import json
 import tomllib
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from itertools import repeat
+from itertools import islice, repeat
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, overload
 
 import numpy as np
+from numpy.typing import NDArray
 
-from sms_adapters.raw import ERROR_FRAME, EXTENDED, FD_FRAME, MOST_BYTES, REMOTE_FRAME, CanFrames, Raw, SerialChunk
+from sms_adapters.candump import parsed
+from sms_adapters.files import reading
+from sms_adapters.lines import LineReader
+from sms_adapters.raw import ERROR_FRAME, EXTENDED, FD_FRAME, REMOTE_FRAME, CanFrames, Raw, SerialChunk
 from sms_online.errors import InputError
 from sms_online.stream import Array
 
@@ -38,15 +42,9 @@ STAMPS, DROPPED = ".stamps", ".dropped"
 MICROSECOND = 1e-6
 # Bit of a candump identifier that marks an error frame (CAN_ERR_FLAG of linux/can.h), written with eight digits.
 _ERROR_ID = 0x2000_0000
-_EXTENDED_DIGITS = 8
-_NO_STAMP = "-"
-# Frames of one piece when a recording is read: a third of a second of a busy bus.
-_AT_ONCE = 1024
-_NEVER = 1 << 62
+_NO_STAMP = b"-"
 
 Kind = Literal["can", "serial"]
-# arrival s, stamp s, identifier, length, data, flags
-_Frame = tuple[float, float, int, int, bytes, int]
 
 
 def to_microseconds(t: float) -> int:
@@ -54,7 +52,11 @@ def to_microseconds(t: float) -> int:
     return round(t / MICROSECOND)
 
 
-def from_microseconds(count: int) -> float:
+@overload
+def from_microseconds(count: int) -> float: ...
+@overload
+def from_microseconds(count: NDArray[np.int64]) -> Array: ...
+def from_microseconds(count: int | NDArray[np.int64]) -> float | Array:
     """The time of so many µs; every arrival is one of these, so that a recording holds it exactly."""
     return count * MICROSECOND
 
@@ -94,8 +96,10 @@ def ending_text(duration: float, unrecorded: int, warnings: Sequence[str]) -> st
 def read_header(directory: Path) -> tuple[SessionHeader, dict[str, Any] | None]:
     """The header of a recording and its ending, None after a kill; InputError where it is no recording."""
     path = directory / SESSION
+    with reading(path, "a recording's session.toml"):
+        text = path.read_text(encoding="utf-8")
     try:
-        document = tomllib.loads(path.read_text(encoding="utf-8"))
+        document = tomllib.loads(text)
         if document["schema"] != SCHEMA:
             raise ValueError(f"schema {document['schema']!r}")
         if not set(document["sources"].values()) <= set(SUFFIXES):
@@ -107,8 +111,6 @@ def read_header(directory: Path) -> tuple[SessionHeader, dict[str, Any] | None]:
             document["versions"],
             int(document.get("rules", 1)),
         )
-    except OSError as error:
-        raise InputError(str(path), "", error.strerror or str(error), "a recording's session.toml") from None
     except (ValueError, KeyError, TypeError, AttributeError) as error:
         raise InputError(str(path), "", f"{error}", f"a document of schema {SCHEMA}") from None
     return header, document.get("end")
@@ -140,7 +142,7 @@ def frame_lines(name: str, epoch: int, frames: CanFrames) -> list[str]:
 
 def stamp_lines(frames: CanFrames) -> list[str]:
     """Lines of <source>.stamps."""
-    return [_NO_STAMP + "\n" if np.isnan(t) else f"{to_microseconds(t)}\n" for t in frames.stamp.tolist()]
+    return ["-\n" if np.isnan(t) else f"{to_microseconds(t)}\n" for t in frames.stamp.tolist()]
 
 
 def chunk_line(name: str, epoch: int, chunk: SerialChunk) -> str:
@@ -152,92 +154,69 @@ def chunk_line(name: str, epoch: int, chunk: SerialChunk) -> str:
 class RecordedItems:
     """The raw items of one source of a recording, in order of arrival, without those the estimator never saw.
 
-    cut: the last line had no end (a kill), and was left out. Raises InputError for a line that is none.
+    Raises InputError for a line that is none.
     """
 
     def __init__(self, directory: Path, name: str, kind: Kind, epoch: int) -> None:
         self.path = directory / (name + SUFFIXES[kind])
-        self.cut = False
         self._kind = kind
         self._epoch = epoch
-        self._stamps = directory / (name + STAMPS)
+        self._lines = LineReader(self.path)
+        self._stamp_lines = LineReader(directory / (name + STAMPS))
         self._dropped = _ranges(directory / (name + DROPPED))
 
+    @property
+    def cut(self) -> bool:
+        """Whether the last line had no end (a kill), and was left out."""
+        return self._lines.cut_line is not None or self._stamp_lines.cut_line is not None
+
     def __iter__(self) -> Iterator[Raw]:
-        dropped = iter([*self._dropped, (_NEVER, 0)])
-        first, count = next(dropped)
-        frames: list[_Frame] = []
-        for number, (line, stamp) in enumerate(zip(self._lines(self.path), self._stamp_lines(), strict=False)):
-            while number >= first + count:
-                first, count = next(dropped)
-            if number >= first:
-                continue
-            try:
-                if self._kind == "serial":
-                    yield self._chunk(line)
-                else:
-                    frames.append(self._frame(line, stamp))
-            except (ValueError, IndexError):
-                expected = "a line as the recorder writes it"
-                raise InputError(str(self.path), f"line {number + 1}", repr(line[:60]), expected) from None
-            if len(frames) == _AT_ONCE:
-                yield _as_arrays(frames)
-                frames = []
-        if frames:
-            yield _as_arrays(frames)
+        stamps = self._stamps()
+        before = 0
+        for line, text in _whole_lines(self._lines):
+            if self._kind == "serial":
+                chunks = [self._chunk(line + k, each) for k, each in enumerate(bytes(text).decode().splitlines())]
+                yield from (chunk for chunk, used in zip(chunks, self._used(before, len(chunks)), strict=True) if used)
+                before += len(chunks)
+            else:
+                times, frames, _ = parsed(self.path, line, text, {})
+                stamp = np.array(list(islice(stamps, len(frames))), dtype=np.float64)
+                frames, times = frames[: stamp.size], times[: stamp.size]  # a kill may have cost the last stamps
+                arrival = from_microseconds(times // 1000 - self._epoch)
+                used = self._used(before, len(frames))
+                if used.any():
+                    yield replace(frames, arrival=arrival, stamp=stamp)[used]
+                before += len(frames)
 
-    def _lines(self, path: Path) -> Iterator[str]:
-        """Whole lines; a file that is not there has none, for nothing ever came."""
-        if not path.is_file():
-            return
-        with path.open(encoding="ascii", errors="replace") as file:
-            for line in file:
-                if not line.endswith("\n"):
-                    self.cut = True
-                    return
-                yield line[:-1]
+    def _used(self, before: int, count: int) -> NDArray[np.bool_]:
+        """Which of the items (count,), after so many before them, were not dropped."""
+        used = np.ones(count, dtype=np.bool_)
+        for first, dropped in self._dropped:
+            used[max(0, first - before) : max(0, first + dropped - before)] = False
+        return used
 
-    def _stamp_lines(self) -> Iterator[str]:
-        return self._lines(self._stamps) if self._stamps.is_file() else repeat(_NO_STAMP)
+    def _stamps(self) -> Iterator[float]:
+        """The stamp of each frame, s, NaN where there is none."""
+        if not self._stamp_lines.path.is_file():
+            yield from repeat(np.nan)
+        for _, text in _whole_lines(self._stamp_lines):
+            for word in bytes(text).split():
+                yield np.nan if word == _NO_STAMP else from_microseconds(int(word))
 
-    def _arrival(self, time: str) -> float:
-        seconds, _, micro = time[1:-1].partition(".")
-        return from_microseconds(int(seconds) * 1_000_000 + int(micro) - self._epoch)
-
-    def _chunk(self, line: str) -> SerialChunk:
-        time, _, payload = line.split(" ")
-        return SerialChunk(self._arrival(time), bytes.fromhex(payload))
-
-    def _frame(self, line: str, stamp: str) -> _Frame:
-        time, _, text = line.split(" ")
-        word, _, payload = text.partition("#")
-        id_, flags = int(word, 16), 0
-        if len(word) == _EXTENDED_DIGITS:
-            id_, flags = (id_ & ~_ERROR_ID, ERROR_FRAME) if id_ & _ERROR_ID else (id_ | EXTENDED, 0)
-        data = b""
-        if payload.startswith("R"):
-            flags |= REMOTE_FRAME
-            length = int(payload[1:])
-        else:
-            if payload.startswith("#"):
-                flags |= FD_FRAME
-                payload = payload[2:]
-            data = bytes.fromhex(payload)
-            length = len(data)
-        stamped = np.nan if stamp == _NO_STAMP else from_microseconds(int(stamp))
-        return self._arrival(time), stamped, id_, length, data.ljust(MOST_BYTES, b"\0"), flags
+    def _chunk(self, number: int, line: str) -> SerialChunk:
+        try:
+            time, _, payload = line.split(" ")
+            seconds, _, micro = time[1:-1].partition(".")
+            arrival = from_microseconds(int(seconds) * 1_000_000 + int(micro) - self._epoch)
+            return SerialChunk(arrival, bytes.fromhex(payload))
+        except (ValueError, IndexError):
+            expected = "a line as the recorder writes it"
+            raise InputError(str(self.path), f"line {number}", repr(line[:60]), expected) from None
 
 
-def _as_arrays(frames: list[_Frame]) -> CanFrames:
-    arrival, stamp, id_, length, data, flags = zip(*frames, strict=True)
-    return CanFrames(
-        np.array(arrival),
-        np.array(stamp),
-        np.array(id_, dtype=np.uint32),
-        np.array(length, dtype=np.uint8),
-        np.frombuffer(b"".join(data), np.uint8).reshape(-1, MOST_BYTES),
-        np.array(flags, dtype=np.uint8),
-    )
+def _whole_lines(reader: LineReader) -> Iterator[tuple[int, memoryview]]:
+    """See `LineReader`; a file that is not there, or empty, has none, for nothing ever came."""
+    return iter(reader) if reader.path.is_file() and reader.path.stat().st_size else iter(())
 
 
 def _ranges(path: Path) -> list[tuple[int, int]]:

@@ -6,6 +6,7 @@ import json
 from pathlib import Path
 from typing import Any
 
+from sms_adapters.files import read_json, write_text
 from sms_online.errors import InputError
 
 SCHEMA = "sms-online/truth/1"
@@ -24,22 +25,15 @@ def write_truth(capture: Path, parameters: dict[str, float], extra: dict[str, An
     document = {"schema": SCHEMA, "parameters": parameters}
     if taken := document.keys() & extra.keys():
         raise ValueError(f"extra must not hold {sorted(taken)}")
-    text = json.dumps(document | extra, indent=2, allow_nan=False) + "\n"
-    path = truth_path(capture)
-    part = path.with_name(path.name + ".part")
-    part.write_text(text, encoding="utf-8")
-    part.replace(path)
+    write_text(truth_path(capture), json.dumps(document | extra, indent=2, allow_nan=False) + "\n")
 
 
 def read_truth(capture: Path) -> dict[str, Any] | None:
     """The truth document beside a capture, None where there is none; InputError where it is not such a document."""
     path = truth_path(capture)
-    try:
-        document = json.loads(path.read_text(encoding="utf-8"))
-    except FileNotFoundError:
+    if not path.is_file():
         return None
-    except ValueError as error:
-        raise InputError(str(path), "", f"no JSON ({error})", f"a document of schema {SCHEMA}") from None
+    document = read_json(path, f"a document of schema {SCHEMA}")
     if not isinstance(document, dict) or document.get("schema") != SCHEMA:
         found = document.get("schema") if isinstance(document, dict) else type(document).__name__
         raise InputError(str(path), "schema", repr(found), SCHEMA)

@@ -17,6 +17,8 @@ from xml.etree import ElementTree
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from sms_adapters.files import reading
+from sms_adapters.raw import one_line
 from sms_online.description.parse import parse_system
 from sms_online.effects.friction import URDF_DYNAMICS
 from sms_online.errors import InputError
@@ -96,16 +98,15 @@ def _read(path: Path) -> Any:
     try:
         return URDF.load(str(path), build_scene_graph=False, load_meshes=False).robot
     except Exception as error:  # of many kinds, for numbers that are none and elements that are missing
-        raise InputError(str(path), "", " ".join(str(error).split()) or type(error).__name__, "a URDF") from None
+        raise InputError(str(path), "", one_line(error), "a URDF") from None
 
 
 def read_xml(path: Path) -> ElementTree.ElementTree[ElementTree.Element]:
     """A URDF's elements and comments; InputError where it is none."""
     try:
         builder = ElementTree.TreeBuilder(insert_comments=True)
-        document = ElementTree.parse(path, parser=ElementTree.XMLParser(target=builder))
-    except OSError as error:
-        raise InputError(str(path), "", error.strerror or "unreadable", "a readable URDF") from None
+        with reading(path, "a readable URDF"):
+            document = ElementTree.parse(path, parser=ElementTree.XMLParser(target=builder))
     except ElementTree.ParseError as error:
         raise InputError(str(path), "", str(error), "a URDF") from None
     root = document.getroot()

@@ -18,11 +18,10 @@ from sms_online.linearised import Motion
 from sms_online.model.base_parameters import find_base_parameters
 from sms_online.pipeline.estimator import Estimator
 from sms_online.priors import base_prior
-from sms_online.result import json_text
 from sms_online.sensor_set import SensorSet, readable_channels, sensor_set
 from sms_online.session import Data, recorded_session
 from sms_online.stream import Array
-from sms_online.tables import html_table, text_table
+from sms_online.tables import Tabled
 from sms_sim.capture import Simulated
 from sms_sim.plant import Plant
 from sms_sim.sensors import Sensors
@@ -58,28 +57,6 @@ class Bound:
 def percent(std: float, value: float) -> float | None:
     """A bound in per cent of a value."""
     return 100.0 * std / abs(value) if value and math.isfinite(std) else None
-
-
-class Tabled:
-    """A result that people see as a table, on a terminal and in a notebook."""
-
-    def rows(self) -> tuple[list[str], list[list[str]]]:
-        """Headings, and a row of cells for each line of the table."""
-        raise NotImplementedError
-
-    def document(self) -> dict[str, Any]:
-        """The same as plain lists, dictionaries and numbers."""
-        raise NotImplementedError
-
-    def to_json(self) -> str:
-        """The document as text; numbers that do not exist are null."""
-        return json_text(self.document())
-
-    def __str__(self) -> str:
-        return text_table(*self.rows(), left=2)
-
-    def _repr_html_(self) -> str:
-        return html_table(*self.rows())
 
 
 @dataclass(frozen=True)

@@ -26,7 +26,8 @@ from sms_online.errors import InputError
 from sms_online.linearised import Motion
 from sms_online.model.base_parameters import find_base_parameters
 from sms_online.stream import Array
-from sms_sim.bound import Bounds, Tabled, motion_bounds, noisy_sensors
+from sms_online.tables import Tabled
+from sms_sim.bound import Bounds, motion_bounds, noisy_sensors
 from sms_sim.capture import Simulated
 from sms_sim.ensemble import ensemble
 from sms_sim.motion_limits import Extremes, Limits

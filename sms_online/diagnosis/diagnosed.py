@@ -19,10 +19,10 @@ from sms_online.diagnosis.mistakes import Mistake
 from sms_online.errors import InputError
 from sms_online.pipeline.estimator import Estimator
 from sms_online.priors import base_prior
-from sms_online.result import Finding, Parameter, Parameters, json_text
+from sms_online.result import Finding, Parameter, Parameters
 from sms_online.session import Data, recorded_session
 from sms_online.stream import Block
-from sms_online.tables import html_table, text_table
+from sms_online.tables import Documented, html_table, text_table
 from sms_online.trackers.interface import Prior
 from sms_online.trust import Residual, Residuals, Trust
 from sms_online.truth import true_values
@@ -73,7 +73,7 @@ class Candidate:
 
 
 @dataclass(frozen=True)
-class Diagnosis:
+class Diagnosis(Documented):
     """What a capture holds that its system file does not describe.
 
     verdict: "clean", "named" or "unexplained". summary: the same in a sentence. mistakes: of units, signs and wiring,
@@ -99,10 +99,6 @@ class Diagnosis:
     def document(self) -> dict[str, Any]:
         """diagnosis.json as plain lists, dictionaries and numbers."""
         return dict(self._document)
-
-    def to_json(self) -> str:
-        """The text of diagnosis.json; numbers that do not exist are null."""
-        return json_text(self.document())
 
     def _rows(self) -> tuple[list[str], list[list[str]]]:
         rows = []

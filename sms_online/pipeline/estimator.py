@@ -30,7 +30,7 @@ from sms_online.pipeline.internal_states import FollowedStates
 from sms_online.pipeline.joint_balance import JointBalance, SquaredResidual
 from sms_online.pipeline.momentum import Momentum
 from sms_online.pipeline.observer import Observer
-from sms_online.pipeline.outliers import Outliers
+from sms_online.pipeline.outliers import LeftOut, Outliers
 from sms_online.pipeline.rates import RateSamples, RatesStage
 from sms_online.pipeline.sensing import AttitudeContinuity, Sensing, stated_period
 from sms_online.pipeline.statistics import Method, Setup
@@ -245,11 +245,9 @@ class Estimator(Stage):
         return self._synchroniser.start_time
 
     @property
-    def outliers(self) -> dict[str, tuple[int, int]]:
-        """How many samples were left out as outliers, and of how many, of each channel with any."""
-        now = self._outliers.state
-        counts = zip(self.channels, now.left_out.tolist(), now.judged.tolist(), strict=True)
-        return {name: (left_out, of) for name, left_out, of in counts if left_out}
+    def outliers(self) -> dict[str, LeftOut]:
+        """Samples left out as outliers, of each channel with any."""
+        return self._outliers.found(self.channels)
 
     @property
     def counters(self) -> SyncCounters:

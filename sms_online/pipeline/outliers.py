@@ -11,6 +11,7 @@ Statistical Association 88 (1993) 782).
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,12 +37,21 @@ MEMORY, FEWEST = 400.0, 20
 NORMAL_MEDIAN = 0.674489750196082
 
 
+class LeftOut(NamedTuple):
+    """Samples of a channel that were left out: their number, of how many, and the time of the first, s."""
+
+    number: int
+    of: int
+    first: float
+
+
 class OutlierState(State):
     """What is kept of the samples.
 
     time (B,), values (B, C): rows that predict later ones, then those that wait. passed: how many of them are passed
     on. deviation (C,): robust 1σ of what samples are off by, and weight (C,): number of samples behind it. step (C,):
-    smallest change from sample to sample. left_out, judged (C,): how many samples so far.
+    smallest change from sample to sample. left_out, judged (C,): how many samples so far. first (C,): time of the
+    first that was left out, s.
     """
 
     time: Array
@@ -52,6 +62,7 @@ class OutlierState(State):
     step: Array
     left_out: NDArray[np.int64]
     judged: NDArray[np.int64]
+    first: Array
 
 
 class Outliers(Stage):
@@ -64,7 +75,14 @@ class Outliers(Stage):
         self._columns: NDArray[np.int64] = np.array(columns, dtype=np.int64)
         none = np.zeros(channels, dtype=np.int64)
         empty, unknown = np.empty((0, channels)), np.zeros(channels)
-        self.state = OutlierState(empty[:, 0], empty, 0, unknown, unknown, np.full(channels, np.inf), none, none)
+        never = np.full(channels, np.inf)
+        self.state = OutlierState(empty[:, 0], empty, 0, unknown, unknown, never, none, none, never)
+
+    def found(self, channels: Sequence[str]) -> dict[str, LeftOut]:
+        """What was left out so far, of each channel with any. channels: names of all."""
+        now = self.state
+        counts = zip(now.left_out.tolist(), now.judged.tolist(), now.first.tolist(), strict=True)
+        return {name: LeftOut(*found) for name, found in zip(channels, counts, strict=True) if found[0]}
 
     def push(self, t: Array, values: Array, last: bool = False) -> tuple[Array, Array]:
         """Take rows (B, C) at times t (B,), NaN where a channel has no sample, and return those judged by now.
@@ -123,12 +141,13 @@ class Outliers(Stage):
         now.step[columns] = np.minimum(now.step[columns], np.where(change > 0.0, change, np.inf).min(axis=0))
         least = np.maximum(OUTLIER * now.deviation[columns], STEPS * now.step[columns])
         least[memory < FEWEST] = np.inf
-        now.left_out, now.judged = now.left_out.copy(), now.judged.copy()
+        now.left_out, now.judged, now.first = now.left_out.copy(), now.judged.copy(), now.first.copy()
         now.judged[columns] += count
         for k in np.flatnonzero((np.abs(off[own]) > least).any(axis=0)).tolist():
             found = _outliers(t, samples[:, k], float(least[k]), own)
             values[rows[found], columns[k]] = np.nan
             now.left_out[columns[k]] += found.size
+            now.first[columns[k]] = t[found].min(initial=now.first[columns[k]])
 
 
 def _off(t: Array, samples: Array) -> Array:

@@ -24,6 +24,7 @@ from sms_online.pipeline.errors_in_variables import NoiseBias, unbiased
 from sms_online.pipeline.events import Event
 from sms_online.pipeline.joint_balance import SquaredResidual
 from sms_online.pipeline.latency import Latency
+from sms_online.pipeline.outliers import LeftOut
 from sms_online.pipeline.plain_rows import PlainRows
 from sms_online.pipeline.sensing import Sensing
 from sms_online.pipeline.synchronise import SyncCounters
@@ -106,10 +107,10 @@ class MomentumStatistics:
 class Statistics:
     """Sufficient statistics, counts and events of a session up to now.
 
-    finished: no more samples come. outliers: by channel, how many samples were left out, and of how many. last_time
-    (channels,): of each one's last sample, s, -inf where none has come. periods (channels,): s a sample, NaN where
-    unknown. energy: the energy balance's tracker; shared: what errors that its rows share do. joints: sums behind the
-    relative residual of each.
+    finished: no more samples come. outliers: by channel, samples that were left out. last_time (channels,): of each
+    one's last sample, s, -inf where none has come. periods (channels,): s a sample, NaN where unknown. energy: the
+    energy balance's tracker; shared: what errors that its rows share do. joints: sums behind the relative residual of
+    each.
     """
 
     setup: Setup
@@ -119,7 +120,7 @@ class Statistics:
     duration: float
     dropped_rows: int
     counters: SyncCounters
-    outliers: dict[str, tuple[int, int]]
+    outliers: dict[str, LeftOut]
     last_time: Array
     periods: Array
     events: tuple[Event, ...]

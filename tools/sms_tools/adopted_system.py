@@ -10,11 +10,9 @@ from typing import Any
 
 from sms_online.description.parse import shipped_systems, shipped_text
 from sms_online.description.schema import System
-from sms_online.errors import InputError
 from sms_tools.found_effects import cells_of
 
-NAME = "system.toml"
-# Beside a recording, which holds the described system under that name.
+# Beside a recording, which holds the described system as system.toml.
 ONLINE_NAME = "adopted.toml"
 
 
@@ -86,14 +84,3 @@ def described_text(described: str) -> str:
     """The text of a system file, or of a shipped system by its name."""
     shipped = described in shipped_systems()
     return shipped_text(described) if shipped else Path(described).read_text(encoding="utf-8")
-
-
-def write_adopted(directory: Path, text: str, name: str = NAME) -> Path:
-    """Write DIR/system.toml, or another name; InputError where that fails."""
-    path = directory / name
-    try:
-        directory.mkdir(parents=True, exist_ok=True)
-        path.write_text(text, encoding="utf-8")
-    except OSError as error:
-        raise InputError(str(path), "", error.strerror or str(error), "a file that can be written") from None
-    return path

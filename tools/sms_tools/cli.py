@@ -8,16 +8,15 @@ from __future__ import annotations
 import argparse
 import importlib
 import io
-import math
 import os
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NoReturn
 
 from sms_online.errors import InputError
 from sms_tools.exit_codes import BAD_INPUT, INTERRUPTED, OK
-from sms_tools.view.choice import parse_choice
+from sms_tools.option_values import positive, rerun, seconds, whole
 
 PROGRAM = "sms-online"
 
@@ -132,13 +131,13 @@ def _add_view(parser: Parser, default: str = "off") -> None:
     places = "a file in DIR, a page in the browser, a viewer started or running already"
     text = f"view in rerun: {places}; {default} by default"
     names = "off|save|serve[=ADDRESS]|spawn|connect=URL"
-    parser.add_argument("--rerun", metavar=names, type=_rerun, default=default, help=text)
+    parser.add_argument("--rerun", metavar=names, type=rerun, default=default, help=text)
     text = "factor on the deflections that the view draws, 1 by default"
-    parser.add_argument("--exaggerate", metavar="FACTOR", type=_factor, default=1.0, help=text)
+    parser.add_argument("--exaggerate", metavar="FACTOR", type=positive, default=1.0, help=text)
 
 
 def _add_adopt(parser: Parser) -> None:
-    text = "take up effects that the model lacks as soon as they are named, and write adopted.toml with them"
+    text = "add effects that the model lacks to it as soon as they are named, and write adopted.toml with them"
     parser.add_argument("--adopt", action="store_true", help=text)
 
 
@@ -153,7 +152,7 @@ def _add_tracker(parser: Parser) -> None:
 def _add_noise(parser: Parser) -> None:
     text = "noise of all sensors in place of the described one: 0 none, A, B, C ever more"
     parser.add_argument("--grade", choices=("0", "A", "B", "C"), help=text)
-    parser.add_argument("--seed", metavar="N", type=_whole(0), default=0, help="of the noise, 0 by default")
+    parser.add_argument("--seed", metavar="N", type=whole(0), default=0, help="of the noise, 0 by default")
 
 
 def _add_capture(parser: Parser, required: bool = True) -> None:
@@ -199,7 +198,7 @@ def _add_record(verbs: Verbs) -> None:
 
 def _add_session_length(parser: Parser) -> None:
     text = "end after so long; Ctrl-C ends it too"
-    parser.add_argument("--duration", metavar="SECONDS", type=_seconds(positive=True), help=text)
+    parser.add_argument("--duration", metavar="SECONDS", type=seconds(positive=True), help=text)
 
 
 def _add_simulate(verbs: Verbs) -> None:
@@ -207,7 +206,7 @@ def _add_simulate(verbs: Verbs) -> None:
     _add_system(parser)
     _add_capture(parser)
     text = "length of the session, the described trajectory's by default"
-    parser.add_argument("--duration", metavar="SECONDS", type=_seconds(positive=True), help=text)
+    parser.add_argument("--duration", metavar="SECONDS", type=seconds(positive=True), help=text)
     text = "an effect that the system file does not declare, NAME@WHERE:coefficient=value,…; may be repeated"
     parser.add_argument("--effect", metavar="EFFECT", action="append", default=[], help=text)
     text = (
@@ -237,8 +236,8 @@ def _add_replay(verbs: Verbs) -> None:
 
 def _add_part(parser: Parser) -> None:
     """Which part of a capture, and what is known beforehand."""
-    parser.add_argument("-ss", dest="start", metavar="SECONDS", type=_seconds(), help="leave out what is before")
-    parser.add_argument("-to", dest="stop", metavar="SECONDS", type=_seconds(positive=True), help="and what is after")
+    parser.add_argument("-ss", dest="start", metavar="SECONDS", type=seconds(), help="leave out what is before")
+    parser.add_argument("-to", dest="stop", metavar="SECONDS", type=seconds(positive=True), help="and what is after")
     text = (
         "start from the system file's nominal values, each ± 10 %% (those of 0 stay unknown); "
         "priors that the file itself states hold with and without it"
@@ -254,7 +253,7 @@ def _add_diagnose(verbs: Verbs) -> None:
     _add_out(parser)
     _add_part(parser)
     text = (
-        "check what is found on this capture; the same one stands for what comes after -to. "
+        "check what is found on this capture; the same one means what comes after -to. "
         "Without it blocks of time are held out in turn"
     )
     parser.add_argument("--holdout", metavar="CAPTURE", type=Path, help=text)
@@ -268,8 +267,8 @@ def _add_validate(verbs: Verbs) -> None:
     text = "results.json of a session or the folder of its run; or a system file, whose nominal values are taken"
     parser.add_argument("--system", metavar="FILE|NAME", required=True, help=text)
     parser.add_argument("--out", metavar="DIR", type=Path, help="where validation.json goes, runs/<time> by default")
-    parser.add_argument("-ss", dest="start", metavar="SECONDS", type=_seconds(), help="leave out what is before")
-    parser.add_argument("-to", dest="stop", metavar="SECONDS", type=_seconds(positive=True), help="and what is after")
+    parser.add_argument("-ss", dest="start", metavar="SECONDS", type=seconds(), help="leave out what is before")
+    parser.add_argument("-to", dest="stop", metavar="SECONDS", type=seconds(positive=True), help="and what is after")
 
 
 def _add_check(verbs: Verbs) -> None:
@@ -306,8 +305,8 @@ def _add_export(verbs: Verbs) -> None:
 def _add_markers(verbs: Verbs) -> None:
     parser = _add_verb(verbs, "markers", "markers", "Eigenmodes of each flexible link and the markers that they need.")
     _add_system(parser)
-    text = "how many modes the markers have to tell apart, 2 by default"
-    parser.add_argument("--modes", metavar="N", type=_whole(1), default=2, help=text)
+    text = "how many modes the markers have to resolve, 2 by default"
+    parser.add_argument("--modes", metavar="N", type=whole(1), default=2, help=text)
 
 
 def _add_show(verbs: Verbs) -> None:
@@ -344,18 +343,18 @@ def _add_excite(verbs: Verbs) -> None:
         "--duration": ("SECONDS", f"length of the motion, {own}"),
     }
     for name, (unit, text) in units.items():
-        read = _seconds(positive=True) if name == "--duration" else _factor
+        read = seconds(positive=True) if name == "--duration" else positive
         parser.add_argument(name, metavar=unit, type=read, help=text)
     text = (
-        "two effects, NAME@WHERE:coefficient=value, that a diagnosis could not tell apart: the motion is designed for "
+        "two effects, NAME@WHERE:coefficient=value, that a diagnosis could not separate: the motion is designed for "
         "their coefficients; all parameters count without it"
     )
     parser.add_argument("--separate", metavar="EFFECT", nargs=2, help=text)
     text = "noise of all sensors in place of the described one: A, B, C ever more; B where none is described"
     parser.add_argument("--grade", choices=("A", "B", "C"), help=text)
-    parser.add_argument("--seed", metavar="N", type=_whole(0), default=0, help="of the random draw, 0 by default")
+    parser.add_argument("--seed", metavar="N", type=whole(0), default=0, help="of the random draw, 0 by default")
     text = "steps of the optimiser at most, 15 by default"
-    parser.add_argument("--iterations", metavar="N", type=_whole(1), default=15, help=text)
+    parser.add_argument("--iterations", metavar="N", type=whole(1), default=15, help=text)
     text = "where system.toml, reference.csv and excitation.json go, runs/<time> by default"
     parser.add_argument("--out", metavar="DIR", type=Path, help=text)
 
@@ -377,52 +376,6 @@ def _add_archive(verbs: Verbs) -> None:
     parser.add_argument("--out", metavar="DIR", type=Path, help=text)
     where = parser.add_mutually_exclusive_group()
     text = "processes of this machine, one for each core by default"
-    where.add_argument("--workers", metavar="N", type=_whole(1), help=text)
+    where.add_argument("--workers", metavar="N", type=whole(1), help=text)
     text = "address of a Dask scheduler, whose workers see the same files under the same names"
     where.add_argument("--scheduler", metavar="ADDRESS", help=text)
-
-
-def _seconds(positive: bool = False) -> Callable[[str], float]:
-    """Reader of a time that is not negative, or positive."""
-
-    def read(text: str) -> float:
-        value = _number(text)
-        if not (math.isfinite(value) and (value > 0 if positive else value >= 0)):
-            expected = "greater than 0" if positive else "0 or more"
-            raise argparse.ArgumentTypeError(f"{text!r}; expected a number of seconds, {expected}")
-        return value
-
-    return read
-
-
-def _rerun(text: str) -> str:
-    try:
-        parse_choice(text)
-    except ValueError as error:
-        raise argparse.ArgumentTypeError(str(error)) from None
-    return text
-
-
-def _factor(text: str) -> float:
-    value = _number(text)
-    if not (math.isfinite(value) and value > 0.0):
-        raise argparse.ArgumentTypeError(f"{text!r}; expected a number greater than 0")
-    return value
-
-
-def _number(text: str) -> float:
-    try:
-        return float(text)
-    except ValueError:
-        return math.nan
-
-
-def _whole(least: int) -> Callable[[str], int]:
-    """Reader of a whole number of at least `least`."""
-
-    def read(text: str) -> int:
-        if not (text.isdecimal() and int(text) >= least):
-            raise argparse.ArgumentTypeError(f"{text!r}; expected a whole number, {least} or more")
-        return int(text)
-
-    return read

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import argparse
 import math
 import sys
+from collections.abc import Collection, Iterable, Sequence
 from typing import Any
 
 from rich.console import Console
@@ -11,7 +13,7 @@ from rich.table import Table
 from rich.text import Text
 
 from sms_online.calibration.found import Calibration
-from sms_online.tables import formatter
+from sms_online.tables import formatter, json_text
 
 # Width of a table that goes to a file or a pipe, where there is no terminal to ask.
 FILE_WIDTH = 140
@@ -44,6 +46,28 @@ def show(console: Console, *parts: Table | str | Text) -> None:
     console.file.write(capture.get())
 
 
+def say(args: argparse.Namespace, *parts: Table | str | Text, document: str | dict[str, Any]) -> None:
+    """Print for people, and with --json the document, as its text or as numbers and names, for programs."""
+    show(report_console(args.json), *parts)
+    if args.json:
+        print(document if isinstance(document, str) else json_text(document))
+
+
+def table(
+    headings: Sequence[str],
+    rows: Iterable[Sequence[str]] = (),
+    left: Collection[str] = (),
+    title: str | Text | None = None,
+) -> Table:
+    """Cells below their headings, those of `left` aligned to the left; long ones of the first column are folded."""
+    out = Table(title=title, title_justify="left", box=None, header_style="bold", pad_edge=False)
+    for heading in headings:
+        out.add_column(heading, justify="left" if heading in left else "right", overflow="fold")
+    for cells in rows:
+        out.add_row(*cells)
+    return out
+
+
 def verdict_text(verdict: Document) -> Text:
     """Whether to trust the numbers, in its colour, and the other reasons below."""
     style = GRAVE_STYLE if verdict["grave"] else LEVEL_STYLES[verdict["level"]]
@@ -56,14 +80,12 @@ def parameter_table(document: Document, width: int, title: str | Text | None = N
     and the truth."""
     parameters = document["parameters"]
     simulated = any(p["true"] is not None for p in parameters)
-    table = Table(title=title, title_justify="left", box=None, header_style="bold", pad_edge=False)
-    table.add_column("parameter", overflow="fold")
-    table.add_column("unit")
+    out = table(("parameter", "unit"), left=("parameter", "unit"), title=title)
     wide = width >= WIDTH_WITH_ALL
     headings = ["estimate"] + ["± std"] * wide + ["95 % interval"] + ["true"] * (simulated and wide)
     headings += ["error %"] * simulated
     for heading in headings:
-        table.add_column(heading, justify="right", no_wrap=True)
+        out.add_column(heading, justify="right", no_wrap=True)
     for p in parameters:
         cells = [p["name"], p["unit"]]
         if p["identifiable"]:
@@ -75,8 +97,8 @@ def parameter_table(document: Document, width: int, title: str | Text | None = N
         if simulated:
             cells += ["" if p["true"] is None else f"{p['true']:.6g}"] * wide
             cells.append(_error(p))
-        table.add_row(*cells, style=None if p["identifiable"] else "dim")
-    return table
+        out.add_row(*cells, style=None if p["identifiable"] else "dim")
+    return out
 
 
 def tracker_table(document: Document) -> Table | None:
@@ -84,18 +106,14 @@ def tracker_table(document: Document) -> Table | None:
     trackers = document.get("trackers", [])
     if len(trackers) < 2:
         return None
-    table = Table(
-        title="trackers on the same rows", title_justify="left", box=None, header_style="bold", pad_edge=False
-    )
-    table.add_column("parameter", overflow="fold")
-    table.add_column("unit")
+    out = table(("parameter", "unit"), left=("parameter", "unit"), title="trackers on the same rows")
     for tracker in trackers:
-        table.add_column(tracker["name"] + (", judged" if tracker["judged"] else ""), justify="right", no_wrap=True)
+        out.add_column(tracker["name"] + (", judged" if tracker["judged"] else ""), justify="right", no_wrap=True)
     for p, *row in zip(document["parameters"], *(tracker["parameters"] for tracker in trackers), strict=True):
-        table.add_row(p["name"], p["unit"], *map(value_cell, row))
+        out.add_row(p["name"], p["unit"], *map(value_cell, row))
     for heading, cells in tracker_facts(trackers).items():
-        table.add_row(heading, "", *cells, style="dim")
-    return table
+        out.add_row(heading, "", *cells, style="dim")
+    return out
 
 
 def value_cell(parameter: Document) -> str:

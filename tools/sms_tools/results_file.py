@@ -6,6 +6,7 @@ from datetime import datetime
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
+from sms_adapters.files import write_text
 from sms_adapters.recorder import being_recorded
 from sms_adapters.runs import NAME
 from sms_online.errors import InputError
@@ -51,11 +52,4 @@ def write_results(directory: Path, text: str) -> Path:
 
 def write_document(path: Path, text: str) -> Path:
     """Write the text of a document as a whole or not at all; its directory is made. InputError where that fails."""
-    part = path.with_name(path.name + ".part")
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        part.write_text(text + "\n", encoding="utf-8")
-        part.replace(path)
-    except OSError as error:
-        raise InputError(str(path), "", error.strerror or str(error), "a file that can be written") from None
-    return path
+    return write_text(path, text + "\n")

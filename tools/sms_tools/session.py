@@ -9,6 +9,7 @@ from pathlib import Path
 
 from rich.table import Table
 
+from sms_adapters.files import write_text
 from sms_adapters.system_file import load_system
 from sms_online.description.given import given_system
 from sms_online.description.schema import System
@@ -16,7 +17,7 @@ from sms_online.errors import InputError
 from sms_online.result import Result
 from sms_online.session import Session, with_trackers
 from sms_online.stream import Block
-from sms_tools.adopted_system import ONLINE_NAME, adopted_text, remarks, write_adopted
+from sms_tools.adopted_system import ONLINE_NAME, adopted_text, remarks
 from sms_tools.exit_codes import INTERRUPTED, NOTHING_DETERMINED, OK
 from sms_tools.interruption import Interruption
 from sms_tools.report import parameter_table, report_console, show, tracker_table, trust_lines
@@ -74,5 +75,5 @@ def write_named(args: argparse.Namespace, session: Session, directory: Path) -> 
     described = with_trackers(load_system(args.system), args.tracker)
     if args.adopt and system != described:
         found = [effect for episode in session.diagnosis.document() for effect in episode["effects"]]
-        path = write_adopted(directory, adopted_text(args.system, described, system, remarks(found)), ONLINE_NAME)
+        path = write_text(directory / ONLINE_NAME, adopted_text(args.system, described, system, remarks(found)))
         show(report_console(args.json), f"system file with what was found: {path}")

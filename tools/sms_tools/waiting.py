@@ -12,7 +12,9 @@ from typing import Protocol
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
+from sms_adapters.sources import open_source
 from sms_online.capture import PIECE
+from sms_online.description.schema import System
 from sms_online.stream import Block, Source
 
 # What is over before this many seconds needs no bar.
@@ -20,8 +22,6 @@ MOMENT = 2.0
 # Bytes of a file up to which its samples are held in memory and counted; a larger one is as far as its bytes are read.
 # Of less, a reader takes too large a part at once to say how far the estimator is.
 SMALL = 20_000_000
-
-OnBytes = Callable[[int], None]
 
 
 class Mover(Protocol):
@@ -53,14 +53,16 @@ class Watched:
 
 
 @contextmanager
-def watched(path: Path, opened: Callable[[OnBytes | None], Source]) -> Iterator[Watched]:
+def watched(
+    path: Path, system: System, folder: Path | None, start: float | None = None, stop: float | None = None
+) -> Iterator[Watched]:
     """Open a recorded session with a bar on stderr while the context lasts, where that is a terminal.
 
-    opened: opens it, from whom to call with the bytes consumed so far.
+    The arguments are those of `open_source`.
     """
     console = Console(stderr=True, highlight=False)
     if not console.is_terminal:
-        source = opened(None)
+        source = open_source(path, system, start, stop, None, folder)
         yield Watched(source, source, console)
         return
     size = _size(path)
@@ -68,10 +70,10 @@ def watched(path: Path, opened: Callable[[OnBytes | None], Source]) -> Iterator[
     try:
         if size > SMALL:
             on_bytes = _mover(bar, path.name, size)
-            source = opened(on_bytes)
+            source = open_source(path, system, start, stop, on_bytes, folder)
             yield Watched(source, source, console)
         else:
-            source = opened(None)
+            source = open_source(path, system, start, stop, None, folder)
             blocks = list(source)
             move = _mover(bar, path.name, sum(block.t.size for block in blocks))
             yield Watched(source, _counted(blocks, move), console)

@@ -12,6 +12,7 @@ from typing import Any
 import pyarrow as pa
 import pyarrow.parquet as pq
 
+from sms_adapters.files import writing
 from sms_adapters.recorded import captured, recorded_at
 from sms_adapters.runs import NAME as RESULTS
 from sms_adapters.session_log import SESSION
@@ -153,10 +154,5 @@ def write_table(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
         pairs = [(row.get("parameters") or {}).get(name, (None, None)) for row in rows]
         for label, values in zip((name, f"{name}.std"), zip(*pairs, strict=True), strict=True):
             columns[label] = pa.array(values, pa.float64())
-    part = path.with_name(path.name + ".part")
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
+    with writing(path) as part:
         pq.write_table(pa.table(columns), part)
-        part.replace(path)
-    except OSError as error:
-        raise InputError(str(path), "", error.strerror or str(error), "a file that can be written") from None

@@ -7,8 +7,9 @@ import os
 from pathlib import Path
 from typing import Any
 
+from sms_adapters.files import WRITABLE, reading
 from sms_online.errors import InputError
-from sms_online.result import json_text
+from sms_online.tables import json_text
 
 Row = dict[str, Any]
 
@@ -35,11 +36,9 @@ class RowFile:
 
     def append(self, row: Row) -> None:
         """Add a row, which is on the disk when this returns; InputError where it cannot be written."""
-        try:
+        with reading(self.path, WRITABLE):
             self.path.parent.mkdir(parents=True, exist_ok=True)
             with self.path.open("a", encoding="utf-8") as file:
                 file.write(json.dumps(json.loads(json_text(row)), ensure_ascii=False) + "\n")
                 file.flush()
                 os.fsync(file.fileno())
-        except OSError as error:
-            raise InputError(str(self.path), "", error.strerror or str(error), "a file that can be written") from None

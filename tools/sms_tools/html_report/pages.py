@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from jinja2 import Environment, PackageLoader, StrictUndefined
 
-from sms_online.errors import InputError
+from sms_adapters.files import write_text
 from sms_tools.html_report.figures import PALETTE
 from sms_tools.html_report.parameter_rows import breakable, with_subscripts
 
@@ -35,12 +35,4 @@ def _environment() -> Environment:
 
 def write_page(path: Path, template: str, **content: Any) -> Path:
     """A self-contained page of a template; InputError where it cannot be written."""
-    text = _environment().get_template(template).render(content)
-    part = path.with_name(path.name + ".part")
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        part.write_text(text, encoding="utf-8")
-        part.replace(path)
-    except OSError as error:
-        raise InputError(str(path), "", error.strerror or str(error), "a file that can be written") from None
-    return path
+    return write_text(path, _environment().get_template(template).render(content))

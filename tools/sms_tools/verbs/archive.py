@@ -8,11 +8,10 @@ from pathlib import Path
 
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-from sms_online.result import json_text
 from sms_tools.archive.captures import ROWS, TABLE, archive
 from sms_tools.archive.rows import Row
 from sms_tools.exit_codes import NOTHING_DETERMINED, OK
-from sms_tools.report import report_console, show
+from sms_tools.report import report_console, say
 from sms_tools.results_file import RUNS, results_directory
 from sms_tools.session import described_system
 
@@ -34,12 +33,8 @@ def run(args: argparse.Namespace) -> int:
 
         rows = archive(args.folder, system, folder, out, workers=args.workers, scheduler=args.scheduler, progress=tell)
     counts = Counter(row.get("verdict") or "failed" for row in rows)
-    told = ", ".join(f"{count} {verdict}" for verdict, count in sorted(counts.items()))
-    show(console, "", f"{len(rows)} captures: {told}", f"table: {out / TABLE}", f"rows: {out / ROWS}")
-    if args.json:
-        print(
-            json_text(
-                {"schema": "sms-online/archive/1", "system": system.name, "table": str(out / TABLE), "rows": rows}
-            )
-        )
+    verdicts = ", ".join(f"{count} {verdict}" for verdict, count in sorted(counts.items()))
+    document = {"schema": "sms-online/archive/1", "system": system.name, "table": str(out / TABLE), "rows": rows}
+    files = [f"table: {out / TABLE}", f"rows: {out / ROWS}"]
+    say(args, "", f"{len(rows)} captures: {verdicts}", *files, document=document)
     return OK if any(row.get("parameters") for row in rows) else NOTHING_DETERMINED

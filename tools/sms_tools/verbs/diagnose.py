@@ -9,21 +9,22 @@ from pathlib import Path
 from rich.table import Table
 from rich.text import Text
 
+from sms_adapters.files import write_text
 from sms_adapters.recorded import captured, recorded_at
-from sms_adapters.sources import open_source
+from sms_adapters.session_log import SYSTEM
 from sms_online.capture import Capture
 from sms_online.description.schema import System
 from sms_online.diagnosis.diagnosed import Diagnosis, diagnose
 from sms_online.errors import InputError
 from sms_online.pipeline.estimator import Estimator
 from sms_online.priors import base_prior
-from sms_online.result import json_text
+from sms_online.tables import json_text
 from sms_online.truth import true_values
-from sms_tools.adopted_system import added_lines, adopted_text, remarks, write_adopted
+from sms_tools.adopted_system import added_lines, adopted_text, remarks
 from sms_tools.exit_codes import NOTHING_DETERMINED, OK
 from sms_tools.found_effects import cells_of, look_alikes, why
 from sms_tools.interruption import Interruption
-from sms_tools.report import Document, parameter_table, report_console, show, verdict_text
+from sms_tools.report import Document, parameter_table, report_console, show, table, verdict_text
 from sms_tools.results_file import results_directory, write_document
 from sms_tools.session import check_part, described_system
 from sms_tools.view.frames import Diagnosed
@@ -79,7 +80,7 @@ def run(args: argparse.Namespace) -> int:
     if found.system != system:
         adopted = adopted_text(args.system, system, found.system, remarks(document["effects"]))
         added = added_lines(args.system, adopted)
-        lines.append(f"system file with what was found: {write_adopted(directory, adopted)}")
+        lines.append(f"system file with what was found: {write_text(directory / SYSTEM, adopted)}")
     # Matplotlib takes a second to be imported, which nobody should wait for before the diagnosis.
     from sms_tools.html_report.diagnosis_page import write_diagnosis
 
@@ -147,37 +148,27 @@ def _evidence(document: Document) -> dict[str, float]:
 
 
 def _samples(capture: Path, system: System, start: float | None, stop: float | None, folder: Path | None) -> Capture:
-    with watched(capture, lambda moved: open_source(capture, system, start, stop, moved, folder)) as reading:
+    with watched(capture, system, folder, start, stop) as reading:
         return captured(recorded_at(capture, reading))
 
 
 def _effects(document: Document) -> Table:
-    table = Table(
-        title="effects, from the rows of the diagnosis",
-        title_justify="left",
-        box=None,
-        header_style="bold",
-        pad_edge=False,
-    )
-    for heading in ("effect", "coefficient", "estimate", "± std", "unit", "indistinguishable from"):
-        table.add_column(heading, justify="right" if heading in ("estimate", "± std") else "left", overflow="fold")
+    rows = []
     for effect in document["effects"]:
-        others = look_alikes(effect)
-        first = True
+        first, others = f"{effect['name']}@{effect['where']}", look_alikes(effect)
         for name, value in effect["coefficients"].items() or [("", None)]:
-            cells = ["", "", ""] if value is None else cells_of(value)
-            table.add_row(f"{effect['name']}@{effect['where']}" if first else "", name, *cells, others if first else "")
-            first = False
-    return table
+            rows.append([first, name, *(["", "", ""] if value is None else cells_of(value)), others])
+            first = others = ""
+    headings = ("effect", "coefficient", "estimate", "± std", "unit", "indistinguishable from")
+    left = [heading for heading in headings if heading not in ("estimate", "± std")]
+    return table(headings, rows, left, title="effects, from the rows of the diagnosis")
 
 
 def _residuals(document: Document) -> Table:
-    title = "residual of data not fitted"
-    table = Table(title=title, title_justify="left", box=None, header_style="bold", pad_edge=False)
-    for heading in ("rows", "× noise before", "after", "share of torque before", "after"):
-        table.add_column(heading, justify="left" if heading == "rows" else "right")
     parts = [document[state]["holdout"] for state in ("before", "after")]
+    rows = []
     for row in parts[0]:
         whitened, relative = ([part[row][measure] for part in parts] for measure in ("whitened", "relative"))
-        table.add_row(row, *(f"{w:.3g}" for w in whitened), *("" if r is None else f"{r:.3g}" for r in relative))
-    return table
+        rows.append([row, *(f"{w:.3g}" for w in whitened), *("" if r is None else f"{r:.3g}" for r in relative)])
+    headings = ("rows", "× noise before", "after", "share of torque before", "after")
+    return table(headings, rows, left=("rows",), title="residual of data not fitted")

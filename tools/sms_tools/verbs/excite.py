@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import argparse
 
-from rich.table import Table
-
+from sms_adapters.files import write_text
+from sms_adapters.session_log import SYSTEM
 from sms_sim.excitation import Excitation, excite
 from sms_sim.motion_limits import Limits
-from sms_tools.adopted_system import NAME, write_adopted
 from sms_tools.exit_codes import OK
-from sms_tools.report import report_console, show
+from sms_tools.report import say, table
 from sms_tools.results_file import results_directory, write_document
 from sms_tools.session import described_system
 from sms_tools.trajectory_file import REFERENCE, reference_lines, system_text
@@ -39,29 +38,18 @@ def run(args: argparse.Namespace) -> int:
         )
     trajectory = found.system.trajectory
     assert trajectory is not None
-    file = write_adopted(directory, system_text(args.system, trajectory), NAME)
+    file = write_text(directory / SYSTEM, system_text(args.system, trajectory))
     reference = write_document(directory / REFERENCE, "\n".join(reference_lines(trajectory, system.sample_rate)))
     document = write_document(directory / DOCUMENT, found.to_json())
-    console = report_console(args.json)
+    notes = []
     if found.after.grade != args.grade:
-        show(console, f"noise: grade {found.after.grade}, for {args.system} does not state that of every sensor")
+        notes.append(f"noise: grade {found.after.grade}, for {args.system} does not state that of every sensor")
     if trajectory == system.trajectory:
-        show(console, "no better motion was found: the described one is kept; try more --iterations or another --seed")
-    show(console, _table(found), "", _reached(found), "")
-    show(console, f"system file with the motion: {file}", f"reference: {reference}", f"document: {document}")
-    if args.json:
-        print(found.to_json())
+        notes.append("no better motion was found: the described one is kept; try more --iterations or another --seed")
+    files = [f"system file with the motion: {file}", f"reference: {reference}", f"document: {document}"]
+    shown = table(*found.rows(), left=("parameter", "unit"))
+    say(args, *notes, shown, "", _reached(found), "", *files, document=found.to_json())
     return OK
-
-
-def _table(found: Excitation) -> Table:
-    headings, rows = found.rows()
-    table = Table(box=None, header_style="bold", pad_edge=False)
-    for k, heading in enumerate(headings):
-        table.add_column(heading, justify="left" if k < 2 else "right", overflow="fold")
-    for cells in rows:
-        table.add_row(*cells)
-    return table
 
 
 def _reached(found: Excitation) -> str:

@@ -9,12 +9,10 @@ from pathlib import Path
 
 from sms_adapters.importers import import_emps, import_quanser
 from sms_adapters.mcap_capture import capture_writer
-from sms_adapters.sources import open_source
 from sms_adapters.truth import truth_path
 from sms_online.errors import InputError
-from sms_online.result import json_text
 from sms_tools.exit_codes import OK
-from sms_tools.report import report_console, show
+from sms_tools.report import say
 from sms_tools.session import described_system
 from sms_tools.verbs import import_urdf
 from sms_tools.waiting import watched
@@ -33,10 +31,8 @@ def run(args: argparse.Namespace) -> int:
     # What a simulation of the same name left would pass for the truth of a measurement.
     truth_path(args.capture).unlink(missing_ok=True)
     lines = [f"warning: {warning}" for warning in warnings]
-    show(report_console(args.json), f"capture: {args.capture}, {samples} samples", *lines)
-    if args.json:
-        document = {"schema": "sms-online/import/1", "capture": str(args.capture), "samples": samples}
-        print(json_text({**document, "warnings": warnings}))
+    document = {"schema": "sms-online/import/1", "capture": str(args.capture), "samples": samples, "warnings": warnings}
+    say(args, f"capture: {args.capture}, {samples} samples", *lines, document=document)
     return OK
 
 
@@ -51,7 +47,7 @@ def _log(args: argparse.Namespace) -> tuple[int, list[str]]:
     system, folder = described_system(args)
     samples = 0
     with (
-        watched(args.source, lambda moved: open_source(args.source, system, None, None, moved, folder)) as reading,
+        watched(args.source, system, folder) as reading,
         capture_writer(args.capture, tuple(reading.channels)) as writer,
     ):
         for block in reading:

@@ -6,9 +6,8 @@ import argparse
 
 from sms_adapters.urdf import import_urdf
 from sms_online.errors import InputError
-from sms_online.result import json_text
 from sms_tools.exit_codes import OK
-from sms_tools.report import report_console, show
+from sms_tools.report import say
 
 
 def run(args: argparse.Namespace) -> int:
@@ -17,7 +16,6 @@ def run(args: argparse.Namespace) -> int:
     if path.exists():
         raise InputError(str(path), "", "a file of this name", "--out with the name of a file that is not there yet")
     path.write_text(import_urdf(args.source), encoding="utf-8")
-    show(report_console(args.json), f"system file: {path}; its first lines say what is to be completed")
-    if args.json:
-        print(json_text({"schema": "sms-online/import-urdf/1", "system": str(path)}))
+    document = {"schema": "sms-online/import-urdf/1", "system": str(path)}
+    say(args, f"system file: {path}; its first lines say what is to be completed", document=document)
     return OK

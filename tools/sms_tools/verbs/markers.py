@@ -10,9 +10,8 @@ from rich.table import Table
 
 from sms_online.description.schema import FlexibleLink, System
 from sms_online.model.eigenmodes import LinkMarkers, markers
-from sms_online.result import json_text
 from sms_tools.exit_codes import OK
-from sms_tools.report import report_console, show
+from sms_tools.report import say, table
 from sms_tools.session import described_system
 
 
@@ -20,13 +19,9 @@ def run(args: argparse.Namespace) -> int:
     """Print the modes and the number of markers of every link that bends."""
     system, _ = described_system(args)
     links = [_link(system, found) for found in markers(system, args.modes)]
-    console = report_console(args.json)
-    if links:
-        show(console, _modes_table(links), "", _markers_table(links))
-    else:
-        show(console, f"{system.name}: no flexible link that bends")
-    if args.json:
-        print(json_text({"schema": "sms-online/markers/1", "system": system.name, "links": links}))
+    none = [f"{system.name}: no flexible link that bends"]
+    document = {"schema": "sms-online/markers/1", "system": system.name, "links": links}
+    say(args, *([_modes(links), "", _markers(links)] if links else none), document=document)
     return OK
 
 
@@ -53,25 +48,19 @@ def _link(system: System, found: LinkMarkers) -> dict[str, Any]:
     }
 
 
-def _modes_table(links: list[dict[str, Any]]) -> Table:
-    table = _table("link", "plane", "β, 1/m", "β/2π, 1/m", "frequency, Hz")
-    for link in links:
-        for mode in link["modes"]:
-            numbers = (f"{mode[key]:.4g}" for key in ("beta", "spatial_frequency", "frequency_hz"))
-            table.add_row(link["link"], mode["plane"], *numbers)
-    return table
+def _modes(links: list[dict[str, Any]]) -> Table:
+    rows = [
+        [link["link"], mode["plane"], *(f"{mode[key]:.4g}" for key in ("beta", "spatial_frequency", "frequency_hz"))]
+        for link in links
+        for mode in link["modes"]
+    ]
+    return table(("link", "plane", "β, 1/m", "β/2π, 1/m", "frequency, Hz"), rows, left=("link", "plane"))
 
 
-def _markers_table(links: list[dict[str, Any]]) -> Table:
-    table = _table("link", "f_max, 1/m", "f_s, 1/m", "markers required", "in the system file")
-    for link in links:
-        counts = (str(link["markers_required"]), str(link["markers_described"]))
-        table.add_row(link["link"], f"{link['f_max']:.4g}", f"{link['f_s']:.4g}", *counts)
-    return table
-
-
-def _table(*headings: str) -> Table:
-    table = Table(box=None, header_style="bold", pad_edge=False)
-    for heading in headings:
-        table.add_column(heading, justify="left" if heading in ("link", "plane") else "right")
-    return table
+def _markers(links: list[dict[str, Any]]) -> Table:
+    rows = [
+        [f"{each['link']}", f"{each['f_max']:.4g}", f"{each['f_s']:.4g}"]
+        + [str(each[key]) for key in ("markers_required", "markers_described")]
+        for each in links
+    ]
+    return table(("link", "f_max, 1/m", "f_s, 1/m", "markers required", "in the system file"), rows, left=("link",))

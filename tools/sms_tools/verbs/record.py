@@ -15,13 +15,12 @@ from sms_adapters.recorder import Recorder
 from sms_adapters.session_log import SessionHeader
 from sms_online.description.sources import CanSource, Device, SerialField, SerialLines, SerialPort
 from sms_online.errors import InputError
-from sms_online.result import json_text
 from sms_tools.exit_codes import INTERRUPTED, NOTHING_RECEIVED, OK
 from sms_tools.interruption import Interruption
 from sms_tools.live.feed import Feed, SessionClock, kind_of
 from sms_tools.live.signals import termination_interrupts
 from sms_tools.live.testbed import versions
-from sms_tools.report import Document, report_console, show
+from sms_tools.report import Document, report_console, say, show
 from sms_tools.results_file import results_directory
 
 BAUDRATE = 115200
@@ -70,13 +69,12 @@ def run(args: argparse.Namespace) -> int:
         "warnings": warnings,
     }
     parts = [f"{name}: {count} items" for name, count in document["sources"].items()]
-    show(console, *parts, *(f"warning: {warning}" for warning in warnings), f"recording: {directory}")
+    lines = [*parts, *(f"warning: {warning}" for warning in warnings), f"recording: {directory}"]
     received = any(document["sources"].values())
     if not received:
         listened = ", ".join(f"{source.name} ({_device(source)})" for source in sources)
-        show(console, f"nothing was received from {listened}")
-    if args.json:
-        print(json_text(document))
+        lines.append(f"nothing was received from {listened}")
+    say(args, *lines, document=document)
     if not received:
         return NOTHING_RECEIVED
     return INTERRUPTED if interruption.requested else OK

@@ -10,7 +10,6 @@ from time import perf_counter
 
 from sms_adapters.data_check import ChannelChecks, Checked
 from sms_adapters.recorded import recorded_at
-from sms_adapters.sources import open_source
 from sms_online.capture import PIECE
 from sms_online.cramer_rao import MotionRecord, session_bound
 from sms_online.session import Session
@@ -34,8 +33,7 @@ def run(args: argparse.Namespace) -> int:
     capture: Path = args.capture
     opened = perf_counter()
     with Interruption() as interruption, termination_interrupts():
-        part = (args.start, args.stop)
-        with watched(capture, lambda moved: open_source(capture, system, *part, moved, folder)) as reading:
+        with watched(capture, system, folder, args.start, args.stop) as reading:
             source = reading.source
             recorded = recorded_at(capture, source, whole=args.start is args.stop is None)
             session = Session(

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from sms_online.result import json_text
+from sms_online.tables import json_text
 from sms_tools.exit_codes import OK
 from sms_tools.report import report_console
 from sms_tools.report import show as print_to
@@ -17,8 +17,7 @@ def run(args: argparse.Namespace) -> int:
     """Say which channels there are, and open the view."""
     system, _ = described_system(args)
     table = channel_table(system)
-    console = report_console(args.json)
-    print_to(console, *(f"{row.place}: {', '.join(row.channels)}" for row in table))
+    print_to(report_console(args.json), *(f"{row.place}: {', '.join(row.channels)}" for row in table))
     directory = Path("runs") / "show" if args.out is None else args.out
     place = show(system, rerun=args.rerun, directory=directory, exaggeration=args.exaggerate)
     if args.json:

@@ -8,10 +8,9 @@ from pathlib import Path
 from sms_adapters.mcap_capture import capture_writer
 from sms_adapters.truth import truth_path, write_truth
 from sms_online.effects.build import build_model
-from sms_online.result import json_text
 from sms_sim.capture import Simulated
 from sms_tools.exit_codes import OK
-from sms_tools.report import report_console, show
+from sms_tools.report import say
 from sms_tools.session import described_system
 from sms_tools.waiting import waiting
 
@@ -53,7 +52,5 @@ def run(args: argparse.Namespace) -> int:
     # As in what a diagnosis writes: the values of its effects are for the estimator to find.
     idle = [e for e in build_model(described).effects if e.parameters and all(p.nominal == 0.0 for p in e.parameters)]
     lines += [f"warning: {e.name}@{e.where} does nothing, for {args.system} states no size of it" for e in idle]
-    show(report_console(args.json), *lines)
-    if args.json:
-        print(json_text(document))
+    say(args, *lines, document=document)
     return OK

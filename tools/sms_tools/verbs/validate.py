@@ -5,15 +5,13 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from rich.table import Table
-
 from sms_adapters.recorded import captured, recorded_at
 from sms_adapters.runs import read_results
 from sms_adapters.sources import open_source
 from sms_online.description.schema import System
 from sms_online.validation import validate
 from sms_tools.exit_codes import OK
-from sms_tools.report import report_console, show
+from sms_tools.report import say, table
 from sms_tools.results_file import results_directory, write_document
 from sms_tools.session import check_part, described_system
 
@@ -30,16 +28,8 @@ def run(args: argparse.Namespace) -> int:
     )
     found = validate(system, capture, parameters)
     path = write_document(directory / NAME, found.to_json())
-    headings, rows = found.rows()
-    table = Table(box=None, header_style="bold", pad_edge=False)
-    for heading in headings:
-        table.add_column(heading, justify="left" if heading == "joint" else "right")
-    for row in rows:
-        table.add_row(*row)
-    warnings = [f"warning: {warning}" for warning in found.warnings]
-    show(report_console(args.json), table, "", *warnings, f"validation: {path}", "", found.sentence)
-    if args.json:
-        print(found.to_json())
+    lines = [*(f"warning: {warning}" for warning in found.warnings), f"validation: {path}", "", found.sentence]
+    say(args, table(*found.rows(), left=("joint",)), "", *lines, document=found.to_json())
     return OK
 
 
