@@ -151,26 +151,38 @@ def test_channels_that_the_model_does_not_use_are_named(bench: Path) -> None:
 def test_a_terminal_has_a_bar_for_what_takes_more_than_a_moment(
     bench: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], small: int
 ) -> None:
-    replay = ["replay", "run.csv", "--system", "axis.toml", "--out", "done"]
-    assert main(replay) == 0
-    assert capsys.readouterr().err == ""
-    monkeypatch.setenv("FORCE_COLOR", "1")  # rich takes it for a terminal
-    assert main(replay) == 0
-    assert capsys.readouterr().err == ""
-    monkeypatch.setattr("sms_tools.waiting.MOMENT", 0.0)
+    check = ["check", "run.csv", "--system", "axis.toml"]
     monkeypatch.setattr("sms_tools.waiting.SMALL", small)
+    for colour, moment in ((None, 0.0), ("1", 1e6)):  # no terminal, then nothing that takes so long
+        if colour is not None:
+            monkeypatch.setenv("FORCE_COLOR", colour)  # rich takes it for a terminal
+        monkeypatch.setattr("sms_tools.waiting.MOMENT", moment)
+        assert main(check) == 0
+        assert capsys.readouterr().err == ""
+    monkeypatch.setattr("sms_tools.waiting.MOMENT", 0.0)
+    assert main(check) == 0
+    shown = capsys.readouterr().err
+    assert "run.csv" in shown
+    assert re.search(r"\d:\d\d:\d\d", shown)  # the time left
+
+
+def test_every_verb_that_takes_long_has_a_bar(
+    bench: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("FORCE_COLOR", "1")
+    monkeypatch.setattr("sms_tools.waiting.MOMENT", 0.0)
     capture = ["run.csv", "--system", "axis.toml"]
-    simulated = ["--system", "moved.toml", "--capture", "new.csv", "--duration", "1"]
-    verbs = {
-        "run.csv": (replay, ["check", *capture], ["bound", *capture], ["diagnose", *capture, "--out", "done"]),
-        "solving the motion": (["simulate", *simulated], ["bound", "--system", "moved.toml"]),
-        "fitting the model": (["diagnose", *capture, "--out", "done"],),
-    }
-    for what, verb in ((what, verb) for what, every in verbs.items() for verb in every):
+    verbs: list[tuple[list[str], list[str]]] = [
+        (["replay", *capture, "-to", "2", "--out", "done"], ["run.csv"]),
+        (["bound", *capture], ["run.csv"]),
+        (["diagnose", *capture, "--out", "done"], ["run.csv", "fitting the model"]),
+        (["simulate", "--system", "moved.toml", "--capture", "new.csv", "--duration", "1"], ["solving the motion"]),
+        (["bound", "--system", "moved.toml"], ["solving the motion"]),
+    ]
+    for verb, said in verbs:
         assert main(verb) in (0, 3)  # without noise there is no bound
         shown = capsys.readouterr().err
-        assert what in shown
-        assert re.search(r"\d:\d\d:\d\d", shown)  # the time left
+        assert all(what in shown for what in said)
 
 
 @pytest.mark.parametrize(("presses", "written"), [(1, True), (2, False)])

@@ -61,8 +61,8 @@ def test_no_sample_waits_longer_than_the_first_second() -> None:
     given_out = 0
     for k in range(0, t.size, 5):
         given_out += clock.push(device[k : k + 5], arrival[k : k + 5]).size
-        assert given_out == (0 if not clock.settled else k + device[k : k + 5].size)
-        assert clock.settled == (t[k : k + 5][-1] >= 2.1) or 1.9 < t[k] < 2.1
+        assert given_out == (0 if not clock.known else k + device[k : k + 5].size)
+        assert clock.known == (t[k : k + 5][-1] >= 2.1) or 1.9 < t[k] < 2.1
 
 
 @pytest.mark.parametrize("jump", [2.0, -2.0, 0.06])

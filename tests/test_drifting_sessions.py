@@ -28,6 +28,7 @@ def followed(data: sms.Capture) -> sms.Result:
     return sms.estimate(sms.load_system("paper-planar"), data, tracker=[LEARNED, "rls"])
 
 
+@pytest.mark.slow
 def test_a_drift_on_the_way_is_named_and_followed(followed: sms.Result) -> None:
     (drift,) = followed.drifts
     assert drift.parameter == STIFFNESS
@@ -41,6 +42,7 @@ def test_a_drift_on_the_way_is_named_and_followed(followed: sms.Result) -> None:
     assert followed.trust.level == "trust"
 
 
+@pytest.mark.slow
 def test_least_squares_beside_it_says_that_it_fails(followed: sms.Result) -> None:
     judged, squares = followed.trackers
     assert judged.consistency.consistent
@@ -48,6 +50,7 @@ def test_least_squares_beside_it_says_that_it_fails(followed: sms.Result) -> Non
     assert squares.drifts == ()
 
 
+@pytest.mark.slow
 def test_without_a_tracker_that_follows_nothing_is_green(data: sms.Capture) -> None:
     result = sms.estimate(sms.load_system("paper-planar"), data)
     stiffness = result.parameters[STIFFNESS]

@@ -15,7 +15,7 @@ from sms_sim.ensemble import ensemble
 from sms_sim.excitation import Excitation, excite
 from sms_sim.motion_limits import Extremes, Limits
 from sms_sim.plant import Plant
-from sms_sim.references import FourierReference
+from sms_sim.references import fourier_reference
 from sms_sim.simulate import exact_states, simulate
 from sms_tools.cli import main
 from sms_tools.trajectory_file import reference_lines, system_text
@@ -128,7 +128,7 @@ def test_the_verb_writes_file_reference_and_table(tmp_path: Path, capsys: pytest
     assert json.loads(json.dumps(document["trajectory"])) == system.trajectory.model_dump(mode="json")
     assert system.model_copy(update={"trajectory": None}) == load_system(path).model_copy(update={"trajectory": None})
     table = np.loadtxt(out / "reference.csv", delimiter=",", skiprows=1)
-    q_d, rate = FourierReference(system.trajectory)(table[:, 0])
+    q_d, rate = fourier_reference(system.trajectory)(table[:, 0])
     np.testing.assert_array_equal(table[:, 1:], np.column_stack((q_d, rate)))
     assert table.shape[0] == round(system.trajectory.duration * system.sample_rate) + 1
 

@@ -56,6 +56,12 @@ def report_of(estimator: Estimator, history: History, directory: Path, throughpu
 
 
 @pytest.fixture(scope="module")
+def planar_block(planar_block: Block) -> Block:
+    """The first eight seconds, in which all parameters are determined."""
+    return next(iter(planar_block.pieces(8001)))
+
+
+@pytest.fixture(scope="module")
 def page(planar_block: Block, tmp_path_factory: pytest.TempPathFactory) -> str:
     """The report of the planar example."""
     return report_of(*watched(planar_block), tmp_path_factory.mktemp("report"))

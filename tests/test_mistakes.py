@@ -20,8 +20,9 @@ from sms_online.diagnosis.record import SampleRecord, Segment
 from sms_online.diagnosis.sample_mistakes import shown, without_gaps
 from sms_online.pipeline.estimator import Estimator
 from sms_online.stream import Array, Block
-from sms_sim.simulate import sampled_blocks, simulate
+from sms_sim.simulate import sampled_blocks
 from sms_tools.adopted_system import adopted_text
+from tests import simulations
 from tests.campaigns.mistakes import described
 
 DURATION = 6.0
@@ -35,7 +36,7 @@ def stated() -> System:
 
 @cache
 def session() -> Block:
-    blocks = list(sampled_blocks(simulate(load_system("paper-planar"), DURATION), "B", seed=4))
+    blocks = list(sampled_blocks(simulations.planar(DURATION), "B", seed=4))
     t, values = (np.concatenate([getattr(block, part) for block in blocks]) for part in ("t", "values"))
     return Block(t, blocks[0].channels, values)
 

@@ -14,7 +14,7 @@ from sms_sim.controller import JointPD
 from sms_sim.integrate import Collocation, solve
 from sms_sim.plant import Plant
 from sms_sim.realtime import STEP, RealTimeStepper
-from sms_sim.references import FourierReference
+from sms_sim.references import fourier_reference
 from sms_sim.sensors import Sensors
 from sms_sim.simulate import Simulation, exact_states, sampled_blocks, simulate
 
@@ -115,7 +115,7 @@ def test_a_reference_starts_at_zero_and_its_rate_is_its_derivative() -> None:
         (Harmonic(frequency=1.5, sine=1.3), Harmonic(frequency=4.0, cosine=-0.2)),
         (Harmonic(frequency=3.0, sine=1.0),),
     )
-    reference = FourierReference(Trajectory(duration=1.0, joints=joints))
+    reference = fourier_reference(Trajectory(duration=1.0, joints=joints))
     t = np.linspace(0.0, 5.0, 50)
     q_d, q_d_dot = reference(t)
     assert_allclose(q_d[0], 0.0, atol=1e-15)
@@ -124,7 +124,7 @@ def test_a_reference_starts_at_zero_and_its_rate_is_its_derivative() -> None:
 
 
 def test_the_controller_pulls_towards_the_reference() -> None:
-    reference = FourierReference(Trajectory(duration=1.0, joints=((Harmonic(frequency=2.0, sine=0.5),),)))
+    reference = fourier_reference(Trajectory(duration=1.0, joints=((Harmonic(frequency=2.0, sine=0.5),),)))
     controller = JointPD(Controller(stiffness=(500.0,), damping=(100.0,)), reference)
     # At t = 0: q_d = 0, q̇_d = 1 rad/s.
     assert_allclose(controller(np.zeros(1), np.array([[0.1]]), np.array([[0.4]])), [[500 * -0.1 + 100 * 0.6]])

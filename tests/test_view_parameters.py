@@ -69,15 +69,15 @@ def test_without_anything_to_compare_with_nothing_is_drawn_and_the_axis_is_that_
     assert (group.kind, group.unit, group.half_range) == ("effects", "%", 100.0)
 
 
-def followed(scale: OwnScale, t: float, estimate: list[float], percent: float, settled: bool = True) -> bool:
+def followed(scale: OwnScale, t: float, estimate: list[float], percent: float, converged: bool = True) -> bool:
     """An instant at which every error bar (1σ) is so many percent long."""
     values = np.array(estimate)
-    return scale.follow(Known(t, values, np.abs(values) * percent / 100.0), settled)
+    return scale.follow(Known(t, values, np.abs(values) * percent / 100.0), converged)
 
 
-def test_an_axis_is_about_the_estimate_once_it_has_settled_and_as_wide_as_its_bars_ask_for() -> None:
+def test_an_axis_is_about_the_estimate_once_converged_and_as_wide_as_its_bars_ask_for() -> None:
     scale = OwnScale([Reference(10.0, False)] * 4)
-    assert not followed(scale, 1.0, [12.0] * 4, 1.0, settled=False)
+    assert not followed(scale, 1.0, [12.0] * 4, 1.0, converged=False)
     assert (scale.basis.half_range, scale.basis.about[0]) == (100.0, 10.0)
     assert followed(scale, 2.0, [12.0] * 4, 1.0)
     assert scale.basis.about.tolist() == [12.0] * 4
@@ -107,18 +107,18 @@ def test_an_axis_of_a_restless_estimate_changes_ever_more_rarely() -> None:
 def test_what_is_determined_later_joins_the_axis_of_the_others() -> None:
     scale = OwnScale([None] * 2)
     values, std = np.array([5.0, 7.0]), np.array([0.01, 0.01])
-    assert scale.follow(Known(1.0, values, np.array([0.01, np.inf])), settled=True)
+    assert scale.follow(Known(1.0, values, np.array([0.01, np.inf])), converged=True)
     assert np.isnan(scale.basis.about[1])
     # Everything is drawn anew then, so not at every moment.
-    assert not scale.follow(Known(1.0, values, std), settled=True)
-    assert scale.follow(Known(1.0 + LEAST_REST, values, std), settled=True)
+    assert not scale.follow(Known(1.0, values, std), converged=True)
+    assert scale.follow(Known(1.0 + LEAST_REST, values, std), converged=True)
     assert scale.basis.about.tolist() == [5.0, 7.0]
 
 
 def test_where_all_true_values_are_known_the_axis_never_changes() -> None:
     scale = OwnScale([Reference(1.0, True)] * 4)
     assert not followed(scale, 5.0, [12.0] * 4, 1.0)
-    assert not scale.follow(Known(9.0, np.full(4, 12.0), np.full(4, 0.1)), settled=True, last=True)
+    assert not scale.follow(Known(9.0, np.full(4, 12.0), np.full(4, 0.1)), converged=True, last=True)
 
 
 def test_long_combinations_are_cut_to_a_label() -> None:

@@ -109,7 +109,7 @@ def _diagnosis(capture: Path) -> Path:
 
 
 def _photograph(recording: Path, name: str, animated: bool) -> None:
-    # The viewer stands beside the interpreter, whether or not that directory is in PATH. `ViewerClient.spawn` would
+    # The viewer lies beside the interpreter, whether or not that directory is in PATH. `ViewerClient.spawn` would
     # start one of another size.
     port = _free_port()
     program = [Path(sys.executable).with_name("rerun"), "--headless", "--port", str(port)]

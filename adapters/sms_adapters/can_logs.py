@@ -129,7 +129,7 @@ class _Lines(io.TextIOBase):
 
 
 def _arrays(path: Path, reader: can.io.generic.MessageReader, place: Callable[[int], str]) -> Iterator[LoggedFrames]:
-    """The frames of a reader, times from 0 on; place: where a frame stands, from the number of those before it."""
+    """The frames of a reader, times from 0 on; place: where a frame is, from the number of those before it."""
     messages = iter(reader)
     first: float | None = None
     last = -np.inf

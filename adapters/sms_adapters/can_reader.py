@@ -34,7 +34,7 @@ from sms_online.stream import Array
 # Where the host stamps frames they wait in the driver until so long before the session's next tick, s. Nobody else
 # computes then, and at every frame another thread may take the interpreter for a millisecond. Reading takes half of it.
 BEFORE_TICK = 4e-3
-# Where nothing but the reading tells when a frame arrived, it must not wait so long, s.
+# Where nothing but the reading shows when a frame arrived, it must not wait so long, s.
 PROMPT_INTERVAL = 1e-3
 # Bytes that UDP multicast may hold back; the usual 212 kB overflow within a tenth of a second of a busy bus.
 RECEIVE_BUFFER = 4 << 20
@@ -97,7 +97,7 @@ class CanReader:
         self._host_stamped = source.interface in HOST_STAMPED
         self._last_read = -np.inf
         self._last_arrival = -np.inf
-        self._lost: LostDevice | None = None  # found while frames were at hand, to be told after them
+        self._lost: LostDevice | None = None  # found while frames were at hand, to be raised after them
 
     def open(self) -> None:
         """Open the bus; raises LostDevice where that fails, InputError where it always will."""

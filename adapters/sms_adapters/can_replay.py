@@ -48,7 +48,7 @@ class CanLogReader:
 
     Each frame of a wanted message gives one sample, NaN in the channels of other messages. t: seconds since the log's
     first frame of any kind. start, stop, block, on_bytes: as for CaptureReader. directory: where the system file
-    stands, with its DBC or EDS. With several CAN sources, each takes the frames of the interface that is its `channel`.
+    lies, with its DBC or EDS. With several CAN sources, each takes the frames of the interface that is its `channel`.
 
     What the decoders skip is counted in `warnings`, as is a cut end. Raises InputError, on construction for a system
     without a CAN source and for what does not fit its DBC or EDS; while iterating for what the log's reader cannot
@@ -135,7 +135,7 @@ class CanLogReader:
         return t[order], np.concatenate(values)[order]
 
     def _check_buses(self, logged: LoggedFrames) -> None:
-        """InputError where one message comes from two interfaces: two devices, and no telling them apart."""
+        """InputError where one message comes from two interfaces: two devices that cannot be distinguished."""
         for message in self._decoders[0].messages:
             for bus in np.unique(logged.bus[logged.frames.id == message.id]).tolist():
                 first = self._bus_of.setdefault(message.id, bus)

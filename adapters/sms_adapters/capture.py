@@ -68,7 +68,7 @@ class CaptureReader:
 
     @property
     def warnings(self) -> list[str]:
-        """What the current iteration has skipped or left open so far."""
+        """What the current iteration has skipped or left empty so far."""
         found = []
         by_count: dict[int, list[str]] = {}
         for channel, count in zip(self._channels, self._unsampled.tolist(), strict=True):

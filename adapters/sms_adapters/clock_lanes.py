@@ -17,7 +17,7 @@ from sms_online.pipeline.blocks import momentum_blocks
 
 
 def lanes(system: System, directory: Path | None) -> list[SourceLane]:
-    """A lane for each source of the system; directory: where its file stands, with the files that it names.
+    """A lane for each source of the system; directory: where its file lies, with the files that it names.
 
     Raises InputError for a system without devices, and as the decoders do.
     """

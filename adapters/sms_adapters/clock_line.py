@@ -27,8 +27,8 @@ BIN = 0.25
 # with delays up to 2 ms give the offset to a microsecond.
 WINDOW = 30.0
 # Intervals before the first line is good enough to give times (a second: 10 µs), and after a jump, when drift is known.
-SETTLING = 4
-SETTLING_AFTER_JUMP = 2
+FIRST_INTERVALS = 4
+FIRST_AFTER_JUMP = 2
 # No clock worth the name is further off than this; a line through a few late samples could be.
 LARGEST_DRIFT = 2e-4
 # What two crystals of 20 ppm are off by against each other, 1σ.
@@ -37,7 +37,7 @@ CRYSTALS = 3e-5
 INDEPENDENT = 0.5
 # Drifts that the mean is taken over: enough of them, as likely as e^-LEAST_LIKELY of the likeliest one at least.
 DRIFTS, ENOUGH, LEAST_LIKELY = 101, 25, 18.0
-# Delays are not told finer than this, s: clocks of the machine are read to it.
+# Delays are not resolved finer than this, s: clocks of the machine are read to it.
 FINEST_DELAY = 1e-7
 # Device times that run ahead of the line or go back by more than this are a jump, s. Delays are positive, so the first
 # cannot be one; and no bus turns the order of samples so far apart.
@@ -102,7 +102,7 @@ def likely_line(x: Array, y: Array) -> tuple[float, float]:
 
 
 class DeviceClock:
-    """Turns a device's stamps into times of the session clock, causally: a sample waits until its time can be told.
+    """Turns a device's stamps into times of the session clock, causally: a sample waits until its time is known.
 
     latency: constant delay between the instant of a sample and its arrival, s, as stated.
 
@@ -119,19 +119,19 @@ class DeviceClock:
         self._origin: tuple[float, float] | None = None  # first device time and arrival: small numbers to reckon with
         self._slope = 1.0
         self._offset = 0.0
-        self._settled = False
+        self._known = False
         self._ahead_at_first: float = np.nan  # of the two clocks, when the first line was fitted
         self._held = np.empty(0)  # device times that wait for their time
         self._dropped = np.empty(0, dtype=bool)  # of those, which are not to get one
         self._ready = np.empty(0)  # times of samples before a jump, not yet given out
         self._suspects: list[tuple[float, float]] = []  # the last samples held, if they could be beyond a jump
         self._newest = -np.inf  # latest device time
-        self._begin(SETTLING)
+        self._begin(FIRST_INTERVALS)
 
     @property
-    def settled(self) -> bool:
-        """Whether times can be told now."""
-        return self._settled
+    def known(self) -> bool:
+        """Whether the line is known well enough to give times."""
+        return self._known
 
     @property
     def drift(self) -> float:
@@ -166,9 +166,9 @@ class DeviceClock:
         if self._origin is None:
             return np.empty(0)
         self._discard(self._held.size)
-        if self._best is not None and not self._settled:
+        if self._best is not None and not self._known:
             self._complete_interval()
-            self._settled = True
+            self._known = True
         return self._release()
 
     def _suspicious(self, d: Array, a: Array) -> np.ndarray[tuple[int], np.dtype[np.bool_]]:
@@ -206,24 +206,24 @@ class DeviceClock:
         offset = float(np.min(suspects[:, 1] - self._slope * suspects[:, 0]))
         self.last_jump = self._offset - offset
         beyond = last + 1 - len(suspects)
-        if self._settled:
+        if self._known:
             self._ready = np.concatenate((self._ready, self._times(beyond)))
         else:
             self._ready = np.concatenate((self._ready, np.full(beyond, np.nan)))
         self._held, self._dropped = self._held[beyond:], self._dropped[beyond:]
         self._newest = -np.inf
-        self._begin(SETTLING_AFTER_JUMP)
+        self._begin(FIRST_AFTER_JUMP)
         self._offset = offset
         self._take(suspects[:, 0], suspects[:, 1])
 
-    def _begin(self, settling: int) -> None:
-        """Forget the line's points; times are told after so many intervals."""
+    def _begin(self, first: int) -> None:
+        """Forget the line's points; times are given after so many intervals."""
         self._points: deque[tuple[float, float]] = deque()
         self._best: tuple[float, float] | None = None  # of the current interval
         self._end = -np.inf  # of the current interval
         self._bins = 0
-        self._settling = settling
-        self._settled = False
+        self._first = first
+        self._known = False
         self._off: list[tuple[float, float]] = []  # points in a row that are far off the line
 
     def _take(self, d: Array, a: Array) -> None:
@@ -249,7 +249,7 @@ class DeviceClock:
         assert self._best is not None
         point, self._best = self._best, None
         self._bins += 1
-        off = point[1] - self._line(point[0]) if self._settled else 0.0
+        off = point[1] - self._line(point[0]) if self._known else 0.0
         if abs(off) > STEP:
             if self._off and (off > 0.0) != (self._off[-1][1] > self._line(self._off[-1][0])):
                 self._off = []
@@ -284,12 +284,12 @@ class DeviceClock:
         points = np.array(self._points)
         order = np.argsort(points[:, 0], kind="stable")
         x, y = points[order].T
-        if x.size >= SETTLING:
+        if x.size >= FIRST_INTERVALS:
             self._slope, self._offset = likely_line(x, y)
         else:
             self._offset = float(np.min(y - self._slope * x))
-        self._settled = self._bins >= self._settling
-        if self._settled and np.isnan(self._ahead_at_first):
+        self._known = self._bins >= self._first
+        if self._known and np.isnan(self._ahead_at_first):
             self._ahead_at_first = self._ahead()
 
     def _times(self, count: int) -> Array:
@@ -299,7 +299,7 @@ class DeviceClock:
         return np.where(self._dropped[:count], np.nan, t)
 
     def _release(self) -> Array:
-        count = self._held.size - len(self._suspects) if self._settled else 0
+        count = self._held.size - len(self._suspects) if self._known else 0
         out = np.concatenate((self._ready, self._times(count)))
         self._ready = np.empty(0)
         self._held, self._dropped = self._held[count:], self._dropped[count:]

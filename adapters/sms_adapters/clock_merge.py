@@ -31,7 +31,7 @@ TICK = TICK_MICROSECONDS * 1e-6
 REORDERING = 0.01
 # A source that is silent is waited for so long, s; a sender that stumbles loses nothing within it.
 PATIENCE = 0.3
-# A source from which nothing comes for so long is silent, s: its device may be gone without the bus telling.
+# A source from which nothing comes for so long is silent, s: its device may be gone without the bus saying so.
 SILENCE = 1.0
 # At the start all wait until the clocks of all sources are known, at most so long, s.
 START_PATIENCE = 3.0
@@ -197,7 +197,7 @@ class Merger(Stage):
         self._start = start
         self._first = np.inf  # arrival of the first item
         self._silent = [False for _ in lanes]
-        self._settled = False
+        self._started = False
         self._given = -np.inf  # time up to which rows are out
         self._guards = [StuckGuard([stream.columns for stream in lane.streams]) for lane in lanes]
         self.steps = steps
@@ -241,7 +241,7 @@ class Merger(Stage):
         return max(min(newest) - REORDERING, now - PATIENCE)
 
     def _decode(self) -> None:
-        """Take up the items that are there."""
+        """Decode the items that are there."""
         for k, lane in enumerate(self.lanes):
             raw, self._items[k] = self._items[k], []
             if raw:
@@ -276,9 +276,9 @@ class Merger(Stage):
     def _due(self, now: float) -> float:
         """The time that nothing older can still be overtaken by."""
         newest = np.concatenate([lane.newest for lane in self.lanes])
-        if not self._settled:
-            self._settled = bool(np.isfinite(newest).all()) or now > self._first + START_PATIENCE
-        if not self._settled:
+        if not self._started:
+            self._started = bool(np.isfinite(newest).all()) or now > self._first + START_PATIENCE
+        if not self._started:
             return -np.inf
         return max(float(newest.min()) - REORDERING, now - PATIENCE)
 
@@ -309,12 +309,12 @@ class Merger(Stage):
     def clock_offsets(self) -> dict[str, float]:
         """How far the session's clock has gained on each device's, ms, by source and, of several, number of the stream.
 
-        Of what can be told now.
+        Of the clocks that are known.
         """
         offsets = {}
         for lane in self.lanes:
             for k, clock in enumerate(lane.clocks, start=1):
-                if clock.settled:
+                if clock.known:
                     offsets[lane.name if len(lane.clocks) == 1 else f"{lane.name} {k}"] = 1e3 * clock.gained
         return offsets
 

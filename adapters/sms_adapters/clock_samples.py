@@ -15,7 +15,7 @@ HOLE = 0.1
 class CountedTime:
     """A sender that counts its frames and sends them periodically: count times period is its time.
 
-    modulus: at which the count starts again from 0; whole rounds lost are told by the arrivals. period: nominal, s;
+    modulus: at which the count starts again from 0; whole rounds lost are counted by the arrivals. period: nominal, s;
     what it is off by shows up as drift of the clock.
     """
 

@@ -93,7 +93,7 @@ def _numbers(source: Path, data: Mapping[str, Any], name: str, shape: tuple[int 
 
 
 def _measured(source: Path, data: Mapping[str, Any], name: str, t: Array) -> Array:
-    """The measured column of [t, commanded or reference, measured], checked to stand on the instants t."""
+    """The measured column of [t, commanded or reference, measured], checked to be sampled at the instants t."""
     table = _numbers(source, data, name, (t.size, 3))
     if not np.array_equal(table[:, 0], t):
         raise InputError(str(source), f"variable {name!r}", "other times than data_Im1", "one clock for all tables")

@@ -25,9 +25,8 @@ class LineReader:
 
     Yields (number of the chunk's first line, chunk), the chunk ending in a newline and valid until the next one is
     asked for: all share one buffer, since fresh memory for each would cost a quarter of the parser's time.
-    What follows the last newline is never yielded: a logger that died in the middle of `0.0123` leaves `0.01`, which no
-    parser can tell from a number. Then `cut_line` is the number of that line; it is None where the file ends in a
-    newline.
+    What follows the last newline is never yielded: a logger that died in the middle of `0.0123` leaves `0.01`, which is
+    a number to any parser. Then `cut_line` is the number of that line; it is None where the file ends in a newline.
     on_bytes: called with the bytes of the file consumed so far, to be compared with its size.
     Raises InputError for a file that is missing, unreadable, empty, not gzip despite its name, or not lines of text.
     """

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-# A field's name, or what stands in brackets after it.
+# A field's name, or what is in brackets after it.
 _STEP = re.compile(r"\.?([^.\[\]]+)|\[([^\[\]]+)\]")
 # Where messages such as JointState list what the entries of their other lists belong to.
 _NAMES = "name"

@@ -149,7 +149,7 @@ class Recorder:
             self._queue.append((name, items, count, dropped))
 
     def close(self, duration: float, warnings: Sequence[str] = ()) -> None:
-        """Write what waits, and how the session ended; duration: s. warnings: what no raw item tells of it."""
+        """Write what waits, and how the session ended; duration: s. warnings: what no raw item shows of it."""
         self._closing.set()
         self._thread.join()
         for track in self._tracks.values():

@@ -40,7 +40,7 @@ class Recording:
     """What a live session recorded, as the session's own blocks: a `Source`.
 
     directory: of session.toml. system: as the session had it; its sources are those of the recording. system_directory:
-    where its file stands. start, stop: s after the session's start. Raises InputError where the directory is no
+    where its file lies. start, stop: s after the session's start. Raises InputError where the directory is no
     recording, or of other sources.
     """
 

@@ -34,7 +34,7 @@ def open_source(
 
     A .csv is a capture where its header says so, or the system has no source of kind `table`. Text may be compressed
     (.gz). start, stop: seconds after the file's first sample or frame, or the session's start.
-    on_bytes: called with the bytes of the file consumed so far. directory: where the system file stands, to find its
+    on_bytes: called with the bytes of the file consumed so far. directory: where the system file lies, to find its
     DBC. Raises InputError for another ending, a channel that the system does not have, and as the readers do.
     """
     if (path / SESSION).is_file():

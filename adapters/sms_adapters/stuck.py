@@ -1,4 +1,4 @@
-"""Sensors that stand still: a channel that repeats one value more often than its own noise ever would."""
+"""Stuck sensors: a channel that repeats one value more often than its own noise ever would."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ FALSE_ALARM = 1e-12
 LEARNT = 200
 # Fewest repetitions that can be an alarm: a sensor read twice as often as it samples repeats each value once.
 LEAST_RUN = 8
-# A coarse encoder that turns back stands still too, but creeps there by single steps; what stops from a change of more
+# A coarse encoder that turns back rests too, but creeps there by single steps; what stops from a change of more
 # than this many of its smallest steps has stopped all at once.
 SUDDEN = 3.0
 

@@ -13,7 +13,7 @@ SCHEMA = "sms-online/truth/1"
 
 
 def truth_path(capture: Path) -> Path:
-    """Where the truth of a capture stands: its full name with .truth.json after it."""
+    """Where the truth of a capture lies: its full name with .truth.json after it."""
     return capture.with_name(capture.name + ".truth.json")
 
 

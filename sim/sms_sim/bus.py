@@ -162,7 +162,7 @@ def _as_messages(frames: CanFrames) -> list[can.Message]:
 class Bus:
     """Senders of a system's sources, and what is still to be sent.
 
-    directory: where the system file stands. clocks, transport: of the sources. seed: of the jitter. Raises InputError
+    directory: where the system file lies. clocks, transport: of the sources. seed: of the jitter. Raises InputError
     and LostDevice where a source cannot be made.
     """
 

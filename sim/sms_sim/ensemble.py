@@ -19,6 +19,7 @@ from sms_online.threads import one_blas_thread
 from sms_sim.controller import JointPD
 from sms_sim.integrate import JACOBIAN_INCREMENT, radau
 from sms_sim.plant import Plant
+from sms_sim.references import References
 
 STAGES = 3
 # What Newton's iteration leaves of a stage, rad, m and, as of rates, 1/s: far below the differences between
@@ -28,22 +29,6 @@ POSITION_TOLERANCE, SPEED_TOLERANCE = 1e-6, 1e-4
 ITERATIONS = 10
 # A step is halved no more often than this: friction reverses within a millisecond.
 HALVINGS = 6
-
-
-class References:
-    """Fourier series of P candidates over the same frequencies ω (K,), rad/s; sine, cosine (P, K, joints), rad (m)."""
-
-    def __init__(self, frequency: Array, sine: Array, cosine: Array) -> None:
-        self._frequency, self._sine, self._cosine = frequency, sine, cosine
-
-    def __call__(self, t: Array) -> tuple[Array, Array]:
-        """q_d and q̇_d (B, joints) at t (B,), s: B / P consecutive rows for each candidate."""
-        P, joints = self._sine.shape[0], self._sine.shape[2]
-        phase = (t[:, None] * self._frequency).reshape(P, -1, self._frequency.size)
-        sin, cos = np.sin(phase), np.cos(phase)
-        q_d = sin @ self._sine + (cos - 1.0) @ self._cosine
-        q_d_dot = (cos * self._frequency) @ self._sine - (sin * self._frequency) @ self._cosine
-        return q_d.reshape(-1, joints), q_d_dot.reshape(-1, joints)
 
 
 @dataclass(frozen=True)

@@ -285,7 +285,7 @@ def solve(
     longest: float = np.inf,
     progress: Callable[[float], None] = lambda t: None,
 ) -> Dense:
-    """All of `march` as one solution; progress: told the end of each step, s."""
+    """All of `march` as one solution; progress: is called with the end of each step, s."""
     steps = []
     for step in march(f, y0, duration, tolerance, stages, longest):
         steps.append(step)

@@ -15,7 +15,7 @@ from sms_online.sensor_set import Readings, readable_channels
 from sms_online.stream import Array
 from sms_sim.controller import JointPD
 from sms_sim.drifting import ParameterDrift
-from sms_sim.references import FourierReference
+from sms_sim.references import fourier_reference
 
 
 class Plant:
@@ -37,7 +37,7 @@ class Plant:
         self._drifts = [(drift, self.model.dynamics(drift.direction(self.model, self.parameters))) for drift in drifts]
         self.controller: JointPD | None = None
         if system.controller is not None and system.trajectory is not None:
-            self.controller = JointPD(system.controller, FourierReference(system.trajectory))
+            self.controller = JointPD(system.controller, fourier_reference(system.trajectory))
         layout = self.model.layout
         # Columns of a joint's link side and motor side, among the speeds and among the positions.
         self._q_speed, self._motor_speed = list(layout.q), list(layout.theta_m)

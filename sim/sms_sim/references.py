@@ -8,24 +8,29 @@ from sms_online.description.schema import Trajectory
 from sms_online.stream import Array
 
 
-class FourierReference:
-    """q_d,i(t) = Σ sine sin(ω t) + cosine (cos(ω t) - 1): starts at 0, and unless Σ sine ω = 0 with a step in rate."""
+class References:
+    """q_d,i(t) = Σ sine sin(ω t) + cosine (cos(ω t) - 1): starts at 0, and unless Σ sine ω = 0 with a step in rate.
 
-    def __init__(self, trajectory: Trajectory) -> None:
-        self.joints = len(trajectory.joints)
-        terms = [(joint, harmonic) for joint, series in enumerate(trajectory.joints) for harmonic in series]
-        self._frequency = np.array([harmonic.frequency for _, harmonic in terms])
-        # (terms, joints): amplitude of a term on its joint, rad (m on a prismatic joint)
-        self._sine = np.zeros((len(terms), self.joints))
-        self._cosine = np.zeros((len(terms), self.joints))
-        for k, (joint, harmonic) in enumerate(terms):
-            self._sine[k, joint] = harmonic.sine
-            self._cosine[k, joint] = harmonic.cosine
+    P candidates over the same frequencies ω (K,), rad/s; sine, cosine (P, K, joints), rad (m on a prismatic joint).
+    """
+
+    def __init__(self, frequency: Array, sine: Array, cosine: Array) -> None:
+        self._frequency, self._sine, self._cosine = frequency, sine, cosine
 
     def __call__(self, t: Array) -> tuple[Array, Array]:
-        """q_d and q̇_d (B, joints) at instants t (B,), s: rad and rad/s (m and m/s)."""
-        phase = t[:, None] * self._frequency
+        """q_d, rad (m), and q̇_d (B, joints) at t (B,), s: B / P consecutive rows for each candidate."""
+        P, joints = self._sine.shape[0], self._sine.shape[2]
+        phase = (t[:, None] * self._frequency).reshape(P, -1, self._frequency.size)
         sin, cos = np.sin(phase), np.cos(phase)
         q_d = sin @ self._sine + (cos - 1.0) @ self._cosine
         q_d_dot = (cos * self._frequency) @ self._sine - (sin * self._frequency) @ self._cosine
-        return q_d, q_d_dot
+        return q_d.reshape(-1, joints), q_d_dot.reshape(-1, joints)
+
+
+def fourier_reference(trajectory: Trajectory) -> References:
+    """The one reference that a system file describes."""
+    terms = [(joint, harmonic) for joint, series in enumerate(trajectory.joints) for harmonic in series]
+    sine, cosine = np.zeros((2, 1, len(terms), len(trajectory.joints)))
+    for k, (joint, harmonic) in enumerate(terms):
+        sine[0, k, joint], cosine[0, k, joint] = harmonic.sine, harmonic.cosine
+    return References(np.array([harmonic.frequency for _, harmonic in terms]), sine, cosine)

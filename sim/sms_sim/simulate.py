@@ -135,8 +135,9 @@ def simulate(
     """Integrate a described system in closed loop, to `position_tolerance` (m, rad) a step.
 
     duration: s, the reference's own by default. parameters: π (n_pi,) in place of the nominal ones. initial: x (n_x,)
-    and v (n_v,) in place of rest. progress: told the share that is solved, step by step. drifts: of parameters. Raises
-    InputError where nothing states the duration, ArithmeticError where the motion cannot be followed.
+    and v (n_v,) in place of rest. progress: is called with the share that is solved, step by step. drifts: of
+    parameters. Raises InputError where nothing states the duration, ArithmeticError where the motion cannot be
+    followed.
     """
     if duration is None:
         if system.trajectory is None:

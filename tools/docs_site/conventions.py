@@ -16,7 +16,7 @@ from sms_online.model.chain import Configuration, Frame
 from sms_online.model.model import Model
 from sms_online.stream import Array
 
-# x, y, z of every frame; all three can be told from white and from black paper.
+# x, y, z of every frame; all three are seen on white and on black paper.
 COLORS = ("#c0392b", "#1e8449", "#2471a3")
 GREY = "#7f8c8d"
 LENGTH = 0.32  # m, of a frame's axes as drawn

@@ -61,15 +61,15 @@ def _state(lines: list[str], table: str, statement: str) -> None:
 
 
 def remarks(effects: Iterable[Mapping[str, Any]]) -> dict[str, str]:
-    """What was found of effects, as a document tells them, for a line of text each, by name@where; first come first."""
+    """What was found of effects, as a document has them: a line of text each, by name@where; the first counts."""
     out: dict[str, str] = {}
     for effect in effects:
-        values = (" ".join((name, *_told(value))) for name, value in effect["coefficients"].items())
+        values = (" ".join((name, *_cells(value))) for name, value in effect["coefficients"].items())
         out.setdefault(f"{effect['name']}@{effect['where']}", ", ".join(values))
     return out
 
 
-def _told(value: Mapping[str, Any]) -> list[str]:
+def _cells(value: Mapping[str, Any]) -> list[str]:
     estimate, std, unit = cells_of(value)
     return [estimate, *([f"± {std}"] if std else []), *([unit] if unit else [])]
 

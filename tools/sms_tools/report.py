@@ -17,7 +17,7 @@ from sms_online.tables import formatter, json_text
 
 # Width of a table that goes to a file or a pipe, where there is no terminal to ask.
 FILE_WIDTH = 140
-# A terminal narrower than this has no room for what the intervals and errors tell too: ± std, the true values.
+# A terminal narrower than this has no room for what intervals and errors say already: ± std, the true values.
 WIDTH_WITH_ALL = 112
 NOT_DETERMINED = "not determined"
 # Of a verdict, by its level; what is grave is red.

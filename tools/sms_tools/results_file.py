@@ -27,7 +27,7 @@ def results_directory(out: Path | None) -> Path:
     if being_recorded(directory):
         raise InputError(str(directory), "", "the folder of a session that runs", "another directory")
     try:
-        # Trying tells more than permissions do: of a disk that is full or read-only, and to root.
+        # Trying shows more than permissions do: of a disk that is full or read-only, and to root.
         with TemporaryDirectory(prefix=".sms-online-", dir=existing) as tried:
             (Path(tried) / NAME).write_text("tried\n", encoding="utf-8")
     except OSError as error:

@@ -25,7 +25,7 @@ from sms_tools.results_file import write_results
 
 
 def described_system(args: argparse.Namespace) -> tuple[System, Path | None]:
-    """The system asked for, and the directory of its file, where its DBC stands too; None for a shipped one."""
+    """The system asked for, and the directory of its file, where its DBC lies too; None for a shipped one."""
     system, folder = given_system(args.system)
     return with_trackers(system, getattr(args, "tracker", None)), folder
 

@@ -8,7 +8,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from sms_online.description.schema import Trajectory
-from sms_sim.references import FourierReference
+from sms_sim.references import fourier_reference
 from sms_tools.adopted_system import described_text
 
 REFERENCE = "reference.csv"
@@ -41,5 +41,5 @@ def reference_lines(trajectory: Trajectory, rate: float) -> Iterator[str]:
     joints = range(1, len(trajectory.joints) + 1)
     yield ",".join(["t", *(f"q_d_{i}" for i in joints), *(f"q_d_dot_{i}" for i in joints)])
     t = np.arange(round(trajectory.duration * rate) + 1) / rate
-    for row in np.column_stack((t, *FourierReference(trajectory)(t))).tolist():
+    for row in np.column_stack((t, *fourier_reference(trajectory)(t))).tolist():
         yield ",".join(map(repr, row))

@@ -98,7 +98,7 @@ def _state(path: Path) -> str:
 def identify(path: Path, system: System, directory: Path | None, out: Path) -> Row:
     """The row of a capture: what is estimated, and what the diagnosis says; results.json and diagnosis.json in `out`.
 
-    Raises InputError where the capture cannot be read; that it cannot be diagnosed stands in the row.
+    Raises InputError where the capture cannot be read; that it cannot be diagnosed is said in the row.
     """
     begin = process_time()
     capture = captured(recorded_at(path, open_source(path, system, directory=directory)))

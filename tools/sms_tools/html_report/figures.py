@@ -134,7 +134,7 @@ def ink(name: str) -> str:
 
 
 def drawn(name: str, width: float, height: float, draw: Callable[[Axes], None], bare: bool = False) -> Markup:
-    """A drawing of a size, pt, as it stands in a page. name: no other drawing of the page has it.
+    """A drawing of a size, pt, as part of a page. name: no other drawing of the page has it.
 
     bare: no axes, and no room for them. The same drawing has the same text, wherever it is made.
     """

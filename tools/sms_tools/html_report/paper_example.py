@@ -17,7 +17,7 @@ from sms_sim.simulate import Simulation, exact_states, sampled_blocks, simulate
 from sms_tools.html_report.figures import Chart, Series, chart
 from sms_tools.html_report.pages import write_page
 
-# Table V says EI_2 = 1768.8 N m², Table III 597.87; the figure's size of motion does not tell them apart.
+# Table V says EI_2 = 1768.8 N m², Table III 597.87; the figure's size of motion does not separate them.
 SYSTEM = "paper-planar-table-v"
 DURATION = 10.0  # s, section VI
 # Points of a curve: enough for a smooth line.

@@ -181,7 +181,7 @@ class LiveSession:
 
     @property
     def warnings(self) -> list[str]:
-        """What no raw item tells of this session."""
+        """What no raw item shows of this session."""
         found = [warning for feed in self._feeds for warning in feed.warnings]
         if self._unsaved:
             found.append(f"a checkpoint could not be written: {self._unsaved}")

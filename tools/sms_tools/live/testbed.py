@@ -64,7 +64,7 @@ def open_testbed(
 ) -> tuple[LiveSession, Session, Merger]:
     """The session of a system, its devices not yet opened; it records into `directory`.
 
-    name: of the system, as given. folder: where its file stands. resume: directory of an earlier session, from whose
+    name: of the system, as given. folder: where its file lies. resume: directory of an earlier session, from whose
     last checkpoint this one goes on. Threads of this process give way to each other sooner from now on. Raises
     InputError for a system without sources, files that do not fit, a directory that cannot be written, a checkpoint of
     another system.

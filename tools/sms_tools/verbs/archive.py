@@ -26,12 +26,12 @@ def run(args: argparse.Namespace) -> int:
     with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as progress:
         task = progress.add_task("captures", total=None)
 
-        def tell(row: Row, done: int, of: int) -> None:
+        def note(row: Row, done: int, of: int) -> None:
             progress.update(task, completed=done, total=of)
             text = f"{row['capture']}: {row['error'] or row['summary']}"
             progress.console.print(text, markup=False, highlight=False, soft_wrap=True)
 
-        rows = archive(args.folder, system, folder, out, workers=args.workers, scheduler=args.scheduler, progress=tell)
+        rows = archive(args.folder, system, folder, out, workers=args.workers, scheduler=args.scheduler, progress=note)
     counts = Counter(row.get("verdict") or "failed" for row in rows)
     verdicts = ", ".join(f"{count} {verdict}" for verdict, count in sorted(counts.items()))
     document = {"schema": "sms-online/archive/1", "system": system.name, "table": str(out / TABLE), "rows": rows}

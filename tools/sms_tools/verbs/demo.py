@@ -68,12 +68,12 @@ def _watch(args: argparse.Namespace, arm: SimulatedArm, file: Path, directory: P
         if console.is_terminal:
             drawn = stack.enter_context(Live(console=console, auto_refresh=False, transient=True))
             assert system.trajectory is not None  # the arm moves
-            tell = _draw(drawn, session, truth, system.trajectory.duration)
+            show_progress = _draw(drawn, session, truth, system.trajectory.duration)
         else:
-            tell = _tell(console, session, truth)
+            show_progress = _say(console, session, truth)
         for block in shown.watch(live.blocks(interruption, ended=arm.ended, ready=arm.start)):
             session.update(block)
-            tell()
+            show_progress()
         session.finish()
         live.close()
         stack.close()
@@ -95,7 +95,7 @@ def _draw(live: Live, session: Session, truth: Mapping[str, Any], duration: floa
             now = session.evaluate(truth).document()
             title = f"{now['system']['title']}: {now['duration_s']:.1f} of {duration:g} s"
             table = parameter_table(now, live.console.width, title)
-            # Before it has settled an estimate may be off by any number of its bars.
+            # Before it has converged an estimate may be off by any number of its bars.
             table.style = "dim" if now["verdict"]["level"] == "not yet" else ""
             live.update(Group(table, verdict_text(now["verdict"])), refresh=True)
             drawn = perf_counter()
@@ -103,20 +103,20 @@ def _draw(live: Live, session: Session, truth: Mapping[str, Any], duration: floa
     return draw
 
 
-def _tell(console: Console, session: Session, truth: Mapping[str, Any]) -> Callable[[], None]:
+def _say(console: Console, session: Session, truth: Mapping[str, Any]) -> Callable[[], None]:
     """Says now and then how far it has come."""
-    told = 0.0
+    said = 0.0
 
-    def tell() -> None:
-        nonlocal told
-        if session.estimator.duration >= told + LINE_INTERVAL:
-            told = session.estimator.duration
+    def say() -> None:
+        nonlocal said
+        if session.estimator.duration >= said + LINE_INTERVAL:
+            said = session.estimator.duration
             now = session.evaluate(truth)
             determined = [p for p in now.parameters.values() if p.determined]
-            line = f"{told:5.1f} s: {len(determined)} of {len(now.parameters)} parameters determined"
+            line = f"{said:5.1f} s: {len(determined)} of {len(now.parameters)} parameters determined"
             errors = [abs(p.value / p.true - 1.0) for p in determined if p.true]
             if errors:
                 line += f", errors {100.0 * median(errors):.2g} % (median), {100.0 * max(errors):.2g} % (largest)"
             show(console, f"{line}; {now.trust.sentence}")
 
-    return tell
+    return say

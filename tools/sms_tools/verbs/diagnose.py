@@ -99,11 +99,11 @@ def _watched(args: argparse.Namespace, system: System, found: Diagnosis, capture
     document = found.document()
     # What is to be seen has been found already: no diagnosis runs beside it.
     estimator = Estimator(found.system, capture.channels, str(args.capture))
-    told: dict[str, tuple[float, float]] = {}
+    estimates: dict[str, tuple[float, float]] = {}
     if found.search.attempt.prior is not None:
         estimator.set_prior(base_prior(found.system, estimator.base, args.prior))
         # These come from the diagnosis's rows, not from a session; see `diagnosis_document`.
-        told = {p.name: (p.value, p.std) for p in found.after.parameters.values()}
+        estimates = {p.name: (p.value, p.std) for p in found.after.parameters.values()}
     with (
         Interruption() as interruption,
         open_view(
@@ -114,7 +114,7 @@ def _watched(args: argparse.Namespace, system: System, found: Diagnosis, capture
             None if capture.truth is None else true_values(capture.truth, system, found.system),
             patient=True,
             exaggeration=args.exaggerate,
-            diagnosed=Diagnosed(told, found.trust),
+            diagnosed=Diagnosed(estimates, found.trust),
         ) as view,
     ):
         for block in view.watch(capture):
@@ -128,14 +128,14 @@ def _watched(args: argparse.Namespace, system: System, found: Diagnosis, capture
         for t in (begin, end):
             view.evidence(t, scores)
         view.event(end, found.summary)
-        told_of = remarks(document["effects"])
+        said = remarks(document["effects"])
         for finding in found.effects:
-            view.event(end, ", ".join(filter(None, (finding.effect, told_of[finding.effect]))))
+            view.event(end, ", ".join(filter(None, (finding.effect, said[finding.effect]))))
     return view
 
 
 def _evidence(document: Document) -> dict[str, float]:
-    """log10 of the gain, before anything was taken up, of what was named and of the best others, MOST_LINES in all.
+    """log10 of the gain, before anything was selected, of what was named and of the best others, MOST_LINES in all.
 
     What was found by comparing whole descriptions has the gain of that comparison, for as a candidate it gains nothing.
     """

@@ -15,7 +15,7 @@ TIMELINE = "time"
 # Sizes as shares of the arm's reach.
 LINK_RADIUS, GHOST_RADIUS, JOINT_RADIUS, MARKER_RADIUS, TRAIL_RADIUS = 0.010, 0.004, 0.022, 0.015, 0.006
 MARK_RADIUS = 0.045
-# A mark's text stands so far above it, as a share of the reach, that it hides no marker's.
+# A mark's text is so far above it, as a share of the reach, that it hides no marker's.
 TEXT_OFFSET = 0.25
 
 

@@ -29,8 +29,8 @@ class Reference:
 class Diagnosed:
     """That the session has been diagnosed before it is shown: verdict and evidence are in front.
 
-    parameters: estimate and standard deviation by name, to be shown instead of what the session tells; empty where that
-    tells the same. trust: of the diagnosis.
+    parameters: estimate and standard deviation by name, to be shown in place of the session's; empty where those are
+    the same. trust: of the diagnosis.
     """
 
     parameters: Mapping[str, tuple[float, float]]
@@ -49,7 +49,7 @@ class Circumstances:
 class Start:
     """The session before any sample, the channels of its blocks, a reference for each parameter.
 
-    recording: file that `save` writes. exaggeration: factor on every deflection drawn. live: the source tells its
+    recording: file that `save` writes. exaggeration: factor on every deflection drawn. live: the source states its
     latency and clocks. diagnosed: of a session that is shown once more.
     """
 
@@ -80,7 +80,7 @@ class Picture:
 
 @dataclass(frozen=True)
 class Event:
-    """Something to be marked in every plot and told in the log."""
+    """Something to be marked in every plot and named in the log."""
 
     t: float
     text: str

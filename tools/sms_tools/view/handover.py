@@ -76,7 +76,7 @@ class Handover:
 
 
 def _send_item(item: Any, pipe: IO[bytes]) -> None:
-    """Arrays go from where they stand: a copy of some MB would hold the interpreter's lock."""
+    """Arrays go from where they are: a copy of some MB would hold the interpreter's lock."""
     buffers: list[pickle.PickleBuffer] = []
     body = pickle.dumps(item, protocol=5, buffer_callback=buffers.append)
     arrays = [buffer.raw() for buffer in buffers]

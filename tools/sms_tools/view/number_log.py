@@ -103,7 +103,7 @@ class NumberLog:
         document = rr.TextDocument.columns(text=[text], media_type=["text/markdown"])
         self._stream.send_columns(TABLE, times(np.array([t])), document)
 
-    def tell(self, t: float, text: str, warning: bool = False) -> None:
+    def say(self, t: float, text: str, warning: bool = False) -> None:
         """A line of the log; it begins with the time, for the viewer's own column of it is too narrow to be read."""
         line = rr.TextLog.columns(text=[f"{t:.2f} s: {text}"], level=["WARN" if warning else "INFO"])
         self._stream.send_columns(LOG, times(np.array([t])), line)

@@ -14,7 +14,7 @@ from sms_tools.view.parameter_groups import HALF_RANGES, Basis, half_range
 
 # An axis reaches so many times as far as the error bars: estimates move within them.
 ROOM = 2.0
-# Bars this many times shorter than their axis has room for get a new one: a viewer that is told to change its layout
+# Bars this many times shorter than their axis has room for get a new one: a viewer whose layout is changed
 # forgets what a person has changed in it.
 SHRUNK = 10.0
 # For the same reason, and because what has been drawn is drawn again, an axis stays for so long at least, s, and for
@@ -35,10 +35,10 @@ class OwnScale:
         self._own = False
         self._begun, self._due = np.inf, -np.inf  # s
 
-    def follow(self, now: Known, settled: bool, last: bool = False) -> bool:
+    def follow(self, now: Known, converged: bool, last: bool = False) -> bool:
         """Take in what is known now; whether there is another basis for it.
 
-        settled: the estimate moves within its error bars. last: of the session.
+        converged: the estimate moves within its error bars. last: of the session.
         """
         t, estimate = now.t, now.estimate
         more = estimate.size - self._compared.size
@@ -51,7 +51,7 @@ class OwnScale:
         drawn = now.determined & self._compared & (estimate != 0.0)
         known = np.where(drawn, estimate, np.nan)
         self._begun = min(self._begun, t)
-        if drawn.any() and (last or (settled and t >= self._due)):
+        if drawn.any() and (last or (converged and t >= self._due)):
             bars = 100.0 * BOUNDS * now.std / np.abs(known)
             wanted = half_range(ROOM * bars)
             shrunk = wanted * SHRUNK <= basis.half_range

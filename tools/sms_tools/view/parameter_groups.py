@@ -13,7 +13,7 @@ from sms_online.model.parameters import Parameter
 from sms_online.stream import Array
 from sms_tools.view.frames import Reference
 
-# Lines that a person can tell apart in one plot.
+# Lines that a person can distinguish in one plot.
 MOST_LINES = 6
 # Longest label, characters.
 LONGEST_LABEL = 18
@@ -22,7 +22,7 @@ EFFECTS = "effects"
 # Half width of a plot of deviations from true values, %: estimates come close to them.
 TRUE_RANGE = 0.2
 # Half ranges of other axes, %, tried in this order until so large a share of what is drawn fits. The viewer labels
-# powers of ten alone, so that of an axis to 5 only its zero would be told.
+# powers of ten alone, so that of an axis to 5 only its zero would be labelled.
 HALF_RANGES = (*(float(f"{step}e{power}") for power in range(-4, 2) for step in (1, 2)), 100.0)
 FITTING = 0.75
 

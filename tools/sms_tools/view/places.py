@@ -6,7 +6,7 @@ import re
 from collections.abc import Mapping, Sequence
 from fnmatch import fnmatchcase
 
-# Places that are drawn; a channel's sensor sits at one of them, and where its name does not tell, on the base.
+# Places that are drawn; a channel's sensor sits at one of them, and where its name does not say, on the base.
 PLACE = re.compile(r"base|tip|(joint|link)_\d+")
 JOINT_CHANNEL = re.compile(r"(?:q|theta_m|tau|force)_(\d+)")
 LINK_CHANNEL = re.compile(r"(link_\d+)\.")

@@ -52,7 +52,7 @@ RATE_STATES = 20
 
 
 class Recorder:
-    """One session on one sink. opened: told where the view is to be found, once something is drawn.
+    """One session on one sink. opened: is called with where the view is, once something is drawn.
 
     Raises TroubleError, from every method, where the sink does not take the data.
     """
@@ -76,7 +76,7 @@ class Recorder:
         self._circumstances = Circumstances()
         self._residual = np.full(len(system.joints), np.nan)
         self._recent = RecentResidual()
-        self._events = 0  # marked and told so far
+        self._events = 0  # marked and named so far
         self._determined: NDArray[np.bool_] = np.zeros(now.base.n, dtype=bool)
         self._gaps = 0
         self._beyond: set[str] = set()  # plots of residuals in which something was too much
@@ -138,10 +138,10 @@ class Recorder:
                 self._numbers.add_named(f"{HEALTH}/{plot}", t_state, values)
 
     def event(self, event: Event) -> None:
-        """Mark an event in the plots and tell it in the log."""
+        """Mark an event in the plots and name it in the log."""
         if self._opened is None:
             self._mark(event.t)
-            self._numbers.tell(event.t, event.text)
+            self._numbers.say(event.t, event.text)
 
     def evidence(self, evidence: Evidence) -> None:
         """Scores of candidate effects."""
@@ -165,7 +165,7 @@ class Recorder:
         if end is not None and self._opened is None:
             self._take(end.t, end.state, end.circumstances, last=True)
             for warning in self._now.warnings:
-                self._numbers.tell(end.t, warning, warning=True)
+                self._numbers.say(end.t, warning, warning=True)
         self.write()
         if self._opened is None:
             self._sink.close()
@@ -178,12 +178,12 @@ class Recorder:
         if slow or circumstances != self._circumstances:
             self._circumstances = circumstances
             self._judge(t, last)
-        settled = self._trust is not None and self._trust.level != "not yet"
-        self._arrange(t, more, self._scale.follow(known, settled, last))
+        converged = self._trust is not None and self._trust.level != "not yet"
+        self._arrange(t, more, self._scale.follow(known, converged, last))
         self._parameters.add(known)
         self._residual = self._recent.push(t, state, known.estimate)
         self._numbers.add(f"{RESIDUAL}/relative", t, self._residual)
-        self._tell_changes(known)
+        self._name_changes(known)
         if slow:
             self._numbers.table(t, markdown_table(now.parameters, self._references, known))
             self._whole_residuals(t)
@@ -200,21 +200,21 @@ class Recorder:
             self._sink.arrange(self._layout())
 
     def _judge(self, t: float, last: bool) -> None:
-        """May the numbers be trusted? Shown on top, marked on the arm, and told where the answer is another one."""
+        """May the numbers be trusted? Shown on top, marked on the arm, and logged where the answer is another one."""
         before, now = self._trust, self._now.trust if self._diagnosed is None else self._diagnosed.trust
         self._trust = now
         self._banner.show(t, now)
         self._marks = drawn_marks(now.marks, self._sensing.channels)
         if last or before is None or (before.level, before.grave, before.marks) != (now.level, now.grave, now.marks):
-            self._numbers.tell(t, now.sentence, warning=now.level == "doubt")
+            self._numbers.say(t, now.sentence, warning=now.level == "doubt")
 
     def _known(self, t: float) -> Known:
         """What is known of the base parameters at t, s: by the session, or by a diagnosis."""
         now = self._now
         if self._diagnosed is not None and self._diagnosed.parameters:
             unknown = np.nan, np.inf
-            told = [self._diagnosed.parameters.get(p.name, unknown) for p in now.parameters]
-            estimate, std = np.array(told).T
+            shown = [self._diagnosed.parameters.get(p.name, unknown) for p in now.parameters]
+            estimate, std = np.array(shown).T
             return Known(t, estimate, std)
         return Known(t, now.estimate.pi, now.std)
 
@@ -229,7 +229,7 @@ class Recorder:
         return style.NOT_YET if self._trust is None else style.verdict_color(self._trust)
 
     def _follow_events(self) -> bool:
-        """Mark and tell new events; whether they have added parameters."""
+        """Mark and name new events; whether they have added parameters."""
         more = self._now.base.n - len(self._references)
         if more > 0:
             self._references = (*self._references, *[None] * more)
@@ -237,7 +237,7 @@ class Recorder:
         events = self._now.statistics.events
         for event in events[self._events :]:
             self._mark(event.time)
-            self._numbers.tell(event.time, event_line(event_document(event)), warning=True)
+            self._numbers.say(event.time, event_line(event_document(event)), warning=True)
         self._events = len(events)
         return more > 0
 
@@ -263,18 +263,18 @@ class Recorder:
         rms = np.sqrt(energy.rss / energy.dof) if energy.dof > 0.0 else np.nan
         self._numbers.add(f"{RESIDUAL}/energy", t, np.array([rms]))
 
-    def _tell_changes(self, now: Known) -> None:
+    def _name_changes(self, now: Known) -> None:
         """What has become known or has been lost since the last state."""
         t, determined = now.t, now.determined
         for k in np.flatnonzero(determined != self._determined):
             p = self._now.parameters[k]
             if determined[k]:
-                self._numbers.tell(t, f"{p.name} is determined: {now.estimate[k]:.4g} ± {now.std[k]:.2g} {p.unit}")
+                self._numbers.say(t, f"{p.name} is determined: {now.estimate[k]:.4g} ± {now.std[k]:.2g} {p.unit}")
             else:
-                self._numbers.tell(t, f"{p.name} is not determined any more", warning=True)
+                self._numbers.say(t, f"{p.name} is not determined any more", warning=True)
         self._determined = determined
         gaps = self._now.statistics.counters.gaps
         if gaps > self._gaps:
             self._mark(t)
-            self._numbers.tell(t, "a gap too long to bridge: a new window of the balance begins", warning=True)
+            self._numbers.say(t, "a gap too long to bridge: a new window of the balance begins", warning=True)
         self._gaps = gaps

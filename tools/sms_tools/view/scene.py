@@ -12,11 +12,11 @@ from sms_online.model.chain import Configuration
 from sms_online.model.model import Model
 from sms_online.stream import Array
 
-# A dimension of the spacecraft that the description does not tell is drawn as this share of its largest.
+# A dimension of the spacecraft that the description does not state is drawn as this share of its largest.
 LEAST_SIDE = 0.2
 # In the plane the spacecraft is a plate so far below the arm, as a share of its reach, that the arm passes over it.
 PLATE_DEPTH = 0.03
-# m, where the description tells of no length at all, as of a single axis.
+# m, where the description states no length at all, as of a single axis.
 UNKNOWN_REACH = 1.0
 # A fixed base is drawn as a cube with this share of the arm's reach as half its side.
 PEDESTAL = 0.06

@@ -111,7 +111,7 @@ class View:
                     shown, stated = interval, interval // SAMPLES_A_STATE
 
     def event(self, t: float, text: str) -> None:
-        """Mark an instant, s, in the plots, and tell it in the log."""
+        """Mark an instant, s, in the plots, and name it in the log."""
         self._put(Event(t, text))
 
     def evidence(self, t: float, scores: Mapping[str, float]) -> None:

@@ -1,6 +1,6 @@
 """Where the view goes: one rerun recording stream with one sink, which never waits for ever.
 
-A rerun sink whose other end is gone or does not read first buffers, then blocks, and tells of a full disk only in its
+A rerun sink whose other end is gone or does not read first buffers, then blocks, and reports a full disk only in its
 own log; a flush with a time limit after every batch finds out all of this.
 """
 

@@ -18,7 +18,7 @@ TIP: Color = (90, 200, 250)
 TRACKED: Color = (190, 130, 250)
 EVENT: Color = (240, 90, 90)
 REFERENCE: Color = (140, 140, 140)
-# Lines of a plot, told apart by people with any colour vision. Source: M. Okabe, K. Ito, Color Universal Design (2008).
+# Lines of a plot, for people with any colour vision. Source: M. Okabe, K. Ito, Color Universal Design (2008).
 LINES: tuple[Color, ...] = (
     (86, 180, 233),
     (230, 159, 0),

@@ -1,6 +1,6 @@
 """The view's process: reads frames from stdin, draws them, reports one JSON line a message on stdout.
 
-It stands apart because rerun can block for ever, and so that its work takes no time from the estimator's interpreter.
+It is separate because rerun can block for ever, and so that its work takes no time from the estimator's interpreter.
 It ends when its input ends, however that comes about.
 """
 
@@ -52,7 +52,7 @@ def _serve(start: Start, frames: Queue[Frame | None], messages: IO[str]) -> None
         messages.write(json.dumps(message) + "\n")
 
     try:
-        # Here, so that a broken installation of rerun is told like any other trouble.
+        # Here, so that a broken installation of rerun is reported like any other trouble.
         from sms_online.threads import one_blas_thread
         from sms_tools.view.recorder import Recorder
 
