@@ -18,7 +18,6 @@ from sms_online.cramer_rao import MotionRecord, session_bound
 from sms_online.description.channels import channels as known_channels
 from sms_online.description.given import Given, given_system
 from sms_online.description.schema import System, TrackerChoice
-from sms_online.description.tracker import parse_tracker
 from sms_online.diagnosis.online import Immediate, OnlineDiagnosis, Searcher
 from sms_online.errors import InputError
 from sms_online.evaluation import Evaluation
@@ -28,6 +27,7 @@ from sms_online.priors import base_prior
 from sms_online.result import Result, result_of
 from sms_online.state import Stage
 from sms_online.stream import Array, Block, Source
+from sms_online.trackers.parse import parse_tracker
 from sms_online.truth import true_values
 
 # One or several trackers, as texts or records; None for those of the system file.

@@ -10,8 +10,8 @@ import pytest
 import sms_online as sms
 from sms_online.description.parse import parse_system, shipped_text
 from sms_online.description.schema import TrackerChoice
-from sms_online.description.tracker import parse_tracker
 from sms_online.tracker_results import TrackerResult
+from sms_online.trackers.parse import parse_tracker
 from sms_tools.cli import main
 
 FORGETTING = "rls:forgetting=exponential,memory=3"

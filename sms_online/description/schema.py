@@ -305,7 +305,8 @@ class Tolerances(Record):
 class TrackerChoice(Record):
     """A tracker of the momentum balance's rows. Of several `[[tracker]]` tables the first gives the judged estimate.
 
-    kind: `rls`, recursive least squares, or `kalman`, a Kalman filter in which parameters may drift.
+    kind: `rls`, recursive least squares, or `kalman`, a Kalman filter in which parameters may drift; or another that
+    `sms_online/trackers/build.py` lists.
     forgetting: of `rls`: `none`; `exponential`, old rows fade; `directional`, they fade as new rows replace them;
     `window`, rows of the last `memory` s count alike.
     memory: of a forgetting, s: the time in which a row's weight falls by 1/e, or the window's length.
@@ -317,7 +318,7 @@ class TrackerChoice(Record):
     share: the same as a share of the parameter's stated value, where `std` does not name it.
     """
 
-    kind: Literal["rls", "kalman"] = "rls"
+    kind: str = "rls"
     forgetting: Forgetting = "none"
     memory: Positive | None = None
     drift: Drift | dict[str, Drift] = "none"
@@ -329,6 +330,8 @@ class TrackerChoice(Record):
         """Name for people, such as "rls", "rls exponential 5 s" or "kalman learned"."""
         if self.kind == "rls":
             return "rls" if self.memory is None else f"rls {self.forgetting} {self.memory:g} s"
+        if self.kind != "kalman":
+            return self.kind if self.memory is None else f"{self.kind} {self.memory:g} s"
         if isinstance(self.drift, str):
             return "kalman" if self.drift == "none" else f"kalman {self.drift.replace('_', ' ')}"
         return f"kalman {', '.join(f'{name} {drift}' for name, drift in self.drift.items())}".replace("_", " ")

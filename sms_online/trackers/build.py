@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TypeVar
 
@@ -43,20 +43,44 @@ class Tracked:
     rows_per_second: float
     source: str
 
+    @property
+    def n(self) -> int:
+        """Columns of its rows."""
+        return self.nuisances + len(self.parameters)
+
 
 def build_tracker(choice: TrackerChoice, tracked: Tracked) -> Tracker:
     """The empty tracker of a choice; InputError where it does not fit the system's parameters."""
-    n = tracked.nuisances + len(tracked.parameters)
-    _check(choice, tracked.source)
-    if choice.kind == "rls":
-        return RecursiveLeastSquares(n, _forgetting(choice, tracked.rows_per_second), tracked.prior, tracked.scaled)
+    if choice.kind not in KINDS:
+        near = hint(nearest(choice.kind, list(KINDS)))
+        raise InputError(tracked.source, "tracker.kind", repr(choice.kind), f"one of {', '.join(KINDS)}{near}")
+    return KINDS[choice.kind](choice, tracked)
+
+
+def _least_squares(choice: TrackerChoice, tracked: Tracked) -> Tracker:
+    if choice.drift != "none" or choice.std or choice.share is not None:
+        raise InputError(tracked.source, "tracker", "drift of rls", 'kind = "kalman", or a forgetting')
+    if (choice.forgetting == "none") != (choice.memory is None):
+        found = "no memory" if choice.memory is None else f"a memory of {choice.memory:g} s and no forgetting"
+        raise InputError(tracked.source, "tracker", found, "forgetting and its memory in s, or neither")
+    forgetting = _forgetting(choice, tracked.rows_per_second)
+    return RecursiveLeastSquares(tracked.n, forgetting, tracked.prior, tracked.scaled)
+
+
+def _kalman(choice: TrackerChoice, tracked: Tracked) -> Tracker:
+    if choice.forgetting != "none" or choice.memory is not None:
+        raise InputError(tracked.source, "tracker", "forgetting of kalman", 'kind = "rls", or a drift')
     drifts = drifts_of(choice, tracked)
     std = process_std(choice, tracked, drifts)
     if not {"trend", "learned"} & set(drifts):
-        return RandomWalk(n, std, tracked.prior)
+        return RandomWalk(tracked.n, std, tracked.prior)
     trends = np.where(_columns(drifts, "trend", tracked.nuisances), std, 0.0)
     walks = np.where(_columns(drifts, "random_walk", tracked.nuisances), std, 0.0)
-    return LearnedTrend(n, _groups(drifts, tracked), trends, walks, tracked.prior)
+    return LearnedTrend(tracked.n, _groups(drifts, tracked), trends, walks, tracked.prior)
+
+
+# Every tracker that a system file and the command line can choose, by its kind.
+KINDS: Mapping[str, Callable[[TrackerChoice, Tracked], Tracker]] = {"rls": _least_squares, "kalman": _kalman}
 
 
 def drifts_of(choice: TrackerChoice, tracked: Tracked) -> list[Drift]:
@@ -94,17 +118,6 @@ def _groups(drifts: Sequence[Drift], tracked: Tracked) -> list[tuple[int, ...]]:
         if drift == "learned":
             groups.setdefault(p.owner if p.owner in TOGETHER else p.name, []).append(k)
     return [tuple(columns) for columns in groups.values()]
-
-
-def _check(choice: TrackerChoice, source: str) -> None:
-    if choice.kind == "rls":
-        if choice.drift != "none" or choice.std or choice.share is not None:
-            raise InputError(source, "tracker", "drift of rls", 'kind = "kalman", or a forgetting')
-        if (choice.forgetting == "none") != (choice.memory is None):
-            found = "no memory" if choice.memory is None else f"a memory of {choice.memory:g} s and no forgetting"
-            raise InputError(source, "tracker", found, "forgetting and its memory in s, or neither")
-    elif choice.forgetting != "none" or choice.memory is not None:
-        raise InputError(source, "tracker", "forgetting of kalman", 'kind = "rls", or a drift')
 
 
 def _forgetting(choice: TrackerChoice, rows_per_second: float) -> Forgetting:

@@ -6,6 +6,7 @@ from typing import get_args
 
 from sms_online.description.schema import Drift, Forgetting, TrackerChoice
 from sms_online.errors import InputError
+from sms_online.trackers.build import KINDS
 
 # As the site, the command line and messages say it.
 GRAMMAR = "rls, rls:forgetting=KIND,memory=SECONDS or kalman:drift=KIND,PARAMETER=KIND/STD,share=NUMBER"
@@ -17,7 +18,7 @@ def parse_tracker(text: str) -> TrackerChoice:
     A drift may have its process noise behind a slash: "kalman:joint_1.stiffness=random_walk/20". InputError otherwise.
     """
     kind, _, options = text.partition(":")
-    if kind not in ("rls", "kalman"):
+    if kind not in KINDS:
         raise InputError("--tracker", text, repr(kind), GRAMMAR)
     chosen: dict[str, object] = {"kind": kind}
     drifts: dict[str, str] = {}
@@ -28,7 +29,7 @@ def parse_tracker(text: str) -> TrackerChoice:
             chosen[key] = _number(text, option, value)
         elif key == "forgetting" and kind == "rls":
             chosen[key] = _one_of(text, option, value, get_args(Forgetting))
-        elif kind == "kalman" and value:
+        elif kind != "rls" and value:
             drift, slash, noise = value.partition("/")
             drifts["*" if key == "drift" else key] = _one_of(text, option, drift, get_args(Drift))
             if slash:
