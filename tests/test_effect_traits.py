@@ -50,7 +50,7 @@ def test_what_a_held_command_does_is_no_sensor_s_lag() -> None:
 
 
 def test_a_force_reverses_where_it_follows_its_rate_s_sign() -> None:
-    """Of what depends on the sign of a rate all but viscous friction jumps, or its slope does; what is dry lasts."""
+    """What differs at opposite rates jumps, or its slope does, unless it follows the rate; what is dry lasts."""
     joints = [each for each in candidates(paper()) if each.where == "joint_1" and ENTRIES[each.name].kind == "force"]
     for declared in joints:
         model = build_model(paper(effects=(declared,)))
@@ -61,8 +61,13 @@ def test_a_force_reverses_where_it_follows_its_rate_s_sign() -> None:
         x[:, layout.theta_m[0] + layout.n_base_positions - layout.n_base_speeds] = 0.2
         v[:, layout.theta_m[0]] = 0.01, -0.01
         up, down = effect.force(layout, x, v, None)[:, layout.theta_m[0]]
-        depends = not np.allclose(up, down)
-        assert depends == (effect.reversing or effect.name == "viscous_friction"), effect.name
+        v[:, layout.theta_m[0]] = 0.02, 0.0
+        forwards, rest = effect.force(layout, x, v, None)[:, layout.theta_m[0]]
+        odd_and_smooth = np.allclose(forwards - rest, 2.0 * (up - rest), rtol=0.1) and np.allclose(
+            up + down, 2.0 * rest
+        )
+        jumps = not np.allclose(up, down) and not odd_and_smooth
+        assert jumps == effect.reversing, effect.name
         assert effect.dry == (effect.reversing and bool(np.all(np.abs(up) > 0.05))), effect.name
 
 

@@ -18,7 +18,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import islice, repeat
 from pathlib import Path
-from typing import Any, Literal, overload
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -52,11 +52,7 @@ def to_microseconds(t: float) -> int:
     return round(t / MICROSECOND)
 
 
-@overload
-def from_microseconds(count: int) -> float: ...
-@overload
-def from_microseconds(count: NDArray[np.int64]) -> Array: ...
-def from_microseconds(count: int | NDArray[np.int64]) -> float | Array:
+def from_microseconds(count: int) -> float:
     """The time of so many µs; every arrival is one of these, so that a recording holds it exactly."""
     return count * MICROSECOND
 
@@ -182,7 +178,7 @@ class RecordedItems:
                 times, frames, _ = parsed(self.path, line, text, {})
                 stamp = np.array(list(islice(stamps, len(frames))), dtype=np.float64)
                 frames, times = frames[: stamp.size], times[: stamp.size]  # a kill may have cost the last stamps
-                arrival = from_microseconds(times // 1000 - self._epoch)
+                arrival = (times // 1000 - self._epoch).astype(np.float64) * MICROSECOND
                 used = self._used(before, len(frames))
                 if used.any():
                     yield replace(frames, arrival=arrival, stamp=stamp)[used]

@@ -9,6 +9,7 @@ import numpy as np
 
 from sms_online.state import Stage
 from sms_online.stream import Array
+from sms_online.trackers.factor import triangular_factor
 from sms_online.trackers.information import Information
 
 
@@ -154,7 +155,7 @@ class Tracker(Stage, ABC):
     """
 
     enabled: bool
-    """While False, rows are ignored and the estimate stands still."""
+    """While False, rows are ignored and the estimate stays as it is."""
 
     @abstractmethod
     def update(self, rows: Rows) -> None:
@@ -171,6 +172,17 @@ class Tracker(Stage, ABC):
     @abstractmethod
     def begin(self, known: Information) -> None:
         """Forget all rows, and go on from what others say of π; priors stay. ValueError where it is not of n."""
+
+    @property
+    def information(self) -> Information:
+        """What rows and priors say of π now, for others to go on from; by default as much as the estimate holds."""
+        estimate = self.estimate()
+        known = np.flatnonzero(estimate.determined)
+        root = np.linalg.inv(np.linalg.cholesky(estimate.covariance[np.ix_(known, known)]))
+        rows = np.zeros((known.size + 1, estimate.pi.size + 1))
+        rows[:-1, known], rows[:-1, -1] = root, root @ estimate.pi[known]
+        rows[-1, -1] = np.sqrt(estimate.rss)
+        return Information(triangular_factor(rows), int(estimate.rows))
 
 
 def checked(known: Information, n: int) -> Information:
