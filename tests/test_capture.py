@@ -10,7 +10,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sms_adapters.capture import LARGEST, CaptureReader, CaptureWriter
+from sms_adapters.capture import BLOCK, LARGEST, CaptureReader, CaptureWriter
+from sms_adapters.part import Part
 from sms_adapters.sources import open_source
 from sms_adapters.truth import read_truth, truth_path, write_truth
 from sms_online.description.schema import Joint, System
@@ -87,8 +88,8 @@ def test_blocks_are_bounded_and_progress_ends_at_the_file_size(tmp_path: Path, s
     with CaptureWriter(path, samples.channels) as writer:
         writer.write(samples)
     consumed: list[int] = []
-    blocks = list(CaptureReader(path, block=1000, on_bytes=consumed.append))
-    assert max(block.t.size for block in blocks) == 1000
+    blocks = list(CaptureReader(path, on_bytes=consumed.append))
+    assert max(block.t.size for block in blocks) <= BLOCK
     assert sum(block.t.size for block in blocks) == samples.t.size
     assert consumed == sorted(consumed)
     assert consumed[-1] == path.stat().st_size
@@ -113,10 +114,11 @@ def test_memory_does_not_grow_with_the_file(tmp_path: Path) -> None:
 
 def test_start_and_stop_count_from_the_first_sample(tmp_path: Path) -> None:
     path = write(tmp_path / "run.csv", "t,q_1\n" + "".join(f"{100 + k},{k}\n" for k in range(10)))
-    t, values = read(CaptureReader(path, start=2.0, stop=5.0))
+    t, values = read(Part(CaptureReader(path), "run.csv", 2.0, 5.0))
     assert t.tolist() == [102, 103, 104]
     assert values[:, 0].tolist() == [2, 3, 4]
-    assert "no samples from 20 s" in refusal(path, start=20.0)
+    with pytest.raises(InputError, match="no samples from 20 s"):
+        list(Part(CaptureReader(path), "run.csv", 20.0, None))
 
 
 def test_empty_and_nan_cells_are_gaps_counted_per_channel(tmp_path: Path) -> None:
@@ -174,7 +176,7 @@ def test_the_samples_before_a_malformed_chunk_are_out_already(tmp_path: Path) ->
     rows = "".join(f"{k},0.12345678901234567\n" for k in range(100_000))
     path = write(tmp_path / "run.csv", f"t,q_1\n{rows}oops\n{rows}")
     count = 0
-    blocks = iter(CaptureReader(path, block=1000))
+    blocks = iter(CaptureReader(path))
     while count < 50_000:
         count += next(blocks).t.size
     with pytest.raises(InputError, match=r"line 100002: 1 cells"):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Protocol
@@ -47,7 +46,7 @@ class CanLogReader:
     """A CAN log as blocks in order of time; each iteration starts from its beginning.
 
     Each frame of a wanted message gives one sample, NaN in the channels of other messages. t: seconds since the log's
-    first frame of any kind. start, stop, block, on_bytes: as for CaptureReader. directory: where the system file
+    first frame of any kind. on_bytes: as for CaptureReader. directory: where the system file
     lies, with its DBC or EDS. With several CAN sources, each takes the frames of the interface that is its `channel`.
 
     What the decoders skip is counted in `warnings`, as is a cut end. Raises InputError, on construction for a system
@@ -59,9 +58,6 @@ class CanLogReader:
         self,
         path: Path,
         system: System,
-        start: float | None = None,
-        stop: float | None = None,
-        block: int = BLOCK,
         on_bytes: Callable[[int], None] | None = None,
         directory: Path | None = None,
     ) -> None:
@@ -70,9 +66,6 @@ class CanLogReader:
             expected = f"a [[source]] of kind 'can' or 'canopen' in the system {system.name!r}"
             raise InputError(str(path), "", "a CAN log without a DBC", expected)
         self._path = path
-        self._start = -math.inf if start is None else start
-        self._stop = math.inf if stop is None else stop
-        self._block = block
         self._directory = directory
         self._decoders = self._new_decoders()
         self._log = open_log(path, on_bytes)
@@ -104,16 +97,11 @@ class CanLogReader:
         rows = 0
         for logged in self._log:
             t, values = self._rows(logged)
-            inside = slice(*np.searchsorted(t, (self._start, self._stop)))
-            t, values = t[inside], values[inside]
             rows += t.size
-            for k in range(0, t.size, self._block):
-                yield Block(t[k : k + self._block], channels, values[k : k + self._block])
-            if logged.frames.arrival[-1] >= self._stop:
-                break
+            yield from Block(t, channels, values).pieces(BLOCK)
         if not rows:
             names = ", ".join(message.name for decoder in self._decoders for message in decoder.messages)
-            raise InputError(str(self._path), "", "no samples", f"frames of {names} between start and stop")
+            raise InputError(str(self._path), "", "no samples", f"frames of {names}")
 
     def _rows(self, logged: LoggedFrames) -> tuple[Array, Array]:
         """Times (M,) and values (M, C) of the samples in some frames, those of all sources in order of time."""

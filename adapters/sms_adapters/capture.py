@@ -29,9 +29,8 @@ _NUMBER = re.compile(r"\s*[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?\s*")
 class CaptureReader:
     """A capture file, .csv or .csv.gz, as blocks in order of time; each iteration starts from its beginning.
 
-    start, stop: seconds after the capture's first sample; samples with start <= t - t[0] < stop are yielded, with the
-    capture's own t. block: most rows in a block. on_bytes: called with the bytes of the file consumed so far.
-    known: the channels that mean something to the caller; others are errors. One chunk of text is held at a time.
+    on_bytes: called with the bytes of the file consumed so far. known: the channels that mean something to the caller;
+    others are errors. One chunk of text is held at a time.
 
     Empty and NaN cells are NaN in the block, a later sample with an equal time is skipped, and so is a last line that
     does not end in a newline; each is counted in `warnings`.
@@ -42,16 +41,10 @@ class CaptureReader:
     def __init__(
         self,
         path: Path,
-        start: float | None = None,
-        stop: float | None = None,
-        block: int = BLOCK,
         on_bytes: Callable[[int], None] | None = None,
         known: Sequence[str] | None = None,
     ) -> None:
         self._path = path
-        self._start = -math.inf if start is None else start
-        self._stop = math.inf if stop is None else stop
-        self._block = block
         self._lines = LineReader(path, on_bytes)
         self._channels = _header(path, LineReader(path).first_line())
         if known is not None:
@@ -83,7 +76,7 @@ class CaptureReader:
     def __iter__(self) -> Iterator[Block]:
         """Yield the blocks from the capture's beginning."""
         self._reset()
-        first, last = math.nan, -math.inf
+        last = -math.inf
         for line, chunk in self._lines:
             if line == 1:
                 line, chunk = 2, chunk[bytes(chunk).index(b"\n") + 1 :]
@@ -100,20 +93,11 @@ class CaptureReader:
                 if not t.size:
                     continue
             last = t[-1]
-            if math.isnan(first):
-                first = t[0]
-            inside = slice(*np.searchsorted(t - first, (self._start, self._stop)))
-            rows = rows[inside]
             self._rows += len(rows)
             self._unsampled += np.isnan(rows[:, 1:]).sum(axis=0)
-            for k in range(0, len(rows), self._block):
-                part = rows[k : k + self._block]
-                yield Block(part[:, 0], self._channels, part[:, 1:])
-            if last - first >= self._stop:
-                break
+            yield from Block(t, self._channels, rows[:, 1:]).pieces(BLOCK)
         if not self._rows:
-            where = "" if math.isnan(first) else f" from {self._start:g} s to {self._stop:g} s"
-            raise InputError(str(self._path), "", f"no samples{where}", "at least one row below the header")
+            raise InputError(str(self._path), "", "no samples", "at least one row below the header")
 
     def _reset(self) -> None:
         self._rows = 0

@@ -7,7 +7,6 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from numpy.typing import NDArray
 
 from sms_adapters.capture import BLOCK
@@ -36,8 +35,8 @@ class LogReader:
     """A table or bag as blocks in order of time; each iteration starts from its beginning.
 
     What its columns or topics mean is said by the system's sources of kind `table` or `bag`. Stamps that are whole
-    numbers or dates count from the first one. start, stop: s after the first sample. on_bytes: called with the bytes of
-    the file consumed so far, where these are known. What is skipped is counted in `warnings`.
+    numbers or dates count from the first one. on_bytes: called with the bytes of the file consumed so far, where these
+    are known. What is skipped is counted in `warnings`.
     Raises InputError, on construction for a file that is not there, a system without such a source, a unit that is none
     and a topic that the bag does not hold; while iterating for what cannot be read, a column or path that is not there,
     stamps of a table that go back, and a channel without any sample.
@@ -47,14 +46,10 @@ class LogReader:
         self,
         path: Path,
         system: System,
-        start: float | None = None,
-        stop: float | None = None,
         on_bytes: Callable[[int], None] | None = None,
     ) -> None:
         self._path = path
         self._system = system
-        self._start = -math.inf if start is None else start
-        self._stop = math.inf if stop is None else stop
         self._on_bytes = on_bytes
         self._bag = open_bag(path, on_bytes) if is_bag(path) else None
         self._topics: list[str] = []  # of each lane of a bag
@@ -81,21 +76,10 @@ class LogReader:
         self._lanes = self._new_lanes()
         self._merge = LogMerge([len(lane.keys) for lane in self._lanes], math.inf if self._bag is None else PATIENCE)
         channels = self.channels
-        first, rows = math.nan, 0
         for t, values in self._merged():
-            if not t.size:
-                continue
-            first = float(t[0]) if math.isnan(first) else first
-            inside = slice(*np.searchsorted(t - first, (self._start, self._stop)))
-            rows += t[inside].size
-            yield from Block(t[inside], channels, values[inside]).pieces(BLOCK)
-            if t[-1] - first >= self._stop:
-                break
-        else:
-            for lane in self._lanes:
-                lane.check()
-        if not rows:
-            raise InputError(str(self._path), "", "no samples", "rows between start and stop")
+            yield from Block(t, channels, values).pieces(BLOCK)
+        for lane in self._lanes:
+            lane.check()
 
     def _merged(self) -> Iterator[tuple[Array, Array]]:
         """Times and values of all lanes, as they come to be in order."""

@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 
 from sms_adapters.capture import CaptureReader
-from sms_adapters.checkpoint import read_checkpoint
 from sms_adapters.mcap_capture import capture_writer
-from sms_adapters.recording import Recording
+from sms_adapters.part import Part
+from sms_adapters.recording import resumed_from
 from sms_adapters.searches import searcher_of
 from sms_adapters.session_log import SESSION
 from sms_adapters.sources import open_source
@@ -25,12 +25,11 @@ from sms_online.stream import Source
 
 def recorded_at(path: Path, source: Source, whole: bool = True) -> Recorded:
     """The recorded session of a source that `open_source` opened at a path; whole: it is all that was recorded."""
-    checkpoint = source.checkpoint if isinstance(source, Recording) else None
     return Recorded(
         source,
         str(path),
         truth_beside(path),
-        None if checkpoint is None else read_checkpoint(checkpoint),
+        resumed_from(path),
         partial(searcher_of, path) if whole else lambda adopt: Immediate(),
     )
 
@@ -58,7 +57,7 @@ def read_capture(
         return captured(recorded_at(path, open_source(path, system, start, stop, None, folder)))
     if not path.name.removesuffix(".gz").endswith(".csv"):
         raise InputError(str(path), "", "no system", "the system, to know which signals are which channels")
-    return captured(Recorded(CaptureReader(path, start, stop), str(path), truth_beside(path)))
+    return captured(Recorded(Part(CaptureReader(path), str(path), start, stop), str(path), truth_beside(path)))
 
 
 def captured(recorded: Recorded) -> Capture:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
@@ -13,6 +12,7 @@ from sms_adapters.clock_lanes import merger
 from sms_adapters.clock_merge import TICK, TICK_MICROSECONDS
 from sms_adapters.raw import CanFrames, Raw
 from sms_adapters.session_log import CHECKPOINT, RULES, SYSTEM, RecordedItems, from_microseconds, read_header
+from sms_online.checkpoint import Checkpoint
 from sms_online.description.schema import System
 from sms_online.errors import InputError
 from sms_online.stream import Block
@@ -36,11 +36,17 @@ def split(items: Sequence[Raw], time: float) -> tuple[list[Raw], list[Raw]]:
     return list(items), []
 
 
+def resumed_from(path: Path) -> Checkpoint | None:
+    """The state that a recorded session resumed from, None where it began anew or the path is no recording."""
+    checkpoint = path / CHECKPOINT
+    return read_checkpoint(checkpoint) if checkpoint.is_file() else None
+
+
 class Recording:
     """What a live session recorded, as the session's own blocks: a `Source`.
 
     directory: of session.toml. system: as the session had it; its sources are those of the recording. system_directory:
-    where its file lies. start, stop: s after the session's start. Raises InputError where the directory is no
+    where its file lies. start: of the session, s. Raises InputError where the directory is no
     recording, or of other sources.
     """
 
@@ -49,13 +55,10 @@ class Recording:
         directory: Path,
         system: System,
         system_directory: Path | None = None,
-        start: float | None = None,
-        stop: float | None = None,
     ) -> None:
         self._directory = directory
         self._header, self._ending = read_header(directory)
-        self._start = -math.inf if start is None else start
-        self._stop = math.inf if stop is None else stop
+        self.start = self._header.start
         self._system, self._system_directory = system, system_directory
         names = [source.name for source in system.devices]
         if set(names) != set(self._header.sources):
@@ -69,12 +72,6 @@ class Recording:
     def channels(self) -> tuple[str, ...]:
         """The channels of all sources, in the order of the system file."""
         return self._merger.channels
-
-    @property
-    def checkpoint(self) -> Path | None:
-        """Where the state is that the session resumed from, None where it began anew."""
-        path = self._directory / CHECKPOINT
-        return path if path.is_file() else None
 
     @property
     def warnings(self) -> list[str]:
@@ -99,8 +96,8 @@ class Recording:
             for source in self._system.devices
         ]
         self._merger = ours = merger(self._system, self._system_directory, self._header.start)
-        if self.checkpoint is not None:
-            read_checkpoint(self.checkpoint).put_into_source(ours)
+        if (resumed := resumed_from(self._directory)) is not None:
+            resumed.put_into_source(ours)
         recorded = [iter(items) for items in self._items]
         waiting: list[list[Raw]] = [[] for _ in recorded]
         number = 0
@@ -119,16 +116,9 @@ class Recording:
             for k in range(len(waiting)):
                 early, waiting[k] = split(waiting[k], now)
                 due.append(early)
-            block = self._cut(ours.advance(now, due))
+            block = ours.advance(now, due)
             if block is not None:
                 yield block
-        block = self._cut(ours.finish())
+        block = ours.finish()
         if block is not None:
             yield block
-
-    def _cut(self, block: Block | None) -> Block | None:
-        """The part from start to stop."""
-        if block is None or (self._start == -math.inf and self._stop == math.inf):
-            return block
-        inside = (block.t - self._header.start >= self._start) & (block.t - self._header.start < self._stop)
-        return Block(block.t[inside], block.channels, block.values[inside])

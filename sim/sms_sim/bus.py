@@ -30,6 +30,7 @@ from sms_adapters.can_decoder import CanDecoder
 from sms_adapters.can_reader import CanReader, open_bus
 from sms_adapters.can_signals import wanted_messages
 from sms_adapters.capture import CaptureReader
+from sms_adapters.part import Part
 from sms_adapters.raw import EXTENDED, CanFrames, LostDevice
 from sms_adapters.system_file import load_system
 from sms_online.description.channels import drive_channels
@@ -319,7 +320,7 @@ def _solve(arm: MovingArm, pipe: Connection, others: Connection) -> None:
 def capture_blocks(path: Path, duration: float, rows: int = 64) -> Iterator[Block]:
     """A capture's samples up to `duration` s, a few at a time, from t = 0."""
     first: float | None = None
-    for block in CaptureReader(path, stop=duration):
+    for block in Part(CaptureReader(path), str(path), None, duration):
         first = float(block.t[0]) if first is None else first
         yield from Block(block.t - first, block.channels, block.values).pieces(rows)
 

@@ -9,22 +9,18 @@ is estimated from the data, and the nominal values that the estimator sees are n
 
 from __future__ import annotations
 
-import argparse
-import json
-import sys
 from pathlib import Path
 from time import process_time
-from typing import Any
 
 import numpy as np
 
 from sms_adapters.system_file import load_system
 from sms_online.effects.build import build_model
-from sms_online.errors import InputError
 from sms_online.evaluation import NORMAL_95
 from sms_online.model.base_parameters import find_base_parameters
 from sms_online.pipeline.estimator import Estimator
 from sms_online.stream import Array, Block
+from tests.campaigns.results import Record, append, campaign, read, summed
 from tests.campaigns.sessions import disguised, exact_session, noisy_session, true_parameters
 from tests.evaluated import standard_deviation
 from tests.exactly_known import exactly_known
@@ -46,21 +42,18 @@ POOLED, EACH = (93.5, 96.5), (88.5, 99.5)
 # Asked of the mean error, in standard deviations.
 LARGEST_BIAS = 1.0 / 3.0
 
-Record = dict[str, Any]
-
 
 def run(results: Path, cache: Path, runs: int, grades: list[str]) -> None:
     """Append the sessions that `results` lacks, seed by seed."""
     system = load_system(SYSTEM)
     exact = exact_session(system, cache)
-    done = {(record["grade"], record["seed"]) for record in read(results)} if results.exists() else set()
+    done = {(record["grade"], record["seed"]) for record in read(results)}
     for seed in range(runs):
         for grade in grades:
             if (grade, seed) in done:
                 continue
             record = one_session(noisy_session(system, exact, grade, seed))
-            with results.open("a", encoding="utf-8") as file:
-                file.write(json.dumps({"grade": grade, "seed": seed, **record}) + "\n")
+            append(results, {"grade": grade, "seed": seed, **record})
 
 
 def one_session(block: Block) -> Record:
@@ -83,18 +76,6 @@ def one_session(block: Block) -> Record:
         "events": None if events is None else len(events),
         "seconds": process_time() - start,
     }
-
-
-def read(results: Path) -> list[Record]:
-    """Sessions in a results file; what a stopped run left of its last line is taken out of the file."""
-    text = results.read_text(encoding="utf-8")
-    whole = text[: text.rfind("\n") + 1]
-    if whole != text:
-        results.write_text(whole, encoding="utf-8")
-    try:
-        return [json.loads(line) for line in whole.splitlines()]
-    except json.JSONDecodeError as error:
-        raise InputError(str(results), "", f"a line that is not JSON ({error})", "lines that `run` wrote") from None
 
 
 def summary(records: list[Record]) -> str:
@@ -150,30 +131,16 @@ def flagged(value: float, missed: bool, form: str) -> str:
     return f"{value:{form}}" + ("!" if missed else "")
 
 
-def main() -> int:
-    """Parse the command line; 2 where the results file cannot be read."""
-    parser = argparse.ArgumentParser(prog="python -m tests.campaigns.accuracy", description=__doc__.splitlines()[0])
-    verbs = parser.add_subparsers(dest="verb", required=True)
-    runner = verbs.add_parser("run", help="append the sessions that RESULTS lacks")
-    runner.add_argument("results", metavar="RESULTS", type=Path)
-    runner.add_argument("--runs", type=int, default=200, help="seeds 0, 1, … of each grade, 200 by default")
-    runner.add_argument("--grades", nargs="+", choices=GRADES, default=list(GRADES))
-    runner.add_argument("--exact", metavar="FILE.npz", type=Path, help="exact samples, beside RESULTS by default")
-    shower = verbs.add_parser("summary", help="print what the sessions show")
-    shower.add_argument("results", metavar="RESULTS", type=Path)
-    args = parser.parse_args()
-    try:
-        if args.verb == "run":
-            run(args.results, args.exact or args.results.with_suffix(".exact.npz"), args.runs, args.grades)
-        else:
-            print(summary(read(args.results)))
-    except (InputError, OSError) as error:
-        print(error, file=sys.stderr)
-        return 2
-    except KeyboardInterrupt:
-        return 130
-    return 0
-
-
 if __name__ == "__main__":
-    sys.exit(main())
+    campaign(
+        __doc__,
+        {
+            "run": lambda args: run(
+                args.results, args.exact or args.results.with_suffix(".exact.npz"), args.runs, args.grades
+            ),
+            "summary": summed(summary),
+        },
+        runs={"type": int, "default": 200, "help": "seeds 0, 1, … of each grade, 200 by default"},
+        grades={"nargs": "+", "choices": GRADES, "default": list(GRADES)},
+        exact={"metavar": "FILE.npz", "type": Path, "help": "exact samples, beside RESULTS by default"},
+    )

@@ -16,8 +16,6 @@ goes on where it was.
 
 from __future__ import annotations
 
-import argparse
-import json
 import zlib
 from collections.abc import Iterator
 from pathlib import Path
@@ -44,7 +42,8 @@ from sms_online.model.base_parameters import find_base_parameters
 from sms_online.pipeline.estimator import Estimator
 from sms_online.pipeline.statistics import Statistics
 from sms_online.stream import Array, Block
-from tests.campaigns.accuracy import flagged, read
+from tests.campaigns.accuracy import flagged
+from tests.campaigns.results import append, campaign, read, summed
 from tests.campaigns.sessions import disguised, exact_session, noisy_session, true_parameters
 
 SYSTEM = "paper-planar"
@@ -163,7 +162,7 @@ def run(results: Path, cache: Path, seeds: int, names: list[str], struck: bool) 
     system = load_system(SYSTEM)
     kind = "struck" if struck else "single"
     draw = Draw(system, cache)
-    done = {(r["kind"], r["name"], r["seed"]) for r in read(results)} if results.exists() else set()
+    done = {(r["kind"], r["name"], r["seed"]) for r in read(results)}
     for seed in range(seeds):
         for name in names:
             if (kind, name, seed) in done or (struck and ENTRIES[name].kind == "kinematics"):
@@ -171,14 +170,14 @@ def run(results: Path, cache: Path, seeds: int, names: list[str], struck: bool) 
             effect = draw.effect(name, seed)
             block = draw.session((effect,), seed)
             case = _struck(system, block, effect, draw) if struck else _case(system, block, effect)
-            _append(results, {"kind": kind, "seed": seed, **case})
+            append(results, {"kind": kind, "seed": seed, **case})
 
 
 def pairs(results: Path, cache: Path, seeds: int, names: list[str]) -> None:
     """Append sessions with two effects of different names, one pair for each seed."""
     system = load_system(SYSTEM)
     draw = Draw(system, cache)
-    done = {r["seed"] for r in read(results) if r["kind"] == "pair"} if results.exists() else set()
+    done = {r["seed"] for r in read(results) if r["kind"] == "pair"}
     drawn = [name for name in names if ENTRIES[name].kind != "kinematics"]
     for seed in range(seeds):
         if seed in done:
@@ -195,25 +194,20 @@ def pairs(results: Path, cache: Path, seeds: int, names: list[str]) -> None:
             "found": _keys(found),
             "holdout": found.after.holdout.whitened,
         }
-        _append(results, record)
+        append(results, record)
 
 
 def clean(results: Path, cache: Path, seeds: int) -> None:
     """Append clean sessions of all grades."""
     system = load_system(SYSTEM)
     exact = exact_session(system, cache / "clean.npz")
-    done = {(r["name"], r["seed"]) for r in read(results) if r["kind"] == "clean"} if results.exists() else set()
+    done = {(r["name"], r["seed"]) for r in read(results) if r["kind"] == "clean"}
     for seed in range(seeds):
         for grade in ("A", "B", "C"):
             if (grade, seed) not in done:
                 found = diagnose(disguised(system), [noisy_session(system, exact, grade, seed)], "case", lambda _: None)
                 record = {"kind": "clean", "name": grade, "seed": seed, "verdict": found.verdict, "found": _keys(found)}
-                _append(results, record | {"holdout": found.after.holdout.whitened})
-
-
-def _append(results: Path, record: Record) -> None:
-    with results.open("a", encoding="utf-8") as file:
-        file.write(json.dumps(record) + "\n")
+                append(results, record | {"holdout": found.after.holdout.whitened})
 
 
 def _keys(found: Diagnosis) -> list[str]:
@@ -393,24 +387,17 @@ def _against_declared(singles: list[Record]) -> list[str]:
     return lines
 
 
-def main() -> None:
-    """Command line of the campaign."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("what", choices=("run", "struck", "pairs", "clean", "summary"))
-    parser.add_argument("results", type=Path)
-    parser.add_argument("--seeds", type=int, default=4)
-    parser.add_argument("--cache", type=Path, default=Path("runs/blind"))
-    parser.add_argument("--names", nargs="*", default=list(ENTRIES))
-    args = parser.parse_args()
-    if args.what in ("run", "struck"):
-        run(args.results, args.cache, args.seeds, args.names, args.what == "struck")
-    elif args.what == "pairs":
-        pairs(args.results, args.cache, args.seeds, args.names)
-    elif args.what == "clean":
-        clean(args.results, args.cache, args.seeds)
-    else:
-        print(summary(read(args.results)))
-
-
 if __name__ == "__main__":
-    main()
+    campaign(
+        __doc__,
+        {
+            "run": lambda args: run(args.results, args.cache, args.seeds, args.names, False),
+            "struck": lambda args: run(args.results, args.cache, args.seeds, args.names, True),
+            "pairs": lambda args: pairs(args.results, args.cache, args.seeds, args.names),
+            "clean": lambda args: clean(args.results, args.cache, args.seeds),
+            "summary": summed(summary),
+        },
+        seeds={"type": int, "default": 4},
+        cache={"type": Path, "default": Path("runs/blind")},
+        names={"nargs": "*", "default": list(ENTRIES)},
+    )

@@ -9,9 +9,6 @@ every seed, its size is that of the kind.
 
 from __future__ import annotations
 
-import argparse
-import json
-import sys
 from collections.abc import Callable
 from functools import cache
 from pathlib import Path
@@ -28,7 +25,7 @@ from sms_online.evaluation import NORMAL_95, Evaluation
 from sms_online.pipeline.estimator import Estimator
 from sms_online.pipeline.statistics import Statistics
 from sms_online.stream import Array, Block
-from tests.campaigns.accuracy import Record, read
+from tests.campaigns.results import Record, append, campaign, read, summed
 from tests.campaigns.sessions import disguised, exact_session, noisy_session, true_parameters
 
 SYSTEM = "paper-planar"
@@ -140,19 +137,14 @@ def _exact(folder: Path, length: float, axis: float) -> Block:
 
 def run(results: Path, folder: Path, seeds: int, kinds: list[str], tolerances: list[str]) -> None:
     """Append the sessions that `results` lacks, seed by seed."""
-    done = (
-        {(record["kind"], record["tolerances"], record["seed"]) for record in read(results)}
-        if results.exists()
-        else set()
-    )
+    done = {(record["kind"], record["tolerances"], record["seed"]) for record in read(results)}
     for seed in range(seeds):
         for kind in kinds:
             for each in tolerances:
                 if (kind, each, seed) in done:
                     continue
                 record = one_session(folder, kind, each, seed)
-                with results.open("a", encoding="utf-8") as file:
-                    file.write(json.dumps({"kind": kind, "tolerances": each, "seed": seed, **record}) + "\n")
+                append(results, {"kind": kind, "tolerances": each, "seed": seed, **record})
 
 
 def one_session(folder: Path, kind: str, tolerances: str, seed: int) -> Record:
@@ -218,24 +210,14 @@ def _line(kind: str, tolerances: str, own: list[dict[str, Any]], truth: Array, c
     return f"{kind:24}{tolerances:>12}" + "".join(f"{number:>9}" for number in numbers)
 
 
-def main() -> int:
-    """Parse the command line."""
-    parser = argparse.ArgumentParser(prog="python -m tests.campaigns.calibration", description=__doc__.splitlines()[0])
-    verbs = parser.add_subparsers(dest="verb", required=True)
-    runner = verbs.add_parser("run", help="append the sessions that RESULTS lacks")
-    runner.add_argument("results", metavar="RESULTS", type=Path)
-    runner.add_argument("--seeds", type=int, default=10, help="seeds 0, 1, … of each kind, 10 by default")
-    runner.add_argument("--kinds", nargs="+", choices=list(KINDS), default=list(KINDS))
-    runner.add_argument("--tolerances", nargs="+", choices=TOLERANCES, default=list(TOLERANCES))
-    shower = verbs.add_parser("summary", help="print what the sessions show")
-    shower.add_argument("results", metavar="RESULTS", type=Path)
-    args = parser.parse_args()
-    if args.verb == "run":
-        run(args.results, args.results.parent, args.seeds, args.kinds, args.tolerances)
-    else:
-        print(summary(read(args.results)))
-    return 0
-
-
 if __name__ == "__main__":
-    sys.exit(main())
+    campaign(
+        __doc__,
+        {
+            "run": lambda args: run(args.results, args.results.parent, args.seeds, args.kinds, args.tolerances),
+            "summary": summed(summary),
+        },
+        seeds={"type": int, "default": 10, "help": "seeds 0, 1, … of each kind, 10 by default"},
+        kinds={"nargs": "+", "choices": list(KINDS), "default": list(KINDS)},
+        tolerances={"nargs": "+", "choices": TOLERANCES, "default": list(TOLERANCES)},
+    )

@@ -10,9 +10,6 @@ not the true ones. The judged tracker is `kalman` with `drift = learned`, least 
 
 from __future__ import annotations
 
-import argparse
-import json
-import sys
 from collections import Counter
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -27,13 +24,13 @@ from sms_adapters.system_file import load_system
 from sms_online.description.schema import System
 from sms_online.effects.build import build_model
 from sms_online.effects.catalogue import parse_effect
-from sms_online.errors import InputError
 from sms_online.evaluation import NORMAL_95
 from sms_online.model.base_parameters import find_base_parameters
 from sms_online.session import Session
 from sms_online.stream import Array, Block
 from sms_sim.drifting import drifted, parsed
-from tests.campaigns.accuracy import Record, flagged, read
+from tests.campaigns.accuracy import flagged
+from tests.campaigns.results import Record, append, campaign, read, summed
 from tests.campaigns.sessions import disguised, exact_session, noisy_session
 from tests.exactly_known import exactly_known
 
@@ -112,7 +109,7 @@ def true_course(case: Case, t: Array) -> Array:
 
 def run(results: Path, runs: int, names: list[str]) -> None:
     """Append the sessions that `results` lacks, seed by seed."""
-    done = {(record["case"], record["seed"]) for record in read(results)} if results.exists() else set()
+    done = {(record["case"], record["seed"]) for record in read(results)}
     for seed, name in product(range(runs), names):
         if (name, seed) in done:
             continue
@@ -123,8 +120,7 @@ def run(results: Path, runs: int, names: list[str]) -> None:
         )
         exact = exact_session(whole, results.with_suffix(f".{name}.npz"), duration=DURATION, drifts=parsed(case.drifts))
         record = one_session(case, noisy_session(whole, exact, GRADE, seed))
-        with results.open("a", encoding="utf-8") as file:
-            file.write(json.dumps({"case": name, "seed": seed, **record}) + "\n")
+        append(results, {"case": name, "seed": seed, **record})
 
 
 def one_session(case: Case, block: Block) -> Record:
@@ -234,30 +230,10 @@ def _counts(names: Iterable[str]) -> str:
     return ", ".join(f"{name} × {count}" for name, count in Counter(names).items()) or "none"
 
 
-def main() -> int:
-    """Parse the command line; 2 where the results file cannot be read."""
-    assert __doc__ is not None
-    parser = argparse.ArgumentParser(prog="python -m tests.campaigns.drifting", description=__doc__.splitlines()[0])
-    verbs = parser.add_subparsers(dest="verb", required=True)
-    runner = verbs.add_parser("run", help="append the sessions that RESULTS lacks")
-    runner.add_argument("results", metavar="RESULTS", type=Path)
-    runner.add_argument("--runs", type=int, default=10, help="seeds 0, 1, … of each case, 10 by default")
-    runner.add_argument("--cases", nargs="+", choices=list(CASES), default=list(CASES))
-    shower = verbs.add_parser("summary", help="print what the sessions show")
-    shower.add_argument("results", metavar="RESULTS", type=Path)
-    args = parser.parse_args()
-    try:
-        if args.verb == "run":
-            run(args.results, args.runs, args.cases)
-        else:
-            print(summary(read(args.results)))
-    except (InputError, OSError) as error:
-        print(error, file=sys.stderr)
-        return 2
-    except KeyboardInterrupt:
-        return 130
-    return 0
-
-
 if __name__ == "__main__":
-    sys.exit(main())
+    campaign(
+        __doc__,
+        {"run": lambda args: run(args.results, args.runs, args.cases), "summary": summed(summary)},
+        runs={"type": int, "default": 10, "help": "seeds 0, 1, … of each case, 10 by default"},
+        cases={"nargs": "+", "choices": list(CASES), "default": list(CASES)},
+    )

@@ -11,8 +11,6 @@ same ones without a mistake. Every case is a line of RESULTS.jsonl; a stopped ca
 
 from __future__ import annotations
 
-import argparse
-import json
 import zlib
 from collections.abc import Callable
 from pathlib import Path
@@ -26,7 +24,7 @@ from sms_online.description.parse import describe
 from sms_online.description.schema import System
 from sms_online.diagnosis.diagnose import diagnose
 from sms_online.stream import Array, Block
-from tests.campaigns.accuracy import read
+from tests.campaigns.results import append, campaign, read, summed
 from tests.campaigns.sessions import DISGUISED, exact_session, noisy_session
 
 SYSTEMS = ("paper-planar", "paper-planar-table-v", "spatial-two-link")
@@ -199,13 +197,12 @@ def case(
 
 def run(results: Path, cache: Path, seeds: int, systems: list[str], names: list[str]) -> None:
     """Append the cases that `results` lacks."""
-    done = {(r["system"], r["name"], r["seed"]) for r in read(results)} if results.exists() else set()
+    done = {(r["system"], r["name"], r["seed"]) for r in read(results)}
     for seed in range(seeds):
         for system in systems:
             for make in MISTAKES:
                 if make.__name__ in names and (system, make.__name__, seed) not in done:
-                    with results.open("a", encoding="utf-8") as file:
-                        file.write(json.dumps(case(system, cache, seed, make)) + "\n")
+                    append(results, case(system, cache, seed, make))
 
 
 def summary(records: list[dict[str, Any]]) -> str:
@@ -221,21 +218,15 @@ def summary(records: list[dict[str, Any]]) -> str:
     return "\n".join(lines)
 
 
-def main() -> None:
-    """See above."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("what", choices=("run", "summary"))
-    parser.add_argument("results", type=Path)
-    parser.add_argument("--seeds", type=int, default=5)
-    parser.add_argument("--cache", type=Path, default=Path("runs/mistakes"))
-    parser.add_argument("--systems", nargs="*", default=list(SYSTEMS))
-    parser.add_argument("--names", nargs="*", default=[make.__name__ for make in MISTAKES])
-    args = parser.parse_args()
-    if args.what == "run":
-        run(args.results, args.cache, args.seeds, args.systems, args.names)
-    else:
-        print(summary(read(args.results)))
-
-
 if __name__ == "__main__":
-    main()
+    campaign(
+        __doc__,
+        {
+            "run": lambda args: run(args.results, args.cache, args.seeds, args.systems, args.names),
+            "summary": summed(summary),
+        },
+        seeds={"type": int, "default": 5},
+        cache={"type": Path, "default": Path("runs/mistakes")},
+        systems={"nargs": "*", "default": list(SYSTEMS)},
+        names={"nargs": "*", "default": [make.__name__ for make in MISTAKES]},
+    )

@@ -12,8 +12,6 @@ goes on where it was.
 
 from __future__ import annotations
 
-import argparse
-import json
 from pathlib import Path
 from time import process_time
 from typing import Any
@@ -27,7 +25,7 @@ from sms_online.effects.catalogue import ENTRIES, channel_effects, parse_effect
 from sms_online.pipeline.estimator import Estimator
 from sms_online.stream import Block
 from sms_sim.simulate import Simulation, exact_states, simulate
-from tests.campaigns.accuracy import read
+from tests.campaigns.results import append, campaign, read, summed
 from tests.campaigns.sessions import disguised, noisy_session
 from tests.changed_session import changed_session
 
@@ -85,7 +83,7 @@ def run(results: Path, seeds: int) -> None:
     """Append the cases that `results` lacks."""
     system = load_system(SYSTEM)
     before = simulate(system, END)
-    done = {(r["kind"], r["case"], r["seed"]) for r in read(results)} if results.exists() else set()
+    done = {(r["kind"], r["case"], r["seed"]) for r in read(results)}
     for text in CASES:
         missing = [seed for seed in range(seeds) if ("begun", text, seed) not in done]
         exact = session(before, system, text) if missing else None
@@ -97,7 +95,7 @@ def run(results: Path, seeds: int) -> None:
                 "kind": "begun", "case": text, "seed": seed, "episodes": online.document(),
                 "events": [event.kind for event in estimator.events], "seconds": process_time() - start,
             }  # fmt: skip
-            _append(results, record)
+            append(results, record)
 
 
 def steady(results: Path, seeds: int) -> None:
@@ -108,7 +106,7 @@ def steady(results: Path, seeds: int) -> None:
     states = exact_states(simulation, np.arange(samples + 1) / system.sample_rate)
     plant = simulation.plant
     exact = Block(states.t, plant.channels, plant.channel_values(states.torque, states.x))
-    done = {(r["case"], r["seed"]) for r in read(results) if r["kind"] == "steady"} if results.exists() else set()
+    done = {(r["case"], r["seed"]) for r in read(results) if r["kind"] == "steady"}
     for seed in range(seeds):
         for grade in ("A", "B", "C"):
             if (grade, seed) not in done:
@@ -116,12 +114,7 @@ def steady(results: Path, seeds: int) -> None:
                 assert estimator.momentum is not None
                 largest = max(estimator.momentum.test.evidence.values())
                 record = {"kind": "steady", "case": grade, "seed": seed, "episodes": online.document(), "sum": largest}
-                _append(results, record)
-
-
-def _append(results: Path, record: Record) -> None:
-    with results.open("a", encoding="utf-8") as file:
-        file.write(json.dumps(record) + "\n")
+                append(results, record)
 
 
 def summary(records: list[Record]) -> str:
@@ -153,18 +146,13 @@ def summary(records: list[Record]) -> str:
     return "\n".join(lines)
 
 
-def main() -> None:
-    """Command line of the campaign."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("what", choices=("run", "steady", "summary"))
-    parser.add_argument("results", type=Path)
-    parser.add_argument("--seeds", type=int, default=2)
-    args = parser.parse_args()
-    if args.what == "summary":
-        print(summary(read(args.results)))
-    else:
-        (run if args.what == "run" else steady)(args.results, args.seeds)
-
-
 if __name__ == "__main__":
-    main()
+    campaign(
+        __doc__,
+        {
+            "run": lambda args: run(args.results, args.seeds),
+            "steady": lambda args: steady(args.results, args.seeds),
+            "summary": summed(summary),
+        },
+        seeds={"type": int, "default": 2},
+    )

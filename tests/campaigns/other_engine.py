@@ -10,7 +10,6 @@ Captures are kept in --cache: the engine needs half a minute of a core for each.
 
 from __future__ import annotations
 
-import argparse
 import json
 from dataclasses import dataclass
 from pathlib import Path
@@ -24,7 +23,7 @@ from sms_online.diagnosis.diagnose import Diagnosis, diagnose
 from sms_online.diagnosis.document import coefficients
 from sms_online.pipeline.estimator import Estimator
 from sms_online.stream import Block
-from tests.campaigns.accuracy import read
+from tests.campaigns.results import append, campaign, read, summed
 from tests.campaigns.sessions import disguised, noisy_session, true_parameters
 from tests.engine_mujoco import EngineEffects, mujoco_capture
 
@@ -73,8 +72,7 @@ def captured(effects: EngineEffects, cache: Path) -> Block:
 
 def run(results: Path, cache: Path, names: list[str]) -> None:
     """Diagnose the cases that are not in the results yet."""
-    results.parent.mkdir(parents=True, exist_ok=True)
-    done = {record["case"] for record in read(results)} if results.exists() else set()
+    done = {record["case"] for record in read(results)}
     for name in names:
         if name in done:
             continue
@@ -84,8 +82,7 @@ def run(results: Path, cache: Path, names: list[str]) -> None:
         block = noisy_session(described, captured(case.effects, cache / f"mujoco-{engine}.npz"), GRADE, SEED)
         begin = process_time()
         record = {"case": name, **_record(case, _diagnosed(case, block)), "seconds": process_time() - begin}
-        with results.open("a") as file:
-            file.write(json.dumps(record) + "\n")
+        append(results, record)
         print(json.dumps(record), flush=True)
 
 
@@ -140,19 +137,10 @@ def summary(records: list[dict[str, Any]]) -> str:
     return "\n".join(lines)
 
 
-def main() -> None:
-    """Command line of the campaign."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("what", choices=("run", "summary"))
-    parser.add_argument("results", type=Path)
-    parser.add_argument("--cache", type=Path, default=Path("runs"))
-    parser.add_argument("--cases", nargs="*", choices=tuple(CASES), default=list(CASES))
-    args = parser.parse_args()
-    if args.what == "run":
-        run(args.results, args.cache, args.cases)
-    else:
-        print(summary(read(args.results)))
-
-
 if __name__ == "__main__":
-    main()
+    campaign(
+        __doc__,
+        {"run": lambda args: run(args.results, args.cache, args.cases), "summary": summed(summary)},
+        cache={"type": Path, "default": Path("runs")},
+        cases={"nargs": "*", "choices": tuple(CASES), "default": list(CASES)},
+    )

@@ -10,9 +10,7 @@ values that the estimator sees are not the true ones, and nothing is a prior.
 
 from __future__ import annotations
 
-import argparse
 import json
-import sys
 from pathlib import Path
 from time import process_time
 from typing import Any
@@ -27,7 +25,7 @@ from sms_online.pipeline.estimator import Estimator
 from sms_online.stream import Block
 from sms_sim.sensors import Sensors
 from sms_sim.simulate import simulate
-from tests.campaigns.accuracy import Record, read
+from tests.campaigns.results import Record, append, campaign, read
 from tests.campaigns.sessions import disguised, exact_session, true_parameters
 from tests.evaluated import standard_deviation
 from tests.plain_rig import bound_of, plain_rig
@@ -66,12 +64,11 @@ def run(results: Path, runs: int) -> None:
     limit = results.with_suffix(".bound.json")
     if not limit.exists():
         limit.write_text(json.dumps(bound_of(simulate(system)).tolist()), encoding="utf-8")
-    done = {record["seed"] for record in read(results)} if results.exists() else set()
+    done = {record["seed"] for record in read(results)}
     for seed in range(runs):
         if seed not in done:
             record = one_session(system, noisy(system, exact, seed))
-            with results.open("a", encoding="utf-8") as file:
-                file.write(json.dumps({"seed": seed, **record}) + "\n")
+            append(results, {"seed": seed, **record})
 
 
 def summary(results: Path) -> str:
@@ -101,28 +98,9 @@ def summary(results: Path) -> str:
     return "\n".join(lines)
 
 
-def main() -> int:
-    """Parse the command line."""
-    parser = argparse.ArgumentParser(prog="python -m tests.campaigns.plain_rig", description=__doc__.splitlines()[0])
-    verbs = parser.add_subparsers(dest="verb", required=True)
-    runner = verbs.add_parser("run", help="append the sessions that RESULTS lacks")
-    runner.add_argument("results", metavar="RESULTS", type=Path)
-    runner.add_argument("--runs", type=int, default=20, help="seeds 0, 1, …, 20 by default")
-    shower = verbs.add_parser("summary", help="print what the sessions show")
-    shower.add_argument("results", metavar="RESULTS", type=Path)
-    args = parser.parse_args()
-    try:
-        if args.verb == "run":
-            run(args.results, args.runs)
-        else:
-            print(summary(args.results))
-    except OSError as error:
-        print(error, file=sys.stderr)
-        return 2
-    except KeyboardInterrupt:
-        return 130
-    return 0
-
-
 if __name__ == "__main__":
-    sys.exit(main())
+    campaign(
+        __doc__,
+        {"run": lambda args: run(args.results, args.runs), "summary": lambda args: summary(args.results)},
+        runs={"type": int, "default": 20, "help": "seeds 0, 1, …, 20 by default"},
+    )
