@@ -12,7 +12,7 @@ import numpy as np
 
 from sms_online.effects.base import Entry, Force
 from sms_online.effects.friction import MotorSide
-from sms_online.trackers import Tracker
+from sms_online.trackers import Prior, Tracker
 
 HOW_TO = Path(__file__).parents[1] / "docs" / "how-to"
 # What a guide asks for in one file, at most.
@@ -35,9 +35,9 @@ def windage() -> type[Force]:
     return cast(type[Force], names["WindageFriction"])
 
 
-def fading(n: int, memory: float) -> Tracker:
+def fading(n: int, memory: float, prior: Prior | None = None) -> Tracker:
     """The tracker, of n parameters and a memory in s."""
     module = ModuleType("fading")
     sys.modules[module.__name__] = module  # where the annotations of its state are evaluated
     exec(compile(code_of("add-a-tracker.md", "from __future__"), "add-a-tracker.md", "exec"), module.__dict__)
-    return cast(Tracker, module.__dict__["FadingLeastSquares"](n, memory))
+    return cast(Tracker, module.__dict__["FadingLeastSquares"](n, memory, prior))

@@ -7,8 +7,13 @@ import re
 from pathlib import Path
 
 import numpy as np
+import pytest
 
+import sms_online as sms
+from sms_online.description.parse import parse_system
 from sms_online.trackers import RecursiveLeastSquares, Rows
+from sms_online.trackers.build import KINDS
+from tests.axis import AXIS, axis_block
 from tests.guide import fading
 from tests.tracker_rows import PI_TRUE, N, exciting_rows, rows_of
 
@@ -84,6 +89,19 @@ def test_the_guides_tracker_follows_a_change() -> None:
     tracker.update(Rows(after.Y, after.b, after.std, after.t + 0.5))
     estimate = tracker.estimate()
     assert (np.abs(estimate.pi - PI_TRUE) < 5.0 * estimate.std).all()
+
+
+def test_the_guides_tracker_is_chosen_by_its_name(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Judged, with the tolerances of clocks and sensors as its prior, it estimates as exponential forgetting does."""
+    monkeypatch.setitem(KINDS, "fading", lambda choice, for_: fading(for_.n, choice.memory or 10.0, for_.prior))
+    block, system = axis_block(coulomb=0.0), parse_system(AXIS, "axis")
+    data = sms.Capture(block.t, block.channels, block.values)
+    own = sms.estimate(system, data, tracker="fading:memory=3")
+    like = sms.estimate(system, data, tracker="rls:forgetting=exponential,memory=3")
+    assert own.trackers[0].name == "fading 3 s"
+    for one, other in zip(own.parameters.values(), like.parameters.values(), strict=True):
+        assert one.value == pytest.approx(other.value, abs=0.2 * other.std)
+        assert one.std == pytest.approx(other.std, rel=0.1)
 
 
 def test_the_guides_tracker_names_what_is_not_determined() -> None:

@@ -13,6 +13,7 @@ import pytest
 
 import sms_online as sms
 from sms_adapters.raw import LostDevice, SerialChunk
+from sms_adapters.sources import READERS
 from sms_online.description.parse import parse_system
 from tests.axis import AXIS, axis_block
 
@@ -52,8 +53,22 @@ def test_the_guides_log_gives_the_estimate_of_its_samples(tmp_path: Path) -> Non
         scope["NumpyLog"](path)
 
 
+def test_the_guides_format_is_read_and_cut_by_every_verb(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    log, entry = shown("add-a-source.md", "python")[:2]
+    scope: dict[str, Any] = {"__name__": "guide"}
+    exec(compile(log, "add-a-source.md", "exec"), scope)
+    for ending, reader in eval(f"{{{entry}}}", scope).items():
+        monkeypatch.setitem(READERS, ending, reader)
+    block, system = axis_block(coulomb=0.0), parse_system(AXIS, "axis")
+    np.savez(tmp_path / "run.npz", t=block.t, values=block.values, channels=block.channels)
+    capture = sms.read_capture(tmp_path / "run.npz", system, start=1.0, stop=4.0)
+    assert (capture.t[0], capture.t[-1]) == (1.0, pytest.approx(3.995))
+    with pytest.raises(sms.InputError, match="no samples from 20 s"):
+        sms.read_capture(tmp_path / "run.npz", system, start=20.0)
+
+
 def test_the_guides_own_source_reads_and_decodes() -> None:
-    code = shown("add-a-source.md", "python")[1]
+    code = shown("add-a-source.md", "python")[-1]
     assert len(code.splitlines()) < 50
     scope: dict[str, Any] = {"__name__": "guide"}
     exec(compile(code, "add-a-source.md", "exec"), scope)

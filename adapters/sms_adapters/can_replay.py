@@ -54,6 +54,8 @@ class CanLogReader:
     read, one message on two interfaces, or no sample at all.
     """
 
+    origin = 0.0  # s, of parts: the first frame
+
     def __init__(
         self,
         path: Path,

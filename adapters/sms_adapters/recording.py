@@ -46,7 +46,7 @@ class Recording:
     """What a live session recorded, as the session's own blocks: a `Source`.
 
     directory: of session.toml. system: as the session had it; its sources are those of the recording. system_directory:
-    where its file lies. start: of the session, s. Raises InputError where the directory is no
+    where its file lies. origin: the session's start, s. Raises InputError where the directory is no
     recording, or of other sources.
     """
 
@@ -58,7 +58,7 @@ class Recording:
     ) -> None:
         self._directory = directory
         self._header, self._ending = read_header(directory)
-        self.start = self._header.start
+        self.origin = self._header.start
         self._system, self._system_directory = system, system_directory
         names = [source.name for source in system.devices]
         if set(names) != set(self._header.sources):

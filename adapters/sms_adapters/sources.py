@@ -21,6 +21,33 @@ from sms_online.description.sources import TableSource
 from sms_online.errors import InputError
 from sms_online.stream import Source
 
+Reader = Callable[[Path, System, Callable[[int], None] | None, Path | None], Source]
+
+
+def _log(path: Path, system: System, on_bytes: Callable[[int], None] | None, directory: Path | None) -> Source:
+    return LogReader(path, system, on_bytes)
+
+
+def _csv(path: Path, system: System, on_bytes: Callable[[int], None] | None, directory: Path | None) -> Source:
+    """A capture, python-can's CAN log, or a table: by the header, and by whether the system describes a table."""
+    header = LineReader(path).first_line().strip()
+    if header == CSV_HEADER:
+        return CanLogReader(path, system, on_bytes, directory)
+    known = channels(system)
+    captured = set(header.split(",")) <= {"t", *known}
+    if not captured and any(isinstance(source, TableSource) for source in system.sources):
+        return LogReader(path, system, on_bytes)
+    return CaptureReader(path, on_bytes, known)
+
+
+# The reader of a file by the ending of its name. Text may be compressed, with .gz behind.
+READERS: dict[str, Reader] = {
+    ".csv": _csv,
+    **dict.fromkeys((".log", ".asc", ".trc", ".blf", ".mf4"), CanLogReader),
+    **dict.fromkeys((*PARQUET_ENDINGS, *ARRAY_ENDINGS), _log),
+}
+COMPRESSED = (".csv", ".log", ".asc", ".trc")
+
 
 def open_source(
     path: Path,
@@ -33,33 +60,25 @@ def open_source(
     """The reader of a capture (.csv), a CAN log (.log of candump, .asc, .blf, .trc, .mf4, .csv of python-can), a table
     (.csv, .parquet, .h5, .mat), a bag (.bag, .db3, .mcap or its directory) or a live session's recording (directory).
 
-    A .csv is a capture where its header says so, or the system has no source of kind `table`. Text may be compressed
-    (.gz). start, stop: the part that is read, s after the file's first sample or frame, or the session's start.
+    A .csv is a capture where its header says so, or the system has no source of kind `table`. start, stop: the part
+    that is read, s after the file's first sample, or after the source's own `origin` where it states one.
     on_bytes: called with the bytes of the file consumed so far. directory: where the system file lies, to find its
     DBC. Raises InputError for another ending, a channel that the system does not have, and as the readers do.
     """
-    source, origin = _whole(path, system, on_bytes, directory)
-    return source if start is stop is None else Part(source, str(path), start, stop, origin)
+    source = _whole(path, system, on_bytes, directory)
+    if start is stop is None:
+        return source
+    return Part(source, str(path), start, stop, getattr(source, "origin", None))
 
 
-def _whole(
-    path: Path, system: System, on_bytes: Callable[[int], None] | None, directory: Path | None
-) -> tuple[Source, float | None]:
-    """The reader of all of a file, and the time that a part of it counts from; None for that of the first sample."""
+def _whole(path: Path, system: System, on_bytes: Callable[[int], None] | None, directory: Path | None) -> Source:
+    """The reader of all of a file."""
     if (path / SESSION).is_file():
-        recording = Recording(path, system, directory)
-        return recording, recording.start
-    name = path.name.removesuffix(".gz")
-    if is_bag(path) or path.suffix in (*PARQUET_ENDINGS, *ARRAY_ENDINGS):
-        return LogReader(path, system, on_bytes), None
-    if name.endswith(".csv") and (header := LineReader(path).first_line().strip()) != CSV_HEADER:
-        known = channels(system)
-        captured = set(header.split(",")) <= {"t", *known}
-        if not captured and any(isinstance(source, TableSource) for source in system.sources):
-            return LogReader(path, system, on_bytes), None
-        return CaptureReader(path, on_bytes, known), None
-    if name.endswith((".csv", ".log", ".asc", ".trc")) or path.suffix in (".blf", ".mf4"):
-        return CanLogReader(path, system, on_bytes, directory), 0.0
-    text, binary = ".csv, .log, .asc, .trc (or .gz of those)", ".blf, .mf4, .parquet, .h5, .mat, .mcap, .bag or .db3"
-    expected = f"a name ending in {text}, {binary}, or a recording"
+        return Recording(path, system, directory)
+    if is_bag(path):
+        return LogReader(path, system, on_bytes)
+    plain = Path(path.name.removesuffix(".gz"))
+    if plain.suffix in READERS and (plain.suffix in COMPRESSED or plain.name == path.name):
+        return READERS[plain.suffix](path, system, on_bytes, directory)
+    expected = f"a name ending in {', '.join(READERS)} (or .gz of text), .mcap, .bag or .db3, or a recording"
     raise InputError(str(path), "", f"a file named {path.name}", expected)

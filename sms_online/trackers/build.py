@@ -80,7 +80,7 @@ def _kalman(choice: TrackerChoice, tracked: Tracked) -> Tracker:
 
 
 # Every tracker that a system file and the command line can choose, by its kind.
-KINDS: Mapping[str, Callable[[TrackerChoice, Tracked], Tracker]] = {"rls": _least_squares, "kalman": _kalman}
+KINDS: dict[str, Callable[[TrackerChoice, Tracked], Tracker]] = {"rls": _least_squares, "kalman": _kalman}
 
 
 def drifts_of(choice: TrackerChoice, tracked: Tracked) -> list[Drift]:
