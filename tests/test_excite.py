@@ -18,7 +18,7 @@ from sms_sim.plant import Plant
 from sms_sim.references import fourier_reference
 from sms_sim.simulate import exact_states, simulate
 from sms_tools.cli import main
-from sms_tools.trajectory_file import reference_lines, system_text
+from sms_tools.trajectory_file import reference_lines, with_trajectory
 from tests.axis import AXIS, MOTION
 
 MOVED = (AXIS + MOTION).replace("duration = 6.0", "duration = 3.0")
@@ -136,10 +136,10 @@ def test_the_verb_writes_file_reference_and_table(tmp_path: Path, capsys: pytest
 def test_another_trajectory_changes_nothing_else_of_a_file(tmp_path: Path) -> None:
     trajectory = parse_system(MOVED, "axis.toml").trajectory
     assert trajectory is not None
-    shipped = system_text("paper-planar", load_system("paper-planar").trajectory or trajectory)
+    shipped = with_trajectory("paper-planar", load_system("paper-planar").trajectory or trajectory)
     assert parse_system(shipped, "x.toml") == load_system("paper-planar")
     assert "# (46), for twice the paper's 10 s" in shipped
     path = tmp_path / "axis.toml"
     path.write_text(AXIS + MOTION.partition("[trajectory]")[0])
-    assert parse_system(system_text(str(path), trajectory), "axis.toml") == parse_system(MOVED, "axis.toml")
+    assert parse_system(with_trajectory(str(path), trajectory), "axis.toml") == parse_system(MOVED, "axis.toml")
     assert next(reference_lines(trajectory, 10.0)) == "t,q_d_1,q_d_dot_1"

@@ -1,4 +1,4 @@
-"""CAN frames to samples: each frame of a wanted message is one, decoded in arrays with the state of its counters."""
+"""CAN frames to samples, decoded in arrays. Each frame of a wanted message is one."""
 
 from __future__ import annotations
 

@@ -82,10 +82,11 @@ class WantedMessage:
 
 
 def wanted_messages(source: CanSource, directory: Path | None) -> list[WantedMessage]:
-    """The messages of source.signals, columns in its order; the DBC from the system's directory or among those shipped.
+    """The messages that channels come from, their columns in the order of source.signals.
 
-    Raises InputError for a DBC that is missing or unreadable, a message or signal it does not hold, and a counter of a
-    message that no channel comes from, that is not a plain unsigned number, or that not every frame holds.
+    The DBC lies in the system's directory or is a shipped one. Raises InputError for a DBC that is missing or
+    unreadable, a message or signal it does not hold, and a counter of a message that no channel comes from, that is not
+    a plain unsigned number, or that not every frame holds.
     """
     place = f"source {source.name}"
     database = _read_dbc(place, source.dbc, directory)

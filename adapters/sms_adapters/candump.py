@@ -39,7 +39,10 @@ _NOT_HEX = 255
 
 @dataclass(frozen=True)
 class LoggedFrames:
-    """Some consecutive frames of a log: arrival and stamp, s since its first; bus: (N,) of each, indices of `buses`."""
+    """Some consecutive frames of a log.
+
+    Arrival and stamp are s since its first frame. bus (N,): of each, an index of `buses`.
+    """
 
     frames: CanFrames
     bus: NDArray[np.intp]

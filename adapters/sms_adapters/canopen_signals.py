@@ -14,6 +14,7 @@ from cantools.database.can import Signal
 from cantools.database.conversion import BaseConversion
 
 from sms_adapters.can_signals import WantedMessage
+from sms_adapters.extras import installed
 from sms_adapters.files import reading
 from sms_adapters.raw import EXTENDED, one_line
 from sms_online.description.sources import CanopenSource
@@ -74,15 +75,12 @@ def pdo_messages(source: CanopenSource, directory: Path | None) -> list[WantedMe
 
 
 def _read_eds(place: str, name: str, node: int, directory: Path | None) -> ObjectDictionary:
-    try:
-        import canopen
-    except ImportError:
-        expected = "it: pip install 'sms-online[canopen]'"
-        raise InputError(place, "kind", "the package canopen is not installed", expected) from None
+    canopen = installed("canopen", place, "kind", "canopen")
     path = (directory or Path()) / name
     try:
         with reading(path, "the EDS beside the system file"):
-            return canopen.import_od(str(path), node)
+            dictionary: ObjectDictionary = canopen.import_od(str(path), node)
+            return dictionary
     except InputError:
         raise
     # Its parser lets through whatever a malformed entry raises.

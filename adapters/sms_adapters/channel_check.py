@@ -36,7 +36,10 @@ LEAST = 20
 
 @dataclass(frozen=True)
 class Remark:
-    """What is the matter with a channel, or with the capture (channel ""). grave: estimates will suffer from it."""
+    """What is the matter with a channel, or with the whole capture, whose channel is "".
+
+    grave: estimates will suffer from it.
+    """
 
     channel: str
     text: str

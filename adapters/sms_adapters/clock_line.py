@@ -1,4 +1,4 @@
-"""The session's time at which a device took its samples, from what its clock says and when the samples arrive.
+"""When a device took its samples, in the session's time, by its own clock and the samples' arrivals.
 
     arrival = (1 + drift) device + offset + latency + delay,    delay >= 0
 
@@ -57,7 +57,10 @@ PAUSE, SAME, PAUSED_INTERVALS = 0.2, 5e-3, 4
 
 @dataclass
 class ClockCounters:
-    """jumps: of the device's clock, confirmed. steps: smaller ones, or a changed latency. corrupt: stamps dropped."""
+    """What happened to a device's clock.
+
+    jumps: confirmed ones. steps: smaller ones, or a changed latency. corrupt: stamps dropped.
+    """
 
     jumps: int = 0
     steps: int = 0
@@ -65,10 +68,11 @@ class ClockCounters:
 
 
 def likely_line(x: Array, y: Array) -> tuple[float, float]:
-    """Slope and value at x = 0 of the mean line below the points (n,), x increasing; slope within 1 ± LARGEST_DRIFT.
+    """Slope, and value at x = 0, of the mean line below points.
 
-    For a drift g the line touches the lowest point, y - x - g x = m(g); with delays of the mean s its likelihood is
-    exp(-Σ (y - x - g x - m) / s), a concave function of g in the exponent. One point gives slope 1.
+    x, y (n,): x increasing. The slope is within 1 ± LARGEST_DRIFT. For a drift g the line touches the lowest point, y -
+    x - g x = m(g); with delays of the mean s its likelihood is exp(-Σ (y - x - g x - m) / s), a concave function of g
+    in the exponent. One point gives slope 1.
     """
     # About the last point, for clocks may be decades apart.
     since_last = x - x[-1]
@@ -102,7 +106,7 @@ def likely_line(x: Array, y: Array) -> tuple[float, float]:
 
 
 class DeviceClock:
-    """Turns a device's stamps into times of the session clock, causally: a sample waits until its time is known.
+    """Turns a device's stamps into times of the session's clock. A sample waits until its time is known.
 
     latency: constant delay between the instant of a sample and its arrival, s, as stated.
 
@@ -144,9 +148,9 @@ class DeviceClock:
         return self._ahead() - self._ahead_at_first
 
     def push(self, device: Array, arrival: Array) -> Array:
-        """Times (K,) of the next K samples in order of arrival, earlier ones held back included; NaN: drop the sample.
+        """Times (K,) of the next samples in order of arrival, those held back before included.
 
-        device, arrival: (M,) s, stamp and arrival of the new samples, in order of arrival.
+        NaN: drop the sample. device, arrival: (M,) s, stamp and arrival of the new samples, in order of arrival.
         """
         if device.size == 0:
             return np.empty(0)

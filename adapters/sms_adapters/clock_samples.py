@@ -1,4 +1,4 @@
-"""Device times of samples whose device sends none: from the count of its frames, or from counting them here."""
+"""Device times of samples whose device sends none, by the count of its frames."""
 
 from __future__ import annotations
 

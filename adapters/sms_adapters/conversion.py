@@ -1,4 +1,4 @@
-"""Numbers of a device to SI: scale and limits, turns of a wrapping number, frames that a counter shows to be lost."""
+"""Numbers of a device to SI units: scale, limits, wraps and lost frames."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ class TurnsState(State):
 
 
 class Turns(Stage):
-    """Undoes the wrapping of a number that counts modulo `wrap`: between two samples it moves by less than half of it.
+    """Undoes the wrapping of a number, which moves by less than half its `wrap` between two samples.
 
     The first sample of all lies in turn 0. Limitation: a hole in which it moves further loses whole turns.
     """
@@ -45,7 +45,7 @@ class Turns(Stage):
 
 
 class Conversions:
-    """A device's numbers to channels, as `Signal` describes each; what is not finite or not plausible becomes NaN.
+    """A device's numbers to channels. What is not finite or not plausible becomes NaN.
 
     signals: of K channels that are sampled together. counters: non_finite and out_of_range are counted there. turns: of
     the channels that wrap.

@@ -1,4 +1,4 @@
-"""A capture against its system file, before it is estimated from: what its channels are like, what its motion shows."""
+"""A capture compared with its system file, before it is estimated from."""
 
 from __future__ import annotations
 
@@ -39,7 +39,10 @@ SHOWN = 4
 
 @dataclass(frozen=True)
 class CheckedChannel:
-    """A channel as it was found. rate: Hz, None where it has too few samples; low, high: its values, in its unit."""
+    """A channel as it was found.
+
+    rate: Hz, None where it has too few samples. low, high: its values, in its unit.
+    """
 
     name: str
     unit: str
@@ -210,12 +213,12 @@ class Checked:
 
 
 def check(system: Given, data: Data) -> Check:
-    """Whether a capture is worth estimating from: what is the matter with its channels, what its motion determines.
+    """Whether a capture is worth estimating from.
 
-    system: described, or its name or file. data: a capture, the path of one, of a log or of a recording, or blocks of
-    samples in order of time. Rates, stamps and resolutions are compared with the description; stuck, saturated
-    and wrapped channels are named, those with outliers, and those that nobody reads. InputError where the data cannot
-    be read.
+    It says what is the matter with its channels, and what its motion determines. system: described, or its name or
+    file. data: a capture, the path of one, of a log or of a recording, or blocks of samples in order of time. Rates,
+    stamps and resolutions are compared with the description; stuck, saturated and wrapped channels are named, those
+    with outliers, and those that nobody reads. InputError where the data cannot be read.
     """
     system, folder = given_system(system)
     recorded = recorded_session(system, data, folder)

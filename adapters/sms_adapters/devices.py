@@ -22,9 +22,10 @@ def make_reader(source: Device, clock: Clock, turn: Turn = at_once) -> Reader:
 
 
 def make_decoder(source: Device, directory: Path | None) -> Decoder:
-    """The decoder of a source's raw items; directory: where the system file lies, with its DBC or EDS beside it.
+    """The decoder of a source's raw items.
 
-    Raises InputError where those do not fit the source.
+    directory: where the system file lies, with its DBC or EDS beside it. Raises InputError where those do not fit the
+    source.
     """
     if isinstance(source, CanSource | CanopenSource):
         return make_can_decoder(source, directory)

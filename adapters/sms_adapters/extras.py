@@ -8,10 +8,10 @@ from typing import Any
 from sms_online.errors import InputError
 
 
-def installed(module: str, source: str, place: str = "") -> Any:
-    """A module of the extra `logs`; InputError, with how to install it, where it is missing. source: what needs it."""
+def installed(module: str, source: str, place: str = "", extra: str = "logs") -> Any:
+    """A module of an extra; InputError says how to install it. source, place: what needs it."""
     try:
         return import_module(module)
     except ImportError:
         found = f"the package {module.partition('.')[0]} is not installed"
-        raise InputError(source, place, found, "it: pip install 'sms-online[logs]'") from None
+        raise InputError(source, place, found, f"it: pip install 'sms-online[{extra}]'") from None

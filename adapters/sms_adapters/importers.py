@@ -66,7 +66,7 @@ def import_quanser(source: Path, capture: Path) -> int:
 
 
 def load_matlab(source: Path, names: Sequence[str] | None = None) -> Mapping[str, Any]:
-    """Variables of a .mat file up to version 7, structs as dictionaries; InputError where it is none. names: which."""
+    """Variables of a .mat file up to version 7, structs as dictionaries. names: which. InputError: it is none."""
     try:
         with reading(source, "a readable .mat file"), source.open("rb") as file:
             # Its stubs know names only.

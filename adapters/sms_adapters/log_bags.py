@@ -26,7 +26,10 @@ def is_bag(path: Path) -> bool:
 
 
 def open_bag(path: Path, on_bytes: Callable[[int], None] | None = None) -> Bag:
-    """The bag at a path; on_bytes: called with the bytes consumed so far, of an MCAP file. InputError: no such file."""
+    """The bag at a path; InputError where there is none.
+
+    on_bytes: called with the bytes consumed so far, of an MCAP file.
+    """
     if not path.exists():
         raise InputError(str(path), "", "no such file", "a bag")
     parts = [path] if path.is_file() else list(path.glob(f"*{MCAP}"))

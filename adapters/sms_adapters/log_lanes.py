@@ -26,7 +26,10 @@ _SECOND = NANOSECONDS["s"]
 
 @dataclass
 class Origin:
-    """Instant of t = 0 of a file, ns: its first stamp where that is a whole number or a date; else stamps are kept."""
+    """Instant of t = 0 of a file, ns.
+
+    It is the first stamp where that is a whole number or a date. Other stamps are kept.
+    """
 
     nanoseconds: int | None = None
 

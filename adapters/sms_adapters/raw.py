@@ -59,9 +59,10 @@ class CanFrames:
 
 @dataclass(frozen=True)
 class SerialChunk:
-    """Bytes as they were read at once; arrival: s on the session's clock, of the moment when the last was there.
+    """Bytes as they were read at once.
 
-    No bytes mark a break: the port was opened, and what comes next may begin in the middle of a frame or a line.
+    arrival: when the last was there, s on the session's clock. No bytes mark a break: the port was opened, and what
+    comes next may begin in the middle of a frame or a line.
     """
 
     arrival: float
@@ -125,7 +126,7 @@ class DecodedSamples:
 
 
 class Decoder(Protocol):
-    """Raw items of one source to samples: the same items give the same samples, however they are grouped in pushes.
+    """Makes samples of raw items. The same items give the same samples, however they are grouped in pushes.
 
     channels: C names. counters: what was skipped so far, by kind of fault; every kind is there from the start. turns:
     of the channels whose numbers wrap, which a resumed session goes on with.

@@ -43,9 +43,10 @@ class Repeated:
 
 
 def searcher_of(capture: Path, adopt: bool) -> Searcher:
-    """For the replay of a capture: at once, or, of a recording that was made with the same `adopt`, as it was then.
+    """Who searches while a capture is replayed.
 
-    Raises InputError where the recording's searches are no such document.
+    Of a recording that was made with the same `adopt`, searches are used when they were then; else at once. Raises
+    InputError where the recording's searches are no such document.
     """
     path = capture / NAME
     if not path.is_file():

@@ -33,10 +33,10 @@ _XOR = re.compile(rb"\$?([^*]*)\*([0-9A-Fa-f]{2})[ \t]*")
 
 
 class Items:
-    """Cuts a stream of bytes at a delimiter, with bounded memory: pieces longer than `longest` are dropped and counted.
+    """Cuts a stream of bytes at a delimiter, with bounded memory.
 
-    After a break (see SerialChunk) the first piece is dropped, for nothing shows that it is whole (cut_line): a sender
-    that begins with a delimiter loses nothing by that.
+    Pieces longer than `longest` are dropped and counted. After a break (see SerialChunk) the first piece is dropped,
+    for nothing shows that it is whole (cut_line): a sender that begins with a delimiter loses nothing by that.
     """
 
     def __init__(self, delimiter: bytes, longest: int, counters: dict[str, int]) -> None:

@@ -37,3 +37,9 @@ def load_system(described: str | Path | Mapping[str, Any]) -> System:
         reason = error.strerror or type(error).__name__
         raise InputError(path_or_name, "", reason[0].lower() + reason[1:], "a readable system file") from None
     return parse_system(text, path_or_name)
+
+
+def system_text(path_or_name: str) -> str:
+    """The text of a system file, or of a shipped system by its name."""
+    shipped = path_or_name in shipped_systems()
+    return shipped_text(path_or_name) if shipped else Path(path_or_name).read_text(encoding="utf-8")

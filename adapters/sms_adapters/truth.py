@@ -18,9 +18,10 @@ def truth_path(capture: Path) -> Path:
 
 
 def write_truth(capture: Path, parameters: dict[str, float], extra: dict[str, Any]) -> None:
-    """Write the parameters (name to value, SI units) and what else describes the simulation (JSON values) beside it.
+    """Write the truth of a capture beside it.
 
-    Raises ValueError for an infinite value, NaN, or a key of extra that the document itself uses.
+    parameters: name to value, SI units. extra: what else describes the simulation, JSON values. Raises ValueError for
+    an infinite value, NaN, or a key of extra that the document itself uses.
     """
     document = {"schema": SCHEMA, "parameters": parameters}
     if taken := document.keys() & extra.keys():
@@ -29,7 +30,7 @@ def write_truth(capture: Path, parameters: dict[str, float], extra: dict[str, An
 
 
 def read_truth(capture: Path) -> dict[str, Any] | None:
-    """The truth document beside a capture, None where there is none; InputError where it is not such a document."""
+    """The truth beside a capture, None where there is none. InputError: it is no such document."""
     path = truth_path(capture)
     if not path.is_file():
         return None

@@ -9,7 +9,6 @@ from __future__ import annotations
 import json
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
@@ -17,6 +16,7 @@ from xml.etree import ElementTree
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from sms_adapters.extras import installed
 from sms_adapters.files import reading
 from sms_adapters.raw import one_line
 from sms_online.description.parse import parse_system
@@ -90,13 +90,10 @@ def import_urdf(path: Path) -> str:
 
 
 def _read(path: Path) -> Any:
-    if find_spec("yourdfpy") is None:
-        raise InputError(str(path), "", "a URDF", "the extra `urdf`: pip install 'sms-online[urdf]'")
-    from yourdfpy import URDF
-
+    yourdfpy = installed("yourdfpy", str(path), extra="urdf")
     read_xml(path)  # yourdfpy repairs what is no XML as it thinks best
     try:
-        return URDF.load(str(path), build_scene_graph=False, load_meshes=False).robot
+        return yourdfpy.URDF.load(str(path), build_scene_graph=False, load_meshes=False).robot
     except Exception as error:  # of many kinds, for numbers that are none and elements that are missing
         raise InputError(str(path), "", one_line(error), "a URDF") from None
 

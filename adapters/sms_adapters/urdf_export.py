@@ -70,7 +70,7 @@ def export_urdf(path: Path, system: System, estimates: Mapping[str, float]) -> E
 
 
 def nearest(model: Model, estimates: Mapping[str, float]) -> Array:
-    """π (n_pi,) nearest to the nominal one that has the estimated combinations; distances relative to nominal sizes."""
+    """The nearest π (n_pi,) to the nominal one that has the estimates. Distances are relative to nominal sizes."""
     base = find_base_parameters(model)
     names = [p.name for p in base.parameters]
     for name in estimates:

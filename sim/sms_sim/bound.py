@@ -152,9 +152,10 @@ def _of_simulation(
 
 
 def noisy_sensors(plant: Plant, grade: str | None) -> tuple[SensorSet, str | None]:
-    """The sensors that a system describes, or those of a grade, and that grade; DEFAULT_GRADE where none has noise.
+    """The sensors of a plant, and the grade of their noise where it is not described.
 
-    Raises InputError where a drive is not measured, or a channel has no model of its reading.
+    grade: in place of the described noise; DEFAULT_GRADE where a sensor has none. Raises InputError where a drive is
+    not measured, or a channel has no model of its reading.
     """
     if grade is None and not _noise(Sensors(plant.system, _readable(plant), None, seed=0)).all():
         grade = DEFAULT_GRADE

@@ -142,7 +142,7 @@ def _bits(numbers: Array | NDArray[np.int64], signal: CanSignal) -> NDArray[np.u
 def devices(
     system: System, directory: Path | None, clocks: Sequence[DeviceClock]
 ) -> tuple[list[CanDevice], list[SerialDevice]]:
-    """The devices of a system's sources; clocks: of each source. Raises InputError for a source it cannot send as."""
+    """The devices of a system's sources. clocks: of each. InputError for a source that cannot be simulated."""
     can: list[CanDevice] = []
     serial: list[SerialDevice] = []
     for source, clock in zip(system.sources, clocks, strict=True):

@@ -65,7 +65,10 @@ ITERATIONS = 15
 
 @dataclass(frozen=True)
 class Reached:
-    """How far a motion goes of what it may: limit, None where there is none, and the largest magnitude, in the unit."""
+    """How far a motion goes of what it may.
+
+    limit: None where there is none. largest: magnitude that is reached. Both are in the unit.
+    """
 
     name: str
     unit: str

@@ -36,7 +36,10 @@ class Limits:
 
 @dataclass(frozen=True)
 class Signal:
-    """A number of a motion that is limited. stated: by a stated limit of its kind; others of the kind are then free."""
+    """A number of a motion that is limited.
+
+    stated: a stated limit of its kind is meant for it; others of the kind are then free.
+    """
 
     name: str
     unit: str

@@ -40,7 +40,7 @@ class Sample:
 
 
 class RealTimeStepper:
-    """A plant that advances by STEP a call, from rest; the planar example takes less than STEP of one core in mean."""
+    """A plant that advances by STEP a call, from rest, in less than STEP of one core for the planar example."""
 
     def __init__(self, plant: Plant) -> None:
         self.plant = plant

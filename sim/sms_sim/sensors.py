@@ -15,7 +15,11 @@ from sms_online.stream import Array
 
 @dataclass(frozen=True)
 class Grade:
-    """White noise per sample, 1σ: encoders and base angle rad, markers and base position m (slopes rad), n τ N m."""
+    """White noise of a sample, 1σ.
+
+    encoder: of encoders and the base's angle, rad. marker: of markers and the base's position, m (slopes rad).
+    torque: of n τ, N m.
+    """
 
     encoder: float
     marker: float

@@ -5,10 +5,9 @@ from __future__ import annotations
 import re
 from collections.abc import Iterable, Mapping
 from difflib import ndiff
-from pathlib import Path
 from typing import Any
 
-from sms_online.description.parse import shipped_systems, shipped_text
+from sms_adapters.system_file import system_text
 from sms_online.description.schema import System
 from sms_tools.found_effects import cells_of
 
@@ -21,7 +20,7 @@ def adopted_text(described: str, before: System, after: System, remarks: Mapping
 
     remarks: what to say of an effect, by name@where, for people: a session estimates what is no shape constant anew.
     """
-    lines = described_text(described).rstrip().splitlines()
+    lines = system_text(described).rstrip().splitlines()
     if after.gravity != before.gravity:
         stated = [k for k, line in enumerate(lines) if re.match(r"\s*gravity\s*=", line)]
         gravity = (
@@ -76,11 +75,5 @@ def _cells(value: Mapping[str, Any]) -> list[str]:
 
 def added_lines(described: str, adopted: str) -> list[str]:
     """Lines of the TOML `adopted` that the text of `described`, file or name of a system, does not hold."""
-    pairs = ndiff(described_text(described).rstrip().splitlines(), adopted.splitlines())
+    pairs = ndiff(system_text(described).rstrip().splitlines(), adopted.splitlines())
     return [line[2:] for line in pairs if line.startswith("+ ")]
-
-
-def described_text(described: str) -> str:
-    """The text of a system file, or of a shipped system by its name."""
-    shipped = described in shipped_systems()
-    return shipped_text(described) if shipped else Path(described).read_text(encoding="utf-8")

@@ -123,8 +123,8 @@ def _add_system(parser: Parser, default: str | None = None) -> None:
     parser.add_argument("--system", metavar="FILE|NAME", required=default is None, default=default, help=text)
 
 
-def _add_out(parser: Parser) -> None:
-    parser.add_argument("--out", metavar="DIR", type=Path, help="where results.json goes, runs/<time> by default")
+def _add_out(parser: Parser, what: str = "results.json goes, runs/<time> by default") -> None:
+    parser.add_argument("--out", metavar="DIR", type=Path, help=f"where {what}")
 
 
 def _add_view(parser: Parser, default: str = "off") -> None:
@@ -150,9 +150,13 @@ def _add_tracker(parser: Parser) -> None:
 
 
 def _add_noise(parser: Parser) -> None:
-    text = "noise of all sensors in place of the described one: 0 none, A, B, C ever more"
-    parser.add_argument("--grade", choices=("0", "A", "B", "C"), help=text)
+    _add_grade(parser, "0 none, A, B, C ever more", "0", "A", "B", "C")
     parser.add_argument("--seed", metavar="N", type=whole(0), default=0, help="of the noise, 0 by default")
+
+
+def _add_grade(parser: Parser, meaning: str, *grades: str) -> None:
+    text = f"noise of all sensors in place of the described one: {meaning}"
+    parser.add_argument("--grade", choices=grades, help=text)
 
 
 def _add_capture(parser: Parser, required: bool = True) -> None:
@@ -178,7 +182,7 @@ def _add_live(verbs: Verbs) -> None:
     _add_adopt(parser)
     text = "go on from the last checkpoint of an earlier session"
     parser.add_argument("--resume", metavar="DIR", type=Path, help=text)
-    _add_session_length(parser)
+    _add_duration(parser)
     _add_tracker(parser)
     _add_view(parser)
 
@@ -192,12 +196,11 @@ def _add_record(verbs: Verbs) -> None:
     parser.add_argument("--can", metavar="BUS", action="append", default=[], help=text)
     text = "a serial port: [NAME=]PATH[:BAUDRATE], such as /dev/ttyUSB0:115200"
     parser.add_argument("--serial", metavar="PORT", action="append", default=[], help=text)
-    parser.add_argument("--out", metavar="DIR", type=Path, help="where the recording goes, runs/<time> by default")
-    _add_session_length(parser)
+    _add_out(parser, "the recording goes, runs/<time> by default")
+    _add_duration(parser)
 
 
-def _add_session_length(parser: Parser) -> None:
-    text = "end after so long; Ctrl-C ends it too"
+def _add_duration(parser: Parser, text: str = "end after so long; Ctrl-C ends it too") -> None:
     parser.add_argument("--duration", metavar="SECONDS", type=seconds(positive=True), help=text)
 
 
@@ -205,8 +208,7 @@ def _add_simulate(verbs: Verbs) -> None:
     parser = _add_verb(verbs, "simulate", "simulate", "Simulate a system; write a capture, and its truth beside it.")
     _add_system(parser)
     _add_capture(parser)
-    text = "length of the session, the described trajectory's by default"
-    parser.add_argument("--duration", metavar="SECONDS", type=seconds(positive=True), help=text)
+    _add_duration(parser, "length of the session, the described trajectory's by default")
     text = "an effect that the system file does not declare, NAME@WHERE:coefficient=value,…; may be repeated"
     parser.add_argument("--effect", metavar="EFFECT", action="append", default=[], help=text)
     text = (
@@ -219,12 +221,11 @@ def _add_simulate(verbs: Verbs) -> None:
 
 def _add_replay(verbs: Verbs) -> None:
     parser = _add_verb(verbs, "replay", "replay", "Estimate the parameters of a system from a recorded session.")
-    parser.add_argument(
-        "capture", metavar="CAPTURE", type=Path, help="a capture (.csv), CAN log, bag, table or recording"
-    )
+    _add_recorded(parser, "a capture (.csv), CAN log, bag, table or recording")
     _add_system(parser)
     _add_out(parser)
     _add_part(parser)
+    _add_prior(parser)
     text = "the Cramér-Rao bound of every parameter too, as the yardstick of its estimate"
     parser.add_argument("--bound", action="store_true", help=text)
     text = "as fast as it goes, or in step with the recorded time"
@@ -234,10 +235,16 @@ def _add_replay(verbs: Verbs) -> None:
     _add_view(parser)
 
 
+def _add_recorded(parser: Parser, text: str = "a capture, log or recording, as for replay") -> None:
+    parser.add_argument("capture", metavar="CAPTURE", type=Path, help=text)
+
+
 def _add_part(parser: Parser) -> None:
-    """Which part of a capture, and what is known beforehand."""
     parser.add_argument("-ss", dest="start", metavar="SECONDS", type=seconds(), help="leave out what is before")
     parser.add_argument("-to", dest="stop", metavar="SECONDS", type=seconds(positive=True), help="and what is after")
+
+
+def _add_prior(parser: Parser) -> None:
     text = (
         "start from the system file's nominal values, each ± 10 %% (those of 0 stay unknown); "
         "priors that the file itself states hold with and without it"
@@ -248,10 +255,11 @@ def _add_part(parser: Parser) -> None:
 def _add_diagnose(verbs: Verbs) -> None:
     text = "Find what a recorded session holds that its system file does not describe, and describe it."
     parser = _add_verb(verbs, "diagnose", "diagnose", text)
-    parser.add_argument("capture", metavar="CAPTURE", type=Path, help="a capture, log or recording, as for replay")
+    _add_recorded(parser)
     _add_system(parser)
     _add_out(parser)
     _add_part(parser)
+    _add_prior(parser)
     text = (
         "check what is found on this capture; the same one means what comes after -to. "
         "Without it blocks of time are held out in turn"
@@ -263,20 +271,19 @@ def _add_diagnose(verbs: Verbs) -> None:
 def _add_validate(verbs: Verbs) -> None:
     text = "Predict another run with everything fixed, and measure what is left of its torques."
     parser = _add_verb(verbs, "validate", "validate", text)
-    parser.add_argument("capture", metavar="CAPTURE", type=Path, help="a capture, log or recording, as for replay")
+    _add_recorded(parser)
     text = "results.json of a session or the folder of its run; or a system file, whose nominal values are taken"
     parser.add_argument("--system", metavar="FILE|NAME", required=True, help=text)
-    parser.add_argument("--out", metavar="DIR", type=Path, help="where validation.json goes, runs/<time> by default")
-    parser.add_argument("-ss", dest="start", metavar="SECONDS", type=seconds(), help="leave out what is before")
-    parser.add_argument("-to", dest="stop", metavar="SECONDS", type=seconds(positive=True), help="and what is after")
+    _add_out(parser, "validation.json goes, runs/<time> by default")
+    _add_part(parser)
 
 
 def _add_check(verbs: Verbs) -> None:
     text = "What is the matter with a capture, and what its motion determines: before it is estimated from."
     parser = _add_verb(verbs, "check", "check", text)
-    parser.add_argument("capture", metavar="CAPTURE", type=Path, help="a capture, log or recording, as for replay")
+    _add_recorded(parser)
     _add_system(parser)
-    parser.add_argument("--out", metavar="DIR", type=Path, help="where check.json goes; none is written by default")
+    _add_out(parser, "check.json goes; none is written by default")
 
 
 def _add_import(verbs: Verbs) -> None:
@@ -323,8 +330,7 @@ def _add_bound(verbs: Verbs) -> None:
     text = "a capture; without one the described trajectory is simulated"
     parser.add_argument("capture", metavar="CAPTURE", type=Path, nargs="?", help=text)
     _add_system(parser)
-    text = "noise of all sensors in place of the described one: A, B, C ever more; B where none is described"
-    parser.add_argument("--grade", choices=("A", "B", "C"), help=text)
+    _add_grade(parser, "A, B, C ever more; B where none is described", "A", "B", "C")
     text = "what the bounds would be without each of the described sensors"
     parser.add_argument("--each-sensor", action="store_true", help=text)
 
@@ -350,13 +356,11 @@ def _add_excite(verbs: Verbs) -> None:
         "their coefficients; all parameters count without it"
     )
     parser.add_argument("--separate", metavar="EFFECT", nargs=2, help=text)
-    text = "noise of all sensors in place of the described one: A, B, C ever more; B where none is described"
-    parser.add_argument("--grade", choices=("A", "B", "C"), help=text)
+    _add_grade(parser, "A, B, C ever more; B where none is described", "A", "B", "C")
     parser.add_argument("--seed", metavar="N", type=whole(0), default=0, help="of the random draw, 0 by default")
     text = "steps of the optimiser at most, 15 by default"
     parser.add_argument("--iterations", metavar="N", type=whole(1), default=15, help=text)
-    text = "where system.toml, reference.csv and excitation.json go, runs/<time> by default"
-    parser.add_argument("--out", metavar="DIR", type=Path, help=text)
+    _add_out(parser, "system.toml, reference.csv and excitation.json go, runs/<time> by default")
 
 
 def _add_compare(verbs: Verbs) -> None:
@@ -364,7 +368,7 @@ def _add_compare(verbs: Verbs) -> None:
     parser = _add_verb(verbs, "compare", "compare", text)
     text = "results.json of a session, or the folder of its run"
     parser.add_argument("runs", metavar="RUN", type=Path, nargs="+", help=text)
-    parser.add_argument("--out", metavar="DIR", type=Path, help="where the page goes, runs/<time> by default")
+    _add_out(parser, "the page goes, runs/<time> by default")
 
 
 def _add_archive(verbs: Verbs) -> None:
@@ -372,8 +376,7 @@ def _add_archive(verbs: Verbs) -> None:
     parser = _add_verb(verbs, "archive", "archive", text)
     parser.add_argument("folder", metavar="DIR", type=Path, help="the folder with captures, logs and recordings")
     _add_system(parser)
-    text = "where rows, table and results go, runs/archive-<name of DIR> by default"
-    parser.add_argument("--out", metavar="DIR", type=Path, help=text)
+    _add_out(parser, "rows, table and results go, runs/archive-<name of DIR> by default")
     where = parser.add_mutually_exclusive_group()
     text = "processes of this machine, one for each core by default"
     where.add_argument("--workers", metavar="N", type=whole(1), help=text)

@@ -1,4 +1,4 @@
-"""Effects of a diagnosis in words: coefficients that are determined, look-alikes by kind, why one and not the next."""
+"""Effects of a diagnosis in words."""
 
 from __future__ import annotations
 
@@ -29,7 +29,10 @@ def look_alikes(effect: Mapping[str, Any]) -> str:
 
 
 def why(effect: Mapping[str, Any]) -> str:
-    """The finding in words, or what it improves of data not fitted beside the next best; empty where not compared."""
+    """Why an effect was found; empty where it was not compared.
+
+    The finding in words, or what it improves of data not fitted beside the next best.
+    """
     if effect["sentence"]:
         return str(effect["sentence"])
     evidence = effect["evidence"]

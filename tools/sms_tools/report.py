@@ -59,7 +59,7 @@ def table(
     left: Collection[str] = (),
     title: str | Text | None = None,
 ) -> Table:
-    """Cells below their headings, those of `left` aligned to the left; long ones of the first column are folded."""
+    """Cells below their headings, those below `left` aligned to the left."""
     out = Table(title=title, title_justify="left", box=None, header_style="bold", pad_edge=False)
     for heading in headings:
         out.add_column(heading, justify="left" if heading in left else "right", overflow="fold")
@@ -76,8 +76,10 @@ def verdict_text(verdict: Document) -> Text:
 
 
 def parameter_table(document: Document, width: int, title: str | Text | None = None) -> Table:
-    """Parameter, unit, estimate, 95 % interval and, where it is known, the error; where `width` allows it also ± std
-    and the truth."""
+    """Parameters with their estimates and intervals, and their errors where the truth is known.
+
+    Where `width` allows it also ± std and the truth.
+    """
     parameters = document["parameters"]
     simulated = any(p["true"] is not None for p in parameters)
     out = table(("parameter", "unit"), left=("parameter", "unit"), title=title)

@@ -45,11 +45,6 @@ def _new_run() -> Path:
     return run
 
 
-def write_results(directory: Path, text: str) -> Path:
-    """Write results.json into the directory, which is made; InputError where that fails."""
-    return write_document(directory / NAME, text)
-
-
 def write_document(path: Path, text: str) -> Path:
-    """Write the text of a document as a whole or not at all; its directory is made. InputError where that fails."""
+    """Write the text of a document, see `write_text`, and end its last line."""
     return write_text(path, text + "\n")

@@ -10,6 +10,7 @@ from pathlib import Path
 from rich.table import Table
 
 from sms_adapters.files import write_text
+from sms_adapters.runs import NAME as RESULTS
 from sms_adapters.system_file import load_system
 from sms_online.description.given import given_system
 from sms_online.description.schema import System
@@ -21,7 +22,7 @@ from sms_tools.adopted_system import ONLINE_NAME, adopted_text, remarks
 from sms_tools.exit_codes import INTERRUPTED, NOTHING_DETERMINED, OK
 from sms_tools.interruption import Interruption
 from sms_tools.report import parameter_table, report_console, show, tracker_table, trust_lines
-from sms_tools.results_file import write_results
+from sms_tools.results_file import write_document
 
 
 def described_system(args: argparse.Namespace) -> tuple[System, Path | None]:
@@ -56,7 +57,7 @@ def conclude(args: argparse.Namespace, result: Result, directory: Path, interrup
     if trackers is not None:
         parts[1:1] = ["", trackers]
     try:
-        path = write_results(directory, result.to_json())
+        path = write_document(directory / RESULTS, result.to_json())
     except InputError:
         # A disk that refuses the file must not take the numbers with it.
         show(console, *parts)

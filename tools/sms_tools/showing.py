@@ -72,8 +72,7 @@ class Showing:
         online.on_evidence, online.on_verdict = evidence, verdict
 
     def report(self, result: Result, interruption: Interruption) -> None:
-        """Write the page of a finished session, say where it is and whether to trust the numbers, and keep serving the
-        view while that is asked for."""
+        """Write the page of a finished session and say whether to trust its numbers; then serve the view."""
         # Matplotlib takes a second to be imported, which nobody should wait for before a session.
         from sms_tools.html_report.page import write_report
 

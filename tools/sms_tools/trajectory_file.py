@@ -7,16 +7,16 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from sms_adapters.system_file import system_text
 from sms_online.description.schema import Trajectory
 from sms_sim.references import fourier_reference
-from sms_tools.adopted_system import described_text
 
 REFERENCE = "reference.csv"
 
 
-def system_text(described: str, trajectory: Trajectory) -> str:
+def with_trajectory(described: str, trajectory: Trajectory) -> str:
     """TOML of the text of `described`, file or name of a system, with another trajectory."""
-    lines = described_text(described).rstrip().splitlines()
+    lines = system_text(described).rstrip().splitlines()
     kept: list[str] = []
     inside, place = False, None
     for line in lines:
@@ -37,7 +37,10 @@ def system_text(described: str, trajectory: Trajectory) -> str:
 
 
 def reference_lines(trajectory: Trajectory, rate: float) -> Iterator[str]:
-    """The reference as CSV at a rate, Hz: t, s, then of each joint q_d, rad (m), and of each its rate, rad/s (m/s)."""
+    """Lines of the reference as CSV at a rate, Hz.
+
+    Columns: t, s; of each joint q_d, rad (m); of each its rate, rad/s (m/s).
+    """
     joints = range(1, len(trajectory.joints) + 1)
     yield ",".join(["t", *(f"q_d_{i}" for i in joints), *(f"q_d_dot_{i}" for i in joints)])
     t = np.arange(round(trajectory.duration * rate) + 1) / rate

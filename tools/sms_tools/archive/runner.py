@@ -14,6 +14,7 @@ from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 
+from sms_adapters.extras import installed
 from sms_online.errors import InputError
 from sms_tools.archive.rows import Row
 
@@ -109,18 +110,14 @@ def _initialise() -> None:
 
 
 def _on_cluster(work: Work, tasks: Tasks, scheduler: str) -> Iterator[tuple[str, Row]]:
+    dask = installed("distributed", "--scheduler", scheduler, "cluster")
     try:
-        from distributed import Client, KilledWorker, as_completed
-    except ImportError:
-        expected = "pip install 'sms-online[cluster]'"
-        raise InputError("--scheduler", scheduler, "Dask's distributed is not installed", expected) from None
-    try:
-        client = Client(scheduler, timeout=PATIENCE)  # type: ignore[no-untyped-call]
+        client = dask.Client(scheduler, timeout=PATIENCE)
     except (OSError, ValueError) as error:
         raise InputError("--scheduler", scheduler, str(error) or "no answer", "a scheduler's address") from None
     with client:
         keys = {client.submit(outcome, work, arguments, pure=False): key for key, arguments in tasks.items()}
-        for future in as_completed(keys):  # type: ignore[no-untyped-call]
+        for future in dask.as_completed(keys):
             if future.cancelled():
                 raise InputError("--scheduler", scheduler, "it ended", "a scheduler that runs until the end")
             # The scheduler gives what a dead worker did to others, and gives up what has killed several.
@@ -128,4 +125,4 @@ def _on_cluster(work: Work, tasks: Tasks, scheduler: str) -> Iterator[tuple[str,
                 yield keys[future], future.result()
                 continue
             found = future.exception()
-            yield keys[future], {"error": KILLED if isinstance(found, KilledWorker) else f"on its worker: {found}"}
+            yield keys[future], {"error": KILLED if isinstance(found, dask.KilledWorker) else f"on its worker: {found}"}

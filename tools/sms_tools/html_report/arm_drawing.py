@@ -42,9 +42,9 @@ def arm_drawings(scene: Scene, x: Array, chosen: Sequence[int], captions: Sequen
 
 
 def marked_arm(scene: Scene, x: Array, row: int, marks: Mapping[str, str]) -> Markup:
-    """One picture of a row of x (B, n_x) with places marked: `joint_i`, `link_i`, `base`, `tip` to a mark's short text.
+    """One picture of a row of x (B, n_x) with places marked.
 
-    The tip's places in all rows are behind.
+    marks: `joint_i`, `link_i`, `base` or `tip` to a mark's short text. The tip's places in all rows are behind.
     """
     arm = _Arm(scene, x, [row], MARKED)
 

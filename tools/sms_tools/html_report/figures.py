@@ -1,4 +1,4 @@
-"""Figures of a page: Matplotlib's SVG in the page's own colours, so that it suits light and dark, 400 px and 1400."""
+"""Figures of a page: Matplotlib's SVG in the page's own colours, light or dark."""
 
 from __future__ import annotations
 

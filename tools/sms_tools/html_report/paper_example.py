@@ -83,7 +83,10 @@ def figure_6(simulation: Simulation) -> list[Chart]:
 
 
 def table_v(simulation: Simulation) -> tuple[int, list[list[str]]]:
-    """Number of samples, and rows: symbol, unit, then actual and estimated value and error in %, printed and ours."""
+    """Number of samples, and the rows of Table V, printed and ours.
+
+    A row: symbol, unit, then actual value, estimated value and error in %, first as printed.
+    """
     system = simulation.plant.system
     blocks = list(sampled_blocks(simulation, "0"))
     session = Session(system, blocks[0].channels)

@@ -18,9 +18,10 @@ from sms_tools.view.parameter_groups import half_range, shortened
 
 @dataclass(frozen=True)
 class Bar:
-    """An error bar: where it begins and ends and where the estimate is, % of its cell's width; its colour's name.
+    """An error bar: where it begins and ends, and where the estimate is, % of its cell's width.
 
-    middle: none where the estimate is beyond the cell. below, above: whether the bar goes on beyond it.
+    color: its name. middle: none where the estimate is beyond the cell. below, above: whether the bar goes on beyond
+    it.
     """
 
     start: float

@@ -31,8 +31,10 @@ MOST_WAITING = 65536
 
 
 class Interpreter:
-    """Who has the interpreter: the loop while it computes, for at every system call of a reader another thread may take
-    it for a millisecond, and both would be slower; what has come waits in the driver. Used as a context by the loop.
+    """Gives the interpreter to the loop while it computes, which uses this as a context.
+
+    At every system call of a reader another thread may take the interpreter for a millisecond, and both would be
+    slower. What has come waits in the driver.
     """
 
     def __init__(self) -> None:
@@ -51,7 +53,10 @@ class Interpreter:
 
 
 class SessionClock:
-    """Seconds since the session began, on the machine's monotonic clock, in whole µs. epoch: UTC of its zero, µs."""
+    """Seconds since the session began, by the machine's monotonic clock, in whole µs.
+
+    epoch: UTC of its zero, µs.
+    """
 
     def __init__(self) -> None:
         self._zero = time.monotonic_ns()

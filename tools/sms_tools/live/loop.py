@@ -1,4 +1,4 @@
-"""The live loop: ticks of the session's clock, each drained, merged, estimated; saved and shown now and then."""
+"""The live loop: what arrived in each tick of the session's clock is merged and estimated."""
 
 from __future__ import annotations
 

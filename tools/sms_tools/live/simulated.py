@@ -11,7 +11,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from time import monotonic
 
-from sms_online.description.parse import shipped_systems, shipped_text
+from sms_adapters.system_file import system_text
+from sms_online.description.parse import shipped_systems
 from sms_online.description.schema import System
 from sms_online.errors import InputError
 from sms_sim.bus_layout import BASE, DBC, MARKERS, dbc_text, source_tables
@@ -27,7 +28,7 @@ LINGERING = 0.5
 
 
 def write_testbed(name: str, system: System, grade: str | None, folder: Path) -> Path:
-    """A system file, in `folder`, of a system on a simulated bus: its own sources, or CAN and serial ports made up.
+    """The system file of a system on a simulated bus, with its own sources or with made up ones in `folder`.
 
     name: shipped name or path. Raises InputError as for the simulated sensors.
     """
@@ -35,7 +36,7 @@ def write_testbed(name: str, system: System, grade: str | None, folder: Path) ->
         if name in shipped_systems():
             raise InputError(name, "source", "a device of a real testbed", "a system without [[source]] to simulate")
         return Path(name)
-    text = shipped_text(name) if name in shipped_systems() else Path(name).read_text(encoding="utf-8")
+    text = system_text(name)
     channels = Sensors(system, Plant(system).channels, grade, 0).channels
     ports = {port: str(folder / port) for port in (BASE, MARKERS)}
     options: dict[str, str | int] = {"interface": "udp_multicast", "channel": GROUP, "port": _free_port()}

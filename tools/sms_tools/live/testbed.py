@@ -14,7 +14,8 @@ from sms_adapters.devices import make_reader
 from sms_adapters.recorder import Recorder
 from sms_adapters.session_log import CHECKPOINT as RESUMED_FROM
 from sms_adapters.session_log import MICROSECOND, SYSTEM, SessionHeader, read_header
-from sms_online.description.parse import shipped_systems, shipped_text
+from sms_adapters.system_file import system_text
+from sms_online.description.parse import shipped_systems
 from sms_online.description.schema import System
 from sms_online.errors import InputError
 from sms_online.session import Session
@@ -42,10 +43,9 @@ def versions() -> dict[str, str]:
 
 def system_files(name: str, system: System) -> dict[str, bytes]:
     """The system file of a name or path, as `system.toml`, and the files beside it that it names."""
+    files, path = {SYSTEM: system_text(name).encode()}, Path(name)
     if name in shipped_systems():
-        return {SYSTEM: shipped_text(name).encode()}
-    path = Path(name)
-    files = {SYSTEM: path.read_bytes()}
+        return files
     for source in system.sources:
         for file in [getattr(source, "dbc", None), *getattr(source, "nodes", {}).values()]:
             if file is not None and (path.parent / file).is_file():

@@ -12,7 +12,7 @@ from sms_tools.exit_codes import OK
 from sms_tools.report import say, table
 from sms_tools.results_file import results_directory, write_document
 from sms_tools.session import described_system
-from sms_tools.trajectory_file import REFERENCE, reference_lines, system_text
+from sms_tools.trajectory_file import REFERENCE, reference_lines, with_trajectory
 from sms_tools.waiting import waiting
 
 DOCUMENT = "excitation.json"
@@ -38,7 +38,7 @@ def run(args: argparse.Namespace) -> int:
         )
     trajectory = found.system.trajectory
     assert trajectory is not None
-    file = write_text(directory / SYSTEM, system_text(args.system, trajectory))
+    file = write_text(directory / SYSTEM, with_trajectory(args.system, trajectory))
     reference = write_document(directory / REFERENCE, "\n".join(reference_lines(trajectory, system.sample_rate)))
     document = write_document(directory / DOCUMENT, found.to_json())
     notes = []

@@ -72,9 +72,10 @@ class ArmLog:
         self._text_offset = TEXT_OFFSET * size * np.array(up)
 
     def write(self, t: Array, x: Array, residual: Array, marks: dict[str, str], color: style.Color) -> None:
-        """Pictures at t (B,), s, of positions x (B, n_x); residual (B, links): the relative one of each link's rows.
+        """Write pictures of the arm at t (B,), s.
 
-        marks: a text for each place (`joint_i`, `link_i`, `base`, `tip`) that is marked, in this colour.
+        x (B, n_x): positions. residual (B, links): the relative one of each link's rows. marks: a text for each place
+        (`joint_i`, `link_i`, `base`, `tip`) that is marked, in this colour.
         """
         drawing = self._scene.draw(x)
         if self._marked != (marks, color):

@@ -7,6 +7,8 @@ from dataclasses import dataclass
 from ipaddress import IPv4Address
 from typing import Literal
 
+from sms_online.errors import InputError
+
 Kind = Literal["off", "save", "serve", "spawn", "connect"]
 EXPECTED = (
     "off, save, serve, serve=ADDRESS (of this machine; 0.0.0.0 for all), spawn "
@@ -30,6 +32,14 @@ class Choice:
     def url(self) -> str:
         """Address in rerun's own form."""
         return f"rerun+http://{self.host}:{self.port}/proxy"
+
+
+def chosen(text: str) -> Choice:
+    """The choice that a value of --rerun names; InputError where it names none."""
+    try:
+        return parse_choice(text)
+    except ValueError as error:
+        raise InputError("--rerun", "", str(error).split(";")[0], EXPECTED) from None
 
 
 def parse_choice(text: str) -> Choice:

@@ -18,7 +18,7 @@ from sms_online.errors import InputError
 from sms_online.model.model import Model
 from sms_online.stream import Array
 from sms_tools.interruption import Interruption
-from sms_tools.view.choice import EXPECTED, parse_choice
+from sms_tools.view.choice import EXPECTED, chosen
 from sms_tools.view.scene import Scene
 from sms_tools.view.session import RECORDING, absent
 
@@ -67,10 +67,7 @@ def show(
     nothing can be written.
     """
     system, _ = given_system(system)
-    try:
-        choice = parse_choice(rerun)
-    except ValueError as error:
-        raise InputError("--rerun", "", str(error).split(";")[0], EXPECTED) from None
+    choice = chosen(rerun)
     if choice.kind == "off":
         return "no view"
     if choice.kind == "connect" and (missing := absent(choice)):

@@ -59,7 +59,7 @@ class Group:
 
 
 def half_range(reach: Array) -> float:
-    """Half range, %, of an axis for what reaches so far (·,) from its middle; the largest where that is nothing."""
+    """Half range, %, of an axis for what reaches so far (·,) from its middle."""
     reach = reach[np.isfinite(reach)]
     fits = [limit for limit in HALF_RANGES if reach.size and np.mean(reach <= limit) >= FITTING]
     return fits[0] if fits else HALF_RANGES[-1]

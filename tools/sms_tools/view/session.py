@@ -19,12 +19,12 @@ from typing import IO
 
 import numpy as np
 
-from sms_online.errors import InputError
+from sms_adapters.files import reading
 from sms_online.pipeline.estimator import Estimator
 from sms_online.pipeline.statistics import Statistics
 from sms_online.stream import Block
 from sms_tools.interruption import Interruption
-from sms_tools.view.choice import EXPECTED, Choice, parse_choice
+from sms_tools.view.choice import Choice, chosen
 from sms_tools.view.frames import Circumstances, Diagnosed, End, Event, Evidence, Frame, Picture, Reference, Start
 from sms_tools.view.handover import Handover
 
@@ -214,18 +214,13 @@ def open_view(
     exaggeration: factor on drawn deflections. health: see there; what it returns must not change afterwards. diagnosed:
     see there. Raises InputError on an unknown choice or a directory that cannot be made.
     """
-    try:
-        parsed = parse_choice(choice)
-    except ValueError as error:
-        raise InputError("--rerun", "", str(error).split(";")[0], EXPECTED) from None
+    parsed = chosen(choice)
     if parsed.kind == "off":
         return View(estimator, None, patient, None)
     recording = directory / RECORDING
     if parsed.kind == "save":
-        try:
+        with reading(directory, "a directory that can be made"):
             directory.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise InputError(str(directory), "", error.strerror or str(error), "a directory that can be made") from None
     start = Start(
         statistics=Statistics.of(estimator),
         channels=channels,

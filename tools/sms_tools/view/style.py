@@ -52,7 +52,7 @@ def translucent(color: Color) -> tuple[int, int, int, int]:
 
 
 def residual_colors(relative: Array) -> NDArray[np.uint8]:
-    """From green (nothing unexplained) to red (so much that a warning is given) for relative residuals (...): (..., 3).
+    """Colours (..., 3) of relative residuals (...), from green to the red at which a warning is given.
 
     NaN, where nothing is known yet, is green.
     """
