@@ -289,16 +289,16 @@ def test_a_recorded_motion_has_bounds() -> None:
     assert "joint_1.stiffness" in str(bounds)
 
 
-@pytest.mark.parametrize("kind", [str, Path])
-def test_a_system_may_be_given_by_the_path_of_its_file(tmp_path: Path, kind: type) -> None:
+def test_a_system_may_be_given_by_the_path_of_its_file(tmp_path: Path) -> None:
     path, block = tmp_path / "axis.toml", axis_block(coulomb=0.0)
     path.write_text(AXIS)
     capture, system = sms.Capture(block.t, block.channels, block.values), sms.load_system(path)
-    ours, same = sms.estimate(kind(path), capture), sms.estimate(system, capture)
+    ours, same = sms.estimate(str(path), capture), sms.estimate(system, capture)
     assert without_timing(ours.document()) == without_timing(same.document())
-    assert sms.Session(kind(path), block.channels).system == system
-    assert sms.check(kind(path), capture).system == system.name
-    assert sms.bound(kind(path), capture).parameters == sms.bound(system, capture).parameters
+    for given in (path, str(path)):
+        assert sms.Session(given, block.channels).system == system
+    assert sms.check(path, capture).system == system.name
+    assert sms.bound(path, capture).parameters == sms.bound(system, capture).parameters
 
 
 @pytest.mark.parametrize(

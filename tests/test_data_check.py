@@ -49,7 +49,14 @@ def test_a_healthy_capture_has_nothing_the_matter() -> None:
     assert "link_1.inertia" in found.motion()[0]
 
 
-@pytest.mark.parametrize(("name", "grade"), [("paper-planar", "B"), ("paper-planar", "0"), ("spatial-two-link", "C")])
+@pytest.mark.parametrize(
+    ("name", "grade"),
+    [
+        ("paper-planar", "B"),
+        pytest.param("paper-planar", "0", marks=pytest.mark.slow),
+        pytest.param("spatial-two-link", "C", marks=pytest.mark.slow),
+    ],
+)
 def test_simulated_sessions_have_nothing_the_matter(name: str, grade: str) -> None:
     system = sms.load_system(name)
     assert grave(sms.simulate(system, duration=2.5, grade=grade, seed=2), system) == []

@@ -236,7 +236,7 @@ def test_an_axis_holds_the_lines_not_their_bounds() -> None:
 
 
 def test_drawings_have_the_colours_of_the_page() -> None:
-    svg = chart("c", [Series("a", np.arange(3.0), np.arange(3.0))], "x", marks=[1.0], shaded=[(1.0, 2.0)]).svg
+    svg = chart("c", [Series("a", np.arange(3.0), np.arange(3.0))], "x", marks=[1.0]).svg
     assert not re.search("#[0-9a-f]{6}\\b", svg)
     assert set(re.findall(r"var\(--(\w+)\)", svg)) <= set(PALETTE)
     light = [light for light, _ in PALETTE.values()]

@@ -61,15 +61,19 @@ def written(capture: sms.Capture, folder: Path, form: str) -> Path:
 
 
 @pytest.mark.parametrize("form", ["ros 1", "ros 2 in sqlite", "ros 2 in mcap", "mcap with ros 2", "mcap with json"])
-def test_a_bag_gives_the_bits_of_the_csv(
-    capture: sms.Capture, bagged: sms.System, pi: list[float], tmp_path: Path, form: str
-) -> None:
+def test_a_bag_gives_the_bits_of_the_csv(capture: sms.Capture, bagged: sms.System, tmp_path: Path, form: str) -> None:
     path = written(capture, tmp_path, form)
     read = sms.read_capture(path, bagged)
     order = [read.channels.index(name) for name in capture.channels]
     np.testing.assert_array_equal(read.values[:, order], capture.values)
     np.testing.assert_array_equal(read.t, capture.t)
     assert read.warnings == ()
+
+
+def test_a_bag_is_estimated_from_as_the_csv_is(
+    capture: sms.Capture, bagged: sms.System, pi: list[float], tmp_path: Path
+) -> None:
+    path = written(capture, tmp_path, "ros 2 in mcap")
     assert [p.value for p in sms.estimate(bagged, path).parameters.values()] == pi
 
 

@@ -81,9 +81,9 @@ def test_a_session_without_a_mistake_has_none() -> None:
     [
         (times(-1.0, "tau_2"), "torque_sign@tau_2", "the other sign"),
         (times(50.0, "tau_1", "tau_2"), "joint_torque@tau_1, tau_2", "everything is 50 × its description"),
-        (times(180.0 / np.pi, "q_2"), "degrees@q_2", "q_2 is in degrees"),
-        (times(1e3, "r_S_x", "r_S_y"), "millimetres@r_S_*", "in mm in place of m"),
-        (times(50.0, "theta_m_1"), "motor_angle@theta_m_1", "before the gear"),
+        pytest.param(times(180.0 / np.pi, "q_2"), "degrees@q_2", "q_2 is in degrees", marks=pytest.mark.slow),
+        pytest.param(times(1e3, "r_S_x", "r_S_y"), "millimetres@r_S_*", "in mm in place of m", marks=pytest.mark.slow),
+        pytest.param(times(50.0, "theta_m_1"), "motor_angle@theta_m_1", "before the gear", marks=pytest.mark.slow),
         (swap("tau_1", "tau_2"), "swapped@tau_1, tau_2", "are swapped"),
     ],
 )

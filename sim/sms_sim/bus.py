@@ -210,12 +210,12 @@ class Bus:
         while not (self._ended or self._full or self._solved >= self._ahead):
             time.sleep(PATIENCE)
 
-    def run(self, duration: float, speed: float) -> None:
-        """Send the samples taken, `duration` s of them, in step with the clock, times `speed`."""
+    def run(self, duration: float) -> None:
+        """Send the samples taken, `duration` s of them, in step with the clock."""
         ahead = self._ahead
         start: float | None = None
         began = time.monotonic()
-        while ahead and not (self._ended or self._full or self._far_enough(time.monotonic() - began, duration, speed)):
+        while ahead and not (self._ended or self._full or self._far_enough(time.monotonic() - began, duration)):
             time.sleep(PATIENCE)
         while True:
             with self._moving:
@@ -225,8 +225,8 @@ class Bus:
                     return
                 due, _, sender, payload = self._queue[0]
             if start is None:
-                start = time.monotonic() - due / speed
-            wait = start + due / speed - time.monotonic()
+                start = time.monotonic() - due
+            wait = start + due - time.monotonic()
             # Not a microsecond early: who reads the bus takes the least delayed of its samples for undelayed.
             if wait > 0.0:
                 time.sleep(min(wait, PATIENCE))
@@ -236,11 +236,11 @@ class Bus:
                 self._moving.notify()
             sender.send(payload)
 
-    def _far_enough(self, elapsed: float, duration: float, speed: float) -> bool:
+    def _far_enough(self, elapsed: float, duration: float) -> bool:
         """Whether what is still to be solved will be in time, at the pace since the beginning, `elapsed` s ago."""
         if self._solved < FIRST_LEAD:
             return False
-        return self._solved >= AHEAD or SLOWED * (duration - self._solved) * elapsed / self._solved < duration / speed
+        return self._solved >= AHEAD or SLOWED * (duration - self._solved) * elapsed / self._solved < duration
 
     def _fill(self, blocks: Iterable[Block], ahead: float) -> None:
         """Keep the queue filled `ahead` of what is being sent."""
@@ -359,7 +359,7 @@ def main(arguments: list[str] | None = None) -> int:
             sys.stdin.readline()
         if args.capture is None:
             bus.take(blocks, ahead=0.0 if args.commanded else AHEAD)
-        bus.run(duration, args.speed)
+        bus.run(duration)
         if args.wait:
             # Devices whose arm rests are there still.
             print("done", flush=True)
@@ -385,7 +385,6 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--drift", type=float, default=0.0, help="of the serial devices' clocks, relative")
     parser.add_argument("--latency", type=float, default=0.0, help="constant delay of the transport, s")
     parser.add_argument("--jitter", type=float, default=0.0, help="uniform delay from 0 to this, s")
-    parser.add_argument("--speed", type=float, default=1.0, help="times as fast as real time")
     parser.add_argument(
         "--wait",
         action="store_true",

@@ -281,16 +281,15 @@ def solve(
     y0: Array,
     duration: float,
     tolerance: Array,
-    stages: int = STAGES,
     longest: float = np.inf,
     progress: Callable[[float], None] = lambda t: None,
 ) -> Dense:
     """All of `march` as one solution; progress: is called with the end of each step, s."""
     steps = []
-    for step in march(f, y0, duration, tolerance, stages, longest):
+    for step in march(f, y0, duration, tolerance, longest=longest):
         steps.append(step)
         progress(step.t)
-    return dense(stages, 0.0, y0, steps)
+    return dense(STAGES, 0.0, y0, steps)
 
 
 def dense(stages: int, t0: float, y0: Array, steps: Sequence[Step]) -> Dense:

@@ -92,12 +92,11 @@ def chart(
     x_label: str,
     y_range: tuple[float, float] | None = None,
     marks: Sequence[float] = (),
-    shaded: Sequence[tuple[float, float]] = (),
     log: bool = False,
 ) -> Chart:
     """A chart of lines; without a range the y axis holds all lines, not their bounds.
 
-    caption: no other chart of the page has it. marks: at these x. shaded: from x to x. log: the y axis.
+    caption: no other chart of the page has it. marks: at these x. log: the y axis.
     """
     colors = [line.color or LINES[k % len(LINES)] for k, line in enumerate(series)]
 
@@ -113,8 +112,6 @@ def chart(
             if line.lower is not None and line.upper is not None:
                 bounds = line.lower[rows], line.upper[rows]
                 axes.fill_between(line.x[rows], *bounds, color=ink(name), alpha=BAND, linewidth=0)
-        for start, end in shaded:
-            axes.axvspan(start, end, color=ink("panel"), zorder=0)
         for mark in marks:
             axes.axvline(mark, color=ink("alarm"), linestyle=":", linewidth=1.0)
         ends = [float(value) for line in series for value in (line.x.min(), line.x.max())]
