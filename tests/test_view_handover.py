@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import os
+import pickle
 from threading import Event as Flag
 from time import sleep
 from typing import Any
@@ -11,7 +12,7 @@ from typing import Any
 import pytest
 
 from sms_tools.view.choice import Choice, parse_choice
-from sms_tools.view.handover import Handover, receive
+from sms_tools.view.handover import Handover
 
 
 class Gate(io.RawIOBase):
@@ -35,7 +36,7 @@ class Gate(io.RawIOBase):
         found = []
         while True:
             try:
-                found.append(receive(stream))
+                found.append(pickle.load(stream))
             except EOFError:
                 return found
 

@@ -17,7 +17,7 @@ from sms_online.errors import InputError
 from sms_online.stream import Array
 from sms_online.threads import one_blas_thread
 from sms_sim.controller import JointPD
-from sms_sim.integrate import JACOBIAN_INCREMENT, radau
+from sms_sim.integrate import finite_difference_jacobians, radau
 from sms_sim.plant import Plant
 from sms_sim.references import References
 
@@ -97,14 +97,9 @@ class _Flow:
         self._increments = Z
 
     def _linearise(self, h: float) -> None:
-        P, n = self.y.shape
-        increment = JACOBIAN_INCREMENT * np.maximum(1.0, np.abs(self.y))
-        states = np.repeat(self.y[:, None], n + 1, axis=1)
-        states[:, 1:][:, np.arange(n), np.arange(n)] += increment
-        rates = self._plant.rate(np.full(P * (n + 1), self.t), states.reshape(-1, n)).reshape(P, n + 1, n)
-        jacobians = ((rates[:, 1:] - rates[:, :1]) / increment[:, :, None]).transpose(0, 2, 1)
+        _, jacobians = finite_difference_jacobians(self._plant.rate, self.t, self.y)
         jacobians = np.nan_to_num(jacobians, nan=0.0, posinf=0.0, neginf=0.0)
-        shifts = (self._method.eigenvalues / h)[:, None, None] * np.eye(n)
+        shifts = (self._method.eigenvalues / h)[:, None, None] * np.eye(self.y.shape[1])
         self._inverses, self._step = np.asarray(np.linalg.inv(shifts - jacobians[:, None]), dtype=np.complex128), h
 
     def _stages(self, h: float) -> tuple[Array, Array]:
@@ -113,14 +108,11 @@ class _Flow:
         assert self._inverses is not None
         t = np.tile(self.t + method.c * h, P)
         # The last step's polynomial goes on, which is as long where the Jacobians are those of this step.
-        theta = 1.0 + method.c
-        onward = (theta[:, None] ** np.arange(1, STAGES + 1)) @ method.basis
-        Z = onward @ self._increments - self._increments[:, -1:]
+        Z = method.onward(self._increments)
         left = np.full(P, np.inf)
         for _ in range(ITERATIONS):
             F = self._plant.rate(t, (self.y[:, None] + Z).reshape(-1, n)).reshape(Z.shape)
-            residual = method.T_inverse @ F - (method.eigenvalues[:, None] / h) * (method.T_inverse @ Z)
-            change = np.real(method.T @ (self._inverses @ residual[..., None])[..., 0])
+            change = method.newton_change(h, F, Z, self._inverses)
             Z = Z + change
             left = np.nan_to_num(np.abs(change / self._tolerance).max(axis=(1, 2)), nan=np.inf)
             left[np.isnan(self.y).any(axis=1)] = 0.0  # given up already

@@ -66,6 +66,23 @@ class Radau:
         """Number of stages s."""
         return int(self.c.size)
 
+    def onward(self, Z: Array, ratio: float = 1.0) -> Array:
+        """Stage increments (…, s, n) of a step, by extending the polynomial of the step before, of increments Z.
+
+        ratio: of the step's length to that of the step before.
+        """
+        theta = 1.0 + self.c * ratio
+        return np.asarray((theta[:, None] ** np.arange(1, self.stages + 1)) @ self.basis @ Z - Z[..., -1:, :])
+
+    def newton_change(self, h: float, F: Array, Z: Array, inverses: NDArray[np.complex128]) -> Array:
+        """Change (…, s, n) of Z by one simplified Newton iteration on Z = h A F.
+
+        inverses (…, p, n, n): of eigenvalue / h - Jacobian.
+        """
+        # T⁻¹ (F - A⁻¹ Z / h), each component solved with its own shift.
+        residual = self.T_inverse @ F - (self.eigenvalues[:, None] / h) * (self.T_inverse @ Z)
+        return np.asarray(np.real(self.T @ (inverses @ residual[..., None])[..., 0]))
+
 
 @cache
 def radau(stages: int) -> Radau:
@@ -135,12 +152,14 @@ class Dense:
         return np.asarray(ends[step] + (weights[:, None] @ increments[step])[:, 0])
 
 
-def finite_difference_jacobian(f: RightHandSide, t: float, y: Array) -> tuple[Array, Array]:
-    """ẏ (n,) and ∂ẏ/∂y (n, n) at one state, in one batched call."""
+def finite_difference_jacobians(f: RightHandSide, t: float, y: Array) -> tuple[Array, Array]:
+    """ẏ (P, n) and ∂ẏ/∂y (P, n, n) at states y (P, n), in one batched call."""
+    P, n = y.shape
     increment = JACOBIAN_INCREMENT * np.maximum(1.0, np.abs(y))
-    states = np.concatenate((y[None], y + np.diag(increment)))
-    rates = f(np.full(y.size + 1, t), states)
-    return rates[0], ((rates[1:] - rates[0]) / increment[:, None]).T
+    states = np.repeat(y[:, None], n + 1, axis=1)
+    states[:, 1:][:, np.arange(n), np.arange(n)] += increment
+    rates = f(np.full(P * (n + 1), t), states.reshape(-1, n)).reshape(P, n + 1, n)
+    return rates[:, 0], ((rates[:, 1:] - rates[:, :1]) / increment[:, :, None]).transpose(0, 2, 1)
 
 
 class Collocation:
@@ -157,7 +176,7 @@ class Collocation:
 
     def refresh(self) -> None:
         """Take the Jacobian at the present state, in one batched call."""
-        self.rate, self._jacobian = finite_difference_jacobian(self.f, self.t, self.y)
+        (self.rate,), (self._jacobian,) = finite_difference_jacobians(self.f, self.t, self.y[None])
         self._factored_step = 0.0
 
     def _factor(self, h: float) -> None:
@@ -170,20 +189,15 @@ class Collocation:
 
     def _start(self, h: float) -> Array:
         """Stage increments (s, n) by extending the polynomial of the step before."""
-        method = self.method
         if self._previous is None:
-            return np.zeros((method.stages, self.y.size))
+            return np.zeros((self.method.stages, self.y.size))
         previous_h, Z = self._previous
-        theta = 1.0 + method.c * (h / previous_h)
-        return np.asarray((theta[:, None] ** np.arange(1, method.stages + 1)) @ method.basis @ Z - Z[-1])
+        return self.method.onward(Z, h / previous_h)
 
     def newton_step(self, h: float, Z: Array) -> tuple[Array, Array, Array]:
         """One simplified Newton iteration on Z = h A F(y + Z), one batched call: new Z, its change, and F (s, n)."""
-        method = self.method
-        F = self.f(self.t + method.c * h, self.y + Z)
-        # T⁻¹ (F - A⁻¹ Z / h), each component solved with its own shift.
-        residual = method.T_inverse @ F - (method.eigenvalues[:, None] / h) * (method.T_inverse @ Z)
-        change = np.real(method.T @ (self._inverses @ residual[..., None])[..., 0])
+        F = self.f(self.t + self.method.c * h, self.y + Z)
+        change = self.method.newton_change(h, F, Z, self._inverses)
         return Z + change, change, F
 
     def error(self, h: float, F: Array) -> Array:

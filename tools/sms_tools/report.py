@@ -90,12 +90,8 @@ def parameter_table(document: Document, width: int, title: str | Text | None = N
         out.add_column(heading, justify="right", no_wrap=True)
     for p in parameters:
         cells = [p["name"], p["unit"]]
-        if p["identifiable"]:
-            shown = formatter(p["estimate"], p["std"])
-            cells += [shown(p["estimate"]), *[f"{p['std']:.2g}"] * wide]
-            cells.append(f"{shown(p['lower95'])} … {shown(p['upper95'])}")
-        else:
-            cells += [NOT_DETERMINED, _in_doubt(p), *[""] * wide]
+        estimate, std, interval = estimate_cells(p)
+        cells += [estimate, *[std] * wide, interval] if std else [estimate, _in_doubt(p), *[""] * wide]
         if simulated:
             cells += ["" if p["true"] is None else f"{p['true']:.6g}"] * wide
             cells.append(_error(p))
@@ -116,6 +112,14 @@ def tracker_table(document: Document) -> Table | None:
     for heading, cells in tracker_facts(trackers).items():
         out.add_row(heading, "", *cells, style="dim")
     return out
+
+
+def estimate_cells(p: Document) -> tuple[str, str, str]:
+    """Estimate, standard deviation and 95 % interval; the first alone where it is not determined."""
+    if not p["identifiable"]:
+        return NOT_DETERMINED, "", ""
+    shown = formatter(p["estimate"], p["std"])
+    return shown(p["estimate"]), f"{p['std']:.2g}", f"{shown(p['lower95'])} … {shown(p['upper95'])}"
 
 
 def value_cell(parameter: Document) -> str:

@@ -10,8 +10,7 @@ from typing import Any
 import numpy as np
 from markupsafe import Markup, escape
 
-from sms_online.tables import formatter
-from sms_tools.report import NOT_DETERMINED, Document
+from sms_tools.report import Document, estimate_cells
 from sms_tools.view.known import BOUNDS
 from sms_tools.view.parameter_groups import half_range, shortened
 
@@ -75,7 +74,7 @@ def parameter_rows(results: Mapping[str, tuple[list[Document], str]], nominal: M
             p
             | {
                 "short": shortened(p["symbol"]),
-                "estimates": [_estimate(each) for each in own],
+                "estimates": [("", "", "") if each is None else estimate_cells(each) for each in own],
                 "nominal": "" if stated is None else f"{stated:.6g}",
                 "true": "" if p["true"] is None else f"{p['true']:.6g}",
                 "deviation": _deviation(own, p["true"] if is_true else stated),
@@ -89,14 +88,6 @@ def parameter_rows(results: Mapping[str, tuple[list[Document], str]], nominal: M
             for (off, bound), (_, color) in zip(bars, results.values(), strict=True)
         ]
     return {"rows": rows, "columns": list(results), "is_true": is_true, "limit": f"{limit:g}"}
-
-
-def _estimate(p: Document | None) -> tuple[str, str, str]:
-    """Estimate, standard deviation and 95 % interval."""
-    if p is None or not p["identifiable"]:
-        return "" if p is None else NOT_DETERMINED, "", ""
-    shown = formatter(p["estimate"], p["std"])
-    return shown(p["estimate"]), f"{p['std']:.2g}", f"{shown(p['lower95'])} … {shown(p['upper95'])}"
 
 
 def _deviation(estimates: Sequence[Document | None], value: float | None) -> str:

@@ -69,30 +69,9 @@ class Handover:
                 except IndexError:
                     self._closed.wait(TURN)
                     continue
-                _send_item(item, self._pipe)
+                # Protocol 5 writes large arrays from where they are: a copy would hold the interpreter's lock.
+                pickle.dump(item, self._pipe, protocol=5)
+                self._pipe.flush()
                 self.taken += 1
         except (OSError, ValueError):  # the other end is gone
             self.broken = True
-
-
-def _send_item(item: Any, pipe: IO[bytes]) -> None:
-    """Arrays go from where they are: a copy of some MB would hold the interpreter's lock."""
-    buffers: list[pickle.PickleBuffer] = []
-    body = pickle.dumps(item, protocol=5, buffer_callback=buffers.append)
-    arrays = [buffer.raw() for buffer in buffers]
-    pickle.dump((body, [array.nbytes for array in arrays]), pipe)
-    for array in arrays:
-        pipe.write(array)
-    pipe.flush()
-
-
-def receive(pipe: IO[bytes]) -> Any:
-    """The next item at the pipe's other end, its arrays read-only.
-
-    EOFError or pickle.UnpicklingError where the pipe ends, which may be in the middle of one.
-    """
-    body, sizes = pickle.load(pipe)
-    arrays = [pipe.read(size) for size in sizes]
-    if [len(array) for array in arrays] != sizes:
-        raise EOFError
-    return pickle.loads(body, buffers=arrays)

@@ -17,7 +17,6 @@ from time import perf_counter
 from typing import IO, TYPE_CHECKING
 
 from sms_tools.view.frames import End, Event, Evidence, Frame, Start, TroubleError
-from sms_tools.view.handover import receive
 
 if TYPE_CHECKING:
     from sms_tools.view.recorder import Recorder
@@ -96,7 +95,7 @@ def _read(pipe: IO[bytes], frames: Queue[Frame | None]) -> None:
     """Frames as they come; None at their end, which may be in the middle of one where the session was killed."""
     try:
         while True:
-            frames.put(receive(pipe))
+            frames.put(pickle.load(pipe))
     except (EOFError, pickle.UnpicklingError):
         pass
     finally:
