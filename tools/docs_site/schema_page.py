@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import inspect
+import json
 import re
-from types import NoneType, UnionType
-from typing import Annotated, Any, Literal, Union, get_args, get_origin
+from typing import Any, get_args
 
-from annotated_types import Ge, Gt, MinLen
 from markdown.extensions.toc import slugify
-from pydantic.fields import FieldInfo
 
 from sms_online.description import schema, sources
 from sms_online.description.parse import RENAMED
@@ -47,6 +45,7 @@ HEADINGS: dict[type[Record], str] = {
     sources.SerialField: "Fields of lines",
     sources.LogSignal: "Signals of a log",
 }
+TYPES = {"number": "number", "integer": "whole number", "string": "text", "boolean": "true or false"}
 ENTRY = re.compile(r"(\w+(?:, \w+)*): (.*)")
 
 
@@ -112,9 +111,11 @@ def _section(record: type[Record], heading: str) -> str:
     lines = [f"## {heading}", "", about, ""]
     lines += ["| key | value | default | meaning |", "|---|---|---|---|"]
     tables = {field: key for key, field in RENAMED.items()}
-    for name, field in record.model_fields.items():
+    schema = record.model_json_schema(by_alias=False)
+    for name, field in schema["properties"].items():
         key = tables.get(name, name) if record is System else name
-        lines.append(f"| `{key}` | {_type(field)} | {_default(field)} | {_cell(fields[name])} |")
+        default = "required" if name in schema.get("required", ()) else _default(field.get("default"))
+        lines.append(f"| `{key}` | {_value(field)} | {default} | {_cell(fields[name])} |")
     return "\n".join([*lines, ""])
 
 
@@ -123,61 +124,32 @@ def _cell(text: str) -> str:
     return text.replace("|", "\\|")
 
 
-def _type(field: FieldInfo) -> str:
-    return _named(field.annotation, field.metadata)
+def _value(field: dict[str, Any]) -> str:
+    """What a field of a JSON schema takes, in words."""
+    if "$ref" in field:
+        name = field["$ref"].rpartition("/")[2]
+        heading = next(heading for record, heading in HEADINGS.items() if record.__name__ == name)
+        return f"[{name}](#{slugify(heading.replace('`', ''), '-')})"
+    if choices := field.get("anyOf") or field.get("oneOf"):
+        return " or ".join(dict.fromkeys(_value(each) for each in choices if each.get("type") != "null"))
+    if values := field.get("enum") or [field[key] for key in ("const",) if key in field]:
+        return " or ".join(f"`{json.dumps(value, ensure_ascii=False)}`" for value in values)
+    if field["type"] == "object":
+        return f"table of {_value(field['additionalProperties'])}"
+    if "prefixItems" in field:
+        return f"{len(field['prefixItems'])} numbers"
+    if field["type"] == "array":
+        return f"list of {_value(field['items'])}" + (", not empty" if field.get("minItems") else "")
+    limits = [f" {sign} {field[key]}" for key, sign in (("exclusiveMinimum", ">"), ("minimum", "≥")) if key in field]
+    return TYPES[field["type"]] + "".join(limits)
 
 
-def _named(annotation: Any, limits: list[Any]) -> str:
-    """An annotation in words."""
-    origin, inner = get_origin(annotation), get_args(annotation)
-    if origin is Annotated:
-        return _named(inner[0], [*inner[1:], *limits])
-    if origin in (Union, UnionType):
-        parts = [_named(part, []) for part in inner if part is not NoneType]
-        return " or ".join(dict.fromkeys(parts))
-    if origin is Literal:
-        return " or ".join(f"`{value!r}`".replace("'", '"') for value in inner)
-    if origin is tuple:
-        if inner[-1] is Ellipsis:
-            return f"list of {_named(inner[0], [])}" + (", not empty" if _has(limits, MinLen) else "")
-        return f"{len(inner)} numbers"
-    if origin is dict:
-        return f"table of {_named(inner[1], [])}"
-    if isinstance(annotation, type) and issubclass(annotation, Record):
-        heading = HEADINGS[annotation].replace("`", "")
-        return f"[{annotation.__name__}](#{slugify(heading, '-')})"
-    return _limited({float: "number", int: "whole number", str: "text", bool: "true or false"}[annotation], limits)
-
-
-def _limited(text: str, limits: list[Any]) -> str:
-    for limit in _flat(limits):
-        if isinstance(limit, Gt):
-            text += f" > {limit.gt}"
-        if isinstance(limit, Ge):
-            text += f" ≥ {limit.ge}"
-    return text
-
-
-def _has(limits: list[Any], kind: type) -> bool:
-    return any(isinstance(limit, kind) for limit in _flat(limits))
-
-
-def _flat(limits: list[Any]) -> list[Any]:
-    """Limits, those within a `Field(…)` too."""
-    return [limit for each in limits for limit in (each.metadata if isinstance(each, FieldInfo) else [each])]
-
-
-def _default(field: FieldInfo) -> str:
-    if field.is_required():
-        return "required"
-    value = field.default
-    if value is None or value == () or value == {}:
+def _default(value: Any) -> str:
+    """A default of a JSON schema, as a system file states it."""
+    if value in (None, [], {}):
         return "none"
-    if isinstance(value, Record) or (isinstance(value, tuple) and isinstance(value[0], Record)):
+    if isinstance(value, dict) or (isinstance(value, list) and isinstance(value[0], dict)):
         return "its defaults"
-    text = {True: "true", False: "false"}.get(value) if isinstance(value, bool) else None
-    if isinstance(value, tuple):
-        text = f"[{', '.join(f'{each:g}' for each in value)}]"
-    if isinstance(value, str):
-        text = f'"{value}"'
-    return f"`{text if text is not None else format(value, 'g')}`"
+    if isinstance(value, list):
+        return f"`[{', '.join(f'{each:g}' for each in value)}]`"
+    return f"`{json.dumps(value, ensure_ascii=False) if isinstance(value, bool | str) else format(value, 'g')}`"
