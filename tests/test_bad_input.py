@@ -221,7 +221,7 @@ def test_without_motion_nothing_is_determined_and_that_is_written(
     ]
 
 
-def test_a_cut_last_line_is_left_out_and_told(bench: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_cut_last_line_is_left_out_and_named(bench: Path, capsys: pytest.CaptureFixture[str]) -> None:
     lines = capture_lines()
     (bench / "run.csv").write_text("\n".join(lines)[:-4])
     code, document = replayed(bench, capsys)

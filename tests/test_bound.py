@@ -114,7 +114,7 @@ def bound_of(planar: tuple[Model, BaseParameters, Motion], channels: list[str]) 
 
 
 @pytest.mark.parametrize("channels", [POSITIONS, [*WITHOUT_SLOPES, "gyro_0_z"]], ids=["positions", "rig with a gyro"])
-def test_the_planar_arm_meets_generalised_least_squares_on_the_whole_record(
+def test_the_planar_bound_is_generalised_least_squares(
     planar: tuple[Model, BaseParameters, Motion], channels: list[str]
 ) -> None:
     model, base, motion = planar
@@ -194,7 +194,7 @@ def moved(model: Model, x: Array, small: Array) -> Array:
     return x + model.position_rate(x, small)
 
 
-def test_the_linearisation_predicts_forces_and_readings_of_a_moved_spatial_arm(
+def test_the_linearisation_predicts_a_moved_spatial_arm(
     spatial: tuple[Model, BaseParameters, Array, Array],
 ) -> None:
     model, base, x, v = spatial
@@ -228,7 +228,7 @@ def test_the_linearisation_predicts_forces_and_readings_of_a_moved_spatial_arm(
     assert_allclose(predicted, reading, rtol=1e-5, atol=1e-4 * np.abs(reading).max())
 
 
-def test_the_linearisation_carries_a_small_rotation_of_the_base_with_its_spin(
+def test_the_linearisation_carries_a_small_rotation_of_the_base(
     spatial: tuple[Model, BaseParameters, Array, Array],
 ) -> None:
     model, base, x, v = spatial

@@ -62,7 +62,7 @@ WITHOUT_NOISE = (
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", WITHOUT_NOISE)
-def test_a_shipped_system_without_stated_noise_has_the_bounds_of_grade_b(
+def test_a_system_without_stated_noise_has_bounds_of_grade_b(
     name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     path = tmp_path / "system.toml"

@@ -101,7 +101,7 @@ def test_every_format_gives_the_same_samples(tmp_path: Path, ending: str) -> Non
         assert reader.warnings == [f"run{ending}: 1 frames skipped, no channel comes from their ids (077)"]
 
 
-def test_text_is_read_compressed_and_in_a_window_and_progress_is_told(tmp_path: Path) -> None:
+def test_text_is_read_compressed_and_in_parts_with_progress(tmp_path: Path) -> None:
     path = written(tmp_path, ".asc", messages())
     packed = tmp_path / "run.asc.gz"
     packed.write_bytes(gzip.compress(path.read_bytes()))
@@ -114,7 +114,7 @@ def test_text_is_read_compressed_and_in_a_window_and_progress_is_told(tmp_path: 
     assert consumed[-1] == binary.stat().st_size
 
 
-def test_a_capture_is_told_from_a_log_by_its_header(tmp_path: Path) -> None:
+def test_a_capture_is_known_by_its_header(tmp_path: Path) -> None:
     path = tmp_path / "run.csv"
     path.write_text("t,q_1\n0.0,1.0\n")
     assert isinstance(open_source(path, rig(tmp_path)), CaptureReader)

@@ -132,7 +132,7 @@ def test_empty_and_nan_cells_are_gaps_counted_per_channel(tmp_path: Path) -> Non
 
 
 @pytest.mark.parametrize("cut", ["3", "3,", "3,1", "3,1.", "3,1e-", "3,1.5"])
-def test_a_cut_last_line_is_skipped_and_told(tmp_path: Path, cut: str) -> None:
+def test_a_cut_last_line_is_skipped_and_named(tmp_path: Path, cut: str) -> None:
     reader = CaptureReader(write(tmp_path / "run.csv", f"t,q_1\n1,1\n2,1\n{cut}"))
     t, _ = read(reader)
     assert t.tolist() == [1, 2]

@@ -112,7 +112,7 @@ def test_the_truth_reaches_the_report_and_never_the_estimate(bench: Path, capsys
     assert row.endswith("-50")
 
 
-def test_a_truth_of_other_parameters_is_told_and_not_compared(bench: Path) -> None:
+def test_a_truth_of_other_parameters_is_not_compared(bench: Path) -> None:
     write_truth(bench / "run.csv", {"link_1.inertia": INERTIA}, {})
     assert main(["replay", "run.csv", "--system", "axis.toml", "--out", "done"]) == 0
     found = document(bench / "done")
@@ -213,7 +213,7 @@ def test_ctrl_c_finishes_with_what_has_been_read(
 # priors
 
 
-def test_a_stated_prior_holds_without_being_asked_for_nominal_values_only_with() -> None:
+def test_a_stated_prior_holds_without_the_option() -> None:
     system = parse_system(AXIS + '[prior."link_1.inertia"]\nvalue = 0.5\nstd = 0.05\n', "axis.toml")
     base = find_base_parameters(build_model(system))
     names = [parameter.name for parameter in base.parameters]

@@ -158,7 +158,7 @@ def test_an_effect_on_channels_is_marked_where_their_sensors_sit(where: str, pla
     assert places_of(where, channels(load_system("paper-planar"))) == places
 
 
-def test_what_a_system_file_gains_is_told_alone() -> None:
+def test_only_what_a_system_file_gains_is_shown() -> None:
     system = load_system("paper-planar")
     found = Effect(name="cubic_stiffness", where="joint_1")
     after = system.model_copy(update={"effects": (*system.effects, found)})

@@ -106,7 +106,7 @@ def samples(session: Session) -> int:
     return len(path.read_text().splitlines()) if path.is_file() else 0
 
 
-def test_an_arm_that_is_killed_is_named_and_picked_up_when_it_moves_again(
+def test_a_killed_arm_is_named_and_followed_when_it_moves_again(
     tmp_path: Path, started: list[subprocess.Popen[Any]]
 ) -> None:
     file = described_testbed(tmp_path)
@@ -168,7 +168,7 @@ def start_viewer() -> tuple[subprocess.Popen[bytes], str]:
 
 
 @pytest.mark.parametrize("killed", ["view", "viewer"])
-def test_a_view_or_viewer_that_is_killed_is_named_and_the_session_goes_on(
+def test_a_killed_view_is_named_and_the_session_goes_on(
     tmp_path: Path, started: list[subprocess.Popen[Any]], killed: str
 ) -> None:
     file = described_testbed(tmp_path)

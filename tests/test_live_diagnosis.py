@@ -62,9 +62,7 @@ class Late(Immediate):
 
 
 @pytest.mark.realtime
-def test_a_live_session_and_the_replay_of_its_recording_give_the_same_document(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_live_session_and_its_replay_give_the_same_document(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """With --adopt; how far it comes depends on the machine, for answers take time and the clock runs fast."""
     plain = bus_streams.motion
 
@@ -109,7 +107,7 @@ def test_answers_that_came_late_are_used_as_late_in_the_repetition(tmp_path: Pat
 
 
 @pytest.mark.slow
-def test_what_falls_due_while_a_search_runs_is_searched_right_after_it(tmp_path: Path) -> None:
+def test_what_falls_due_during_a_search_is_searched_after_it(tmp_path: Path) -> None:
     """An answer that takes two seconds skips one search that is due; the next one does not wait for another to be."""
     block = axis_block(cogging, BEGIN, seconds=14.0)
     estimator = Estimator(SYSTEM, block.channels, "session")
@@ -145,7 +143,7 @@ def asked() -> Request:
     return requests[0]
 
 
-def test_a_search_in_another_process_says_what_it_says_here_and_is_noted(tmp_path: Path) -> None:
+def test_a_search_in_another_process_says_what_it_says_here(tmp_path: Path) -> None:
     searches = SearchProcess(tmp_path, adopt=True)
     assert searches.submit(3, asked())
     assert not searches.submit(4, asked())  # one at a time
@@ -186,7 +184,7 @@ def test_a_search_process_that_dies_is_named_and_nobody_waits_for_it(tmp_path: P
     assert not repeated.submit(2, asked())
 
 
-def test_a_search_that_the_sessions_end_overtook_is_no_problem_and_never_answers(tmp_path: Path) -> None:
+def test_a_search_overtaken_by_the_sessions_end_never_answers(tmp_path: Path) -> None:
     searches = SearchProcess(tmp_path, adopt=False)
     assert searches.submit(1, asked())
     searches.close()
@@ -196,7 +194,7 @@ def test_a_search_that_the_sessions_end_overtook_is_no_problem_and_never_answers
     assert repeated.outcome(1000) is None
 
 
-def test_the_searches_of_a_recording_are_repeated_only_under_the_same_conditions(tmp_path: Path) -> None:
+def test_searches_are_repeated_only_under_the_same_conditions(tmp_path: Path) -> None:
     assert isinstance(searcher_of(tmp_path, adopt=True), Immediate)
     (tmp_path / NAME).write_text('{"adopt": true}\n{"search": 1, "block": 9}\n{"search": 2, "bl')
     assert isinstance(searcher_of(tmp_path, adopt=True), Repeated)
@@ -219,7 +217,7 @@ def replayed(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def test_the_results_hold_verdict_evidence_and_parameters_of_what_was_adopted(replayed: Path) -> None:
+def test_results_hold_verdict_and_evidence_of_what_was_adopted(replayed: Path) -> None:
     results = json.loads((replayed / "results.json").read_text())
     (episode,) = results["diagnosis"]
     assert (episode["verdict"], episode["effects"][0]["name"]) == ("named", "cogging")
@@ -243,7 +241,7 @@ def test_the_page_shows_the_verdict_and_how_the_evidence_grew(replayed: Path) ->
     assert "Evidence for candidates" in page
 
 
-def test_the_view_plots_the_evidence_and_tells_the_verdict(replayed: Path) -> None:
+def test_the_view_plots_the_evidence_and_logs_the_verdict(replayed: Path) -> None:
     scores: dict[str, list[float]] = {}
     told: list[str] = []
     for chunk in RrdReader(str(replayed / "session.rrd")).stream():

@@ -135,7 +135,7 @@ def system(tmp_path: Path) -> System:
     return axis_testbed(tmp_path)
 
 
-def test_readers_leave_the_interpreter_to_the_loop_while_it_computes_but_not_for_ever(
+def test_readers_leave_the_interpreter_to_a_loop_that_computes(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     done: list[str] = []
@@ -159,7 +159,7 @@ def test_readers_leave_the_interpreter_to_the_loop_while_it_computes_but_not_for
 
 
 @pytest.mark.realtime
-def test_a_live_session_and_the_replay_of_its_recording_give_the_same_document(tmp_path: Path, system: System) -> None:
+def test_a_live_session_and_its_replay_give_the_same_document(tmp_path: Path, system: System) -> None:
     bench = Bench(tmp_path, system)
     live = bench.run(21.0)
     assert live["samples"] > 7000  # of 8000; a loaded machine plays the last ones too late
@@ -170,7 +170,7 @@ def test_a_live_session_and_the_replay_of_its_recording_give_the_same_document(t
 
 
 @pytest.mark.realtime
-def test_a_device_that_was_unplugged_is_named_opened_again_and_pi_goes_on(tmp_path: Path, system: System) -> None:
+def test_an_unplugged_device_is_named_and_opened_again(tmp_path: Path, system: System) -> None:
     bench = Bench(tmp_path, system)
     bench.readers[1].unplugged = (8.0, 10.0)
     live = bench.run(21.0)
@@ -182,7 +182,7 @@ def test_a_device_that_was_unplugged_is_named_opened_again_and_pi_goes_on(tmp_pa
 
 
 @pytest.mark.realtime
-def test_ten_times_the_rate_drops_and_counts_and_replays_what_was_used(
+def test_ten_times_the_rate_drops_counts_and_replays_what_was_used(
     tmp_path: Path, system: System, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(feed_module, "MOST_WAITING", 200)
@@ -224,7 +224,7 @@ def test_a_display_that_never_reads_blocks_nobody(tmp_path: Path, system: System
     os.close(reader)  # which ends the write that waits
 
 
-def test_health_tells_the_latency_and_the_clocks(tmp_path: Path, system: System) -> None:
+def test_health_holds_the_latency_and_the_clocks(tmp_path: Path, system: System) -> None:
     bench = Bench(tmp_path, system)
     bench.run(21.0)
     health = bench.session.health
@@ -233,7 +233,7 @@ def test_health_tells_the_latency_and_the_clocks(tmp_path: Path, system: System)
 
 
 @pytest.mark.realtime
-def test_a_checkpoint_is_there_while_the_session_runs_and_goes_on_to_the_same_bits(
+def test_a_checkpoint_of_a_running_session_gives_the_same_bits(
     tmp_path: Path, system: System, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("sms_tools.live.loop.CHECKPOINT_INTERVAL", 3.0)
@@ -269,7 +269,7 @@ def test_arrivals_never_go_back_behind_a_tick_that_was_worked_off() -> None:
     assert feed.drain(1.02) == [SerialChunk(1.0, b"a")]
 
 
-def test_a_loop_that_is_behind_waits_until_its_readers_have_fetched_what_came(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_loop_that_is_behind_waits_for_its_readers(monkeypatch: pytest.MonkeyPatch) -> None:
     """It goes on when a read has come back, and at once where the device is not there."""
 
     class Counted(Played):

@@ -43,7 +43,7 @@ def some_frames(count: int) -> CanFrames:
     return CanFrames(arrival, stamp, id_, length, data, flags)
 
 
-def test_a_recording_made_under_other_rules_says_that_its_replay_differs(tmp_path: Path) -> None:
+def test_a_recording_under_other_rules_says_that_it_differs(tmp_path: Path) -> None:
     system = axis_testbed(tmp_path)
 
     def warnings(directory: Path) -> str:
@@ -114,7 +114,7 @@ def test_a_recording_replayed_gives_the_blocks_of_the_session(tmp_path: Path) ->
         assert a.values.tobytes() == b.values.tobytes()
 
 
-def test_what_the_estimator_was_too_slow_for_is_recorded_and_left_out_of_the_replay(tmp_path: Path) -> None:
+def test_dropped_items_are_recorded_and_left_out_of_the_replay(tmp_path: Path) -> None:
     frames = some_frames(100)
     recorder = Recorder(tmp_path / "run", HEADER)
     for k in range(0, 100, 10):
@@ -127,7 +127,7 @@ def test_what_the_estimator_was_too_slow_for_is_recorded_and_left_out_of_the_rep
 
 
 @pytest.mark.realtime
-def test_after_a_kill_at_most_a_second_is_missing_and_the_rest_is_replayed(tmp_path: Path) -> None:
+def test_after_a_kill_at_most_a_second_is_missing(tmp_path: Path) -> None:
     program = f"""
 import sys, time
 import numpy as np
@@ -227,7 +227,7 @@ def test_a_directory_that_holds_a_recording_is_not_written_over(tmp_path: Path) 
         Recorder(tmp_path / "run", HEADER)
 
 
-def test_what_is_no_recording_is_told(tmp_path: Path) -> None:
+def test_what_is_no_recording_is_refused(tmp_path: Path) -> None:
     system = axis_testbed(tmp_path)
     with pytest.raises(InputError, match="No such file"):
         Recording(tmp_path, system)

@@ -120,7 +120,7 @@ def test_after_a_break_what_was_cut_is_dropped() -> None:
     assert faults(decoder) == {"cut_line": 2, "lost_counter": 2}
 
 
-def test_a_sender_that_begins_with_a_delimiter_loses_nothing_after_a_break() -> None:
+def test_a_leading_delimiter_loses_nothing_after_a_break() -> None:
     decoder = make_decoder(FRAMES, None)
     samples = push(decoder, b"", b"\0" + frame(0) + frame(1))
     assert len(samples.values) == 2
@@ -181,7 +181,7 @@ def test_a_checksum_is_that_of_nmea() -> None:
     assert faults(decoder) == {"crc": 2}
 
 
-def test_a_counter_of_steady_frames_tells_the_time() -> None:
+def test_a_counter_of_steady_frames_is_a_clock() -> None:
     decoder = make_decoder(lines({"counter": True, "tick": 0.25, "wrap": 8}, {"channel": "q"}), None)
     samples = push(decoder, b"6,1\n7,1\n0,1\n2,1\n")
     assert samples.t_device.tolist() == [1.5, 1.75, 2.0, 2.5]

@@ -43,7 +43,7 @@ def received(device: Reader, count: int) -> list[SerialChunk]:
     return chunks
 
 
-def test_bytes_that_come_while_a_reader_waits_for_its_turn_are_fetched_with_the_others() -> None:
+def test_bytes_that_come_while_a_reader_waits_are_fetched_too() -> None:
     far, name = pair()
 
     def turn() -> None:

@@ -50,9 +50,7 @@ def test_the_recording_ends_with_the_parameters_after(diagnosed: Path, document:
     assert shown == found
 
 
-def test_evidence_is_drawn_over_the_whole_session_and_the_effect_has_the_most(
-    diagnosed: Path, document: dict[str, Any]
-) -> None:
+def test_evidence_is_drawn_and_the_effect_has_the_most(diagnosed: Path, document: dict[str, Any]) -> None:
     (effect,) = document["effects"]
     assert effect["name"] == "coulomb_friction"
     evidence = {}

@@ -56,7 +56,7 @@ def test_pickled_statistics_say_the_same_after_an_event(session: Block) -> None:
     assert elsewhere(Statistics.of(estimator)) == results_document(estimator, 0.0, [])
 
 
-def test_the_recording_goes_on_with_the_parameter_that_an_event_has_added(shown: Path) -> None:
+def test_a_parameter_that_an_event_has_added_is_recorded(shown: Path) -> None:
     results = json.loads((shown / "results.json").read_text())
     assert not any("view" in warning for warning in results["warnings"])
     found = {p["name"]: p["estimate"] for p in results["parameters"]}

@@ -62,7 +62,7 @@ def test_a_deviation_is_in_percent_of_its_reference() -> None:
     assert (-2.1 - group.zero[0]) / group.scale[0] == pytest.approx(-5.0)
 
 
-def test_without_anything_to_compare_with_nothing_is_drawn_and_the_axis_is_that_of_the_others() -> None:
+def test_without_a_reference_nothing_is_drawn() -> None:
     parameter = Parameter("coulomb_friction@joint_1.torque", "c_1", "N m", 0.0)
     (group,) = parameter_groups([parameter], [None], about([parameter]))
     assert np.isnan((3.0 - group.zero[0]) / group.scale[0])
@@ -75,7 +75,7 @@ def followed(scale: OwnScale, t: float, estimate: list[float], percent: float, c
     return scale.follow(Known(t, values, np.abs(values) * percent / 100.0), converged)
 
 
-def test_an_axis_is_about_the_estimate_once_converged_and_as_wide_as_its_bars_ask_for() -> None:
+def test_an_axis_is_about_the_estimate_once_converged() -> None:
     scale = OwnScale([Reference(10.0, False)] * 4)
     assert not followed(scale, 1.0, [12.0] * 4, 1.0, converged=False)
     assert (scale.basis.half_range, scale.basis.about[0]) == (100.0, 10.0)
@@ -86,7 +86,7 @@ def test_an_axis_is_about_the_estimate_once_converged_and_as_wide_as_its_bars_as
     assert "2.0 s" in scale.basis.name
 
 
-def test_an_axis_stays_until_bars_are_ten_times_shorter_or_estimates_leave_it() -> None:
+def test_an_axis_stays_until_bars_shrink_or_estimates_leave_it() -> None:
     scale = OwnScale([None] * 4)
     assert followed(scale, 0.0, [12.0] * 4, 1.0)
     assert not followed(scale, 10.0, [12.1] * 4, 0.5)
@@ -127,7 +127,7 @@ def test_long_combinations_are_cut_to_a_label() -> None:
     assert shortened("m_0+m_1+m_2+m_m1+m_m2+m_m3").startswith("m_0+m_1")
 
 
-def test_a_table_tells_no_number_of_what_is_not_determined() -> None:
+def test_a_table_has_no_number_of_what_is_not_determined() -> None:
     parameters = [Parameter("joint_1.stiffness", "k_1", "N m/rad", 1000.0)] * 2
     now = Known(1.0, np.array([1010.0, 7.0]), np.array([5.0, np.inf]))
     lines = markdown_table(parameters, [Reference(1000.0, True), None], now).splitlines()

@@ -103,7 +103,7 @@ def test_rerun_verifies_the_recording(recorded: Path) -> None:
     assert done.returncode == 0, done.stderr
 
 
-def test_events_are_told_when_they_happen(recorded: Path) -> None:
+def test_events_are_logged_when_they_happen(recorded: Path) -> None:
     rows = [row for row in columns(recorded / "session.rrd", "/log") if row.get("TextLog:text")]
     lines = [row["TextLog:text"][0].split(" s: ")[1] for row in rows]
     told = {line.split(" is ")[0] for line in lines if "is determined" in line}
@@ -262,7 +262,7 @@ def _channels() -> tuple[str, ...]:
     return (*layout.position_names, "tau_1", "tau_2")
 
 
-def test_a_legend_stands_over_time_to_come() -> None:
+def test_a_legend_is_over_time_to_come() -> None:
     plot = _Plots(begin=None)._plot("a plot", ["a/**"])
     legend, axis = plot.properties["PlotLegend"], plot.properties["TimeAxis"]
     assert legend.corner.as_arrow_array().to_pylist() == [Corner2D.RightTop.value]
