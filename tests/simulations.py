@@ -13,8 +13,10 @@ from pathlib import Path
 import numpy as np
 
 from sms_adapters.system_file import load_system
+from sms_online.capture import Capture
 from sms_online.description.parse import describe
 from sms_online.description.schema import System
+from sms_sim.capture import Simulated
 from sms_sim.plant import Plant
 from sms_sim.simulate import POSITION_TOLERANCE, Simulation, simulate
 
@@ -51,6 +53,12 @@ def planar(seconds: float = 20.0) -> Simulation:
     """The paper's example (Table III) along (46)."""
     whole = simulated(load_system("paper-planar"), 20.0)
     return whole if seconds == whole.duration else until(whole, seconds)
+
+
+def planar_capture(seconds: float, grade: str = "B", seed: int = 0) -> Capture:
+    """The first seconds of the paper's example, at most 20, as `sms.simulate` records them."""
+    session = Simulated.of(load_system("paper-planar"), duration=seconds, grade=grade, seed=seed)
+    return session.capture(planar(seconds))
 
 
 def until(whole: Simulation, seconds: float) -> Simulation:

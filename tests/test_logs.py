@@ -19,6 +19,7 @@ from sms_online.description.parse import parse_system, shipped_text
 from sms_online.errors import InputError
 from sms_tools.cli import main
 from tests.bags import path_of, write_json_mcap, write_ros1, write_ros2
+from tests.simulations import planar_capture
 
 BAG, TABLE = "bag", "table"
 
@@ -33,7 +34,7 @@ def described(kind: str, signals: dict[str, str], further: str = "") -> sms.Syst
 @pytest.fixture(scope="module")
 def capture() -> sms.Capture:
     """Three seconds of the planar example. Seed 4."""
-    return sms.simulate(sms.load_system("paper-planar"), duration=3.0, grade="B", seed=4)
+    return planar_capture(3.0, seed=4)
 
 
 @pytest.fixture(scope="module")

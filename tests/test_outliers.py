@@ -11,6 +11,7 @@ import pytest
 import sms_online as sms
 from sms_online.pipeline.outliers import Outliers
 from sms_online.stream import Array
+from tests.simulations import planar_capture
 
 RATE = 1000.0
 
@@ -73,7 +74,7 @@ def test_slow_channels_have_their_outliers_found_too() -> None:
 @pytest.mark.slow
 def test_outliers_cost_a_session_no_trust_in_its_parameters() -> None:
     system = sms.load_system("paper-planar")
-    data = sms.simulate(system, duration=6.0, grade="B", seed=1)
+    data = planar_capture(6.0, seed=1)
     column = data.channels.index("link_1.marker_2.u_y")
     values = data.values.copy()
     hit = np.arange(50, len(values), 97)

@@ -112,6 +112,10 @@ def test_a_recording_replayed_gives_the_blocks_of_the_session(tmp_path: Path) ->
     for a, b in zip(replayed, live, strict=True):
         assert a.t.tobytes() == b.t.tobytes()
         assert a.values.tobytes() == b.values.tobytes()
+    # A part counts from the session's start.
+    part = np.concatenate([block.t for block in open_source(tmp_path / "run", system, 2.0, 4.5, directory=tmp_path)])
+    whole = np.concatenate([block.t for block in live])
+    np.testing.assert_array_equal(part, whole[(whole >= 2.0) & (whole < 4.5)])
 
 
 def test_dropped_items_are_recorded_and_left_out_of_the_replay(tmp_path: Path) -> None:

@@ -92,6 +92,13 @@ class Simulated:
         """What the sensors record of it."""
         return sampled_blocks(simulation, self.grade, self.seed)
 
+    def capture(self, simulation: Simulation) -> Capture:
+        """The same as a capture with its truth."""
+        blocks = list(self.blocks(simulation))
+        t, values = (np.concatenate([getattr(block, part) for block in blocks]) for part in ("t", "values"))
+        name = f"simulation of {self.described.name}"
+        return Capture(t, self.channels, values, name, (), self.truth(simulation))
+
     def truth(self, simulation: Simulation) -> dict[str, Any]:
         """True parameters of the described system, and how they came about."""
         return {
@@ -131,8 +138,5 @@ def simulate(
     """
     system, _ = given_system(system)
     session = Simulated.of(system, effects, duration, grade, seed, drift)
-    channels = session.channels
-    simulation = session.solve()
-    blocks = list(session.blocks(simulation))
-    t, values = (np.concatenate([getattr(block, part) for block in blocks]) for part in ("t", "values"))
-    return Capture(t, channels, values, f"simulation of {system.name}", (), session.truth(simulation))
+    _ = session.channels  # an unknown grade is known before a long simulation
+    return session.capture(session.solve())
