@@ -369,7 +369,7 @@ class Evaluation:
         missing = ", ".join(setup.sensing.missing)
         if now.method == "smoother":
             if missing:
-                out.append(f"not measured, and told by the equations of motion: {missing}")
+                out.append(f"not measured, but estimated by the equations of motion: {missing}")
             if smoother.level > 0.0:
                 share = f"{100.0 * smoother.level:.2g} % of the usual ones"
                 out.append(
@@ -386,13 +386,11 @@ class Evaluation:
         if not self.statistics.finished:
             return []
         if projection is None:
-            return ["whether real bodies can have these parameters is not known: the search for them did not converge"]
+            return ["physical consistency is not known: the search for consistent parameters did not converge"]
         if projection.distance == 0.0:
             return []
         distance, names = f"{projection.distance:.2g} standard deviations", ", ".join(projection.active)
-        return [
-            f"no real bodies have these parameters, because of {names}: the nearest that some have are {distance} away"
-        ]
+        return [f"the estimate violates physical consistency, because of {names}, by {distance}"]
 
     @cached_property
     def notices(self) -> list[str]:

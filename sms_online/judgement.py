@@ -308,12 +308,14 @@ def _cautions(facts: Facts) -> list[Reason]:
                 full=f"sensor noise in the columns pulls {names} by more than the error bar",
             )
         )
-    out += [Reason(f"a change at {t:.1f} s came too late to be told: values of before", False) for t in facts.undecided]
+    out += [Reason(f"a change at {t:.1f} s came too late: values of before", False) for t in facts.undecided]
     for discrepancy in facts.discrepancies:
         if discrepancy.verdict == "passed":
             out.append(Reason(f"the residual of {discrepancy.row} was more than noise for a time", False))
     if facts.distance > LARGEST_DISTANCE:
-        out.append(Reason(f"no real bodies are nearer than {facts.distance:.0f} standard deviations", False))
+        out.append(
+            Reason(f"the estimate violates physical consistency by {facts.distance:.0f} standard deviations", False)
+        )
     return out
 
 

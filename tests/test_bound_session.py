@@ -95,7 +95,7 @@ def test_estimates_of_real_bodies_stand_alone(simulation: Simulation) -> None:
     document = results_document(session(simulation, "A"), 1.0, [])
     assert document["physical"] == {"distance_std": 0.0, "active": []}
     assert all(p["projected"] is None for p in document["parameters"])
-    assert not any("real bodies" in warning for warning in document["warnings"])
+    assert not any("physical consistency" in warning for warning in document["warnings"])
 
 
 def test_estimates_of_no_real_bodies_come_with_the_nearest_ones(simulation: Simulation) -> None:
@@ -113,4 +113,4 @@ def test_estimates_of_no_real_bodies_come_with_the_nearest_ones(simulation: Simu
     # It pulls the inertia beside it below zero too, so that the way back is longer than that of the mass alone.
     assert "motor_2.mass" in document["physical"]["active"]
     assert document["physical"]["distance_std"] >= 0.999 * -mass["estimate"] / mass["std"]
-    assert any("real bodies" in warning and "motor_2.mass" in warning for warning in document["warnings"])
+    assert any("physical consistency" in warning and "motor_2.mass" in warning for warning in document["warnings"])

@@ -81,7 +81,7 @@ def test_what_error_bars_do_not_know_of_is_a_grave_doubt(facts: Facts, said: str
         (replace(GOOD, pulled=("motor_2.mass",)), "noise pulls motor_2.mass beyond the error bar"),
         (replace(GOOD, undecided=(19.2,)), "a change at 19.2 s"),
         (replace(GOOD, discrepancies=(Discrepancy("base", 3.0, "passed"),)), "more than noise for a time"),
-        (replace(GOOD, distance=39.0), "no real bodies are nearer than 39 standard deviations"),
+        (replace(GOOD, distance=39.0), "the estimate violates physical consistency by 39 standard deviations"),
         (replace(GOOD, lost=0.2), "20 % of the samples are lost"),
         (replace(GOOD, troubles=("drive: silent",)), "drive: silent"),
         (with_row("joint_1", relative=0.4, whitened=2.1), "the residual of joint_1 is 2.1 × noise"),

@@ -252,7 +252,7 @@ def test_the_view_plots_the_evidence_and_logs_the_verdict(replayed: Path) -> Non
     (cogs,) = (values for path, values in scores.items() if "cogging" in path)
     gains = [search["candidates"]["cogging@joint_1"] for search in _evidence(replayed)]
     assert cogs == pytest.approx(np.log10(gains).tolist())
-    assert any("the model lacks cogging@joint_1" in text and "taken up" in text for text in told)
+    assert any("the model lacks cogging@joint_1" in text and "added to the model" in text for text in told)
 
 
 def _evidence(folder: Path) -> list[dict[str, dict[str, float]]]:

@@ -100,7 +100,7 @@ def test_without_adopt_it_is_only_told() -> None:
     assert (episode.verdict, episode.adopted) == ("named", None)
     assert [named.key for named in episode.named] == ["cogging@joint_1"]
     assert [p.name for p in estimator.base.parameters] == ["link_1.inertia", "viscous_friction@joint_1.damping"]
-    assert "taken up" not in online.notices[0]
+    assert "added to the model" not in online.notices[0]
     plain = Estimator(SYSTEM, ("force_1", "q_1"), "plain")
     plain.push(axis_block(cogging, BEGIN))
     plain.finish()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import struct
 from collections.abc import Callable, Collection, Iterator
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -148,7 +149,8 @@ class McapBag(Bag):
         try:
             # In the order of the file: the library's reader by index queues all chunks' messages in that order.
             yield from self._mcap.NonSeekingReader(file).iter_messages(topics, log_time_order=False)
-        except exceptions.EndOfFile as error:
+        # Its library names an end between records, and raises what Python does of one within a record.
+        except (exceptions.EndOfFile, struct.error) as error:
             if whole:
                 raise self._broken(error) from None
         except exceptions.McapError as error:

@@ -51,9 +51,9 @@ def line(episode: Episode) -> str:
         told = ", ".join(_told(named) for named in episode.named)
         taken = ""
         if episode.adopted is not None:
-            taken = f"; taken up at {episode.adopted:.2f} s"
+            taken = f"; added to the model at {episode.adopted:.2f} s"
         elif episode.refused is not None:
-            taken = f"; not taken up: {episode.refused}"
+            taken = f"; not added to the model: {episode.refused}"
         return f"{where}: the model lacks {told}{taken}"
     if episode.verdict == "unexplained":
         nearest = ""
