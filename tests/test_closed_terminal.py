@@ -14,7 +14,6 @@ from pathlib import Path
 import pytest
 
 from sms_tools.interruption import Interruption
-from sms_tools.live.signals import termination_interrupts
 from tests.axis import AXIS, capture_lines
 from tests.test_killed_processes import described_testbed, kill
 
@@ -74,7 +73,7 @@ def test_a_closed_terminal_ends_a_session_with_results(tmp_path: Path, terminal:
 
 def test_only_the_first_hangup_interrupts() -> None:
     before = signal.getsignal(signal.SIGHUP)
-    with Interruption() as interruption, termination_interrupts():
+    with Interruption() as interruption:
         for _ in range(3):
             signal.raise_signal(signal.SIGHUP)
         assert interruption.requested
@@ -84,7 +83,7 @@ def test_only_the_first_hangup_interrupts() -> None:
 def test_a_session_under_nohup_heeds_no_hangup() -> None:
     before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
     try:
-        with Interruption() as interruption, termination_interrupts():
+        with Interruption() as interruption:
             signal.raise_signal(signal.SIGHUP)
             assert not interruption.requested
     finally:

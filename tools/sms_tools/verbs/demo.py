@@ -22,7 +22,6 @@ from sms_adapters.truth import write_truth
 from sms_online.session import Session, with_trackers
 from sms_tools.interruption import Interruption
 from sms_tools.live.searches import SearchProcess
-from sms_tools.live.signals import termination_interrupts
 from sms_tools.live.simulated import SimulatedArm, write_testbed
 from sms_tools.live.testbed import open_testbed
 from sms_tools.report import parameter_table, report_console, show, verdict_text
@@ -60,7 +59,7 @@ def _watch(args: argparse.Namespace, arm: SimulatedArm, file: Path, directory: P
     write_truth(directory / SESSION, truth["parameters"], {})
     console = report_console(args.json)
     show(console, Text("solving the arm's motion ahead …", style="dim"))
-    with Interruption() as interruption, termination_interrupts(), ExitStack() as stack:
+    with Interruption() as interruption, ExitStack() as stack:
         shown = stack.enter_context(showing(args, session, directory, truth, live=live))
         searches = stack.enter_context(closing(SearchProcess(directory, adopt=False)))
         session.diagnosis.searcher = searches

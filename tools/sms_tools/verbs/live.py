@@ -10,7 +10,6 @@ from sms_adapters.data_check import ChannelChecks, Checked
 from sms_tools.exit_codes import INTERRUPTED
 from sms_tools.interruption import Interruption
 from sms_tools.live.searches import SearchProcess
-from sms_tools.live.signals import termination_interrupts
 from sms_tools.live.status import StatusWriter
 from sms_tools.live.testbed import open_testbed
 from sms_tools.report import report_console, show
@@ -25,7 +24,7 @@ def run(args: argparse.Namespace) -> int:
     directory = results_directory(args.out)
     status = StatusWriter()
     live, session, merger = open_testbed(args.system, system, folder, directory, args.resume, status, args.adopt)
-    with Interruption() as interruption, termination_interrupts():
+    with Interruption() as interruption:
         with (
             showing(args, session, directory, None, live=live) as shown,
             closing(SearchProcess(directory, args.adopt)) as searches,

@@ -18,7 +18,6 @@ from sms_online.errors import InputError
 from sms_tools.exit_codes import INTERRUPTED, NOTHING_RECEIVED, OK
 from sms_tools.interruption import Interruption
 from sms_tools.live.feed import Feed, SessionClock, kind_of
-from sms_tools.live.signals import termination_interrupts
 from sms_tools.live.testbed import versions
 from sms_tools.report import Document, report_console, say, show
 from sms_tools.results_file import results_directory
@@ -44,7 +43,7 @@ def run(args: argparse.Namespace) -> int:
     feeds = [Feed(make_reader(source, clock), recorder, queued=False) for source in sources]
     console = report_console(args.json)
     end = math.inf if args.duration is None else args.duration
-    with Interruption() as interruption, termination_interrupts():
+    with Interruption() as interruption:
         for feed in feeds:
             feed.start()
         said = 0.0

@@ -15,7 +15,6 @@ from sms_online.cramer_rao import MotionRecord, session_bound
 from sms_online.session import Session
 from sms_online.stream import Block
 from sms_tools.interruption import Interruption
-from sms_tools.live.signals import termination_interrupts
 from sms_tools.results_file import results_directory
 from sms_tools.session import check_part, conclude, described_system, feed, write_named
 from sms_tools.showing import showing
@@ -32,7 +31,7 @@ def run(args: argparse.Namespace) -> int:
     directory = results_directory(args.out)
     capture: Path = args.capture
     opened = perf_counter()
-    with Interruption() as interruption, termination_interrupts():
+    with Interruption() as interruption:
         with watched(capture, system, folder, args.start, args.stop) as reading:
             source = reading.source
             recorded = recorded_at(capture, source, whole=args.start is args.stop is None)
