@@ -20,7 +20,9 @@ from sms_online.nominal import Comparison, compare, unit_factors
 from sms_online.physical import PhysicalSet, Projection
 from sms_online.pipeline.latency import source_channels
 from sms_online.pipeline.periods import LONGEST_HOLE
+from sms_online.pipeline.sensing import is_slow
 from sms_online.pipeline.statistics import Statistics
+from sms_online.pipeline.synchronise import SIDE
 from sms_online.pipeline.tracker_bank import Reading, rows_per_second
 from sms_online.row_types import ENERGY, joint_rows, row_types
 from sms_online.stream import Array
@@ -231,7 +233,6 @@ class Evaluation:
         """May the estimate be trusted? The answer changes while a session runs."""
         now, estimate, flags = self.statistics, self.estimate, self.determined
         names = [p.name for p in self.parameters]
-        lost = now.counters.lost_samples
         below = flags & (estimate.pi + NORMAL_95 * np.where(flags, self.std, 0.0) < 0.0)
         momentum, projection = now.momentum, self.projection
         return judge(
@@ -250,7 +251,8 @@ class Evaluation:
                 undecided=tuple(event.time for event in now.events if event.kind == "undecided"),
                 distance=0.0 if projection is None else projection.distance,
                 comparison=self.comparison,
-                lost=lost / max(1, lost + now.samples),
+                lost=self._lost,
+                slow=self._slow,
                 outliers={channel: left.number / left.of for channel, left in now.outliers.items()},
                 discrepancies=self._discrepancies,
                 coloured={} if momentum is None else momentum.coloured,
@@ -259,6 +261,24 @@ class Evaluation:
                 weaknesses=tuple(self._weaknesses()),
             )
         )
+
+    @property
+    def _lost(self) -> float:
+        """Share of the grid's points that were lost; not what interpolation between slow samples needs at the ends."""
+        now = self.statistics
+        ends = 2.0 * SIDE * float(np.nanmax(now.periods, initial=0.0)) * now.setup.system.sample_rate
+        lost = max(0.0, now.counters.lost_samples - ends)
+        return lost / max(1.0, lost + now.samples)
+
+    @property
+    def _slow(self) -> dict[str, float]:
+        """Sample rates, Hz, of position channels that are too slow for the momentum balance's windows."""
+        now = self.statistics
+        if now.method == "smoother" or now.setup.system.balance == "energy":
+            return {}
+        sensing, window = now.setup.sensing, now.setup.system.windows.momentum
+        each = {sensing.channels[k]: now.periods[k] for k in sensing.position_columns}
+        return {name: 1.0 / period for name, period in each.items() if is_slow(float(period), window)}
 
     def _miscalibrated(self) -> list[Reason]:
         """Where the description is wrong by more than its tolerances allow; corrections are linear, up to a bound.

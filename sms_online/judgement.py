@@ -42,6 +42,7 @@ CHECK_SCALE = "check unit and gear of the torques, or weigh one part and state i
 CHECK_PRIOR = "check that prior, and run `sms-online diagnose` for what the model lacks in these rows"
 CHECK_OUTLIERS = "look at that sensor: reflections and swapped markers, a loose cable, bits that flip"
 CHECK_COLOUR = "look at what filters that sensor, or log its samples as they are"
+BY_SMOOTHER = 'state its rate under [[sensor]], or balance = "smoother"'
 CHECK_LOSSES = "look at the faults that the session counted: a bus that is too busy, a loose cable"
 CHECK_DEVICE = "look at power, cable and address of what is silent, and at its table in the system file"
 CHECK_TROUBLE = "see to the devices, the recording and the machine first"
@@ -86,7 +87,8 @@ class Facts:
     that the data pull away from their prior. undecided: times, s, of changes that the session ended too early to decide
     on. distance: from the nearest real bodies, in standard deviations. comparison: with the values that the system file
     states. lost: share of the samples. outliers: by channel, the share of the samples that was left out. coloured: by
-    channel, the correlation time of its noise, s. miscalibrated: what is off by more than the description's tolerances
+    channel, the correlation time of its noise, s. slow: rates, Hz, of sensors that are too slow for the balance.
+    miscalibrated: what is off by more than the description's tolerances
     allow. troubles: of the devices, the recording and the machine of a live session, a short sentence each. weaknesses:
     of an estimate by the way it is made.
     """
@@ -106,6 +108,7 @@ class Facts:
     lost: float = 0.0
     outliers: Mapping[str, float] = field(default_factory=dict)
     coloured: Mapping[str, float] = field(default_factory=dict)
+    slow: Mapping[str, float] = field(default_factory=dict)
     discrepancies: tuple[Discrepancy, ...] = ()
     miscalibrated: tuple[Reason, ...] = ()
     troubles: tuple[str, ...] = ()
@@ -133,7 +136,7 @@ def judge(facts: Facts) -> Trust:
         doubts += _negative(facts.negative)
         doubts += _disputed(facts.disputed)
     # What befell the samples comes before what that may have done to the estimate.
-    losses = [*_losses(facts.lost), *_outliers(facts.outliers)]
+    losses = [*_losses(facts.lost), *_outliers(facts.outliers), *_slow(facts.slow)]
     if doubts:
         return Trust("doubt", (*losses, *doubts, *_cautions(facts)), grave=True)
     if never := [name for name, since in facts.silent.items() if math.isinf(since)]:
@@ -361,6 +364,14 @@ def _more_than_noise(row: str, coloured: Mapping[str, float]) -> list[Reason]:
     channel = max(coloured, key=lambda name: coloured[name])
     text += f", where that of {channel} is correlated over {1e3 * coloured[channel]:.2g} ms"
     return [Reason(text, False, (row,), "coloured noise", then=CHECK_COLOUR)]
+
+
+def _slow(rates: Mapping[str, float]) -> list[Reason]:
+    if not rates:
+        return []
+    slowest = min(rates.values())
+    text = f"{_listed([*rates])}: {slowest:.3g} samples/s are too few for the windows of the balance"
+    return [Reason(text, False, (), "slow", then=BY_SMOOTHER)]
 
 
 def _outliers(shares: Mapping[str, float]) -> list[Reason]:

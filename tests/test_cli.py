@@ -64,8 +64,8 @@ def test_replay_prints_a_table_and_writes_the_document(bench: Path, capsys: pyte
     found = document(bench / "done")
     assert sorted(path.name for path in (bench / "done").iterdir()) == ["report.html", "results.json"]
     assert list(found) == [
-        "schema", "system", "samples", "duration_s", "method", "verdict", "parameters", "calibration", "trackers",
-        "events", "residual", "physical", "condition_number", "throughput_samples_per_s", "lost_samples", "outliers",
+        "schema", "system", "samples", "duration_s", "method", "verdict", "parameters", "scale_tolerance",
+        "calibration", "trackers", "events", "residual", "physical", "condition_number", "throughput_samples_per_s", "lost_samples", "outliers",
         "warnings",
         "diagnosis",
     ]  # fmt: skip

@@ -25,8 +25,9 @@ CLUSTER = 20
 # A shift counts from so many of its standard deviations on.
 EVIDENCE = 2.0
 # Along a direction of whose information noise makes this share or more nothing is corrected, for small errors of the
-# share would be large ones of the correction. What it would be counts as a deviation, with this share at most.
-LARGEST_SHARE, CAPPED_SHARE = 0.5, 0.99
+# share would be large ones of the correction. What it would be counts as a deviation, so many times the estimate at
+# most.
+LARGEST_SHARE, LARGEST_FACTOR = 0.5, 100.0
 # When there are so many clusters, neighbours merge.
 MOST_CLUSTERS = 128
 
@@ -98,16 +99,18 @@ class NoiseBias(State):
         clusters = self._clusters[:, rows[:, None], rows] / scale
         changed = clusters.sum(axis=0)
         # Directions of unit information, and the share of it that noise makes.
-        root = np.linalg.inv(np.linalg.cholesky(gram[:-1, :-1])).T
+        values, vectors = np.linalg.eigh(gram[:-1, :-1])
+        root = vectors / np.sqrt(np.maximum(values, np.finfo(np.float64).eps * values[-1]))
         share, axes = np.linalg.eigh(root.T @ changed[:-1, :-1] @ root)
         directions = root @ axes
-        biased = directions @ (directions.T @ gram[:-1, -1])
-        free = (directions.T @ (gram - changed)[:-1, -1]) / (1.0 - np.minimum(share, CAPPED_SHARE))
-        moved = free - directions.T @ gram[:-1, -1]
+        along = directions.T @ gram[:-1, -1]
         lost = share >= LARGEST_SHARE
-        whole = directions @ np.where(lost, 0.0, moved)
+        kept = directions[:, ~lost]
+        whole = kept @ ((kept.T @ (gram - changed)[:-1, -1]) / (1.0 - share[~lost]) - along[~lost])
+        apart = np.abs(1.0 - share[lost])
+        attenuated = along[lost] * np.clip(share[lost] / np.maximum(apart, 1.0 / LARGEST_FACTOR), 1.0, LARGEST_FACTOR)
         # Each cluster's part of it, to first order.
-        parts = directions @ (directions.T @ (clusters[:, :-1] @ np.append(biased, -1.0)).T)
+        parts = kept @ (kept.T @ (clusters[:, :-1] @ np.append(directions @ along, -1.0)).T)
         scatter = np.sum(parts**2, axis=1)
         doubt = EVIDENCE**2 * scatter
         certain = 1.0 - np.divide(doubt, whole**2, out=np.ones_like(doubt), where=whole**2 > doubt)
@@ -116,7 +119,7 @@ class NoiseBias(State):
         count = parts.shape[1]
         if count > 1:
             parts = (parts - parts.mean(axis=1, keepdims=True)) * np.sqrt(count / (count - 1.0))
-        parts = np.concatenate((parts, certain[:, None] * parts, directions[:, lost] * moved[lost]), axis=1)
+        parts = np.concatenate((parts, certain[:, None] * parts, directions[:, lost] * attenuated), axis=1)
         parts *= unit[:, None]
         covariance[np.ix_(known, known)] = parts @ parts.T
         return shift, covariance

@@ -32,7 +32,7 @@ from sms_online.pipeline.momentum import Momentum
 from sms_online.pipeline.observer import Observer
 from sms_online.pipeline.outliers import LeftOut, Outliers
 from sms_online.pipeline.rates import RateSamples, RatesStage
-from sms_online.pipeline.sensing import AttitudeContinuity, Sensing, stated_period
+from sms_online.pipeline.sensing import AttitudeContinuity, Sensing, is_slow, stated_period
 from sms_online.pipeline.statistics import Method, Setup
 from sms_online.pipeline.synchronise import GridSamples, SyncCounters, Synchroniser
 from sms_online.smoother.session import Smoother
@@ -86,7 +86,7 @@ class Estimator(Stage):
         if distorted and self.sensing.missing and system.balance != "energy":
             found = f"{distorted[0].name}@{distorted[0].where}, and no {self.sensing.missing[0]}"
             raise InputError(source, "", found, 'balance = "energy", or all coordinates measured')
-        if not distorted and (system.balance == "smoother" or (self.sensing.missing and system.balance != "energy")):
+        if not distorted and self._needs_smoother:
             self.smoother = Smoother(model, base, self.sensing, channels)
         self.channels = tuple(dict.fromkeys((*self.sensing.channels, *self._smoothed_channels)))
         self._columns = [channels.index(name) for name in self.channels]
@@ -103,7 +103,7 @@ class Estimator(Stage):
         self._followed = FollowedStates(model, self.sensing, system.sample_rate)
         self._energy = EnergyBalance(model, base, system.sample_rate)
         # A balance of forces does not hold in a shape that is not the link's; energies bear it best.
-        by_energy = system.balance == "energy" or self.sensing.missing
+        by_energy = system.balance == "energy" or self.sensing.missing or (self.smoother is not None and self._slow)
         self.momentum = None if by_energy else Momentum(model, base, self.sensing, self._begin_joints)
         if by_energy and not all(choice.static for choice in system.trackers):
             found = "a tracker of its own, and no momentum balance"
@@ -115,6 +115,21 @@ class Estimator(Stage):
         self.prior: Prior | None = None
         self._setup: tuple[int, Setup] | None = None  # and the number of events that it is since
         self.state = EstimatorState(np.empty(0), np.empty((0, len(self._columns))))
+
+    @property
+    def _needs_smoother(self) -> bool:
+        """Whether states are to be estimated with the parameters: asked for, or for want of sensors or of samples."""
+        system = self.system
+        if system.balance != "both":
+            return system.balance == "smoother" or (system.balance == "momentum" and bool(self.sensing.missing))
+        planar_or_fixed = system.motion == "planar" or system.spacecraft is None
+        return bool(self.sensing.missing) or (self._slow and planar_or_fixed)
+
+    @property
+    def _slow(self) -> bool:
+        """Whether a position sensor is described as too slow for the windows of the momentum balance."""
+        positions = tuple(self.sensing.channels[k] for k in self.sensing.position_columns)
+        return is_slow(stated_period(self.system, positions), self.system.windows.momentum)
 
     def renew(self) -> None:
         """See Stage."""

@@ -29,7 +29,8 @@ ALONE = 4.0
 SIDE = 2
 # Outliers next to each other that are told apart.
 PASSES = 4
-# Rows wait no longer than this for samples that a channel still owes, s.
+# Rows wait no longer than this for samples that a channel still owes, s. Channels that are too slow for that are not
+# judged: their neighbours do not predict them either.
 PATIENCE = 0.1
 # Deviations of a channel follow its samples with this memory, in samples; before there are so many, none is judged.
 MEMORY, FEWEST = 400.0, 20
@@ -129,6 +130,8 @@ class Outliers(Stage):
         if rows.size < 2 * SIDE + 1 or count == 0:
             return
         samples, t = values[np.ix_(rows, columns)], time[rows]
+        if np.median(np.diff(t)) > PATIENCE / SIDE:
+            return
         off = _off(t, samples)
         median = np.median(np.abs(off[own]), axis=0) / NORMAL_MEDIAN
         memory = now.weight[columns] + count

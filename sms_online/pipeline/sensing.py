@@ -30,10 +30,22 @@ def stated_noise(system: System, channels: Sequence[str]) -> Array:
     return stated
 
 
+# Samples of a sensor in a window of the momentum balance; fewer do not show how it moves there.
+LEAST_IN_WINDOW = 8
+
+
 def stated_period(system: System, channels: Sequence[str]) -> float:
     """Period of the slowest sensor that fills any of the channels, s, as described."""
     read = [sensor for sensor in system.sensors if set(sensed_channels(system, sensor)) & set(channels)]
     return max([1.0 / system.sample_rate, *(1.0 / sensor.rate for sensor in read if sensor.rate is not None)])
+
+
+def is_slow(period: float, window: float) -> bool:
+    """Whether samples of some period, s, are too few for windows of the momentum balance of some length, s.
+
+    Between them the motion is interpolated by polynomials. A window weighs its middle half, in which these must follow.
+    """
+    return window < LEAST_IN_WINDOW * period
 
 
 class Sensing:
