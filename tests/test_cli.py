@@ -65,9 +65,8 @@ def test_replay_prints_a_table_and_writes_the_document(bench: Path, capsys: pyte
     assert sorted(path.name for path in (bench / "done").iterdir()) == ["report.html", "results.json"]
     assert list(found) == [
         "schema", "system", "samples", "duration_s", "method", "verdict", "parameters", "scale_tolerance",
-        "calibration", "trackers", "events", "residual", "physical", "condition_number", "throughput_samples_per_s", "lost_samples", "outliers",
-        "warnings",
-        "diagnosis",
+        "calibration", "trackers", "events", "residual", "physical", "condition_number", "throughput_samples_per_s",
+        "lost_samples", "outliers", "warnings", "diagnosis",
     ]  # fmt: skip
     assert found["schema"] == "sms-online/results/1"
     assert found["samples"] == 1200

@@ -97,6 +97,10 @@ class NoiseBias(State):
         scale = np.outer(size, size)
         gram = self.gram[np.ix_(rows, rows)] / scale
         clusters = self._clusters[:, rows[:, None], rows] / scale
+        # A column that is noise alone may make any multiple of its square: more than some would drown the others.
+        own = np.abs(np.diag(clusters.sum(axis=0)))
+        limit = np.sqrt(np.divide(LARGEST_FACTOR, own, out=np.ones_like(own), where=own > LARGEST_FACTOR))
+        clusters = clusters * np.outer(limit, limit)
         changed = clusters.sum(axis=0)
         # Directions of unit information, and the share of it that noise makes.
         values, vectors = np.linalg.eigh(gram[:-1, :-1])
