@@ -18,6 +18,7 @@ from sms_online.judgement import Discrepancy, Dispute, Facts, judge
 from sms_online.model.parameters import Parameter
 from sms_online.nominal import Comparison, compare, unit_factors
 from sms_online.physical import PhysicalSet, Projection
+from sms_online.pipeline.description import described, nearer
 from sms_online.pipeline.latency import source_channels
 from sms_online.pipeline.periods import LONGEST_HOLE
 from sms_online.pipeline.sensing import is_slow
@@ -153,8 +154,9 @@ class Evaluation:
         momentum = self.statistics.momentum
         if self.statistics.method == "momentum" and momentum is not None and momentum.reference is not None:
             return momentum.reference
-        estimate, m = self.estimate, len(self.statistics.setup.nuisances)
-        return estimate.joint if estimate.nuisances.size == m else np.concatenate((np.zeros(m), estimate.pi))
+        # An attenuated estimate of what rows hardly determine would leave its signal in the residual.
+        found, m = nearer(self.estimate, *described(self.model, self.base)), len(self.statistics.setup.nuisances)
+        return found if found.size == m + self.base.n else np.concatenate((np.zeros(m), found))
 
     @cached_property
     @one_blas_thread()

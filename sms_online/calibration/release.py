@@ -31,17 +31,15 @@ def release_gain(block: Array, weight: Array) -> Array:
     the shares. C (n, k): covariances with the nuisances in these units. Source: the identity of Woodbury.
     """
     lost = 1.0 - weight
-    # Corrections for noise may make a variance larger than that of the tolerance alone.
-    size, axes = np.linalg.eigh(block)
-    block = (axes * np.minimum(size, 1.0)) @ axes.T
     return np.asarray(np.linalg.solve(np.eye(lost.size) - lost[:, None] * block, np.diag(lost)))
 
 
-def released(estimate: Estimate, nuisances: Sequence[Nuisance]) -> Estimate:
+def released(estimate: Estimate, nuisances: Sequence[Nuisance], squares: Array) -> Estimate:
     """The estimate (nuisances first) as if each tolerance beyond `NORMAL` were one of heavier tails.
 
-    Its information on a nuisance ν is replaced by h / tolerance², with h = (1 + NORMAL² / TAIL) / (1 + (ν / tolerance)²
-    / TAIL), see `release_gain`. Those of torques keep theirs.
+    squares (n, n): covariance by least squares. What corrections for noise add to it is no information. That of a
+    tolerance on a nuisance ν is replaced by h / tolerance², with h = (1 + NORMAL² / TAIL) / (1 + (ν / tolerance)² /
+    TAIL), see `release_gain`. Those of torques keep theirs.
     """
     m = len(nuisances)
     tolerance = np.array([each.tolerance for each in nuisances])
@@ -52,7 +50,7 @@ def released(estimate: Estimate, nuisances: Sequence[Nuisance]) -> Estimate:
         return estimate
     # Beside a prior all rows were weighed with one factor, these among them.
     unit = tolerance[far] * (1.0 if estimate.scale is None else estimate.scale)
-    C, start = estimate.covariance[:, far] / unit, estimate.pi[far] / unit
+    C, start = squares[:, far] / unit, estimate.pi[far] / unit
     block = C[far] / unit[:, None]
     value, weight = start, np.ones(far.size)
     gain = np.zeros((far.size, far.size))

@@ -25,13 +25,19 @@ def described(model: Model, base: BaseParameters) -> tuple[Array, Array]:
 
 
 def nearer(estimate: Estimate, value: Array, size: Array) -> Array:
-    """The estimate (n,) with described values (n,) as normal priors, LOOSE · size each; a size of zero is no prior."""
-    out = np.where(estimate.determined, estimate.pi, value)
+    """Nuisances and π (m + n,) of an estimate, with described values (n,) as normal priors of π.
+
+    size (n,): LOOSE · size is the standard deviation of each; zero is no prior.
+    """
+    m = estimate.nuisances.size
+    out = np.concatenate((estimate.nuisances, np.where(estimate.determined, estimate.pi, value)))
     known = np.flatnonzero(estimate.determined & (size > 0.0))
     if not known.size:
         return out
     unit = LOOSE * size[known]
     covariance = estimate.covariance[:, known] / unit
     information = np.linalg.inv(covariance[known] / unit[:, None] + np.eye(known.size))
-    moved = covariance @ information @ ((value - estimate.pi)[known] / unit)
-    return np.where(estimate.determined, out + moved, out)
+    every = covariance if estimate.crossed is None else np.concatenate((estimate.crossed[:, known] / unit, covariance))
+    out += every @ (information @ ((value - estimate.pi)[known] / unit))
+    out[m:] = np.where(estimate.determined, out[m:], value)
+    return out

@@ -205,7 +205,7 @@ class Momentum(Stage):
         estimate, scale_free = self.tracker.estimate(), self.scale_free
         if scale_free is not None:
             return scale_free.estimate(estimate)
-        return released(unbiased(estimate, self.bias), self.nuisances)
+        return released(unbiased(estimate, self.bias), self.nuisances, estimate.covariance)
 
     @property
     def scale_free(self) -> ScaleFree | None:
@@ -229,7 +229,7 @@ class Momentum(Stage):
 
     def _solved(self) -> Array:
         """Nuisances and β, of the rows and, where these say little, of the description."""
-        return nearer(self._joint(), *self.fit.described)
+        return nearer(self._own(), *self.fit.described)
 
     def observe(self, t: Array, values: Array) -> None:
         """Take the channels' own samples (B, channels) at t (B,), NaN where there is none, to tell their noise."""

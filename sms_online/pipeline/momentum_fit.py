@@ -163,9 +163,7 @@ class MomentumFit(Stage):
             np.arange(-self._nuisances, base.n), np.flatnonzero(np.isin(base.independent, model.inertial))
         )
         self.columns = Columns(self._nuisances, tuple(gains), inertial)
-        nuisances = np.zeros(self._nuisances)
-        value, size = described(model, base)
-        self.described = np.concatenate((nuisances, value)), np.concatenate((nuisances, size))
+        self.described = described(model, base)
         self._balance = balance
         self._solve, self._drift = solve, drift
         self._beforehand = beforehand if beforehand is not None else lambda: Beforehand.none(self._nuisances + base.n)

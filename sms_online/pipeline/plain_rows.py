@@ -13,7 +13,7 @@ from sms_online.stream import Array
 # noise behind the prediction scatters by 7 %, and colour that nobody knows of may double it.
 LARGEST_RATIO = 2.0
 # Few windows exceed it by chance: that one of all speeds does has at most this probability.
-CHANCE = 1e-4
+CHANCE = 1e-3
 # Rounding of a sum of products, in units of its last place.
 ROUNDED = 16.0
 

@@ -167,7 +167,7 @@ class Statistics:
             return self.momentum.trackers[0].estimate
         rows, scale_free = self.momentum.tracker.estimate(), self.momentum.scale_free
         if scale_free is None:
-            joint = released(unbiased(rows, self.momentum.bias), setup.nuisances)
+            joint = released(unbiased(rows, self.momentum.bias), setup.nuisances, rows.covariance)
         else:
             joint = scale_free.estimate(rows)
         return joint.without_nuisances(len(setup.nuisances))

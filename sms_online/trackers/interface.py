@@ -102,7 +102,8 @@ class Estimate:
     factor, inf where its rank is not full. rows: number of rows, less where old ones count less.
     rss: residual sum of squares of the whitened rows, priors included. dof: its degrees of freedom. scale: what the
     rows' stated std were multiplied with to weigh them against a prior; None where they were taken as stated.
-    nuisances, nuisances_std (m,): what was estimated beside π, see `without_nuisances`.
+    nuisances, nuisances_std (m,): what was estimated beside π, see `without_nuisances`; crossed (m, n): its covariance
+    with π.
     """
 
     pi: Array
@@ -116,6 +117,7 @@ class Estimate:
     scale: float | None = None
     nuisances: Array = field(default_factory=lambda: np.empty(0))
     nuisances_std: Array = field(default_factory=lambda: np.empty(0))
+    crossed: Array | None = None
 
     def without_nuisances(self, m: int) -> Estimate:
         """Of an estimate of m nuisances and then π, the marginal one of π."""
@@ -130,6 +132,7 @@ class Estimate:
             determined=self.determined[m:],
             nuisances=self.pi[:m],
             nuisances_std=self.std[:m],
+            crossed=self.covariance[:m, m:],
         )
 
     @property
