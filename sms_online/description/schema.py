@@ -212,6 +212,17 @@ class Prior(Record):
     std: Positive
 
 
+class Fitted(Record):
+    """What an earlier session has found of a parameter: its nominal value from then on.
+
+    value: in the parameter's unit, with the parameters that are lumped into it as described.
+    std: its standard deviation, in the same unit; a prior's with `--prior`. Not stated: undetermined.
+    """
+
+    value: float
+    std: Positive | None = None
+
+
 class Controller(Record):
     """Joint PD control of the simulator, n τ = K_p (q_d - q) + K_D (q̇_d - q̇).
 
@@ -364,6 +375,7 @@ class System(Record):
     effects: `[[effect]]` tables.
     known: parameters that are known exactly, name to value in the parameter's unit; they leave the unknowns.
     priors: parameters that are known with a standard deviation, a table `[prior]`.
+    fitted: parameters that an earlier session has found, in place of the values that the other tables state.
     controller: of the simulator.
     trajectory: of the simulator.
     windows: widths of the test functions.
@@ -390,6 +402,7 @@ class System(Record):
     effects: tuple[Effect, ...] = ()
     known: dict[str, float] = {}
     priors: dict[str, Prior] = {}
+    fitted: dict[str, Fitted] = {}
     controller: Controller | None = None
     trajectory: Trajectory | None = None
     windows: Windows = Windows()

@@ -97,10 +97,12 @@ def _watched(args: argparse.Namespace, system: System, found: Diagnosis, capture
     """The session once more in view, with what was found; with it the first candidates' evidence, and the verdict."""
     document = found.document()
     # What is to be seen has been found already: no diagnosis runs beside it.
-    estimator = Estimator(found.system, capture.channels, str(args.capture))
+    # Estimated anew: what was fitted to these samples is nothing known of them beforehand.
+    after = found.search.after.system
+    estimator = Estimator(after, capture.channels, str(args.capture))
     told: dict[str, tuple[float, float]] = {}
     if found.search.attempt.prior is not None:
-        estimator.set_prior(base_prior(found.system, estimator.base, args.prior))
+        estimator.set_prior(base_prior(after, estimator.base, args.prior))
         # These come from the diagnosis's rows, not from a session; see `diagnosis_document`.
         told = {p.name: (p.value, p.std) for p in found.after.parameters.values()}
     with (
@@ -110,7 +112,7 @@ def _watched(args: argparse.Namespace, system: System, found: Diagnosis, capture
             estimator,
             capture.channels,
             directory,
-            None if capture.truth is None else true_values(capture.truth, system, found.system),
+            None if capture.truth is None else true_values(capture.truth, system, after),
             patient=True,
             exaggeration=args.exaggerate,
             diagnosed=Diagnosed(told, found.trust),
