@@ -288,7 +288,7 @@ class Tolerances(Record):
     marker_zero: zero of a marker's displacement, m.
     marker_zero_angle: zero of a marker's rotation, rad.
     camera_scale: scale of the base's position and the markers' displacements.
-    drive_gain: gain of a joint's torque relative to that of joint 1.
+    drive_gain: gain of a joint's torque, that of joint 1 where a parameter is known; else of the others against it.
     drive_offset: zero of a joint's torque or force, after the gear, N m (N); not stated: unknown.
     """
 
@@ -414,6 +414,15 @@ class System(Record):
     def devices(self) -> tuple[Device, ...]:
         """The sources that a live session listens to."""
         return tuple(source for source in self.sources if not isinstance(source, LogSource))
+
+    @property
+    def scale_tolerance(self) -> float | None:
+        """1σ of the factor that all parameters have in common: that of the torques, which no residual shows.
+
+        None where a parameter that is known, or has a prior, fixes it.
+        """
+        stated = [*self.known.values(), *(prior.value for prior in self.priors.values())]
+        return None if any(stated) else self.tolerances.drive_gain
 
     @property
     def nominal(self) -> dict[str, float]:

@@ -53,7 +53,7 @@ class CandidateRows:
         positive (n,): which cannot be negative. calibrated: what the description may be off by, nothing by default;
         its m unknowns come last in a solution.
         """
-        nothing = Calibrated((), np.empty((*rows.b.shape, 0)))
+        nothing = Calibrated((), np.empty((*rows.b.shape, 0)), frozenset())
         self.calibrated, self._fixed = nothing if calibrated is None else calibrated, list(fixed)
         self.rows, self.candidates, self.folds = rows, list(candidates), folds
         self._laws, self._prior = laws, prior

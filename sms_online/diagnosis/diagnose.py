@@ -11,7 +11,7 @@ import numpy as np
 from sms_online.calibration.found import Calibration
 from sms_online.description.schema import Effect, System
 from sms_online.diagnosis.attempt import FITTED_ONCE, SEARCHED, TRACED, Attempt, Case, PriorOf, Progress, State, Step
-from sms_online.diagnosis.calibrated import SAYABLE
+from sms_online.diagnosis.calibrated import sayable
 from sms_online.diagnosis.candidate import Finding, Ranked
 from sms_online.diagnosis.constants import stands
 from sms_online.diagnosis.hypothesis import corrections, share_left, verdict
@@ -267,7 +267,7 @@ def diagnose(
 def _miscalibrated(session: Estimator) -> tuple[Calibration, ...]:
     """What a session's description is off by beyond its tolerances, and no effect of the catalogue says."""
     every = Evaluation(Statistics.of(session), session.estimate()).calibration
-    return tuple(each for each in every if each.beyond and each.name not in SAYABLE)
+    return tuple(each for each in every if each.beyond and each.name not in sayable(session.system))
 
 
 def _check_measured(session: Estimator, source: str) -> None:

@@ -67,7 +67,8 @@ class Entry:
     coefficients: those that may be declared and are reported, name to unit ("": a ratio); on a prismatic joint m stands
     for rad and N for N m. separated_by: the motion that tells it from its look-alikes. shapes: shape constants.
     further: coefficients that may be declared but are not reported. relative_to: place that coefficients are relative
-    to, so that as much the other way there is the same. said: the finding in words, of its place and coefficients.
+    to where no parameter is known, so that as much the other way there is the same. said: the finding in words, of its
+    place and coefficients.
     """
 
     name: str

@@ -208,6 +208,20 @@ def periods(effect: Effect) -> float | None:
     return next((effect.coefficients[name] for name in counted if name in effect.coefficients), None)
 
 
+def either(effect: Effect, system: System) -> str:
+    """The place where as much the other way is the same; empty where an effect is of its own place alone."""
+    return ENTRIES[effect.name].relative_to if system.scale_tolerance is not None else ""
+
+
+def in_words(effect: Effect, system: System, coefficients: Mapping[str, float]) -> str:
+    """An effect with these coefficients as a sentence; empty where the catalogue has none."""
+    said, other = ENTRIES[effect.name].said, either(effect, system)
+    if said is None:
+        return ""
+    words = said(effect.where, coefficients)
+    return f"{words} against {other}'s: which is right the data cannot decide" if other else words
+
+
 # Channels that come together, beside those of a link's markers.
 DEVICES = ("r_S_*", "eps_*")
 
