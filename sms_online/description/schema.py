@@ -17,6 +17,7 @@ from sms_online.description.sources import Device, LogSource, Source
 Vector3 = tuple[float, float, float]
 Deformation = Literal["traction", "torsion", "bending_y", "bending_z"]
 Forgetting = Literal["none", "exponential", "window", "directional"]
+Over = Literal["rate", "angle", "deflection", "load"]
 Drift = Literal["none", "random_walk", "trend", "learned"]
 
 
@@ -194,11 +195,15 @@ class Effect(Record):
     name: of the effect.
     where: `joint_i`, `link_i`, `base`, `tip`, or a channel or shell pattern of channels.
     coefficients: nominal values by name; the simulator alone uses them, except shape constants, which are fixed.
+    over: of a learned curve, the joint's variable that it is over: `rate`, `angle`, `deflection` or `load`.
+    knots: of a learned curve, values of that variable between which it is a cubic, ascending, rad/s or rad (m/s or m).
     """
 
     name: str
     where: str
     coefficients: dict[str, float] = {}
+    over: Over | None = None
+    knots: tuple[float, ...] = ()
 
 
 class Prior(Record):

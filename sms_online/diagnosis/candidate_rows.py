@@ -23,6 +23,8 @@ ACTS = 0.01
 # Rows whose mean square exceeds their variance by more than this although everything that is known of has been
 # subtracted have an error of their own: friction is never quite its model.
 LARGEST_RATIO = 1.5
+# Rows for a column at least, for curves to be fitted together.
+LEAST_ROWS = 4
 # Share of a row's variance by which that of the effects chosen has to change for rows to be weighed anew.
 SMALL_CHANGE = 0.1
 
@@ -136,7 +138,11 @@ class CandidateRows:
         torque are homogeneous in π: what makes π small makes their residual small, which counts against their terms.
         """
         left = self.rows.b / self.std
-        plain = np.concatenate([self._plain_model, *self._plain, self._plain_calibration], axis=2)
+        every = np.concatenate([self._plain_model, *self._plain, self._plain_calibration], axis=2)
+        laws = (p for p, each in zip(self._plain, self.candidates, strict=True) if not each.traits.learned)
+        # All curves at once would leave little of few rows, whatever these hold.
+        enough = LEAST_ROWS * every.shape[2] <= left.size
+        plain = every if enough else np.concatenate([self._plain_model, *laws, self._plain_calibration], axis=2)
         solution = together(plain, left, self._prior)
         left = left - plain @ solution
         ratio = np.mean(left**2, axis=0)

@@ -20,7 +20,7 @@ from sms_online.diagnosis.standstill import LEAVING, SessionStandstill
 from sms_online.diagnosis.weak_windows import Motion, WeakWindows
 from sms_online.effects.base import Ranges, position
 from sms_online.effects.build import build_model
-from sms_online.effects.catalogue import ENTRIES, LINEAR, candidates, periods
+from sms_online.effects.catalogue import ENTRIES, LINEAR, candidates, curve_variables, periods, traits_of
 from sms_online.model.effect import Inputs
 from sms_online.model.model import Model
 from sms_online.model.parameters import Parameter
@@ -86,11 +86,18 @@ class CandidateColumns:
         made = [self.of(effect) for effect in effects]
         return [candidate for candidate in made if np.any(candidate.columns)]
 
-    def effects(self) -> Iterator[Effect]:
-        """Declarations that may be missing; kinematics are compared as whole systems, not as columns."""
+    def effects(self, learned: bool = False) -> Iterator[Effect]:
+        """Declarations that may be missing; kinematics are compared as whole systems, not as columns.
+
+        learned: whether curves are among them.
+        """
         for effect in candidates(self.system):
             entry = ENTRIES[effect.name]
             if entry.kind == "kinematics":
+                continue
+            if entry.forms is not None:
+                if learned:
+                    yield from entry.forms(effect, self._variables(effect))
                 continue
             if entry.kind == "channel":
                 yield effect.model_copy(update={"coefficients": {}})
@@ -106,6 +113,16 @@ class CandidateColumns:
                 if any(value <= 0.0 < entry.shapes[s].default for s, value in shapes.items()):
                     continue  # a joint at rest has no range to take a share of
                 yield shaped
+
+    def _variables(self, effect: Effect) -> dict[str, Array]:
+        """Values (K,) that the variables of a joint's curves go through, by name."""
+        layout, i = self.rows.model.layout, int(effect.where.removeprefix("joint_")) - 1
+        motor, link = layout.theta_m[i], layout.q[i]
+        x, v = (np.concatenate([getattr(m, part) for m, _ in self.rows.weak.motions()]) for part in ("x", "v"))
+        deflection = position(layout, x, motor) - position(layout, x, link)
+        values = {"rate": v[:, motor], "angle": position(layout, x, motor), "deflection": deflection}
+        values["load"] = deflection
+        return {over: values[over] for over in curve_variables(self.system, effect)}
 
     def _turns(self, where: str, order: float) -> bool:
         """Whether an effect of so many periods a motor turn goes through one: less of it is a constant or a gain."""
@@ -149,7 +166,7 @@ class CandidateColumns:
 
     @staticmethod
     def _candidate(effect: Effect, parameters: Sequence[Parameter], columns: Array) -> Candidate:
-        return Candidate(effect, tuple(parameters), columns, ENTRIES[effect.name].traits, is_constant(effect))
+        return Candidate(effect, tuple(parameters), columns, traits_of(effect), is_constant(effect))
 
     def _force(self, model: Model) -> Array:
         """Columns (W, n_v, c) of a model's last effect."""

@@ -137,13 +137,15 @@ def diagnose(
     prior: bool = False,
     progress: Callable[[str, float], None] = lambda what, share: None,
     stop: Callable[[], bool] = lambda: False,
+    learned: bool = False,
 ) -> Diagnosis:
     """Find what recorded data hold that a system file does not describe, and describe it.
 
     system, data: as for `estimate`. holdout: another capture of the same rig, to check on; without it blocks of the
     data, each predicted from the others. prior: start from nominal values, each ± 10 %. progress: is called with what
     is being done, a few words, and the share of all that is done, roughly. stop: is asked between steps whether to end
-    with a partial verdict. Raises InputError where the data cannot be read or do not fit the system, a coordinate is
+    with a partial verdict. learned: whether a curve may be named where no law of the catalogue is.
+    Raises InputError where the data cannot be read or do not fit the system, a coordinate is
     not measured, parameters jump within the capture, or there is too little motion.
     """
     system, folder = given_system(system)
@@ -162,7 +164,7 @@ def diagnose(
     def known(estimator: Estimator) -> Prior | None:
         return base_prior(system, estimator.base, prior) if prior or system.priors else None
 
-    found = search_for_effects(system, blocks, recorded.name, known, held, progress, stop)
+    found = search_for_effects(system, blocks, recorded.name, known, held, progress, stop, learned)
     true = None if recorded.truth is None else true_values(recorded.truth, system, found.after.system)
     document = diagnosis_document(found, warnings, true)
     after = Fit._of(document["after"])

@@ -15,7 +15,7 @@ from sms_online.diagnosis.diagnose import Diagnosis
 from sms_online.diagnosis.hypothesis import LARGEST_SHARE_LEFT
 from sms_online.diagnosis.reported import Coefficients, of_constant, of_unknowns
 from sms_online.diagnosis.shape import slopes
-from sms_online.effects.catalogue import ENTRIES, declarable, either, in_words
+from sms_online.effects.catalogue import ENTRIES, declarable, either, in_words, traits_of
 from sms_online.evaluation import NORMAL_95, Evaluation, identifiable
 from sms_online.judgement import Facts, judge, judge_diagnosis, undecided
 from sms_online.model.parameters import Parameter
@@ -242,7 +242,21 @@ def _effect(diagnosis: Diagnosis, finding: Finding) -> dict[str, Any]:
 
 
 def _said(diagnosis: Diagnosis, effect: Effect, found: Coefficients) -> str:
+    if traits_of(effect).learned:
+        return _curve_in_words(diagnosis, effect)
     return in_words(effect, diagnosis.after.system, {name: value for name, (value, _) in found.items()})
+
+
+def _curve_in_words(diagnosis: Diagnosis, curve: Effect) -> str:
+    """What a curve takes off the torque of its joint, blocks predicted from the others."""
+    relative = [diagnosis.before.holdout.relative, *(step.relative for step in diagnosis.steps)]
+    taken = [step.taken for step in diagnosis.steps].index(f"{curve.name}@{curve.where}")
+    before, after = (relative[k].get(curve.where, 0.0) for k in (taken, taken + 1))
+    over = f"this curve over the {curve.over} of {curve.where}"
+    return (
+        f"no known law; {over} takes what is left of the torque from {100.0 * before:.2g} % to {100.0 * after:.2g} % "
+        "on data it has not seen"
+    )
 
 
 def _undecided(diagnosis: Diagnosis) -> list[Reason]:

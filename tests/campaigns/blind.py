@@ -288,8 +288,8 @@ def _struck(system: System, block: Block, effect: Effect, draw: Draw) -> Record:
     }
     inner = CandidateColumns.effects
 
-    def allowed(self: CandidateColumns) -> Iterator[Effect]:
-        return (e for e in inner(self) if f"{e.name}@{e.where}" not in near)
+    def allowed(self: CandidateColumns, learned: bool = False) -> Iterator[Effect]:
+        return (e for e in inner(self, learned) if f"{e.name}@{e.where}" not in near)
 
     with patch.object(CandidateColumns, "effects", allowed):
         found = diagnose(disguised(system), [block], "case", lambda _: None)
@@ -400,7 +400,7 @@ def main() -> None:
     parser.add_argument("results", type=Path)
     parser.add_argument("--seeds", type=int, default=4)
     parser.add_argument("--cache", type=Path, default=Path("runs/blind"))
-    parser.add_argument("--names", nargs="*", default=list(ENTRIES))
+    parser.add_argument("--names", nargs="*", default=[name for name, entry in ENTRIES.items() if entry.forms is None])
     args = parser.parse_args()
     if args.what in ("run", "struck"):
         run(args.results, args.cache, args.seeds, args.names, args.what == "struck")

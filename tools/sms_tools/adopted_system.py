@@ -46,6 +46,9 @@ def adopted_text(described: str, before: System, after: System, remarks: Mapping
             if effect.coefficients:
                 inside = ", ".join(f"{name} = {value:.9g}" for name, value in effect.coefficients.items())
                 lines.append(f"coefficients = {{ {inside} }}")
+            if effect.over is not None:
+                lines.append(f'over = "{effect.over}"')
+                lines.append(f"knots = [{', '.join(f'{knot:.9g}' for knot in effect.knots)}]")
             if remark := remarks.get(f"{effect.name}@{effect.where}"):
                 lines.append(f"# found: {remark}")
     if after.fitted != before.fitted:

@@ -59,6 +59,7 @@ def run(args: argparse.Namespace) -> int:
             prior=args.prior,
             progress=progress,
             stop=lambda: interruption.requested,
+            learned=args.learn,
         )
     document = found.document()
     view = None if args.rerun == "off" else _watched(args, system, found, capture, directory)

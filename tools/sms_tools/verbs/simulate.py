@@ -55,6 +55,7 @@ def run(args: argparse.Namespace) -> int:
     effects = build_model(described).effects
     idle = [e for e in effects if e.parameters and not any(nominal[p.name] for p in e.parameters)]
     lines += [f"warning: {e.name}@{e.where} does nothing, for {args.system} states no size of it" for e in idle]
+    lines += [f"warning: {said}" for said in simulation.beyond]
     show(report_console(args.json), *lines)
     if args.json:
         print(json_text(document))
