@@ -172,14 +172,25 @@ class Tracing(Acceptance):
         laws = sorted((k for k in beside if self._holds(k)), key=lambda k: -gains[k].gain)[:RIVALS]
         if not laws:
             return None
-        told = {k: self._deviance([*chosen, k]) for k in laws}
-        law = min(laws, key=lambda k: told[k])
-        others = [self._deviance(each) for each in ([*chosen, best], chosen) if law not in each]
-        self._deviance([*chosen, law])
-        # Where rows leave more than noise whatever is added, any large variance at rest would make them likelier.
-        explained = not np.any(self.floor[self._acts(law)])
+        told = {}
+        for k in laws:
+            self._iterated([*chosen, k])
+            # Where rows leave more than noise whatever is added, any large variance at rest would make them likelier.
+            if not np.any(self.floor[self._acts(k)]):
+                told[k] = self._deviance([*chosen, k])
+        found = None
+        if told:
+            law = min(told, key=lambda k: told[k])
+            others = [self._deviance(each) for each in ([*chosen, best], chosen) if law not in each]
+            found = law if told[law] < min(others) - DECISIVE else None
         self.settle(chosen)
-        return law if explained and told[law] < min(others) - DECISIVE else None
+        return found
+
+    def _iterated(self, chosen: Sequence[int]) -> None:
+        """Weigh the rows for those chosen until the weights are those of their coefficients."""
+        for _ in range(ROUNDS):
+            if not self.settle(chosen):
+                break
 
     def _holds(self, k: int) -> bool:
         candidate = self.candidates[k]
@@ -190,9 +201,7 @@ class Tracing(Acceptance):
 
         Fitted to the other windows; what is left open goes with the coefficients from all of them.
         """
-        for _ in range(ROUNDS):
-            if not self.settle(chosen):
-                break
+        self._iterated(chosen)
         columns, deviance = self._columns(chosen), np.log(self.rows.white_std) * 2.0
         total = 0.0
         for k, solution in enumerate(self.solutions(chosen)):
