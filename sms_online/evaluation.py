@@ -14,7 +14,8 @@ from numpy.typing import NDArray
 
 from sms_online.calibration.found import Calibration, found
 from sms_online.calibration.nuisance import BOUND
-from sms_online.judgement import Discrepancy, Dispute, Facts, judge
+from sms_online.effects.catalogue import either, in_words
+from sms_online.judgement import Discrepancy, Dispute, Facts, judge, undecided
 from sms_online.model.parameters import Parameter
 from sms_online.nominal import Comparison, compare, unit_factors
 from sms_online.physical import PhysicalSet, Projection
@@ -258,9 +259,10 @@ class Evaluation:
                 outliers={channel: left.number / left.of for channel, left in now.outliers.items()},
                 discrepancies=self._discrepancies,
                 coloured={} if momentum is None else momentum.coloured,
-                miscalibrated=tuple(self._miscalibrated()),
+                miscalibrated=(*self._miscalibrated(), *self._undecided()),
                 troubles=tuple(self._troubles),
                 weaknesses=tuple(self._weaknesses()),
+                scale=now.setup.system.scale_tolerance,
             )
         )
 
@@ -299,6 +301,18 @@ class Evaluation:
             if each.tolerance is not None
             and (each.beyond or (changed and each.name == "clock" and abs(each.estimate) > MOVED * each.tolerance))
         ]
+
+    def _undecided(self) -> list[Reason]:
+        """Effects of the description, larger than their tolerance, that may as well be the other way elsewhere."""
+        model, names = self.model, [p.name for p in self.parameters]
+        scale, out = model.system.scale_tolerance, []
+        for effect in model.system.effects:
+            other = either(effect, model.system)
+            key = f"{effect.name}@{effect.where}."
+            values = {n.removeprefix(key): float(self.estimate.pi[k]) for k, n in enumerate(names) if n.startswith(key)}
+            if other and scale is not None and any(abs(value) > scale for value in values.values()):
+                out.append(undecided(in_words(effect, model.system, values), effect.where, other))
+        return out
 
     def _disputes(self) -> list[Dispute]:
         """Parameters that the data pull further from what was known of them beforehand than that allows."""

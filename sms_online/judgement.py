@@ -33,6 +33,8 @@ LARGEST_DISTANCE = 3.0
 NAMED = 2
 # Without a spring, a mass or a rigidity nobody simulates the arm: green needs them, by the ends of their names.
 VITAL = ("mass", "mass_per_length", "stiffness", "rigidity", "rigidity_y", "rigidity_z")
+# Word for what may be at either of two places.
+UNDECIDED = "this or the other"
 # What to do next.
 DIAGNOSE = "run `sms-online diagnose` on the recording"
 ADD_EFFECT = "run `sms-online diagnose` and replay with the system.toml that it writes, or use --adopt"
@@ -44,6 +46,7 @@ CHECK_OUTLIERS = "look at that sensor: reflections and swapped markers, a loose 
 CHECK_COLOUR = "look at what filters that sensor, or log its samples as they are"
 BY_SMOOTHER = 'state its rate under [[sensor]], or balance = "smoother"'
 CHECK_LOSSES = "look at the faults that the session counted: a bus that is too busy, a loose cable"
+WEIGH = "weigh one part and state it under [known], or measure a torque constant"
 CHECK_DEVICE = "look at power, cable and address of what is silent, and at its table in the system file"
 CHECK_TROUBLE = "see to the devices, the recording and the machine first"
 MOVE = "move all joints, faster and over a larger range, and long enough"
@@ -90,7 +93,8 @@ class Facts:
     channel, the correlation time of its noise, s. slow: rates, Hz, of sensors that are too slow for the balance.
     miscalibrated: what is off by more than the description's tolerances
     allow. troubles: of the devices, the recording and the machine of a live session, a short sentence each. weaknesses:
-    of an estimate by the way it is made.
+    of an estimate by the way it is made. scale: 1σ of the factor that all parameters have in common, where nothing
+    else fixes it.
     """
 
     determined: tuple[int, int]
@@ -113,6 +117,7 @@ class Facts:
     miscalibrated: tuple[Reason, ...] = ()
     troubles: tuple[str, ...] = ()
     weaknesses: tuple[str, ...] = ()
+    scale: float | None = None
 
 
 def judge(facts: Facts) -> Trust:
@@ -154,12 +159,25 @@ def judge(facts: Facts) -> Trust:
     return Trust("doubt", cautions) if cautions else Trust("trust", tuple(_grounds(facts)))
 
 
-def judge_diagnosis(verdict: str, effects: Sequence[str], row: str | None, after: Trust, near: bool = False) -> Trust:
+def undecided(said: str, where: str, other: str) -> Reason:
+    """That what is said of one place may as well be the other way at another: all parameters depend on which."""
+    return Reason(said, False, (where, other), UNDECIDED, then=WEIGH)
+
+
+def judge_diagnosis(
+    verdict: str,
+    effects: Sequence[str],
+    row: str | None,
+    after: Trust,
+    near: bool = False,
+    either: Sequence[Reason] = (),
+) -> Trust:
     """The judgement of a diagnosed capture.
 
     verdict: `clean`, `named` or `unexplained`. effects: what was named, `name@where`. row: type of the rows that
     what is not explained acts on. after: of the session with what was named. near: whether effects that are named
-    in an unexplained session leave little of it.
+    in an unexplained session leave little of it. either: what was named that may as well be elsewhere, and scales
+    the parameters differently there.
     """
     if verdict == "clean":
         return after
@@ -176,9 +194,13 @@ def judge_diagnosis(verdict: str, effects: Sequence[str], row: str | None, after
     else:
         what, them = (effects[0], "it") if len(effects) == 1 else (f"{len(effects)} effects", "them")
         trusted = f"; trust the parameters with {them}" + (" but for what follows" if after.level == "doubt" else "")
-        told = f"the system file lacks {what}" + ("" if after.grave or after.level == "not yet" else trusted)
+        unsure = after.grave or after.level == "not yet" or either
+        told = f"the system file lacks {what}" + ("" if unsure else trusted)
         found = [replace(each[0], text=told)] if len(each) == 1 else [Reason(told, after.grave), *each]
-    rest = after.grounds if after.level != "trust" else ()
+        found = [replace(reason, grave=after.grave) for reason in either] + found
+    # The session with what was named says so too.
+    rest = [reason for reason in after.grounds if not (either and reason.mark == UNDECIDED)]
+    rest = rest if after.level != "trust" else []
     return Trust("doubt", (*found, *rest), grave=found[0].grave)
 
 
@@ -397,6 +419,8 @@ def _grounds(facts: Facts) -> list[Reason]:
     out = [Reason(f"{known} of {of} parameters determined{rests}", False)]
     if facts.undetermined:
         out.append(Reason(f"not determined: {_listed(facts.undetermined)}", False))
+    if facts.scale:
+        out.append(Reason(f"the scale of all rests on the torque constants, ± {100.0 * facts.scale:.2g} %", False))
     return out
 
 

@@ -1,13 +1,19 @@
-"""What is known of the base parameters before a session, from what a system file says about the physical ones."""
+"""What is known of the base parameters before a session, from what a system file says about the physical ones.
+
+And the way back: estimates of base parameters as what a system file says of the physical ones they are named after.
+"""
 
 from __future__ import annotations
+
+from collections.abc import Mapping
 
 import numpy as np
 
 from sms_online.description.explain import hint, nearest
-from sms_online.description.schema import System
+from sms_online.description.schema import Fitted, System
 from sms_online.errors import InputError
 from sms_online.model.base_parameters import BaseParameters
+from sms_online.result import Parameter
 from sms_online.stream import Array
 from sms_online.trackers.interface import Prior
 
@@ -20,9 +26,10 @@ VECTORS = ("first_moment_", "inertia_")
 def base_prior(system: System, base: BaseParameters, nominal: bool) -> Prior:
     """Prior of the base parameters β = π_independent + mixture π_dependent, NaN where nothing is known.
 
-    Physical parameters have the priors that the system file states; with `nominal`, the others their nominal value ±
-    10 %, components of a first moment or an inertia ± 10 % of the whole; what is nominally 0 otherwise has none, for
-    that only says that it is not described. A combination has a prior where every parameter in it has one; their errors
+    Physical parameters have the priors that the system file states; with `nominal`, those that an earlier session has
+    found what that states of their whole combination, and the others their nominal value ± 10 %, components of a first
+    moment or an inertia ± 10 % of the whole; what is nominally 0 otherwise has none, for that only says that it is not
+    described. Any other combination has a prior where every parameter in it has one; their errors
     count as independent. Raises InputError for a prior of a parameter that does not exist.
     """
     names = [parameter.name for parameter in base.physical]
@@ -40,6 +47,10 @@ def base_prior(system: System, base: BaseParameters, nominal: bool) -> Prior:
     mixing[np.arange(base.n), list(base.independent)] = 1.0
     mixing[:, list(base.dependent)] = base.mixture
     variance = np.where(mixing != 0.0, mixing**2 * std**2, 0.0).sum(axis=1)
+    if nominal:
+        for row, index in enumerate(base.independent):
+            if names[index] in system.fitted:
+                variance[row] = (system.fitted[names[index]].std or np.nan) ** 2
     return Prior(mixing @ value, np.sqrt(np.where(variance > 0.0, variance, np.nan)))
 
 
@@ -54,3 +65,18 @@ def _sizes(base: BaseParameters) -> Array:
         squares[whole] = squares.get(whole, 0.0) + parameter.nominal**2
     sizes = np.sqrt([squares[whole] for whole in wholes])
     return np.where(sizes > 0.0, sizes, np.nan)
+
+
+def with_estimates(system: System, base: BaseParameters, parameters: Mapping[str, Parameter]) -> System:
+    """The system with estimates of its base parameters (by name) and their deviations as its fitted values.
+
+    Each is that of the parameter which its combination is named after, what is lumped into it being as described.
+    """
+    lumped = base.mixture @ np.array([base.physical[index].nominal for index in base.dependent])
+    fitted = dict(system.fitted)
+    for combination, index, rest in zip(base.parameters, base.independent, lumped.tolist(), strict=True):
+        if combination.name in parameters:
+            found = parameters[combination.name]
+            std = found.std if 0.0 < found.std < np.inf else None
+            fitted[base.physical[index].name] = Fitted(value=found.value - rest, std=std)
+    return system.model_copy(update={"fitted": fitted})

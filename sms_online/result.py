@@ -237,6 +237,7 @@ class Result(Documented):
             "method": self.method,
             "verdict": self.trust.document(),
             "parameters": [parameter.document() for parameter in self.parameters.values()],
+            "scale_tolerance": self.system.scale_tolerance,
             "calibration": [each.document() for each in self.calibration],
             "trackers": [each.document() for each in self.trackers],
             "events": [event_document(event) for event in self.events],

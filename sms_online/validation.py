@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from html import escape
 from typing import Any
@@ -10,11 +10,14 @@ from typing import Any
 import numpy as np
 
 from sms_online.capture import check_channels
+from sms_online.cramer_rao import MotionRecord
 from sms_online.description.channels import channels as known_channels
 from sms_online.description.schema import System
 from sms_online.diagnosis.evidence import RANK_TOLERANCE
 from sms_online.errors import InputError
+from sms_online.linearised import Motion
 from sms_online.model.base_parameters import BaseParameters
+from sms_online.model.model import Model
 from sms_online.pipeline.estimator import Estimator
 from sms_online.pipeline.joint_balance import SquaredResidual
 from sms_online.result import Parameters
@@ -56,7 +59,7 @@ class Validation(Tabled):
     """A run predicted with everything fixed.
 
     system: with which description. duration: of the run, s. joints: `joint_i` to what is left of its torque; those
-    without a torque are left out. warnings: of the source.
+    without a torque are left out. warnings: of the source, and of a motion beyond what effects are known for.
     """
 
     system: str
@@ -117,6 +120,8 @@ def validate(system: System, data: Data, parameters: Parameters | Mapping[str, f
     check_channels(tuple(recorded.source.channels), known_channels(system), recorded.name)
     # The rows of the joints' torques depend on no estimate; without a momentum balance no event changes the model.
     session = Estimator(system.model_copy(update={"balance": "energy"}), recorded.source.channels, recorded.name)
+    motion = MotionRecord(system.sample_rate)
+    session.observers.append(motion)
     for block in recorded.source:
         session.push(block)
     session.finish()
@@ -126,7 +131,16 @@ def validate(system: System, data: Data, parameters: Parameters | Mapping[str, f
         raise InputError(recorded.name, "", "no torque, or too few samples", "a run with measured torques")
     fitted = _fitted(list(sums.values()), beta.size)
     joints = {name: Predicted(_share(each, beta), _share(each, fitted)) for name, each in sums.items()}
-    return Validation(system.name, session.duration, joints, tuple(recorded.source.warnings))
+    warnings = (*recorded.source.warnings, *beyond(session.model, motion.motions))
+    return Validation(system.name, session.duration, joints, warnings)
+
+
+def beyond(model: Model, motions: Sequence[Motion]) -> list[str]:
+    """Where a run goes beyond what effects of its model are known for, a sentence each."""
+    if not motions:
+        return []
+    x, v = (np.concatenate([getattr(motion, part) for motion in motions]) for part in ("x", "v"))
+    return [said for effect in model.effects if (said := effect.beyond(model.layout, x, v))]
 
 
 def _share(sums: SquaredResidual, beta: Array) -> float:

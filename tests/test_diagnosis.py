@@ -118,8 +118,8 @@ def test_an_effect_that_nobody_knows_is_unexplained_where_it_acts() -> None:
     alike = ("cubic_stiffness", "backlash", "encoder_eccentricity", "torsional_hysteresis", "encoder_offset")
     inner = CandidateColumns.effects
 
-    def known(self: CandidateColumns) -> Iterator[Effect]:
-        return (effect for effect in inner(self) if effect.name not in alike)
+    def known(self: CandidateColumns, learned: bool = False) -> Iterator[Effect]:
+        return (effect for effect in inner(self, learned) if effect.name not in alike)
 
     block = block_of("cubic_stiffness@joint_1:stiffness=300")
     with patch.object(CandidateColumns, "effects", known):

@@ -322,7 +322,8 @@ def test_the_guide_lists_every_effect_with_its_coefficients_and_defaults() -> No
 
 def test_an_effect_as_the_guide_writes_it_is_one() -> None:
     model = build_model(paper())
-    site = Site(model.system, model.chain, "joint_1", 1, model.weight)
+    declared = Effect(name="windage_friction", where="joint_1")
+    site = Site(model.system, model.chain, declared, 1, model.weight)
     effect = windage()(site, {"drag": 0.3})  # type: ignore[call-arg, arg-type]
     s = Motion(model)
     f = effect.force(model.layout, s.x, s.v, None)[..., 0] * effect.parameters[0].nominal

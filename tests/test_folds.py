@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 
+from sms_online.diagnosis.evidence import least_squares, least_squares_without
 from sms_online.diagnosis.folds import ALWAYS, BLOCKS, Folds, fall
 from sms_online.pipeline.momentum_windows import HOPS
 
@@ -55,3 +57,16 @@ def test_a_rise_is_one_beyond_what_a_coefficient_costs() -> None:
     before = np.full(10, 1.0)
     assert fall(before, np.full(10, 1.5)).rises
     assert not fall(before, np.full(10, 1.01)).rises
+
+
+@pytest.mark.parametrize("dependent", [False, True])
+def test_parts_of_one_factorisation_solve_without_a_block(dependent: bool) -> None:
+    """Also where a column is nothing without a block, or two are the same (seed 8)."""
+    rng = np.random.default_rng(8)
+    columns, b = rng.standard_normal((200, 6)), rng.standard_normal(200)
+    left_out = np.arange(200) // 40 == np.arange(5)[:, None]
+    if dependent:
+        columns[:, 5] = columns[:, 4]
+    columns[~left_out[2], 3] = 0.0
+    expected = [least_squares(columns[~each], b[~each]) for each in left_out]
+    assert_allclose(least_squares_without(columns, b, list(left_out)), expected, rtol=1e-9, atol=1e-12)

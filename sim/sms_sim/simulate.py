@@ -87,6 +87,15 @@ class Simulation:
             parts.append(np.column_stack((plant.motor_power(t[rows], y[rows]), dissipated)))
         return np.concatenate(parts).reshape(shape[0], shape[1], -1)
 
+    @property
+    def beyond(self) -> list[str]:
+        """Where the motion goes beyond what effects are known for, a sentence each."""
+        model = self.plant.model
+        if not model.effects:
+            return []
+        exact = exact_states(self, self.solution.t)
+        return [said for effect in model.effects if (said := effect.beyond(model.layout, exact.x, exact.v))]
+
     @cached_property
     def drift(self) -> Drift:
         """Energy and momentum that the integrator lost."""

@@ -71,7 +71,9 @@ def torque_families(sensing: Sensing, tolerances: Tolerances) -> list[TorqueFami
     joints = [i for i, joint in enumerate(sensing.model.system.joints) if not joint.passive]
     units = ["N" if joint.kind == "prismatic" else "N m" for joint in sensing.model.system.joints]
     offset = np.inf if tolerances.drive_offset is None else tolerances.drive_offset
-    gained = [i for i in joints if i > 0 and ("drive_gain", f"joint_{i + 1}") not in declared]
+    # Unless a parameter is known, a gain that is common to all torques is that of all parameters.
+    first = 1 if sensing.model.system.scale_tolerance is not None else 0
+    gained = [i for i in joints if i >= first and ("drive_gain", f"joint_{i + 1}") not in declared]
     shifted = [i for i in joints if ("drive_offset", f"joint_{i + 1}") not in declared]
     every = [
         TorqueFamily(

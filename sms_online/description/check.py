@@ -232,13 +232,13 @@ def _check_effects(system: System, names: tuple[str, ...], source: str) -> None:
 
 
 def _check_parameter_names(system: System, source: str) -> None:
-    """`known` and `prior`: the owner exists; whether it has the quantity, the model says."""
+    """`known`, `prior` and `fitted`: the owner exists; whether it has the quantity, the model says."""
     owners = [] if system.spacecraft is None else ["spacecraft"]
     owners += _numbered(system)
     owners += [f"motor_{i}" for i, motor in enumerate(system.motors, start=1) if motor is not None]
     owners += ["payload"] if system.payload is not None else []
     owners += [f"{effect.name}@{effect.where}" for effect in system.effects]
-    for table, parameters in (("known", system.known), ("prior", system.priors)):
+    for table, parameters in (("known", system.known), ("prior", system.priors), ("fitted", system.fitted)):
         for name in parameters:
             parts = PARAMETER_NAME.fullmatch(name)
             if parts is None:

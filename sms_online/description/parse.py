@@ -1,8 +1,8 @@
 """From the text of a system file (TOML) to a checked `System`, and the texts that are shipped with the package.
 
 Tables of a file: [spacecraft], then [joint_i], [motor_i] (optional) and [link_i] for i = 1..N, those of fixed joints
-last, [payload], [[sensor]], [[source]], [[effect]], [known], [prior], [controller], [trajectory], [windows],
-[tolerances], [tracker]; keys are the fields of `schema`.
+last, [payload], [[sensor]], [[source]], [[effect]], [known], [prior], [fitted], [controller], [trajectory],
+[windows], [tolerances], [tracker]; keys are the fields of `schema`.
 """
 
 from __future__ import annotations
@@ -22,7 +22,10 @@ from sms_online.description.schema import System
 from sms_online.errors import InputError
 
 # Top-level keys of a file and the field of `System` that each fills; numbered tables come beside them.
-PLAIN = ("name", "title", "reference", "motion", "gravity", "sample_rate", "balance", "spacecraft", "payload", "known")
+PLAIN = (
+    "name", "title", "reference", "motion", "gravity", "sample_rate", "balance", "spacecraft", "payload", "known",
+    "fitted",
+)  # fmt: skip
 RENAMED = {"sensor": "sensors", "source": "sources", "effect": "effects", "prior": "priors", "tracker": "trackers"}
 WITHOUT_NUMBERS = (*PLAIN, *RENAMED, "controller", "trajectory", "windows", "tolerances")
 NUMBERED = re.compile(r"(joint|motor|link)_([1-9]\d*)")

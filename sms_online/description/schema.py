@@ -17,6 +17,7 @@ from sms_online.description.sources import Device, LogSource, Source
 Vector3 = tuple[float, float, float]
 Deformation = Literal["traction", "torsion", "bending_y", "bending_z"]
 Forgetting = Literal["none", "exponential", "window", "directional"]
+Over = Literal["rate", "angle", "deflection", "load"]
 Drift = Literal["none", "random_walk", "trend", "learned"]
 
 
@@ -195,11 +196,15 @@ class Effect(Record):
     name: of the effect.
     where: `joint_i`, `link_i`, `base`, `tip`, or a channel or shell pattern of channels.
     coefficients: nominal values by name; the simulator alone uses them, except shape constants, which are fixed.
+    over: of a learned curve, the joint's variable that it is over: `rate`, `angle`, `deflection` or `load`.
+    knots: of a learned curve, values of that variable between which it is a cubic, ascending, rad/s or rad (m/s or m).
     """
 
     name: str
     where: str
     coefficients: dict[str, float] = {}
+    over: Over | None = None
+    knots: tuple[float, ...] = ()
 
 
 class Prior(Record):
@@ -211,6 +216,17 @@ class Prior(Record):
 
     value: float
     std: Positive
+
+
+class Fitted(Record):
+    """What an earlier session has found of a parameter: its nominal value from then on.
+
+    value: in the parameter's unit, with the parameters that are lumped into it as described.
+    std: its standard deviation, in the same unit; a prior's with `--prior`. Not stated: undetermined.
+    """
+
+    value: float
+    std: Positive | None = None
 
 
 class Controller(Record):
@@ -278,7 +294,7 @@ class Tolerances(Record):
     marker_zero: zero of a marker's displacement, m.
     marker_zero_angle: zero of a marker's rotation, rad.
     camera_scale: scale of the base's position and the markers' displacements.
-    drive_gain: gain of a joint's torque relative to that of joint 1.
+    drive_gain: gain of a joint's torque, that of joint 1 where a parameter is known; else of the others against it.
     drive_offset: zero of a joint's torque or force, after the gear, N m (N); not stated: unknown.
     """
 
@@ -368,6 +384,7 @@ class System(Record):
     effects: `[[effect]]` tables.
     known: parameters that are known exactly, name to value in the parameter's unit; they leave the unknowns.
     priors: parameters that are known with a standard deviation, a table `[prior]`.
+    fitted: parameters that an earlier session has found, in place of the values that the other tables state.
     controller: of the simulator.
     trajectory: of the simulator.
     windows: widths of the test functions.
@@ -394,6 +411,7 @@ class System(Record):
     effects: tuple[Effect, ...] = ()
     known: dict[str, float] = {}
     priors: dict[str, Prior] = {}
+    fitted: dict[str, Fitted] = {}
     controller: Controller | None = None
     trajectory: Trajectory | None = None
     windows: Windows = Windows()
@@ -405,6 +423,15 @@ class System(Record):
     def devices(self) -> tuple[Device, ...]:
         """The sources that a live session listens to."""
         return tuple(source for source in self.sources if not isinstance(source, LogSource))
+
+    @property
+    def scale_tolerance(self) -> float | None:
+        """1σ of the factor that all parameters have in common: that of the torques, which no residual shows.
+
+        None where a parameter that is known, or has a prior, fixes it.
+        """
+        stated = [*self.known.values(), *(prior.value for prior in self.priors.values())]
+        return None if any(stated) else self.tolerances.drive_gain
 
     @property
     def nominal(self) -> dict[str, float]:

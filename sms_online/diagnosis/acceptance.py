@@ -10,9 +10,6 @@ from sms_online.diagnosis.candidate_rows import CandidateRows
 from sms_online.diagnosis.folds import Fall, fall
 from sms_online.stream import Array
 
-# An effect must lower the rms of the held-out rows that it acts on by this share: on measured rigs laws that gained
-# less within a run were as likely to harm another run as to help it.
-LEAST_IMPROVEMENT = 0.10
 # Coefficients of effects that are correlated by more than this are those of one effect too many.
 ONE_TOO_MANY = 0.99
 # Rows that hold more than this multiple of their deviation leave more than noise.
@@ -28,15 +25,15 @@ class Acceptance(CandidateRows):
 
     def improves(self, chosen: Sequence[int], candidate: int) -> bool:
         """Whether a candidate beside those chosen lowers the residual of held-out rows, and no type's rises."""
-        together = [*chosen, candidate]
+        together, least = [*chosen, candidate], self.candidates[candidate].traits.least_improvement
         acts = self._acts(candidate)
         before, after = (self.fitted(each, chosen) for each in (chosen, together))
-        if fall(before[:, acts].sum(axis=1), after[:, acts].sum(axis=1)).share < LEAST_IMPROVEMENT:
+        if fall(before[:, acts].sum(axis=1), after[:, acts].sum(axis=1)).share < least:
             return False  # not even of the rows that it is fitted to
         before, after = (self.held_out(each, chosen) for each in (chosen, together))
         own = fall(before[:, acts].sum(axis=1), after[:, acts].sum(axis=1))
         types = (fall(before[:, each].sum(axis=1), after[:, each].sum(axis=1)) for each in self._types)
-        return own.share >= LEAST_IMPROVEMENT and own.certain and not any(each.rises for each in types)
+        return own.share >= least and own.certain and not any(each.rises for each in types)
 
     def improvement(self, chosen: Sequence[int], candidate: int) -> Fall:
         """Of the rms of the held-out rows that a candidate acts on, beside those chosen.
@@ -111,9 +108,9 @@ class Acceptance(CandidateRows):
         return out
 
     def _insignificant(self, chosen: Sequence[int], asked: Sequence[int]) -> list[int]:
+        """Those whose coefficients are no more than what the blocks differ by."""
         if self.folds.count < LEAST_FOLDS:
             return []
-        """Those whose coefficients are no more than what the blocks differ by."""
         solution, std = self.solution(chosen), self.spread(chosen)
         places = self._places(chosen)
         return [k for k in asked if np.all(np.abs(solution[places[k]]) < SIGNIFICANT * std[places[k]])]
@@ -125,7 +122,7 @@ class Acceptance(CandidateRows):
             others = [other for other in chosen if other != k]
             if self.candidates[k].traits.dry:
                 self.settle(others)
-            if self.improvement(others, k).share < LEAST_IMPROVEMENT:
+            if self.improvement(others, k).share < self.candidates[k].traits.least_improvement:
                 idle.append(k)
             self.settle(chosen)
         return idle

@@ -103,7 +103,8 @@ PriorOf = Callable[[Estimator], Prior | None]
 class Case:
     """A capture to be diagnosed: its session with the system as described, samples, and those held out.
 
-    progress: see `Progress`. stop: whether to end with what has been found.
+    progress: see `Progress`. stop: whether to end with what has been found. learned: whether curves are tried where no
+    law is selected.
     """
 
     source: str
@@ -114,6 +115,7 @@ class Case:
     prior: PriorOf
     progress: Progress = lambda what, share: None
     stop: Callable[[], bool] = lambda: False
+    learned: bool = False
 
 
 def _noise_behind(described: Estimator, case: Case) -> SensorNoise:
@@ -199,12 +201,12 @@ class Attempt(Hypothesis):
             expected = f"some {seconds:.1f} s without a gap, to fit and to check"
             raise InputError(case.source, "", f"too few windows of {span:g} s: {rows.count}", expected)
         folds = Folds.of(rows.weak.windows.segment, rows.time)
-        effects = list(make.effects()) if candidates is None else candidates
+        effects = list(make.effects(case.learned)) if candidates is None else candidates
         self._lasting = [effect for effect in effects if is_constant(effect)]
         forces = [effect for effect in effects if not is_constant(effect)]
         made = make.seen(forces) if candidates is None else [make.of(effect) for effect in forces]
         if beta is None:
-            _start(rows, made, prior)
+            _start(rows, [candidate for candidate in made if not candidate.traits.learned], prior)
         else:
             _weigh(rows, beta)
         self._most_found = 0

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sms_online.calibration.nuisance import Nuisance
-from sms_online.description.schema import Effect
+from sms_online.description.schema import Effect, System
 from sms_online.effects.catalogue import ENTRIES
 from sms_online.stream import Array
 
@@ -24,22 +24,30 @@ from sms_online.stream import Array
 LIMIT = 2.5
 # A number that is held at zero counts as known to this share of its tolerance.
 HELD = 1e-6
-# Tolerances that effects of the catalogue say.
-SAYABLE = frozenset(name for entry in ENTRIES.values() for name in entry.traits.calibrates)
+
+
+def sayable(system: System) -> frozenset[str]:
+    """Tolerances that effects of the catalogue say: where a parameter is known, not what is relative to a place."""
+    entries = (each for each in ENTRIES.values() if system.scale_tolerance is not None or not each.relative_to)
+    return frozenset(name for entry in entries for name in entry.traits.calibrates)
 
 
 @dataclass(frozen=True)
 class Calibrated:
-    """Nuisances (m) with their columns (W, n_v, m) in the rows, as `SessionRows` has them once it is weighed."""
+    """Nuisances (m) with their columns (W, n_v, m) in the rows, as `SessionRows` has them once it is weighed.
+
+    sayable: see that function.
+    """
 
     nuisances: tuple[Nuisance, ...]
     columns: Array
+    sayable: frozenset[str]
 
     @classmethod
-    def of(cls, nuisances: Sequence[Nuisance], columns: Array) -> Calibrated:
+    def of(cls, nuisances: Sequence[Nuisance], columns: Array, system: System) -> Calibrated:
         """Those that have a tolerance: where nothing is known, as of a torque's zero, the effect alone says it."""
         known = [k for k, each in enumerate(nuisances) if np.isfinite(each.tolerance)]
-        return cls(tuple(nuisances[k] for k in known), columns[..., known])
+        return cls(tuple(nuisances[k] for k in known), columns[..., known], sayable(system))
 
     @property
     def count(self) -> int:
@@ -62,8 +70,8 @@ class Calibrated:
 
     def beyond(self, values: Array) -> NDArray[np.bool_]:
         """Which of them (m,) an effect of the catalogue has to say, for estimates (m,)."""
-        sayable = np.array([each.name in SAYABLE for each in self.nuisances], dtype=np.bool_)
-        return np.asarray(sayable & (np.abs(values) > LIMIT * self.tolerance))
+        said = np.array([each.name in self.sayable for each in self.nuisances], dtype=np.bool_)
+        return np.asarray(said & (np.abs(values) > LIMIT * self.tolerance))
 
 
 def _says(effect: Effect, nuisance: Nuisance) -> bool:

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from sms_online.diagnosis.calibrated import Calibrated
 from sms_online.diagnosis.candidate import Candidate, Laws
-from sms_online.diagnosis.evidence import Gain, basis, free_of, gain, least_squares, together
+from sms_online.diagnosis.evidence import Gain, basis, free_of, gain, least_squares, least_squares_without, together
 from sms_online.diagnosis.folds import Folds
 from sms_online.diagnosis.weak_rows import WeakRows
 from sms_online.pipeline.momentum_windows import HOPS
@@ -23,6 +23,8 @@ ACTS = 0.01
 # Rows whose mean square exceeds their variance by more than this although everything that is known of has been
 # subtracted have an error of their own: friction is never quite its model.
 LARGEST_RATIO = 1.5
+# Rows for a column at least, for curves to be fitted together.
+LEAST_ROWS = 4
 # Share of a row's variance by which that of the effects chosen has to change for rows to be weighed anew.
 SMALL_CHANGE = 0.1
 
@@ -53,7 +55,7 @@ class CandidateRows:
         positive (n,): which cannot be negative. calibrated: what the description may be off by, nothing by default;
         its m unknowns come last in a solution.
         """
-        nothing = Calibrated((), np.empty((*rows.b.shape, 0)))
+        nothing = Calibrated((), np.empty((*rows.b.shape, 0)), frozenset())
         self.calibrated, self._fixed = nothing if calibrated is None else calibrated, list(fixed)
         self.rows, self.candidates, self.folds = rows, list(candidates), folds
         self._laws, self._prior = laws, prior
@@ -105,7 +107,7 @@ class CandidateRows:
     def weigh(self) -> None:
         """Weigh the rows, and whiten them, with what the laws of the effects of the last `settle` do not determine."""
         rows = self.rows
-        self._zeroed: dict[frozenset[int], NDArray[np.bool_]] = {}
+        self._forget()
         self.std = np.sqrt(rows.std**2 + self._own + self._free[:, 0])
         self._plain_model = self._model / self.std[..., None]
         self._plain_calibration = self.calibrated.columns / self.std[..., None]
@@ -136,7 +138,11 @@ class CandidateRows:
         torque are homogeneous in π: what makes π small makes their residual small, which counts against their terms.
         """
         left = self.rows.b / self.std
-        plain = np.concatenate([self._plain_model, *self._plain, self._plain_calibration], axis=2)
+        every = np.concatenate([self._plain_model, *self._plain, self._plain_calibration], axis=2)
+        laws = (p for p, each in zip(self._plain, self.candidates, strict=True) if not each.traits.learned)
+        # All curves at once would leave little of few rows, whatever these hold.
+        enough = LEAST_ROWS * every.shape[2] <= left.size
+        plain = every if enough else np.concatenate([self._plain_model, *laws, self._plain_calibration], axis=2)
         solution = together(plain, left, self._prior)
         left = left - plain @ solution
         ratio = np.mean(left**2, axis=0)
@@ -201,7 +207,12 @@ class CandidateRows:
         self.candidates[k] = candidate
         self._plain[k] = candidate.columns / self.std[..., None]
         self._Z[k] = self._whitened(candidate.columns)
-        self._zeroed = {}
+        self._forget()
+
+    def _forget(self) -> None:
+        """What was solved with other weights or columns."""
+        self._zeroed: dict[frozenset[int], NDArray[np.bool_]] = {}
+        self._solved: dict[tuple[tuple[int, ...], frozenset[int] | None], Array] = {}
 
     def _whitened(self, columns: Array) -> Array:
         white = self.rows.white(columns)
@@ -216,21 +227,23 @@ class CandidateRows:
         """Columns (W, n_v, n + c) of the model with those chosen."""
         return np.concatenate([self._model, *(self.candidates[k].columns for k in chosen)], axis=2)
 
-    def solution(
-        self, chosen: Sequence[int], windows: NDArray[np.bool_] | None = None, beside: Sequence[int] | None = None
-    ) -> Array:
-        """Parameters, coefficients and calibration (n + c + m,) of the model with those chosen.
+    def solution(self, chosen: Sequence[int], beside: Sequence[int] | None = None) -> Array:
+        """Parameters, coefficients and calibration (n + c + m,) of the model with those chosen; beside: see `_columns`.
 
-        windows (W,): fitted to, all unless given. beside: see `_columns`.
+        Kept until rows are weighed anew.
         """
-        use = np.ones(len(self._b), dtype=bool)
-        if windows is not None:
-            use[: windows.size * self._n_v] = np.repeat(windows, self._n_v)
-        return least_squares(self._columns(chosen, beside)[use], self._b[use])
+        key = tuple(chosen), None if beside is None else frozenset(beside)
+        if key not in self._solved:
+            self._solved[key] = least_squares(self._columns(chosen, beside), self._b)
+        return self._solved[key]
 
     def solutions(self, chosen: Sequence[int], beside: Sequence[int] | None = None) -> Array:
         """The same without each of the blocks in turn, (B, n + c + m)."""
-        return np.array([self.solution(chosen, self.folds.fitted(k), beside) for k in range(self.folds.count)])
+        known = np.zeros(len(self._b) - self.rows.b.size, dtype=bool)
+        left_out = [
+            np.concatenate((np.repeat(~self.folds.fitted(k), self._n_v), known)) for k in range(self.folds.count)
+        ]
+        return least_squares_without(self._columns(chosen, beside), self._b, left_out)
 
     def predicted(
         self, chosen: Sequence[int], solutions: Array | None = None, beside: Sequence[int] | None = None

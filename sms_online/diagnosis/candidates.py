@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
 from fnmatch import fnmatchcase
 from functools import cached_property
 from itertools import product
+from typing import TypeVar
 
 import numpy as np
 
@@ -20,7 +21,7 @@ from sms_online.diagnosis.standstill import LEAVING, SessionStandstill
 from sms_online.diagnosis.weak_windows import Motion, WeakWindows
 from sms_online.effects.base import Ranges, position
 from sms_online.effects.build import build_model
-from sms_online.effects.catalogue import ENTRIES, LINEAR, candidates, periods
+from sms_online.effects.catalogue import ENTRIES, LINEAR, candidates, curve_variables, periods, traits_of
 from sms_online.model.effect import Inputs
 from sms_online.model.model import Model
 from sms_online.model.parameters import Parameter
@@ -30,6 +31,9 @@ from sms_online.stream import Array
 
 # Share of its law that friction may lack just before it gives way, 1σ: the spring winds up meanwhile.
 WINDING = 0.2
+# Declarations of which models and noisy columns are kept: those that a search returns to.
+KEPT = 100
+_T = TypeVar("_T")
 
 
 class CandidateColumns:
@@ -48,13 +52,23 @@ class CandidateColumns:
         self._since, self._resting = since, resting
         self._weak = rows.weak if weak is None else weak
         self._noisy: list[CandidateColumns] = []
+        self._made: dict[tuple[object, ...], Model] = {}
+        self._moved: dict[tuple[object, ...], list[Array]] = {}
         self._held: dict[str, SessionStandstill] = {}
         self._turned: dict[str, Reversals] = {}
         self._own = {p.name for p in rows.model.parameters}
 
     def within(self, weak: WeakWindows, resting: bool = False) -> CandidateColumns:
         """The same for other windows of the session."""
-        return CandidateColumns(self.rows, self.system, weak, resting=resting)
+        other = CandidateColumns(self.rows, self.system, weak, resting=resting)
+        other._made = self._made
+        return other
+
+    def _model(self, effect: Effect) -> Model:
+        """The model with one more effect, the last one. What becomes a constant is linear only beside known masses."""
+        if is_constant(effect):
+            return build_model(self._declaring(effect), self.rows.base.physical_values(self.rows.beta))
+        return _kept(self._made, effect, lambda: build_model(self._declaring(effect)))
 
     def inputs(self, motion: Motion) -> Inputs:
         """What the effects that the system declares need beside the motion."""
@@ -86,11 +100,18 @@ class CandidateColumns:
         made = [self.of(effect) for effect in effects]
         return [candidate for candidate in made if np.any(candidate.columns)]
 
-    def effects(self) -> Iterator[Effect]:
-        """Declarations that may be missing; kinematics are compared as whole systems, not as columns."""
+    def effects(self, learned: bool = False) -> Iterator[Effect]:
+        """Declarations that may be missing; kinematics are compared as whole systems, not as columns.
+
+        learned: whether curves are among them.
+        """
         for effect in candidates(self.system):
             entry = ENTRIES[effect.name]
             if entry.kind == "kinematics":
+                continue
+            if entry.forms is not None:
+                if learned:
+                    yield from entry.forms(effect, self._variables(effect))
                 continue
             if entry.kind == "channel":
                 yield effect.model_copy(update={"coefficients": {}})
@@ -106,6 +127,16 @@ class CandidateColumns:
                 if any(value <= 0.0 < entry.shapes[s].default for s, value in shapes.items()):
                     continue  # a joint at rest has no range to take a share of
                 yield shaped
+
+    def _variables(self, effect: Effect) -> dict[str, Array]:
+        """Values (K,) that the variables of a joint's curves go through, by name."""
+        layout, i = self.rows.model.layout, int(effect.where.removeprefix("joint_")) - 1
+        motor, link = layout.theta_m[i], layout.q[i]
+        x, v = (np.concatenate([getattr(m, part) for m, _ in self.rows.weak.motions()]) for part in ("x", "v"))
+        deflection = position(layout, x, motor) - position(layout, x, link)
+        values = {"rate": v[:, motor], "angle": position(layout, x, motor), "deflection": deflection}
+        values["load"] = deflection
+        return {over: values[over] for over in curve_variables(self.system, effect)}
 
     def _turns(self, where: str, order: float) -> bool:
         """Whether an effect of so many periods a motor turn goes through one: less of it is a constant or a gain."""
@@ -132,10 +163,7 @@ class CandidateColumns:
         """The candidate of one declaration."""
         if ENTRIES[effect.name].kind == "channel":
             return self._channel(effect)
-        # What becomes a constant is linear only beside parameters that are known.
-        model = build_model(
-            self._declaring(effect), self.rows.base.physical_values(self.rows.beta) if is_constant(effect) else None
-        )
+        model = self._model(effect)
         added = [k for k, p in enumerate(model.parameters) if p.name not in self._own]
         parameters = [model.parameters[k] for k in added]
         if ENTRIES[effect.name].kind == "inertia":
@@ -149,7 +177,7 @@ class CandidateColumns:
 
     @staticmethod
     def _candidate(effect: Effect, parameters: Sequence[Parameter], columns: Array) -> Candidate:
-        return Candidate(effect, tuple(parameters), columns, ENTRIES[effect.name].traits, is_constant(effect))
+        return Candidate(effect, tuple(parameters), columns, traits_of(effect), is_constant(effect))
 
     def _force(self, model: Model) -> Array:
         """Columns (W, n_v, c) of a model's last effect."""
@@ -188,14 +216,17 @@ class CandidateColumns:
         nothing = np.zeros((len(self.rows.b), HOPS, self.rows.b.shape[1]))
         if ENTRIES[effect.name].kind != "force" or is_constant(effect) or self.rows.noise.exact:
             return LeftOpen(nothing[:, 0], nothing)
-        model = build_model(self._declaring(effect))
+        model = self._model(effect)
         force = model.effects[-1]
         if effect.where.startswith("joint_") and not force.reversing and not force.n_states:
             return LeftOpen(self._spread(model, coefficients), nothing)
         if not self._noisy:
             self._noisy = [self.within(weak) for weak in self.rows.noisy()]
-        noisy = [make.of(effect).columns for make in self._noisy]
-        changes = [(columns - candidate.columns) @ coefficients for columns in noisy]
+
+        def moved() -> list[Array]:
+            return [make.of(effect).columns - candidate.columns for make in self._noisy]
+
+        changes = [columns @ coefficients for columns in _kept(self._moved, effect, moved)]
         squares = np.mean(np.square(changes), axis=0)
         near = slice(HOPS - 1, HOPS - 1 + len(squares))
         sums = [np.convolve(column, np.ones(2 * HOPS - 1))[near] for column in (np.ones(len(squares)), *squares.T)]
@@ -258,7 +289,7 @@ class CandidateColumns:
 
         Empty where β does not hold what they are relative to.
         """
-        force = build_model(self._declaring(effect)).effects[-1]
+        force = self._model(effect).effects[-1]
         known = dict(zip((p.name for p in self.rows.base.parameters), beta.tolist(), strict=True))
         if not known.keys() >= set(force.relative_to):
             return {}
@@ -323,3 +354,13 @@ class CandidateColumns:
             columns.append(response)
             parameters.append(Parameter(f"{effect.name}@{effect.where}.{quantity}", quantity, unit, 0.0))
         return self._candidate(effect, parameters, np.stack(columns, axis=2))
+
+
+def _kept(store: dict[tuple[object, ...], _T], effect: Effect, make: Callable[[], _T]) -> _T:
+    """What was made of a declaration, kept in a store of the last ones."""
+    key = effect.name, effect.where, *sorted(effect.coefficients.items()), effect.over, effect.knots
+    if key not in store:
+        if len(store) == KEPT:
+            del store[next(iter(store))]
+        store[key] = make()
+    return store[key]

@@ -11,7 +11,7 @@ import numpy as np
 from sms_online.calibration.found import Calibration
 from sms_online.description.schema import Effect, System
 from sms_online.diagnosis.attempt import FITTED_ONCE, SEARCHED, TRACED, Attempt, Case, PriorOf, Progress, State, Step
-from sms_online.diagnosis.calibrated import SAYABLE
+from sms_online.diagnosis.calibrated import sayable
 from sms_online.diagnosis.candidate import Finding, Ranked
 from sms_online.diagnosis.constants import stands
 from sms_online.diagnosis.hypothesis import corrections, share_left, verdict
@@ -159,12 +159,13 @@ def diagnose(
     holdout: Sequence[Block] = (),
     progress: Progress = lambda what, share: None,
     stop: Callable[[], bool] = lambda: False,
+    learned: bool = False,
 ) -> Diagnosis:
     """Trace what a capture holds beyond its description, adopt it and fit again.
 
     blocks: samples of the capture; holdout: those of another one of the same rig, to check on. progress: see
-    `Progress`. stop: whether to end with what has been found so far. Raises InputError where a channel is missing or
-    there is too little motion for any row.
+    `Progress`. stop: whether to end with what has been found so far. learned: whether curves are tried where no law is
+    selected. Raises InputError where a channel is missing or there is too little motion for any row.
     """
     what = "fitting the model as described"
     clock = wrong_clock(system, np.concatenate([block.t for block in blocks]))
@@ -190,7 +191,7 @@ def diagnose(
         expected = "a part without it: -ss or -to"
         raise InputError(source, f"{event.time:.2f} s", f"an event ({event.kind}) within the capture", expected)
     held = _session(system, holdout, source, prior)[1].segments() if holdout else []
-    case = Case(source, before, before.momentum.sensor_noise, record.segments(), held, prior, progress, stop)
+    case = Case(source, before, before.momentum.sensor_noise, record.segments(), held, prior, progress, stop, learned)
     progress("tracing what it leaves", FITTED_ONCE)
     try:
         attempt = described = Attempt(case, system)
@@ -267,7 +268,7 @@ def diagnose(
 def _miscalibrated(session: Estimator) -> tuple[Calibration, ...]:
     """What a session's description is off by beyond its tolerances, and no effect of the catalogue says."""
     every = Evaluation(Statistics.of(session), session.estimate()).calibration
-    return tuple(each for each in every if each.beyond and each.name not in SAYABLE)
+    return tuple(each for each in every if each.beyond and each.name not in sayable(session.system))
 
 
 def _check_measured(session: Estimator, source: str) -> None:

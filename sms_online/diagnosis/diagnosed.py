@@ -16,9 +16,11 @@ from sms_online.diagnosis.diagnose import Diagnosis as Search
 from sms_online.diagnosis.diagnose import diagnose as search_for_effects
 from sms_online.diagnosis.document import diagnosis_document, trust_of
 from sms_online.diagnosis.mistakes import Mistake
+from sms_online.effects.build import build_model
 from sms_online.errors import InputError
+from sms_online.model.base_parameters import find_base_parameters
 from sms_online.pipeline.estimator import Estimator
-from sms_online.priors import base_prior
+from sms_online.priors import base_prior, with_estimates
 from sms_online.result import Finding, Parameter, Parameters
 from sms_online.session import Data, recorded_session
 from sms_online.stream import Block
@@ -79,7 +81,8 @@ class Diagnosis(Documented):
     verdict: "clean", "named" or "unexplained". summary: the same in a sentence. mistakes: of units, signs and wiring,
     undone in what follows. effects: what was found. before, after:
     fits of the system as described and with what was found. candidates: effects that were tried, the best first.
-    system: with what was found, to estimate with. trust: may the parameters after, and the system file, be trusted.
+    system: with what was found and the parameters after as its fitted values, to estimate with, predict and simulate.
+    trust: may the parameters after, and the system file, be trusted.
     warnings: a sentence each.
     """
 
@@ -130,13 +133,15 @@ def diagnose(
     prior: bool = False,
     progress: Callable[[str, float], None] = lambda what, share: None,
     stop: Callable[[], bool] = lambda: False,
+    learned: bool = False,
 ) -> Diagnosis:
     """Find what recorded data hold that a system file does not describe, and describe it.
 
     system, data: as for `estimate`. holdout: another capture of the same rig, to check on; without it blocks of the
     data, each predicted from the others. prior: start from nominal values, each ± 10 %. progress: is called with what
     is being done, a few words, and the share of all that is done, roughly. stop: is asked between steps whether to end
-    with a partial verdict. Raises InputError where the data cannot be read or do not fit the system, a coordinate is
+    with a partial verdict. learned: whether a curve may be named where no law of the catalogue is.
+    Raises InputError where the data cannot be read or do not fit the system, a coordinate is
     not measured, parameters jump within the capture, or there is too little motion.
     """
     system, folder = given_system(system)
@@ -155,18 +160,21 @@ def diagnose(
     def known(estimator: Estimator) -> Prior | None:
         return base_prior(system, estimator.base, prior) if prior or system.priors else None
 
-    found = search_for_effects(system, blocks, recorded.name, known, held, progress, stop)
+    found = search_for_effects(system, blocks, recorded.name, known, held, progress, stop, learned)
     true = None if recorded.truth is None else true_values(recorded.truth, system, found.after.system)
     document = diagnosis_document(found, warnings, true)
+    after = Fit._of(document["after"])
+    described = found.after.system
+    base = find_base_parameters(build_model(described))
     return Diagnosis(
         verdict=found.verdict,
         summary=document["summary"],
         mistakes=found.mistakes,
         effects=tuple(map(Finding.of, document["effects"])),
         before=Fit._of(document["before"]),
-        after=Fit._of(document["after"]),
+        after=after,
         candidates=tuple(Candidate(**candidate) for candidate in document["candidates"]),
-        system=found.after.system,
+        system=with_estimates(described, base, after.parameters),
         trust=trust_of(found),
         warnings=tuple(document["warnings"]),
         search=found,

@@ -8,15 +8,16 @@ from typing import Any
 
 import numpy as np
 
+from sms_online.description.schema import Effect
 from sms_online.diagnosis.attempt import Attempt, Part
 from sms_online.diagnosis.candidate import Finding
 from sms_online.diagnosis.diagnose import Diagnosis
 from sms_online.diagnosis.hypothesis import LARGEST_SHARE_LEFT
 from sms_online.diagnosis.reported import Coefficients, of_constant, of_unknowns
 from sms_online.diagnosis.shape import slopes
-from sms_online.effects.catalogue import ENTRIES, declarable
+from sms_online.effects.catalogue import ENTRIES, declarable, either, in_words, traits_of
 from sms_online.evaluation import NORMAL_95, Evaluation, identifiable
-from sms_online.judgement import Facts, judge, judge_diagnosis
+from sms_online.judgement import Facts, judge, judge_diagnosis, undecided
 from sms_online.model.parameters import Parameter
 from sms_online.pipeline.estimator import Estimator
 from sms_online.pipeline.statistics import Statistics
@@ -136,9 +137,9 @@ def trust_of(diagnosis: Diagnosis, after: Evaluation | None = None) -> Trust:
         off = tuple(Reason(f"{each}: beyond its tolerance", False, then=each.advice) for each in diagnosis.calibration)
         return rest if rest.level != "trust" else Trust("doubt", off)
     if not diagnosis.mistakes:
-        return judge_diagnosis(diagnosis.verdict, effects, row, rest, _near(diagnosis))
+        return judge_diagnosis(diagnosis.verdict, effects, row, rest, _near(diagnosis), _undecided(diagnosis))
     if effects or row is not None:
-        rest = judge_diagnosis(diagnosis.verdict, effects, row, rest, _near(diagnosis))
+        rest = judge_diagnosis(diagnosis.verdict, effects, row, rest, _near(diagnosis), _undecided(diagnosis))
     # The numbers are those of corrected samples: as recorded, or as described, they would be wrong without limit.
     wrong = [Reason(m.sentence, True, tuple(m.where.split(", ")), "a mistake", then=m.step) for m in diagnosis.mistakes]
     return Trust("doubt", (*wrong, *(rest.grounds if rest.level != "trust" else ())), grave=True)
@@ -167,7 +168,7 @@ def _of_effects(diagnosis: Diagnosis) -> str:
     if diagnosis.verdict == "unexplained" and diagnosis.unexplained is None:
         reason = _after(diagnosis, evaluation(diagnosis.estimator_after)).reasons[0]
         return f"No effect of the catalogue is seen in what the rows leave, but {reason}."
-    keys = [f"{effect['name']} at {effect['where']}" for effect in _named(diagnosis)]
+    keys = [_named_in_words(diagnosis, effect) for effect in _named(diagnosis)]
     before, after = diagnosis.before.holdout.whitened, diagnosis.after.holdout.whitened
     row = max(before, key=lambda name: before[name] ** 2 - after[name] ** 2)
     fall = f"from {_times(before[row])} to {_times(after[row])} times noise"
@@ -205,6 +206,11 @@ def _named(diagnosis: Diagnosis) -> list[dict[str, str]]:
     return [{"name": each["name"], "where": each["where"]} for each in _by_comparison(diagnosis)] + found
 
 
+def _named_in_words(diagnosis: Diagnosis, named: Mapping[str, str]) -> str:
+    other = either(Effect(name=named["name"], where=named["where"]), diagnosis.after.system)
+    return f"{named['name']} at {named['where']}" + (f" or {other}" if other else "")
+
+
 def _part(part: Part) -> dict[str, Residual]:
     return {row: Residual(part.relative.get(row), whitened) for row, whitened in part.whitened.items()}
 
@@ -213,7 +219,8 @@ def _effect(diagnosis: Diagnosis, finding: Finding) -> dict[str, Any]:
     effect = finding.candidate.effect
     entry, found = ENTRIES[effect.name], coefficients(diagnosis, finding)
     units = declarable(entry, diagnosis.after.system)
-    alike = [*([f"{effect.name}@{entry.relative_to}"] if entry.relative_to else []), *finding.ambiguous]
+    other = either(effect, diagnosis.after.system)
+    alike = [*([f"{effect.name}@{other}"] if other else []), *finding.ambiguous]
     units |= {p.quantity: p.unit for p in finding.candidate.parameters if p.quantity in units}
     return {
         "name": effect.name,
@@ -221,7 +228,7 @@ def _effect(diagnosis: Diagnosis, finding: Finding) -> dict[str, Any]:
         "coefficients": {
             name: {"estimate": value, "std": std, "unit": units.get(name, "")} for name, (value, std) in found.items()
         },
-        "sentence": entry.said(effect.where, {name: value for name, (value, _) in found.items()}) if entry.said else "",
+        "sentence": _said(diagnosis, effect, found),
         "ambiguous_with": alike,
         "separated_by": entry.separated_by if alike else None,
         "evidence": {
@@ -232,6 +239,35 @@ def _effect(diagnosis: Diagnosis, finding: Finding) -> dict[str, Any]:
             "next_held_out_improvement": None if finding.rival is None else finding.rival.improvement,
         },
     }
+
+
+def _said(diagnosis: Diagnosis, effect: Effect, found: Coefficients) -> str:
+    if traits_of(effect).learned:
+        return _curve_in_words(diagnosis, effect)
+    return in_words(effect, diagnosis.after.system, {name: value for name, (value, _) in found.items()})
+
+
+def _curve_in_words(diagnosis: Diagnosis, curve: Effect) -> str:
+    """What a curve takes off the torque of its joint, blocks predicted from the others."""
+    relative = [diagnosis.before.holdout.relative, *(step.relative for step in diagnosis.steps)]
+    taken = [step.taken for step in diagnosis.steps].index(f"{curve.name}@{curve.where}")
+    before, after = (relative[k].get(curve.where, 0.0) for k in (taken, taken + 1))
+    over = f"this curve over the {curve.over} of {curve.where}"
+    return (
+        f"no known law; {over} takes what is left of the torque from {100.0 * before:.2g} % to {100.0 * after:.2g} % "
+        "on data it has not seen"
+    )
+
+
+def _undecided(diagnosis: Diagnosis) -> list[Reason]:
+    """What was found that may as well be the other way elsewhere."""
+    system = diagnosis.after.system
+    found = [(finding, either(finding.candidate.effect, system)) for finding in diagnosis.findings]
+    return [
+        undecided(_said(diagnosis, f.candidate.effect, coefficients(diagnosis, f)), f.candidate.effect.where, other)
+        for f, other in found
+        if other
+    ]
 
 
 def _by_comparison(diagnosis: Diagnosis) -> list[dict[str, Any]]:

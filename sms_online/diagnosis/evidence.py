@@ -7,9 +7,12 @@ the likelihood ratio, a χ² with as many degrees of freedom as Z⊥ has columns
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import solve_triangular
 from scipy.stats import chi2
 
 from sms_online.stream import Array
@@ -19,6 +22,8 @@ from sms_online.trackers.interface import Prior
 FREE = 1e-5
 # Singular values below this share of the largest, of columns scaled to unit length, are not solved for.
 RANK_TOLERANCE = 1e-10
+# Solutions by parts of one factorisation are right to 1e-10 where no direction is smaller than this.
+WELL_CONDITIONED = 1e-6
 
 
 def basis(columns: Array) -> Array:
@@ -58,6 +63,31 @@ def together(columns: Array, b: Array, prior: Prior | None) -> Array:
     left = b - columns[..., known] @ solution[known]
     solution[~known] = least_squares(columns[..., ~known].reshape(b.size, -1), left.ravel())
     return solution
+
+
+def least_squares_without(columns: Array, b: Array, left_out: Sequence[NDArray[np.bool_]]) -> Array:
+    """Solutions (B, n) for columns (M, n) and b (M,) without each of some sets of rows (M,), from one factorisation.
+
+    Where columns are nearly dependent, or are so without a set, each is solved for itself. Source: the block form of
+    leaving one out, Cook and Weisberg, Residuals and Influence in Regression, 1982, section 3.6.
+    """
+    size = np.linalg.norm(columns, axis=0)
+    size[size == 0.0] = 1.0
+    Q, R = np.linalg.qr(columns / size)
+    n, diagonal = columns.shape[1], np.abs(np.diag(R))
+    if len(columns) < n or diagonal.min(initial=np.inf) <= WELL_CONDITIONED * diagonal.max(initial=0.0):
+        return np.array([least_squares(columns[~each], b[~each]) for each in left_out])
+    along = Q.T @ b
+    residual, out = b - Q @ along, np.empty((len(left_out), n))
+    for k, each in enumerate(left_out):
+        own = Q[each]
+        kept = np.eye(n) - own.T @ own
+        if np.linalg.eigvalsh(kept)[0] <= WELL_CONDITIONED:
+            out[k] = least_squares(columns[~each], b[~each])
+            continue
+        moved = along - np.linalg.solve(kept, own.T @ residual[each])
+        out[k] = solve_triangular(R, moved) / size
+    return out
 
 
 @dataclass(frozen=True)

@@ -121,6 +121,8 @@ def _variable(attempt: Attempt, i: int, name: str, order: float) -> Variable:
                 return motion.v[:, motor]
             case "deflection":
                 return position(layout, motion.x, motor) - position(layout, motion.x, link)
+            case "motor angle":
+                return position(layout, motion.x, motor)
             case "torque":
                 return motion.torque[:, i]
         return np.mod(order * gear * position(layout, motion.x, motor), 2.0 * np.pi)

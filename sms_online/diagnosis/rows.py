@@ -183,7 +183,7 @@ class SessionRows(WeakRows):
         stacked = np.array(responses).reshape(self.count, len(DISPLACEMENTS), model.layout.n_v, -1)
         self.responses = dict(zip(DISPLACEMENTS, np.moveaxis(stacked, 1, 0), strict=True))
         of_calibration = np.array(columns).reshape(self.count, model.layout.n_v, calibration.count)
-        self.calibrated = Calibrated.of(nuisances(sensing), of_calibration)
+        self.calibrated = Calibrated.of(nuisances(sensing), of_calibration, model.system)
         self.have_noise(covariances)
 
     def _second_order(self) -> SecondOrderNoise:

@@ -27,6 +27,8 @@ SAME_SHARE = 0.03
 DECISIVE = 10.0
 # Share of what an effect explains that one that is like it explains of that.
 SAME_PART = 0.5
+# A curve is as smooth as leaves at most this multiple of what the best leaves of held-out rows.
+HARDLY_MORE = 1.02
 # Dry friction is told by what it leaves open where its axis stands still for at least this share of a session.
 MUCH_REST = 0.05
 # Laws of it that are compared, with their shape constants, those that explain most.
@@ -57,6 +59,16 @@ class Tracing(Acceptance):
         best = max(allowed, key=lambda k: excess[k])
         near = [k for k in allowed if excess[k] > 0.0 and self._near(gains[k].gain, gains[best].gain)]
         return min(near, key=lambda k: (self._constants(k), -gains[k].gain))
+
+    def _curve(self, chosen: Sequence[int], gains: Sequence[Gain], allowed: Sequence[int]) -> int | None:
+        """The curve that leaves least of held-out rows, or one with fewer coefficients that leaves hardly more."""
+        left = {
+            k: 1.0 - self.improvement(chosen, k).share
+            for k in allowed
+            if self.candidates[k].traits.learned and self._excess(k, gains[k]) > 0.0
+        }
+        near = [k for k in left if left[k] <= HARDLY_MORE * min(left.values())]
+        return min(near, key=lambda k: (len(self.candidates[k].parameters), left[k]), default=None)
 
     @staticmethod
     def _near(one: float, best: float) -> bool:
@@ -106,11 +118,14 @@ class Tracing(Acceptance):
         useless: set[str] = set()
         while len(chosen) < MOST_EFFECTS and not watch(chosen):
             gains, eligible = self.gains(chosen), self._eligible(chosen, self._refused | useless)
-            best = self._preferred(gains, [k for k in eligible if self.candidates[k].extends is None])
-            best = self._preferred(gains, eligible) if best is None else best
+            laws = [k for k in eligible if not self.candidates[k].traits.learned]
+            # Simple laws first, then those that refine them, and curves where no law is of use.
+            best = self._preferred(gains, [k for k in laws if self.candidates[k].extends is None])
+            best = self._preferred(gains, laws) if best is None else best
+            best = self._curve(chosen, gains, eligible) if best is None else best
             if best is None:
                 break
-            law = self._holding(chosen, best, gains, eligible)
+            law = self._holding(chosen, best, gains, laws)
             if law is None and not self.improves(chosen, best):
                 useless.add(self.candidates[best].key)
                 continue
@@ -157,14 +172,25 @@ class Tracing(Acceptance):
         laws = sorted((k for k in beside if self._holds(k)), key=lambda k: -gains[k].gain)[:RIVALS]
         if not laws:
             return None
-        told = {k: self._deviance([*chosen, k]) for k in laws}
-        law = min(laws, key=lambda k: told[k])
-        others = [self._deviance(each) for each in ([*chosen, best], chosen) if law not in each]
-        self._deviance([*chosen, law])
-        # Where rows leave more than noise whatever is added, any large variance at rest would make them likelier.
-        explained = not np.any(self.floor[self._acts(law)])
+        told = {}
+        for k in laws:
+            self._iterated([*chosen, k])
+            # Where rows leave more than noise whatever is added, any large variance at rest would make them likelier.
+            if not np.any(self.floor[self._acts(k)]):
+                told[k] = self._deviance([*chosen, k])
+        found = None
+        if told:
+            law = min(told, key=lambda k: told[k])
+            others = [self._deviance(each) for each in ([*chosen, best], chosen) if law not in each]
+            found = law if told[law] < min(others) - DECISIVE else None
         self.settle(chosen)
-        return law if explained and told[law] < min(others) - DECISIVE else None
+        return found
+
+    def _iterated(self, chosen: Sequence[int]) -> None:
+        """Weigh the rows for those chosen until the weights are those of their coefficients."""
+        for _ in range(ROUNDS):
+            if not self.settle(chosen):
+                break
 
     def _holds(self, k: int) -> bool:
         candidate = self.candidates[k]
@@ -175,9 +201,7 @@ class Tracing(Acceptance):
 
         Fitted to the other windows; what is left open goes with the coefficients from all of them.
         """
-        for _ in range(ROUNDS):
-            if not self.settle(chosen):
-                break
+        self._iterated(chosen)
         columns, deviance = self._columns(chosen), np.log(self.rows.white_std) * 2.0
         total = 0.0
         for k, solution in enumerate(self.solutions(chosen)):
@@ -221,7 +245,7 @@ class Tracing(Acceptance):
             others = [other for other in chosen if other != k]
             gains = self.gains(others)
             # What refines a law is a step of its own, and in place of no other effect.
-            simple = [j for j in self._eligible(others, self._refused) if j == k or self.candidates[j].extends is None]
+            simple = [j for j in self._eligible(others, self._refused) if j == k or self._simple(j, k)]
             best = self._preferred(gains, [*simple, k] if k not in simple else simple)
             if best is None or self._excess(k, gains[k]) <= 0.0:
                 chosen = chosen if k == last or k in self._held else others
@@ -233,6 +257,11 @@ class Tracing(Acceptance):
             ):
                 chosen = [best if other == k else other for other in chosen]
         return chosen
+
+    def _simple(self, j: int, k: int) -> bool:
+        """Whether a candidate may take the place of another: no refinement of a law, and a curve that of itself."""
+        one, other = self.candidates[j], self.candidates[k]
+        return one.extends is None and (not one.traits.learned or one.key == other.key)
 
     def finding(self, chosen: Sequence[int], k: int) -> Finding:
         """What is to be said of one of the candidates chosen."""
@@ -251,6 +280,7 @@ class Tracing(Acceptance):
             # A law and what refines it are no rivals.
             if candidate.key not in taken | {found.extends}
             and candidate.extends != found.key
+            and (found.traits.learned or not candidate.traits.learned)
             and gains[j].seen
             # What its own noise hides has no rivals to compare it with.
             and own.gain > limit
@@ -260,7 +290,7 @@ class Tracing(Acceptance):
         )
         acts, known = self._acts(k), {*taken, *ambiguous}
         beside = (j for j, g in enumerate(gains) if g.gain > 0.0 and np.any(acts & self._acts(j)))
-        rivals = [j for j in beside if self.candidates[j].key not in known]
+        rivals = [j for j in beside if self.candidates[j].key not in known and not self.candidates[j].traits.learned]
         nearest = max(rivals, key=lambda j: gains[j].gain, default=None)
         rival = None
         if nearest is not None:

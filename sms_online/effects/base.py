@@ -6,13 +6,13 @@ Stribeck velocity, a gap) enter nonlinearly and are fixed when the effect is bui
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import ClassVar, Literal
 
 import numpy as np
 
-from sms_online.description.schema import Effect, System
+from sms_online.description.schema import Effect, Over, System
 from sms_online.effects.traits import Traits
 from sms_online.model.chain import Chain
 from sms_online.model.effect import ForceEffect, Inputs
@@ -67,7 +67,9 @@ class Entry:
     coefficients: those that may be declared and are reported, name to unit ("": a ratio); on a prismatic joint m stands
     for rad and N for N m. separated_by: the motion that tells it from its look-alikes. shapes: shape constants.
     further: coefficients that may be declared but are not reported. relative_to: place that coefficients are relative
-    to, so that as much the other way there is the same. said: the finding in words, of its place and coefficients.
+    to where no parameter is known, so that as much the other way there is the same. said: the finding in words, of its
+    place and coefficients. over: variables that a curve of it may be over, with its traits there. forms: of a curve,
+    the declarations to try, of one at a place and the values (K,) that its variables go through in a session.
     """
 
     name: str
@@ -80,6 +82,8 @@ class Entry:
     traits: Traits = field(default_factory=Traits)
     relative_to: str = ""
     said: Callable[[str, Mapping[str, float]], str] | None = None
+    over: Mapping[Over, Traits] = field(default_factory=dict)
+    forms: Callable[[Effect, Mapping[str, Array]], Iterator[Effect]] | None = None
 
     @property
     def change(self) -> str:
@@ -93,14 +97,19 @@ class Site:
     """Where an effect sits.
 
     index: number of the joint or link, from 1; 0 elsewhere. weight: x (B, n_x) to the generalized forces (B, n_v, 2) of
-    1 m/s² of gravity along inertial x and y on every mass.
+    1 m/s² of gravity along inertial x and y on every mass. declared: the effect as a system file declares it.
     """
 
     system: System
     chain: Chain
-    where: str
+    declared: Effect
     index: int
     weight: Callable[[Array], Array]
+
+    @property
+    def where(self) -> str:
+        """Its place."""
+        return self.declared.where
 
     @property
     def prismatic(self) -> bool:
@@ -178,6 +187,10 @@ class Force:
     def power(self, layout: Layout, x: Array, v: Array, inputs: Inputs | None) -> Array:
         """-f · v."""
         return np.asarray(-np.einsum("bvn,bv->bn", self.force(layout, x, v, inputs), v))
+
+    def beyond(self, layout: Layout, x: Array, v: Array) -> str:
+        """Where a motion goes beyond what the force is known for, in a sentence: nowhere, for a law."""
+        return ""
 
     def state_rate(self, layout: Layout, x: Array, v: Array, z: Array) -> Array:
         """No states, no rates."""

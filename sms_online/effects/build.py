@@ -65,7 +65,7 @@ def build_effects(
             continue  # the links are exact already
         check_effect(system, effect, f"effect {k}", system.name)
         numbered = NUMBERED.fullmatch(effect.where)
-        site = Site(system, chain, effect.where, int(numbered[1]) if numbered else 0, weight)
+        site = Site(system, chain, effect, int(numbered[1]) if numbered else 0, weight)
         given = with_shapes(effect, system).coefficients
         if effect.name in FORCE_CLASSES:
             forces.append(FORCE_CLASSES[effect.name](site, given))

@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable, Mapping
 from fnmatch import fnmatchcase
+from itertools import pairwise
 
 from sms_online.description.channels import channels, drive_channels, has_motor_side, strain_channel
 from sms_online.description.explain import hint, nearest
@@ -23,9 +24,11 @@ from sms_online.effects.friction import (
     StribeckFriction,
     ViscousFriction,
 )
+from sms_online.effects.learned import LearnedForce
 from sms_online.effects.link import SEPARATED_BY, LinkDamping, LinkMassDamping
 from sms_online.effects.payload import TipPayload
 from sms_online.effects.spacecraft import AirDrag, CableSpring, ReactionWheel, Slosh, TableTilt, ThrusterLeak
+from sms_online.effects.traits import Traits
 from sms_online.effects.transmission import Backlash, CubicStiffness, KinematicError, TorsionalHysteresis
 from sms_online.errors import InputError
 from sms_online.model.effect import ForceEffect, InertiaEffect
@@ -34,6 +37,7 @@ FORCES = (
     CoulombFriction, ViscousFriction, StribeckFriction, LoadFriction, DirectionFriction, TorsionalHysteresis,
     CubicStiffness, Backlash, KinematicError, Cogging, TorqueRipple, LinkDamping, LinkMassDamping, ReactionWheel,
     ThrusterLeak, TableTilt, AirDrag, CableSpring, Slosh, TorqueGain, TorqueOffset,
+    LearnedForce,
 )  # fmt: skip
 CHANNELS = (EncoderOffset, EncoderEccentricity, SensorLag, TorqueDelay)
 INERTIAS = (TipPayload,)
@@ -56,6 +60,9 @@ _CHANNELS: dict[str, Callable[[str, Mapping[str, float]], ChannelEffect]] = {eac
 LINEAR: dict[str, tuple[Linear, ...]] = {each.entry.name: each.linear for each in CHANNELS}
 CONSTANTS: dict[str, type[Constant]] = {each.entry.name: each for each in _CLASSES if issubclass(each, Constant)}
 # Tried at any joint where something changes while a session runs.
+# Fewest knots of a curve, two of them its ends; and variables of joints with a spring.
+LEAST_KNOTS = 3
+OF_SPRINGS = ("deflection", "load")
 BEGINNING = tuple(sorted(entry.name for entry in ENTRIES.values() if entry.traits.begins))
 
 
@@ -114,6 +121,7 @@ def check_effect(system: System, effect: Effect, place: str, source: str) -> Non
     if not any(matching(each, effect.where) for each in allowed):
         expected = f"one of {', '.join(allowed)}" if allowed else f"a system with a {entry.at}"
         raise InputError(source, place, f"{effect.name} at {effect.where!r}", expected)
+    _check_curve(system, effect, place, source)
     known = declarable(entry, system)
     for name, value in effect.coefficients.items():
         if name not in known:
@@ -123,6 +131,36 @@ def check_effect(system: System, effect: Effect, place: str, source: str) -> Non
             raise InputError(source, place, f"{name} = {value:g} of {effect.name}", "a number greater than 0")
         if name == "time" and effect.name == TorqueDelay.entry.name and not 0.0 <= value <= LONGEST_DELAY:
             raise InputError(source, place, f"{name} = {value:g} s of {effect.name}", f"0 to {LONGEST_DELAY:g} s")
+
+
+def _check_curve(system: System, effect: Effect, place: str, source: str) -> None:
+    """InputError on a variable or knots of what is no curve, or of one that cannot be."""
+    over = ENTRIES[effect.name].over
+    if not over:
+        if effect.over is not None or effect.knots:
+            raise InputError(source, place, f"over or knots of {effect.name}", "neither: it is a law")
+        return
+    if (effect.over is None) == bool(effect.knots):
+        raise InputError(source, place, f"over or knots of {effect.name} without the other", "both, or neither")
+    known = curve_variables(system, effect)
+    if effect.over is not None and effect.over not in known:
+        expected = f"one of {', '.join(known)}"
+        raise InputError(source, place, f"{effect.name} over {effect.over!r} of {effect.where}", expected)
+    if effect.knots and (len(effect.knots) < LEAST_KNOTS or any(b <= a for a, b in pairwise(effect.knots))):
+        expected = f"{LEAST_KNOTS} or more, ascending"
+        raise InputError(source, place, f"knots {list(effect.knots)} of {effect.name}", expected)
+
+
+def curve_variables(system: System, effect: Effect) -> tuple[str, ...]:
+    """What a curve of an effect may be over at its joint; one without a spring has neither deflection nor load."""
+    joint = system.joints[int(effect.where.removeprefix("joint_")) - 1]
+    return tuple(over for over in ENTRIES[effect.name].over if has_motor_side(joint) or over not in OF_SPRINGS)
+
+
+def traits_of(effect: Effect) -> Traits:
+    """Traits of an effect, those of its variable where it is a curve."""
+    entry = ENTRIES[effect.name]
+    return entry.traits if effect.over is None else entry.over[effect.over]
 
 
 def with_shapes(effect: Effect, system: System) -> Effect:
@@ -206,6 +244,20 @@ def periods(effect: Effect) -> float | None:
     """Periods that an effect has in a motor's turn, None where it has none."""
     counted = (name for name, shape in ENTRIES[effect.name].shapes.items() if shape.counted)
     return next((effect.coefficients[name] for name in counted if name in effect.coefficients), None)
+
+
+def either(effect: Effect, system: System) -> str:
+    """The place where as much the other way is the same; empty where an effect is of its own place alone."""
+    return ENTRIES[effect.name].relative_to if system.scale_tolerance is not None else ""
+
+
+def in_words(effect: Effect, system: System, coefficients: Mapping[str, float]) -> str:
+    """An effect with these coefficients as a sentence; empty where the catalogue has none."""
+    said, other = ENTRIES[effect.name].said, either(effect, system)
+    if said is None:
+        return ""
+    words = said(effect.where, coefficients)
+    return f"{words} against {other}'s: which is right the data cannot decide" if other else words
 
 
 # Channels that come together, beside those of a link's markers.

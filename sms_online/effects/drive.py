@@ -108,14 +108,14 @@ class TorqueOffset(MotorSide):
 
 def _gain_in_words(where: str, given: Mapping[str, float]) -> str:
     ratio = given["ratio"]
-    reads = f"{where}'s torque reads {100.0 * abs(ratio):.2g} % {'low' if ratio > 0.0 else 'high'} against joint_1's"
-    return f"{reads}; which of them is right the data cannot decide"
+    return f"{where}'s torque reads {100.0 * abs(ratio):.2g} % {'low' if ratio > 0.0 else 'high'}"
 
 
 class TorqueGain(MotorSide):
     """The arm feels (1 + g) n τ where n τ is measured; g: `ratio`.
 
-    Limitations: a gain common to all joints only rescales π, so it is relative to joint 1, which has none.
+    Limitations: a gain common to all joints only rescales π, so it is relative to joint 1, which has none. Where a
+    parameter is known, the gains of all joints are matters of calibration.
     """
 
     entry = Entry(

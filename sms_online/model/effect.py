@@ -56,6 +56,9 @@ class ForceEffect(Protocol):
     def power(self, layout: Layout, x: Array, v: Array, inputs: Inputs | None) -> Array:
         """Power (B, coefficients) that one unit of each coefficient takes out, W."""
 
+    def beyond(self, layout: Layout, x: Array, v: Array) -> str:
+        """Where a motion x (B, n_x), v (B, n_v) goes beyond what the force is known for; empty where it does not."""
+
     def state_rate(self, layout: Layout, x: Array, v: Array, z: Array) -> Array:
         """ż (B, n_states) of the internal states z (B, n_states)."""
 

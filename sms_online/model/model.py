@@ -19,7 +19,14 @@ from sms_online.model.effect import EffectsOf, ForceEffect, InertiaEffect, Input
 from sms_online.model.flexible import ShapeRate
 from sms_online.model.inertia import BodyTerm, LinkMotion, LinkTerm, Term, convective
 from sms_online.model.layout import Layout, build_layout
-from sms_online.model.parameters import InertialParameter, Parameter, motor, rigid_body, rigidity_parameter
+from sms_online.model.parameters import (
+    InertialParameter,
+    Parameter,
+    motor,
+    rigid_body,
+    rigidity_parameter,
+    with_fitted,
+)
 from sms_online.model.projection import project
 from sms_online.model.springs import QuadraticForms, Spring
 from sms_online.stream import Array
@@ -75,8 +82,8 @@ class Model:
             self.state_slices.append(slice(self.n_states, self.n_states + effect.n_states))
             self.n_states += effect.n_states
         self.needs_torque = any(effect.needs_torque for effect in self.effects)
-        self.parameters = tuple(parameters)
-        self.nominal = np.array([p.nominal for p in parameters])
+        self.parameters = with_fitted(parameters, system)
+        self.nominal = np.array([p.nominal for p in self.parameters])
         self.reference = self.nominal if reference is None else reference
 
     def _add_bodies(self, parameters: list[Parameter]) -> None:

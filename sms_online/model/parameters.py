@@ -6,11 +6,14 @@ formed.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
+from sms_online.description.explain import hint, nearest
 from sms_online.description.schema import FlexibleLink, Inertia, RigidBody, System
+from sms_online.errors import InputError
 from sms_online.model.so3 import skew
 from sms_online.stream import Array
 
@@ -145,3 +148,14 @@ def rigidity_parameter(i: int, rigidity: str, link: FlexibleLink, planar: bool) 
     symbol = RIGIDITIES[rigidity] if planar or rigidity != "flexural_rigidity_z" else "EI_z"
     unit = "N" if rigidity == "axial_rigidity" else "N m²"
     return Parameter(f"link_{i}.{name}", f"{symbol}_{i}", unit, getattr(link, rigidity))
+
+
+def with_fitted(parameters: Sequence[Parameter], system: System) -> tuple[Parameter, ...]:
+    """The parameters with the nominal values that a system states as fitted; InputError on an unknown name."""
+    names = [parameter.name for parameter in parameters]
+    for name in system.fitted:
+        if name not in names:
+            expected = f"the name of a parameter of this system{hint(nearest(name, names))}"
+            raise InputError(system.name, f'fitted."{name}"', "no such parameter", expected)
+    fitted = system.fitted
+    return tuple(replace(p, nominal=fitted[p.name].value) if p.name in fitted else p for p in parameters)

@@ -8,17 +8,19 @@ from difflib import ndiff
 from typing import Any
 
 from sms_adapters.system_file import system_text
-from sms_online.description.schema import System
+from sms_online.description.schema import Fitted, System
 from sms_tools.found_effects import cells_of
 
 # Beside a recording, which holds the described system as system.toml.
 ONLINE_NAME = "adopted.toml"
+# The table of fitted values, or that of one of them.
+FITTED = re.compile(r"\s*\[fitted[\].]")
 
 
 def adopted_text(described: str, before: System, after: System, remarks: Mapping[str, str]) -> str:
     """TOML of the system `after`: the text of `described`, file or name of the system `before`, and what is new.
 
-    remarks: what to say of an effect, by name@where, for people: a session estimates what is no shape constant anew.
+    remarks: what to say of an effect, by name@where, for people.
     """
     lines = system_text(described).rstrip().splitlines()
     if after.gravity != before.gravity:
@@ -41,8 +43,13 @@ def adopted_text(described: str, before: System, after: System, remarks: Mapping
             if effect.coefficients:
                 inside = ", ".join(f"{name} = {value:.9g}" for name, value in effect.coefficients.items())
                 lines.append(f"coefficients = {{ {inside} }}")
+            if effect.over is not None:
+                lines.append(f'over = "{effect.over}"')
+                lines.append(f"knots = [{', '.join(f'{knot:.9g}' for knot in effect.knots)}]")
             if remark := remarks.get(f"{effect.name}@{effect.where}"):
                 lines.append(f"# found: {remark}")
+    if after.fitted != before.fitted:
+        _state_fitted(lines, after.fitted)
     return "\n".join(lines) + "\n"
 
 
@@ -57,6 +64,17 @@ def _state(lines: list[str], table: str, statement: str) -> None:
             lines[k] = statement
             return
     lines.insert(begin + 1, statement)
+
+
+def _state_fitted(lines: list[str], fitted: Mapping[str, Fitted]) -> None:
+    """Put a table [fitted] at the end of TOML lines, in place of what they hold of one."""
+    while (begin := next((k for k, line in enumerate(lines) if FITTED.match(line)), None)) is not None:
+        end = next((k for k in range(begin + 1, len(lines)) if lines[k].lstrip().startswith("[")), len(lines))
+        del lines[begin:end]
+    lines += ["", "[fitted] # nominal values from here on; with --prior, priors of these standard deviations"]
+    for name, found in fitted.items():
+        std = "" if found.std is None else f", std = {found.std:.3g}"
+        lines.append(f'"{name}" = {{ value = {found.value:.9g}{std} }}')
 
 
 def remarks(effects: Iterable[Mapping[str, Any]]) -> dict[str, str]:

@@ -265,6 +265,8 @@ def _add_diagnose(verbs: Verbs) -> None:
         "Without it blocks of time are held out in turn"
     )
     parser.add_argument("--holdout", metavar="CAPTURE", type=Path, help=text)
+    text = "where no law of the catalogue is selected, try curves over a joint's rate, angle, deflection and load"
+    parser.add_argument("--learn", action="store_true", help=text)
     _add_view(parser)
 
 

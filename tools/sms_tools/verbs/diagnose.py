@@ -60,6 +60,7 @@ def run(args: argparse.Namespace) -> int:
             prior=args.prior,
             progress=progress,
             stop=lambda: interruption.requested,
+            learned=args.learn,
         )
     document = found.document()
     view = None if args.rerun == "off" else _watched(args, system, found, capture, directory)
@@ -98,10 +99,12 @@ def _watched(args: argparse.Namespace, system: System, found: Diagnosis, capture
     """The session once more in view, with what was found; with it the first candidates' evidence, and the verdict."""
     document = found.document()
     # What is to be seen has been found already: no diagnosis runs beside it.
-    estimator = Estimator(found.system, capture.channels, str(args.capture))
+    # Estimated anew: what was fitted to these samples is nothing known of them beforehand.
+    after = found.search.after.system
+    estimator = Estimator(after, capture.channels, str(args.capture))
     estimates: dict[str, tuple[float, float]] = {}
     if found.search.attempt.prior is not None:
-        estimator.set_prior(base_prior(found.system, estimator.base, args.prior))
+        estimator.set_prior(base_prior(after, estimator.base, args.prior))
         # These come from the diagnosis's rows, not from a session; see `diagnosis_document`.
         estimates = {p.name: (p.value, p.std) for p in found.after.parameters.values()}
     with (
@@ -111,7 +114,7 @@ def _watched(args: argparse.Namespace, system: System, found: Diagnosis, capture
             estimator,
             capture.channels,
             directory,
-            None if capture.truth is None else true_values(capture.truth, system, found.system),
+            None if capture.truth is None else true_values(capture.truth, system, after),
             patient=True,
             exaggeration=args.exaggerate,
             diagnosed=Diagnosed(estimates, found.trust),

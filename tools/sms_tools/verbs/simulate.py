@@ -49,8 +49,11 @@ def run(args: argparse.Namespace) -> int:
         conserved = "not conserved here (fixed base, gravity, or effects on the base)"
         text = conserved if value is None else f"{value:.1e} of what base and arm exchange"
         lines.append(f"{what} momentum drift: {text}")
-    # As in what a diagnosis writes: the values of its effects are for the estimator to find.
-    idle = [e for e in build_model(described).effects if e.parameters and all(p.nominal == 0.0 for p in e.parameters)]
+    nominal = described.nominal
+    # As in what a running session writes: the values of its effects are for the estimator to find.
+    effects = build_model(described).effects
+    idle = [e for e in effects if e.parameters and not any(nominal[p.name] for p in e.parameters)]
     lines += [f"warning: {e.name}@{e.where} does nothing, for {args.system} states no size of it" for e in idle]
+    lines += [f"warning: {said}" for said in simulation.beyond]
     say(args, *lines, document=document)
     return OK
