@@ -369,7 +369,7 @@ class Evaluation:
         missing = ", ".join(setup.sensing.missing)
         if now.method == "smoother":
             if missing:
-                out.append(f"not measured, and told by the equations of motion: {missing}")
+                out.append(f"not measured, and estimated by the equations of motion: {missing}")
             if smoother.level > 0.0:
                 share = f"{100.0 * smoother.level:.2g} % of the usual ones"
                 out.append(

@@ -97,9 +97,9 @@ class Estimator(Stage):
         self._attitude = AttitudeContinuity()
         self._synchroniser = Synchroniser(self.sensing.channels, system.sample_rate)
         self._conditioning = Conditioning(system, self.sensing.channels)
-        layout = model.layout
-        # Positions choose the filter's width; torques pass the same filter for the sake of the lag.
-        self._rates = RatesStage(system.sample_rate, range(layout.n_x), self.sensing.noise)
+        # Positions choose the filter's width, as far as their noise is a sensor's; torques pass the same filter for the
+        # sake of the lag.
+        self._rates = RatesStage(system.sample_rate, *self.sensing.deciding)
         self._followed = FollowedStates(model, self.sensing, system.sample_rate)
         self._energy = EnergyBalance(model, base, system.sample_rate)
         # A balance of forces does not hold in a shape that is not the link's; energies bear it best.

@@ -19,8 +19,8 @@ from sms_online.linearised import Motion, linearise
 from sms_online.model.base_parameters import BaseParameters
 from sms_online.model.dynamics import Dynamics
 from sms_online.model.model import Model
+from sms_online.model.readings import Readings
 from sms_online.physical import PhysicalSet
-from sms_online.sensor_set import Readings
 from sms_online.smoother.collocation import defects, momenta_and_forces, transitions
 from sms_online.smoother.filter import FixedIntervalSmoother
 from sms_online.smoother.span import Innovations, Span, interpolated

@@ -10,12 +10,12 @@ from numpy.typing import NDArray
 
 from sms_online.model.base_parameters import BaseParameters
 from sms_online.model.model import Model
+from sms_online.model.readings import Readings, readable_channels
 from sms_online.physical import PhysicalSet
 from sms_online.pipeline.noise import noise_std
 from sms_online.pipeline.sensing import Sensing, stated_noise
 from sms_online.pipeline.sensor_noise import FEWEST_SAMPLES, SAMPLES
 from sms_online.pipeline.synchronise import GridSamples, Synchroniser
-from sms_online.sensor_set import Readings, readable_channels
 from sms_online.smoother.fit import DivergedError, SpanFit, SpanSmoother
 from sms_online.smoother.span import Span
 from sms_online.state import Stage, State
