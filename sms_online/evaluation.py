@@ -415,6 +415,10 @@ class Evaluation:
         coloured = {} if now.momentum is None else now.momentum.coloured
         out += [f"{channel}: noise is correlated over {1e3 * time:.2g} ms" for channel, time in coloured.items()]
         out += [f"{channel}: {count} outliers left out" for channel, (count, _) in now.outliers.items()]
+        out += [
+            f"{s.first} and {s.second} swapped from {s.begin:.3f} to {s.end:.3f} s: {s.samples} samples relabelled"
+            for s in now.swaps
+        ]
         out += self.unstated_latency
         if now.setup.unused:
             out.append(f"channels not used: {', '.join(now.setup.unused)}")

@@ -6,15 +6,33 @@ import numpy as np
 
 from sms_adapters.system_file import load_system
 from sms_online.description.markers import Marker
+from sms_online.description.parse import parse_system
 from sms_online.description.schema import FlexibleLink, Sensor, System, Tolerances
 from sms_online.stream import Array
 from sms_sim.bound import motion_bounds
 from sms_sim.simulate import Simulation
+from tests.one_link import TEXT
 
 CAMERA_RATE = 240.0  # Hz
 # Of each link: stations off the ends of its elements, the middle one beside the neutral axis.
 POSITIONS = ((0.35, 0.0, 0.0), (0.75, 0.03, 0.0), (1.15, 0.0, 0.0))
 SPATIAL_POSITIONS = ((0.35, 0.0, 0.05), (0.75, 0.06, -0.04), (1.15, -0.05, 0.02))
+
+
+MARKERS = """
+[[link_1.markers]]
+position = [0.3, 0.0, 0.0]
+
+[[link_1.markers]]
+name = "beside the tip"
+position = [1.0, 0.03, 0.0]
+"""
+
+
+def marked_bench(old: str = "", new: str = "") -> System:
+    """A bench of one link with two markers; a text of its description replaced."""
+    text = TEXT.replace("KINEMATICS", "linear").replace("marker_*.u_y", "marker_*.[xy]") + MARKERS
+    return parse_system(text.replace(old, new) if old else text, "one-link")
 
 
 def bound_of(simulation: Simulation) -> Array:

@@ -9,37 +9,21 @@ from numpy.testing import assert_allclose
 from sms_adapters.system_file import load_system
 from sms_online.description.channels import channels
 from sms_online.description.markers import Marker
-from sms_online.description.parse import parse_system
 from sms_online.description.schema import FlexibleLink, System
 from sms_online.effects.build import build_model
 from sms_online.errors import InputError
 from sms_online.model.model import Model
 from sms_online.model.points import LinkPoints
 from sms_online.model.readings import Readings, readable_channels
-from sms_online.pipeline.estimator import Estimator
 from sms_online.pipeline.sensing import Sensing
-from sms_online.stream import Array
 from sms_sim.plant import Plant
-from sms_sim.simulate import Simulation, sampled_blocks, simulate
-from tests.camera_rig import bound_of, seen_by_cameras
+from sms_sim.simulate import sampled_blocks, simulate
+from tests.camera_rig import bound_of, marked_bench, seen_by_cameras
 from tests.model_systems import random_states
-from tests.one_link import TEXT, one_link
+from tests.one_link import one_link
+from tests.sessions_of import normalised, session_of
 
-MARKERS = """
-[[link_1.markers]]
-position = [0.3, 0.0, 0.0]
-
-[[link_1.markers]]
-name = "beside the tip"
-position = [1.0, 0.03, 0.0]
-"""
 SYSTEMS = ("paper-planar", "paper-planar-exact", "spatial-two-link")
-
-
-def marked_bench(old: str = "", new: str = "") -> System:
-    """A bench of one link with two markers; a text of its description replaced."""
-    text = TEXT.replace("KINEMATICS", "linear").replace("marker_*.u_y", "marker_*.[xy]") + MARKERS
-    return parse_system(text.replace(old, new) if old else text, "one-link")
 
 
 def pointed(link: FlexibleLink, *positions: tuple[float, float, float]) -> FlexibleLink:
@@ -124,24 +108,10 @@ def test_a_static_shape_is_found_from_points_to_a_hundredth() -> None:
     assert_allclose(found, x, atol=0.01 * np.abs(x[0, 7:]).max())
 
 
-def session(system: System, simulation: Simulation, seed: int) -> Estimator:
-    blocks = list(sampled_blocks(Simulation(Plant(system), simulation.solution), None, seed))
-    estimator = Estimator(system, blocks[0].channels, "simulation")
-    for block in blocks:
-        estimator.push(block)
-    estimator.finish()
-    return estimator
-
-
-def normalised(estimator: Estimator) -> Array:
-    truth = estimator.base.values(estimator.model.nominal)
-    return np.asarray((estimator.estimate().pi - truth) / estimator.estimate().std)
-
-
 def test_one_link_is_identified_from_points_alone() -> None:
     system = marked_bench()
     simulation = simulate(system)
-    estimator = session(system, simulation, 0)
+    estimator = session_of(system, sampled_blocks(simulation, None, 0))
     assert estimator.by_smoother
     assert np.all(np.abs(normalised(estimator)) < 4.0)
     # The bound's step of 10 ms costs it some percent.
@@ -152,7 +122,7 @@ def test_one_link_is_identified_from_points_alone() -> None:
 def test_an_arm_of_two_links_is_identified_from_points_alone() -> None:
     system = seen_by_cameras("paper-planar")
     simulation = simulate(system)
-    estimator = session(system, simulation, 0)
+    estimator = session_of(system, sampled_blocks(simulation, None, 0))
     assert estimator.by_smoother
     assert np.all(np.abs(normalised(estimator)) < 4.0)
     assert np.all(estimator.estimate().std < 1.1 * bound_of(simulation))

@@ -74,7 +74,7 @@ class PointedShape:
     def coordinates(self, readings: Array, origin: Array, rotation: Array) -> Array:
         """q_f (B, n_f) for positions (B, n · axes), m, NaN where a marker is not seen.
 
-        origin (B, 3), m, rotation (B, 3, 3): of the link's frame {i}.
+        origin (B, 3), m, rotation (B, 3, 3): of the link's frame {i}. NaN where no marker is seen.
         """
         B, axes = len(readings), self._axes
         seen = np.zeros((B, readings.shape[1] // len(axes), 3))
@@ -92,4 +92,5 @@ class PointedShape:
             weighted = np.where(np.isnan(off)[..., None], 0.0, J) / self._sigma**2
             right = (weighted.swapaxes(1, 2) @ np.nan_to_num(off)[..., None])[..., 0] - z @ self._precision
             z += np.linalg.solve(weighted.swapaxes(1, 2) @ J + self._precision, right[..., None])[..., 0]
+        z[np.isnan(seen).all(axis=1)] = np.nan
         return z[:, : self._n_f]

@@ -219,12 +219,21 @@ class Sensing:
         first = len(self._base)
         return [(first + joint, first + len(self._q) + motor) for joint, motor in self._beyond]
 
-    def coordinates(self, values: Array) -> Array:
-        """Positions x (B, n_x) of samples (B, channels)."""
+    @property
+    def n_rigid(self) -> int:
+        """Number of positions of base and joints."""
+        return len(self._base) + len(self._q) + len(self._theta_m)
+
+    def rigid(self, values: Array) -> Array:
+        """Positions (B, n_rigid) of base and joints, the first of x, of samples (B, channels or more)."""
         q = values[:, self._q]
         for joint, motor in self._beyond:
             q[:, joint] += values[:, self._theta_m[motor]]
-        rigid = np.concatenate((values[:, self._base], q, values[:, self._theta_m]), axis=1)
+        return np.concatenate((values[:, self._base], q, values[:, self._theta_m]), axis=1)
+
+    def coordinates(self, values: Array) -> Array:
+        """Positions x (B, n_x) of samples (B, channels)."""
+        rigid = self.rigid(values)
         x = np.zeros((len(values), self.model.layout.n_x))
         x[:, : rigid.shape[1]] = rigid
         for i, (shape, columns) in self._links.items():

@@ -215,6 +215,11 @@ def _add_simulate(verbs: Verbs) -> None:
         "PARAMETER:half_life=20, and begin=SECONDS; may be repeated"
     )
     parser.add_argument("--drift", metavar="DRIFT", action="append", default=[], help=text)
+    text = (
+        "a fault of the cameras: missing@link_1.*:share=0.1, hidden@link_2.*:begin=8,over=2 or "
+        "swapped@link_1.marker_1+link_1.marker_2:begin=5,over=1; may be repeated"
+    )
+    parser.add_argument("--fault", metavar="FAULT", action="append", default=[], help=text)
     _add_noise(parser)
 
 
