@@ -231,7 +231,9 @@ class Evaluation:
         """May the estimate be trusted? The answer changes while a session runs."""
         now, estimate, flags = self.statistics, self.estimate, self.determined
         names = [p.name for p in self.parameters]
-        lost = now.counters.lost_samples
+        # Of the smoother's samples those are lost that have no torque.
+        smoother = now.smoother if now.method == "smoother" else None
+        lost = now.counters.lost_samples if smoother is None else smoother.lost
         below = flags & (estimate.pi + NORMAL_95 * np.where(flags, self.std, 0.0) < 0.0)
         momentum, projection = now.momentum, self.projection
         return judge(
@@ -343,6 +345,8 @@ class Evaluation:
         by_smoother = now.method == "smoother"
         if now.smoother is not None and now.smoother.level > 0.0 and by_smoother:
             out.append("samples do not agree with the equations of motion")
+        if by_smoother and any(value != 0.0 for value in now.setup.system.tolerances.model_dump().values()):
+            out.append("error bars by the smoother count no tolerances of geometry and calibration")
         if now.momentum is None and not by_smoother:
             out.append("by the energy balance alone, nothing tests whether the model lacks something")
         if now.smoother is not None and not by_smoother and missing:

@@ -42,7 +42,7 @@ class SmootherStatistics(NamedTuple):
 
     failures: spans that were left out and why, a sentence each. spans, rows: how many were taken. mean_square: of the
     last span, see `SpanFit`; level: the largest of all. factor (n + 1, n + 1): square-root information about beta (n,).
-    last_step: of the last fit. end: time of the newest sample, s.
+    last_step: of the last fit. end: time of the newest sample, s. lost: samples without a torque.
     """
 
     failures: tuple[str, ...]
@@ -55,6 +55,7 @@ class SmootherStatistics(NamedTuple):
     rss: float
     last_step: float
     end: float
+    lost: int
 
     def estimate(self, prior: Prior | None) -> Estimate:
         """The base parameters, with what is known of them beforehand; only after the first span."""
@@ -105,7 +106,7 @@ class Smoother(Stage):
         self._synchroniser = Synchroniser([f"n_tau_{i}" for i in range(1, joints + 1)], self._rate)
         nothing = np.zeros((base.n + 1, base.n + 1)), np.full(base.n, np.nan)
         self.state = SmootherState(
-            known=SmootherStatistics((), 0, np.nan, np.nan, *nothing, 0, 0.0, np.nan, -np.inf),
+            known=SmootherStatistics((), 0, np.nan, np.nan, *nothing, 0, 0.0, np.nan, -np.inf, 0),
             t=np.empty(0),
             values=np.empty((0, len(self.channels))),
             index=np.empty((0, 2), dtype=np.int64),
@@ -266,6 +267,7 @@ class Smoother(Stage):
             rss=past.rss + fit.rows * fit.mean_square,
             last_step=fit.step,
             end=end,
+            lost=self._synchroniser.counters.lost_samples,
         )
 
     def _realisable(self, estimate: Estimate) -> Array:
