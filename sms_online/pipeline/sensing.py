@@ -86,6 +86,9 @@ class Sensing:
             names = [f"link_{i}.{name}" for name in kinematics.marker_names]
             read = [k for k, name in enumerate(names) if name in available]
             points = point_channels(model.system, i)
+            if not partial and model.system.links[i - 1].markers:
+                found = f"link_{i} measured by points alone, on a spatial free base"
+                raise InputError(source, "header", found, "planar motion or a fixed base, or no link_i.markers")
             if partial and (model.system.links[i - 1].markers or (not read and points[0] in available)):
                 self._pointed[i - 1] = self._pointed_shape(i - 1), [need(name) for name in points]
                 missing.append(f"shape of link_{i} between its markers")
