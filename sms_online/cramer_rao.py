@@ -24,7 +24,8 @@ from sms_online.linearised import Motion, linearise
 from sms_online.model.base_parameters import BaseParameters
 from sms_online.model.dynamics import Dynamics
 from sms_online.model.model import Model
-from sms_online.sensor_set import Readings, SensorSet, session_sensors
+from sms_online.model.readings import Readings
+from sms_online.sensor_set import SensorSet, session_sensors
 from sms_online.stream import Array
 from sms_online.threads import one_blas_thread
 from sms_online.trackers.factor import raw_triangle

@@ -270,6 +270,9 @@ class Evaluation:
     def _lost(self) -> float:
         """Share of the grid's points that were lost; not what interpolation between slow samples needs at the ends."""
         now = self.statistics
+        if now.method == "smoother" and now.smoother is not None:
+            # Of its samples those are lost that have no torque.
+            return now.smoother.lost / max(1, now.smoother.lost + now.samples)
         ends = 2.0 * SIDE * float(np.nanmax(now.periods, initial=0.0)) * now.setup.system.sample_rate
         lost = max(0.0, now.counters.lost_samples - ends)
         return lost / max(1.0, lost + now.samples)
@@ -379,6 +382,8 @@ class Evaluation:
         by_smoother = now.method == "smoother"
         if now.smoother is not None and now.smoother.level > 0.0 and by_smoother:
             out.append("samples do not agree with the equations of motion")
+        if by_smoother and any(value != 0.0 for value in now.setup.system.tolerances.model_dump().values()):
+            out.append("error bars by the smoother count no tolerances of geometry and calibration")
         if now.momentum is None and not by_smoother:
             out.append("by the energy balance alone, nothing tests whether the model lacks something")
         if now.smoother is not None and not by_smoother and missing:
@@ -449,6 +454,10 @@ class Evaluation:
         coloured = {} if now.momentum is None else now.momentum.coloured
         out += [f"{channel}: noise is correlated over {1e3 * time:.2g} ms" for channel, time in coloured.items()]
         out += [f"{channel}: {left.number} outliers left out" for channel, left in now.outliers.items()]
+        out += [
+            f"{s.first} and {s.second} swapped from {s.begin:.3f} to {s.end:.3f} s: {s.samples} samples relabelled"
+            for s in now.swaps
+        ]
         out += self.unstated_latency
         if now.setup.unused:
             out.append(f"channels not used: {', '.join(now.setup.unused)}")

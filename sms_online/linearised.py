@@ -16,14 +16,10 @@ import numpy as np
 
 from sms_online.model.base_parameters import BaseParameters
 from sms_online.model.dynamics import Dynamics
-from sms_online.model.model import Model
+from sms_online.model.readings import Readings
 from sms_online.model.so3 import skew
 from sms_online.pipeline.sensitivity import derivatives
-from sms_online.sensor_set import Readings
 from sms_online.stream import Array
-
-# Step of the central differences of readings, rad, m, rad/s, m/s: truncation and rounding both near 1e-10 relative.
-DIFFERENCE = 1e-5
 
 
 @dataclass(frozen=True)
@@ -71,7 +67,7 @@ def linearise(
         return np.asarray(np.tensordot(weights, told, 1))
 
     P_x, G_v, G_x = np.split(interpolated(derivatives(dynamics, x[nodes], v[nodes])), 3, axis=2)
-    C_x, C_v = (interpolated(part) for part in reading_derivatives(readings, model, x[nodes], v[nodes]))
+    C_x, C_v = (interpolated(part) for part in readings.derivatives(x[nodes], v[nodes]))
     H = dynamics.mass_matrix(x)
     P, G = (base.columns(part) for part in model.momentum_columns(x, v))
     # δv by δx, δp and δβ.
@@ -87,20 +83,3 @@ def linearise(
     E[:, n_v:, :joints] = model.generalized_force(np.eye(joints)).T
     E[:, :n_v, joints:], E[:, n_v:, joints:] = v_beta, G + G_v @ v_beta
     return LinearSystem(A, E, np.concatenate((C_x + C_v @ v_x, C_v @ v_p), axis=2), C_v @ v_beta, H)
-
-
-def reading_derivatives(readings: Readings, model: Model, x: Array, v: Array) -> tuple[Array, Array]:
-    """Derivatives (B, channels, n_v) of readings by displacements in the order of the speeds, and by speeds."""
-    B, n_v = v.shape
-    # Every instant n_v times, moved along one coordinate or rate each.
-    x_n, v_n = np.repeat(x, n_v, axis=0), np.repeat(v, n_v, axis=0)
-    dv = DIFFERENCE * np.tile(np.eye(n_v), (B, 1))
-    dx = model.position_rate(x_n, dv)
-
-    def difference(plus: Array, minus: Array) -> Array:
-        return np.asarray(((plus - minus) / (2.0 * DIFFERENCE)).reshape(B, n_v, -1).transpose(0, 2, 1))
-
-    by_x = difference(readings(x_n + dx, v_n), readings(x_n - dx, v_n))
-    if not readings.reads_rates:
-        return by_x, np.zeros_like(by_x)
-    return by_x, difference(readings(x_n, v_n + dv), readings(x_n, v_n - dv))

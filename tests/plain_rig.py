@@ -11,7 +11,8 @@ from sms_online.cramer_rao import STEP, cramer_rao_bound
 from sms_online.description.schema import Sensor, System
 from sms_online.linearised import Motion
 from sms_online.model.base_parameters import find_base_parameters
-from sms_online.sensor_set import readable_channels, sensor_set
+from sms_online.model.readings import readable_channels
+from sms_online.sensor_set import sensor_set
 from sms_online.stream import Array
 from sms_sim.sensors import Sensors
 from sms_sim.simulate import Simulation, exact_states

@@ -13,8 +13,9 @@ from sms_online.errors import InputError
 from sms_online.linearised import Motion, linearise
 from sms_online.model.base_parameters import BaseParameters, find_base_parameters, random_states
 from sms_online.model.model import Model
+from sms_online.model.readings import Readings, readable_channels
 from sms_online.model.so3 import from_euler_parameters, logarithm
-from sms_online.sensor_set import Readings, SensorSet, readable_channels, sensor_set
+from sms_online.sensor_set import SensorSet, sensor_set
 from sms_online.stream import Array
 from sms_sim.plant import Plant
 from sms_sim.simulate import exact_states, simulate

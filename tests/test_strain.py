@@ -11,8 +11,8 @@ from sms_online.effects.build import build_model
 from sms_online.effects.catalogue import candidates
 from sms_online.errors import InputError
 from sms_online.model.model import Model
+from sms_online.model.readings import Readings
 from sms_online.pipeline.sensing import Sensing
-from sms_online.sensor_set import Readings
 
 STRAIN = ("link_1.strain_angle", "link_2.strain_angle")
 DRIVES = ("tau_1", "tau_2", "theta_m_1", "theta_m_2")

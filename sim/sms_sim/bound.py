@@ -16,9 +16,10 @@ from sms_online.description.schema import System
 from sms_online.errors import InputError
 from sms_online.linearised import Motion
 from sms_online.model.base_parameters import find_base_parameters
+from sms_online.model.readings import readable_channels
 from sms_online.pipeline.estimator import Estimator
 from sms_online.priors import base_prior
-from sms_online.sensor_set import SensorSet, readable_channels, sensor_set
+from sms_online.sensor_set import SensorSet, sensor_set
 from sms_online.session import Data, recorded_session
 from sms_online.stream import Array
 from sms_online.tables import Tabled

@@ -16,6 +16,7 @@ from sms_online.effects.build import build_model
 from sms_online.effects.catalogue import check_effect, parse_effect
 from sms_online.errors import InputError
 from sms_online.stream import Block
+from sms_sim.camera_faults import CameraFault, CameraFaults, parsed_faults
 from sms_sim.drifting import ParameterDrift, drifted, parsed
 from sms_sim.plant import Plant
 from sms_sim.sensors import Sensors
@@ -28,7 +29,7 @@ class Simulated:
     """A session to be simulated: the described system with effects that its file does not declare, and its sensors.
 
     grade: noise in place of the described one. seed: of the noise. duration: s, None for the trajectory's own. drifts:
-    of its parameters.
+    of its parameters. faults: of the cameras that see its markers.
     """
 
     described: System
@@ -37,6 +38,7 @@ class Simulated:
     grade: str | None = None
     seed: int = 0
     drifts: tuple[ParameterDrift, ...] = ()
+    faults: tuple[CameraFault, ...] = ()
 
     @staticmethod
     def of(
@@ -46,8 +48,9 @@ class Simulated:
         grade: str | None = None,
         seed: int = 0,
         drift: Sequence[str | ParameterDrift] = (),
+        faults: Sequence[str | CameraFault] = (),
     ) -> Simulated:
-        """Effects and drifts as texts or records; InputError where one cannot act on the system."""
+        """Effects, drifts and faults as texts or records; InputError where one cannot act on the system."""
         if isinstance(effects, str):
             raise InputError("effects", "", repr(effects), f"a list of effects, [{effects!r}]")
         injected: list[Effect] = []
@@ -64,7 +67,10 @@ class Simulated:
         for each in drifts:
             assert model is not None
             each.direction(model, model.nominal)
-        return Simulated(system, tuple(injected), duration, grade, seed, drifts)
+        out = Simulated(system, tuple(injected), duration, grade, seed, drifts, parsed_faults(faults))
+        if out.faults:
+            CameraFaults(out.faults, out.channels, seed)  # refuses markers that there are not
+        return out
 
     @cached_property
     def system(self) -> System:
@@ -90,7 +96,8 @@ class Simulated:
 
     def blocks(self, simulation: Simulation) -> Iterator[Block]:
         """What the sensors record of it."""
-        return sampled_blocks(simulation, self.grade, self.seed)
+        whole = sampled_blocks(simulation, self.grade, self.seed)
+        return map(CameraFaults(self.faults, self.channels, self.seed), whole) if self.faults else whole
 
     def capture(self, simulation: Simulation) -> Capture:
         """The same as a capture with its truth."""
@@ -109,6 +116,7 @@ class Simulated:
             "duration_s": simulation.duration,
             "effects": [effect.model_dump(mode="json") for effect in self.effects],
             "drifts": [drift.document() for drift in self.drifts],
+            "faults": [fault.document() for fault in self.faults],
         }
 
     def _at_end(self, simulation: Simulation) -> dict[str, float]:
@@ -126,6 +134,7 @@ def simulate(
     seed: int = 0,
     effects: Sequence[str | Effect] = (),
     drift: Sequence[str | ParameterDrift] = (),
+    faults: Sequence[str | CameraFault] = (),
 ) -> Capture:
     """Simulate a described system in closed loop, and record what its sensors see.
 
@@ -133,10 +142,11 @@ def simulate(
     sensors in place of the described one, "0" none, "A", "B", "C" ever more. seed: of the noise. effects: what the
     system file does not describe, as texts "name@where:coefficient=value,…". drift: parameters that change on the way,
     "parameter:share=-0.1,over=60" for instance, or "parameter:half_life=20"; what is true is then the value at the end.
-    The capture holds the truth, which no estimate uses. InputError for an effect, a drift or a grade that there is not,
-    or a motion that cannot be followed.
+    faults: of the cameras, "missing@link_1.*:share=0.1", "hidden@link_2.*:begin=8,over=2" or
+    "swapped@link_1.marker_1+link_1.marker_2:begin=5,over=1". The capture holds the truth, which no estimate uses.
+    InputError for an effect, a drift, a fault or a grade that there is not, or a motion that cannot be followed.
     """
     system, _ = given_system(system)
-    session = Simulated.of(system, effects, duration, grade, seed, drift)
+    session = Simulated.of(system, effects, duration, grade, seed, drift, faults)
     _ = session.channels  # an unknown grade is known before a long simulation
     return session.capture(session.solve())

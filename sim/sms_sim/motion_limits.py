@@ -7,7 +7,7 @@ from typing import Literal
 
 import numpy as np
 
-from sms_online.sensor_set import Readings, readable_channels
+from sms_online.model.readings import Readings, readable_channels
 from sms_online.stream import Array
 from sms_sim.plant import Plant
 

@@ -11,7 +11,7 @@ from sms_online.description.channels import drive_channels, sensed_channels
 from sms_online.description.schema import System
 from sms_online.effects.build import build_model
 from sms_online.model.effect import Inputs
-from sms_online.sensor_set import Readings, readable_channels
+from sms_online.model.readings import Readings, position_channels, readable_channels
 from sms_online.stream import Array
 from sms_sim.controller import JointPD
 from sms_sim.drifting import ParameterDrift
@@ -86,22 +86,14 @@ class Plant:
     @cached_property
     def channels(self) -> tuple[str, ...]:
         """Channels that the exact motion gives: drives, then positions of base, joints and markers."""
-        model = self.model
-        rigid = len(model.layout.position_names) - sum(s.stop - s.start for s in model.layout.q_f)
-        markers = [
-            f"link_{i}.{name}"
-            for i, kinematics in enumerate(model.chain.flexible, start=1)
-            if kinematics is not None
-            for name in kinematics.marker_names
-        ]
-        return (*drive_channels(self.system), *model.layout.position_names[:rigid], *markers)
+        return (*drive_channels(self.system), *position_channels(self.model))
 
     @cached_property
     def further_channels(self) -> tuple[str, ...]:
-        """What some described sensor reads beside positions: v_S, ω_0 and a gyro's rates, strain."""
+        """What some described sensor reads beside positions: v_S, ω_0 and a gyro's rates, strain, points."""
         system = self.system
         described = {channel for sensor in system.sensors for channel in sensed_channels(system, sensor)}
-        further = readable_channels(self.model)[self.model.layout.n_x :]
+        further = (channel for channel in readable_channels(self.model) if channel not in self.channels)
         return tuple(channel for channel in further if channel in described)
 
     @property
@@ -115,17 +107,16 @@ class Plant:
 
     def channel_values(self, torque: Array, x: Array) -> Array:
         """Exact values (B, channels) at torques after the gear n τ (B, joints) and positions x (B, n_x)."""
-        model = self.model
         drives = drive_channels(self.system)
         joints = [i - 1 for i in drives.values()]
         gears = np.array([self.system.joints[i].gear_ratio for i in joints])
         at_shaft = np.array([channel.startswith("tau_") for channel in drives])
-        parts = [torque[:, joints] / np.where(at_shaft, gears, 1.0)]
-        parts.append(x[:, : model.layout.n_x - sum(s.stop - s.start for s in model.layout.q_f)])
-        for i, kinematics in enumerate(model.chain.flexible):
-            if kinematics is not None:
-                parts.append(kinematics.markers(model.chain.elastic(x, i)))
-        return np.concatenate(parts, axis=1)
+        of_drives = torque[:, joints] / np.where(at_shaft, gears, 1.0)
+        return np.concatenate((of_drives, self._positions(x, np.zeros((len(x), self.model.layout.n_v)))), axis=1)
+
+    @cached_property
+    def _positions(self) -> Readings:
+        return Readings(self.model, position_channels(self.model))
 
     def rate(self, t: Array, y: Array) -> Array:
         """ẏ (B, n_y) from H v̇ + C = Q, (40), and the effects' own laws."""

@@ -60,10 +60,19 @@ def channels(system: System) -> tuple[str, ...]:
         names += _base_channels(planar=system.motion == "planar")
     for i, link in enumerate(system.links, start=1):
         if isinstance(link, FlexibleLink):
-            names += _link_channels(i, link, planar=system.motion == "planar")
-        elif i <= len(system.joints) and (strain := strain_channel(system, i)) is not None:
+            names += _link_channels(i, link, system.motion == "planar")
+            continue
+        names += point_channels(system, i)
+        if i <= len(system.joints) and (strain := strain_channel(system, i)) is not None:
             names.append(strain)
     return tuple(names)
+
+
+def point_channels(system: System, i: int) -> list[str]:
+    """Positions of the markers of link i (from 1) in the laboratory's axes, marker by marker."""
+    fields = AXES[:2] if system.motion == "planar" else AXES
+    count = len(system.links[i - 1].points)
+    return [f"link_{i}.marker_{j}.{field}" for j in range(1, count + 1) for field in fields]
 
 
 def _base_channels(planar: bool) -> list[str]:
@@ -80,11 +89,14 @@ def _base_channels(planar: bool) -> list[str]:
 
 
 def _link_channels(i: int, link: FlexibleLink, planar: bool) -> list[str]:
-    """Markers in link frame {i} and in the laboratory's axes, and the root's strain; an exact link also shortens."""
+    """Markers in link frame {i} and in the laboratory's axes, and the root's strain; an exact link also shortens.
+
+    Markers whose places are stated are seen in the laboratory's axes alone.
+    """
     exact = link.kinematics == "exact"
     local = [name for name, moved_by in NODAL.items() if moved_by in link.deformations or (exact and name == "u_x")]
-    fields = local + list(AXES[:2] if planar else AXES)
-    return [f"link_{i}.marker_{j}.{field}" for j in range(1, link.elements + 1) for field in fields] + [
+    fields = ([] if link.markers else local) + list(AXES[:2] if planar else AXES)
+    return [f"link_{i}.marker_{j}.{field}" for j in range(1, len(link.points) + 1) for field in fields] + [
         f"link_{i}.strain_angle"
     ]
 

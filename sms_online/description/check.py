@@ -50,6 +50,7 @@ def check_system(system: System, source: str) -> None:
     for i, link in enumerate(system.links, start=1):
         if isinstance(link, FlexibleLink):
             _check_flexible(f"link_{i}", link, system.motion == "planar", source)
+        _check_markers(f"link_{i}", link, source)
     check_tips(system, source)
     for place, inertia in _inertias(system):
         _check_inertia(place, inertia, system.motion == "planar", source)
@@ -113,6 +114,18 @@ def _check_joint(i: int, joint: Joint, motor: Motor | None, planar: bool, source
         raise InputError(source, f"{place}.axis", f"{list(joint.axis)}", "[0, 0, 1] or [0, 0, -1] in planar motion")
     if joint.kind == "prismatic" and joint.axis[2] != 0.0:
         raise InputError(source, f"{place}.axis", f"{list(joint.axis)}", "an axis in the x-y plane in planar motion")
+
+
+def _check_markers(place: str, link: FlexibleLink | RigidLink, source: str) -> None:
+    """Markers sit on their link."""
+    if isinstance(link, RigidLink):
+        if link.markers and link.kind == "cross":
+            raise InputError(source, f"{place}.markers", "markers on a cross", "none, for it has no body")
+        return
+    for j, marker in enumerate(link.markers, start=1):
+        if not 0.0 <= marker.position[0] <= link.length:
+            place, found = f"{place}.markers[{j}].position", f"x = {marker.position[0]:g} m"
+            raise InputError(source, place, found, f"a station along the link, 0 to {link.length:g} m")
 
 
 def _check_flexible(place: str, link: FlexibleLink, planar: bool, source: str) -> None:

@@ -10,6 +10,7 @@ from pydantic import BaseModel, ValidationError
 from pydantic_core import ErrorDetails
 
 from sms_online.description import schema, sources
+from sms_online.description.markers import Marker
 from sms_online.errors import InputError
 
 # Fields of `System` that are numbered tables, or lists of tables, in the file.
@@ -179,7 +180,7 @@ def _keys_beside(loc: tuple[int | str, ...]) -> tuple[str, ...]:
     if loc[-2] in INERTIAS:
         record: type[BaseModel] = schema.Inertia
     elif loc[0] == "links":
-        record = LINKS[str(loc[2])]
+        record = Marker if "markers" in loc else LINKS[str(loc[2])]
     elif loc[0] == "sources" and "signals" in loc:
         record = sources.LogSignal if loc[2] in ("table", "bag") else sources.Signal
     elif loc[0] == "sources" and "fields" in loc:

@@ -11,6 +11,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field, model_validator
 
+from sms_online.description.markers import Marker
 from sms_online.description.record import NonNegative, Positive, Record
 from sms_online.description.sources import Device, LogSource, Source
 
@@ -125,22 +126,30 @@ class RigidLink(RigidBody):
     name: what it is called elsewhere, in a URDF for instance.
     kind: `rigid`; or `cross`, without mass and length, between the axes of a universal or spherical joint.
     tip: where the next joint, or the payload, is mounted, m.
+    markers: points that cameras see, `[[link_i.markers]]`.
     """
 
     name: str = ""
     kind: Literal["rigid", "cross"]
     tip: Vector3 = (0.0, 0.0, 0.0)
+    markers: tuple[Marker, ...] = ()
+
+    @property
+    def points(self) -> tuple[Vector3, ...]:
+        """Positions of the markers that cameras see, in the link's frame, m."""
+        return tuple(marker.position for marker in self.markers)
 
 
 class FlexibleLink(Record):
-    """A uniform flexible link along the x axis of its frame, with a marker at the end of each of its elements.
+    """A uniform flexible link along the x axis of its frame.
 
     name: what it is called elsewhere, in a URDF for instance.
     kind: `flexible`.
     root_position: of the link's root from joint i, in the joint's frame, m: a bracket without mass.
     root_rotation: rotation vector from the joint's frame to the link's frame {i}, rad.
     length: L, m.
-    elements: number of elements, and of markers, equally spaced; the last one is at the tip.
+    elements: number of elements, of equal length; marker j is at the end of element j unless `markers` are stated.
+    markers: points that cameras see, `[[link_i.markers]]`.
     mass_per_length: ρA, kg/m.
     polar_inertia_per_length: ρI_p, kg m.
     axial_rigidity: EA, N.
@@ -167,6 +176,13 @@ class FlexibleLink(Record):
     deformations: Annotated[tuple[Deformation, ...], Field(min_length=1)]
     kinematics: Literal["linear", "exact"] = "exact"
     tip_rotation: Literal["exponential", "first_order"] = "exponential"
+    markers: tuple[Marker, ...] = ()
+
+    @property
+    def points(self) -> tuple[Vector3, ...]:
+        """Positions of the markers that cameras see, in the frame of the undeformed link, m."""
+        ends = ((self.length * j / self.elements, 0.0, 0.0) for j in range(1, self.elements + 1))
+        return tuple(marker.position for marker in self.markers) or tuple(ends)
 
 
 Link = Annotated[RigidLink | FlexibleLink, Field(discriminator="kind")]

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 from numpy.polynomial import Polynomial
 
 from sms_online.description.schema import FlexibleLink
 from sms_online.model import so3
-from sms_online.model.flexible import Shape, ShapeRate
+from sms_online.model.flexible import Sections, Shape, ShapeRate
 from sms_online.model.layout import nodal_names
 from sms_online.stream import Array
 
@@ -15,6 +17,8 @@ from sms_online.stream import Array
 GAUSS_POINTS = 4
 
 FIELDS = ("u_x", "u_y", "u_z", "theta_x", "theta_y", "theta_z")
+# The rotation that a displacement's slope is, with its sign.
+SLOPES = {"u_y": ("theta_z", 1.0), "u_z": ("theta_y", -1.0)}
 
 
 def element_shape_functions(length: float) -> dict[tuple[str, str, int], Polynomial]:
@@ -42,6 +46,8 @@ class LinearLink:
 
     def __init__(self, link: FlexibleLink) -> None:
         self.length = link.length
+        self._elements = link.elements
+        self._names = nodal_names(link)
         self.first_order = link.tip_rotation == "first_order"
         names = nodal_names(link)
         self.n_f = link.elements * len(names)
@@ -136,6 +142,35 @@ class LinearLink:
             tip=q_f_dot @ self._tip_J[0].T,
             tip_angular=(shape.tip_spin @ q_f_dot[..., None])[..., 0],
         )
+
+    def sections(self, stations: Array) -> Callable[[Array], Sections]:
+        """Sections at stations (n,), m from the root; they turn by the slopes as the tip does."""
+        element_length = self.length / self._elements
+        functions = element_shape_functions(element_length)
+        fields = np.zeros((stations.size, len(FIELDS), self.n_f))
+        for at, s in zip(fields, stations.tolist(), strict=True):
+            element = min(int(s / element_length), self._elements - 1)
+            local = s - element * element_length
+            for (field, name, node), function in functions.items():
+                if name not in self._names or element + node < 2:  # node 1 of the first element is clamped
+                    continue
+                column = (element + node - 2) * len(self._names) + self._names.index(name)
+                at[FIELDS.index(field), column] = function(local)
+                if field in SLOPES:
+                    rotation, sign = SLOPES[field]
+                    at[FIELDS.index(rotation), column] = sign * function.deriv()(local)
+        displacement, theta = fields[:, :3], fields[:, 3:]
+        straight = stations[:, None] * np.array([1.0, 0.0, 0.0])
+
+        def at_stations(q_f: Array) -> Sections:
+            center = straight + (displacement @ q_f[:, None, :, None])[..., 0]
+            angle = (theta @ q_f[:, None, :, None])[..., 0]
+            if self.first_order:
+                return Sections(center, np.eye(3) + so3.skew(angle), displacement[None], theta[None])
+            turn = so3.RotationVector(angle)
+            return Sections(center, turn.matrix, displacement[None], turn.left_jacobian @ theta)
+
+        return at_stations
 
     def markers(self, q_f: Array) -> Array:
         """The nodal coordinates themselves, (B, n_f)."""

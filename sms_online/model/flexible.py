@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -41,6 +42,20 @@ class ShapeRate:
     tip_angular: Array  # (B, 3) rad/s, in {i}
 
 
+@dataclass(frozen=True)
+class Sections:
+    """Sections of a link at n stations, at B configurations, in its frame {i}.
+
+    center (B, n, 3) m: on the neutral axis. rotation (B, n, 3, 3). J, spin (B or 1, n, 3, n_f): what elastic
+    coordinates do to the centre, and the angular velocity of the section.
+    """
+
+    center: Array
+    rotation: Array
+    J: Array
+    spin: Array
+
+
 class LinkKinematics(Protocol):
     """Kinematics of one flexible link.
 
@@ -59,6 +74,9 @@ class LinkKinematics(Protocol):
 
     def shape_rate(self, q_f: Array, q_f_dot: Array, shape: Shape) -> ShapeRate:
         """Rates of `shape` for q̇_f (B, n_f)."""
+
+    def sections(self, stations: Array) -> Callable[[Array], Sections]:
+        """Sections at stations (n,), m from the root, as a function of q_f (B, n_f)."""
 
     def markers(self, q_f: Array) -> Array:
         """Nodal displacements (m) and rotations (rad) of the markers, (B, n_markers · per node), in {i}, (31)."""

@@ -7,12 +7,14 @@ Source: the strain parametrisation of Boyer, Lebastard, Candelier, Renda, IEEE T
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 from numpy.polynomial import Legendre, Polynomial
 
 from sms_online.description.schema import FlexibleLink
 from sms_online.model import so3
-from sms_online.model.flexible import Shape, ShapeRate
+from sms_online.model.flexible import Sections, Shape, ShapeRate
 from sms_online.model.layout import STRAIN, nodal_names, strain_names
 from sms_online.stream import Array
 
@@ -42,7 +44,7 @@ class ExactRod:
         self.marker_names = tuple(f"marker_{j}.{name}" for j in range(1, link.elements + 1) for name in nodal)
         self._nodal_rows = [("u_x", "u_y", "u_z", "theta_x", "theta_y", "theta_z").index(name) for name in nodal]
         self._G = SHAPE_POINTS + POINTS_AN_ELEMENT * link.elements
-        nodes, weights = np.polynomial.legendre.leggauss(self._G)
+        self._gauss = nodes, weights = np.polynomial.legendre.leggauss(self._G)
         s = 0.5 * link.length * (nodes + 1.0)
         self.weights = 0.5 * link.length * weights
         marker_s = link.length * np.arange(1, link.elements + 1) / link.elements
@@ -127,6 +129,24 @@ class ExactRod:
             tip=(shape.tip_J @ rates)[..., 0],
             tip_angular=(shape.tip_spin @ rates)[..., 0],
         )
+
+    def sections(self, stations: Array) -> Callable[[Array], Sections]:
+        """Sections at stations (n,), m from the root."""
+        G, integrate = self._G, _cumulative_integration(self.length, *self._gauss, stations)
+
+        def at_stations(q_f: Array) -> Sections:
+            R = self._rotations(q_f)[:, :G]
+            kappa = np.tensordot(q_f, self._fields, axes=(1, 0)).transpose(0, 2, 1)
+            turning = R[..., self._axis] * self._chi[:, None, :]
+            tangent = R[..., 0]
+            return Sections(
+                center=_along(integrate, tangent),
+                rotation=np.eye(3) + _along(integrate, R @ so3.skew(kappa)),
+                J=_along(integrate, _cross_columns(_along(self._integrate[:G], turning), tangent)),
+                spin=_along(integrate, turning),
+            )
+
+        return at_stations
 
     def _one_field_markers(self) -> _OneFieldMarkers:
         G, angles = self._G, self._integrate @ self._chi

@@ -6,9 +6,18 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from sms_online.model import so3
 from sms_online.model.flexible import LinkKinematics
+from sms_online.model.points import LinkPoints
 from sms_online.model.rod import NEWTON_STEPS
 from sms_online.stream import Array
+
+# Deflection of a link that is usual, as a share of its length. Beside points good to 0.1 mm it shapes what they do not
+# show, and hardly changes what they do.
+USUAL_DEFLECTION = 0.03
+# What a link's frame is off by, made of readings of base and joints as it is, m and rad, as a multiple of the points'
+# noise. With none a link behind noisy frames comes out bent; a hundred times as much lets it hang from a wrong slope.
+FRAME_NOISE = 3.0
 
 
 class SensedShape:
@@ -40,3 +49,48 @@ class SensedShape:
             ahead = told[..., None] + J @ q_f[..., None]
             q_f = (bent @ np.linalg.solve(J @ bent, ahead))[..., 0]
         return q_f
+
+
+class PointedShape:
+    """Shape of a link whose markers cameras see as points: of all that agree with them, that of least strain energy.
+
+    A frame that is off by its noise would bend a link that is held to it. So it may move by as much.
+    length: of the link, m. axes: of {i} that are active. sigma: noise of the points, m.
+    """
+
+    def __init__(
+        self, length: float, kinematics: LinkKinematics, points: LinkPoints, axes: list[int], sigma: float
+    ) -> None:
+        self._points, self._axes, self._sigma, self._n_f = points, axes, sigma, kinematics.n_f
+        self._turning = [2] if axes == [0, 1] else [0, 1, 2]
+        stiffness = np.sum(list(kinematics.stiffness.values()), axis=0)
+        # Rigidities are not known here; each kind of strain counts alike.
+        tip = kinematics.shape(np.zeros((1, kinematics.n_f))).tip_J[0]
+        soft = float(np.trace(tip @ np.linalg.solve(stiffness, tip.T)))
+        frame = np.full(len(axes) + len(self._turning), FRAME_NOISE * sigma)
+        self._precision = np.diag(np.concatenate((np.zeros(kinematics.n_f), 1.0 / frame**2)))
+        self._precision[: kinematics.n_f, : kinematics.n_f] = stiffness * soft / (USUAL_DEFLECTION * length) ** 2
+
+    def coordinates(self, readings: Array, origin: Array, rotation: Array) -> Array:
+        """q_f (B, n_f) for positions (B, n · axes), m, NaN where a marker is not seen.
+
+        origin (B, 3), m, rotation (B, 3, 3): of the link's frame {i}. NaN where no marker is seen.
+        """
+        B, axes = len(readings), self._axes
+        seen = np.zeros((B, readings.shape[1] // len(axes), 3))
+        seen[..., axes] = readings.reshape(B, -1, len(axes))
+        seen[..., axes] -= origin[:, None, axes]
+        seen = (seen @ rotation)[..., axes].reshape(B, -1)
+        z = np.zeros((B, len(self._precision)))
+        for _ in range(NEWTON_STEPS):
+            local = self._points.local(z[:, : self._n_f])
+            moved = np.broadcast_to(np.eye(3)[:, axes], (*local.position.shape, len(axes)))
+            turned = -so3.skew(local.position)[..., self._turning]
+            J = np.concatenate((local.by_elastic, moved, turned), axis=3)[:, :, axes].reshape(B, -1, z.shape[1])
+            frame = (J[..., self._n_f :] @ z[:, self._n_f :, None])[..., 0]
+            off = seen - local.position[..., axes].reshape(B, -1) - frame
+            weighted = np.where(np.isnan(off)[..., None], 0.0, J) / self._sigma**2
+            right = (weighted.swapaxes(1, 2) @ np.nan_to_num(off)[..., None])[..., 0] - z @ self._precision
+            z += np.linalg.solve(weighted.swapaxes(1, 2) @ J + self._precision, right[..., None])[..., 0]
+        z[np.isnan(seen).all(axis=1)] = np.nan
+        return z[:, : self._n_f]

@@ -28,6 +28,7 @@ from sms_online.pipeline.energy_balance import BalanceRows, EnergyBalance, Share
 from sms_online.pipeline.events import Event
 from sms_online.pipeline.internal_states import FollowedStates
 from sms_online.pipeline.joint_balance import JointBalance, SquaredResidual
+from sms_online.pipeline.marker_identity import MarkerIdentity, Swap
 from sms_online.pipeline.momentum import Momentum
 from sms_online.pipeline.observer import Observer
 from sms_online.pipeline.outliers import LeftOut, Outliers
@@ -91,15 +92,16 @@ class Estimator(Stage):
         self.channels = tuple(dict.fromkeys((*self.sensing.channels, *self._smoothed_channels)))
         self._columns = [channels.index(name) for name in self.channels]
         self._smoothed_columns = [self.channels.index(name) for name in self._smoothed_channels]
+        self._identity = MarkerIdentity(model, self.sensing, self.channels)
         # A torque may jump for one sample.
         sensors = [k for k, name in enumerate(self.channels) if not name.startswith(("tau_", "force_"))]
         self._outliers = Outliers(len(self.channels), sensors)
         self._attitude = AttitudeContinuity()
         self._synchroniser = Synchroniser(self.sensing.channels, system.sample_rate)
         self._conditioning = Conditioning(system, self.sensing.channels)
-        layout = model.layout
-        # Positions choose the filter's width; torques pass the same filter for the sake of the lag.
-        self._rates = RatesStage(system.sample_rate, range(layout.n_x), self.sensing.noise)
+        # Positions choose the filter's width, as far as their noise is a sensor's; torques pass the same filter for the
+        # sake of the lag.
+        self._rates = RatesStage(system.sample_rate, *self.sensing.deciding)
         self._followed = FollowedStates(model, self.sensing, system.sample_rate)
         self._energy = EnergyBalance(model, base, system.sample_rate)
         # A balance of forces does not hold in a shape that is not the link's; energies bear it best.
@@ -260,6 +262,11 @@ class Estimator(Stage):
         return self._synchroniser.start_time
 
     @property
+    def swaps(self) -> list[Swap]:
+        """Markers that cameras have taken for each other."""
+        return self._identity.state.swaps
+
+    @property
     def outliers(self) -> dict[str, LeftOut]:
         """Samples left out as outliers, of each channel with any."""
         return self._outliers.found(self.channels)
@@ -311,7 +318,7 @@ class Estimator(Stage):
             self.smoother.work(self._balanced, last=True)
 
     def _synchronise(self, t: Array, values: Array, last: bool = False) -> None:
-        t, values = self._outliers.push(t, values, last)
+        t, values = self._outliers.push(t, self._identity.push(t, values), last)
         if self.smoother is not None:
             torque = self.sensing.joint_torque(values[:, : len(self.sensing.channels)])
             self.smoother.push(t, torque, values[:, self._smoothed_columns])

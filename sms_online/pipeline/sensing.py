@@ -6,16 +6,19 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from sms_online.description.channels import sensed_channels, strain_channel
+from sms_online.description.channels import point_channels, sensed_channels, strain_channel
 from sms_online.description.explain import hint, nearest
-from sms_online.description.schema import System
+from sms_online.description.schema import FlexibleLink, System
 from sms_online.errors import InputError
 from sms_online.model.beam import LinearLink
 from sms_online.model.model import Model
-from sms_online.model.static_shape import SensedShape
+from sms_online.model.points import LinkPoints
+from sms_online.model.static_shape import PointedShape, SensedShape
 from sms_online.state import Stage, State
 from sms_online.stream import Array, Block
 
+# Of points whose noise is not stated, m; it weighs them against what is known of a link's frame and shape.
+USUAL_NOISE = 1e-4
 EULER_PARAMETERS = ("eps_x", "eps_y", "eps_z", "eta")
 
 
@@ -53,9 +56,9 @@ class Sensing:
 
     channels: those it takes, in an order of its own. torque_columns: the torques' among them, drive by drive.
     unused: the source's others. In place of q_i a flexible joint may have the strain of the strip that it stands for,
-    an angle beyond θ_m_i. A flexible link needs one marker at least; where it has fewer readings than coordinates its
-    shape is the static one, and `missing` names what is not read. Not so on a spatial free base, where every marker is
-    needed.
+    an angle beyond θ_m_i. A flexible link needs one marker at least, in its own frame or, where nothing is read there,
+    in the laboratory's; where it has fewer readings than coordinates, or points, its shape is the static one, and
+    `missing` names what is not read. Not so on a spatial free base, where every marker is needed.
     Raises InputError, naming the source, when a channel that the model needs is not there.
     """
 
@@ -87,12 +90,21 @@ class Sensing:
         # Markers that are not there leave some of a link's coordinates to the smoother, which needs a vector of them.
         partial = layout.planar or not layout.free
         self._links: dict[int, tuple[SensedShape, list[int]]] = {}
+        self._pointed: dict[int, tuple[PointedShape, list[int]]] = {}
         missing = []
         for i, kinematics in enumerate(model.chain.flexible, start=1):
             if kinematics is None:
                 continue
             names = [f"link_{i}.{name}" for name in kinematics.marker_names]
             read = [k for k, name in enumerate(names) if name in available]
+            points = point_channels(model.system, i)
+            if not partial and model.system.links[i - 1].markers:
+                found = f"link_{i} measured by points alone, on a spatial free base"
+                raise InputError(source, "header", found, "planar motion or a fixed base, or no link_i.markers")
+            if partial and (model.system.links[i - 1].markers or (not read and points[0] in available)):
+                self._pointed[i - 1] = self._pointed_shape(i - 1), [need(name) for name in points]
+                missing.append(f"shape of link_{i} between its markers")
+                continue
             if not partial or not read:
                 read = list(range(len(names)))
             self._links[i - 1] = SensedShape(kinematics, read), [need(names[k]) for k in read]
@@ -124,9 +136,13 @@ class Sensing:
         """
         stated = self.stated_noise
         markers = []
-        for i, (shape, columns) in self._links.items():
-            kinematics = self.model.chain.flexible[i]
-            assert kinematics is not None
+        for i, kinematics in enumerate(self.model.chain.flexible):
+            if kinematics is None:
+                continue
+            if i not in self._links:
+                markers.append(np.full(kinematics.n_f, np.nan))
+                continue
+            shape, columns = self._links[i]
             own = isinstance(kinematics, LinearLink) and shape.complete
             markers.append(stated[columns] if own else np.full(kinematics.n_f, np.nan))
         joints = self._by_joint(stated[self.torque_columns])
@@ -136,6 +152,20 @@ class Sensing:
         return np.concatenate((stated[self._base], q, stated[self._theta_m], *markers, joints))
 
     @property
+    def deciding(self) -> tuple[list[int], Array]:
+        """Positions whose noise is a sensor's, and `noise` as the width of a filter is chosen by it.
+
+        Between the samples of a slow sensor noise is interpolated: a filter of many samples averages fewer of them.
+        """
+        noise, layout = self.noise, self.model.layout
+        if not self.missing:
+            return list(range(layout.n_x)), noise
+        columns = [*self._base, *self._q, *self._theta_m]
+        periods = [stated_period(self.model.system, [self.channels[column]]) for column in columns]
+        noise[: len(columns)] *= np.sqrt(np.array(periods) * self.model.system.sample_rate)
+        return list(range(len(columns))), noise
+
+    @property
     def position_columns(self) -> list[int]:
         """Channels of the position sensors, in the order of the coordinates that they stand for, where none is missing.
 
@@ -143,6 +173,17 @@ class Sensing:
         """
         markers = (column for _, columns in self._links.values() for column in columns)
         return [*self._base, *self._q, *self._theta_m, *markers]
+
+    def _pointed_shape(self, i: int) -> PointedShape:
+        model = self.model
+        link, kinematics = model.system.links[i], model.chain.flexible[i]
+        assert isinstance(link, FlexibleLink)
+        assert kinematics is not None
+        points = LinkPoints(model.system, model.chain, i)
+        stated = stated_noise(model.system, points.names)
+        sigma = float(np.fmax.reduce(stated, initial=-np.inf))
+        axes = [0, 1] if model.layout.planar else [0, 1, 2]
+        return PointedShape(link.length, kinematics, points, axes, sigma if sigma > 0.0 else USUAL_NOISE)
 
     def readings(self, x: Array) -> Array:
         """Readings (K, n_x) of the position sensors at coordinates x (K, n_x): where no marker is missing."""
@@ -193,15 +234,33 @@ class Sensing:
         first = len(self._base)
         return [(first + joint, first + len(self._q) + motor) for joint, motor in self._beyond]
 
-    def coordinates(self, values: Array) -> Array:
-        """Positions x (B, n_x) of samples (B, channels)."""
+    @property
+    def n_rigid(self) -> int:
+        """Number of positions of base and joints."""
+        return len(self._base) + len(self._q) + len(self._theta_m)
+
+    def rigid(self, values: Array) -> Array:
+        """Positions (B, n_rigid) of base and joints, the first of x, of samples (B, channels or more)."""
         q = values[:, self._q]
         for joint, motor in self._beyond:
             q[:, joint] += values[:, self._theta_m[motor]]
-        parts = [values[:, self._base], q, values[:, self._theta_m]]
-        for shape, columns in self._links.values():
-            parts.append(shape.coordinates(values[:, columns]))
-        return np.concatenate(parts, axis=1)
+        return np.concatenate((values[:, self._base], q, values[:, self._theta_m]), axis=1)
+
+    def coordinates(self, values: Array) -> Array:
+        """Positions x (B, n_x) of samples (B, channels)."""
+        rigid = self.rigid(values)
+        x = np.zeros((len(values), self.model.layout.n_x))
+        x[:, : rigid.shape[1]] = rigid
+        for i, (shape, columns) in self._links.items():
+            self.model.chain.elastic(x, i)[:] = shape.coordinates(values[:, columns])
+        # From the base outwards: where a link's frame is follows from the links before it.
+        for i in self.model.chain.tree.outwards if self._pointed else ():
+            if i in self._pointed:
+                pointed, columns = self._pointed[i]
+                frame = self.model.chain.configure(x).frames[2 * i + 2]
+                elastic = pointed.coordinates(values[:, columns], frame.origin, frame.rotation)
+                self.model.chain.elastic(x, i)[:] = elastic
+        return x
 
     def motion(self, values: Array) -> Array:
         """x, n τ and internal states side by side (B, n_x + joints + n_states) of samples (B, channels + n_states)."""

@@ -24,6 +24,7 @@ from sms_online.pipeline.errors_in_variables import NoiseBias, unbiased
 from sms_online.pipeline.events import Event
 from sms_online.pipeline.joint_balance import SquaredResidual
 from sms_online.pipeline.latency import Latency
+from sms_online.pipeline.marker_identity import Swap
 from sms_online.pipeline.outliers import LeftOut
 from sms_online.pipeline.plain_rows import PlainRows
 from sms_online.pipeline.sensing import Sensing
@@ -121,6 +122,7 @@ class Statistics:
     dropped_rows: int
     counters: SyncCounters
     outliers: dict[str, LeftOut]
+    swaps: tuple[Swap, ...]
     last_time: Array
     periods: Array
     events: tuple[Event, ...]
@@ -143,6 +145,7 @@ class Statistics:
             dropped_rows=estimator.state.dropped_rows,
             counters=state_copy(estimator.counters),
             outliers=estimator.outliers,
+            swaps=tuple(estimator.swaps),
             last_time=estimator.last_time,
             periods=estimator.periods.copy(),
             events=tuple(estimator.events),

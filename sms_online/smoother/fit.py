@@ -10,6 +10,7 @@ equations; Bell, SIAM J. Optimization 4 (1994) 626, for the iterated smoother as
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 
@@ -19,8 +20,8 @@ from sms_online.linearised import Motion, linearise
 from sms_online.model.base_parameters import BaseParameters
 from sms_online.model.dynamics import Dynamics
 from sms_online.model.model import Model
+from sms_online.model.readings import Readings
 from sms_online.physical import PhysicalSet
-from sms_online.sensor_set import Readings
 from sms_online.smoother.collocation import defects, momenta_and_forces, transitions
 from sms_online.smoother.filter import FixedIntervalSmoother
 from sms_online.smoother.span import Innovations, Span, interpolated
@@ -113,12 +114,23 @@ class SpanSmoother:
 
         last_step: of the collocation of an earlier span, s; None in the first one. Raises DivergedError.
         """
+        if last_step is None:
+            return self._searched(span, beta, known, LEVELS, STEPS)
+        try:
+            return self._searched(span, beta, known, LATER_LEVELS, (last_step,))
+        except DivergedError:
+            # Parameters are known, but not the motion, where cameras have not seen a link for a while.
+            return self._searched(span, beta, known, LEVELS, (last_step,))
+
+    def _searched(
+        self, span: Span, beta: Array, known: Array, levels: Sequence[float], steps: Sequence[float]
+    ) -> SpanFit:
         try:
             with np.errstate(over="raise", divide="raise", invalid="raise"):
                 search = _Search(self, span, beta, known)
-                for level in LEVELS if last_step is None else LATER_LEVELS:
+                for level in levels:
                     search.loosen(level)
-                return search.tightened(STEPS if last_step is None else (last_step,))
+                return search.tightened(steps)
         except NO_NUMBERS as error:
             raise DivergedError(str(error)) from None
 
@@ -162,7 +174,7 @@ class _Search:
         self.motion = Motion(t, interpolated(old.t, old.x, t), interpolated(old.t, old.v, t))
         self._use_nodes()
 
-    def tightened(self, steps: tuple[float, ...]) -> SpanFit:
+    def tightened(self, steps: Sequence[float]) -> SpanFit:
         """The fit with equations that hold, or that hold as well as the samples allow."""
         for k, step in enumerate(steps):
             self.refine(step)

@@ -10,12 +10,12 @@ from numpy.typing import NDArray
 
 from sms_online.model.base_parameters import BaseParameters
 from sms_online.model.model import Model
+from sms_online.model.readings import Readings, readable_channels
 from sms_online.physical import PhysicalSet
 from sms_online.pipeline.noise import noise_std
 from sms_online.pipeline.sensing import Sensing, stated_noise
 from sms_online.pipeline.sensor_noise import FEWEST_SAMPLES, SAMPLES
 from sms_online.pipeline.synchronise import GridSamples, Synchroniser
-from sms_online.sensor_set import Readings, readable_channels
 from sms_online.smoother.fit import DivergedError, SpanFit, SpanSmoother
 from sms_online.smoother.span import Span
 from sms_online.state import Stage, State
@@ -25,8 +25,14 @@ from sms_online.trackers.interface import Estimate, Prior, prior_factor
 
 # Length of a span, s. Its first state is unknown, which costs some information; its arrays take some 10 MB a second.
 SPAN = 10.0
+# Where a gap of the motion is at its end, it goes on to the end of the gap, at most to this multiple of its length.
+LATER_END = 1.5
 # A shorter one may not hold a motion.
 LEAST_SPAN = 0.5
+# A gap of the motion longer than this is filled, at this interval, s: 1 m/s moves the arm by a centimetre in it.
+HOLE, FILL = 0.015, 0.01
+# Samples within this time of an instant, s, say what a channel reads then.
+NEARBY = 0.05
 # No channel is better than this share of its largest reading: the collocation errs by as much.
 FINEST = 1e-6
 
@@ -36,7 +42,7 @@ class SmootherStatistics(NamedTuple):
 
     failures: spans that were left out and why, a sentence each. spans, rows: how many were taken. mean_square: of the
     last span, see `SpanFit`; level: the largest of all. factor (n + 1, n + 1): square-root information about beta (n,).
-    last_step: of the last fit. end: time of the newest sample, s.
+    last_step: of the last fit. end: time of the newest sample, s. lost: samples without a torque.
     """
 
     failures: tuple[str, ...]
@@ -49,6 +55,7 @@ class SmootherStatistics(NamedTuple):
     rss: float
     last_step: float
     end: float
+    lost: int
 
     def estimate(self, prior: Prior | None) -> Estimate:
         """The base parameters, with what is known of them beforehand; only after the first span."""
@@ -99,7 +106,7 @@ class Smoother(Stage):
         self._synchroniser = Synchroniser([f"n_tau_{i}" for i in range(1, joints + 1)], self._rate)
         nothing = np.zeros((base.n + 1, base.n + 1)), np.full(base.n, np.nan)
         self.state = SmootherState(
-            known=SmootherStatistics((), 0, np.nan, np.nan, *nothing, 0, 0.0, np.nan, -np.inf),
+            known=SmootherStatistics((), 0, np.nan, np.nan, *nothing, 0, 0.0, np.nan, -np.inf, 0),
             t=np.empty(0),
             values=np.empty((0, len(self.channels))),
             index=np.empty((0, 2), dtype=np.int64),
@@ -160,10 +167,16 @@ class Smoother(Stage):
         """Torque samples of the first span, 0 where more of them may come."""
         segment = self.state.index[:, 1]
         run = int(np.searchsorted(segment, segment[0], side="right")) if segment.size else 0
-        longest = round(SPAN * self._rate) + 1
-        if run >= longest:
-            return longest
-        return run if last or run < segment.size else 0
+        longest, most = (round(factor * SPAN * self._rate) + 1 for factor in (1.0, LATER_END))
+        if run < longest:
+            return run if last or run < segment.size else 0
+        # A span ends, and the next one begins, where the motion is known: a first state that is guessed rings.
+        known = np.flatnonzero(np.isin(self.state.index[longest - 1 : min(run, most), 0], self.state.moved))
+        if known.size:
+            return longest + int(known[0])
+        moved = self.state.moved[-1] if self.state.moved.size else -1
+        over = last or run < segment.size or (run >= most and moved >= self.state.index[most - 1, 0])
+        return longest if over else 0
 
     def _time(self, index: NDArray[np.int64]) -> Array:
         return np.asarray(self._synchroniser.start_time + index / self._rate)
@@ -189,11 +202,8 @@ class Smoother(Stage):
         values, sigma, torque_density = self._weighed(now.t[inside], now.values[inside], now.torque[:count])
         sensed = np.flatnonzero(np.isfinite(sigma))
         readings = Readings(self._model, [self.channels[k] for k in sensed])
-        guess_x, guess_v = np.split(now.motion[moved], [self._model.layout.n_x], axis=1)
-        span = Span(
-            torque_t, now.torque[:count], now.t[inside], values[:, sensed],
-            self._time(now.moved[moved]), guess_x, guess_v,
-        )  # fmt: skip
+        guess = self._guess(self._time(now.moved[moved]), now.motion[moved], now.t[inside], values)
+        span = Span(torque_t, now.torque[:count], now.t[inside], values[:, sensed], *guess)
         smoother = SpanSmoother(self._model, self._base, readings, sigma[sensed], torque_density)
         try:
             if not moved.any():
@@ -208,6 +218,42 @@ class Smoother(Stage):
             return
         self._take(fit, end)
 
+    def _guess(self, t: Array, motion: Array, sampled: Array, values: Array) -> tuple[Array, Array, Array]:
+        """Instants, x and v of a motion with gaps, filled from those sensors that read something.
+
+        What they do not show, as the shape of a link that cameras do not see, goes straight through a gap.
+        t (B,), motion (B, n_x + n_v). sampled (M,), values (M, channels): of the readings.
+        """
+        layout = self._model.layout
+        known = np.concatenate((sampled[:1], t, sampled[-1:]))
+        fills = [np.arange(known[k] + FILL, known[k + 1], FILL) for k in np.flatnonzero(np.diff(known) > HOLE)]
+        filled = []
+        for fill in fills:
+            around = np.concatenate((fill[:1] - FILL, fill, fill[-1:] + FILL))
+            x = self._sensing.coordinates(self._read(around, sampled, values))
+            straight = np.stack([np.interp(around, t, column) for column in motion.T[: layout.n_x]], axis=1)
+            x = np.where(np.isfinite(x), x, straight)
+            v = layout.speeds(x, np.gradient(x, around, axis=0))
+            filled.append(np.concatenate((x, v), axis=1)[1:-1])
+        times = np.concatenate((t, *fills))
+        order = np.argsort(times, kind="stable")
+        whole = np.concatenate((motion, *filled))[order]
+        return times[order], whole[:, : layout.n_x], whole[:, layout.n_x :]
+
+    def _read(self, t: Array, sampled: Array, values: Array) -> Array:
+        """Readings (B, sensing's channels) at t (B,), s, between samples; NaN where there are none nearby."""
+        out = np.full((t.size, len(self._sensing.channels)), np.nan)
+        for column, name in enumerate(self._sensing.channels):
+            own = values[:, self.channels.index(name)] if name in self.channels else np.empty(0)
+            read = np.flatnonzero(np.isfinite(own))
+            if read.size:
+                at = sampled[read]
+                out[:, column] = np.interp(t, at, own[read])
+                after = np.searchsorted(at, t).clip(0, read.size - 1)
+                apart = np.minimum(np.abs(at[after] - t), np.abs(at[np.maximum(after - 1, 0)] - t))
+                out[apart > NEARBY, column] = np.nan
+        return out
+
     def _take(self, fit: SpanFit, end: float) -> None:
         past = self.state.known
         self.state.known = SmootherStatistics(
@@ -221,6 +267,7 @@ class Smoother(Stage):
             rss=past.rss + fit.rows * fit.mean_square,
             last_step=fit.step,
             end=end,
+            lost=self._synchroniser.counters.lost_samples,
         )
 
     def _realisable(self, estimate: Estimate) -> Array:

@@ -8,7 +8,7 @@ from functools import cached_property
 import numpy as np
 from scipy.interpolate import BSpline, make_interp_spline
 
-from sms_online.sensor_set import Readings
+from sms_online.model.readings import Readings
 from sms_online.stream import Array
 
 # Degree of the splines through torques and through states at the nodes: their errors fall faster with the step than

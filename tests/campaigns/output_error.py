@@ -17,7 +17,7 @@ from sms_online.cramer_rao import discretise
 from sms_online.linearised import linearise
 from sms_online.model.base_parameters import BaseParameters
 from sms_online.model.model import Model
-from sms_online.sensor_set import Readings
+from sms_online.model.readings import Readings
 from sms_online.stream import Array
 
 # Length of a segment, s: noise of the torque moves a joint by less than its encoder's noise in it.

@@ -216,6 +216,11 @@ def _add_simulate(verbs: Verbs) -> None:
         "PARAMETER:half_life=20, and begin=SECONDS; may be repeated"
     )
     parser.add_argument("--drift", metavar="DRIFT", action="append", default=[], help=text)
+    text = (
+        "a fault of the cameras: missing@link_1.*:share=0.1, hidden@link_2.*:begin=8,over=2 or "
+        "swapped@link_1.marker_1+link_1.marker_2:begin=5,over=1; may be repeated"
+    )
+    parser.add_argument("--fault", metavar="FAULT", action="append", default=[], help=text)
     _add_noise(parser)
 
 
@@ -291,10 +296,11 @@ def _add_check(verbs: Verbs) -> None:
 def _add_import(verbs: Verbs) -> None:
     text = "Turn a log, or a published measurement, into a capture, or a URDF into a system file."
     parser = _add_verb(verbs, "import", "import_data", text)
-    text = "log: a bag, table, CAN log or recording; quanser, emps: a published measurement (.mat); urdf"
-    parser.add_argument("kind", metavar="KIND", choices=("log", "quanser", "emps", "urdf"), help=text)
+    text = "log: a bag, table, CAN log or recording; points: a motion capture (.c3d, Motive's or Nexus' .csv); "
+    text += "quanser, emps: a published measurement (.mat); urdf"
+    parser.add_argument("kind", metavar="KIND", choices=("log", "points", "quanser", "emps", "urdf"), help=text)
     parser.add_argument("source", metavar="SOURCE", type=Path, help="the file as it is")
-    text = "of a log: the system file, whose [[source]] tables say what the log's numbers are"
+    text = "of a log: the system file, whose [[source]] tables say what its numbers are, or whose markers have names"
     parser.add_argument("--system", metavar="FILE|NAME", help=text)
     _add_capture(parser, required=False)
     text = "of a URDF: the system file to write, SOURCE with the ending .toml by default"

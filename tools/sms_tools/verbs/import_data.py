@@ -9,6 +9,7 @@ from pathlib import Path
 
 from sms_adapters.importers import import_emps, import_quanser
 from sms_adapters.mcap_capture import capture_writer
+from sms_adapters.motion_capture import import_points
 from sms_adapters.truth import truth_path
 from sms_online.errors import InputError
 from sms_tools.exit_codes import OK
@@ -56,8 +57,17 @@ def _log(args: argparse.Namespace) -> tuple[int, list[str]]:
     return samples, list(reading.warnings)
 
 
+def _points(args: argparse.Namespace) -> tuple[int, list[str]]:
+    """Points of a motion capture's file."""
+    if args.system is None:
+        raise InputError("import points", "", "no --system", "the system file, whose markers have names")
+    system, _ = described_system(args)
+    return import_points(args.source, system, args.capture)
+
+
 KINDS: dict[str, Importer] = {
     "emps": partial(_published, import_emps),
     "quanser": partial(_published, import_quanser),
     "log": _log,
+    "points": _points,
 }

@@ -18,7 +18,7 @@ from sms_tools.waiting import waiting
 def run(args: argparse.Namespace) -> int:
     """Simulate a session and write FILE.csv and FILE.csv.truth.json."""
     described, _ = described_system(args)
-    session = Simulated.of(described, args.effect, args.duration, args.grade, args.seed, args.drift)
+    session = Simulated.of(described, args.effect, args.duration, args.grade, args.seed, args.drift, args.fault)
     capture: Path = args.capture
     # The writer comes first: a name that cannot be written is known before a long simulation.
     with capture_writer(capture, session.channels) as writer:

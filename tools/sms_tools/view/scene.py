@@ -10,6 +10,7 @@ from sms_online.description.schema import FlexibleLink, RigidLink
 from sms_online.description.tree import BASE, mounts
 from sms_online.model.chain import Configuration
 from sms_online.model.model import Model
+from sms_online.model.points import LinkPoints
 from sms_online.stream import Array
 
 # A dimension of the spacecraft that the description does not state is drawn as this share of its largest.
@@ -22,7 +23,6 @@ UNKNOWN_REACH = 1.0
 PEDESTAL = 0.06
 # A last link whose description states no point but its joint is drawn so long, as a share of the arm's reach.
 STUB = 0.15
-DISPLACEMENTS = ("u_x", "u_y", "u_z")
 
 
 @dataclass(frozen=True)
@@ -72,12 +72,9 @@ class Scene:
             if not self._ends[i].any() and i < len(system.joints) and system.joints[i].kind == "revolute":
                 # Across the axis, so that its turning is seen.
                 self._ends[i] = STUB * self.reach * np.eye(3)[np.argmin(np.abs(system.joints[i].axis))]
-        self.markers = tuple(
-            (i, j)
-            for i, link in enumerate(system.links, start=1)
-            if isinstance(link, FlexibleLink)
-            for j in range(1, link.elements + 1)
-        )
+        links = [i for i, link in enumerate(system.links) if link.points]
+        self._points = [LinkPoints(system, model.chain, i) for i in links]
+        self.markers = tuple((i + 1, j + 1) for i in links for j in range(len(system.links[i].points)))
         layout = model.layout
         offset = layout.n_base_positions - layout.n_base_speeds
         self._q = [index + offset for index in layout.q]
@@ -148,23 +145,9 @@ class Scene:
         return np.concatenate((ends, inner, configuration.end(i, link).origin[:, None]), axis=1)
 
     def _markers(self, configuration: Configuration) -> Array:
-        """Markers (B, M, 3): their displacements from the straight link, turned to inertial axes."""
-        points = [np.empty((configuration.size, 0, 3))]
-        chain = self.model.chain
-        for i, kinematics in enumerate(chain.flexible):
-            link = chain.links[i]
-            if kinematics is None or not isinstance(link, FlexibleLink):
-                continue
-            readings = kinematics.markers(chain.elastic(configuration.x, i))
-            local = np.zeros((configuration.size, link.elements, 3))
-            local[..., 0] = link.length * np.arange(1, link.elements + 1) / link.elements
-            for column, name in enumerate(kinematics.marker_names):
-                marker, field = name.removeprefix("marker_").split(".")
-                if field in DISPLACEMENTS:
-                    local[:, int(marker) - 1, DISPLACEMENTS.index(field)] += readings[:, column]
-            frame = configuration.frames[2 * i + 2]
-            points.append(frame.origin[:, None] + np.einsum("bij,bmj->bmi", frame.rotation, local))
-        return np.concatenate(points, axis=1)
+        """Markers (B, M, 3) where the model has them, in inertial axes."""
+        none = np.empty((configuration.size, 0, 3))
+        return np.concatenate([none, *(points(configuration) for points in self._points)], axis=1)
 
 
 def _extent(link: RigidLink | FlexibleLink) -> Array:

@@ -1,0 +1,61 @@
+"""Rigs whose links cameras see as points: three markers a link at 240 Hz, 0.1 mm, and the base's pose with them."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from sms_adapters.system_file import load_system
+from sms_online.description.markers import Marker
+from sms_online.description.parse import parse_system
+from sms_online.description.schema import FlexibleLink, Sensor, System, Tolerances
+from sms_online.stream import Array
+from sms_sim.bound import motion_bounds
+from sms_sim.simulate import Simulation
+from tests.one_link import TEXT
+
+CAMERA_RATE = 240.0  # Hz
+# Of each link: stations off the ends of its elements, the middle one beside the neutral axis.
+POSITIONS = ((0.35, 0.0, 0.0), (0.75, 0.03, 0.0), (1.15, 0.0, 0.0))
+SPATIAL_POSITIONS = ((0.35, 0.0, 0.05), (0.75, 0.06, -0.04), (1.15, -0.05, 0.02))
+
+
+MARKERS = """
+[[link_1.markers]]
+position = [0.3, 0.0, 0.0]
+
+[[link_1.markers]]
+name = "beside the tip"
+position = [1.0, 0.03, 0.0]
+"""
+
+
+def marked_bench(old: str = "", new: str = "") -> System:
+    """A bench of one link with two markers; a text of its description replaced."""
+    text = TEXT.replace("KINEMATICS", "linear").replace("marker_*.u_y", "marker_*.[xy]") + MARKERS
+    return parse_system(text.replace(old, new) if old else text, "one-link")
+
+
+def bound_of(simulation: Simulation) -> Array:
+    """Cramér–Rao bound (n,) of a simulated motion and the sensors that its system describes."""
+    return np.array([bound.std for bound in motion_bounds(simulation).parameters.values()])
+
+
+def seen_by_cameras(name: str) -> System:
+    """A shipped system with points in place of displacements; noise grade B, its geometry exactly known."""
+    system = load_system(name)
+    planar = system.motion == "planar"
+    markers = tuple(Marker(position=at) for at in (POSITIONS if planar else SPATIAL_POSITIONS))
+    links = tuple(
+        link.model_copy(update={"markers": markers}) if isinstance(link, FlexibleLink) else link
+        for link in system.links
+    )
+    sensors = (
+        Sensor(channels=("tau_*",), noise=0.01),  # 0.5 N m after the gear
+        Sensor(channels=("theta_m_*", "q_*"), noise=1e-4),
+        Sensor(channels=("r_S_*",), rate=CAMERA_RATE, noise=1e-4),
+        Sensor(channels=("theta_0",) if planar else ("eps_*", "eta"), rate=CAMERA_RATE, noise=1e-4 if planar else 5e-5),
+        Sensor(channels=("link_*.marker_*.[xyz]",), rate=CAMERA_RATE, noise=1e-4),
+    )
+    return system.model_copy(
+        update={"links": links, "sensors": sensors, "tolerances": Tolerances.model_validate("none")}
+    )
