@@ -60,11 +60,11 @@ class Rows:
     def _columns(self, balance: MomentumBalance) -> Array:
         pi = balance.rough.without(self.base.physical_values(self.beta))
         found, instants = self._windows(balance, self.sensing, self.exact)
-        told = Sensitivities(self.model, self.sensing.displacements, balance.span / INSTANTS)
         calibration = CalibrationColumns(self.model, self.sensing, balance.span)
+        told = Sensitivities(self.model, self.sensing.displacements, balance.span / INSTANTS, calibration.geometries)
         for piece in instants:
-            told.tell(pi, piece.x, piece.v, piece.signals)
-            calibration.tell(pi, piece.x, piece.v, piece.signals, told.rates(len(piece.x)))
+            by_geometry = told.tell(pi, piece.x, piece.v, piece.signals)
+            calibration.tell(piece.x, piece.signals, told.rates(len(piece.x)), by_geometry)
         out = []
         for window in found:
             sensitivity = told.window(window.start)

@@ -25,7 +25,7 @@ from sms_online.pipeline.whitening import ROUNDING, Whitener, Whitening
 from sms_online.stream import Array
 from sms_sim.plant import Plant
 from tests.axis import AXIS
-from tests.model_systems import FRICTION, paper, spatial
+from tests.model_systems import paper, spatial
 from tests.prescribed_motion import prescribed
 
 SPAN = 0.4  # s
@@ -188,26 +188,6 @@ def test_a_clock_that_is_off_moves_rows_by_the_rates_of_its_readings() -> None:
     young = RowNoise(model.layout.theta_m, balance.span, (clock,))
     own = young.covariance(kernels[-1], seen[-1].rates, *nothing, NO_FREE_FORCES, 0.5 * CLOCK_KNOWN)[-1]
     np.testing.assert_allclose(own, 4.0 * found[-1][-1], rtol=1e-12)
-
-
-def test_sensitivities_of_columns_told_with_the_rows_are_those_of_the_dynamics() -> None:
-    model = build_model(paper(effects=FRICTION))
-    balance = MomentumBalance(model, find_base_parameters(model), model.system.sample_rate, SPAN)
-    motion = prescribed(model, balance.width + balance.lead + balance.margin + 1, seed=2)  # of one window
-    samples = np.concatenate((motion.x, np.zeros((len(motion.x), len(model.layout.q)))), axis=1)
-    by_columns, by_dynamics = (
-        Sensitivities(model, lambda x: np.tile(np.eye(model.layout.n_v), (len(x), 1, 1)), balance.span / INSTANTS)
-        for _ in range(2)
-    )
-    _, instants = balance.push(np.arange(len(samples)), [samples] * COPIES, np.ones(15), by_columns.probes)
-    (piece,) = instants
-    assert piece.probed is not None
-    by_columns.tell(model.nominal, piece.x, piece.v, piece.signals, piece.probed)
-    by_dynamics.tell(model.nominal, piece.x, piece.v, piece.signals)
-    ours, theirs = by_columns.window(0), by_dynamics.window(0)
-    for part in ("P_x", "G_v", "G_x"):
-        expected = getattr(theirs, part)
-        np.testing.assert_allclose(getattr(ours, part), expected, atol=1e-8 * np.abs(expected).max())
 
 
 def test_what_windows_hold_beside_a_force_that_nobody_knows_is_still_told() -> None:

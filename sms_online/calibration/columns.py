@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from scipy.interpolate import make_interp_spline
 
 from sms_online.calibration.channels import Motion, position_families, torque_families
-from sms_online.calibration.geometry import GeometryDerivatives, geometries
+from sms_online.calibration.geometry import geometries
 from sms_online.calibration.nuisance import Nuisance
 from sms_online.model.model import Model
 from sms_online.pipeline.momentum_windows import EXPONENT, INSTANTS, STEPS
@@ -60,7 +60,7 @@ class CalibrationState(State):
 class CalibrationColumns(Stage):
     """Evaluates the columns window by window, at the instants of the sensitivities.
 
-    count: of nuisances.
+    count: of nuisances. geometries: those of geometry, which come last.
     """
 
     def __init__(self, model: Model, sensing: Sensing, span: float) -> None:
@@ -69,7 +69,7 @@ class CalibrationColumns(Stage):
         self._positions = position_families(sensing, sensing.model.system.tolerances)
         self._torques = torque_families(sensing, sensing.model.system.tolerances)
         # Of the session's system: an event's may hold more that has a geometry.
-        self._geometry = GeometryDerivatives(model, list(geometries(sensing.model.system)))
+        self.geometries = tuple(geometries(sensing.model.system))
         self._joint_rows = list(model.layout.theta_m)
         # What is added at the instants, in the sum over steps; and that sum of c, by parts of a `Sensitivity`.
         self._to_steps = _interpolation(np.arange(INSTANTS + 1)) * span / STEPS
@@ -91,12 +91,12 @@ class CalibrationColumns(Stage):
             *np.empty((2, 0, layout.n_v, moved)),
         )
 
-    def tell(self, pi: Array, x: Array, v: Array, signals: Array, rates: Array) -> None:
-        """Take the next instants: x (K, n_x), v (K, n_v), signals as in `Instants`, with parameters π (n_pi,).
+    def tell(self, x: Array, signals: Array, rates: Array, by_geometry: Array) -> None:
+        """Take the next instants: x (K, n_x), signals as in `Instants`, rates (K, sensors) of the readings.
 
-        rates (K, sensors): of the readings.
+        by_geometry (2, K, n_v, c): what geometries change momentum and force by.
         """
-        if not self.count or not len(x):
+        if not self.count:
             return
         torque = signals[:, : len(self._model.layout.q)]
         _, T_0 = self._model.layout.base_pose(x)
@@ -104,7 +104,7 @@ class CalibrationColumns(Stage):
         K = len(x)
         added = [np.empty((K, *self.state.added.shape[1:2], 0)), *(family.adds(motion) for family in self._positions)]
         torques = [np.empty((K, *self.state.torque.shape[1:2], 0)), *(family.adds(motion) for family in self._torques)]
-        momentum, force = self._geometry.at(pi, x, v, signals)
+        momentum, force = by_geometry
         self.state.added = np.concatenate((self.state.added, np.concatenate(added, axis=2)))
         self.state.torque = np.concatenate((self.state.torque, np.concatenate(torques, axis=2)))
         self.state.momentum = np.concatenate((self.state.momentum, momentum))

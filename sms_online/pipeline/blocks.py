@@ -28,8 +28,8 @@ def energy_blocks(system: System) -> tuple[float, float]:
 def momentum_blocks(system: System, slowest: float) -> tuple[float, float]:
     """Duration of the first block with momentum rows, but for whole blocks, and of the others, s.
 
-    Whole hops. A block ends with the last sample behind a window, with those that interpolate the slowest channel there, which has
-    the period `slowest`, s, and with those that show whether these are outliers.
+    A block of whole hops ends with the last sample behind a window, with those that interpolate the slowest channel
+    there, which has the period `slowest`, s, and with those that show whether these are outliers.
     """
     hop = 2 * half_hop(system.sample_rate, system.windows.momentum)
     margin = prompt_margin(hop * HOPS)

@@ -30,6 +30,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sms_online.pipeline.beforehand import WIDENED, Beforehand, Penalty
+from sms_online.pipeline.gram_sum import GramSum
 from sms_online.pipeline.momentum_windows import OVERLAP
 from sms_online.state import State
 from sms_online.stream import Array
@@ -54,28 +55,29 @@ class RowGrams(State):
     """Sums over windows of whitened rows, by generalized speed.
 
     signal (n_v, n + 1, n + 1): Gram matrices of [Y b]. noise: the same of what the sensors' noise adds to the rows, of
-    first and of second order, from synthetic noise. windows: how many. No array is written twice, see `PlainRows`.
+    first and of second order, from synthetic noise. windows: how many.
     """
 
-    signal: Array
-    noise: Array
+    signal: GramSum
+    noise: GramSum
     windows: int = 0
 
     @staticmethod
     def none(n_v: int, n: int) -> RowGrams:
         """Of no windows, with rows of n_v speeds and n parameters."""
-        return RowGrams(*np.zeros((2, n_v, n + 1, n + 1)))
+        return RowGrams(GramSum.none(n_v, n + 1), GramSum.none(n_v, n + 1))
 
     def add(self, rows: Array, noisy: Array) -> None:
         """Rows [Y b] (n_v, n + 1) of a window; noisy (2, n_v, n + 1): with synthetic noise added and subtracted."""
         first, second = 0.5 * (noisy[0] - noisy[1]), 0.5 * (noisy[0] + noisy[1]) - rows
-        self.signal = self.signal + rows[:, :, None] * rows[:, None, :]
-        self.noise = self.noise + first[:, :, None] * first[:, None, :] + second[:, :, None] * second[:, None, :]
+        self.signal.add(rows[:, None])
+        self.noise.add(np.stack((first, second), axis=1))
         self.windows += 1
 
     def weaken(self, share: Array) -> None:
         """Have the rows so far count less, (n_v,) of their squares: they were whitened with too small a variance."""
-        self.signal, self.noise = share[:, None, None] * self.signal, share[:, None, None] * self.noise
+        self.signal.weaken(share)
+        self.noise.weaken(share)
 
 
 @dataclass(frozen=True)
@@ -165,25 +167,26 @@ class _Criterion:
         columns: Columns,
         start: Array,
     ) -> None:
-        self._A, self._lacking = grams.signal, lacking
+        signal, of_noise = grams.signal.sum, grams.noise.sum
+        self._A, self._lacking = signal, lacking
         self._count = np.where(lacking, grams.windows / OVERLAP, float(grams.windows))
-        beyond = grams.signal - grams.noise
+        beyond = signal - of_noise
         same = np.where(torque[:, None, None], columns.of_torque, columns.of_motion)
         self._M = np.where(same, beyond, 0.0)
         diagonal = np.einsum("vii->vi", self._M)
         diagonal[:] = np.maximum(diagonal, 0.0)
         # Rows without noise have a constant deviation: one.
-        noise = self._quadratic(grams.noise, start)
+        noise = self._quadratic(of_noise, start)
         noisy = ~lacking & ~torque & (noise > grams.windows * LEAST_NOISE)
         self._scale = np.where(
             noisy, grams.windows / np.where(noisy, noise, 1.0), np.where(lacking & ~torque, 1.0, 0.0)
         )
         self._constant = np.where(lacking | noisy, 0.0, float(grams.windows))
-        self._G = self._scale[:, None, None] * grams.noise
+        self._G = self._scale[:, None, None] * of_noise
 
     @staticmethod
     def _quadratic(matrices: Array, w: Array) -> Array:
-        return np.asarray(np.einsum("i,vij,j->v", w, matrices, w))
+        return np.asarray(matrices @ w @ w)
 
     def _least(self, w: Array) -> Array:
         """Rounding (n_v,) of such sums."""
@@ -228,12 +231,12 @@ class _Criterion:
         inside = np.where(self._lacking, n / S, n / D)  # weight of the squares
         outside = np.where(self._lacking, n / D, n * S / D**2)  # and of what is expected
         slopes = inside[:, None] * a - outside[:, None] * g
-        squares = np.einsum("v,vij->ij", inside, self._A)
-        whole = squares - np.einsum("v,vij->ij", outside, self._G) - np.einsum("v,vij->ij", outside * errors, self._M)
+        squares = np.tensordot(inside, self._A, 1)
+        whole = squares - np.tensordot(outside, self._G, 1) - np.tensordot(outside * errors, self._M, 1)
         log, plain = np.where(self._lacking, n, 0.0), np.where(self._lacking, 0.0, n)
-        whole += np.einsum("v,vi,vj->ij", -2.0 * log / S**2, a, a)
-        cross = np.einsum("v,vi,vj->ij", -2.0 * plain / D**2, a, g)
-        whole += np.einsum("v,vi,vj->ij", 2.0 * log / D**2 + 4.0 * plain * S / D**3, g, g) + cross + cross.T
+        whole += (-2.0 * log / S**2 * a.T) @ a
+        cross = (-2.0 * plain / D**2 * a.T) @ g
+        whole += ((2.0 * log / D**2 + 4.0 * plain * S / D**3) * g.T) @ g + cross + cross.T
         return slopes, squares, whole
 
 
@@ -252,7 +255,7 @@ def minimum(
     """
     w = np.append(starts[0], -1.0)
     criterion = _Criterion(grams, lacking, torque, columns, w)
-    squares = np.einsum("vii->vi", grams.signal)
+    squares = np.einsum("vii->vi", grams.signal.sum)
     penalties = [Penalty(known, columns.nuisances, squares, w, widened) for widened in WIDENED]
     penalty = penalties[-1]
     found = [_descended(criterion, np.append(start, -1.0), penalty) for start in starts]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from copy import copy
 
 import msgspec
 import numpy as np
@@ -216,7 +215,7 @@ class Momentum(Stage):
         weights = np.pad(self.fit.weights, (len(self.nuisances), 0))
         lacking = self.fit.plain.misfit > 0.0
         fit, known = self.fit, self._beforehand()
-        return ScaleFree(copy(self.grams), lacking, fit.torque, weights, fit.columns, known, self.prior is None)
+        return ScaleFree(state_copy(self.grams), lacking, fit.torque, weights, fit.columns, known, self.prior is None)
 
     def _beforehand(self) -> Beforehand:
         """What is known of nuisances and parameters beside the rows; tolerances may give way, within bounds."""
@@ -266,7 +265,7 @@ class Momentum(Stage):
 
     def _process(self, piece: GridSamples, noise: SensorNoise) -> None:
         copies = self._copies(piece.values, noise)
-        windows, instants = self._balance.push(piece.index, copies, noise.coordinates, self.fit.probes)
+        windows, instants = self._balance.push(piece.index, copies, noise.coordinates)
         self._absorb(self.fit.push(windows, instants, noise))
 
     def _decide(self, noise: SensorNoise, last: bool) -> None:

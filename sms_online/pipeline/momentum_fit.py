@@ -34,7 +34,6 @@ from sms_online.pipeline.momentum_windows import (
     HOPS,
     INSTANTS,
     Instants,
-    Probes,
     Window,
 )
 from sms_online.pipeline.plain_rows import PlainRows
@@ -218,7 +217,7 @@ class MomentumFit(Stage):
         if self.weights is not None:
             if windows:
                 self._look(noise, windows[0])
-            self._tell(instants)
+            self._tell()
             out = [self._white(window) for window in windows]
         else:
             self.state.held += windows
@@ -383,15 +382,10 @@ class MomentumFit(Stage):
         self.weighing.begin(weights, noise, self.plain.misfit, self.state.first)
         self._tell()
 
-    @property
-    def probes(self) -> Probes | None:
-        """At which states who weighs wants columns beside those of the rows, once weights are known."""
-        return None if self.weights is None else self.weighing.noise.probes
-
-    def _tell(self, instants: Sequence[Instants] = ()) -> None:
-        """Have the states of the instants known to who weighs; instants: those that came last."""
+    def _tell(self) -> None:
+        """Have the states of the instants known to who weighs."""
         for weighing in self._weighings:
-            weighing.noise.tell(self.state.first, self.state.x, self.state.v, self.state.signals, instants)
+            weighing.noise.tell(self.state.first, self.state.x, self.state.v, self.state.signals)
 
     @property
     def _weighings(self) -> list[Weighing]:

@@ -12,7 +12,7 @@ from sms_online.model.base_parameters import BaseParameters
 from sms_online.model.model import Model
 from sms_online.pipeline.latency import SourceGroup
 from sms_online.pipeline.momentum_balance import MomentumBalance
-from sms_online.pipeline.momentum_windows import INSTANTS, Instants, Probes, Window
+from sms_online.pipeline.momentum_windows import INSTANTS, Window
 from sms_online.pipeline.row_noise import RowNoise
 from sms_online.pipeline.sensitivity import Sensitivities
 from sms_online.pipeline.sensor_noise import SensorNoise
@@ -63,7 +63,8 @@ class WindowNoise(Stage):
         self.n_v = model.layout.n_v
         self._base, self._rough = base, balance.rough
         self._sample_rate = balance.sample_rate
-        self._sensitivities = Sensitivities(model, readings, balance.span / INSTANTS)
+        geometries = () if calibration is None else calibration.geometries
+        self._sensitivities = Sensitivities(model, readings, balance.span / INSTANTS, geometries)
         self._noise = RowNoise(model.layout.theta_m, balance.span, clocks)
         self._calibration = calibration
         self.nuisances = 0 if calibration is None else calibration.count
@@ -91,25 +92,17 @@ class WindowNoise(Stage):
         """Noise that β began with."""
         return self.state.sensor_noise
 
-    @property
-    def probes(self) -> Probes:
-        """At which states it wants columns of new instants."""
-        return self._sensitivities.probes
-
-    def tell(self, first: int, x: Array, v: Array, signals: Array, instants: Sequence[Instants] = ()) -> None:
-        """Take the states (K, ·) of the instants from number `first` on, of which it needs those not told yet.
-
-        instants: those that came last, with columns where they were probed.
-        """
-        needed = self._sensitivities.next_instant
-        fresh = needed - first
+    def tell(self, first: int, x: Array, v: Array, signals: Array) -> None:
+        """Take the states (K, ·) of the instants from number `first` on, of which it needs those not told yet."""
+        fresh = self._sensitivities.next_instant - first
         assert self.state.beta is not None
         pi = self._rough.without(self._base.physical_values(self.state.beta))
-        probed = next((piece.probed for piece in instants if piece.number == needed), None)
         x, v, signals = x[fresh:], v[fresh:], signals[fresh:]
-        self._sensitivities.tell(pi, x, v, signals, probed)
+        if not len(x):
+            return
+        by_geometry = self._sensitivities.tell(pi, x, v, signals)
         if self._calibration is not None:
-            self._calibration.tell(pi, x, v, signals, self._sensitivities.rates(len(x)))
+            self._calibration.tell(x, signals, self._sensitivities.rates(len(x)), by_geometry)
 
     def drop(self, instant: int) -> None:
         """Forget what no window that starts at an instant or later asks for."""
