@@ -74,7 +74,8 @@ class ExactRod:
     def _rotations(self, q_f: Array) -> Array:
         """R (B, stations, 3, 3) of the sections."""
         if self._commuting:
-            angle = ((self._integrate @ self._chi) @ q_f[..., None])[..., 0]
+            turned = self._integrate @ self._chi
+            angle = q_f @ turned.T if turned.ndim == 2 else (turned @ q_f[..., None])[..., 0]
             return so3.about(self._turn, angle.ravel()).reshape(*angle.shape, 3, 3)
         kappa = np.tensordot(q_f, self._fields, axes=(1, 0)).transpose(0, 2, 1)  # (B, G, 3)
         R = so3.RotationVector(self._integrate @ kappa).matrix

@@ -27,7 +27,7 @@ class GramSum(State):
         return GramSum(np.zeros((n_v, n, n)))
 
     @property
-    def sum(self) -> Array:
+    def matrices(self) -> Array:
         """(n_v, n, n) of all rows so far."""
         if not self.waiting:
             return self.total
@@ -38,8 +38,8 @@ class GramSum(State):
         """Rows (n_v, k, n) of a window, k of each speed."""
         self.waiting.append(rows)
         if len(self.waiting) == GATHERED:
-            self.total, self.waiting = self.sum, []
+            self.total, self.waiting = self.matrices, []
 
     def weaken(self, share: Array) -> None:
         """Have the rows so far count less, (n_v,) of their squares."""
-        self.total, self.waiting = share[:, None, None] * self.sum, []
+        self.total, self.waiting = share[:, None, None] * self.matrices, []

@@ -43,7 +43,7 @@ class PlainRows(State):
     @property
     def gram(self) -> Array:
         """Gram matrices (n_v, n + 1, n + 1) of the rows."""
-        return self.grams.sum
+        return self.grams.matrices
 
     def clear(self) -> None:
         """Forget the windows, not the misfit."""
@@ -67,7 +67,7 @@ class PlainRows(State):
         # Where samples are exact nothing but rounding is left of the sum.
         rounding = np.finfo(np.float64).eps * (np.abs(gram) @ np.abs(w) @ np.abs(w))
         # The variances are those of the weights; noise grows with β.
-        noise = self.noise.sum @ w @ w
+        noise = self.noise.matrices @ w @ w
         scale = np.divide(
             noise, self.at_weights, out=np.ones_like(noise), where=(noise > 0.0) & (self.at_weights > 0.0)
         )
