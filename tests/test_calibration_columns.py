@@ -65,12 +65,11 @@ class Rows:
         for piece in instants:
             by_geometry = told.tell(pi, piece.x, piece.v, piece.signals)
             calibration.tell(piece.x, piece.signals, told.rates(len(piece.x)), by_geometry)
-        out = []
-        for window in found:
-            sensitivity = told.window(window.start)
-            rough = balance.rough.kernel(window.rough, self.base.physical_values(self.beta), sensitivity.displacements)
-            out.append(calibration.window(window.start, sensitivity, rough))
-        return np.concatenate(out)
+        starts = np.array([window.start for window in found])
+        sensitivity = told.windows(starts)
+        responses = np.array([window.rough for window in found])
+        rough = balance.rough.kernels(responses, self.base.physical_values(self.beta), sensitivity.displacements)
+        return np.concatenate(calibration.windows(starts, sensitivity, rough))
 
     def _windows(
         self, balance: MomentumBalance, sensing: Sensing, values: Array

@@ -122,25 +122,30 @@ class CalibrationColumns(Stage):
         of_force = (-phi_dot * sparse, phi_dot * sparse + phi * slope, -phi * sparse)
         return np.asarray(self._to_steps.T @ np.concatenate((of_mass, *of_force), axis=1))
 
-    def window(self, start: int, sensitivity: Sensitivity, rough: Array) -> Array:
-        """N (n_v, count) of the window that starts at an instant.
+    def windows(self, starts: NDArray[np.int64], sensitivity: Sensitivity, rough: Array) -> Array:
+        """N (W, n_v, count) of the windows that start at some instants.
 
-        rough (STEPS + 1, n_v, sensors): what rough forces add to c.
+        rough (W, STEPS + 1, n_v, sensors): what rough forces add to c.
         """
-        n_v, sensors = sensitivity.H.shape[1:]
+        W, _, n_v, sensors = sensitivity.H.shape
         if not self.count:
-            return np.empty((n_v, 0))
-        inside = slice(start - self.state.first, start - self.state.first + INSTANTS + 1)
-        told = (sensitivity.H, sensitivity.P_x, sensitivity.G_v, sensitivity.G_x)
-        weights = self._kernels[sensitivity.offset] @ np.concatenate(told).reshape(-1, n_v * sensors)
-        weights += self._to_steps.T @ rough.reshape(STEPS + 1, -1)
-        flat = weights.reshape(-1, n_v, sensors).swapaxes(0, 1).reshape(n_v, -1)
-        positions = -flat @ self.state.added[inside].reshape(flat.shape[1], -1)
-        torques = np.zeros((n_v, self.state.torque.shape[2]))
-        torques[self._joint_rows] = np.tensordot(self._phi, self.state.torque[inside], 1)
-        moved = -np.tensordot(self._phi_dot, self.state.momentum[inside], 1)
-        moved -= np.tensordot(self._phi, self.state.force[inside], 1)
-        return np.concatenate((positions, torques, moved), axis=1)
+            return np.empty((W, n_v, 0))
+        now, inside = self.state, (starts - self.state.first)[:, None] + np.arange(INSTANTS + 1)
+        told = np.concatenate((sensitivity.H, sensitivity.P_x, sensitivity.G_v, sensitivity.G_x), axis=1)
+        weights = self._kernels[sensitivity.offset] @ told.reshape(W, -1, n_v * sensors)
+        if rough.any():
+            weights += self._to_steps.T @ rough.reshape(W, STEPS + 1, -1)
+        flat = weights.reshape(W, -1, n_v, sensors).swapaxes(1, 2).reshape(W, n_v, -1)
+        positions = -flat @ now.added[inside].reshape(W, flat.shape[2], -1)
+        torques = np.zeros((W, n_v, now.torque.shape[2]))
+        torques[:, self._joint_rows] = self._over(self._phi, now.torque[inside])
+        moved = -self._over(self._phi_dot, now.momentum[inside]) - self._over(self._phi, now.force[inside])
+        return np.concatenate((positions, torques, moved), axis=2)
+
+    @staticmethod
+    def _over(weights: Array, values: Array) -> Array:
+        """Sums (W, …) over the instants of values (W, INSTANTS + 1, …)."""
+        return np.asarray((weights @ values.reshape(*values.shape[:2], -1)).reshape(len(values), *values.shape[2:]))
 
     def drop(self, before: int) -> None:
         """Forget instants with smaller numbers."""

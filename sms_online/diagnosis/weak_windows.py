@@ -142,10 +142,10 @@ class WeakWindows:
             for row in np.flatnonzero(np.any(told, axis=0)):
                 inside = weights**2 * told[seen, row]
                 parts[which, :, row] = np.sqrt(inside.reshape(which.size, INSTANTS, -1).sum(axis=2))
-        out = np.zeros((self.count, HOPS, self._layout.n_v))
-        for k in np.flatnonzero(np.any(parts, axis=(1, 2))).tolist():
-            first = max(k + 1 - HOPS, int(np.searchsorted(self.windows.segment, self.windows.segment[k])))
-            out[k, : k + 1 - first] = common(parts[k], parts[first : k + 1])[::-1]
+        out, segment = np.zeros((self.count, HOPS, self._layout.n_v)), self.windows.segment
+        for hops in range(min(HOPS, self.count)):
+            later = hops + np.flatnonzero(segment[hops:] == segment[: self.count - hops])
+            out[later, hops] = common(parts[later], parts[later - hops], hops)
         return out
 
     def spread(self, slopes: Callable[[Motion], tuple[Array, Array]]) -> Array:

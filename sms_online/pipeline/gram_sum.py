@@ -31,7 +31,8 @@ class GramSum(State):
         """(n_v, n, n) of all rows so far."""
         if not self.waiting:
             return self.total
-        rows = np.concatenate(self.waiting, axis=1)
+        # In one order in memory, whichever they came in: it decides on the last bits.
+        rows = np.ascontiguousarray(np.concatenate(self.waiting, axis=1))
         return np.asarray(self.total + rows.swapaxes(1, 2) @ rows)
 
     def add(self, rows: Array) -> None:

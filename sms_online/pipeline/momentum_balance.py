@@ -370,16 +370,17 @@ class MomentumBalance(Stage):
         both = both.reshape(-1, K, both.shape[1]).swapaxes(0, 1)
         return np.broadcast_to(both, (K, COPIES, both.shape[2])).reshape(K, -1)
 
-    def dense(self, window: Window) -> Array:
-        """Rows [Y b] of a window's copies (copies, n_v, n + 1)."""
-        rows = np.zeros((COPIES, self.model.layout.n_v, self.base.n + 1))
-        rows[:, self.rows, self.columns] = window.Y
-        rows[:, :, -1] = window.b
+    def dense(self, windows: Sequence[Window]) -> Array:
+        """Rows [Y b] of windows' copies (W, copies, n_v, n + 1)."""
+        rows = np.zeros((len(windows), COPIES, self.model.layout.n_v, self.base.n + 1))
+        if len(windows):
+            rows[:, :, self.rows, self.columns] = np.array([window.Y for window in windows])
+            rows[..., -1] = np.array([window.b for window in windows])
         return rows
 
-    def moments(self, window: Window) -> Array:
-        """Rows (n_v, n) of a window by the rates of the parameters about its centre, see `Window.moment`."""
-        rows = np.zeros((self.model.layout.n_v, self.base.n))
+    def moments(self, windows: Sequence[Window]) -> Array:
+        """Rows (W, n_v, n) of windows by the rates of the parameters about their centres, see `Window.moment`."""
+        rows = np.zeros((len(windows), self.model.layout.n_v, self.base.n))
         if self.with_moments:
-            rows[self.rows, self.columns] = window.moment
+            rows[:, self.rows, self.columns] = np.array([window.moment for window in windows])
         return rows

@@ -24,11 +24,11 @@ SPARSE = 2
 
 @dataclass(frozen=True)
 class Sensitivity:
-    """Over a window of INSTANTS + 1 instants, for displacements that one unit of each position sensor's noise makes.
+    """Over W windows of INSTANTS + 1 instants, for displacements that one unit of each position sensor's noise makes.
 
-    H, H_dot (INSTANTS + 1, n_v, sensors): ∂Pπ/∂v and Ḣ. P_x, G_v, G_x (nodes, n_v, sensors): ∂Pπ/∂x, ∂Gπ/∂v, ∂Gπ/∂x at
-    every other instant, the first of which is `offset` instants into the window. rates (INSTANTS + 1, sensors): of the
-    readings. displacements (n_v, sensors): that unit noise makes in the middle of the window.
+    H, H_dot (W, INSTANTS + 1, n_v, sensors): ∂Pπ/∂v and Ḣ. P_x, G_v, G_x (W, nodes, n_v, sensors): ∂Pπ/∂x, ∂Gπ/∂v,
+    ∂Gπ/∂x at every other instant, the first of which is `offset` instants into a window. rates (W, INSTANTS + 1,
+    sensors): of the readings. displacements (W, n_v, sensors): that unit noise makes in the middle of a window.
     """
 
     H: Array
@@ -118,22 +118,28 @@ class Sensitivities(Stage):
         now.derivatives = np.concatenate((now.derivatives, told))
         return by_geometry
 
+    @property
+    def sensors(self) -> int:
+        """Number of position sensors."""
+        return int(self.state.rates.shape[1])
+
     def rates(self, count: int) -> Array:
         """Rates of the readings (count, sensors) at the last instants."""
         return self.state.rates[len(self.state.rates) - count :]
 
-    def window(self, start: int) -> Sensitivity:
-        """At the instants from number `start` on."""
-        n_v = self.model.layout.n_v
-        inside = slice(start - self.state.first, start - self.state.first + INSTANTS + 1)
-        H, readings = self.state.dense[inside, :, :n_v], self.state.dense[inside, :, n_v:]
-        H_dot = (self._slope @ H.reshape(INSTANTS + 1, -1)).reshape(H.shape)
-        offset = -start % SPARSE
-        first = int(np.searchsorted(self.state.numbers, start))
-        told = self.state.derivatives[first : first + nodes(offset).size]
-        P_x, G_v, G_x = (told[:, :, k * n_v : (k + 1) * n_v] @ readings[nodes(offset)] for k in range(3))
-        middle = readings[INSTANTS // 2]
-        return Sensitivity(H @ readings, H_dot @ readings, P_x, G_v, G_x, offset, self.state.rates[inside], middle)
+    def windows(self, starts: NDArray[np.int64]) -> Sensitivity:
+        """At the instants from each of some numbers on, all of them even or all of them odd."""
+        n_v, now = self.model.layout.n_v, self.state
+        inside = (starts - now.first)[:, None] + np.arange(INSTANTS + 1)
+        dense = now.dense[inside]
+        H, readings = dense[..., :n_v], dense[..., n_v:]
+        H_dot = (self._slope @ H.reshape(len(starts), INSTANTS + 1, -1)).reshape(H.shape)
+        offset = int(-starts[0] % SPARSE)
+        at = nodes(offset)
+        told = now.derivatives[np.searchsorted(now.numbers, starts)[:, None] + np.arange(at.size)]
+        P_x, G_v, G_x = (told[..., k * n_v : (k + 1) * n_v] @ readings[:, at] for k in range(3))
+        middle = readings[:, INSTANTS // 2]
+        return Sensitivity(H @ readings, H_dot @ readings, P_x, G_v, G_x, offset, now.rates[inside], middle)
 
     def drop(self, before: int) -> None:
         """Forget instants with smaller numbers."""
