@@ -20,7 +20,7 @@ from sms_online.pipeline.drift_line import DriftLine
 from sms_online.pipeline.errors_in_variables import NoiseBias, unbiased
 from sms_online.pipeline.latency import Latencies, clock_groups, source_groups
 from sms_online.pipeline.momentum_balance import MomentumBalance, half_hop
-from sms_online.pipeline.momentum_fit import MomentumFit, WhiteRows, first_motion
+from sms_online.pipeline.momentum_fit import FIRST_MOTION, MomentumFit, WhiteRows
 from sms_online.pipeline.momentum_windows import COPIES, HOPS, INSTANTS
 from sms_online.pipeline.residual_test import SequentialTest
 from sms_online.pipeline.sensing import Sensing
@@ -37,8 +37,8 @@ from sms_online.trackers.square_root import session_tracker
 
 # The synthetic noise is the same in every session, so that the same samples give the same bits.
 SEED = 6
-# Motion after that of the first fit, s, in which a lack that was there from the start is noticed as a rule.
-TESTED = 1.0
+# Motion, s, in which a lack that was there from the start is noticed as a rule: that of the first fit, and a second.
+TESTED = FIRST_MOTION + 1.0
 # Variance of rows over the predicted one, at most, where noise is not white: its density at low frequencies follows
 # from that at high ones.
 COLOURED_NOISE = 2.0
@@ -177,8 +177,7 @@ class Momentum(Stage):
     @property
     def settled(self) -> bool:
         """Whether there are rows enough since the last event for a test of what they leave."""
-        tested = self.fit.plain.windows * self._balance.span / HOPS
-        return self.started and tested >= first_motion(self._balance.span) + TESTED
+        return self.started and self.fit.plain.windows * self._balance.span / HOPS >= TESTED
 
     @property
     def misfit(self) -> bool:

@@ -45,8 +45,8 @@ from sms_online.pipeline.window_noise import WindowNoise
 from sms_online.state import Stage, State
 from sms_online.stream import Array
 
-# Motion before weights are made, s, and windows side by side, which wider ones take longer for.
-FIRST_MOTION, FIRST_WINDOWS = 1.6, 4
+# Motion before weights are made, s: at the usual width, four windows side by side.
+FIRST_MOTION = 1.6
 # Less does where a gap or the end of the session leaves no more.
 LEAST_MOTION = 0.4
 # What is held back at most, s; the oldest goes, for an arm that rests tells nothing.
@@ -83,11 +83,6 @@ WARM_UP = 3.2
 TOGETHER = 64
 # Singular values below this share of the largest, of columns scaled to unit length, are not solved for.
 RANK_TOLERANCE = 1e-10
-
-
-def first_motion(span: float) -> float:
-    """Motion before weights are made, s, with windows of `span` s."""
-    return max(FIRST_MOTION, FIRST_WINDOWS * span)
 
 
 @dataclass(frozen=True)
@@ -229,7 +224,7 @@ class MomentumFit(Stage):
         else:
             self.state.held += windows
             self.state.moving += sum(self._moves(window, noise) for window in windows)
-            out = self.flush(noise) if self.state.moving >= self._count(first_motion(self._balance.span)) else []
+            out = self.flush(noise) if self.state.moving >= self._count(FIRST_MOTION) else []
             self.state.held = self.state.held[-self._count(HELD_BACK) :]
         self._forget_instants()
         return out
