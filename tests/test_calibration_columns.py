@@ -82,7 +82,7 @@ class Rows:
         model = self.model if model is None else model
         sensing = Sensing(model, self.sensing.channels, "test")
         balance = MomentumBalance(model, self.base, self.model.system.sample_rate, SPAN)
-        dense = [balance.dense(window)[0] for window in self._windows(balance, sensing, values)[0]]
+        dense = balance.dense(self._windows(balance, sensing, values)[0])[:, 0]
         return np.concatenate([rows[:, :-1] @ self.beta - rows[:, -1] for rows in dense])
 
     def moved(self, geometry: Geometry, by: float) -> Array:
