@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
 from fnmatch import fnmatchcase
-from functools import cached_property
+from functools import cached_property, partial
 from itertools import product
 
 import numpy as np
@@ -14,6 +14,7 @@ from sms_online.description.schema import Effect, System
 from sms_online.diagnosis.candidate import Candidate, LeftOpen
 from sms_online.diagnosis.constants import is_constant
 from sms_online.diagnosis.followed import FollowedMotion
+from sms_online.diagnosis.quadratic_forms import QuadraticForms
 from sms_online.diagnosis.reversals import Reversals
 from sms_online.diagnosis.rows import SessionRows
 from sms_online.diagnosis.standstill import LEAVING, SessionStandstill
@@ -48,9 +49,11 @@ class CandidateColumns:
         self._since, self._resting = since, resting
         self._weak = rows.weak if weak is None else weak
         self._noisy: list[CandidateColumns] = []
+        self._forms = QuadraticForms()
         self._held: dict[str, SessionStandstill] = {}
         self._turned: dict[str, Reversals] = {}
         self._own = {p.name for p in rows.model.parameters}
+        self._models: dict[tuple[object, ...], Model] = {}  # with one law more each
 
     def within(self, weak: WeakWindows, resting: bool = False) -> CandidateColumns:
         """The same for other windows of the session."""
@@ -188,23 +191,39 @@ class CandidateColumns:
         nothing = np.zeros((len(self.rows.b), HOPS, self.rows.b.shape[1]))
         if ENTRIES[effect.name].kind != "force" or is_constant(effect) or self.rows.noise.exact:
             return LeftOpen(nothing[:, 0], nothing)
-        model = build_model(self._declaring(effect))
+        law = (effect.name, effect.where, *sorted(effect.coefficients.items()))
+        if law not in self._models:
+            self._models[law] = build_model(self._declaring(effect))
+        model = self._models[law]
         force = model.effects[-1]
         if effect.where.startswith("joint_") and not force.reversing and not force.n_states:
-            return LeftOpen(self._spread(model, coefficients), nothing)
-        if not self._noisy:
-            self._noisy = [self.within(weak) for weak in self.rows.noisy()]
-        noisy = [make.of(effect).columns for make in self._noisy]
-        changes = [(columns - candidate.columns) @ coefficients for columns in noisy]
-        squares = np.mean(np.square(changes), axis=0)
+            spread = partial(self._spread, model)
+            return LeftOpen(self._forms.at(("spread", *law), spread, coefficients), nothing)
+        squares = self._forms.at(("draws", *law), self._drawn(candidate), coefficients)
         near = slice(HOPS - 1, HOPS - 1 + len(squares))
         sums = [np.convolve(column, np.ones(2 * HOPS - 1))[near] for column in (np.ones(len(squares)), *squares.T)]
         own = np.stack(sums[1:], axis=1) / sums[0][:, None]
-        free = self._untold(model, coefficients) if force.reversing else nothing
+        free = nothing
+        if force.reversing:
+            untold = self._forms.at(("untold", *law), partial(self._untold, model), coefficients)
+            free = self._weak.shared(np.sqrt(untold))
         return LeftOpen(np.maximum(own - free[:, 0], 0.0), free)
 
+    def _drawn(self, candidate: Candidate) -> Callable[[Array], Array]:
+        """Gives the mean squares (W, n_v) of what draws of noise change of a force with coefficients (c,)."""
+
+        def squares(coefficients: Array) -> Array:
+            if not self._noisy:
+                self._noisy = [self.within(weak) for weak in self.rows.noisy()]
+            if not changes:
+                changes.extend(make.of(candidate.effect).columns - candidate.columns for make in self._noisy)
+            return np.asarray(np.mean(np.square([change @ coefficients for change in changes]), axis=0))
+
+        changes: list[Array] = []
+        return squares
+
     def _untold(self, model: Model, coefficients: Array) -> Array:
-        """Covariances (W, HOPS, n_v) of the rows by what a model's last effect, a law of a rate's sign, does not tell.
+        """Squares (W, INSTANTS, n_v) of what a model's last effect, a law of a rate's sign, does not determine.
 
         Where the sign changes, at a standstill, and by what the filter rounds off of the rate.
         """
@@ -227,7 +246,7 @@ class CandidateColumns:
             times = np.where(leaving != 0.0, leaving_for * WINDING**2, self._weak.alike)
             return np.where(still, times * along(v) ** 2, jumps)
 
-        return self._weak.free(squares)
+        return self._weak.squares(squares)
 
     def _spread(self, model: Model, coefficients: Array) -> Array:
         """Variance (W, n_v) of the rows for a model's last effect, of a joint, to first order in encoders' noise."""
