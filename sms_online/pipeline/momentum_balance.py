@@ -46,7 +46,7 @@ WIDEST_SHARE = 5
 # there, and passes the windows that follow on to the wide filter.
 PROMPT_SHARE = HOPS
 # So many samples at once are smoothed and have their columns evaluated: of a long segment they would fill the memory.
-PIECE = 2000
+PIECE = 400
 # Samples before and after a window that its filter needs at most.
 MARGIN = HALF_WIDTHS[-1]
 
