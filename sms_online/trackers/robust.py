@@ -75,9 +75,9 @@ def cluster_covariance(
 ) -> Array | None:
     """Cluster-robust covariance (n, n) of a least-squares solution; None while clusters are too few to span it.
 
-    clusters: (C, n + 1, n + 1) factors of all measured rows, before these were divided by `scale`. prior: (k, n + 1) information rows, which keep their
-    stated std. rows: number of measured rows. Small-sample factor C/(C − 1)·(M − 1)/(M − rank): Cameron and Miller,
-    J. Human Resources 50 (2015) 317–372, section II.
+    clusters: (C, n + 1, n + 1) factors of all measured rows, before these were divided by `scale`. prior: (k, n + 1)
+    information rows, which keep their stated std. rows: number of measured rows. Small-sample factor
+    C/(C − 1)·(M − 1)/(M − rank): Cameron and Miller, J. Human Resources 50 (2015) 317–372, section II.
     """
     count, n = int(np.count_nonzero(clusters.any(axis=(1, 2)))), solution.pi.size
     if count <= solution.rank or rows <= solution.rank:
