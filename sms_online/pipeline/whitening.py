@@ -106,7 +106,7 @@ class Whitening:
             band[below[own], (later - hops)[:, None] * n_v + column[own]] = blocks[:, own]
         band[0] += ROUNDING * band[0] + errors.ravel()
         self._factor = cholesky_banded(band, overwrite_ab=True, lower=True, check_finite=False) if W else band
-        self.std = self._factor[0].reshape(W, n_v)
+        self.std: Array = self._factor[0].reshape(W, n_v)
 
     def of(self, columns: Array) -> Array:
         """Columns (W, n_v, c) in the whitened rows, (W n_v, c)."""
