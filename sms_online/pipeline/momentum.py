@@ -121,7 +121,7 @@ class Momentum(Stage):
         )  # fmt: skip
         self.tracker = self._new_tracker()
         self.fit.plain.patient = self.bank.learned is not None
-        self.test = SequentialTest(model.layout, self._balance.span / HOPS, self.nuisances)
+        self.test = self._new_test()
 
     def _rebuild(self) -> None:
         """The same after an event, trackers included."""
@@ -138,6 +138,9 @@ class Momentum(Stage):
         model, balance, sensing = self.changes.model, self._balance, self.sensing
         calibration = CalibrationColumns(model, sensing, balance.span) if self.nuisances else None
         return WindowNoise(model, self.changes.base, balance, sensing.displacements, self._clocks, calibration)
+
+    def _new_test(self) -> SequentialTest:
+        return SequentialTest(self.changes.model.layout, self._balance.span / HOPS, self.nuisances)
 
     def _new_tracker(self) -> Tracker:
         tracker = session_tracker(self.changes.base.n, self.current_prior, len(self.nuisances))
@@ -410,7 +413,7 @@ class Momentum(Stage):
         self.changes.detector.begin(known)
         self.bias, self.grams = NoiseBias.none(n, self._calibration), RowGrams.none(n_v, n)
         self.fit.plain.clear()
-        self.test = SequentialTest(model.layout, self._balance.span / HOPS, self.nuisances)
+        self.test = self._new_test()
         self.bank.refer(known.solution().pi[m:])
         self.state.known, self.state.drift = known.factor, None
 

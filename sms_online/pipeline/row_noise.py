@@ -113,17 +113,19 @@ class RowNoise(Stage):
         now, past = self.state, len(self.state.before)
         # By time, so that what two windows have in common lies in one piece.
         c = np.multiply(kernels.swapaxes(2, 3), np.sqrt(self._step * sensor_density)[:, None], order="C")
-        before = np.concatenate((*(each[None] for each in now.before), c.reshape(W, -1, n_v)))
+        before = [*now.before, *c.reshape(W, -1, n_v)]  # many numbers, and so not copied
         torque = np.concatenate((*(each[None] for each in now.torque), np.tile(torque_density, (W, 1))))
         error = np.where(ages >= CLOCK_KNOWN, CLOCK_ERROR, YOUNG_CLOCK_ERROR)
         by_clock = np.concatenate((*(each[None] for each in now.late), error[:, None, None] * self._by_clock(late)))
         unknown = np.concatenate((*(each[None] for each in now.free), free))
         out: list[list[Array]] = [[] for _ in range(W)]
-        length = before.shape[1]
+        length = len(before[-1])
         for hops in range(min(HOPS, past + W) - 1, -1, -1):  # from each window to a later one
             first = hops * STEPS_A_HOP * sensors
             later = np.arange(max(past, hops), past + W)
-            own = before[later, : length - first].swapaxes(1, 2) @ before[later - hops, first:]
+            own = np.empty((later.size, n_v, n_v))
+            for block, k in zip(own, later.tolist(), strict=True):
+                np.matmul(before[k][: length - first].T, before[k - hops][first:], out=block)
             shared = self._overlap[hops] * np.sqrt(torque_density * torque[later - hops])
             own[:, self._joint_rows, self._joint_rows] += shared
             if self._clocks:
