@@ -18,7 +18,7 @@ from sms_online.model.base_parameters import BaseParameters
 from sms_online.model.dynamics import Dynamics
 from sms_online.model.readings import Readings
 from sms_online.model.so3 import skew
-from sms_online.pipeline.sensitivity import derivatives
+from sms_online.pipeline.derivatives import Derivatives
 from sms_online.stream import Array
 
 
@@ -66,9 +66,12 @@ def linearise(
     def interpolated(told: Array) -> Array:
         return np.asarray(np.tensordot(weights, told, 1))
 
-    P_x, G_v, G_x = np.split(interpolated(derivatives(dynamics, x[nodes], v[nodes])), 3, axis=2)
-    C_x, C_v = (interpolated(part) for part in readings.derivatives(x[nodes], v[nodes]))
     H = dynamics.mass_matrix(x)
+    derivatives, _ = Derivatives(model).at(
+        dynamics.pi, x[nodes], v[nodes], None, H[nodes], np.ones(nodes.size, dtype=np.bool_)
+    )
+    P_x, G_v, G_x = np.split(interpolated(derivatives), 3, axis=2)
+    C_x, C_v = (interpolated(part) for part in readings.derivatives(x[nodes], v[nodes]))
     P, G = (base.columns(part) for part in model.momentum_columns(x, v))
     # δv by δx, δp and δβ.
     v_p = np.linalg.inv(H)

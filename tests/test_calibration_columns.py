@@ -60,17 +60,16 @@ class Rows:
     def _columns(self, balance: MomentumBalance) -> Array:
         pi = balance.rough.without(self.base.physical_values(self.beta))
         found, instants = self._windows(balance, self.sensing, self.exact)
-        told = Sensitivities(self.model, self.sensing.displacements, balance.span / INSTANTS)
         calibration = CalibrationColumns(self.model, self.sensing, balance.span)
+        told = Sensitivities(self.model, self.sensing.displacements, balance.span / INSTANTS, calibration.geometries)
         for piece in instants:
-            told.tell(pi, piece.x, piece.v, piece.signals)
-            calibration.tell(pi, piece.x, piece.v, piece.signals, told.rates(len(piece.x)))
-        out = []
-        for window in found:
-            sensitivity = told.window(window.start)
-            rough = balance.rough.kernel(window.rough, self.base.physical_values(self.beta), sensitivity.displacements)
-            out.append(calibration.window(window.start, sensitivity, rough))
-        return np.concatenate(out)
+            by_geometry = told.tell(pi, piece.x, piece.v, piece.signals)
+            calibration.tell(piece.x, piece.signals, told.rates(len(piece.x)), by_geometry)
+        starts = np.array([window.start for window in found])
+        sensitivity = told.windows(starts)
+        responses = np.array([window.rough for window in found])
+        rough = balance.rough.kernels(responses, self.base.physical_values(self.beta), sensitivity.displacements)
+        return np.concatenate(calibration.windows(starts, sensitivity, rough))
 
     def _windows(
         self, balance: MomentumBalance, sensing: Sensing, values: Array
@@ -83,7 +82,7 @@ class Rows:
         model = self.model if model is None else model
         sensing = Sensing(model, self.sensing.channels, "test")
         balance = MomentumBalance(model, self.base, self.model.system.sample_rate, SPAN)
-        dense = [balance.dense(window)[0] for window in self._windows(balance, sensing, values)[0]]
+        dense = balance.dense(self._windows(balance, sensing, values)[0])[:, 0]
         return np.concatenate([rows[:, :-1] @ self.beta - rows[:, -1] for rows in dense])
 
     def moved(self, geometry: Geometry, by: float) -> Array:

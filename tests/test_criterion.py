@@ -65,7 +65,7 @@ def test_noise_of_rows_without_a_torque_does_not_shrink_the_parameters() -> None
     errors, squares = [], []
     for seed in range(20):
         grams = _rows(1000, 1.0, lack=0.0, seed=seed)
-        whole = grams.signal.sum(axis=0)
+        whole = grams.signal.matrices.sum(axis=0)
         shrunk = np.linalg.solve(whole[:-1, :-1], whole[:-1, -1])
         squares.append(shrunk / TRUE - 1.0)
         errors.append(minimum(grams, np.array([False, False]), TORQUE, [shrunk], *_alone(2)).beta / TRUE - 1.0)

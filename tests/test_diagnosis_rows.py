@@ -245,7 +245,8 @@ def test_rows_share_a_force_that_is_off_at_every_sample(half_hop: int) -> None:
     layout: Any = SimpleNamespace(n_v=2, n_x=2, speeds=lambda x, x_dot: x_dot)
     samples = [Segment(np.arange(200), np.zeros((200, 3))) for _ in range(2)]
     squares = np.random.default_rng(1).random((2, 200, 2))
-    found = WeakWindows(windows, layout, sensing, samples, rate).free(lambda m: squares[m.segment, m.samples])
+    weak = WeakWindows(windows, layout, sensing, samples, rate)
+    found = weak.shared(np.sqrt(weak.squares(lambda m: squares[m.segment, m.samples])))
     phi = np.zeros((segment.size, 200))
     for row, first in zip(phi, start.tolist(), strict=True):
         row[first : first + width + 1] = (1.0 - np.linspace(-1.0, 1.0, width + 1) ** 2) ** EXPONENT / rate

@@ -55,7 +55,7 @@ def predicted(window: Window, sigma: float) -> float:
     rough = MomentumBalance(MODEL, BASE, RATE, SPAN).rough
     pi = np.zeros(MODEL.n_pi)
     pi[friction()] = 1.0
-    c = rough.kernel(window.rough, pi, np.eye(MODEL.layout.n_v))[:, MOTOR, MOTOR]
+    c = rough.kernels(window.rough[None], pi, np.eye(MODEL.layout.n_v)[None])[0, :, MOTOR, MOTOR]
     return float(np.sqrt(np.sum(c**2) * SPAN / STEPS * sigma**2 / RATE))
 
 
@@ -122,7 +122,7 @@ def test_what_friction_may_be_at_a_standstill_is_open() -> None:
     rough = MomentumBalance(MODEL, BASE, RATE, SPAN).rough
     phi = (1.0 - np.linspace(-1.0, 1.0, 401) ** 2) ** 6
     for window in windows:
-        std = np.linalg.norm(rough.at_rest(window.rest, pi), axis=0)
+        std = np.linalg.norm(rough.at_rest(window.rest[None], pi)[0], axis=0)
         assert not np.any(np.delete(std, MOTOR))
         if window.end / RATE < 0.7 or window.end / RATE - SPAN > 1.5:
             assert std[MOTOR] == 0.0

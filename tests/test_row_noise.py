@@ -25,13 +25,18 @@ from sms_online.pipeline.whitening import ROUNDING, Whitener, Whitening
 from sms_online.stream import Array
 from sms_sim.plant import Plant
 from tests.axis import AXIS
-from tests.model_systems import FRICTION, paper, spatial
+from tests.model_systems import paper, spatial
 from tests.prescribed_motion import prescribed
 
 SPAN = 0.4  # s
 # Small enough that rows are linear in it, large against rounding. rad and m; N m of the joint torque.
 POSITION_NOISE, TORQUE_NOISE = 1e-6, 1e-3
-NO_FREE_FORCES = np.empty((0, 0))
+
+
+def _no_free_forces(windows: int) -> Array:
+    return np.empty((windows, 0, 0))
+
+
 # Windows after the first.
 HOPS_FOLLOWED = 3
 AXIS_SYSTEM = parse_system(AXIS.replace("sample_rate = 200.0", "sample_rate = 1000.0"), "axis.toml")
@@ -109,13 +114,13 @@ def scatter(system: System, draws: int, seed: int) -> Scatter:
     found, told = windows(exact)
     noise, whitener = RowNoise(model.layout.theta_m, probe.span), Whitener(draws)
     density = POSITION_NOISE**2 / system.sample_rate, TORQUE_NOISE**2 / system.sample_rate
-    covariances = []
-    for window in found:
-        sensitivity = told.window(window.start)
-        kernel = noise.kernel(sensitivity)
-        kernel += probe.rough.kernel(window.rough, model.nominal, sensitivity.displacements)
-        densities = np.full(model.layout.n_x, density[0]), np.full(len(model.layout.q), density[1])
-        covariances.append(noise.covariance(kernel, sensitivity.rates, *densities, NO_FREE_FORCES))
+    sensitivity = told.windows(np.array([window.start for window in found]))
+    kernels = noise.kernels(sensitivity)
+    responses = np.array([window.rough for window in found])
+    kernels += probe.rough.kernels(responses, model.nominal, sensitivity.displacements)
+    densities = np.full(model.layout.n_x, density[0]), np.full(len(model.layout.q), density[1])
+    late = noise.lateness(kernels, sensitivity.rates)
+    covariances = noise.covariances(kernels, late, *densities, _no_free_forces(len(found)), np.full(len(found), np.inf))
     rest = residual(found)
     errors = np.stack(
         [residual(windows(exact + sigma * rng.standard_normal(exact.shape))[0]) - rest for _ in range(draws)]
@@ -178,36 +183,19 @@ def test_a_clock_that_is_off_moves_rows_by_the_rates_of_its_readings() -> None:
     clock = SourceGroup("encoders", sensors, (), ())
     noise = RowNoise(model.layout.theta_m, balance.span, (clock,))
     nothing = np.zeros(model.layout.n_x), np.zeros(len(model.layout.q))
-    seen = [told.window(start) for start in starts]
-    kernels = [noise.kernel(sensitivity) for sensitivity in seen]
-    found = [noise.covariance(c, each.rates, *nothing, NO_FREE_FORCES) for c, each in zip(kernels, seen, strict=True)]
+    sensitivity = told.windows(np.array(starts))
+    kernels = noise.kernels(sensitivity)
+    lateness = noise.lateness(kernels, sensitivity.rates)
+    W = len(starts)
+    found = noise.covariances(kernels, lateness, *nothing, _no_free_forces(W), np.full(W, np.inf))
     assert len(found) > 2
     for k in range(2):  # a window with itself and with the one before
         expected = (1.0 - k / HOPS) * CLOCK_ERROR**2 * np.outer(slopes[-1], slopes[-1 - k])
         np.testing.assert_allclose(found[-1][-1 - k], expected, atol=0.02 * np.abs(expected).max())
     young = RowNoise(model.layout.theta_m, balance.span, (clock,))
-    own = young.covariance(kernels[-1], seen[-1].rates, *nothing, NO_FREE_FORCES, 0.5 * CLOCK_KNOWN)[-1]
+    age = np.array([0.5 * CLOCK_KNOWN])
+    own = young.covariances(kernels[-1:], lateness[-1:], *nothing, _no_free_forces(1), age)[0][-1]
     np.testing.assert_allclose(own, 4.0 * found[-1][-1], rtol=1e-12)
-
-
-def test_sensitivities_of_columns_told_with_the_rows_are_those_of_the_dynamics() -> None:
-    model = build_model(paper(effects=FRICTION))
-    balance = MomentumBalance(model, find_base_parameters(model), model.system.sample_rate, SPAN)
-    motion = prescribed(model, balance.width + balance.lead + balance.margin + 1, seed=2)  # of one window
-    samples = np.concatenate((motion.x, np.zeros((len(motion.x), len(model.layout.q)))), axis=1)
-    by_columns, by_dynamics = (
-        Sensitivities(model, lambda x: np.tile(np.eye(model.layout.n_v), (len(x), 1, 1)), balance.span / INSTANTS)
-        for _ in range(2)
-    )
-    _, instants = balance.push(np.arange(len(samples)), [samples] * COPIES, np.ones(15), by_columns.probes)
-    (piece,) = instants
-    assert piece.probed is not None
-    by_columns.tell(model.nominal, piece.x, piece.v, piece.signals, piece.probed)
-    by_dynamics.tell(model.nominal, piece.x, piece.v, piece.signals)
-    ours, theirs = by_columns.window(0), by_dynamics.window(0)
-    for part in ("P_x", "G_v", "G_x"):
-        expected = getattr(theirs, part)
-        np.testing.assert_allclose(getattr(ours, part), expected, atol=1e-8 * np.abs(expected).max())
 
 
 def test_what_windows_hold_beside_a_force_that_nobody_knows_is_still_told() -> None:
@@ -223,7 +211,7 @@ def test_what_windows_hold_beside_a_force_that_nobody_knows_is_still_told() -> N
     resting = (time >= 1000) & (time < 1300)
     windows = [slice(start, start + width + 1) for start in range(640, 1000, 2 * half_hop)]
     assert all(np.any(resting[inside]) for inside in windows)
-    nothing = np.zeros((STEPS + 1, 1, 1)), np.zeros((INSTANTS + 1, 1)), np.zeros(1), np.array([sigma**2 * dt])
+    nothing = np.zeros((1, STEPS + 1, 1, 1)), np.zeros((1, 1, 1)), np.zeros(1), np.array([sigma**2 * dt])
     errors, alone = [], 0.0
     for draw in range(50):
         force = 2.0 + sigma * rng.standard_normal(time.size)
@@ -232,13 +220,33 @@ def test_what_windows_hold_beside_a_force_that_nobody_knows_is_still_told() -> N
         white = []
         for inside in windows:
             free = open_at_rest(np.full((width + 1, 1), 20.0), resting[inside, None], phi)
-            covariances = noise.covariance(*nothing, free)
+            (covariances,) = noise.covariances(*nothing, free[None], np.array([np.inf]))
             white.append(whitener.push(covariances, np.array([[phi.sum(), phi @ force[inside]]])))
             alone += float(phi.sum() ** 2 / covariances[-1][0, 0]) if draw == 0 else 0.0
         column, rows = np.concatenate(white).T
         errors.append((column @ rows - 2.0 * (column @ column)) / np.linalg.norm(column))
     assert column @ column > 10.0**2 * alone
     assert np.sqrt(np.mean(np.square(errors))) < 1.5
+
+
+def test_windows_together_have_the_covariances_of_one_after_the_other() -> None:
+    rng = np.random.default_rng(5)
+    W, n_v, sensors = 25, 3, 4
+    clocks = (SourceGroup("a", (0, 1), (1,), ()), SourceGroup("b", (2, 3), (), ()))
+    kernels, late = rng.standard_normal((W, STEPS + 1, n_v, sensors)), rng.standard_normal((W, n_v, sensors))
+    densities, free = (np.full(sensors, 2.0), np.full(1, 3.0)), np.abs(rng.standard_normal((W, INSTANTS, n_v)))
+    ages = np.linspace(0.0, 2.0 * CLOCK_KNOWN, W)
+    noise = RowNoise((0,), SPAN, clocks)
+    whole = noise.covariances(kernels, late, *densities, free, ages)
+    parted = RowNoise((0,), SPAN, clocks)
+    found = [
+        covariances
+        for part in (slice(0, 1), slice(1, 4), slice(4, 20), slice(20, W))
+        for covariances in parted.covariances(kernels[part], late[part], *densities, free[part], ages[part])
+    ]
+    assert [len(each) for each in whole] == [min(HOPS, k + 1) for k in range(W)]
+    for one, other in zip(whole, found, strict=True):
+        np.testing.assert_allclose(one, other, rtol=1e-12, atol=1e-12 * np.abs(one).max())
 
 
 def random_banded(n_v: int, windows: int, seed: int) -> list[list[Array]]:

@@ -54,12 +54,11 @@ def test_a_chain_that_was_told_enough_windows_weighs_like_one_that_knows_them_al
         chain = Weighing(WindowNoise(model, base, balance, sensing.displacements), COPIES * (base.n + 1))
         chain.begin(base.values(model.nominal), noise, np.zeros(model.layout.n_v), windows[first].start)
         chain.noise.tell(0, x, v, signals)
-        white = []
-        for window in windows[first : late + COMPARED]:
-            rows = np.zeros((model.layout.n_v, COPIES * (base.n + 1)))
-            rows[balance.rows, balance.columns] = window.Y[0]
-            white.append(chain.push(window, rows, np.zeros(model.layout.n_v)).rows[:, : base.n])
-        return _information(np.concatenate(white[late - first :]))
+        chosen = windows[first : late + COMPARED]
+        rows = np.zeros((len(chosen), model.layout.n_v, COPIES * (base.n + 1)))
+        rows[:, balance.rows, balance.columns] = [window.Y[0] for window in chosen]
+        white = chain.push(chosen, rows, np.zeros((len(chosen), model.layout.n_v)))
+        return _information(np.concatenate([each.rows[:, : base.n] for each in white[late - first :]]))
 
     whole, warmed, cold = told_from(0), told_from(late - warm), told_from(late)
     assert np.all(np.abs(warmed / whole - 1.0) < 0.25)

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from scipy.interpolate import make_interp_spline
 
 from sms_online.calibration.channels import Motion, position_families, torque_families
-from sms_online.calibration.geometry import GeometryDerivatives, geometries
+from sms_online.calibration.geometry import geometries
 from sms_online.calibration.nuisance import Nuisance
 from sms_online.model.model import Model
 from sms_online.pipeline.momentum_windows import EXPONENT, INSTANTS, STEPS
@@ -60,7 +60,7 @@ class CalibrationState(State):
 class CalibrationColumns(Stage):
     """Evaluates the columns window by window, at the instants of the sensitivities.
 
-    count: of nuisances.
+    count: of nuisances. geometries: those of geometry, which come last.
     """
 
     def __init__(self, model: Model, sensing: Sensing, span: float) -> None:
@@ -69,7 +69,7 @@ class CalibrationColumns(Stage):
         self._positions = position_families(sensing, sensing.model.system.tolerances)
         self._torques = torque_families(sensing, sensing.model.system.tolerances)
         # Of the session's system: an event's may hold more that has a geometry.
-        self._geometry = GeometryDerivatives(model, list(geometries(sensing.model.system)))
+        self.geometries = tuple(geometries(sensing.model.system))
         self._joint_rows = list(model.layout.theta_m)
         # What is added at the instants, in the sum over steps; and that sum of c, by parts of a `Sensitivity`.
         self._to_steps = _interpolation(np.arange(INSTANTS + 1)) * span / STEPS
@@ -91,12 +91,12 @@ class CalibrationColumns(Stage):
             *np.empty((2, 0, layout.n_v, moved)),
         )
 
-    def tell(self, pi: Array, x: Array, v: Array, signals: Array, rates: Array) -> None:
-        """Take the next instants: x (K, n_x), v (K, n_v), signals as in `Instants`, with parameters π (n_pi,).
+    def tell(self, x: Array, signals: Array, rates: Array, by_geometry: Array) -> None:
+        """Take the next instants: x (K, n_x), signals as in `Instants`, rates (K, sensors) of the readings.
 
-        rates (K, sensors): of the readings.
+        by_geometry (2, K, n_v, c): what geometries change momentum and force by.
         """
-        if not self.count or not len(x):
+        if not self.count:
             return
         torque = signals[:, : len(self._model.layout.q)]
         _, T_0 = self._model.layout.base_pose(x)
@@ -104,7 +104,7 @@ class CalibrationColumns(Stage):
         K = len(x)
         added = [np.empty((K, *self.state.added.shape[1:2], 0)), *(family.adds(motion) for family in self._positions)]
         torques = [np.empty((K, *self.state.torque.shape[1:2], 0)), *(family.adds(motion) for family in self._torques)]
-        momentum, force = self._geometry.at(pi, x, v, signals)
+        momentum, force = by_geometry
         self.state.added = np.concatenate((self.state.added, np.concatenate(added, axis=2)))
         self.state.torque = np.concatenate((self.state.torque, np.concatenate(torques, axis=2)))
         self.state.momentum = np.concatenate((self.state.momentum, momentum))
@@ -122,25 +122,30 @@ class CalibrationColumns(Stage):
         of_force = (-phi_dot * sparse, phi_dot * sparse + phi * slope, -phi * sparse)
         return np.asarray(self._to_steps.T @ np.concatenate((of_mass, *of_force), axis=1))
 
-    def window(self, start: int, sensitivity: Sensitivity, rough: Array) -> Array:
-        """N (n_v, count) of the window that starts at an instant.
+    def windows(self, starts: NDArray[np.int64], sensitivity: Sensitivity, rough: Array) -> Array:
+        """N (W, n_v, count) of the windows that start at some instants.
 
-        rough (STEPS + 1, n_v, sensors): what rough forces add to c.
+        rough (W, STEPS + 1, n_v, sensors): what rough forces add to c.
         """
-        n_v, sensors = sensitivity.H.shape[1:]
+        W, _, n_v, sensors = sensitivity.H.shape
         if not self.count:
-            return np.empty((n_v, 0))
-        inside = slice(start - self.state.first, start - self.state.first + INSTANTS + 1)
-        told = (sensitivity.H, sensitivity.P_x, sensitivity.G_v, sensitivity.G_x)
-        weights = self._kernels[sensitivity.offset] @ np.concatenate(told).reshape(-1, n_v * sensors)
-        weights += self._to_steps.T @ rough.reshape(STEPS + 1, -1)
-        flat = weights.reshape(-1, n_v, sensors).swapaxes(0, 1).reshape(n_v, -1)
-        positions = -flat @ self.state.added[inside].reshape(flat.shape[1], -1)
-        torques = np.zeros((n_v, self.state.torque.shape[2]))
-        torques[self._joint_rows] = np.tensordot(self._phi, self.state.torque[inside], 1)
-        moved = -np.tensordot(self._phi_dot, self.state.momentum[inside], 1)
-        moved -= np.tensordot(self._phi, self.state.force[inside], 1)
-        return np.concatenate((positions, torques, moved), axis=1)
+            return np.empty((W, n_v, 0))
+        now, inside = self.state, (starts - self.state.first)[:, None] + np.arange(INSTANTS + 1)
+        told = np.concatenate((sensitivity.H, sensitivity.P_x, sensitivity.G_v, sensitivity.G_x), axis=1)
+        weights = self._kernels[sensitivity.offset] @ told.reshape(W, -1, n_v * sensors)
+        if rough.any():
+            weights += self._to_steps.T @ rough.reshape(W, STEPS + 1, -1)
+        flat = weights.reshape(W, -1, n_v, sensors).swapaxes(1, 2).reshape(W, n_v, -1)
+        positions = -flat @ now.added[inside].reshape(W, flat.shape[2], -1)
+        torques = np.zeros((W, n_v, now.torque.shape[2]))
+        torques[:, self._joint_rows] = self._over(self._phi, now.torque[inside])
+        moved = -self._over(self._phi_dot, now.momentum[inside]) - self._over(self._phi, now.force[inside])
+        return np.concatenate((positions, torques, moved), axis=2)
+
+    @staticmethod
+    def _over(weights: Array, values: Array) -> Array:
+        """Sums (W, …) over the instants of values (W, INSTANTS + 1, …)."""
+        return np.asarray((weights @ values.reshape(*values.shape[:2], -1)).reshape(len(values), *values.shape[2:]))
 
     def drop(self, before: int) -> None:
         """Forget instants with smaller numbers."""

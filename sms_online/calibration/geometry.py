@@ -1,4 +1,4 @@
-"""Nuisances of geometry: what momentum and force of the model change by, for one unit of each."""
+"""Nuisances of geometry, and the systems and states that they make of a described one."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from sms_online.model.model import Model
 from sms_online.stream import Array
 
 # Step of the differences that give derivatives, m or rad: 1e-6 of them is lost to curvature, less to rounding.
-DIFFERENCE = 1e-6
+STEP = 1e-6
 
 
 # Makes states x (K, n_x), v (K, n_v) of a model to which the described one and its states are given, and by how much.
@@ -140,40 +140,3 @@ def _base_turned(axis: int) -> States:
         return x + layout.position_rate(x, turn), v
 
     return states
-
-
-class GeometryDerivatives:
-    """Derivatives of momentum P π and force G π by each of some geometries, at states that the readings give.
-
-    NumPy's calls cost more than the few states of a window: geometries with the same flexible links pass as one batch.
-    """
-
-    def __init__(self, model: Model, chosen: list[Geometry]) -> None:
-        self._model = model
-        self._models = [model, *(model.of_geometry(each.moved(model.system, DIFFERENCE)) for each in chosen)]
-        self._states = [each.states for each in chosen]
-        flexible = [[id(link) for link in each.chain.flexible] for each in self._models]
-        same = [each == flexible[0] for each in flexible]
-        self._groups = [np.flatnonzero(same), *(np.array([k]) for k, stacked in enumerate(same) if not stacked)]
-
-    def at(self, pi: Array, x: Array, v: Array, signals: Array) -> tuple[Array, Array]:
-        """∂Pπ and ∂Gπ (K, n_v, c) at x (K, n_x), v (K, n_v), signals as in `Instants`; readings stay as they are."""
-        if not self._states or not len(x):
-            none = np.zeros((len(x), v.shape[1], len(self._states)))
-            return none, none
-        moved = [
-            states(self._model, model, x, v, DIFFERENCE)
-            for states, model in zip(self._states, self._models[1:], strict=True)
-        ]
-        xs, vs = (np.array(every) for every in zip((x, v), *moved, strict=True))
-        there = np.empty((2, *vs.shape))
-        for group in self._groups:
-            models = [self._models[k] for k in group]
-            stacked = models[0].stacked(models, len(x)).dynamics(pi)
-            found = stacked.momentum_and_force(np.concatenate(xs[group]), np.concatenate(vs[group]))
-            there[:, group] = np.reshape(found, (2, len(group), *v.shape))
-        inputs = self._model.inputs(signals)
-        for k, model in enumerate(self._models if self._model.effects else []):
-            there[1, k] += model.dynamics(pi).effect_force(xs[k], vs[k], inputs)
-        change = (there[:, 1:] - there[:, :1]) / DIFFERENCE
-        return change[0].transpose(1, 2, 0), change[1].transpose(1, 2, 0)

@@ -5,9 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
 from fnmatch import fnmatchcase
-from functools import cached_property
+from functools import cached_property, partial
 from itertools import product
-from typing import TypeVar
 
 import numpy as np
 
@@ -15,6 +14,7 @@ from sms_online.description.schema import Effect, System
 from sms_online.diagnosis.candidate import Candidate, LeftOpen
 from sms_online.diagnosis.constants import is_constant
 from sms_online.diagnosis.followed import FollowedMotion
+from sms_online.diagnosis.quadratic_forms import QuadraticForms
 from sms_online.diagnosis.reversals import Reversals
 from sms_online.diagnosis.rows import SessionRows
 from sms_online.diagnosis.standstill import LEAVING, SessionStandstill
@@ -33,7 +33,6 @@ from sms_online.stream import Array
 WINDING = 0.2
 # Declarations of which models and noisy columns are kept: those that a search returns to.
 KEPT = 100
-_T = TypeVar("_T")
 
 
 class CandidateColumns:
@@ -53,7 +52,7 @@ class CandidateColumns:
         self._weak = rows.weak if weak is None else weak
         self._noisy: list[CandidateColumns] = []
         self._made: dict[tuple[object, ...], Model] = {}
-        self._moved: dict[tuple[object, ...], list[Array]] = {}
+        self._forms = QuadraticForms()
         self._held: dict[str, SessionStandstill] = {}
         self._turned: dict[str, Reversals] = {}
         self._own = {p.name for p in rows.model.parameters}
@@ -68,7 +67,12 @@ class CandidateColumns:
         """The model with one more effect, the last one. What becomes a constant is linear only beside known masses."""
         if is_constant(effect):
             return build_model(self._declaring(effect), self.rows.base.physical_values(self.rows.beta))
-        return _kept(self._made, effect, lambda: build_model(self._declaring(effect)))
+        law = _law(effect)
+        if law not in self._made:
+            if len(self._made) == KEPT:
+                del self._made[next(iter(self._made))]
+            self._made[law] = build_model(self._declaring(effect))
+        return self._made[law]
 
     def inputs(self, motion: Motion) -> Inputs:
         """What the effects that the system declares need beside the motion."""
@@ -218,24 +222,35 @@ class CandidateColumns:
             return LeftOpen(nothing[:, 0], nothing)
         model = self._model(effect)
         force = model.effects[-1]
+        law = _law(effect)
         if effect.where.startswith("joint_") and not force.reversing and not force.n_states:
-            return LeftOpen(self._spread(model, coefficients), nothing)
-        if not self._noisy:
-            self._noisy = [self.within(weak) for weak in self.rows.noisy()]
-
-        def moved() -> list[Array]:
-            return [make.of(effect).columns - candidate.columns for make in self._noisy]
-
-        changes = [columns @ coefficients for columns in _kept(self._moved, effect, moved)]
-        squares = np.mean(np.square(changes), axis=0)
+            spread = partial(self._spread, model)
+            return LeftOpen(self._forms.at(("spread", *law), spread, coefficients), nothing)
+        squares = self._forms.at(("draws", *law), self._drawn(candidate), coefficients)
         near = slice(HOPS - 1, HOPS - 1 + len(squares))
         sums = [np.convolve(column, np.ones(2 * HOPS - 1))[near] for column in (np.ones(len(squares)), *squares.T)]
         own = np.stack(sums[1:], axis=1) / sums[0][:, None]
-        free = self._untold(model, coefficients) if force.reversing else nothing
+        free = nothing
+        if force.reversing:
+            untold = self._forms.at(("untold", *law), partial(self._untold, model), coefficients)
+            free = self._weak.shared(np.sqrt(untold))
         return LeftOpen(np.maximum(own - free[:, 0], 0.0), free)
 
+    def _drawn(self, candidate: Candidate) -> Callable[[Array], Array]:
+        """Gives the mean squares (W, n_v) of what draws of noise change of a force with coefficients (c,)."""
+
+        def squares(coefficients: Array) -> Array:
+            if not self._noisy:
+                self._noisy = [self.within(weak) for weak in self.rows.noisy()]
+            if not changes:
+                changes.extend(make.of(candidate.effect).columns - candidate.columns for make in self._noisy)
+            return np.asarray(np.mean(np.square([change @ coefficients for change in changes]), axis=0))
+
+        changes: list[Array] = []
+        return squares
+
     def _untold(self, model: Model, coefficients: Array) -> Array:
-        """Covariances (W, HOPS, n_v) of the rows by what a model's last effect, a law of a rate's sign, does not tell.
+        """Squares (W, INSTANTS, n_v) of what a model's last effect, a law of a rate's sign, does not determine.
 
         Where the sign changes, at a standstill, and by what the filter rounds off of the rate.
         """
@@ -258,7 +273,7 @@ class CandidateColumns:
             times = np.where(leaving != 0.0, leaving_for * WINDING**2, self._weak.alike)
             return np.where(still, times * along(v) ** 2, jumps)
 
-        return self._weak.free(squares)
+        return self._weak.squares(squares)
 
     def _spread(self, model: Model, coefficients: Array) -> Array:
         """Variance (W, n_v) of the rows for a model's last effect, of a joint, to first order in encoders' noise."""
@@ -356,11 +371,6 @@ class CandidateColumns:
         return self._candidate(effect, parameters, np.stack(columns, axis=2))
 
 
-def _kept(store: dict[tuple[object, ...], _T], effect: Effect, make: Callable[[], _T]) -> _T:
-    """What was made of a declaration, kept in a store of the last ones."""
-    key = effect.name, effect.where, *sorted(effect.coefficients.items()), effect.over, effect.knots
-    if key not in store:
-        if len(store) == KEPT:
-            del store[next(iter(store))]
-        store[key] = make()
-    return store[key]
+def _law(effect: Effect) -> tuple[object, ...]:
+    """What the columns of an effect depend on."""
+    return effect.name, effect.where, *sorted(effect.coefficients.items()), effect.over, effect.knots

@@ -129,7 +129,7 @@ class SessionRows(WeakRows):
         return out
 
     def _of_segment(self, number: int, segment: Segment, added: Array) -> _Told:
-        noise, n_v, balance = self.noise, self.model.layout.n_v, self._balance
+        noise, balance = self.noise, self._balance
         balance.begin_segment()
         followed = self.followed.states(self.model, number)
         measured = self.sensing.motion(np.concatenate((segment.values, followed), axis=1))
@@ -140,7 +140,7 @@ class SessionRows(WeakRows):
                 for sign in (1.0, -1.0)
             ]
         windows, instants = balance.push(segment.index, copies, noise.coordinates)
-        dense = np.array([balance.dense(window) for window in windows]).reshape(-1, COPIES, n_v, self.base.n + 1)
+        dense = balance.dense(windows)
         displacements = np.empty((0, len(DISPLACEMENTS), STEPS + 1, len(self.sensing.position_columns)))
         if windows:
             readings = self._readings(segment, _middle([window.half_width for window in windows]))
@@ -173,8 +173,11 @@ class SessionRows(WeakRows):
             noise.begin(beta, self.noise, 0)
             self._tell(noise, told.instants)
             largest = np.maximum.accumulate(size(told.copies[:, 0], beta), axis=0)
-            for window, own, added in zip(told.windows, rounding(largest), told.displacements, strict=True):
-                propagated = noise.push(window, self.second_order.variance(window.half_width) + own)
+            errors = rounding(largest)
+            errors += np.array([self.second_order.variance(window.half_width) for window in told.windows]).reshape(
+                errors.shape
+            )
+            for propagated, added in zip(noise.push(told.windows, errors), told.displacements, strict=True):
                 covariances.append(propagated.covariances)
                 columns.append(propagated.calibration)
                 # Sums over the steps, sensor by sensor.

@@ -43,9 +43,11 @@ class WeakRows:
         """
         covariances = self._covariances
         if free is not None:
+            added = np.zeros((*free.shape, free.shape[2]))
+            np.einsum("whvv->whv", added)[:] = free
             covariances = [
-                [one + np.diag(other) for one, other in zip(some, more[: len(some)][::-1], strict=True)]
-                for some, more in zip(covariances, free, strict=True)
+                [one + other for one, other in zip(some, more[: len(some)][::-1], strict=True)]
+                for some, more in zip(covariances, added, strict=True)
             ]
         self._whitening = Whitening(covariances, own)
 

@@ -129,10 +129,10 @@ class WeakWindows:
         assert out is not None
         return out
 
-    def free(self, squares: Callable[[Motion], Array]) -> Array:
-        """Covariances (W, HOPS, n_v) of each speed's row with its own, then with those of the windows before.
+    def squares(self, squares: Callable[[Motion], Array]) -> Array:
+        """Squares (W, INSTANTS, n_v) of the rows' parts by half hops, of a force that is off anew at every sample.
 
-        By a force that is off by something else at every sample; squares: gives those of that, (K, n_v).
+        squares: gives those of what it is off by, (K, n_v).
         """
         parts = np.zeros((self.count, INSTANTS, self._layout.n_v))
         for (motion, which), (by_force, _) in zip(self.motions(dense=True), self._sums(dense=True), strict=True):
@@ -141,11 +141,18 @@ class WeakWindows:
             told = squares(motion)
             for row in np.flatnonzero(np.any(told, axis=0)):
                 inside = weights**2 * told[seen, row]
-                parts[which, :, row] = np.sqrt(inside.reshape(which.size, INSTANTS, -1).sum(axis=2))
-        out = np.zeros((self.count, HOPS, self._layout.n_v))
-        for k in np.flatnonzero(np.any(parts, axis=(1, 2))).tolist():
-            first = max(k + 1 - HOPS, int(np.searchsorted(self.windows.segment, self.windows.segment[k])))
-            out[k, : k + 1 - first] = common(parts[k], parts[first : k + 1])[::-1]
+                parts[which, :, row] = inside.reshape(which.size, INSTANTS, -1).sum(axis=2)
+        return parts
+
+    def shared(self, parts: Array) -> Array:
+        """Covariances (W, HOPS, n_v) of each speed's row with its own, then with those of the windows before.
+
+        By a force whose parts in the half hops (W, INSTANTS, n_v) are off by so much.
+        """
+        out, segment = np.zeros((self.count, HOPS, self._layout.n_v)), self.windows.segment
+        for hops in range(min(HOPS, self.count)):
+            later = hops + np.flatnonzero(segment[hops:] == segment[: self.count - hops])
+            out[later, hops] = common(parts[later], parts[later - hops], hops)
         return out
 
     def spread(self, slopes: Callable[[Motion], tuple[Array, Array]]) -> Array:

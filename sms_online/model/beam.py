@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from copy import copy
 
 import numpy as np
 from numpy.polynomial import Polynomial
 
 from sms_online.description.schema import FlexibleLink
 from sms_online.model import so3
-from sms_online.model.flexible import Sections, Shape, ShapeRate
+from sms_online.model.flexible import Sections, Shape, ShapeRate, repeated
 from sms_online.model.layout import nodal_names
 from sms_online.stream import Array
 
@@ -115,9 +116,13 @@ class LinearLink:
             rotation, tip_spin = np.eye(3) + so3.skew(theta), self._tip_theta[None]
         else:
             rotation, tip_spin = turn.matrix, turn.left_jacobian @ self._tip_theta
-        G = self.weights.size
+        G = self._J.shape[1]
+        if len(self._J) == 1:  # constant: one matrix product for the whole block
+            bent = q_f @ self._J[0].reshape(3 * G, self.n_f).T
+        else:
+            bent = self._J.reshape(-1, 3 * G, self.n_f) @ q_f[..., None]
         return Shape(
-            points=self._x + (q_f @ self._J[0].reshape(3 * G, self.n_f).T).reshape(-1, G, 3),
+            points=self._x + bent.reshape(-1, G, 3),
             J=self._J,
             tangent=self._tangent,
             spin=self._twist,
@@ -183,3 +188,14 @@ class LinearLink:
     def coordinates(self, markers: Array) -> Array:
         """The nodal coordinates themselves, (B, n_f)."""
         return markers
+
+    def stacked(self, others: Sequence[LinearLink], repeats: Sequence[int]) -> LinearLink:
+        """See `LinkKinematics`."""
+        out = copy(self)
+        out.weights, out._tip_x = (
+            repeated([getattr(other, name) for other in others], repeats) for name in ("weights", "_tip_x")
+        )
+        out._x, out._J, out._twist = (
+            repeated([getattr(other, name)[0] for other in others], repeats) for name in ("_x", "_J", "_twist")
+        )
+        return out

@@ -78,7 +78,7 @@ class Bracket:
         return twist if self.shift is None else _shift(twist, -self.shift)
 
     @classmethod
-    def stacked(cls, brackets: Sequence[Bracket], repeats: int) -> Bracket:
+    def stacked(cls, brackets: Sequence[Bracket], repeats: Sequence[int]) -> Bracket:
         """Each of some brackets at so many positions of a batch, one after the other."""
         first = brackets[0]
         if all(_same(each.offset, first.offset) and _same(each.rotation, first.rotation) for each in brackets[1:]):
@@ -127,12 +127,16 @@ class Chain:
         # A_i(q) is a combination of these by (1, sin q, 1 - cos q).
         self.turn_basis = [so3.turn_basis(axis) for axis in self.axes]
 
-    def stacked(self, others: Sequence[Chain], repeats: int) -> Chain:
-        """This chain with the brackets and rigid links of others, each at so many positions of a batch in turn.
+    def stacked(self, others: Sequence[Chain], repeats: Sequence[int]) -> Chain:
+        """This chain with the brackets and links of others, each at so many positions of a batch, one after the other.
 
-        The others differ in these alone.
+        The others differ in these alone, and flexible links in their lengths.
         """
         out = copy(self)
+        out.flexible = [
+            None if each[0] is None else each[0] if len(set(map(id, each))) == 1 else each[0].stacked(each, repeats)
+            for each in zip(*(other.flexible for other in others), strict=True)
+        ]
         for name in ("mounts", "roots", "rigid"):
             every = zip(*(getattr(other, name) for other in others), strict=True)
             setattr(out, name, [None if each[0] is None else Bracket.stacked(each, repeats) for each in every])

@@ -107,8 +107,11 @@ class Dynamics:
             weigh = self.pi[list(term.parameters), None] if isinstance(term, LinkTerm) else np.ones((1, 1))
             loads.append((term, 0, p @ weigh, g @ weigh))
         p, g = project(configuration, v, shape_rates, loads, 1)[..., 0]
-        g -= model._spring_coordinates(x) @ self.stiffness + v @ self.damping
-        return p, g + self.effect_force(x, v, inputs)
+        return p, g + self.spring_force(x, v) + self.effect_force(x, v, inputs)
+
+    def spring_force(self, x: Array, v: Array) -> Array:
+        """Generalized forces (B, n_v) of springs and dampers."""
+        return -(self.model._spring_coordinates(x) @ self.stiffness + v @ self.damping)
 
     def effect_force(self, x: Array, v: Array, inputs: Inputs | None = None) -> Array:
         """Generalized forces (B, n_v) of the effects."""

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, Self
+
+import numpy as np
 
 from sms_online.model.so3 import RotationVector
 from sms_online.stream import Array
@@ -59,9 +61,9 @@ class Sections:
 class LinkKinematics(Protocol):
     """Kinematics of one flexible link.
 
-    n_f: number of elastic coordinates. weights (G,) m: quadrature weights along the link. stiffness: for each
-    rigidity, the matrix (n_f, n_f) that makes its strain energy ½ EI q_fᵀ S q_f, (14). marker_names: what `markers`
-    returns.
+    n_f: number of elastic coordinates. weights (G,) m, or (B, G) of a `stacked` one: quadrature weights along the link.
+    stiffness: for each rigidity, the matrix (n_f, n_f) that makes its strain energy ½ EI q_fᵀ S q_f, (14).
+    marker_names: what `markers` returns.
     """
 
     n_f: int
@@ -86,3 +88,11 @@ class LinkKinematics(Protocol):
 
     def coordinates(self, markers: Array) -> Array:
         """Inverse of `markers`: q_f (B, n_f)."""
+
+    def stacked(self, others: Sequence[Self], repeats: Sequence[int]) -> Self:
+        """Shapes of others, which differ in length alone, each at so many configurations of a batch."""
+
+
+def repeated(parts: Sequence[Array], repeats: Sequence[int]) -> Array:
+    """Arrays along a new first axis, each so many times."""
+    return np.repeat(np.stack(parts), repeats, axis=0)

@@ -69,7 +69,7 @@ class LinkTerm(Term):
     """A flexible link: mass per length and, in space, polar inertia per length."""
 
     link: int  # from 0
-    weights: Array  # (G,) m
+    weights: Array  # (G,) m, or (B, G)
     polar: bool
 
 
@@ -117,7 +117,7 @@ class LinkMotion:
 
     def momentum(self, nu: Array) -> Array:
         """p (B, d, n) of each parameter."""
-        weights = self.term.weights[:, None]
+        weights = self.term.weights[..., None]
         out = [self._collect(self._velocities(nu, _columns(self.shape.J, nu[:, 6:])) * weights)]
         if self.term.polar:
             out.append(self._collect_moments(self._spins(nu)[..., None] * self.shape.tangent * weights))
@@ -143,7 +143,7 @@ class LinkMotion:
 
     def momentum_and_convective(self, nu: Array, rate: ShapeRate) -> tuple[Array, Array]:
         """p and g (B, d, n) of each parameter: g = Ȧᵀ u - Aᵀ (ω × u), for the axial spin with tᵀ [0, 1, spin] as A."""
-        weights = self.term.weights[:, None]
+        weights = self.term.weights[..., None]
         elastic = _columns(self.shape.J, nu[:, 6:])
         u = self._velocities(nu, elastic) * weights
         g = -self._collect(_turn(nu, u))
@@ -160,7 +160,7 @@ class LinkMotion:
 
     def bias_force(self, nu: Array, rate: ShapeRate) -> Array:
         """F (B, d, n) at ν̇ = 0 of each parameter: Aᵀ (Ȧ ν + ω × u), and [0, 1, spin]ᵀ d/dt(y t)."""
-        weights = self.term.weights[:, None]
+        weights = self.term.weights[..., None]
         elastic = _columns(self.shape.J, nu[:, 6:])
         a = _turn(nu, elastic + self._velocities(nu, elastic)) + _columns(rate.J, nu[:, 6:])
         out = [self._collect(a * weights)]

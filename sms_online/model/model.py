@@ -168,13 +168,19 @@ class Model:
         """Model of a system that differs from this one's in lengths and directions alone: the same parameters."""
         return Model(system, self._effects_of, self.reference)
 
-    def stacked(self, others: Sequence[Model], repeats: int) -> Model:
-        """This model with the geometry of others, each at so many positions of a batch in turn; without effects.
+    def stacked(self, others: Sequence[Model], repeats: Sequence[int]) -> Model:
+        """What moves in this model, with the geometry of others, each at so many positions of a batch.
 
-        The others are `of_geometry` with the same flexible links.
+        Without springs, dampers and effects. The others are `of_geometry`.
         """
         out = copy(self)
         out.chain = self.chain.stacked([other.chain for other in others], repeats)
+        out.links = [
+            replace(term, weights=link.weights)
+            for term in self.links
+            if (link := out.chain.flexible[term.link]) is not None
+        ]
+        out.springs, out.dampers = [], []
         out.gravity = np.repeat([other.gravity for other in others], repeats, axis=0)
         out.effects, out.effect_slices, out.state_slices = (), [], []
         return out

@@ -7,14 +7,15 @@ Source: the strain parametrisation of Boyer, Lebastard, Candelier, Renda, IEEE T
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from copy import copy
 
 import numpy as np
 from numpy.polynomial import Legendre, Polynomial
 
 from sms_online.description.schema import FlexibleLink
 from sms_online.model import so3
-from sms_online.model.flexible import Sections, Shape, ShapeRate
+from sms_online.model.flexible import Sections, Shape, ShapeRate, repeated
 from sms_online.model.layout import STRAIN, nodal_names, strain_names
 from sms_online.stream import Array
 
@@ -73,7 +74,8 @@ class ExactRod:
     def _rotations(self, q_f: Array) -> Array:
         """R (B, stations, 3, 3) of the sections."""
         if self._commuting:
-            angle = q_f @ (self._integrate @ self._chi).T
+            turned = self._integrate @ self._chi
+            angle = q_f @ turned.T if turned.ndim == 2 else (turned @ q_f[..., None])[..., 0]
             return so3.about(self._turn, angle.ravel()).reshape(*angle.shape, 3, 3)
         kappa = np.tensordot(q_f, self._fields, axes=(1, 0)).transpose(0, 2, 1)  # (B, G, 3)
         R = so3.RotationVector(self._integrate @ kappa).matrix
@@ -189,6 +191,13 @@ class ExactRod:
             q_f = q_f + np.linalg.solve(by_q_f, (markers - told)[..., None])[..., 0]
         return q_f
 
+    def stacked(self, others: Sequence[ExactRod], repeats: Sequence[int]) -> ExactRod:
+        """See `LinkKinematics`; strain fields by s / L are the same for all lengths. Not for readings of markers."""
+        out = copy(self)
+        out.weights = repeated([other.weights for other in others], repeats)
+        out._integrate = repeated([other._integrate for other in others], repeats)
+        return out
+
 
 class _OneFieldMarkers:
     """Markers of a rod that turns about one axis: sines and cosines of its angles, times constant matrices.
@@ -232,7 +241,7 @@ def _cumulative_integration(length: float, nodes: Array, weights: Array, ends: A
 def _along(D: Array, samples: Array) -> Array:
     """Cumulative integral along axis 1 of samples (B, G, ...)."""
     flat = samples.reshape(samples.shape[0], samples.shape[1], -1)
-    return np.asarray((D @ flat).reshape(samples.shape[0], D.shape[0], *samples.shape[2:]))
+    return np.asarray((D @ flat).reshape(samples.shape[0], D.shape[-2], *samples.shape[2:]))
 
 
 def _cross_columns(columns: Array, vector: Array) -> Array:

@@ -13,6 +13,9 @@ from sms_online.pipeline.synchronise import SIDE
 # energy balance alone has long ones, in periods of the grid. With momentum rows a block ends when a window can be
 # completed, for whoever waits for an estimate or an event waits for the block too.
 ENERGY_BLOCK = 256
+# Short windows are completed more often than anybody looks: a block is as many hops as there are in this time, s, which
+# is a hop of the usual windows.
+LEAST_BLOCK = 0.04
 # Of a period of the grid: blocks end between its instants, or rounding would decide to which one a sample belongs.
 BETWEEN = 0.5
 
@@ -25,10 +28,11 @@ def energy_blocks(system: System) -> tuple[float, float]:
 def momentum_blocks(system: System, slowest: float) -> tuple[float, float]:
     """Duration of the first block with momentum rows, but for whole blocks, and of the others, s.
 
-    A block ends with the last sample behind a window, with those that interpolate the slowest channel there, which has
-    the period `slowest`, s, and with those that show whether these are outliers.
+    A block of whole hops ends with the last sample behind a window, with those that interpolate the slowest channel
+    there, which has the period `slowest`, s, and with those that show whether these are outliers.
     """
     hop = 2 * half_hop(system.sample_rate, system.windows.momentum)
     margin = prompt_margin(hop * HOPS)
     after = SIDE * slowest + min(outliers.SIDE * slowest, outliers.PATIENCE)
-    return (margin % hop + BETWEEN) / system.sample_rate + after, hop / system.sample_rate
+    hops = max(1, round(LEAST_BLOCK * system.sample_rate / hop))
+    return (margin % hop + BETWEEN) / system.sample_rate + after, hops * hop / system.sample_rate

@@ -30,6 +30,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sms_online.pipeline.beforehand import WIDENED, Beforehand, Penalty
+from sms_online.pipeline.gram_sum import GramSum
 from sms_online.pipeline.momentum_windows import OVERLAP
 from sms_online.state import State
 from sms_online.stream import Array
@@ -54,28 +55,29 @@ class RowGrams(State):
     """Sums over windows of whitened rows, by generalized speed.
 
     signal (n_v, n + 1, n + 1): Gram matrices of [Y b]. noise: the same of what the sensors' noise adds to the rows, of
-    first and of second order, from synthetic noise. windows: how many. No array is written twice, see `PlainRows`.
+    first and of second order, from synthetic noise. windows: how many.
     """
 
-    signal: Array
-    noise: Array
+    signal: GramSum
+    noise: GramSum
     windows: int = 0
 
     @staticmethod
     def none(n_v: int, n: int) -> RowGrams:
         """Of no windows, with rows of n_v speeds and n parameters."""
-        return RowGrams(*np.zeros((2, n_v, n + 1, n + 1)))
+        return RowGrams(GramSum.none(n_v, n + 1), GramSum.none(n_v, n + 1))
 
     def add(self, rows: Array, noisy: Array) -> None:
         """Rows [Y b] (n_v, n + 1) of a window; noisy (2, n_v, n + 1): with synthetic noise added and subtracted."""
         first, second = 0.5 * (noisy[0] - noisy[1]), 0.5 * (noisy[0] + noisy[1]) - rows
-        self.signal = self.signal + rows[:, :, None] * rows[:, None, :]
-        self.noise = self.noise + first[:, :, None] * first[:, None, :] + second[:, :, None] * second[:, None, :]
+        self.signal.add(rows[:, None])
+        self.noise.add(np.stack((first, second), axis=1))
         self.windows += 1
 
     def weaken(self, share: Array) -> None:
         """Have the rows so far count less, (n_v,) of their squares: they were whitened with too small a variance."""
-        self.signal, self.noise = share[:, None, None] * self.signal, share[:, None, None] * self.noise
+        self.signal.weaken(share)
+        self.noise.weaken(share)
 
 
 @dataclass(frozen=True)
@@ -154,8 +156,27 @@ class ScaleFree:
         )
 
 
+@dataclass(frozen=True)
+class _Point:
+    """w (n + 1,) and its products (·, n + 1) with the matrices of a criterion: linear in w."""
+
+    w: Array
+    A: Array
+    G: Array
+    M: Array
+
+    def moved(self, step: _Point, length: float) -> _Point:
+        """By so much of a step."""
+        own = (self.w, self.A, self.G, self.M)
+        along = (step.w, step.A, step.G, step.M)
+        return _Point(*(one + length * other for one, other in zip(own, along, strict=True)))
+
+
 class _Criterion:
-    """The criterion of some rows; lacking, torque (n_v,): which leave more than noise, and which hold a torque."""
+    """The criterion of some rows; lacking, torque (n_v,): which leave more than noise, and which hold a torque.
+
+    Of the matrices only those are kept that some row needs: they are read once for a step, which is what it costs.
+    """
 
     def __init__(
         self,
@@ -165,49 +186,56 @@ class _Criterion:
         columns: Columns,
         start: Array,
     ) -> None:
-        self._A, self._lacking = grams.signal, lacking
+        signal, of_noise = grams.signal.matrices, grams.noise.matrices
+        self._A, self._lacking = signal, lacking
+        self._squares = np.einsum("vii->vi", signal)
         self._count = np.where(lacking, grams.windows / OVERLAP, float(grams.windows))
-        beyond = grams.signal - grams.noise
-        same = np.where(torque[:, None, None], columns.of_torque, columns.of_motion)
-        self._M = np.where(same, beyond, 0.0)
+        same = np.where(torque[lacking, None, None], columns.of_torque, columns.of_motion)
+        self._M = np.where(same, signal[lacking] - of_noise[lacking], 0.0)
         diagonal = np.einsum("vii->vi", self._M)
         diagonal[:] = np.maximum(diagonal, 0.0)
         # Rows without noise have a constant deviation: one.
-        noise = self._quadratic(grams.noise, start)
+        noise = of_noise @ start @ start
         noisy = ~lacking & ~torque & (noise > grams.windows * LEAST_NOISE)
-        self._scale = np.where(
-            noisy, grams.windows / np.where(noisy, noise, 1.0), np.where(lacking & ~torque, 1.0, 0.0)
-        )
+        scale = np.where(noisy, grams.windows / np.where(noisy, noise, 1.0), np.where(lacking & ~torque, 1.0, 0.0))
         self._constant = np.where(lacking | noisy, 0.0, float(grams.windows))
-        self._G = self._scale[:, None, None] * grams.noise
+        self._noisy = scale > 0.0
+        self._G = scale[self._noisy, None, None] * of_noise[self._noisy]
 
-    @staticmethod
-    def _quadratic(matrices: Array, w: Array) -> Array:
-        return np.asarray(np.einsum("i,vij,j->v", w, matrices, w))
+    def at(self, w: Array) -> _Point:
+        """w (n + 1,) with its products."""
+        return _Point(w, self._A @ w, self._G @ w, self._M @ w)
+
+    def _spread(self, values: Array, rows: NDArray[np.bool_]) -> Array:
+        """Values of some rows (·, …) among zeros of all (n_v, …)."""
+        out = np.zeros((rows.size, *values.shape[1:]))
+        out[rows] = values
+        return out
 
     def _least(self, w: Array) -> Array:
         """Rounding (n_v,) of such sums."""
-        size = np.einsum("vii,i->v", self._A, w**2)
+        size = self._squares @ w**2
         return np.asarray(ROUNDED * np.finfo(np.float64).eps * size + np.finfo(np.float64).tiny)
 
-    def squares(self, w: Array) -> Array:
+    def squares(self, at: _Point) -> Array:
         """Sums of squares (n_v,) of the residual."""
-        return np.asarray(np.maximum(self._quadratic(self._A, w), self._least(w)))
+        return np.asarray(np.maximum(at.A @ at.w, self._least(at.w)))
 
-    def errors(self, w: Array) -> Array:
+    def errors(self, at: _Point) -> Array:
         """e² (n_v,) that explains what the residual holds beyond noise."""
-        beyond = np.maximum(self.squares(w) - self._quadratic(self._G, w), 0.0)
-        size = np.maximum(self._quadratic(self._M, w), self._least(w))
+        beyond = np.maximum(self.squares(at) - self._spread(at.G @ at.w, self._noisy), 0.0)
+        size = np.maximum(self._spread(at.M @ at.w, self._lacking), self._least(at.w))
         return np.where(self._lacking, beyond / size, 0.0)
 
-    def predicted(self, w: Array, errors: Array) -> Array:
+    def predicted(self, at: _Point, errors: Array) -> Array:
         """Expected sums of squares (n_v,)."""
-        noise = self._quadratic(self._G, w) + errors * (self._quadratic(self._M, w)) + self._constant
-        return np.asarray(np.maximum(noise, self._least(w)))
+        of_model = errors * self._spread(at.M @ at.w, self._lacking)
+        noise = self._spread(at.G @ at.w, self._noisy) + of_model + self._constant
+        return np.asarray(np.maximum(noise, self._least(at.w)))
 
-    def value(self, w: Array, errors: Array) -> float:
+    def value(self, at: _Point, errors: Array) -> float:
         """Of the criterion, with e² (n_v,) given."""
-        ratio = self.squares(w) / self.predicted(w, errors)
+        ratio = self.squares(at) / self.predicted(at, errors)
         each = np.where(self._lacking, np.log(ratio), ratio)
         return 0.5 * float(self._count @ each)
 
@@ -216,24 +244,24 @@ class _Criterion:
 
         Columns of nuisances are left out of the rows' size: they may be large and cancel.
         """
-        own = slice(nuisances, None)
-        share = self.squares(w) / np.einsum("vii,i->v", self._A[:, own, own], w[own] ** 2)
+        share = self.squares(self.at(w)) / (self._squares[:, nuisances:] @ w[nuisances:] ** 2)
         return 0.5 * float(self._count @ np.log(share))
 
-    def slopes(self, w: Array, errors: Array) -> tuple[Array, Array, Array]:
+    def slopes(self, at: _Point, errors: Array) -> tuple[Array, Array, Array]:
         """By speed: slopes (n_v, n + 1), curvature of the squares and of the whole (n + 1, n + 1)."""
-        S, D, n = self.squares(w), self.predicted(w, errors), self._count
-        a = self._A @ w
-        g = self._G @ w + errors[:, None] * (self._M @ w)
+        S, D, n = self.squares(at), self.predicted(at, errors), self._count
+        a, g = at.A, self._spread(at.G, self._noisy)
+        g[self._lacking] += errors[self._lacking, None] * at.M
         inside = np.where(self._lacking, n / S, n / D)  # weight of the squares
         outside = np.where(self._lacking, n / D, n * S / D**2)  # and of what is expected
         slopes = inside[:, None] * a - outside[:, None] * g
-        squares = np.einsum("v,vij->ij", inside, self._A)
-        whole = squares - np.einsum("v,vij->ij", outside, self._G) - np.einsum("v,vij->ij", outside * errors, self._M)
+        squares = np.tensordot(inside, self._A, 1)
+        whole = squares - np.tensordot(outside[self._noisy], self._G, 1)
+        whole -= np.tensordot((outside * errors)[self._lacking], self._M, 1)
         log, plain = np.where(self._lacking, n, 0.0), np.where(self._lacking, 0.0, n)
-        whole += np.einsum("v,vi,vj->ij", -2.0 * log / S**2, a, a)
-        cross = np.einsum("v,vi,vj->ij", -2.0 * plain / D**2, a, g)
-        whole += np.einsum("v,vi,vj->ij", 2.0 * log / D**2 + 4.0 * plain * S / D**3, g, g) + cross + cross.T
+        whole += (-2.0 * log / S**2 * a.T) @ a
+        cross = (-2.0 * plain / D**2 * a.T) @ g
+        whole += ((2.0 * log / D**2 + 4.0 * plain * S / D**3) * g.T) @ g + cross + cross.T
         return slopes, squares, whole
 
 
@@ -252,7 +280,7 @@ def minimum(
     """
     w = np.append(starts[0], -1.0)
     criterion = _Criterion(grams, lacking, torque, columns, w)
-    squares = np.einsum("vii->vi", grams.signal)
+    squares = np.einsum("vii->vi", grams.signal.matrices)
     penalties = [Penalty(known, columns.nuisances, squares, w, widened) for widened in WIDENED]
     penalty = penalties[-1]
     found = [_descended(criterion, np.append(start, -1.0), penalty) for start in starts]
@@ -262,9 +290,11 @@ def minimum(
             freed = _descended(criterion, freed, wider)
         found.append(freed)
     w = min(found, key=lambda each: criterion.relative(each, columns.nuisances) + penalty.value(each))
-    slopes, curvature, _ = criterion.slopes(w, criterion.errors(w))
+    there = criterion.at(w)
+    errors = criterion.errors(there)
+    slopes, curvature, _ = criterion.slopes(there, errors)
     basis = _basis(curvature[:-1, :-1] + penalty.derivatives(w)[1])
-    return Minimum(w[:-1], basis @ basis.T, slopes[:, :-1], np.sqrt(criterion.errors(w)))
+    return Minimum(w[:-1], basis @ basis.T, slopes[:, :-1], np.sqrt(errors))
 
 
 def _basis(information: Array) -> Array:
@@ -279,8 +309,9 @@ def _basis(information: Array) -> Array:
 def _descended(criterion: _Criterion, w: Array, penalty: Penalty) -> Array:
     """Newton steps from w; e follows from step to step."""
     for _ in range(MOST_STEPS):
-        errors = criterion.errors(w)
-        slopes, squares, whole = criterion.slopes(w, errors)
+        at = criterion.at(w)
+        errors = criterion.errors(at)
+        slopes, squares, whole = criterion.slopes(at, errors)
         pull, known = penalty.derivatives(w)
         basis = _basis(squares[:-1, :-1] + known)
         slope = basis.T @ (slopes.sum(axis=0)[:-1] + pull)
@@ -289,14 +320,14 @@ def _descended(criterion: _Criterion, w: Array, penalty: Penalty) -> Array:
         gain = -float(slope @ step)
         if gain < CONVERGED:
             break
-        before, length = criterion.value(w, errors) + penalty.value(w), 1.0
+        before, length = criterion.value(at, errors) + penalty.value(w), 1.0
+        along = criterion.at(np.append(basis @ step, 0.0))
         for _ in range(HALVINGS):
-            moved = w.copy()
-            moved[:-1] += length * (basis @ step)
-            if criterion.value(moved, errors) + penalty.value(moved) <= before - SUFFICIENT * length * gain:
+            moved = at.moved(along, length)
+            if criterion.value(moved, errors) + penalty.value(moved.w) <= before - SUFFICIENT * length * gain:
                 break
             length *= 0.5
         else:
             break
-        w = moved
+        w = moved.w
     return w

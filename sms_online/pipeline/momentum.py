@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from copy import copy
 
 import msgspec
 import numpy as np
@@ -122,7 +121,7 @@ class Momentum(Stage):
         )  # fmt: skip
         self.tracker = self._new_tracker()
         self.fit.plain.patient = self.bank.learned is not None
-        self.test = SequentialTest(model.layout, self._balance.span / HOPS, self.nuisances)
+        self.test = self._new_test()
 
     def _rebuild(self) -> None:
         """The same after an event, trackers included."""
@@ -139,6 +138,9 @@ class Momentum(Stage):
         model, balance, sensing = self.changes.model, self._balance, self.sensing
         calibration = CalibrationColumns(model, sensing, balance.span) if self.nuisances else None
         return WindowNoise(model, self.changes.base, balance, sensing.displacements, self._clocks, calibration)
+
+    def _new_test(self) -> SequentialTest:
+        return SequentialTest(self.changes.model.layout, self._balance.span / HOPS, self.nuisances)
 
     def _new_tracker(self) -> Tracker:
         tracker = session_tracker(self.changes.base.n, self.current_prior, len(self.nuisances))
@@ -216,7 +218,7 @@ class Momentum(Stage):
         weights = np.pad(self.fit.weights, (len(self.nuisances), 0))
         lacking = self.fit.plain.misfit > 0.0
         fit, known = self.fit, self._beforehand()
-        return ScaleFree(copy(self.grams), lacking, fit.torque, weights, fit.columns, known, self.prior is None)
+        return ScaleFree(state_copy(self.grams), lacking, fit.torque, weights, fit.columns, known, self.prior is None)
 
     def _beforehand(self) -> Beforehand:
         """What is known of nuisances and parameters beside the rows; tolerances may give way, within bounds."""
@@ -266,7 +268,7 @@ class Momentum(Stage):
 
     def _process(self, piece: GridSamples, noise: SensorNoise) -> None:
         copies = self._copies(piece.values, noise)
-        windows, instants = self._balance.push(piece.index, copies, noise.coordinates, self.fit.probes)
+        windows, instants = self._balance.push(piece.index, copies, noise.coordinates)
         self._absorb(self.fit.push(windows, instants, noise))
 
     def _decide(self, noise: SensorNoise, last: bool) -> None:
@@ -411,7 +413,7 @@ class Momentum(Stage):
         self.changes.detector.begin(known)
         self.bias, self.grams = NoiseBias.none(n, self._calibration), RowGrams.none(n_v, n)
         self.fit.plain.clear()
-        self.test = SequentialTest(model.layout, self._balance.span / HOPS, self.nuisances)
+        self.test = self._new_test()
         self.bank.refer(known.solution().pi[m:])
         self.state.known, self.state.drift = known.factor, None
 

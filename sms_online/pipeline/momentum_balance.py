@@ -23,9 +23,7 @@ from sms_online.pipeline.momentum_windows import (
     HOPS,
     INSTANTS,
     STEPS,
-    Columns,
     Instants,
-    Probes,
     Window,
 )
 from sms_online.pipeline.rough_forces import RoughForces, open_at_rest, responses
@@ -48,7 +46,7 @@ WIDEST_SHARE = 5
 # there, and passes the windows that follow on to the wide filter.
 PROMPT_SHARE = HOPS
 # So many samples at once are smoothed and have their columns evaluated: of a long segment they would fill the memory.
-PIECE = 2000
+PIECE = 400
 # Samples before and after a window that its filter needs at most.
 MARGIN = HALF_WIDTHS[-1]
 
@@ -167,9 +165,7 @@ class MomentumBalance(Stage):
         self.state = MomentumBalanceState(np.empty((0, columns)))
         self._standstill = Standstill(self._motors.size, self.sample_rate)
 
-    def push(
-        self, index: NDArray[np.int64], copies: list[Array], sigma: Array, probes: Probes | None = None
-    ) -> tuple[list[Window], list[Instants]]:
+    def push(self, index: NDArray[np.int64], copies: list[Array], sigma: Array) -> tuple[list[Window], list[Instants]]:
         """Windows that B consecutive samples complete, and the states at their instants.
 
         index (B,): grid index. copies: x, n τ and internal states of effects side by side (B, n_x + joints + n_states)
@@ -191,14 +187,10 @@ class MomentumBalance(Stage):
         windows: list[Window] = []
         # Windows of one width in a row are worked off together.
         for half_width, run in groupby(chosen, key=itemgetter(1)):
-            fresh = instants[0] if probes is not None and len(instants) == 1 and not windows else None
-            further = None if fresh is None or probes is None else probes(fresh)
-            rows, probed = self._rows(half_width, [window for window, _ in run], grid, further)
+            rows = self._rows(half_width, [window for window, _ in run], grid)
             if self.rough.columns.size:
                 rows = self._with_rough(half_width, rows)
             windows += rows
-            if fresh is not None:
-                instants = [replace(fresh, probed=probed)]
         drop = self.state.window - self.state.first
         if drop > 0:
             self.state.samples, self.state.first = self.state.samples[drop:], self.state.window
@@ -243,22 +235,13 @@ class MomentumBalance(Stage):
         v = layout.speeds(x.reshape(-1, layout.n_x), x_dot.reshape(-1, layout.n_x))
         return x, v.reshape(COPIES, -1, layout.n_v), values[..., layout.n_x :]
 
-    def _rows(
-        self, half_width: int, windows: list[int], grid: int, further: tuple[Array, Array, Array] | None
-    ) -> tuple[list[Window], Columns | None]:
+    def _rows(self, half_width: int, windows: list[int], grid: int) -> list[Window]:
         s, n_v, entries = stride(half_width, self.hop), self.model.layout.n_v, self.rows.size
-        probed: Columns | None = None
-
-        def thinned(samples: _Samples) -> Array:
-            nonlocal probed
-            columns, probed = self._columns(*self._states(samples), further)
-            return columns
-
         kept = self._kept(self.state.thinned, half_width, s, windows[0], self._entries)
         phi, phi_dot = self._phi[s]
         width = COPIES * (entries + n_v)
         out = []
-        for window, values in zip(windows, self._seen(kept, half_width, windows, thinned), strict=True):
+        for window, values in zip(windows, self._seen(kept, half_width, windows, self._columns), strict=True):
             weak = -(phi_dot @ values[:, :width] + phi @ values[:, width : 2 * width]).reshape(COPIES, -1)
             b = (phi @ values[:, 2 * width :]).reshape(COPIES, -1) - weak[:, entries:]
             last = grid + window + self.width + self.lead
@@ -268,7 +251,7 @@ class MomentumBalance(Stage):
                 psi, psi_dot = self._moment_weights(s)
                 moment = -(psi_dot @ values[:, :entries] + psi @ values[:, width : width + entries])
             out.append(Window(window // self.half_hop, last, weak[:, :entries], b, half_width, *none, moment))
-        return out, probed
+        return out
 
     def _with_rough(self, half_width: int, rows: list[Window]) -> list[Window]:
         """Rows with the columns of rough forces, and what these leave open."""
@@ -337,24 +320,20 @@ class MomentumBalance(Stage):
         n_v = self.model.layout.n_v
         return COPIES * (2 * self.rows.size + 3 * n_v)
 
-    def _columns(
-        self, x: Array, v: Array, signals: Array, further: tuple[Array, Array, Array] | None
-    ) -> tuple[Array, Columns | None]:
+    def _columns(self, samples: _Samples) -> Array:
         """P and G, each of the base parameters, packed, and of what is known, and Q, for every copy: (K, entries).
 
-        Rough forces are zero there. And all columns at further states.
+        Rough forces are zero there.
         """
+        x, v, signals = self._states(samples)
         own, K = self._distinct(x, v, signals)
-        at = own if further is None else [np.concatenate(pair) for pair in zip(own, further, strict=True)]
-        P, G = self.model.momentum_columns(at[0], at[1], inputs=self.model.inputs(at[2]))
-        seen = slice(0, len(own[0]))
-        G[seen, :, self.rough.columns] = 0.0
+        P, G = self.model.momentum_columns(own[0], own[1], inputs=self.model.inputs(own[2]))
+        G[:, :, self.rough.columns] = 0.0
         everywhere = np.arange(self.rows.size)
-        packed = [self._packed(part[seen], everywhere, K) for part in (P, G)]
+        packed = [self._packed(part, everywhere, K) for part in (P, G)]
         torque = signals[..., : len(self.model.layout.q)]
         force = self.model.generalized_force(torque.swapaxes(0, 1).reshape(-1, torque.shape[2]))
-        probed = None if further is None else (P[seen.stop :], G[seen.stop :])
-        return np.concatenate((*packed, force.reshape(K, -1)), axis=1), probed
+        return np.concatenate((*packed, force.reshape(K, -1)), axis=1)
 
     def _rough_columns(self, samples: _Samples) -> Array:
         """G of rough forces alone, likewise, their slopes, and what breaks them loose: (K, entries)."""
@@ -391,16 +370,17 @@ class MomentumBalance(Stage):
         both = both.reshape(-1, K, both.shape[1]).swapaxes(0, 1)
         return np.broadcast_to(both, (K, COPIES, both.shape[2])).reshape(K, -1)
 
-    def dense(self, window: Window) -> Array:
-        """Rows [Y b] of a window's copies (copies, n_v, n + 1)."""
-        rows = np.zeros((COPIES, self.model.layout.n_v, self.base.n + 1))
-        rows[:, self.rows, self.columns] = window.Y
-        rows[:, :, -1] = window.b
+    def dense(self, windows: Sequence[Window]) -> Array:
+        """Rows [Y b] of windows' copies (W, copies, n_v, n + 1)."""
+        rows = np.zeros((len(windows), COPIES, self.model.layout.n_v, self.base.n + 1))
+        if len(windows):
+            rows[:, :, self.rows, self.columns] = np.array([window.Y for window in windows])
+            rows[..., -1] = np.array([window.b for window in windows])
         return rows
 
-    def moments(self, window: Window) -> Array:
-        """Rows (n_v, n) of a window by the rates of the parameters about its centre, see `Window.moment`."""
-        rows = np.zeros((self.model.layout.n_v, self.base.n))
+    def moments(self, windows: Sequence[Window]) -> Array:
+        """Rows (W, n_v, n) of windows by the rates of the parameters about their centres, see `Window.moment`."""
+        rows = np.zeros((len(windows), self.model.layout.n_v, self.base.n))
         if self.with_moments:
-            rows[self.rows, self.columns] = window.moment
+            rows[:, self.rows, self.columns] = np.array([window.moment for window in windows])
         return rows

@@ -34,7 +34,6 @@ from sms_online.pipeline.momentum_windows import (
     HOPS,
     INSTANTS,
     Instants,
-    Probes,
     Window,
 )
 from sms_online.pipeline.plain_rows import PlainRows
@@ -80,6 +79,8 @@ SHRUNK = 0.5
 SAME_MISFIT = 0.1
 # Time that new weights are told windows before their rows are taken, s: see `weighing`.
 WARM_UP = 3.2
+# Windows whose rows are made together.
+TOGETHER = 64
 # Singular values below this share of the largest, of columns scaled to unit length, are not solved for.
 RANK_TOLERANCE = 1e-10
 
@@ -216,8 +217,8 @@ class MomentumFit(Stage):
         if self.weights is not None:
             if windows:
                 self._look(noise, windows[0])
-            self._tell(instants)
-            out = [self._white(window) for window in windows]
+            self._tell()
+            out = self._white(windows)
         else:
             self.state.held += windows
             self.state.moving += sum(self._moves(window, noise) for window in windows)
@@ -234,7 +235,7 @@ class MomentumFit(Stage):
     def flush(self, noise: SensorNoise) -> list[WhiteRows]:
         """Fit the windows held back, without weights and then with those of the fit before, and return their rows."""
         self.state.moving = 0
-        unweighted, _ = _least_squares(np.concatenate([self._balance.dense(window)[0] for window in self.state.held]))
+        unweighted, _ = _least_squares(np.concatenate(self._balance.dense(self.state.held)[:, 0]))
         weights = self._settled(unweighted, noise, PASSES, partly=False)
         if self.plain.misfit.any():
             misfit, nominal = self.plain.misfit, self.base.values(self.model.nominal)
@@ -244,7 +245,7 @@ class MomentumFit(Stage):
             if self.plain.misfit.any() and misfit.any():
                 weights = self._scale_free([unweighted, nominal], noise)
         self._retell(weights, noise)
-        out = [self._white(window) for window in self.state.held]
+        out = self._white(self.state.held)
         self.state.since = 0
         self.state.renewal = self._count(FIRST_RENEWAL)
         self.state.held = []
@@ -258,7 +259,7 @@ class MomentumFit(Stage):
         self.plain.misfit = np.zeros(self.model.layout.n_v)
         for _ in range(passes):
             self._retell(weights, noise)
-            white = [self._white(window).Y for window in self.state.held]
+            white = [rows.Y for rows in self._white(self.state.held)]
             white += [self._calibration] if len(self._calibration) else []
             fitted, determined = _least_squares(np.concatenate(white))
             beta, known = fitted[self._nuisances :], determined[self._nuisances :]
@@ -273,9 +274,9 @@ class MomentumFit(Stage):
         """
         n_v, m = self.model.layout.n_v, self._nuisances
         grams = RowGrams.none(n_v, m + self.base.n)
-        for window in self.state.held:
-            rows = np.pad(self._balance.dense(window), ((0, 0), (0, 0), (m, 0)))
-            grams.add(rows[0], rows[1:])
+        for rows in self._balance.dense(self.state.held):
+            padded = np.pad(rows, ((0, 0), (0, 0), (m, 0)))
+            grams.add(padded[0], padded[1:])
         lacking = np.ones(n_v, dtype=np.bool_)
         starts = [np.pad(start, (m, 0)) for start in starts]
         for _ in range(PASSES):
@@ -283,7 +284,7 @@ class MomentumFit(Stage):
             # What the rows leave of the new weights' noise, and the rows whitened with it.
             for _ in range(2):
                 self._retell(joint[m:], noise)
-                white = [self._white(window) for window in self.state.held]
+                white = self._white(self.state.held)
                 self.plain.judge(joint)
             grams = RowGrams.none(n_v, m + self.base.n)
             for each in white:
@@ -381,69 +382,93 @@ class MomentumFit(Stage):
         self.weighing.begin(weights, noise, self.plain.misfit, self.state.first)
         self._tell()
 
-    @property
-    def probes(self) -> Probes | None:
-        """At which states who weighs wants columns beside those of the rows, once weights are known."""
-        return None if self.weights is None else self.weighing.noise.probes
-
-    def _tell(self, instants: Sequence[Instants] = ()) -> None:
-        """Have the states of the instants known to who weighs; instants: those that came last."""
+    def _tell(self) -> None:
+        """Have the states of the instants known to who weighs."""
         for weighing in self._weighings:
-            weighing.noise.tell(self.state.first, self.state.x, self.state.v, self.state.signals, instants)
+            weighing.noise.tell(self.state.first, self.state.x, self.state.v, self.state.signals)
 
     @property
     def _weighings(self) -> list[Weighing]:
         return [self.weighing] if self._next is None else [self.weighing, self._next]
 
-    def _white(self, window: Window) -> WhiteRows:
-        n_v = self.model.layout.n_v
-        rows = self._balance.dense(window)
+    def _white(self, windows: Sequence[Window]) -> list[WhiteRows]:
+        """Rows of the next windows, and the weighing to come takes over when it has been told enough of them."""
+        out: list[WhiteRows] = []
+        while len(out) < len(windows):
+            count = TOGETHER if self._next is None else self._count(WARM_UP) - (self.state.warm or 0)
+            out += self._white_together(windows[len(out) : len(out) + min(TOGETHER, count)])
+        return out
+
+    def _white_together(self, windows: Sequence[Window]) -> list[WhiteRows]:
+        W, n_v, n = len(windows), self.model.layout.n_v, self.base.n
+        rows = self._balance.dense(windows)
         # Columns of parameters that change evenly, from the grid's beginning on.
-        moments, centre = self._balance.moments(window), self._centre(window)
-        ramp = (centre * rows[0, :, :-1] + moments)[:, : self._ramps]
-        sample = beyond_first_order(rows, self._known_weights)
-        M, means = window.half_width, self._second_order.means
-        self.state.sampled[M] = min(self.state.sampled[M] + 1, MOST_SAMPLES)
-        means[M] = means[M] + (sample**2 - means[M]) / self.state.sampled[M]
-        self.state.largest = np.maximum(self.state.largest, size(rows[0], self._known_weights))
-        errors = self._second_order.variance(M) + rounding(self.state.largest)
-        misfit = self.weighing.misfit
-        columns = np.concatenate((rows.swapaxes(0, 1).reshape(n_v, -1), ramp), axis=1)
-        weighed = self._weigh(window, columns, errors)
-        white, ramp = np.split(weighed.rows, [columns.shape[1] - self._ramps], axis=1)
-        white = white.reshape(n_v, COPIES, -1).swapaxes(0, 1)
-        noisy = 0.5 * (rows[1] - rows[2])
-        ramp = ramp - centre * white[0, :, : self._ramps]
-        raw, drift = rows[0], self._drift(window.end)
-        if drift is not None:
-            # Behind the whitening, for what it subtracts of earlier windows must have the same reference.
-            white, raw = drift.removed(white, ramp), drift.removed(raw, moments)
+        moments, centres = self._balance.moments(windows), self._centres(windows)
+        ramp = (centres * rows[:, 0, :, :-1] + moments)[..., : self._ramps]
+        weights, misfit = self._known_weights, self.weighing.misfit
+        samples = beyond_first_order(rows, weights)
+        errors = self._errors(windows, samples, size(rows[:, 0], weights))
+        columns = np.concatenate((rows.swapaxes(1, 2).reshape(W, n_v, -1), ramp), axis=2)
+        weighed = self._weigh(windows, columns, errors)
+        raw, noisy = rows[:, 0], 0.5 * (rows[:, 1] - rows[:, 2])
+        white = np.array([each.rows for each in weighed])
+        ramp = white[..., COPIES * (n + 1) :]
+        white = white[..., : COPIES * (n + 1)].reshape(W, n_v, COPIES, -1).swapaxes(1, 2)
+        ramp = ramp - centres * white[:, 0, :, : self._ramps]
+        drifts = [self._drift(window.end) for window in windows]
+        for k, drift in enumerate(drifts):
+            if drift is not None:
+                # Behind the whitening, for what it subtracts of earlier windows must have the same reference.
+                white[k], raw[k] = drift.removed(white[k], ramp[k]), drift.removed(raw[k], moments[k])
         if self._nuisances:
-            columns, white_columns = weighed.calibration
-            raw = np.concatenate((columns, raw), axis=1)
-            white = np.concatenate((np.broadcast_to(white_columns, (COPIES, *columns.shape)), white), axis=2)
-        m = self._nuisances
-        self.plain.add(
-            raw, np.pad(noisy, ((0, 0), (m, 0))), np.diag(weighed.noise), np.pad(self._known_weights, (m, 0))
-        )
-        unsteady = np.diag(UNSTEADY * sample**2)
-        return WhiteRows(
-            white[0], white[1:], raw, weighed.covariance + unsteady, weighed.noise + unsteady, window.end,
-            weighed.late, misfit, ramp, drift,
-        )  # fmt: skip
+            before = np.array([each.calibration[0] for each in weighed])
+            behind = np.array([each.calibration[1] for each in weighed])[:, None]
+            raw = np.concatenate((before, raw), axis=2)
+            white = np.concatenate((np.broadcast_to(behind, (W, COPIES, n_v, self._nuisances)), white), axis=3)
+            noisy = np.pad(noisy, ((0, 0), (0, 0), (self._nuisances, 0)))
+            weights = np.pad(weights, (self._nuisances, 0))
+        raw, white = np.ascontiguousarray(raw), np.ascontiguousarray(white)
+        out = []
+        for k, (window, each) in enumerate(zip(windows, weighed, strict=True)):
+            self.plain.add(raw[k], noisy[k], np.diag(each.noise), weights)
+            unsteady = np.diag(UNSTEADY * samples[k] ** 2)
+            covariance, noise = each.covariance + unsteady, each.noise + unsteady
+            out.append(
+                WhiteRows(
+                    white[k, 0], white[k, 1:], raw[k], covariance, noise, window.end, each.late, misfit, ramp[k],
+                    drifts[k],
+                )
+            )  # fmt: skip
+        return out
 
-    def _centre(self, window: Window) -> float:
-        """Centre of a window, s of the grid."""
-        return window.end / self._balance.sample_rate - 0.5 * self._balance.span
+    def _errors(self, windows: Sequence[Window], samples: Array, sizes: Array) -> Array:
+        """Variance (W, n_v) of rows by what noise does beyond first order, and by rounding.
 
-    def _weigh(self, window: Window, rows: Array, errors: Array) -> Weighed:
-        """Rows (n_v, width) of the next window; the weighing to come is told them too, and then may take over."""
-        self.state.last = window.start
-        self.state.since += 1
-        weighed = self.weighing.push(window, rows, errors)
+        samples (W, n_v): of the former. sizes (W, n_v): sums of the rows' terms.
+        """
+        out = np.empty_like(samples)
+        means = self._second_order.means
+        for own, window, sample, terms in zip(out, windows, samples, sizes, strict=True):
+            M = window.half_width
+            self.state.sampled[M] = min(self.state.sampled[M] + 1, MOST_SAMPLES)
+            means[M] = means[M] + (sample**2 - means[M]) / self.state.sampled[M]
+            self.state.largest = np.maximum(self.state.largest, terms)
+            own[:] = self._second_order.variance(M) + rounding(self.state.largest)
+        return out
+
+    def _centres(self, windows: Sequence[Window]) -> Array:
+        """Centres of windows (W, 1, 1), s of the grid."""
+        ends = np.array([window.end for window in windows])[:, None, None]
+        return np.asarray(ends / self._balance.sample_rate - 0.5 * self._balance.span)
+
+    def _weigh(self, windows: Sequence[Window], rows: Array, errors: Array) -> list[Weighed]:
+        """Rows (W, n_v, width) of the next windows; the weighing to come is told them too, and then may take over."""
+        self.state.last = windows[-1].start
+        self.state.since += len(windows)
+        weighed = self.weighing.push(windows, rows, errors)
         if self._next is not None:
-            self._next.push(window, rows, errors)
-            self.state.warm = (self.state.warm or 0) + 1
+            self._next.push(windows, rows, errors)
+            self.state.warm = (self.state.warm or 0) + len(windows)
             if self.state.warm >= self._count(WARM_UP):
                 self._take_over(self._next)
                 self.state.since = 0

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 from sms_online.pipeline.weak_form import test_function
@@ -34,22 +33,13 @@ COPIES = 3
 class Instants:
     """States at `number`, `number` + 1, …, in half hops since the segment began: x (K, n_x), v (K, n_v).
 
-    signals (K, joints + n_states): n τ, then internal states of effects. probed: columns of momentum and force at the
-    states that `Probes` adds, where there are any.
+    signals (K, joints + n_states): n τ, then internal states of effects.
     """
 
     number: int
     x: Array
     v: Array
     signals: Array
-    probed: Columns | None = None
-
-
-# Columns P and G (E, n_v, n_pi) of `Model.momentum_columns`.
-Columns = tuple[Array, Array]
-# Further states x (E, n_x), v (E, n_v), signals (E, joints + n_states) at which somebody wants them, of new instants:
-# with those of the rows in one call, for of few states a call costs more than these.
-Probes = Callable[[Instants], tuple[Array, Array, Array]]
 
 
 @dataclass(frozen=True)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.special import chdtri
 
+from sms_online.pipeline.gram_sum import GramSum
 from sms_online.pipeline.momentum_windows import OVERLAP
 from sms_online.state import State
 from sms_online.stream import Array
@@ -21,14 +22,14 @@ ROUNDED = 16.0
 class PlainRows(State):
     """Sums over windows, by generalized speed.
 
-    gram, noise (n_v, n + 1, n + 1): Gram matrices of rows [Y b] and of a sample of their noise, over their deviations
-    with the weights of then. at_weights (n_v,): what such a sample leaves with those weights. windows: how many.
-    misfit (n_v,): excess over one of the mean square of such rows' residual, zero where it may be chance. patient:
-    excess may be a drift that is yet to be learned, and is none so far.
+    grams, noise: Gram matrices of rows [Y b] and of a sample of their noise, over their deviations with the weights of
+    then. at_weights (n_v,): what such a sample leaves with those weights. windows: how many. misfit (n_v,): excess over
+    one of the mean square of such rows' residual, zero where it may be chance. patient: excess may be a drift that is
+    yet to be learned, and is none so far.
     """
 
-    gram: Array
-    noise: Array
+    grams: GramSum
+    noise: GramSum
     at_weights: Array
     misfit: Array
     windows: int = 0
@@ -37,30 +38,36 @@ class PlainRows(State):
     @staticmethod
     def none(n_v: int, n: int) -> PlainRows:
         """Of no windows, with rows of n_v speeds and n parameters."""
-        return PlainRows(*np.zeros((2, n_v, n + 1, n + 1)), *np.zeros((2, n_v)))
+        return PlainRows(GramSum.none(n_v, n + 1), GramSum.none(n_v, n + 1), *np.zeros((2, n_v)))
+
+    @property
+    def gram(self) -> Array:
+        """Gram matrices (n_v, n + 1, n + 1) of the rows."""
+        return self.grams.matrices
 
     def clear(self) -> None:
         """Forget the windows, not the misfit."""
-        self.gram, self.noise = np.zeros_like(self.gram), np.zeros_like(self.noise)
+        size = self.grams.total.shape[:2]
+        self.grams, self.noise = GramSum.none(*size), GramSum.none(*size)
         self.at_weights, self.windows = np.zeros_like(self.at_weights), 0
 
     def add(self, rows: Array, noise: Array, variance: Array, weights: Array) -> None:
         """Rows [Y b] (n_v, n + 1) of a window, a sample of their noise, and its variance (n_v,) with weights (n,)."""
         std = np.sqrt(variance)[:, None]
-        plain, sample = rows / std, noise / std
-        self.gram = self.gram + plain[:, :, None] * plain[:, None, :]
-        self.noise = self.noise + sample[:, :, None] * sample[:, None, :]
+        sample = noise / std
+        self.grams.add((rows / std)[:, None])
+        self.noise.add(sample[:, None])
         self.at_weights = self.at_weights + (sample @ np.append(weights, -1.0)) ** 2
         self.windows += 1
 
     def _squares(self, beta: Array) -> Array:
         """Sum (n_v,) of the squares of every speed's residual for β (n,), over its predicted variance."""
-        w = np.append(beta, -1.0)
-        squares = np.einsum("i,vij,j->v", w, self.gram, w)
+        w, gram = np.append(beta, -1.0), self.gram
+        squares = gram @ w @ w
         # Where samples are exact nothing but rounding is left of the sum.
-        rounding = np.finfo(np.float64).eps * np.einsum("i,vij,j->v", np.abs(w), np.abs(self.gram), np.abs(w))
+        rounding = np.finfo(np.float64).eps * (np.abs(gram) @ np.abs(w) @ np.abs(w))
         # The variances are those of the weights; noise grows with β.
-        noise = np.einsum("i,vij,j->v", w, self.noise, w)
+        noise = self.noise.matrices @ w @ w
         scale = np.divide(
             noise, self.at_weights, out=np.ones_like(noise), where=(noise > 0.0) & (self.at_weights > 0.0)
         )

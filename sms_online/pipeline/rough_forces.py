@@ -125,11 +125,13 @@ class RoughForces:
     def at_rest(self, rest: Array, pi: Array) -> Array:
         """What dry friction may add to rows at a standstill, any value up to what breaks it loose, in each half hop.
 
-        (INSTANTS, n_v), one deviation, of parameters π (n_pi,); no half hops for a model without dry friction. rest
-        (INSTANTS, D): see `open_at_rest`.
+        (W, INSTANTS, n_v), one deviation, of parameters π (n_pi,); no half hops for a model without dry friction. rest
+        (W, INSTANTS, D): see `open_at_rest`.
         """
         by_motor = np.eye(self._model.layout.n_v)[self.motors]
-        return np.abs((rest * pi[self.dry]) @ by_motor) if self.dry.size else np.empty((0, by_motor.shape[1]))
+        if not self.dry.size:
+            return np.empty((len(rest), 0, by_motor.shape[1]))
+        return np.asarray(np.abs((rest * pi[self.dry]) @ by_motor))
 
     def without(self, pi: Array) -> Array:
         """π (n_pi,) without the forces that `slopes` tells."""
@@ -137,16 +139,15 @@ class RoughForces:
         out[self.coefficients] = 0.0
         return out
 
-    def kernel(self, told: Array, pi: Array, readings: Array) -> Array:
-        """What these forces add to `RowNoise.kernel` (steps, n_v, sensors), for parameters π (n_pi,).
+    def kernels(self, told: Array, pi: Array, readings: Array) -> Array:
+        """What these forces add to `RowNoise.kernels` (W, steps, n_v, sensors), for parameters π (n_pi,).
 
-        told (steps, E): a window's `responses`. readings (n_v, sensors): displacements by each sensor's reading.
+        told (W, steps, E): windows' `responses`. readings (W, n_v, sensors): displacements by each sensor's reading.
         """
-        n_v, sensors = readings.shape
-        out = np.zeros((len(told), n_v, sensors))
+        out = np.zeros((*told.shape[:2], *readings.shape[1:]))
         for row in np.unique(self.rows):
             own = self.rows == row
-            out[:, row] = (told[:, own] * pi[self.coefficients[own]]) @ readings[self.coordinates[own]]
+            out[:, :, row] = (told[..., own] * pi[self.coefficients[own]]) @ readings[:, self.coordinates[own]]
         return out
 
 

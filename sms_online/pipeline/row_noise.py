@@ -14,7 +14,7 @@ window that is an error of the row in proportion to the rates of that device's r
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 
 import msgspec
 import numpy as np
@@ -51,7 +51,6 @@ class RowNoise(Stage):
     """Covariance of each window's rows with those of the windows before it.
 
     joint_rows: rows that hold each joint's torque. clocks: what comes by each clock; the rest is as late as the grid.
-    late (n_v, sensors): what a second of delay of each sensor adds to the rows of the last window.
     """
 
     def __init__(self, joint_rows: tuple[int, ...], span: float, clocks: Sequence[SourceGroup] = ()) -> None:
@@ -63,8 +62,7 @@ class RowNoise(Stage):
         # ∫ φ(t) φ(t + k hops) dt.
         shifted = [self._phi[: STEPS + 1 - k * STEPS_A_HOP] @ self._phi[k * STEPS_A_HOP :] for k in range(HOPS)]
         self._overlap = self._step * np.array(shifted)
-        self.state = RowNoiseState()  # this window included
-        self.late = np.empty((0, 0))
+        self.state = RowNoiseState()
 
     def _told(self, offset: int, span: float) -> Array:
         """Weights (STEPS + 1, ·) that make c out of H, Ḣ, ∂Pπ/∂x, ∂Gπ/∂v and ∂Gπ/∂x where they are told."""
@@ -80,81 +78,89 @@ class RowNoise(Stage):
         """The next window shares no samples with those before."""
         self.state = RowNoiseState()
 
-    def kernel(self, window: Sensitivity) -> Array:
-        """c (STEPS + 1, n_v, sensors): what a displacement n(t) of each sensor adds to the rows is ∫ c(t) n(t) dt.
+    def kernels(self, windows: Sensitivity) -> Array:
+        """c (W, STEPS + 1, n_v, sensors): what a displacement n(t) of each sensor adds to the rows is ∫ c(t) n(t) dt.
 
-        But for rough forces, which see the motion through the filter: `RoughForces.kernel`.
+        But for rough forces, which see the motion through the filter: `RoughForces.kernels`.
         """
-        parts = (window.H, window.H_dot, window.P_x, window.G_v, window.G_x)
-        n_v, sensors = window.H.shape[1:]
-        stacked = np.concatenate(parts).reshape(-1, n_v * sensors)
-        return np.asarray((self._weights[window.offset] @ stacked).reshape(STEPS + 1, n_v, sensors))
+        parts = (windows.H, windows.H_dot, windows.P_x, windows.G_v, windows.G_x)
+        W, _, n_v, sensors = windows.H.shape
+        stacked = np.concatenate(parts, axis=1).reshape(W, -1, n_v * sensors)
+        return np.asarray((self._weights[windows.offset] @ stacked).reshape(W, STEPS + 1, n_v, sensors))
 
-    def covariance(
-        self, kernel: Array, rates: Array, sensor_density: Array, torque_density: Array, free: Array,
-        age: float = np.inf,
-    ) -> list[Array]:  # fmt: skip
-        """Covariances (n_v, n_v) with the windows before, oldest first, then the window's own; (N s)² and so on.
+    def lateness(self, kernels: Array, rates: Array) -> Array:
+        """What a second of delay of each sensor adds to the rows (W, n_v, sensors).
 
-        kernel (STEPS + 1, n_v, sensors): c. rates (INSTANTS + 1, sensors): of the readings in the window.
-        sensor_density (sensors,): σ² T_s of each position sensor. torque_density (joints,): of n τ, (N m)² s.
-        free (INSTANTS, n_v): deviation of what unknown forces add to each row in a half hop; no half hops where there
-        are none in any window. age: of the clocks at the window's end, s.
+        rates (W, INSTANTS + 1, sensors): of the readings.
         """
-        n_v, sensors = kernel.shape[1:]
-        # By time, so that what two windows have in common lies in one piece.
-        c = np.multiply(kernel.swapaxes(1, 2), np.sqrt(self._step * sensor_density)[:, None], order="C")
-        c = c.reshape(-1, n_v)
-        self.late = self._lateness(kernel, rates)
-        late = (CLOCK_ERROR if age >= CLOCK_KNOWN else YOUNG_CLOCK_ERROR) * self._by_clock(self.late)
-        now = self.state
-        now.before = [*now.before, c][-HOPS:]
-        now.torque = [*now.torque, torque_density][-HOPS:]
-        now.late = [*now.late, late][-HOPS:]
-        hops = np.arange(len(self.state.before) - 1, -1, -1)  # from each window to this one
-        out = np.empty((hops.size, n_v, n_v))
-        for block, other, first in zip(out, self.state.before, (hops * (STEPS_A_HOP * sensors)).tolist(), strict=True):
-            np.matmul(c[: len(c) - first].T, other[first:], out=block)
-        torque = np.sqrt(torque_density * np.array(self.state.torque))
-        out[:, self._joint_rows, self._joint_rows] += self._overlap[hops, None] * torque
-        if self._clocks:
-            # What windows share fades out where they no longer overlap, for the covariance to stay banded.
-            out += ((1.0 - hops / HOPS)[:, None, None] * late) @ np.array(self.state.late).swapaxes(1, 2)
-        own = np.einsum("ii->i", out[-1])
-        own += OWN_SHARE * own
-        if len(free):
-            now.free = [*now.free, free][-HOPS:]
-            np.einsum("hii->hi", out)[:] += common(free, now.free)
-        return list(out)
-
-    def _lateness(self, kernel: Array, rates: Array) -> Array:
-        """See `late`; rates (INSTANTS + 1, sensors): of the readings."""
         # Every other step stands between two instants and counts half for each.
-        weights = kernel[::2].copy()
-        weights[:-1] += 0.5 * kernel[1::2]
-        weights[1:] += 0.5 * kernel[1::2]
-        return np.asarray(self._step * np.einsum("kvs,ks->vs", weights, rates))
+        weights = kernels[:, ::2].copy()
+        weights[:, :-1] += 0.5 * kernels[:, 1::2]
+        weights[:, 1:] += 0.5 * kernels[:, 1::2]
+        return np.asarray(self._step * np.einsum("wkvs,wks->wvs", weights, rates))
+
+    def covariances(
+        self, kernels: Array, late: Array, sensor_density: Array, torque_density: Array, free: Array, ages: Array
+    ) -> list[list[Array]]:
+        """Of each of W windows in a row, covariances (n_v, n_v) with the windows before, oldest first, then its own.
+
+        In (N s)² and so on. kernels (W, STEPS + 1, n_v, sensors): c. late (W, n_v, sensors): `lateness`. sensor_density
+        (sensors,): σ² T_s of each position sensor. torque_density (joints,): of n τ, (N m)² s. free (W, INSTANTS, n_v):
+        deviation of what unknown forces add to each row in a half hop; no half hops where there are none in any window.
+        ages (W,): of the clocks at the windows' ends, s.
+        """
+        W, _, n_v, sensors = kernels.shape
+        now, past = self.state, len(self.state.before)
+        # By time, so that what two windows have in common lies in one piece.
+        c = np.multiply(kernels.swapaxes(2, 3), np.sqrt(self._step * sensor_density)[:, None], order="C")
+        before = [*now.before, *c.reshape(W, -1, n_v)]  # many numbers, and so not copied
+        torque = np.concatenate((*(each[None] for each in now.torque), np.tile(torque_density, (W, 1))))
+        error = np.where(ages >= CLOCK_KNOWN, CLOCK_ERROR, YOUNG_CLOCK_ERROR)
+        by_clock = np.concatenate((*(each[None] for each in now.late), error[:, None, None] * self._by_clock(late)))
+        unknown = np.concatenate((*(each[None] for each in now.free), free))
+        out: list[list[Array]] = [[] for _ in range(W)]
+        length = len(before[-1])
+        for hops in range(min(HOPS, past + W) - 1, -1, -1):  # from each window to a later one
+            first = hops * STEPS_A_HOP * sensors
+            later = np.arange(max(past, hops), past + W)
+            own = np.empty((later.size, n_v, n_v))
+            for block, k in zip(own, later.tolist(), strict=True):
+                np.matmul(before[k][: length - first].T, before[k - hops][first:], out=block)
+            shared = self._overlap[hops] * np.sqrt(torque_density * torque[later - hops])
+            own[:, self._joint_rows, self._joint_rows] += shared
+            if self._clocks:
+                # What windows share fades out where they no longer overlap, for the covariance to stay banded.
+                own += (1.0 - hops / HOPS) * (by_clock[later] @ by_clock[later - hops].swapaxes(1, 2))
+            diagonal = np.einsum("wii->wi", own)
+            if hops == 0:
+                diagonal += OWN_SHARE * diagonal
+            if free.shape[1]:
+                diagonal += common(unknown[later], unknown[later - hops], hops)
+            for k, block in zip((later - past).tolist(), own, strict=True):
+                out[k].append(block)
+        now.before, now.torque, now.late, now.free = (
+            list(each[-(HOPS - 1) :]) for each in (before, torque, by_clock, unknown)
+        )
+        return out
 
     def _by_clock(self, late: Array) -> Array:
-        """The same of each clock (n_v, clocks). All together being late changes nothing: so much do torques do."""
-        columns = np.zeros((len(late), len(self._clocks)))
-        torque = -late.sum(axis=1)
-        for column, (sensors, joint_rows) in zip(columns.T, self._clocks, strict=True):
-            column += late[:, sensors].sum(axis=1)
-            column[joint_rows] += torque[joint_rows]
+        """The same of each clock (W, n_v, clocks). All together being late changes nothing: so much do torques do."""
+        columns = np.zeros((*late.shape[:2], len(self._clocks)))
+        torque = -late.sum(axis=2)
+        for k, (sensors, joint_rows) in enumerate(self._clocks):
+            columns[..., k] += late[..., sensors].sum(axis=2)
+            columns[:, joint_rows, k] += torque[:, joint_rows]
         return columns
 
 
-def common(free: Array, before: Iterable[Array]) -> Array:
-    """Covariances (windows, n_v) of a window with each of `before`, it being the last, by forces that nobody knows.
+def common(free: Array, before: Array, hops: int) -> Array:
+    """Covariances (W, n_v) of windows with those that begin so many hops before, by forces that nobody knows.
 
     As if these stayed for a half hop, in which the test functions of either change little.
-    free (INSTANTS, n_v): see `RowNoise.covariance`.
+    free, before (W, INSTANTS, n_v): see `RowNoise.covariances`.
     """
-    others = list(before)[::-1]
-    instants = range(0, len(others) * (INSTANTS // HOPS), INSTANTS // HOPS)  # by which this one begins later
-    found = [np.sum(free[: INSTANTS - k] * other[k:], axis=0) for k, other in zip(instants, others, strict=True)]
-    return np.array(found[::-1])
+    later = hops * (INSTANTS // HOPS)
+    return np.asarray(np.sum(free[:, : INSTANTS - later] * before[:, later:], axis=1))
 
 
 def _interpolation(at: Array, nodes: Array) -> Array:

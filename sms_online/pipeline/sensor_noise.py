@@ -96,14 +96,21 @@ class NoiseEstimate(Stage):
         self._sort()
         return all(kept.shape[1] >= FEWEST_SAMPLES for kept in self.state.samples)
 
+    def _sampled_together(self, channels: list[int]) -> list[list[int]]:
+        """Some channels, those with samples at the same instants together."""
+        out: dict[bytes, list[int]] = {}
+        for k in channels:
+            out.setdefault(self.state.samples[k][0].tobytes(), []).append(k)
+        return list(out.values())
+
     def noise(self, periods: Array) -> SensorNoise:
         """Noise from what is stated and, where nothing is, from the samples so far; periods (channels,): s, or NaN."""
         self._sort()
         sigma = self._sensing.stated_noise
         silent = np.flatnonzero(np.isnan(sigma))
-        for k in silent:
-            times, samples = self.state.samples[k]
-            sigma[k] = noise_std(samples[:, None], times)[0]
+        for together in self._sampled_together(silent.tolist()):
+            samples = np.stack([self.state.samples[k][1] for k in together], axis=1)
+            sigma[together] = noise_std(samples, self.state.samples[together[0]][0])
         floor = FINEST * self.state.largest + np.finfo(np.float64).tiny
         positions = self._sensing.position_columns
         exact = bool(np.all(sigma[positions] <= ROUGHLY_EXACT * floor[positions]))

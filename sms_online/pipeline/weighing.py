@@ -17,7 +17,7 @@ from sms_online.pipeline.latency import LatencyColumns, SourceGroup
 from sms_online.pipeline.momentum_windows import Window
 from sms_online.pipeline.sensor_noise import SensorNoise
 from sms_online.pipeline.whitening import Whitener
-from sms_online.pipeline.window_noise import WindowNoise
+from sms_online.pipeline.window_noise import PropagatedNoise, WindowNoise
 from sms_online.state import Stage, State
 from sms_online.stream import Array
 
@@ -84,9 +84,13 @@ class Weighing(Stage):
         self.noise.begin_segment()
         self._whitener.begin_segment()
 
-    def push(self, window: Window, rows: Array, errors: Array) -> Weighed:
-        """The next window's rows (n_v, width); errors (n_v,): variance of each that nothing propagates."""
-        noise = self.noise.push(window, errors)
+    def push(self, windows: Sequence[Window], rows: Array, errors: Array) -> list[Weighed]:
+        """The next windows' rows (W, n_v, width); errors (W, n_v): variance of each that nothing propagates."""
+        propagated = self.noise.push(windows, errors)
+        return [self._weighed(noise, own) for noise, own in zip(propagated, rows, strict=True)]
+
+    def _weighed(self, noise: PropagatedNoise, rows: Array) -> Weighed:
+        """Of one window."""
         own = noise.covariances[-1]
         of_noise = own.copy()
         diagonal = np.einsum("ii->i", own)

@@ -12,7 +12,8 @@ from collections.abc import Sequence
 
 import msgspec
 import numpy as np
-from scipy.linalg.lapack import dtrtrs
+from scipy.linalg import cholesky_banded
+from scipy.linalg.lapack import dtbtrs, dtrtrs
 
 from sms_online.state import Stage, State
 from sms_online.stream import Array
@@ -85,26 +86,29 @@ class Whitener(Stage):
 
 
 class Whitening:
-    """Whitens any columns of the rows of W windows, all of which are there: many at once, so each by a product alone.
+    """Whitens any columns of the rows of W windows, all of which are there: by one banded factor.
 
     std (W, n_v): deviation of each row beside those before it.
     """
 
     def __init__(self, covariances: Sequence[Sequence[Array]], errors: Array) -> None:
-        """covariances, errors (W, n_v): of each window as `Factor` takes them."""
-        factor, n_v = Factor(), errors.shape[1]
-        self.std = np.empty_like(errors)
-        self._operators: list[tuple[Array, Array]] = []  # on the whitened rows before, and on a window's own
-        for std, some, error in zip(self.std, covariances, errors, strict=True):
-            before, own = np.split(factor.push(some, error), [-n_v], axis=1)
-            inverse = _solved(own, np.eye(n_v))
-            self._operators.append((inverse @ before, inverse))
-            std[:] = np.diag(own)
+        """covariances, errors (W, n_v): of each window as `Factor` takes them; LinAlgError as it raises it."""
+        W, n_v = errors.shape
+        reach = max((len(some) for some in covariances), default=0)
+        # Lower band: entry (i, j) is at (i - j, j).
+        band = np.zeros((max(1, reach * n_v), W * n_v))
+        row, column = np.indices((n_v, n_v))
+        for hops in range(reach):
+            later = np.array([k for k, some in enumerate(covariances) if len(some) > hops])
+            blocks = np.array([covariances[k][-1 - hops] for k in later.tolist()])
+            below = hops * n_v + row - column
+            own = below >= 0
+            band[below[own], (later - hops)[:, None] * n_v + column[own]] = blocks[:, own]
+        band[0] += ROUNDING * band[0] + errors.ravel()
+        self._factor = cholesky_banded(band, overwrite_ab=True, lower=True, check_finite=False) if W else band
+        self.std: Array = self._factor[0].reshape(W, n_v)
 
     def of(self, columns: Array) -> Array:
         """Columns (W, n_v, c) in the whitened rows, (W n_v, c)."""
-        W, n_v, c = columns.shape
-        out = np.empty((W * n_v, c))
-        for begin, rows, (before, own) in zip(range(0, W * n_v, n_v), columns, self._operators, strict=True):
-            out[begin : begin + n_v] = own @ rows - before @ out[begin - before.shape[1] : begin]
-        return out
+        flat = columns.reshape(self.std.size, columns.shape[2])
+        return np.asarray(dtbtrs(self._factor, flat, uplo="L")[0]) if flat.size else flat

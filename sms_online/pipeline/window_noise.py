@@ -12,20 +12,25 @@ from sms_online.model.base_parameters import BaseParameters
 from sms_online.model.model import Model
 from sms_online.pipeline.latency import SourceGroup
 from sms_online.pipeline.momentum_balance import MomentumBalance
-from sms_online.pipeline.momentum_windows import INSTANTS, Instants, Probes, Window
+from sms_online.pipeline.momentum_windows import INSTANTS, STEPS, Window
 from sms_online.pipeline.row_noise import RowNoise
 from sms_online.pipeline.sensitivity import Sensitivities
 from sms_online.pipeline.sensor_noise import SensorNoise
 from sms_online.state import Stage, State
 from sms_online.stream import Array
 
+# Numbers of the windows' kernels that are worked off together: of few sensors NumPy's calls would cost most of it, of
+# many sensors all windows at once would fill the memory.
+TOGETHER = 2**17
+
 
 @dataclass(frozen=True)
 class PropagatedNoise:
     """Noise of one window's rows.
 
-    covariances: with those of the windows before, then their own; see `RowNoise.covariance`. kernel: see
-    `RowNoise.kernel`, rough forces included. late (n_v, sensors): see `RowNoise.late`.
+    covariances: with those of the windows before, then their own; see `RowNoise.covariances`. kernel (STEPS + 1, n_v,
+    sensors): see `RowNoise.kernels`, rough forces included. late (n_v, sensors): see `RowNoise.lateness`. calibration
+    (n_v, ·): see `CalibrationColumns.windows`.
     """
 
     covariances: list[Array]
@@ -63,7 +68,8 @@ class WindowNoise(Stage):
         self.n_v = model.layout.n_v
         self._base, self._rough = base, balance.rough
         self._sample_rate = balance.sample_rate
-        self._sensitivities = Sensitivities(model, readings, balance.span / INSTANTS)
+        geometries = () if calibration is None else calibration.geometries
+        self._sensitivities = Sensitivities(model, readings, balance.span / INSTANTS, geometries)
         self._noise = RowNoise(model.layout.theta_m, balance.span, clocks)
         self._calibration = calibration
         self.nuisances = 0 if calibration is None else calibration.count
@@ -91,25 +97,17 @@ class WindowNoise(Stage):
         """Noise that β began with."""
         return self.state.sensor_noise
 
-    @property
-    def probes(self) -> Probes:
-        """At which states it wants columns of new instants."""
-        return self._sensitivities.probes
-
-    def tell(self, first: int, x: Array, v: Array, signals: Array, instants: Sequence[Instants] = ()) -> None:
-        """Take the states (K, ·) of the instants from number `first` on, of which it needs those not told yet.
-
-        instants: those that came last, with columns where they were probed.
-        """
-        needed = self._sensitivities.next_instant
-        fresh = needed - first
+    def tell(self, first: int, x: Array, v: Array, signals: Array) -> None:
+        """Take the states (K, ·) of the instants from number `first` on, of which it needs those not told yet."""
+        fresh = self._sensitivities.next_instant - first
         assert self.state.beta is not None
         pi = self._rough.without(self._base.physical_values(self.state.beta))
-        probed = next((piece.probed for piece in instants if piece.number == needed), None)
         x, v, signals = x[fresh:], v[fresh:], signals[fresh:]
-        self._sensitivities.tell(pi, x, v, signals, probed)
+        if not len(x):
+            return
+        by_geometry = self._sensitivities.tell(pi, x, v, signals)
         if self._calibration is not None:
-            self._calibration.tell(pi, x, v, signals, self._sensitivities.rates(len(x)))
+            self._calibration.tell(x, signals, self._sensitivities.rates(len(x)), by_geometry)
 
     def drop(self, instant: int) -> None:
         """Forget what no window that starts at an instant or later asks for."""
@@ -117,20 +115,32 @@ class WindowNoise(Stage):
         if self._calibration is not None:
             self._calibration.drop(instant)
 
-    def push(self, window: Window, errors: Array) -> PropagatedNoise:
-        """Of the next window; errors (n_v,): variance of each row that nothing propagates."""
-        assert self.state.sensor_noise is not None
-        assert self.state.beta is not None
-        pi = self._base.physical_values(self.state.beta)
-        sensitivity = self._sensitivities.window(window.start)
-        age = window.end / self._sample_rate
-        rough = self._rough.kernel(window.rough, pi, sensitivity.displacements)
-        kernel = self._noise.kernel(sensitivity) + rough
-        noise = self.state.sensor_noise
-        free = self._rough.at_rest(window.rest, pi)
-        covariances = self._noise.covariance(kernel, sensitivity.rates, noise.sensors, noise.torque, free, age)
-        diagonal = np.einsum("ii->i", covariances[-1])
-        diagonal += errors
-        none = np.empty((self.n_v, 0))
-        calibration = none if self._calibration is None else self._calibration.window(window.start, sensitivity, rough)
-        return PropagatedNoise(covariances, kernel, self._noise.late, calibration)
+    def push(self, windows: Sequence[Window], errors: Array) -> list[PropagatedNoise]:
+        """Of the next windows; errors (W, n_v): variance of each row that nothing propagates."""
+        size = max(1, TOGETHER // (STEPS * self.n_v * self._sensitivities.sensors))
+        return [
+            noise
+            for k in range(0, len(windows), size)
+            for noise in self._together(windows[k : k + size], errors[k : k + size])
+        ]
+
+    def _together(self, windows: Sequence[Window], errors: Array) -> list[PropagatedNoise]:
+        noise, beta = self.state.sensor_noise, self.state.beta
+        assert noise is not None
+        assert beta is not None
+        pi = self._base.physical_values(beta)
+        starts = np.array([window.start for window in windows])
+        sensitivity = self._sensitivities.windows(starts)
+        ages = np.array([window.end for window in windows]) / self._sample_rate
+        rough = self._rough.kernels(np.array([window.rough for window in windows]), pi, sensitivity.displacements)
+        kernels = self._noise.kernels(sensitivity) + rough
+        free = self._rough.at_rest(np.array([window.rest for window in windows]), pi)
+        late = self._noise.lateness(kernels, sensitivity.rates)
+        covariances = self._noise.covariances(kernels, late, noise.sensors, noise.torque, free, ages)
+        for each, own in zip(covariances, errors, strict=True):
+            diagonal = np.einsum("ii->i", each[-1])
+            diagonal += own
+        calibration = np.empty((len(windows), self.n_v, 0))
+        if self._calibration is not None:
+            calibration = self._calibration.windows(starts, sensitivity, rough)
+        return [PropagatedNoise(*each) for each in zip(covariances, kernels, late, calibration, strict=True)]

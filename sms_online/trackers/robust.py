@@ -70,20 +70,21 @@ def merge_neighbours(factors: Array, group: int) -> Array:
     return np.asarray(np.linalg.qr(padded.reshape(groups, group * n1, n1), mode="r"))
 
 
-def cluster_covariance(solution: Solution, clusters: Array, prior: Array, rows: float) -> Array | None:
+def cluster_covariance(
+    solution: Solution, clusters: Array, prior: Array, rows: float, scale: float = 1.0
+) -> Array | None:
     """Cluster-robust covariance (n, n) of a least-squares solution; None while clusters are too few to span it.
 
-    clusters: (C, n + 1, n + 1) factors of all measured rows. prior: (k, n + 1) information rows, which keep their
-    stated std. rows: number of measured rows. Small-sample factor C/(C − 1)·(M − 1)/(M − rank): Cameron and Miller,
-    J. Human Resources 50 (2015) 317–372, section II.
+    clusters: (C, n + 1, n + 1) factors of all measured rows, before these were divided by `scale`. prior: (k, n + 1)
+    information rows, which keep their stated std. rows: number of measured rows. Small-sample factor
+    C/(C − 1)·(M − 1)/(M − rank): Cameron and Miller, J. Human Resources 50 (2015) 317–372, section II.
     """
-    clusters = clusters[clusters.any(axis=(1, 2))]
-    count, n = len(clusters), solution.pi.size
+    count, n = int(np.count_nonzero(clusters.any(axis=(1, 2)))), solution.pi.size
     if count <= solution.rank or rows <= solution.rank:
         return None
     R = clusters[:, :, :n]
     residual = clusters[:, :, n] - R @ solution.pi
-    score = (residual[:, None, :] @ R)[:, 0, :] @ solution.root  # (C, rank)
+    score = (residual[:, None, :] @ R)[:, 0, :] @ solution.root / scale**2  # (C, rank)
     weighted_prior = prior[:, :n] @ solution.root
     factor = count / (count - 1) * (rows - 1) / (rows - solution.rank)
     return solution.covariance(factor * (score.T @ score) + weighted_prior.T @ weighted_prior)

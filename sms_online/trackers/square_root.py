@@ -66,7 +66,7 @@ class RecursiveLeastSquares(Tracker):
         solution = solve(triangular_factor(self._prior, content.factor / scale))
         robust = None
         if content.clusters is not None:
-            robust = cluster_covariance(solution, content.clusters / scale, self._prior, content.rows)
+            robust = cluster_covariance(solution, content.clusters, self._prior, content.rows, scale)
         return Estimate(
             pi=solution.pi,
             covariance=solution.covariance(),
