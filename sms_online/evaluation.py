@@ -12,10 +12,10 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from sms_online.calibration.found import Calibration, found
+from sms_online.calibration.found import CERTAIN, Calibration, found
 from sms_online.calibration.nuisance import BOUND
 from sms_online.effects.catalogue import either, in_words
-from sms_online.judgement import Discrepancy, Dispute, Facts, judge, undecided
+from sms_online.judgement import STATE_HOLD, Discrepancy, Dispute, Facts, judge, undecided
 from sms_online.model.parameters import Parameter
 from sms_online.nominal import Comparison, compare, unit_factors
 from sms_online.physical import PhysicalSet, Projection
@@ -47,6 +47,8 @@ LARGEST_PULL = 1.0
 LARGEST_DISPUTE = 3.0
 # A clock this many tolerances off may have moved on the way.
 MOVED = 1.5
+# Clocks are alike within this share of what they are off by.
+ALIKE = 0.05
 # Quantities that cannot be negative, as the ends of names.
 POSITIVE = ("mass", "mass_per_length", "stiffness", "damping", "rotor_inertia", "rigidity", "rigidity_y", "rigidity_z")
 # Effects of one cause that a warning names.
@@ -293,7 +295,8 @@ class Evaluation:
         A clock that moves on the way looks like a change of parameters: beside one, less counts.
         """
         changed = any(event.parameters for event in self.statistics.events)
-        return [
+        held = self._held
+        return held + [
             Reason(
                 f"{each}: {abs(each.estimate / each.tolerance):.0f} tolerances",
                 abs(each.estimate) > BOUND * each.tolerance,
@@ -302,8 +305,22 @@ class Evaluation:
             )
             for each in self.calibration
             if each.tolerance is not None
+            and not (held and each.name == "clock")
             and (each.beyond or (changed and each.name == "clock" and abs(each.estimate) > MOVED * each.tolerance))
         ]
+
+    @property
+    def _held(self) -> list[Reason]:
+        """That torques act half a sample later than they are stamped, which commands do that are held."""
+        setup = self.statistics.setup
+        half = 0.5 * float(np.nanmax(self.statistics.periods[list(setup.sensing.torque_columns)], initial=0.0))
+        clocks = [each for each in self.calibration if each.name == "clock"]
+        count = sum(each.name == "clock" for each in setup.nuisances)
+        alike = all(abs(each.estimate - half) < max(CERTAIN * each.std, ALIKE * half) for each in clocks)
+        if not count or len(clocks) < count or not alike or not all(each.beyond for each in clocks):
+            return []
+        text = f"the torques act {1e3 * half:.2g} ms after their stamps: commands that are held over the sample"
+        return [Reason(text, False, then=STATE_HOLD)]
 
     def _undecided(self) -> list[Reason]:
         """Effects of the description, larger than their tolerance, that may as well be the other way elsewhere."""
@@ -444,7 +461,7 @@ class Evaluation:
         fastest = float(np.nanmin(now.periods, initial=np.inf))
         if np.isfinite(fastest) and not 0.8 < fastest / period < 1.25:
             out.append(f"the capture has {1.0 / fastest:.4g} samples/s, the system file says {system.sample_rate:g}")
-        late = [name for sensor in system.sensors if sensor.latency > 0.0 for name in sensor.channels]
+        late = [name for sensor in system.sensors if sensor.delay(system.sample_rate) for name in sensor.channels]
         if late and now.method == "smoother":
             out.append(f"latency of {', '.join(late)} is described but not corrected by the smoother")
         if now.counters.gaps:

@@ -44,6 +44,7 @@ CHECK_SCALE = "check unit and gear of the torques, or weigh one part and state i
 CHECK_PRIOR = "check that prior, and run `sms-online diagnose` for what the model lacks in these rows"
 CHECK_OUTLIERS = "look at that sensor: reflections and swapped markers, a loose cable, bits that flip"
 CHECK_COLOUR = "look at what filters that sensor, or log its samples as they are"
+STATE_HOLD = "state hold = true under [[sensor]] of the torques"
 BY_SMOOTHER = 'state its rate under [[sensor]], or balance = "smoother"'
 CHECK_LOSSES = "look at the faults that the session counted: a bus that is too busy, a loose cable"
 WEIGH = "weigh one part and state it under [known], or measure a torque constant"

@@ -57,7 +57,9 @@ class Sensors:
         else:
             used = [Sensor(channels=(c,), noise=_grade_noise(system, c, drives, GRADES[grade])) for c in self.channels]
         self.sample_rate = system.sample_rate
-        self.latency = np.array([sensor.latency for sensor in used]) + _latencies(system, self.channels)
+        self.latency = np.array([sensor.delay(system.sample_rate) for sensor in used]) + _latencies(
+            system, self.channels
+        )
         self.rate = np.array([min(sensor.rate or self.sample_rate, self.sample_rate) for sensor in used])
         self.noise = np.array([sensor.noise for sensor in used])
         self.resolution = np.array([sensor.resolution for sensor in used])

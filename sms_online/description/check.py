@@ -207,7 +207,10 @@ def _check_sensors(system: System, names: tuple[str, ...], source: str) -> None:
                 near = nearest(pattern, names)
                 expected = f"a channel of this system, such as {near or names[0]!r}"
                 raise InputError(source, f"sensor {k}.channels", f"{pattern!r} matches no channel", expected)
-        for channel in sensed_channels(system, sensor):
+        sensed = sensed_channels(system, sensor)
+        if sensor.hold and (other := [name for name in sensed if not name.startswith(("tau_", "force_"))]):
+            raise InputError(source, f"sensor {k}.hold", f"true for {other[0]!r}", "hold of torques and forces alone")
+        for channel in sensed:
             if channel in filled:
                 raise InputError(
                     source,

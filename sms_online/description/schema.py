@@ -197,6 +197,7 @@ class Sensor(Record):
     resolution: step of its readings, in the channel's unit.
     noise: 1σ of its white noise per sample, in the channel's unit; 0 means that it is estimated from the samples.
     latency: its delay behind the others, s; it is corrected, but by the smoother.
+    hold: whether its readings are commands that act from their stamps on until the next ones, which is corrected too.
     """
 
     channels: Annotated[tuple[str, ...], Field(min_length=1)]
@@ -204,6 +205,11 @@ class Sensor(Record):
     resolution: NonNegative = 0.0
     noise: NonNegative = 0.0
     latency: NonNegative = 0.0
+    hold: bool = False
+
+    def delay(self, sample_rate: float) -> float:
+        """Delay of the mean instant of a reading's action to its stamp, s. sample_rate: of the system, Hz."""
+        return self.latency - (0.5 / (self.rate or sample_rate) if self.hold else 0.0)
 
 
 class Effect(Record):

@@ -211,8 +211,8 @@ def channel_effects(system: System) -> tuple[ChannelEffect, ...]:
 
 def corrections(system: System) -> tuple[ChannelEffect, ...]:
     """What a system says to take off its channels: effects as declared, then latencies of sensors."""
-    late = [SensorLatency(sensor.channels, sensor.latency) for sensor in system.sensors if sensor.latency > 0.0]
-    return (*channel_effects(system), *late)
+    delays = [(sensor.channels, sensor.delay(system.sample_rate)) for sensor in system.sensors]
+    return (*channel_effects(system), *(SensorLatency(channels, delay) for channels, delay in delays if delay != 0.0))
 
 
 def candidates(system: System) -> list[Effect]:

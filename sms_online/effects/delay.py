@@ -164,7 +164,7 @@ class TorqueDelay(Convolved):
 
 
 class SensorLatency(Convolved):
-    """A reading of x(t - d), d `latency` of a sensor in the system file.
+    """A reading of x(t - d), d the delay of a sensor in the system file; of commands that are held it is negative.
 
     Limitations: constant; what a reading does between samples is a cubic.
     """
@@ -183,9 +183,12 @@ class SensorLatency(Convolved):
 
 
 def _ahead(seconds: float, sample_rate: float) -> Array:
-    """Weights (2M + 1,) of the samples about an instant in the cubic through the four around so much later."""
+    """Weights (2M + 1,) of the samples about an instant in the cubic through the four around so much later.
+
+    Of less than none the instant lies before.
+    """
     ahead, part = divmod(seconds * sample_rate, 1.0)
-    M = int(ahead) + 2
+    M = int(abs(ahead)) + 2
     nodes = np.arange(-1, 3)
     weights = np.zeros(2 * M + 1)
     for node in nodes:
