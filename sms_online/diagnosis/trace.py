@@ -172,17 +172,17 @@ class Tracing(Acceptance):
         laws = sorted((k for k in beside if self._holds(k)), key=lambda k: -gains[k].gain)[:RIVALS]
         if not laws:
             return None
-        told = {}
+        deviances = {}
         for k in laws:
             self._iterated([*chosen, k])
             # Where rows leave more than noise whatever is added, any large variance at rest would make them likelier.
             if not np.any(self.floor[self._acts(k)]):
-                told[k] = self._deviance([*chosen, k])
+                deviances[k] = self._deviance([*chosen, k])
         found = None
-        if told:
-            law = min(told, key=lambda k: told[k])
+        if deviances:
+            law = min(deviances, key=lambda k: deviances[k])
             others = [self._deviance(each) for each in ([*chosen, best], chosen) if law not in each]
-            found = law if told[law] < min(others) - DECISIVE else None
+            found = law if deviances[law] < min(others) - DECISIVE else None
         self.settle(chosen)
         return found
 
