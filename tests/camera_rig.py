@@ -28,6 +28,13 @@ name = "beside the tip"
 position = [1.0, 0.03, 0.0]
 """
 
+# Of a session of 20 s.
+FAULTS = (
+    "missing@link_*:share=0.1",
+    "hidden@link_2.*:begin=8,over=2",
+    "swapped@link_1.marker_1+link_1.marker_2:begin=4,over=1",
+)
+
 
 def marked_bench(old: str = "", new: str = "") -> System:
     """A bench of one link with two markers; a text of its description replaced."""

@@ -16,17 +16,11 @@ from sms_online.pipeline.sensing import Sensing
 from sms_online.stream import Array, Block
 from sms_sim.camera_faults import CameraFaults, parse_fault, parsed_faults
 from sms_sim.simulate import Simulation, sampled_blocks, simulate
-from tests.camera_rig import bound_of, marked_bench, seen_by_cameras
+from tests.camera_rig import FAULTS, bound_of, marked_bench, seen_by_cameras
 from tests.evaluated import results_document
 from tests.sessions_of import normalised, session_of
 
 SWAPPED = "swapped@link_1.marker_1+link_1.marker_2:begin=0.5,over=1"
-# Of a session of 20 s.
-FAULTS = (
-    "missing@link_*:share=0.1",
-    "hidden@link_2.*:begin=8,over=2",
-    "swapped@link_1.marker_1+link_1.marker_2:begin=4,over=1",
-)
 
 
 @pytest.fixture(scope="module")

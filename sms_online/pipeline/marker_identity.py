@@ -25,7 +25,7 @@ Indices = NDArray[np.int64]
 Mask = NDArray[np.bool_]
 
 # A sample within this distance of its prediction, m, is its marker's: at 240 Hz 1 m/s moves it by 4 mm. Markers that
-# come nearer to each other than this are not told apart.
+# come nearer to each other than this are never relabelled.
 NEAR = 0.02
 # A sample is another marker's where it is so many times nearer to that one's prediction than to its own.
 CLEARLY = 4.0

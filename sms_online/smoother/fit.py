@@ -55,6 +55,8 @@ REFINED = 1.0
 # smaller by far, as the convergence is quadratic near the end.
 SETTLED = 0.5
 MAX_STEPS = 8
+# With white forces left, which a start that is far from the answer needs, it takes more of them.
+MORE_STEPS = 16
 # Derivatives by displacements are told that often and interpolated, s; they only steer the search.
 DERIVATIVES_INTERVAL = 0.04
 # Mean square of the whitened innovations that noise alone may leave: a span of some seconds scatters by a hundredth,
@@ -115,7 +117,14 @@ class SpanSmoother:
         last_step: of the collocation of an earlier span, s; None in the first one. Raises DivergedError.
         """
         if last_step is None:
-            return self._searched(span, beta, known, LEVELS, STEPS)
+            fit = self._searched(span, beta, known, LEVELS, STEPS)
+            if fit.level > 0.0:
+                # A start that is far off may end there too. From this one, which is near, exact equations are met if
+                # they hold.
+                with suppress(DivergedError):
+                    again = self._searched(span, fit.beta, known, LEVELS, STEPS)
+                    return again if again.level < fit.level else fit
+            return fit
         try:
             return self._searched(span, beta, known, LATER_LEVELS, (last_step,))
         except DivergedError:
@@ -186,7 +195,7 @@ class _Search:
         for level in (0.0, *ALLOWED):
             if level:
                 self.beta, self.motion = before
-                if not self.settled(level):
+                if not self.settled(level, MORE_STEPS):
                     continue
             if self.mean_square <= LARGEST_MEAN_SQUARE:
                 return SpanFit(self.factor, self.beta, self.rows, self.mean_square, level, step)
@@ -199,10 +208,10 @@ class _Search:
             if self.mean_square <= LARGEST_MEAN_SQUARE:
                 return
 
-    def settled(self, level: float) -> bool:
-        """Search until β stands; whether it does."""
+    def settled(self, level: float, most: int = MAX_STEPS) -> bool:
+        """Search until β converges, in so many steps at most; whether it does."""
         try:
-            for _ in range(MAX_STEPS):
+            for _ in range(most):
                 before = self.beta
                 self.advance(level, tame=False)
                 if np.all(np.abs(self.beta - before) <= SETTLED * self.std):
