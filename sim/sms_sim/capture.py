@@ -114,7 +114,9 @@ class Simulated:
             "grade": self.grade,
             "seed": self.seed,
             "duration_s": simulation.duration,
-            "effects": [effect.model_dump(mode="json") for effect in self.effects],
+            "effects": [
+                {"coefficients": {}, **effect.model_dump(mode="json", exclude_defaults=True)} for effect in self.effects
+            ],
             "drifts": [drift.document() for drift in self.drifts],
             "faults": [fault.document() for fault in self.faults],
         }

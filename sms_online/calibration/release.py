@@ -31,6 +31,9 @@ def release_gain(block: Array, weight: Array) -> Array:
     the shares. C (n, k): covariances with the nuisances in these units. Source: the identity of Woodbury.
     """
     lost = 1.0 - weight
+    # Rounding may make a variance larger than that of the tolerance alone.
+    size, axes = np.linalg.eigh(block)
+    block = (axes * np.minimum(size, 1.0)) @ axes.T
     return np.asarray(np.linalg.solve(np.eye(lost.size) - lost[:, None] * block, np.diag(lost)))
 
 
