@@ -264,6 +264,8 @@ class Evaluation:
                 miscalibrated=(*self._miscalibrated(), *self._undecided()),
                 troubles=tuple(self._troubles),
                 weaknesses=tuple(self._weaknesses()),
+                suspected=None if momentum is None or now.method != "momentum" else momentum.suspected,
+                consistency=self.trackers[0].consistency if self.trackers else None,
                 scale=now.setup.system.scale_tolerance,
             )
         )

@@ -11,6 +11,8 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 from sms_online.nominal import AS_STATED, Comparison
+from sms_online.pipeline.tracker_bank import Suspected
+from sms_online.tracker_results import Consistency
 from sms_online.trust import Reason, Residual, Residuals, Trust
 
 # A joint whose unexplained torque reaches this share of the measured one lacks an effect, whatever the error bars say.
@@ -48,6 +50,9 @@ STATE_HOLD = "state hold = true under [[sensor]] of the torques"
 BY_SMOOTHER = 'state its rate under [[sensor]], or balance = "smoother"'
 CHECK_LOSSES = "look at the faults that the session counted: a bus that is too busy, a loose cable"
 WEIGH = "weigh one part and state it under [known], or measure a torque constant"
+FOLLOW = "replay it with `--tracker kalman:drift=learned` (tracker = kalman, drift = learned)"
+GO_ON = "record for longer: a drift is followed once it is certain; then run `sms-online diagnose`"
+CHECK_NOISE = "check the stated noise of the sensors, and the tracker's process noise: error bars are too large"
 CHECK_DEVICE = "look at power, cable and address of what is silent, and at its table in the system file"
 CHECK_TROUBLE = "see to the devices, the recording and the machine first"
 MOVE = "move all joints, faster and over a larger range, and long enough"
@@ -94,8 +99,9 @@ class Facts:
     channel, the correlation time of its noise, s. slow: rates, Hz, of sensors that are too slow for the balance.
     miscalibrated: what is off by more than the description's tolerances
     allow. troubles: of the devices, the recording and the machine of a live session, a short sentence each. weaknesses:
-    of an estimate by the way it is made. scale: 1σ of the factor that all parameters have in common, where nothing
-    else fixes it.
+    of an estimate by the way it is made. suspected: parameters that seem to move, which the judged tracker does not
+    follow. consistency: of that tracker's rows with its error bars. scale: 1σ of the factor that all parameters have in
+    common, where nothing else fixes it.
     """
 
     determined: tuple[int, int]
@@ -118,6 +124,8 @@ class Facts:
     miscalibrated: tuple[Reason, ...] = ()
     troubles: tuple[str, ...] = ()
     weaknesses: tuple[str, ...] = ()
+    suspected: Suspected | None = None
+    consistency: Consistency | None = None
     scale: float | None = None
 
 
@@ -156,7 +164,8 @@ def judge(facts: Facts) -> Trust:
             first = [Reason(text, False, then=CHECK_DEVICE), *first]
         rest = _cautions(replace(facts, troubles=()))
         return Trust("not yet", (*first, Reason(facts.settling, False, then=MOVE), *losses, *rest))
-    cautions = (*losses, *alarms, *_cautions(facts))
+    cautions = (*losses, *alarms, *_moving(facts.suspected), *_cautions(facts))
+    cautions = cautions or tuple(_inconsistent(facts.consistency))
     return Trust("doubt", cautions) if cautions else Trust("trust", tuple(_grounds(facts)))
 
 
@@ -343,6 +352,25 @@ def _cautions(facts: Facts) -> list[Reason]:
             Reason(f"the estimate violates physical consistency by {facts.distance:.0f} standard deviations", False)
         )
     return out
+
+
+def _moving(suspected: Suspected | None) -> list[Reason]:
+    """Parameters that seem to move: the estimate is a mean over time, and its bars are no bars of the value now."""
+    if suspected is None:
+        return []
+    names = _listed(suspected.parameters)
+    text = f"{names} seems to move since {suspected.since:.1f} s, and is not followed"
+    place = place_of(suspected.parameters[0])
+    return [Reason(text, False, place, "may move", then=GO_ON if suspected.learning else FOLLOW)]
+
+
+def _inconsistent(consistency: Consistency | None) -> list[Reason]:
+    """Rows that do not agree with the tracker's error bars, where nothing else says why."""
+    if consistency is None or consistency.nis is None or consistency.consistent:
+        return []
+    band = f"{consistency.lower:.2f} … {consistency.upper:.2f}"
+    text = f"normalised innovations squared are {consistency.nis:.2f}, beyond {band}"
+    return [Reason(text, False, then=DIAGNOSE if consistency.nis > 1.0 else CHECK_NOISE)]
 
 
 def _beyond_noise(residual: Residuals) -> list[Reason]:

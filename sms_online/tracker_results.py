@@ -12,15 +12,15 @@ from sms_online.trackers.interface import Estimate
 
 # Noise behind the rows' predicted variance is estimated to so much of that variance, 1σ.
 NOISE_VARIANCE_STD = 0.07
-# Half width of a band that holds 95 % of a normal variable.
-BAND = 1.96
+# Half width of a band that holds 99.9 % of a normal variable: beyond it the estimate is not trusted.
+BAND = 3.29
 
 
 @dataclass(frozen=True)
 class Consistency:
     """Normalised innovations squared of a tracker's rows: their mean over its memory, 1 where its model holds.
 
-    nis: None while there are too few rows. lower, upper: band that holds 95 % of consistent sessions, from the number
+    nis: None while there are too few rows. lower, upper: band that holds 99.9 % of consistent sessions, from the number
     of rows and from how well the sensors' noise is known.
     """
 
@@ -106,8 +106,8 @@ class TrackerResult:
                 for name, p in self.parameters.items()
             ],
             "nis": consistency.nis,
-            "nis_lower95": consistency.lower,
-            "nis_upper95": None if np.isinf(consistency.upper) else consistency.upper,
+            "nis_lower": consistency.lower,
+            "nis_upper": None if np.isinf(consistency.upper) else consistency.upper,
             "consistent": consistency.consistent,
             "memory_s": self.memory,
             "drifts": [drift.document() for drift in self.drifts],

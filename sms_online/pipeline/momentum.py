@@ -346,9 +346,7 @@ class Momentum(Stage):
             self._renew_drift()
 
     def _follow(self, rows: WhiteRows) -> None:
-        """Hand rows to the chosen trackers."""
-        if not self.bank.others:
-            return
+        """Hand rows to the chosen trackers, and to what watches for drifts."""
         learned = self.bank.learned
         before = 0 if learned is None else learned.state.accepted
         self.bank.update(self._for_trackers(rows), not self.misfit)
@@ -449,4 +447,5 @@ class Momentum(Stage):
             scale_free=self.scale_free,
             latency=self.latencies.found,
             coloured={} if self.state.sensor_noise is None else self.state.sensor_noise.coloured,
+            suspected=self.bank.suspected,
         )

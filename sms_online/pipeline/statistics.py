@@ -29,7 +29,7 @@ from sms_online.pipeline.outliers import LeftOut
 from sms_online.pipeline.plain_rows import PlainRows
 from sms_online.pipeline.sensing import Sensing
 from sms_online.pipeline.synchronise import SyncCounters
-from sms_online.pipeline.tracker_bank import Reading
+from sms_online.pipeline.tracker_bank import Reading, Suspected
 from sms_online.smoother.session import SmootherStatistics
 from sms_online.state import snapshot, state_copy
 from sms_online.stream import Array
@@ -88,7 +88,7 @@ class MomentumStatistics:
     misfit. started: weights are known. tested: there are rows enough for a test of what they leave. alarm: type of the
     rows that the sequential test finds more than noise in. scale_free: what gives the estimate where rows leave more
     than noise. latency: source that is late against the others, if one is. coloured: see
-    `SensorNoise`.
+    `SensorNoise`. suspected: a change of parameters that the judged tracker does not follow.
     """
 
     trackers: tuple[Reading, ...]
@@ -102,6 +102,7 @@ class MomentumStatistics:
     scale_free: ScaleFree | None
     latency: Latency | None
     coloured: dict[str, float]
+    suspected: Suspected | None
 
 
 @dataclass(frozen=True)

@@ -16,8 +16,8 @@ from sms_online.pipeline.errors_in_variables import NoiseBias
 from sms_online.pipeline.momentum_windows import HOPS
 from sms_online.state import Stage, State
 from sms_online.stream import Array
-from sms_online.trackers.build import Tracked, build_tracker
-from sms_online.trackers.drift import Found, LearnedTrend
+from sms_online.trackers.build import Tracked, build_tracker, build_watch
+from sms_online.trackers.drift import STEP, Found, LearnedTrend
 from sms_online.trackers.drift_search import Ramp
 from sms_online.trackers.information import Information
 from sms_online.trackers.interface import Estimate, Prior, Rows, Tracker
@@ -65,6 +65,15 @@ class Change:
     newest: float
 
 
+@dataclass(frozen=True)
+class Suspected:
+    """A change that nobody follows: parameters that may move, since when, s; learning: whether drifts are learned."""
+
+    parameters: tuple[str, ...]
+    since: float
+    learning: bool
+
+
 class BankState(State):
     """reference (n,): parameters from which a drift counts, None where nothing has moved. held: rows since an alarm.
 
@@ -108,6 +117,10 @@ class TrackerBank(Stage):
             _Chosen(choice, None if choice.static and system.trackers[0].static else build_tracker(choice, tracked))
             for choice in system.trackers
         ]
+        self._names = [p.name for p in parameters]
+        # A judged tracker that lets nothing move is watched: rows that show a drift speak against it.
+        judged = system.trackers[0]
+        self._watch = build_watch(tracked) if judged.kind != "kalman" or judged.drift == "none" else None
         # By name, for each is saved as a stage within.
         for k, chosen in enumerate(self._chosen):
             if chosen.tracker is not None:
@@ -119,10 +132,24 @@ class TrackerBank(Stage):
         """Those beside the session's own least squares."""
         return [chosen.tracker for chosen in self._chosen if chosen.tracker is not None]
 
+    @property
+    def _fed(self) -> list[Tracker]:
+        return self.others if self._watch is None else [*self.others, self._watch]
+
+    @property
+    def suspected(self) -> Suspected | None:
+        """A change of parameters that the rows show and the judged tracker does not follow."""
+        learner = self._watch or self.learned
+        change = None if learner is None else learner.state.suspected
+        if change is None:
+            return None
+        names = tuple(self._names[column - self._nuisances] for column in change.columns)
+        return Suspected(names, change.since * STEP, self.learned is not None)
+
     def begin(self, known: Information) -> None:
         """Forget all rows, and go on from what is known of nuisances and parameters after an event."""
         self.release()
-        for tracker in self.others:
+        for tracker in self._fed:
             # What is known beforehand of the nuisances is each tracker's own already.
             tracker.begin(known.without(range(self._nuisances)))
 
@@ -134,7 +161,7 @@ class TrackerBank(Stage):
 
     def update(self, rows: Rows, quiet: bool) -> None:
         """Take in rows of nuisances and parameters; quiet: they leave no more than noise."""
-        for tracker in self.others:
+        for tracker in self._fed:
             if isinstance(tracker, LearnedTrend):
                 tracker.state.quiet = quiet
             tracker.update(rows)

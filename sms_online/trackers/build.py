@@ -57,6 +57,13 @@ def build_tracker(choice: TrackerChoice, tracked: Tracked) -> Tracker:
     return KINDS[choice.kind](choice, tracked)
 
 
+def build_watch(tracked: Tracked) -> LearnedTrend:
+    """What follows no drift, and says where rows show one."""
+    nothing = np.zeros(tracked.n)
+    groups = _groups(["learned"] * len(tracked.parameters), tracked)
+    return LearnedTrend(tracked.n, groups, nothing, nothing, tracked.prior, follow=False)
+
+
 def _least_squares(choice: TrackerChoice, tracked: Tracked) -> Tracker:
     if choice.drift != "none" or choice.std or choice.share is not None:
         raise InputError(tracked.source, "tracker", "drift of rls", 'kind = "kalman", or a forgetting')

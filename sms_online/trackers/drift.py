@@ -25,7 +25,17 @@ from numpy.typing import NDArray
 from sms_online.state import State
 from sms_online.stream import Array
 from sms_online.trackers.drift_filter import Block, DriftFilter, Moving, innovation_loss, reach
-from sms_online.trackers.drift_search import LARGEST_LEFT, Break, Ramp, best_break, best_ramp
+from sms_online.trackers.drift_search import (
+    LARGEST_LEFT,
+    Break,
+    Ramp,
+    Suspicion,
+    Tried,
+    best_break,
+    best_ramp,
+    changes_within,
+    likeliest_change,
+)
 from sms_online.trackers.factor import masked_covariance, solve, triangular_factor
 from sms_online.trackers.information import Information
 from sms_online.trackers.interface import Estimate, Prior, Rows, Tracker, checked, prior_factor
@@ -46,6 +56,11 @@ DECAYS = (np.inf, 300.0, 100.0, 50.0, 30.0, 20.0, 10.0)
 MOST_AT_ONCE = 4
 # Knots from the beginning within which more than noise may be a drift yet to be found.
 PATIENCE = 12
+# A change that may be chance is suspected where two searches in a row show one of the same parameters, and its chance
+# is below this share over the number of searches so far; half a minute of searches gives a false word in some hundred.
+SUSPECTED = 0.07
+# Chance that the earlier of the two has at most.
+SHOWN = 0.1
 # What process noise or decay must gain in twice the log likelihood of the innovations over none.
 COST = 4.0
 
@@ -67,7 +82,8 @@ class DriftState(State):
     [Y, (t - knot) Y, b] since the last knot; fresh: how many of them are not in `now` yet. step: number of the open
     one, from t = 0 on; knots: since the beginning. rows: so far; newest: time of the last, s. accepted: how often
     drifts were. quiet: whether rows leave no more than noise, without which no drift is accepted. until: instant that
-    estimates hold for, s; no earlier than that of the newest row.
+    estimates hold for, s; no earlier than that of the newest row. searches: so far. likeliest: change that the last one
+    found, of what does not move; suspected: where it is hardly chance.
     """
 
     anchor: DriftFilter
@@ -83,16 +99,29 @@ class DriftState(State):
     accepted: int = 0
     quiet: bool = True
     until: float = -np.inf
+    searches: int = 0
+    likeliest: Suspicion | None = None
+    suspected: Suspicion | None = None
 
 
 class LearnedTrend(Tracker):
     """Least squares of π with those parameters on trends that show one.
 
     groups: columns that may move, each group as one hypothesis. trends: columns that move from the start, with the
-    process noise (n,) of their rates, per √s; walks (n,): that of values on random walks, per √s. prior: of π.
+    process noise (n,) of their rates, per √s; walks (n,): that of values on random walks, per √s. prior: of π. follow:
+    whether what shows a trend moves from then on; without, trends are suspected alone.
     """
 
-    def __init__(self, n: int, groups: Sequence[tuple[int, ...]], trends: Array, walks: Array, prior: Prior) -> None:
+    def __init__(
+        self,
+        n: int,
+        groups: Sequence[tuple[int, ...]],
+        trends: Array,
+        walks: Array,
+        prior: Prior,
+        follow: bool = True,
+    ) -> None:
+        self._follow = follow
         self._n, self._groups, self._prior = n, tuple(groups), prior_factor(prior, n)
         self._trends, self._walks = trends, walks
         self.enabled = True
@@ -186,7 +215,9 @@ class LearnedTrend(Tracker):
             gone = self.state.blocks.pop(0)
             following = self.state.blocks[0].knot
             self.state.anchor = self.state.anchor.absorbed(gone).advanced(following)
-        if self.state.quiet and self.state.knots > SETTLED and self.state.knots % SEARCHED == 0:
+        if not self.state.quiet:
+            self.state.likeliest = self.state.suspected = None
+        elif self.state.knots > SETTLED and self.state.knots % SEARCHED == 0:
             self._search()
         if any(each.learned for each in self.state.moving) and self.state.knots % CHOSEN == 0:
             self._choose()
@@ -214,15 +245,15 @@ class LearnedTrend(Tracker):
 
     def _search(self) -> None:
         """Whether one more parameter moves."""
-        found = list(self.state.moving)
-        for _ in range(MOST_AT_ONCE):
-            taken = {column for moving in found for column in moving.columns}
-            free = [group for group in self._groups if not taken & set(group)]
-            ramp = best_ramp(self.state.anchor.with_moving(found), list(self.state.blocks), free)
+        found, tried = list(self.state.moving), self._tried(self.state.moving)
+        self._suspect(tried)
+        for _ in range(MOST_AT_ONCE if self._follow else 0):
+            ramp = best_ramp(tried)
             if ramp is None:
                 break
             begun = ramp.since * STEP
             found.append(Moving(ramp.columns, ramp.since, 0.0, tuple(ramp.rates.tolist()), begun=begun))
+            tried = self._tried(found)
         if len(found) == len(self.state.moving):
             return
         # A lack of the model leaves more than noise, whatever ramps it is taken for.
@@ -232,6 +263,22 @@ class LearnedTrend(Tracker):
             self.state.moving = found
             self._choose()
             self.state.accepted += 1
+            self.state.likeliest = self.state.suspected = None
+
+    def _tried(self, moving: Sequence[Moving]) -> Tried:
+        """Changes of what does not move, within the remembered blocks."""
+        taken = {column for each in moving for column in each.columns}
+        free = [group for group in self._groups if not taken & set(group)]
+        return changes_within(self.state.anchor.with_moving(moving), self.state.blocks, free)
+
+    def _suspect(self, tried: Tried) -> None:
+        """Whether a change is hardly chance, for the second time."""
+        self.state.searches += 1
+        level = max(1.0, self.state.now.factor[-1, -1] ** 2 / max(1.0, self.state.rows - self._n))
+        before, now = self.state.likeliest, likeliest_change(tried, level)
+        again = before is not None and now is not None and before.columns == now.columns and before.chance < SHOWN
+        hardly = now is not None and now.chance < SUSPECTED / self.state.searches
+        self.state.likeliest, self.state.suspected = now, now if again and hardly else None
 
     def _choose(self) -> None:
         """Process noise and decay of each that moves, those under which the innovations are likeliest."""

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.special import chdtrc
 
 from sms_online.stream import Array
 from sms_online.trackers.drift_filter import Block, DriftFilter, decaying
@@ -29,7 +30,10 @@ FREE = 1e-6
 
 @dataclass(frozen=True)
 class Ramp:
-    """A drift that the rows show: columns that move together since a knot, at these rates."""
+    """A drift that the rows show: columns that move together since a knot, at these rates; of a step, by these sizes.
+
+    gain: what it takes off the rows' sum of squares.
+    """
 
     columns: tuple[int, ...]
     since: int
@@ -37,14 +41,30 @@ class Ramp:
     gain: float
 
 
-def best_ramp(anchor: DriftFilter, blocks: Sequence[Block], groups: Sequence[tuple[int, ...]]) -> Ramp | None:
-    """The ramp that explains most of the last blocks, if it is no accident and no step.
+@dataclass(frozen=True)
+class Tried:
+    """Changes of parameters that may lie within the last blocks: ramps of each group from each start, and steps."""
+
+    ramps: list[Ramp]
+    steps: list[Ramp]
+
+
+@dataclass(frozen=True)
+class Suspicion:
+    """A change that rows show and no tracker follows. columns: which may move. since: knot. chance: that it is none."""
+
+    columns: tuple[int, ...]
+    since: int
+    chance: float
+
+
+def changes_within(anchor: DriftFilter, blocks: Sequence[Block], groups: Sequence[tuple[int, ...]]) -> Tried:
+    """What a ramp, and a step, of each group explains of the last blocks, from each start.
 
     anchor: what is known before the blocks.
     """
     n = anchor.n
-    ranked: list[Ramp] = []
-    steps = 0.0
+    tried = Tried([], [])
     # Everything from the anchor to each start, then everything after it.
     state, before = replace(anchor, knot=blocks[0].knot), {}
     for k, block in enumerate(blocks):
@@ -57,17 +77,36 @@ def best_ramp(anchor: DriftFilter, blocks: Sequence[Block], groups: Sequence[tup
         since = blocks[-start].knot
         left, columns = _left(before[start].all_moving(), blocks[-start:], n)
         for group in groups:
-            ramp, step = [n + k for k in group], list(group)
-            gain, rates = _explained(left, columns, ramp)
-            ranked.append(Ramp(group, since, rates, gain))
-            steps = max(steps, _explained(left, columns, step)[0])
-    ranked.sort(key=lambda each: each.gain - LEAST_GAIN * len(each.columns), reverse=True)
+            gain, rates = _explained(left, columns, [n + k for k in group])
+            tried.ramps.append(Ramp(group, since, rates, gain))
+            gain, sizes = _explained(left, columns, list(group))
+            tried.steps.append(Ramp(group, since, sizes, gain))
+    return tried
+
+
+def best_ramp(tried: Tried) -> Ramp | None:
+    """The ramp that explains most, if it is no accident and no step."""
+    ranked = sorted(tried.ramps, key=lambda each: each.gain - LEAST_GAIN * len(each.columns), reverse=True)
     if not ranked:
         return None
     best = ranked[0]
+    steps = max((each.gain for each in tried.steps), default=0.0)
     others = max((each.gain for each in ranked if each.columns != best.columns), default=0.0)
     enough = best.gain > LEAST_GAIN * len(best.columns)
     return best if enough and best.gain > max(steps, others) + DECISIVE * len(best.columns) else None
+
+
+def likeliest_change(tried: Tried, level: float) -> Suspicion | None:
+    """The change that chance explains least, whatever its shape; None where none was tried.
+
+    level: mean square of the whitened rows, at least 1. Its chance counts all that were tried.
+    """
+    both = [*tried.ramps, *tried.steps]
+    chances = [float(chdtrc(len(each.columns), each.gain / level)) for each in both]
+    if not both:
+        return None
+    best = int(np.argmin(chances))
+    return Suspicion(both[best].columns, both[best].since, min(1.0, len(both) * chances[best]))
 
 
 @dataclass(frozen=True)

@@ -132,8 +132,7 @@ def value_cell(parameter: Document) -> str:
 def tracker_facts(trackers: list[Document]) -> dict[str, list[str]]:
     """Normalised innovations squared with their band, and the memory in effect, of each tracker."""
     nis = [
-        "–" if t["nis"] is None else f"{t['nis']:.3f} ({t['nis_lower95']:.2f} … {t['nis_upper95']:.2f})"
-        for t in trackers
+        "–" if t["nis"] is None else f"{t['nis']:.3f} ({t['nis_lower']:.2f} … {t['nis_upper']:.2f})" for t in trackers
     ]
     return {"innovations squared": nis, "memory": [f"{t['memory_s']:.3g} s" for t in trackers]}
 

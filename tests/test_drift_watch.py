@@ -1,0 +1,65 @@
+"""A drift that nobody follows is never green, and steady sessions stay so."""
+
+from __future__ import annotations
+
+import tomllib
+from collections.abc import Sequence
+from dataclasses import replace
+from functools import cache
+
+import pytest
+
+import sms_online as sms
+from sms_online.judgement import CHECK_NOISE, DIAGNOSE, FOLLOW, GO_ON, Facts, judge
+from sms_online.pipeline.tracker_bank import Suspected
+from sms_online.tracker_results import Consistency
+from sms_online.trust import Residual
+from tests.axis import AXIS, MOTION
+
+DRIFT = "link_1.inertia:share=-0.2,over=20,begin=8.3"
+GOOD = Facts(determined=(2, 2), residual={"joint_1": Residual(0.01, 1.0)})
+
+
+@cache
+def axis_capture(seed: int, *drift: str) -> tuple[sms.System, sms.Capture]:
+    """The axis as simulated at grade B."""
+    system = sms.load_system(tomllib.loads(AXIS + MOTION))
+    return system, sms.simulate(system, 18.0, "B", seed, drift=drift)
+
+
+def judged(tracker: str, seed: int, drift: Sequence[str] = ()) -> sms.Trust:
+    system, capture = axis_capture(seed, *drift)
+    return sms.estimate(system, capture, tracker=tracker).trust
+
+
+@pytest.mark.parametrize(("tracker", "then"), [("rls", FOLLOW), ("kalman:drift=learned", GO_ON)])
+@pytest.mark.parametrize("seed", [0, 1])
+def test_a_drift_that_nobody_follows_is_doubted(tracker: str, then: str, seed: int) -> None:
+    """Seeds 0 and 1 show the least of it among eight."""
+    trust = judged(tracker, seed, [DRIFT])
+    assert (trust.level, trust.grave) == ("doubt", False)
+    assert trust.grounds[0].text.startswith("link_1.inertia seems to move since")
+    assert trust.grounds[0].then == then
+
+
+@pytest.mark.parametrize("seed", [0, 3, 9, 15])
+def test_steady_sessions_are_trusted(seed: int) -> None:
+    """Seed 9 has the loudest rows of sixteen, seed 15 the ramp that is least like chance on the way."""
+    assert judged("rls", seed).level == "trust"
+
+
+@pytest.mark.parametrize(("nis", "then"), [(1.4, DIAGNOSE), (0.6, CHECK_NOISE)])
+def test_an_inconsistent_tracker_is_not_trusted(nis: float, then: str) -> None:
+    assert judge(replace(GOOD, consistency=Consistency(1.0, 0.8, 1.2))).level == "trust"
+    trust = judge(replace(GOOD, consistency=Consistency(nis, 0.8, 1.2)))
+    assert trust.level == "doubt"
+    assert not trust.grave
+    assert f"innovations squared are {nis:.2f}" in trust.sentence
+    assert trust.grounds[0].then == then
+
+
+def test_what_is_missing_comes_before_a_suspected_drift() -> None:
+    """A lack of the model bends parameters in time, and is said in place of that."""
+    trust = judge(replace(GOOD, suspected=Suspected(("link_1.inertia",), 8.0, False), alarm="joint_1"))
+    assert trust.grave
+    assert not any("seems to move" in reason.text for reason in trust.grounds)
