@@ -202,7 +202,7 @@ class Recorded:
     """A recorded session: its samples, a name for messages, and what lies beside them.
 
     truth: of a simulation. checkpoint: what the session resumed from. searcher: of its diagnosis, from whether effects
-    are adopted.
+    are adopted. trackers: those that were asked for in place of the system file's, none where nothing was.
     """
 
     source: Source
@@ -210,6 +210,7 @@ class Recorded:
     truth: Mapping[str, Any] | None = None
     checkpoint: Checkpoint | None = None
     searcher: Callable[[bool], Searcher] = lambda adopt: Immediate()
+    trackers: tuple[TrackerChoice, ...] = ()
 
 
 # What can be estimated from: a capture, the path of one, of a log or of a recording, or blocks in order of time.
@@ -240,7 +241,7 @@ def estimate(
         source.channels,
         prior=prior,
         adopt=adopt,
-        tracker=tracker,
+        tracker=recorded.trackers if tracker is None else tracker,
         source=recorded.name,
         searcher=recorded.searcher(adopt),
         checkpoint=recorded.checkpoint,

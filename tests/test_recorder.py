@@ -17,12 +17,15 @@ import pytest
 
 from sms_adapters import recorder as recorder_module
 from sms_adapters.raw import ERROR_FRAME, EXTENDED, FD_FRAME, MOST_BYTES, REMOTE_FRAME, CanFrames, SerialChunk
+from sms_adapters.recorded import recorded_at
 from sms_adapters.recorder import Recorder, being_recorded
 from sms_adapters.recording import Recording
-from sms_adapters.session_log import RULES, RecordedItems, SessionHeader, read_header
+from sms_adapters.session_log import RULES, SESSION, RecordedItems, SessionHeader, header_text, read_header
 from sms_adapters.sources import open_source
+from sms_online.capture import Capture
 from sms_online.errors import InputError
 from sms_online.stream import Array
+from sms_online.trackers.parse import parse_tracker
 from sms_tools.results_file import results_directory
 from tests.bus_streams import AxisBus, axis_testbed, merged
 
@@ -65,6 +68,17 @@ def recorded(directory: Path, frames: CanFrames, chunks: list[SerialChunk]) -> N
         recorder.put("drive", [frames[k : k + 7]], dropped=False)
     recorder.put("encoder", chunks, dropped=False)
     recorder.close(1.0)
+
+
+def test_a_recording_holds_the_trackers_asked_for(tmp_path: Path) -> None:
+    asked = parse_tracker("kalman:drift=learned"), parse_tracker("rls:forgetting=exponential,memory=5")
+    for directory, header in (("with", replace(HEADER, trackers=asked)), ("without", HEADER)):
+        (tmp_path / directory).mkdir()
+        (tmp_path / directory / SESSION).write_text(header_text(header))
+        assert (
+            recorded_at(tmp_path / directory, Capture.from_arrays(np.zeros(1), {"q_1": np.zeros(1)})).trackers
+            == header.trackers
+        )
 
 
 def test_what_was_recorded_is_read_back_to_the_bit(tmp_path: Path) -> None:

@@ -12,7 +12,7 @@ from sms_adapters.mcap_capture import capture_writer
 from sms_adapters.part import Part
 from sms_adapters.recording import resumed_from
 from sms_adapters.searches import searcher_of
-from sms_adapters.session_log import SESSION
+from sms_adapters.session_log import SESSION, read_header
 from sms_adapters.sources import open_source
 from sms_adapters.truth import read_truth, write_truth
 from sms_online.capture import Capture
@@ -31,6 +31,7 @@ def recorded_at(path: Path, source: Source, whole: bool = True) -> Recorded:
         truth_beside(path),
         resumed_from(path),
         partial(searcher_of, path) if whole else lambda adopt: Immediate(),
+        read_header(path)[0].trackers if path.is_dir() and (path / SESSION).is_file() else (),
     )
 
 

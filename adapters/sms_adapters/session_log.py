@@ -27,6 +27,7 @@ from sms_adapters.candump import parsed
 from sms_adapters.files import reading
 from sms_adapters.lines import LineReader
 from sms_adapters.raw import ERROR_FRAME, EXTENDED, FD_FRAME, REMOTE_FRAME, CanFrames, Raw, SerialChunk
+from sms_online.description.schema import TrackerChoice
 from sms_online.errors import InputError
 from sms_online.stream import Array
 
@@ -63,7 +64,7 @@ class SessionHeader:
 
     epoch: UTC of the session's clock zero, µs. sources: name to kind, in the order of the system file. start: time of
     the clock's zero in the estimate, s; not 0 where the session resumed an earlier one. versions: of programs, by name.
-    rules: see RULES.
+    rules: see RULES. trackers: those that were asked for in place of the system file's, none where nothing was.
     """
 
     epoch: int
@@ -71,12 +72,14 @@ class SessionHeader:
     start: float
     versions: dict[str, str]
     rules: int = RULES
+    trackers: tuple[TrackerChoice, ...] = ()
 
 
 def header_text(header: SessionHeader) -> str:
     """session.toml of a session that begins."""
     lines = [f'schema = "{SCHEMA}"', f"epoch_us = {header.epoch}", f"start_s = {header.start!r}"]
-    lines += [f"rules = {header.rules}", "", "[sources]"]
+    trackers = [each.model_dump_json() for each in header.trackers]
+    lines += [f"rules = {header.rules}", *([f"trackers = {json.dumps(trackers)}"] if trackers else []), "", "[sources]"]
     lines += [f'{name} = "{kind}"' for name, kind in header.sources.items()]
     lines += ["", "[versions]", *(f"{json.dumps(name)} = {json.dumps(text)}" for name, text in header.versions.items())]
     return "\n".join(lines) + "\n"
@@ -106,6 +109,7 @@ def read_header(directory: Path) -> tuple[SessionHeader, dict[str, Any] | None]:
             float(document["start_s"]),
             document["versions"],
             int(document.get("rules", 1)),
+            tuple(TrackerChoice.model_validate_json(text) for text in document.get("trackers", [])),
         )
     except (ValueError, KeyError, TypeError, AttributeError) as error:
         raise InputError(str(path), "", f"{error}", f"a document of schema {SCHEMA}") from None

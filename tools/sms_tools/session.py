@@ -73,7 +73,7 @@ def conclude(args: argparse.Namespace, result: Result, directory: Path, interrup
 def write_named(args: argparse.Namespace, session: Session, directory: Path) -> None:
     """With --adopt, the system file with what was named, if anything was."""
     system = session.diagnosis.system
-    described = with_trackers(load_system(args.system), args.tracker)
+    described = with_trackers(load_system(args.system), session.system.trackers)
     if args.adopt and system != described:
         found = [effect for episode in session.diagnosis.document() for effect in episode["effects"]]
         path = write_text(directory / ONLINE_NAME, adopted_text(args.system, described, system, remarks(found)))

@@ -15,6 +15,7 @@ from sms_adapters.recorder import Recorder
 from sms_adapters.session_log import CHECKPOINT as RESUMED_FROM
 from sms_adapters.session_log import MICROSECOND, SYSTEM, SessionHeader, read_header
 from sms_adapters.system_file import system_text
+from sms_online.description.given import given_system
 from sms_online.description.parse import shipped_systems
 from sms_online.description.schema import System
 from sms_online.errors import InputError
@@ -74,7 +75,13 @@ def open_testbed(
     session = Session(system, channels, adopt=adopt, source=name, checkpoint=checkpoint)
     clock = SessionClock()
     start = 0.0 if resume is None else resumed_start(resume, session, clock.epoch)
-    header = SessionHeader(clock.epoch, {source.name: kind_of(source) for source in system.devices}, start, versions())
+    header = SessionHeader(
+        clock.epoch,
+        {source.name: kind_of(source) for source in system.devices},
+        start,
+        versions(),
+        trackers=() if system.trackers == given_system(name)[0].trackers else system.trackers,
+    )
     recorder = Recorder(directory, header, system_files(name, system))
     if resume is not None:
         shutil.copyfile(resume / CHECKPOINT, directory / RESUMED_FROM)

@@ -40,6 +40,7 @@ def run(args: argparse.Namespace) -> int:
                 source.channels,
                 prior=args.prior,
                 adopt=args.adopt,
+                tracker=recorded.trackers if args.tracker is None else None,
                 source=recorded.name,
                 searcher=recorded.searcher(args.adopt),
                 checkpoint=recorded.checkpoint,
