@@ -21,6 +21,7 @@ from sms_adapters.clock_lanes import lanes
 from sms_adapters.devices import make_decoder
 from sms_adapters.raw import SerialChunk, concatenate_frames
 from sms_adapters.serial_decoder import FrameDecoder
+from sms_adapters.session_log import read_header
 from sms_adapters.system_file import load_system
 from sms_online.description.parse import parse_system, shipped_text
 from sms_online.description.schema import System
@@ -154,7 +155,7 @@ def test_a_stopped_live_session_replays_to_the_same_results(
     arm: tuple[SimulatedArm, Path], tmp_path: Path, number: signal.Signals
 ) -> None:
     moving, file = arm
-    process = live(file, tmp_path / "run")
+    process = live(file, tmp_path / "run", "--tracker", "kalman:drift=learned", "--tracker", "rls")
     moving.start()
     time.sleep(5.0)
     os.kill(process.pid, number)
@@ -166,6 +167,8 @@ def test_a_stopped_live_session_replays_to_the_same_results(
     assert files >= {"session.toml", "system.toml", DBC, "can.log", "results.json", "checkpoint.msgpack"}
     system = str(tmp_path / "run" / "system.toml")
     assert main(["replay", str(tmp_path / "run"), "--system", system, "--out", str(tmp_path / "again")]) in (0, 3)
+    asked = [tracker.label for tracker in read_header(tmp_path / "run")[0].trackers]
+    assert asked == ["kalman learned", "rls"]
     assert document(tmp_path / "again") == document(tmp_path / "run")
     assert document(tmp_path / "run")["samples"] > 1000
 
