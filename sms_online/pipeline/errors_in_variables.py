@@ -102,6 +102,9 @@ class NoiseBias(State):
         limit = np.sqrt(np.divide(LARGEST_FACTOR, own, out=np.ones_like(own), where=own > LARGEST_FACTOR))
         clusters = clusters * np.outer(limit, limit)
         changed = clusters.sum(axis=0)
+        if not changed.any():
+            # Directions of exact rows may be known so differently that rounding would move them.
+            return shift, covariance
         # Directions of unit information, and the share of it that noise makes.
         values, vectors = np.linalg.eigh(gram[:-1, :-1])
         root = vectors / np.sqrt(np.maximum(values, np.finfo(np.float64).eps * values[-1]))

@@ -434,7 +434,7 @@ class Momentum(Stage):
 
     def statistics(self, t: float) -> MomentumStatistics:
         """What is known now; nothing in it changes as the session goes on. t: of the newest sample, s."""
-        alarm = self.test.alarm
+        alarm, noise = self.test.alarm, self.state.sensor_noise
         return MomentumStatistics(
             trackers=self.readings(t),
             reference=self._reference,
@@ -446,6 +446,7 @@ class Momentum(Stage):
             alarm=None if alarm is None else alarm.row,
             scale_free=self.scale_free,
             latency=self.latencies.found,
-            coloured={} if self.state.sensor_noise is None else self.state.sensor_noise.coloured,
-            suspected=self.bank.suspected,
+            coloured={} if noise is None else noise.coloured,
+            # Rows of exact samples leave rounding, which moves as it likes.
+            suspected=None if noise is None or noise.exact else self.bank.suspected,
         )
