@@ -52,7 +52,6 @@ CHECK_LOSSES = "look at the faults that the session counted: a bus that is too b
 WEIGH = "weigh one part and state it under [known], or measure a torque constant"
 FOLLOW = "replay it with `--tracker kalman:drift=learned` (tracker = kalman, drift = learned)"
 GO_ON = "record for longer: a drift is followed once it is certain; then run `sms-online diagnose`"
-CHECK_NOISE = "check the stated noise of the sensors, and the tracker's process noise: error bars are too large"
 CHECK_DEVICE = "look at power, cable and address of what is silent, and at its table in the system file"
 CHECK_TROUBLE = "see to the devices, the recording and the machine first"
 MOVE = "move all joints, faster and over a larger range, and long enough"
@@ -365,12 +364,11 @@ def _moving(suspected: Suspected | None) -> list[Reason]:
 
 
 def _inconsistent(consistency: Consistency | None) -> list[Reason]:
-    """Rows that do not agree with the tracker's error bars, where nothing else says why."""
-    if consistency is None or consistency.nis is None or consistency.consistent:
+    """Rows that leave more than the tracker's error bars say, where nothing else says why."""
+    if consistency is None or consistency.nis is None or consistency.nis <= consistency.upper:
         return []
-    band = f"{consistency.lower:.2f} … {consistency.upper:.2f}"
-    text = f"normalised innovations squared are {consistency.nis:.2f}, beyond {band}"
-    return [Reason(text, False, then=DIAGNOSE if consistency.nis > 1.0 else CHECK_NOISE)]
+    text = f"normalised innovations squared are {consistency.nis:.2f}, beyond {consistency.upper:.2f}"
+    return [Reason(text, False, then=DIAGNOSE)]
 
 
 def _beyond_noise(residual: Residuals) -> list[Reason]:

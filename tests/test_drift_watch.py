@@ -10,7 +10,7 @@ from functools import cache
 import pytest
 
 import sms_online as sms
-from sms_online.judgement import CHECK_NOISE, DIAGNOSE, FOLLOW, GO_ON, Facts, judge
+from sms_online.judgement import DIAGNOSE, FOLLOW, GO_ON, Facts, judge
 from sms_online.pipeline.tracker_bank import Suspected
 from sms_online.tracker_results import Consistency
 from sms_online.trust import Residual
@@ -48,14 +48,14 @@ def test_steady_sessions_are_trusted(seed: int) -> None:
     assert judged("rls", seed).level == "trust"
 
 
-@pytest.mark.parametrize(("nis", "then"), [(1.4, DIAGNOSE), (0.6, CHECK_NOISE)])
-def test_an_inconsistent_tracker_is_not_trusted(nis: float, then: str) -> None:
-    assert judge(replace(GOOD, consistency=Consistency(1.0, 0.8, 1.2))).level == "trust"
-    trust = judge(replace(GOOD, consistency=Consistency(nis, 0.8, 1.2)))
-    assert trust.level == "doubt"
-    assert not trust.grave
-    assert f"innovations squared are {nis:.2f}" in trust.sentence
-    assert trust.grounds[0].then == then
+def test_rows_louder_than_the_error_bars_are_not_trusted() -> None:
+    """Rows that are quieter make the bars too large, which harms nobody: samples may be better than stated."""
+    for nis in (0.6, 1.0):
+        assert judge(replace(GOOD, consistency=Consistency(nis, 0.8, 1.2))).level == "trust"
+    trust = judge(replace(GOOD, consistency=Consistency(1.4, 0.8, 1.2)))
+    assert (trust.level, trust.grave) == ("doubt", False)
+    assert "innovations squared are 1.40, beyond 1.20" in trust.sentence
+    assert trust.grounds[0].then == DIAGNOSE
 
 
 def test_what_is_missing_comes_before_a_suspected_drift() -> None:
