@@ -9,7 +9,7 @@ from typing import Any, get_args
 
 from markdown.extensions.toc import slugify
 
-from sms_online.description import schema, sources
+from sms_online.description import markers, schema, sources
 from sms_online.description.parse import RENAMED
 from sms_online.description.record import Record
 from sms_online.description.schema import System
@@ -23,11 +23,13 @@ HEADINGS: dict[type[Record], str] = {
     schema.Motor: "`[motor_i]`",
     schema.RigidLink: '`[link_i]` of `kind = "rigid"`',
     schema.FlexibleLink: '`[link_i]` of `kind = "flexible"`',
+    markers.Marker: "`[[link_i.markers]]`",
     schema.RigidBody: "`[payload]`",
     schema.Inertia: "Inertias",
     schema.Sensor: "`[[sensor]]`",
     schema.Effect: "`[[effect]]`",
     schema.Prior: "`[prior]`",
+    schema.Fitted: "`[fitted]`",
     schema.Controller: "`[controller]`",
     schema.Trajectory: "`[trajectory]`",
     schema.Harmonic: "Harmonics of a trajectory",
