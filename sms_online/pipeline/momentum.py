@@ -447,6 +447,6 @@ class Momentum(Stage):
             scale_free=self.scale_free,
             latency=self.latencies.found,
             coloured={} if noise is None else noise.coloured,
-            # Rows of exact samples leave rounding, which moves as it likes.
-            suspected=None if noise is None or noise.exact else self.bank.suspected,
+            # Rounding moves as it likes where samples are exact, and devices' clocks wander, as if parameters moved.
+            suspected=None if noise is None or noise.exact or self._clocks else self.bank.suspected,
         )
