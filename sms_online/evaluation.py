@@ -138,13 +138,14 @@ class Evaluation:
     @one_blas_thread()
     def residuals(self) -> dict[str, Residual]:
         """By type of the rows."""
-        now, beta = self.statistics, self._joint[len(self.statistics.setup.nuisances) :]
+        now, joint = self.statistics, self._joint
+        beta = joint[len(now.setup.nuisances) :]
         relative = {joint_rows(i): joint.relative(beta) for i, joint in enumerate(now.joints)}
         out = {ENERGY: Residual(None, None)}
+        # Where the smoother knows better, rows of the balance see shapes that are not the links'.
+        momentum = None if now.method == "smoother" else now.momentum
         for name, speeds in row_types(self.model.layout).items():
-            # Where the smoother knows better, rows of the balance see shapes that are not the links'.
-            momentum = None if now.method == "smoother" else now.momentum
-            whitened = None if momentum is None else momentum.rows.whitened(speeds, self._joint)
+            whitened = None if momentum is None else momentum.rows.whitened(speeds, joint)
             out[name] = Residual(relative.get(name), whitened)
         return out
 
