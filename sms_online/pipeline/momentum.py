@@ -151,7 +151,8 @@ class Momentum(Stage):
     def _new_bank(self) -> TrackerBank:
         model, base, nuisances = self.changes.model, self.changes.base, self.nuisances
         prior, n_v = self.current_prior, model.layout.n_v
-        return TrackerBank(model.system, base.parameters, nuisances, prior, n_v, self._window)
+        steady = not self._clocks
+        return TrackerBank(model.system, base.parameters, nuisances, prior, n_v, self._window, steady)
 
     @property
     def _window(self) -> float:
@@ -447,6 +448,6 @@ class Momentum(Stage):
             scale_free=self.scale_free,
             latency=self.latencies.found,
             coloured={} if noise is None else noise.coloured,
-            # Rounding moves as it likes where samples are exact, and devices' clocks wander, as if parameters moved.
-            suspected=None if noise is None or noise.exact or self._clocks else self.bank.suspected,
+            # Rounding moves as it likes where samples are exact.
+            suspected=None if noise is None or noise.exact else self.bank.suspected,
         )

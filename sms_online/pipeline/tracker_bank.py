@@ -89,7 +89,8 @@ class TrackerBank(Stage):
     """The chosen trackers of one session, from one event to the next.
 
     system: with its choice. parameters (n,): columns of the rows behind those of the nuisances. prior: of the
-    parameters. span: of a window, s. InputError where a choice does not fit the parameters.
+    parameters. span: of a window, s. steady: all channels have one clock; clocks of several devices wander, as if
+    parameters moved, and no drift is suspected. InputError where a choice does not fit the parameters.
     """
 
     def __init__(
@@ -100,7 +101,9 @@ class TrackerBank(Stage):
         prior: Prior | None,
         rows_a_window: int,
         span: float,
+        steady: bool,
     ) -> None:
+        self._steady = steady
         self._nuisances, self._rows_a_window = len(nuisances), rows_a_window
         tolerance = np.array([each.tolerance for each in nuisances])
         nothing = np.full(len(parameters), np.nan)
@@ -120,7 +123,8 @@ class TrackerBank(Stage):
         self._names = [p.name for p in parameters]
         # A judged tracker that lets nothing move is watched: rows that show a drift speak against it.
         judged = system.trackers[0]
-        self._watch = build_watch(tracked) if judged.kind != "kalman" or judged.drift == "none" else None
+        still = judged.kind != "kalman" or judged.drift == "none"
+        self._watch = build_watch(tracked) if steady and still else None
         # By name, for each is saved as a stage within.
         for k, chosen in enumerate(self._chosen):
             if chosen.tracker is not None:
@@ -139,7 +143,7 @@ class TrackerBank(Stage):
     @property
     def suspected(self) -> Suspected | None:
         """A change of parameters that the rows show and the judged tracker does not follow."""
-        learner = self._watch or self.learned
+        learner = (self._watch or self.learned) if self._steady else None
         change = None if learner is None else learner.state.suspected
         if change is None:
             return None
