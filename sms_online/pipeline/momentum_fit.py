@@ -138,7 +138,7 @@ class MomentumFit(Stage):
     """Whitens the windows of a session, segment by segment.
 
     new_noise: makes what propagates noise, for the same model, base and balance. solve: gives the estimate so far of
-    nuisances and β (m + n,), which weights follow. sources: whose latencies are told. calibration: rows
+    nuisances and β (m + n,), which weights follow. sources: whose latencies are estimated. calibration: rows
     [N Y b] (k, m + n + 1) of what is known of the nuisances beforehand. beforehand: gives all that is known beside the
     rows. drift: gives the known drift in the window that ends at a grid index. weighing: who weighs now.
     """
@@ -392,7 +392,7 @@ class MomentumFit(Stage):
         return [self.weighing] if self._next is None else [self.weighing, self._next]
 
     def _white(self, windows: Sequence[Window]) -> list[WhiteRows]:
-        """Rows of the next windows, and the weighing to come takes over when it has been told enough of them."""
+        """Rows of the next windows; the weighing to come takes over when it has received enough of them."""
         out: list[WhiteRows] = []
         while len(out) < len(windows):
             count = TOGETHER if self._next is None else self._count(WARM_UP) - (self.state.warm or 0)
@@ -462,7 +462,7 @@ class MomentumFit(Stage):
         return np.asarray(ends / self._balance.sample_rate - 0.5 * self._balance.span)
 
     def _weigh(self, windows: Sequence[Window], rows: Array, errors: Array) -> list[Weighed]:
-        """Rows (W, n_v, width) of the next windows; the weighing to come is told them too, and then may take over."""
+        """Rows (W, n_v, width) of the next windows; the weighing to come receives them too, and then may take over."""
         self.state.last = windows[-1].start
         self.state.since += len(windows)
         weighed = self.weighing.push(windows, rows, errors)
