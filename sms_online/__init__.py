@@ -23,8 +23,8 @@ if TYPE_CHECKING:
     from sms_online.result import Coefficient, Finding, Parameter, Parameters, Result
     from sms_online.session import Session, estimate
     from sms_online.stream import Block
-    from sms_online.trust import Residual, Trust
     from sms_online.validation import Validation, validate
+    from sms_online.verdict.trust import Residual, Trust
     from sms_sim.bound import Bounds, bound
     from sms_sim.capture import simulate
     from sms_sim.excitation import Excitation, excite
@@ -49,11 +49,11 @@ _HOMES = {
     "Limits": "sms_sim.motion_limits",
     "Parameter": "sms_online.result",
     "Parameters": "sms_online.result",
-    "Residual": "sms_online.trust",
+    "Residual": "sms_online.verdict.trust",
     "Result": "sms_online.result",
     "Session": "sms_online.session",
     "System": "sms_online.description.schema",
-    "Trust": "sms_online.trust",
+    "Trust": "sms_online.verdict.trust",
     "Validation": "sms_online.validation",
     "bound": "sms_sim.bound",
     "check": "sms_adapters.data_check",

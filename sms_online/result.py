@@ -19,7 +19,7 @@ from sms_online.pipeline.statistics import Method
 from sms_online.stream import Array
 from sms_online.tables import Documented, finite, formatter, html_table, text_table
 from sms_online.tracker_results import Drift, TrackerResult
-from sms_online.trust import Residual, Residuals, Trust
+from sms_online.verdict.trust import Residual, Residuals, Trust
 
 if TYPE_CHECKING:
     import pandas

@@ -12,7 +12,7 @@ from sms_online.pipeline.statistics import Statistics
 from sms_online.result import result_of
 from sms_online.stream import Array
 from sms_online.trackers.interface import Estimate
-from sms_online.trust import Trust
+from sms_online.verdict.trust import Trust
 
 
 def evaluated(estimator: Estimator, estimate: Estimate | None = None) -> Evaluation:

@@ -10,14 +10,16 @@ from functools import cache
 import pytest
 
 import sms_online as sms
-from sms_online.judgement import DIAGNOSE, FOLLOW, GO_ON, Facts, judge
 from sms_online.pipeline.tracker_bank import Suspected
 from sms_online.tracker_results import Consistency
-from sms_online.trust import Residual
+from sms_online.verdict.evidence import Evidence
+from sms_online.verdict.judge import judge
+from sms_online.verdict.reasons import DIAGNOSE, FOLLOW, GO_ON
+from sms_online.verdict.trust import Residual
 from tests.axis import AXIS, MOTION
 
 DRIFT = "link_1.inertia:share=-0.2,over=20,begin=8.3"
-GOOD = Facts(determined=(2, 2), residual={"joint_1": Residual(0.01, 1.0)})
+GOOD = Evidence(determined=(2, 2), residual={"joint_1": Residual(0.01, 1.0)})
 
 
 @cache

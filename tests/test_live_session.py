@@ -22,9 +22,10 @@ from sms_adapters.recording import split
 from sms_adapters.session_log import SessionHeader, from_microseconds
 from sms_adapters.sources import open_source
 from sms_online.description.schema import System
-from sms_online.judgement import Facts, judge
 from sms_online.pipeline.estimator import Estimator
 from sms_online.session import Session
+from sms_online.verdict.evidence import Evidence
+from sms_online.verdict.judge import judge
 from sms_tools.interruption import Interruption
 from sms_tools.live import feed as feed_module
 from sms_tools.live.feed import Feed, Interpreter, SessionClock
@@ -340,7 +341,7 @@ def test_latency_counts_each_sample_once_and_forgets_the_start() -> None:
 def test_the_status_line_says_what_matters() -> None:
     leading = [Leading("link_1.inertia", "kg m²", 0.3, 0.01)]
     gone = "drive: gone (unplugged), tried again"
-    doubt = judge(Facts(determined=(1, 2), troubles=(gone,)))
+    doubt = judge(Evidence(determined=(1, 2), troubles=(gone,)))
     news = News(12.0, 1234.0, 0.12, 3, 0.02, (1, 2), leading, [gone], doubt)
     said = line(news)
     for part in ("12.0 s", "1,234 samples/s", "p99 120 ms", "lost 3", "residual 2 %", "1 of 2 determined",

@@ -10,7 +10,7 @@ import pytest
 import sms_online as sms
 from sms_online.nominal import compare, unit_factors
 from sms_online.pipeline.estimator import Estimator
-from sms_online.trust import Trust
+from sms_online.verdict.trust import Trust
 from tests.evaluated import judged
 
 GEAR = 100.0

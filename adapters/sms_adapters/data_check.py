@@ -16,12 +16,12 @@ from sms_online.description.channels import channel_unit, drive_channels, sensed
 from sms_online.description.given import Given, given_system
 from sms_online.description.schema import System
 from sms_online.errors import InputError
-from sms_online.judgement import MANY_OUTLIERS
 from sms_online.pipeline.estimator import Estimator
 from sms_online.pipeline.outliers import LeftOut, Outliers
 from sms_online.session import Data, recorded_session
 from sms_online.stream import Array, Block
 from sms_online.tables import Tabled, html_table, text_table
+from sms_online.verdict.reasons import MANY_OUTLIERS
 
 SCHEMA = "sms-online/check/1"
 UNDETERMINED = "not at all"

@@ -23,12 +23,12 @@ from sms_online.diagnosis.unexplained import Unexplained, describe_residual
 from sms_online.effects.catalogue import kinematic_candidates
 from sms_online.errors import InputError
 from sms_online.evaluation import Evaluation
-from sms_online.judgement import LARGEST_RESIDUAL
 from sms_online.pipeline.estimator import Estimator
 from sms_online.pipeline.momentum_windows import HOPS
 from sms_online.pipeline.statistics import Statistics
 from sms_online.stream import Array, Block
 from sms_online.threads import one_blas_thread
+from sms_online.verdict.reasons import LARGEST_RESIDUAL
 
 # Exact links have to take this share of what straight ones leave beyond noise.
 STIFFENING_TAKES = 0.1

@@ -26,8 +26,8 @@ from sms_online.session import Data, recorded_session
 from sms_online.stream import Block
 from sms_online.tables import Documented, html_table, text_table
 from sms_online.trackers.interface import Prior
-from sms_online.trust import Residual, Residuals, Trust
 from sms_online.truth import true_values
+from sms_online.verdict.trust import Residual, Residuals, Trust
 
 
 @dataclass(frozen=True)

@@ -17,14 +17,16 @@ from sms_online.diagnosis.reported import Coefficients, of_constant, of_unknowns
 from sms_online.diagnosis.shape import slopes
 from sms_online.effects.catalogue import ENTRIES, declarable, either, in_words, traits_of
 from sms_online.evaluation import NORMAL_95, Evaluation, identifiable
-from sms_online.judgement import Facts, judge, judge_diagnosis, undecided
 from sms_online.model.parameters import Parameter
 from sms_online.pipeline.estimator import Estimator
 from sms_online.pipeline.statistics import Statistics
 from sms_online.result import residual_document, result_of
 from sms_online.stream import Array
 from sms_online.threads import one_blas_thread
-from sms_online.trust import Reason, Residual, Trust
+from sms_online.verdict.evidence import Evidence
+from sms_online.verdict.judge import judge, judge_diagnosis
+from sms_online.verdict.reasons import undecided
+from sms_online.verdict.trust import Reason, Residual, Trust
 
 SCHEMA = "sms-online/diagnosis/1"
 # What was found by comparing whole descriptions competes with no columns.
@@ -121,7 +123,7 @@ def _after(diagnosis: Diagnosis, session: Evaluation) -> Trust:
         return session.trust
     # Parameters come from the rows of the diagnosis then, see `_posterior`.
     known = [p["identifiable"] for p in _posterior(diagnosis.attempt, diagnosis.chosen)]
-    return judge(Facts((sum(known), len(known)), residual=_part(diagnosis.after.fit)))
+    return judge(Evidence((sum(known), len(known)), residual=_part(diagnosis.after.fit)))
 
 
 def trust_of(diagnosis: Diagnosis, after: Evaluation | None = None) -> Trust:

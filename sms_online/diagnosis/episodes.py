@@ -6,8 +6,8 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from sms_online.diagnosis.online_search import Named, Outcome
-from sms_online.judgement import Discrepancy
 from sms_online.pipeline.events import Event
+from sms_online.verdict.evidence import Discrepancy
 
 
 @dataclass(frozen=True)

@@ -23,7 +23,6 @@ from sms_online.diagnosis.online_search import Named, Outcome, Request, search
 from sms_online.diagnosis.record import Segment, joined
 from sms_online.effects.build import changed_model
 from sms_online.effects.catalogue import ENTRIES
-from sms_online.judgement import Discrepancy
 from sms_online.model.model import Model
 from sms_online.pipeline.estimator import Estimator
 from sms_online.pipeline.events import Event
@@ -32,6 +31,7 @@ from sms_online.pipeline.momentum_balance import MARGIN
 from sms_online.pipeline.observer import Observer
 from sms_online.pipeline.synchronise import GridSamples
 from sms_online.trackers.information import Information
+from sms_online.verdict.evidence import Discrepancy
 
 # Times are in units of the windows of the momentum balance, those of 0.4 s at least.
 SHORTEST_UNIT = 0.4

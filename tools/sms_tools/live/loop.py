@@ -15,9 +15,10 @@ from sms_adapters.clock_merge import Merger
 from sms_adapters.recorder import Recorder
 from sms_adapters.recording import tick_time
 from sms_online.checkpoint import Checkpoint
-from sms_online.judgement import LARGEST_LOSS
+from sms_online.notices import unstated_latency
 from sms_online.session import Session
 from sms_online.stream import Block
+from sms_online.verdict.reasons import LARGEST_LOSS
 from sms_tools.interruption import Interruption
 from sms_tools.live.feed import READ_TIMEOUT, Feed, Interpreter, SessionClock
 from sms_tools.live.latency import RECENT, Latencies
@@ -238,7 +239,7 @@ class LiveSession:
                 *troubles,
                 *self._merger.warnings,
                 *self.warnings,
-                *known.unstated_latency,
+                *unstated_latency(known.statistics),
             ],
             trust=known.trust,
         )

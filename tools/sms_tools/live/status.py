@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from rich.console import Console
 from rich.table import Table
 
-from sms_online.trust import Trust
+from sms_online.verdict.trust import Trust
 from sms_tools.report import verdict_text
 
 # News a second: more than anybody reads; where there is no terminal, a line every so many seconds.

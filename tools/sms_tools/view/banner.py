@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import rerun as rr
 
-from sms_online.trust import Trust
+from sms_online.verdict.trust import Trust
 from sms_tools.view import style
 from sms_tools.view.arm_log import times
 

@@ -6,10 +6,10 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
-from sms_online.judgement import Discrepancy
 from sms_online.pipeline.statistics import Statistics
 from sms_online.stream import Block
-from sms_online.trust import Trust
+from sms_online.verdict.evidence import Discrepancy
+from sms_online.verdict.trust import Trust
 from sms_tools.view.choice import Choice
 
 
@@ -39,7 +39,7 @@ class Diagnosed:
 
 @dataclass(frozen=True)
 class Circumstances:
-    """What the trust in a session takes from beside its estimator: see `judgement.Facts`."""
+    """What the trust in a session takes from beside its estimator: see `verdict.evidence.Evidence`."""
 
     discrepancies: tuple[Discrepancy, ...] = ()
     troubles: tuple[str, ...] = ()

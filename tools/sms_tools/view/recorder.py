@@ -12,11 +12,11 @@ import rerun.blueprint as rrb
 from numpy.typing import NDArray
 
 from sms_online.evaluation import Evaluation
-from sms_online.judgement import LARGEST_RESIDUAL, LARGEST_WHITENED
 from sms_online.pipeline.statistics import Statistics
 from sms_online.result import event_document
 from sms_online.stream import Array
-from sms_online.trust import Trust
+from sms_online.verdict.reasons import LARGEST_RESIDUAL, LARGEST_WHITENED
+from sms_online.verdict.trust import Trust
 from sms_tools.report import event_line
 from sms_tools.view import style
 from sms_tools.view.arm_log import ArmLog

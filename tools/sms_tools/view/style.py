@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from sms_online.judgement import LARGEST_RESIDUAL
 from sms_online.stream import Array
-from sms_online.trust import Trust
+from sms_online.verdict.reasons import LARGEST_RESIDUAL
+from sms_online.verdict.trust import Trust
 
 Color = tuple[int, int, int]
 BASE: Color = (110, 120, 135)

@@ -7,20 +7,22 @@ from dataclasses import replace
 import pytest
 
 from sms_online.description.parse import parse_system
-from sms_online.judgement import CHECK_ROWS, MOVE, Discrepancy, Dispute, Facts, judge, judge_diagnosis, place_of
 from sms_online.nominal import Apart, Comparison
 from sms_online.pipeline.estimator import Estimator
-from sms_online.trust import LONGEST_SENTENCE, Residual
+from sms_online.verdict.evidence import Discrepancy, Dispute, Evidence
+from sms_online.verdict.judge import judge, judge_diagnosis
+from sms_online.verdict.reasons import CHECK_ROWS, MOVE, place_of
+from sms_online.verdict.trust import LONGEST_SENTENCE, Residual
 from tests.axis import AXIS, axis_block
 from tests.evaluated import judged, results_document
 
 QUIET = {"energy": Residual(None, None), "joint_1": Residual(0.01, 1.1), "joint_2": Residual(0.02, 0.9)}
-GOOD = Facts(determined=(15, 16), undetermined=("motor_2.stator_inertia",), residual=QUIET)
+GOOD = Evidence(determined=(15, 16), undetermined=("motor_2.stator_inertia",), residual=QUIET)
 SOFT = Apart("joint_1.stiffness", 39.8, 100.0)
 LACKING = Discrepancy("joint_2", 2.7, "named", ("coulomb_friction@joint_2",))
 
 
-def with_row(row: str, **values: float) -> Facts:
+def with_row(row: str, **values: float) -> Evidence:
     return replace(GOOD, residual={**QUIET, row: QUIET[row]._replace(**values)})
 
 
@@ -40,7 +42,7 @@ def test_a_torque_that_is_mostly_noise_is_weak_data() -> None:
 
 
 @pytest.mark.parametrize(
-    ("facts", "said", "marks"),
+    ("evidence", "said", "marks"),
     [
         (with_row("joint_2", whitened=62.0), "the residual of joint_2 is 62 × noise", {"joint_2": "62 × noise"}),
         (
@@ -68,15 +70,15 @@ def test_a_torque_that_is_mostly_noise_is_weak_data() -> None:
         ),
     ],
 )
-def test_what_error_bars_do_not_know_of_is_a_grave_doubt(facts: Facts, said: str, marks: dict[str, str]) -> None:
-    judgement = judge(facts)
+def test_what_error_bars_do_not_know_of_is_a_grave_doubt(evidence: Evidence, said: str, marks: dict[str, str]) -> None:
+    judgement = judge(evidence)
     assert (judgement.level, judgement.grave) == ("doubt", True)
     assert said in judgement.sentence
     assert judgement.marks == marks
 
 
 @pytest.mark.parametrize(
-    ("facts", "said"),
+    ("evidence", "said"),
     [
         (replace(GOOD, pulled=("motor_2.mass",)), "noise pulls motor_2.mass beyond the error bar"),
         (replace(GOOD, undecided=(19.2,)), "a change at 19.2 s"),
@@ -90,27 +92,27 @@ def test_what_error_bars_do_not_know_of_is_a_grave_doubt(facts: Facts, said: str
         (replace(GOOD, comparison=Comparison(apart=(SOFT,))), "joint_1.stiffness is 39.8, described as 100"),
     ],
 )
-def test_what_harms_some_numbers_is_a_doubt_that_is_not_grave(facts: Facts, said: str) -> None:
-    judgement = judge(facts)
+def test_what_harms_some_numbers_is_a_doubt_that_is_not_grave(evidence: Evidence, said: str) -> None:
+    judgement = judge(evidence)
     assert (judgement.level, judgement.grave) == ("doubt", False)
     assert said in judgement.sentence
 
 
 @pytest.mark.parametrize(
-    "facts",
+    "evidence",
     [
         replace(GOOD, discrepancies=(replace(LACKING, adopted=True), Discrepancy("base", 9.0, "change"))),
         replace(GOOD, lost=1e-4, distance=1.0),
         with_row("joint_1", relative=0.4, whitened=1.4),
     ],
 )
-def test_what_is_explained_or_harmless_leaves_trust(facts: Facts) -> None:
-    assert judge(facts).level == "trust"
+def test_what_is_explained_or_harmless_leaves_trust(evidence: Evidence) -> None:
+    assert judge(evidence).level == "trust"
 
 
 def test_the_named_effect_comes_before_the_residual_that_it_leaves() -> None:
-    facts = replace(with_row("joint_2", whitened=19.0), discrepancies=(LACKING,), pulled=("motor_2.mass",))
-    judgement = judge(facts)
+    evidence = replace(with_row("joint_2", whitened=19.0), discrepancies=(LACKING,), pulled=("motor_2.mass",))
+    judgement = judge(evidence)
     assert "coulomb_friction" in judgement.sentence
     assert judgement.others[0] == "the residual of joint_2 is 19 × noise"
     assert "motor_2.mass" in judgement.others[-1]
@@ -123,8 +125,8 @@ def test_lost_samples_come_before_the_residual_that_they_may_have_made() -> None
     assert judgement.others == ("the residual of joint_2 is 19 × noise",)
 
 
-def test_residuals_of_an_estimate_that_is_settling_show_nothing() -> None:
-    loud = replace(with_row("joint_1", relative=3.0, whitened=80.0), settling="too few rows")
+def test_residuals_of_an_unconverged_estimate_show_nothing() -> None:
+    loud = replace(with_row("joint_1", relative=3.0, whitened=80.0), unconverged="too few rows")
     assert judge(loud).level == "not yet"
     assert judge(loud).sentence == "Not yet: too few rows"
     # Unless a test says so.
@@ -143,7 +145,7 @@ def test_a_prior_that_data_pull_from_is_a_grave_doubt() -> None:
     judgement = judge(replace(GOOD, disputed=(Dispute("link_1.mass", 3.4, None), off)))
     assert judgement.sentence == "Do not trust: joint_2.stiffness is 6 σ off its prior: rows of link_2 pull it"
     assert judgement.marks == {"joint_2": "off its prior", "link_1": "off its prior"}
-    assert not judge(replace(GOOD, settling="too few rows", disputed=(off,))).grave
+    assert not judge(replace(GOOD, unconverged="too few rows", disputed=(off,))).grave
 
 
 def test_the_energy_balance_alone_is_never_trusted() -> None:
@@ -195,7 +197,7 @@ def test_a_named_effect_makes_the_system_file_doubtful_and_the_parameters_with_i
         "trust the parameters with it but for what follows"
         in judge_diagnosis("named", ["slosh@base"], None, caution).sentence
     )
-    early = judge(replace(GOOD, settling="few rows"))
+    early = judge(replace(GOOD, unconverged="few rows"))
     assert "trust the parameters" not in judge_diagnosis("named", ["slosh@base"], None, early).sentence
     still = judge_diagnosis("named", ["backlash@joint_1", "cogging@joint_2"], None, DOUBTED)
     assert still.grave
@@ -257,7 +259,7 @@ def test_a_judgement_is_plain_data_in_results() -> None:
 
 
 def test_beside_every_grave_doubt_stands_what_to_do_next() -> None:
-    for facts in (
+    for evidence in (
         with_row("joint_2", whitened=62.0),
         with_row("joint_1", relative=0.96, whitened=2.0),
         replace(GOOD, discrepancies=(LACKING,)),
@@ -267,5 +269,5 @@ def test_beside_every_grave_doubt_stands_what_to_do_next() -> None:
         replace(GOOD, negative=("motor_2.mass",)),
         replace(GOOD, comparison=Comparison(50.0)),
     ):
-        assert judge(facts).grave
-        assert judge(facts).next_step
+        assert judge(evidence).grave
+        assert judge(evidence).next_step

@@ -1,0 +1,82 @@
+"""What happened to the samples and to the smoother in a session, in sentences for a person."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from sms_online.physical import Projection
+from sms_online.pipeline.statistics import Statistics
+
+# Effects of one cause that a warning names.
+NAMED = 4
+
+
+def smoother_warnings(now: Statistics) -> list[str]:
+    """What the smoother replaced, and where it failed."""
+    setup, smoother = now.setup, now.smoother
+    if smoother is None:
+        asked = setup.system.balance == "smoother"
+        return ["no smoother: it does not know of the effects on channels that are declared"] if asked else []
+    out = [f"the smoother left out {failure}" for failure in smoother.failures]
+    missing = ", ".join(setup.sensing.missing)
+    if now.method != "smoother":
+        text = f"links are taken as bent statically, for {missing} are not measured: estimates are off by percents"
+        return [*out, text] if missing else out
+    if missing:
+        out.append(f"not measured, but estimated by the equations of motion: {missing}")
+    if smoother.level > 0.0:
+        share = f"{100.0 * smoother.level:.2g} % of the usual ones"
+        out.append(f"samples do not agree with the equations of motion: unknown forces of {share} are allowed for")
+    return out
+
+
+def projection_warning(projection: Projection | None) -> list[str]:
+    """How far the estimate of a finished session is from physical consistency."""
+    if projection is None:
+        return ["physical consistency is not known: the search for consistent parameters did not converge"]
+    if projection.distance == 0.0:
+        return []
+    distance, names = f"{projection.distance:.2g} standard deviations", ", ".join(projection.active)
+    return [f"the estimate violates physical consistency, because of {names}, by {distance}"]
+
+
+def notices(now: Statistics) -> list[str]:
+    """What happened to the samples, a sentence each."""
+    system, out = now.setup.system, []
+    if now.dropped_rows:
+        out.append(f"{now.dropped_rows} rows of the balance dropped: a value in them is beyond all numbers")
+    period = 1.0 / system.sample_rate
+    fastest = float(np.nanmin(now.periods, initial=np.inf))
+    if np.isfinite(fastest) and not 0.8 < fastest / period < 1.25:
+        out.append(f"the capture has {1.0 / fastest:.4g} samples/s, the system file says {system.sample_rate:g}")
+    late = [name for sensor in system.sensors if sensor.delay(system.sample_rate) for name in sensor.channels]
+    if late and now.method == "smoother":
+        out.append(f"latency of {', '.join(late)} is described but not corrected by the smoother")
+    if now.counters.gaps:
+        out.append(f"{now.counters.gaps} gaps too long to bridge; each begins a new window of the balance")
+    if now.counters.interpolated_cells:
+        out.append(f"{now.counters.interpolated_cells} cells interpolated")
+    coloured = {} if now.momentum is None else now.momentum.coloured
+    out += [f"{channel}: noise is correlated over {1e3 * time:.2g} ms" for channel, time in coloured.items()]
+    out += [f"{channel}: {left.number} outliers left out" for channel, left in now.outliers.items()]
+    out += [
+        f"{s.first} and {s.second} swapped from {s.begin:.3f} to {s.end:.3f} s: {s.samples} samples relabelled"
+        for s in now.swaps
+    ]
+    out += unstated_latency(now)
+    if now.setup.unused:
+        out.append(f"channels not used: {', '.join(now.setup.unused)}")
+    return out
+
+
+def unstated_latency(now: Statistics) -> list[str]:
+    """That a source is late against the others by more than the system file says, if one is."""
+    found = None if now.momentum is None else now.momentum.latency
+    if found is None:
+        return []
+    late = f"{1e3 * abs(found.size):.3g} ± {1e3 * found.std:.2g} ms"
+    if found.size < 0.0:
+        return [f"all sources but {found.source}: {late} later than their stated latencies"]
+    more = [f"{len(found.effects) - NAMED} more"] if len(found.effects) > NAMED else []
+    effects = ", ".join([*found.effects[:NAMED], *more])
+    return [f"{found.source}: {late} later than its stated latency ({effects})"]

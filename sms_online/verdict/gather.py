@@ -1,0 +1,127 @@
+"""From the statistics of a session to the evidence for or against its estimate."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from sms_online.pipeline.latency import source_channels
+from sms_online.pipeline.periods import LONGEST_HOLE
+from sms_online.pipeline.sensing import is_slow
+from sms_online.pipeline.statistics import Statistics
+from sms_online.pipeline.synchronise import SIDE
+from sms_online.verdict.contradictions import ambiguous_effects, disputes, miscalibrated
+from sms_online.verdict.evidence import Discrepancy, Evidence
+
+if TYPE_CHECKING:
+    from sms_online.evaluation import Evaluation
+
+# Rows of the energy balance, for each parameter, from which on its first transient is forgotten.
+ROWS_A_PARAMETER = 10
+
+
+def evidence_of(evaluation: Evaluation, discrepancies: Sequence[Discrepancy], troubles: Sequence[str]) -> Evidence:
+    """All that an evaluated session says for or against its estimate."""
+    now, flags, momentum = evaluation.statistics, evaluation.determined, evaluation.statistics.momentum
+    projection, trackers = evaluation.projection, evaluation.trackers
+    return Evidence(
+        determined=(int(np.count_nonzero(flags)), flags.size),
+        undetermined=tuple(p.name for p, known in zip(evaluation.parameters, flags, strict=True) if not known),
+        unconverged=_unconverged(evaluation),
+        silent=_silent(now),
+        residual=evaluation.residuals,
+        negative=tuple(evaluation.negative),
+        pulled=tuple(evaluation.pulled),
+        alarm=None if momentum is None else momentum.alarm,
+        disputed=tuple(disputes(evaluation)),
+        undecided=tuple(event.time for event in now.events if event.kind == "undecided"),
+        distance=0.0 if projection is None else projection.distance,
+        comparison=evaluation.comparison,
+        lost=_lost(now),
+        slow=_slow(now),
+        outliers={channel: left.number / left.of for channel, left in now.outliers.items()},
+        discrepancies=tuple(discrepancies),
+        coloured={} if momentum is None else momentum.coloured,
+        miscalibrated=(*miscalibrated(evaluation), *ambiguous_effects(evaluation)),
+        troubles=tuple(troubles),
+        weaknesses=tuple(_weaknesses(now)),
+        suspected=None if momentum is None or now.method != "momentum" else momentum.suspected,
+        consistency=trackers[0].consistency if trackers else None,
+        scale=now.setup.system.scale_tolerance,
+    )
+
+
+def _unconverged(evaluation: Evaluation) -> str:
+    """Why the estimate will still move by more than its error bars."""
+    now, estimate = evaluation.statistics, evaluation.estimate
+    if not evaluation.determined.any():
+        return f"no parameter is determined by the motion of {now.duration:.3g} s"
+    smoother, momentum = now.smoother, now.momentum
+    if smoother is not None and smoother.spans == 0 and not smoother.failures:
+        return "the smoother has not worked off its first span"
+    if now.method == "smoother":
+        return ""
+    if momentum is None:
+        few = estimate.dof < ROWS_A_PARAMETER * estimate.pi.size
+        return "the energy balance has few rows yet" if few else ""
+    if not momentum.started:
+        return f"the first fit has no weights after the motion of {now.duration:.3g} s"
+    if momentum.tested or (now.events and now.events[-1].kind == "undecided"):
+        return ""
+    after = f" since the change at {now.events[-1].time:.1f} s" if now.events else ""
+    return f"the test for more than noise has seen too few rows{after}"
+
+
+def _silent(now: Statistics) -> dict[str, float]:
+    """Since when, s, sources have been silent; channels where not all of a source is, or none is described."""
+    channels, last = now.setup.sensing.channels, now.last_time
+    silent = {
+        name: time
+        for name, time in zip(channels, last.tolist(), strict=True)
+        if np.isneginf(time) or last.max() - time > LONGEST_HOLE
+    }
+    sources: dict[str, float] = {}
+    for source in now.setup.system.sources:
+        used = [name for name in source_channels(source) if name in channels]
+        if used and all(name in silent for name in used):
+            sources[source.name] = max(silent.pop(name) for name in used)
+    return sources | silent
+
+
+def _lost(now: Statistics) -> float:
+    """Share of the grid's points that were lost; not what interpolation between slow samples needs at the ends."""
+    if now.method == "smoother" and now.smoother is not None:
+        # Of its samples those are lost that have no torque.
+        return now.smoother.lost / max(1, now.smoother.lost + now.samples)
+    ends = 2.0 * SIDE * float(np.nanmax(now.periods, initial=0.0)) * now.setup.system.sample_rate
+    lost = max(0.0, now.counters.lost_samples - ends)
+    return lost / max(1.0, lost + now.samples)
+
+
+def _slow(now: Statistics) -> dict[str, float]:
+    """Sample rates, Hz, of position channels that are too slow for the momentum balance's windows."""
+    if now.method == "smoother" or now.setup.system.balance == "energy":
+        return {}
+    sensing, window = now.setup.sensing, now.setup.system.windows.momentum
+    periods = {sensing.channels[k]: float(now.periods[k]) for k in sensing.position_columns}
+    return {name: 1.0 / period for name, period in periods.items() if is_slow(period, window)}
+
+
+def _weaknesses(now: Statistics) -> list[str]:
+    """What weakens an estimate by the way it is made."""
+    out, by_smoother = [], now.method == "smoother"
+    if now.smoother is not None and now.smoother.level > 0.0 and by_smoother:
+        out.append("samples do not agree with the equations of motion")
+    if by_smoother and any(value != 0.0 for value in now.setup.system.tolerances.model_dump().values()):
+        out.append("error bars by the smoother count no tolerances of geometry and calibration")
+    if now.momentum is None and not by_smoother:
+        out.append("by the energy balance alone, nothing tests whether the model lacks something")
+    if now.smoother is not None and not by_smoother and now.setup.sensing.missing:
+        out.append("links are taken as bent statically: estimates are off by percents")
+    late = None if now.momentum is None else now.momentum.latency
+    if late is not None:
+        whose = late.source if late.size > 0.0 else f"all sources but {late.source}"
+        out.append(f"{whose}: {1e3 * abs(late.size):.2g} ms later than stated")
+    return out

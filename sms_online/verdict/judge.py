@@ -1,0 +1,127 @@
+"""May these numbers be trusted? One verdict on a session, from all the evidence for and against its estimate.
+
+It is reached here alone. What people see (the view, the status line, the pages) and `verdict` in results.json are this
+verdict, so that none of them is calmer than another.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+
+from sms_online.verdict import reasons
+from sms_online.verdict.evidence import Evidence
+from sms_online.verdict.trust import Reason, Trust
+
+
+def judge(evidence: Evidence) -> Trust:
+    """The verdict on a session.
+
+    What has been shown to be wrong counts from when it is shown. Residuals of an estimate that has not converged show
+    nothing: it was made of other, poorer rows.
+    """
+    wrong = _wrong(evidence)
+    colour = _colour(evidence)
+    # What befell the samples comes before what that may have done to the estimate.
+    samples = reasons.of_samples(evidence)
+    if wrong:
+        return Trust("doubt", (*samples, *wrong, *_cautions(evidence)), grave=True)
+    if never := [name for name, since in evidence.silent.items() if math.isinf(since)]:
+        return Trust("not yet", (reasons.never_received(never), *samples, *_cautions(evidence)))
+    if evidence.unconverged:
+        # What keeps samples from coming is to be mended before anybody moves more.
+        first = [*reasons.silenced(evidence.silent), *reasons.troubled(evidence.troubles)]
+        rest = _cautions(replace(evidence, troubles=()))
+        return Trust("not yet", (*first, reasons.unconverged(evidence.unconverged), *samples, *rest))
+    cautions = (*samples, *colour, *reasons.moving(evidence.suspected), *_cautions(evidence))
+    cautions = cautions or tuple(reasons.inconsistent(evidence.consistency))
+    return Trust("doubt", cautions) if cautions else Trust("trust", tuple(reasons.grounds(evidence)))
+
+
+def _wrong(evidence: Evidence) -> list[Reason]:
+    """What makes the numbers wrong by more than any error bar says, the strongest first."""
+    converged = not evidence.unconverged
+    out = [*reasons.scaled(evidence.comparison), *reasons.lacking(evidence.discrepancies)]
+    if converged:
+        out += reasons.unexplained_torques(evidence.residual)
+        out += reasons.beyond_limit(evidence.residual)
+        out += [each for each in evidence.miscalibrated if each.grave]
+    out += reasons.unnamed(evidence.discrepancies)
+    out += [each for each in _alarmed(evidence) if each.grave]
+    if converged:
+        out += [*reasons.negative(evidence.negative), *reasons.disputed(evidence.disputed)]
+    return out
+
+
+def _alarmed(evidence: Evidence) -> list[Reason]:
+    """The sequential test's alarm, where no discrepancy of the running diagnosis says the same."""
+    if evidence.alarm is None or any(each.unexplained for each in evidence.discrepancies):
+        return []
+    return [reasons.more_than_noise(evidence.alarm, evidence.coloured)]
+
+
+def _colour(evidence: Evidence) -> list[Reason]:
+    """An alarm that coloured noise may have caused."""
+    return [each for each in _alarmed(evidence) if not each.grave]
+
+
+def _cautions(evidence: Evidence) -> list[Reason]:
+    """What makes some of the numbers, or their error bars, worse than they look."""
+    out = reasons.weak_torques(evidence.residual)
+    out += [each for each in evidence.miscalibrated if not each.grave]
+    out += [Reason(text, False) for text in (*evidence.troubles, *evidence.weaknesses)]
+    out += [*reasons.beyond_noise(evidence.residual), *reasons.apart(evidence.comparison)]
+    out += [*reasons.undetermined(evidence.undetermined), *reasons.pulled(evidence.pulled)]
+    out += reasons.undecided_changes(evidence.undecided)
+    out += reasons.passed(evidence.discrepancies)
+    return out + reasons.inconsistent_physics(evidence.distance)
+
+
+def judge_diagnosis(
+    verdict: str,
+    effects: Sequence[str],
+    row: str | None,
+    after: Trust,
+    near: bool = False,
+    either: Sequence[Reason] = (),
+) -> Trust:
+    """The verdict on a diagnosed capture.
+
+    verdict: `clean`, `named` or `unexplained`. effects: what was named, `name@where`. row: type of the rows that
+    what is not explained acts on. after: of the session with what was named. near: whether effects that are named
+    in an unexplained session leave little of it. either: what was named that may as well be elsewhere, and scales
+    the parameters differently there.
+    """
+    if verdict == "clean":
+        return after
+    found = _unexplained(effects, row, near) if verdict == "unexplained" else _named(effects, after, either)
+    # The session with what was named says so too.
+    rest = [reason for reason in after.grounds if not (either and reason.mark == reasons.UNDECIDED)]
+    rest = rest if after.level != "trust" else []
+    return Trust("doubt", (*found, *rest), grave=found[0].grave)
+
+
+def _unexplained(effects: Sequence[str], row: str | None, near: bool) -> list[Reason]:
+    """That something acts which no known effect explains, or not all of it."""
+    where = "" if row is None else f" on {row}"
+    like = reasons.listed(effects)
+    text = f"something acts{where} that no known effect explains"
+    if near:
+        text = f"what acts{where} is near {like}, but is more or something else"
+    found = [Reason(text, True, () if row is None else (row,), "unexplained")]
+    # These are no findings, so they are not listed one by one.
+    return found if near or not effects else [*found, Reason(f"some of it looks like {like}", True)]
+
+
+def _named(effects: Sequence[str], after: Trust, either: Sequence[Reason]) -> list[Reason]:
+    """What the system file lacks, and whether the parameters can be trusted with it."""
+    each = [
+        Reason(f"it lacks {effect}", after.grave, (reasons.place(effect),), reasons.kind(effect)) for effect in effects
+    ]
+    what, them = (effects[0], "it") if len(effects) == 1 else (f"{len(effects)} effects", "them")
+    unsure = after.grave or after.level == "not yet" or either
+    trusted = f"; trust the parameters with {them}" + (" but for what follows" if after.level == "doubt" else "")
+    text = f"the system file lacks {what}" + ("" if unsure else trusted)
+    found = [replace(each[0], text=text)] if len(each) == 1 else [Reason(text, after.grave), *each]
+    return [*(replace(reason, grave=after.grave) for reason in either), *found]

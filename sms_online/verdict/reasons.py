@@ -1,0 +1,354 @@
+"""The reasons to doubt an estimate: when each counts, what it says, and what to do about it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+
+from sms_online.nominal import Comparison
+from sms_online.pipeline.tracker_bank import Suspected
+from sms_online.tracker_results import Consistency
+from sms_online.verdict.evidence import Discrepancy, Dispute, Evidence
+from sms_online.verdict.trust import Reason, Residual, Residuals
+
+# A joint whose unexplained torque reaches this share of the measured one lacks an effect, whatever the error bars say.
+LARGEST_RESIDUAL = 0.5
+# Rows that hold this many times their predicted deviation distort parameters by more than the reported deviations.
+LARGEST_WHITENED = 3.0
+# Sessions whose model holds leave up to 1.3 of it. Rows beyond this hold more than noise, and green claims too much.
+NOISE_WHITENED = 1.5
+# Share of a torque that friction nobody described leaves; more without rows that say it is noise is no green.
+NOISE_RESIDUAL = 0.1
+# Up to here a multiple of the noise is not given: it is rounded to one, or samples are exact and there is no noise.
+JUST_NOISE = 1.05
+# Share of the samples that may be lost before the rest is no fair part of the motion.
+LARGEST_LOSS = 0.01
+# Share of a channel's samples that may be outliers before its sensor is at fault.
+MANY_OUTLIERS = 1e-3
+# Further from the nearest physically consistent parameters than this, in standard deviations, noise brings no estimate.
+LARGEST_DISTANCE = 3.0
+# Names in a sentence; the others are counted.
+NAMED = 2
+# Without a spring, a mass or a rigidity nobody simulates the arm: green needs them, by the ends of their names.
+VITAL = ("mass", "mass_per_length", "stiffness", "rigidity", "rigidity_y", "rigidity_z")
+# Word for what may be at either of two places.
+UNDECIDED = "this or the other"
+# What to do next.
+DIAGNOSE = "run `sms-online diagnose` on the recording"
+ADD_EFFECT = "run `sms-online diagnose` and replay with the system.toml that it writes, or use --adopt"
+CHECK_TORQUE = "check sign, unit and gear ratio of that torque, then run `sms-online diagnose`"
+CHECK_ROWS = "check geometry, clocks and stated noise of the sensors in these rows, then run `sms-online diagnose`"
+CHECK_SCALE = "check unit and gear of the torques, or weigh one part and state it under [known]"
+CHECK_PRIOR = "check that prior, and run `sms-online diagnose` for what the model lacks in these rows"
+CHECK_OUTLIERS = "look at that sensor: reflections and swapped markers, a loose cable, bits that flip"
+CHECK_COLOUR = "look at what filters that sensor, or log its samples as they are"
+STATE_HOLD = "state hold = true under [[sensor]] of the torques"
+BY_SMOOTHER = 'state its rate under [[sensor]], or balance = "smoother"'
+CHECK_LOSSES = "look at the faults that the session counted: a bus that is too busy, a loose cable"
+WEIGH = "weigh one part and state it under [known], or measure a torque constant"
+FOLLOW = "replay it with `--tracker kalman:drift=learned` (tracker = kalman, drift = learned)"
+GO_ON = "record for longer: a drift is followed once it is certain; then run `sms-online diagnose`"
+CHECK_DEVICE = "look at power, cable and address of what is silent, and at its table in the system file"
+CHECK_TROUBLE = "see to the devices, the recording and the machine first"
+MOVE = "move all joints, faster and over a larger range, and long enough"
+
+
+def of_samples(evidence: Evidence) -> list[Reason]:
+    """What befell the samples themselves."""
+    return [*_lost(evidence.lost), *_outliers(evidence.outliers), *_slow(evidence.slow)]
+
+
+def _lost(share: float) -> list[Reason]:
+    if share <= LARGEST_LOSS:
+        return []
+    return [Reason(f"{100.0 * share:.0f} % of the samples are lost", False, then=CHECK_LOSSES)]
+
+
+def _outliers(shares: Mapping[str, float]) -> list[Reason]:
+    many = {channel: share for channel, share in shares.items() if share > MANY_OUTLIERS}
+    if not many:
+        return []
+    worst = max(many, key=lambda channel: many[channel])
+    others = f" and of {len(many) - 1} more channels" if len(many) > 1 else ""
+    text = f"{100.0 * many[worst]:.1g} % of the samples of {worst}{others} are outliers, left out"
+    return [Reason(text, False, tuple(many), "outliers", then=CHECK_OUTLIERS)]
+
+
+def _slow(rates: Mapping[str, float]) -> list[Reason]:
+    if not rates:
+        return []
+    slowest = min(rates.values())
+    text = f"{listed([*rates])}: {slowest:.3g} samples/s are too few for the windows of the balance"
+    return [Reason(text, False, (), "slow", then=BY_SMOOTHER)]
+
+
+def never_received(names: Sequence[str]) -> Reason:
+    """That nothing has ever come of sources or channels."""
+    return Reason(f"nothing was received of {listed(names)}", False, then=CHECK_DEVICE)
+
+
+def silenced(since: Mapping[str, float]) -> list[Reason]:
+    """That nothing comes any more of sources or channels; since: s."""
+    if not since:
+        return []
+    text = f"nothing has come of {listed([*since])} since {min(since.values()):.1f} s"
+    return [Reason(text, False, then=CHECK_DEVICE)]
+
+
+def troubled(troubles: Sequence[str]) -> list[Reason]:
+    """What keeps samples from coming."""
+    return [Reason(trouble, False, then=CHECK_TROUBLE) for trouble in troubles]
+
+
+def unconverged(why: str) -> Reason:
+    """That the estimate will still move by more than its error bars."""
+    return Reason(why, False, then=MOVE)
+
+
+def scaled(comparison: Comparison) -> list[Reason]:
+    """That everything is off by one factor, which rows cannot show."""
+    factor = comparison.common
+    if factor is None:
+        return []
+    cause = f": {comparison.cause}" if comparison.cause else ""
+    text = f"everything is {factor:.3g} × its description{cause}"
+    full = (
+        f"all parameters are about {factor:.3g} × what the system file states{cause}; no residual shows such a factor"
+    )
+    return [Reason(text, True, (), "", full, CHECK_SCALE)]
+
+
+def lacking(discrepancies: Iterable[Discrepancy]) -> list[Reason]:
+    """Effects that the model is known to lack."""
+    out = []
+    for each in discrepancies:
+        if each.verdict == "named" and not each.adopted:
+            places = tuple(place(effect) for effect in each.effects)
+            mark = ", ".join(dict.fromkeys(kind(effect) for effect in each.effects))
+            out.append(Reason(f"the model lacks {listed(each.effects)}", True, places, mark, then=ADD_EFFECT))
+    return out
+
+
+def unnamed(discrepancies: Iterable[Discrepancy]) -> list[Reason]:
+    """Rows that leave more than noise, of which nobody knows why."""
+    out = []
+    for each in discrepancies:
+        if each.verdict in ("noticed", "unexplained"):
+            why = "not named yet" if each.verdict == "noticed" else "no known effect explains it"
+            text = f"more than noise in the residual of {each.row} since {each.noticed:.1f} s, {why}"
+            out.append(Reason(text, True, (each.row,), "more than noise", then=DIAGNOSE))
+    return out
+
+
+def passed(discrepancies: Iterable[Discrepancy]) -> list[Reason]:
+    """Rows that left more than noise for a time."""
+    return [
+        Reason(f"the residual of {each.row} was more than noise for a time", False)
+        for each in discrepancies
+        if each.verdict == "passed"
+    ]
+
+
+def unexplained_torques(residual: Residuals) -> list[Reason]:
+    """Torques that the model does not explain, the worst first."""
+    shares = {name: share for name, rows in residual.items() if (share := rows.relative) is not None}
+    out = []
+    for name, share in sorted(shares.items(), key=lambda item: -item[1]):
+        if share > LARGEST_RESIDUAL and not _noise_alone(residual[name]):
+            percent = f"{100.0 * share:.0f} % of the torque or force of {name} is not explained"
+            means = "the model lacks an effect there, and the parameters bend to replace it"
+            mark = f"{100.0 * share:.0f} % unexplained"
+            out.append(Reason(percent, True, (name,), mark, f"{percent}: {means}", CHECK_TORQUE))
+    return out
+
+
+def _noise_alone(rows: Residual) -> bool:
+    """Whether rows hold no more than their sensors' noise."""
+    return rows.whitened is not None and rows.whitened <= NOISE_WHITENED
+
+
+def weak_torques(residual: Residuals) -> list[Reason]:
+    """Torques that are little more than their noise: the motion is too weak, and nothing is known to be missing."""
+    shares = {name: rows.relative for name, rows in residual.items() if rows.relative is not None}
+    weak = {name: share for name, share in shares.items() if share > LARGEST_RESIDUAL and _noise_alone(residual[name])}
+    if not weak:
+        return []
+    most = max(weak, key=lambda name: weak[name])
+    percent = 100.0 * min(1.0, weak[most])
+    text = f"weak data: {percent:.0f} % of the torque or force of {listed(sorted(weak))} is noise"
+    return [Reason(text, False, tuple(weak), "weak data", then=MOVE)]
+
+
+def beyond_limit(residual: Residuals) -> list[Reason]:
+    """The rows that are furthest beyond their noise, where that is far."""
+    worst, noise = _worst(residual)
+    if worst is None or noise <= LARGEST_WHITENED:
+        return []
+    full = (
+        f"rows of {worst} hold {noise:.0f} times what the sensors' noise explains: the model or the samples are wrong "
+        "there, by more than error bars can express"
+    )
+    mark = f"{noise:.0f} × noise"
+    return [Reason(f"the residual of {worst} is {mark}", True, (worst,), mark, full, CHECK_ROWS)]
+
+
+def beyond_noise(residual: Residuals) -> list[Reason]:
+    """Rows that hold somewhat more than noise, and torques that are not all explained."""
+    out = []
+    worst, noise = _worst(residual)
+    if worst is not None and NOISE_WHITENED < noise <= LARGEST_WHITENED:
+        mark = f"{noise:.2g} × noise"
+        out.append(Reason(f"the residual of {worst} is {mark}", False, (worst,), mark, then=DIAGNOSE))
+    for name, rows in residual.items():
+        unknown = rows.whitened is None or rows.whitened > NOISE_WHITENED
+        if rows.relative is not None and NOISE_RESIDUAL < rows.relative <= LARGEST_RESIDUAL and unknown:
+            percent = f"{100.0 * rows.relative:.0f} %"
+            text = f"{percent} of the torque or force of {name} is not explained"
+            out.append(Reason(text, False, (name,), f"{percent} unexplained", then=DIAGNOSE))
+    return out
+
+
+def _worst(residual: Residuals) -> tuple[str | None, float]:
+    """The rows that leave most over their noise, and how much."""
+    noise = {name: value for name, rows in residual.items() if (value := rows.whitened) is not None}
+    worst = max(noise, key=lambda name: noise[name], default=None)
+    return worst, noise[worst] if worst is not None else 0.0
+
+
+def more_than_noise(row: str, coloured: Mapping[str, float]) -> Reason:
+    """The alarm of a sequential test, which takes windows for independent; coloured noise makes them less so."""
+    text = f"the residual of {row} is more than noise"
+    if not coloured:
+        return Reason(text, True, (row,), "more than noise", then=DIAGNOSE)
+    channel = max(coloured, key=lambda name: coloured[name])
+    text += f", where that of {channel} is correlated over {1e3 * coloured[channel]:.2g} ms"
+    return Reason(text, False, (row,), "coloured noise", then=CHECK_COLOUR)
+
+
+def negative(names: Sequence[str]) -> list[Reason]:
+    """Parameters that are negative and cannot be."""
+    out = []
+    for name in names:
+        text = f"{name} is negative, which is not physical"
+        full = f"{text}: the model lacks an effect, or the data are weak"
+        out.append(Reason(text, True, place_of(name), "negative", full, DIAGNOSE))
+    return out
+
+
+def disputed(disputes: Sequence[Dispute]) -> list[Reason]:
+    """Parameters that the data pull away from their prior, the furthest first."""
+    out = []
+    for dispute in sorted(disputes, key=lambda each: -abs(each.deviations)):
+        by = "" if dispute.row is None else f": rows of {dispute.row} pull it"
+        off = f"{dispute.parameter} is {abs(dispute.deviations):.0f} σ off its prior"
+        full = f"{off}{by}; the prior, the model or the samples are wrong there"
+        out.append(Reason(off + by, True, place_of(dispute.parameter), "off its prior", full, CHECK_PRIOR))
+    return out
+
+
+def apart(comparison: Comparison) -> list[Reason]:
+    """Parameters that are not as described."""
+    return [
+        Reason(
+            f"{p.name} is {p.value:.3g}, described as {p.nominal:.3g}",
+            False,
+            place_of(p.name),
+            "not as described",
+            then=f"check the stated value of {p.name}, and unit and gear of the channels beside it",
+        )
+        for p in comparison.apart
+    ]
+
+
+def undetermined(names: Sequence[str]) -> list[Reason]:
+    """Parameters that the data do not determine and a simulation of the arm needs."""
+    vital = [name for name in names if name.endswith(VITAL)]
+    if not vital:
+        return []
+    return [Reason(f"not determined: {listed(vital)}", False, place_of(vital[0]), "not determined", then=MOVE)]
+
+
+def pulled(names: Sequence[str]) -> list[Reason]:
+    """Parameters that errors in variables bias."""
+    if not names:
+        return []
+    text = f"sensor noise pulls {listed(names)} beyond the error bar"
+    full = f"sensor noise in the columns pulls {', '.join(names)} by more than the error bar"
+    return [Reason(text, False, full=full)]
+
+
+def undecided_changes(times: Sequence[float]) -> list[Reason]:
+    """Changes, at times in s, that the session ended too early to decide on."""
+    return [Reason(f"a change at {t:.1f} s came too late: values of before", False) for t in times]
+
+
+def undecided(said: str, where: str, other: str) -> Reason:
+    """That what is said of one place may as well be the other way at another: all parameters depend on which."""
+    return Reason(said, False, (where, other), UNDECIDED, then=WEIGH)
+
+
+def inconsistent_physics(distance: float) -> list[Reason]:
+    """That no physically consistent parameters are near; distance: in standard deviations."""
+    if distance <= LARGEST_DISTANCE:
+        return []
+    return [Reason(f"the estimate violates physical consistency by {distance:.0f} standard deviations", False)]
+
+
+def moving(suspected: Suspected | None) -> list[Reason]:
+    """Parameters that seem to move: the estimate is a mean over time, and its bars are no bars of the value now."""
+    if suspected is None:
+        return []
+    names = listed(suspected.parameters)
+    text = f"{names} seems to move since {suspected.since:.1f} s, and is not followed"
+    where = place_of(suspected.parameters[0])
+    return [Reason(text, False, where, "may move", then=GO_ON if suspected.learning else FOLLOW)]
+
+
+def inconsistent(consistency: Consistency | None) -> list[Reason]:
+    """Rows that leave more than the tracker's error bars say, where nothing else says why."""
+    if consistency is None or consistency.nis is None or consistency.nis <= consistency.upper:
+        return []
+    text = f"normalised innovations squared are {consistency.nis:.2f}, beyond {consistency.upper:.2f}"
+    return [Reason(text, False, then=DIAGNOSE)]
+
+
+def grounds(evidence: Evidence) -> list[Reason]:
+    """What trust rests on, and what it does not reach to."""
+    known, of = evidence.determined
+    worst, noise = _worst(evidence.residual)
+    shares = [share for rows in evidence.residual.values() if (share := rows.relative) is not None]
+    rests = ""
+    if worst is not None:
+        rests = ", residual " + ("no more than noise" if noise < JUST_NOISE else f"at most {noise:.2g} × noise")
+    if worst is None and shares:
+        rests = f", {100.0 * max(shares):.2g} % of a torque or force unexplained"
+    out = [Reason(f"{known} of {of} parameters determined{rests}", False)]
+    if evidence.undetermined:
+        out.append(Reason(f"not determined: {listed(evidence.undetermined)}", False))
+    if evidence.scale:
+        out.append(Reason(f"the scale of all rests on the torque constants, ± {100.0 * evidence.scale:.2g} %", False))
+    return out
+
+
+def place_of(parameter: str) -> tuple[str, ...]:
+    """Where on the arm a parameter sits, from its name: `joint_i`, `link_i`, `base` or `tip`."""
+    owner, _, where = parameter.rsplit(".", 1)[0].partition("@")
+    if where:
+        return (where,)
+    owner = owner.replace("motor_", "joint_")
+    return ({"spacecraft": "base", "payload": "tip"}.get(owner, owner),)
+
+
+def place(effect: str) -> str:
+    """Where an effect acts."""
+    return effect.partition("@")[2]
+
+
+def kind(effect: str) -> str:
+    """An effect without its place."""
+    return effect.partition("@")[0].replace("_", " ")
+
+
+def listed(names: Sequence[str]) -> str:
+    """The first names; of the others, how many."""
+    more = f" and {len(names) - NAMED} more" if len(names) > NAMED else ""
+    return ", ".join(names[:NAMED]) + more
