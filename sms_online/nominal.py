@@ -11,7 +11,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sms_online.description.schema import Joint, System
+from sms_online.description.bodies import Joint
+from sms_online.description.schema import System
 from sms_online.stream import Array
 
 # Nominal values of a rig are right to within this factor, all of them together, and each to within the other.

@@ -5,9 +5,10 @@ from __future__ import annotations
 import numpy as np
 
 from sms_adapters.system_file import load_system
+from sms_online.description.bodies import FlexibleLink
 from sms_online.description.markers import Marker
 from sms_online.description.parse import parse_system
-from sms_online.description.schema import FlexibleLink, Sensor, System, Tolerances
+from sms_online.description.schema import Sensor, System, Tolerances
 from sms_online.stream import Array
 from sms_sim.bound import motion_bounds
 from sms_sim.simulate import Simulation

@@ -22,7 +22,8 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from sms_online.description.schema import FlexibleLink, System
+from sms_online.description.bodies import FlexibleLink
+from sms_online.description.schema import System
 from sms_online.stream import Array, Block
 from sms_sim.sensors import Sensors
 

@@ -10,7 +10,8 @@ import mujoco
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from sms_online.description.schema import FlexibleLink, Inertia, Joint, RigidBody, System
+from sms_online.description.bodies import FlexibleLink, Inertia, Joint, RigidBody
+from sms_online.description.schema import System
 from sms_online.stream import Array, Block
 from tests.engine_mujoco import MERGED, ROTOR_SHARE, EngineArm, Motion, _empty, _hinges
 

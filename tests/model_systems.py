@@ -6,9 +6,8 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from sms_online.description.schema import (
+from sms_online.description.bodies import (
     Deformation,
-    Effect,
     FixedJoint,
     FlexibleLink,
     Inertia,
@@ -17,8 +16,8 @@ from sms_online.description.schema import (
     RigidBody,
     RigidLink,
     Spacecraft,
-    System,
 )
+from sms_online.description.schema import Effect, System
 from sms_online.model.layout import Layout
 from sms_online.model.model import Model
 from sms_online.stream import Array

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from sms_adapters.system_file import load_system
-from sms_online.description.schema import Joint, Motor, RigidLink, System
+from sms_online.description.bodies import Joint, Motor, RigidLink
+from sms_online.description.schema import System
 from sms_online.effects.build import build_model
 from sms_online.model.base_parameters import BaseParameters, find_base_parameters
 from sms_online.model.model import Model

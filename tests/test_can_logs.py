@@ -13,7 +13,8 @@ import pytest
 from sms_adapters.can_replay import CanLogReader
 from sms_adapters.capture import CaptureReader
 from sms_adapters.sources import open_source
-from sms_online.description.schema import Joint, System
+from sms_online.description.bodies import Joint
+from sms_online.description.schema import System
 from sms_online.description.sources import CanSource
 from sms_online.errors import InputError
 from sms_online.stream import Array, Source

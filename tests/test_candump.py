@@ -17,7 +17,8 @@ from numpy.typing import NDArray
 from sms_adapters.can_replay import CanLogReader
 from sms_adapters.can_signals import decode_signal
 from sms_adapters.sources import open_source
-from sms_online.description.schema import Joint, System
+from sms_online.description.bodies import Joint
+from sms_online.description.schema import System
 from sms_online.description.sources import CanSource, Signal
 from sms_online.errors import InputError
 from sms_online.stream import Array

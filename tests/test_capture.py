@@ -14,7 +14,8 @@ from sms_adapters.capture import BLOCK, LARGEST, CaptureReader, CaptureWriter
 from sms_adapters.part import Part
 from sms_adapters.sources import open_source
 from sms_adapters.truth import read_truth, truth_path, write_truth
-from sms_online.description.schema import Joint, System
+from sms_online.description.bodies import Joint
+from sms_online.description.schema import System
 from sms_online.errors import InputError
 from sms_online.stream import Array, Block
 

@@ -10,9 +10,10 @@ import numpy as np
 import pytest
 
 from sms_adapters.system_file import load_system
+from sms_online.description.bodies import FlexibleLink, RigidLink
 from sms_online.description.channels import channels, drive_channel, sensed_channels
 from sms_online.description.parse import describe, parse_system, shipped_systems, shipped_text
-from sms_online.description.schema import FlexibleLink, RigidLink, System
+from sms_online.description.schema import System
 from sms_online.errors import InputError
 from tests.axis import AXIS
 

@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from sms_online.description.schema import Effect, Inertia, RigidBody, System
+from sms_online.description.bodies import Inertia, RigidBody
+from sms_online.description.schema import Effect, System
 from sms_online.effects.base import STANDSTILL, Ranges, Site, report
 from sms_online.effects.build import build_model
 from sms_online.effects.catalogue import ENTRIES, NAMES, candidates, parse_effect

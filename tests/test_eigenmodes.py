@@ -7,7 +7,7 @@ import pytest
 from scipy.linalg import eigh
 
 from sms_adapters.system_file import load_system
-from sms_online.description.schema import FlexibleLink
+from sms_online.description.bodies import FlexibleLink
 from sms_online.model.eigenmodes import Bending, TipLoad, clamped_loaded_modes, markers, tip_load
 
 LENGTH, RHO_A, EI = 1.2, 31.42, 1768.8  # the paper's link 1

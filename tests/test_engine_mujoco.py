@@ -11,7 +11,8 @@ import scipy.linalg
 from numpy.testing import assert_allclose
 
 from sms_adapters.system_file import load_system
-from sms_online.description.schema import FlexibleLink, System
+from sms_online.description.bodies import FlexibleLink
+from sms_online.description.schema import System
 from sms_online.pipeline.estimator import Estimator
 from sms_online.stream import Block
 from sms_sim.sensors import GRADES

@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 
 from sms_adapters.system_file import load_system
+from sms_online.description.bodies import Inertia, RigidBody
 from sms_online.description.parse import parse_system
-from sms_online.description.schema import Effect, Inertia, RigidBody, System
+from sms_online.description.schema import Effect, System
 from sms_online.effects.build import build_model
 from sms_online.model.base_parameters import find_base_parameters
 from sms_online.pipeline.estimator import Estimator

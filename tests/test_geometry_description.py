@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import pytest
 
+from sms_online.description.bodies import FlexibleLink
 from sms_online.description.channels import channels
 from sms_online.description.parse import parse_system
-from sms_online.description.schema import FlexibleLink
 from sms_online.description.tree import BASE, tree_of
 from sms_online.errors import InputError
 

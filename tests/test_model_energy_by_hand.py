@@ -13,7 +13,8 @@ from scipy.integrate import simpson
 from scipy.interpolate import CubicHermiteSpline
 from scipy.spatial.transform import Rotation
 
-from sms_online.description.schema import FlexibleLink, Inertia, Joint, Motor, RigidBody, System
+from sms_online.description.bodies import FlexibleLink, Inertia, Joint, Motor, RigidBody
+from sms_online.description.schema import System
 from sms_online.effects.build import build_model
 from sms_online.model.layout import Layout
 from sms_online.stream import Array

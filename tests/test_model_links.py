@@ -8,7 +8,8 @@ from scipy.interpolate import CubicHermiteSpline
 from scipy.linalg import expm
 from scipy.spatial.transform import Rotation
 
-from sms_online.description.schema import FlexibleLink, System
+from sms_online.description.bodies import FlexibleLink
+from sms_online.description.schema import System
 from sms_online.effects.build import build_model
 from sms_online.model.beam import LinearLink
 from sms_online.model.flexible import LinkKinematics

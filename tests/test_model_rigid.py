@@ -7,7 +7,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sms_online.description.schema import Inertia, RigidBody, RigidLink, System
+from sms_online.description.bodies import Inertia, RigidBody, RigidLink
+from sms_online.description.schema import System
 from sms_online.effects.build import build_model
 from sms_online.model.layout import Layout
 from sms_online.model.model import Model

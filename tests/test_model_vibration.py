@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 import scipy.linalg
 
-from sms_online.description.schema import Deformation, FlexibleLink, Inertia, Joint, RigidBody, System
+from sms_online.description.bodies import Deformation, FlexibleLink, Inertia, Joint, RigidBody
+from sms_online.description.schema import System
 from sms_online.effects.build import build_model
 from sms_online.model.eigenmodes import clamped_loaded_modes, tip_load
 from sms_online.stream import Array

@@ -25,7 +25,8 @@ from sms_adapters.devices import make_can_decoder, make_decoder
 from sms_adapters.raw import ERROR_FRAME, EXTENDED, FD_FRAME, REMOTE_FRAME, CanFrames, Decoder, SerialChunk
 from sms_adapters.serial_decoder import LONGEST_LINE
 from sms_adapters.sources import open_source
-from sms_online.description.schema import Joint, System
+from sms_online.description.bodies import Joint
+from sms_online.description.schema import System
 from sms_online.description.sources import CanSource, FrameField, SerialField, SerialFrames, SerialLines
 from sms_online.errors import InputError
 

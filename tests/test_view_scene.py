@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from sms_adapters.system_file import load_system
+from sms_online.description.bodies import FlexibleLink
 from sms_online.description.parse import parse_system
-from sms_online.description.schema import FlexibleLink
 from sms_online.effects.build import build_model
 from sms_online.model.base_parameters import random_states
 from sms_online.model.model import Model

@@ -11,7 +11,8 @@ from xml.etree import ElementTree
 import numpy as np
 
 from sms_adapters.urdf import read_xml
-from sms_online.description.schema import RigidLink, System
+from sms_online.description.bodies import RigidLink
+from sms_online.description.schema import System
 from sms_online.description.tree import mounts
 from sms_online.effects.build import build_model
 from sms_online.effects.friction import URDF_DYNAMICS

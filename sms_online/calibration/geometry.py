@@ -10,8 +10,9 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from sms_online.calibration.nuisance import Nuisance
+from sms_online.description.bodies import FlexibleLink, Joint, Mount
 from sms_online.description.channels import AXES
-from sms_online.description.schema import FlexibleLink, Joint, Mount, System
+from sms_online.description.schema import System
 from sms_online.description.tree import mounts, tree_of
 from sms_online.model.beam import LinearLink
 from sms_online.model.model import Model

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from fnmatch import fnmatchcase
 
-from sms_online.description.schema import Deformation, FlexibleLink, Joint, Sensor, System
+from sms_online.description.bodies import Deformation, FlexibleLink, Joint
+from sms_online.description.schema import Sensor, System
 
 AXES = ("x", "y", "z")
 # Nodal coordinates of a marker in the order of (32), with the deformation that moves each.

@@ -9,11 +9,12 @@ from fnmatch import fnmatchcase
 
 import numpy as np
 
+from sms_online.description.bodies import Deformation, FlexibleLink, Inertia, Joint, Motor, RigidLink
 from sms_online.description.channels import channels, sensed_channels
 from sms_online.description.check_sources import check_sources
 from sms_online.description.check_tree import check_tips, check_tree
 from sms_online.description.explain import hint, nearest, quoted
-from sms_online.description.schema import Deformation, FlexibleLink, Inertia, Joint, Motor, RigidLink, System
+from sms_online.description.schema import System
 from sms_online.errors import InputError
 
 # A direction that is typed with ten decimals is a unit vector to 1e-10.

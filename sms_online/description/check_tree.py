@@ -6,7 +6,8 @@ import math
 
 import numpy as np
 
-from sms_online.description.schema import Inertia, Mount, RigidLink, System
+from sms_online.description.bodies import Inertia, Mount, RigidLink
+from sms_online.description.schema import System
 from sms_online.description.tree import PARENT, mounts, parent_of, tree_of
 from sms_online.errors import InputError
 from sms_online.model.so3 import RotationVector

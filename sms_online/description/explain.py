@@ -9,7 +9,7 @@ from typing import Any
 from pydantic import BaseModel, ValidationError
 from pydantic_core import ErrorDetails
 
-from sms_online.description import schema, sources
+from sms_online.description import bodies, schema, sources
 from sms_online.description.markers import Marker
 from sms_online.errors import InputError
 
@@ -25,11 +25,11 @@ TABLES = {
     "trackers": "tracker {}",
 }
 RECORDS: dict[str, type[BaseModel]] = {
-    "spacecraft": schema.Spacecraft,
-    "payload": schema.RigidBody,
-    "joints": schema.Joint,
-    "fixed_joints": schema.FixedJoint,
-    "motors": schema.Motor,
+    "spacecraft": bodies.Spacecraft,
+    "payload": bodies.RigidBody,
+    "joints": bodies.Joint,
+    "fixed_joints": bodies.FixedJoint,
+    "motors": bodies.Motor,
     "sensors": schema.Sensor,
     "effects": schema.Effect,
     "priors": schema.Prior,
@@ -41,9 +41,9 @@ RECORDS: dict[str, type[BaseModel]] = {
 }
 # Records that a key of the table tells apart, by its values; a serial source needs two such keys.
 LINKS: dict[str, type[BaseModel]] = {
-    "rigid": schema.RigidLink,
-    "cross": schema.RigidLink,
-    "flexible": schema.FlexibleLink,
+    "rigid": bodies.RigidLink,
+    "cross": bodies.RigidLink,
+    "flexible": bodies.FlexibleLink,
 }
 SOURCES: dict[str, type[BaseModel]] = {
     "can": sources.CanSource,
@@ -178,7 +178,7 @@ def _tags(loc: tuple[int | str, ...]) -> tuple[int | str, ...]:
 def _keys_beside(loc: tuple[int | str, ...]) -> tuple[str, ...]:
     """Keys that are allowed where the unknown key `loc` stands."""
     if loc[-2] in INERTIAS:
-        record: type[BaseModel] = schema.Inertia
+        record: type[BaseModel] = bodies.Inertia
     elif loc[0] == "links":
         record = Marker if "markers" in loc else LINKS[str(loc[2])]
     elif loc[0] == "sources" and "signals" in loc:

@@ -6,7 +6,8 @@ import re
 from dataclasses import dataclass
 from functools import cached_property
 
-from sms_online.description.schema import Mount, System
+from sms_online.description.bodies import Mount
+from sms_online.description.schema import System
 
 BASE = -1
 PARENT = re.compile(r"base|link_(?P<number>[1-9]\d*)")

@@ -7,7 +7,8 @@ from collections.abc import Callable
 
 import numpy as np
 
-from sms_online.description.schema import FlexibleLink, System
+from sms_online.description.bodies import FlexibleLink
+from sms_online.description.schema import System
 from sms_online.effects.base import Site
 from sms_online.effects.catalogue import FORCE_CLASSES, GEOMETRIC_STIFFENING, INERTIA_CLASSES, check_effect, with_shapes
 from sms_online.model.chain import Chain

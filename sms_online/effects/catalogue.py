@@ -10,9 +10,10 @@ from collections.abc import Callable, Iterable, Mapping
 from fnmatch import fnmatchcase
 from itertools import pairwise
 
+from sms_online.description.bodies import FlexibleLink
 from sms_online.description.channels import channels, drive_channels, has_motor_side, strain_channel
 from sms_online.description.explain import hint, nearest
-from sms_online.description.schema import Effect, FlexibleLink, System
+from sms_online.description.schema import Effect, System
 from sms_online.effects.base import Constant, Entry, Place, Site
 from sms_online.effects.channel import ChannelEffect, EncoderEccentricity, EncoderOffset, Linear
 from sms_online.effects.delay import LONGEST_DELAY, SensorLag, SensorLatency, TorqueDelay

@@ -8,7 +8,7 @@ from copy import copy
 import numpy as np
 from numpy.polynomial import Polynomial
 
-from sms_online.description.schema import FlexibleLink
+from sms_online.description.bodies import FlexibleLink
 from sms_online.model import so3
 from sms_online.model.flexible import Sections, Shape, ShapeRate, repeated
 from sms_online.model.layout import nodal_names

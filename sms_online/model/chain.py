@@ -17,7 +17,8 @@ from functools import cached_property, lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from sms_online.description.schema import FlexibleLink, Joint, RigidLink, System
+from sms_online.description.bodies import FlexibleLink, Joint, RigidLink
+from sms_online.description.schema import System
 from sms_online.description.tree import BASE, Tree, mounts, tree_of
 from sms_online.model import so3
 from sms_online.model.beam import LinearLink

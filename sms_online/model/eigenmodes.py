@@ -9,7 +9,8 @@ from typing import Literal
 import numpy as np
 from scipy.optimize import brentq
 
-from sms_online.description.schema import FlexibleLink, RigidBody, System
+from sms_online.description.bodies import FlexibleLink, RigidBody
+from sms_online.description.schema import System
 from sms_online.stream import Array
 
 Bending = Literal["bending_y", "bending_z"]

@@ -11,8 +11,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from sms_online.description.bodies import FlexibleLink
 from sms_online.description.channels import AXES, NODAL, has_motor_side
-from sms_online.description.schema import FlexibleLink, System
+from sms_online.description.schema import System
 from sms_online.model import so3
 from sms_online.stream import Array
 

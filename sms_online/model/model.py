@@ -12,7 +12,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from sms_online.description.schema import FlexibleLink, RigidLink, System
+from sms_online.description.bodies import FlexibleLink, RigidLink
+from sms_online.description.schema import System
 from sms_online.model.chain import Chain, Configuration
 from sms_online.model.dynamics import Dynamics
 from sms_online.model.effect import EffectsOf, ForceEffect, InertiaEffect, Inputs

@@ -11,8 +11,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from sms_online.description.bodies import FlexibleLink, Inertia, RigidBody
 from sms_online.description.explain import hint, nearest
-from sms_online.description.schema import FlexibleLink, Inertia, RigidBody, System
+from sms_online.description.schema import System
 from sms_online.errors import InputError
 from sms_online.model.so3 import skew
 from sms_online.stream import Array

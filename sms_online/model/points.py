@@ -7,8 +7,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from sms_online.description.bodies import FlexibleLink
 from sms_online.description.channels import point_channels
-from sms_online.description.schema import FlexibleLink, System
+from sms_online.description.schema import System
 from sms_online.model import so3
 from sms_online.model.chain import Chain, Configuration
 from sms_online.stream import Array

@@ -7,7 +7,8 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from sms_online.description.schema import FlexibleLink, RigidLink, System, Tolerances
+from sms_online.description.bodies import FlexibleLink, RigidLink
+from sms_online.description.schema import System, Tolerances
 from sms_online.stream import Array
 
 

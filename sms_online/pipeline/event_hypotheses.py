@@ -13,7 +13,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from sms_online.description.schema import Effect, RigidBody, System
+from sms_online.description.bodies import RigidBody
+from sms_online.description.schema import Effect, System
 from sms_online.effects.build import build_model
 from sms_online.effects.catalogue import BEGINNING, ENTRIES
 from sms_online.model.base_parameters import BaseParameters

@@ -6,9 +6,10 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from sms_online.description.bodies import FlexibleLink
 from sms_online.description.channels import point_channels, sensed_channels, strain_channel
 from sms_online.description.explain import hint, nearest
-from sms_online.description.schema import FlexibleLink, System
+from sms_online.description.schema import System
 from sms_online.errors import InputError
 from sms_online.model.beam import LinearLink
 from sms_online.model.model import Model

@@ -18,7 +18,8 @@ from pytest_benchmark.fixture import BenchmarkFixture
 from sms_adapters.capture import CaptureWriter
 from sms_adapters.sources import open_source
 from sms_adapters.system_file import load_system
-from sms_online.description.schema import FlexibleLink, System
+from sms_online.description.bodies import FlexibleLink
+from sms_online.description.schema import System
 from sms_online.pipeline.estimator import Estimator
 from sms_online.stream import Block
 from sms_sim.simulate import sampled_blocks, simulate

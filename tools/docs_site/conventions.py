@@ -9,8 +9,8 @@ from matplotlib import rc_context
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from sms_online.description.bodies import FlexibleLink
 from sms_online.description.parse import parse_system, shipped_text
-from sms_online.description.schema import FlexibleLink
 from sms_online.effects.build import build_model
 from sms_online.model.chain import Configuration, Frame
 from sms_online.model.model import Model

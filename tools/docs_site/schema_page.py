@@ -9,7 +9,7 @@ from typing import Any, get_args
 
 from markdown.extensions.toc import slugify
 
-from sms_online.description import markers, schema, sources
+from sms_online.description import bodies, markers, schema, sources
 from sms_online.description.parse import RENAMED
 from sms_online.description.record import Record
 from sms_online.description.schema import System
@@ -17,15 +17,15 @@ from sms_online.description.schema import System
 # Heading of each record's section; `System` comes first, the others in this order.
 HEADINGS: dict[type[Record], str] = {
     schema.System: "Top level",
-    schema.Spacecraft: "`[spacecraft]`",
-    schema.Joint: "`[joint_i]`",
-    schema.FixedJoint: '`[joint_i]` of `kind = "fixed"`',
-    schema.Motor: "`[motor_i]`",
-    schema.RigidLink: '`[link_i]` of `kind = "rigid"`',
-    schema.FlexibleLink: '`[link_i]` of `kind = "flexible"`',
+    bodies.Spacecraft: "`[spacecraft]`",
+    bodies.Joint: "`[joint_i]`",
+    bodies.FixedJoint: '`[joint_i]` of `kind = "fixed"`',
+    bodies.Motor: "`[motor_i]`",
+    bodies.RigidLink: '`[link_i]` of `kind = "rigid"`',
+    bodies.FlexibleLink: '`[link_i]` of `kind = "flexible"`',
     markers.Marker: "`[[link_i.markers]]`",
-    schema.RigidBody: "`[payload]`",
-    schema.Inertia: "Inertias",
+    bodies.RigidBody: "`[payload]`",
+    bodies.Inertia: "Inertias",
     schema.Sensor: "`[[sensor]]`",
     schema.Effect: "`[[effect]]`",
     schema.Prior: "`[prior]`",

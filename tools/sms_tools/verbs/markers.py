@@ -8,7 +8,8 @@ from typing import Any
 
 from rich.table import Table
 
-from sms_online.description.schema import FlexibleLink, System
+from sms_online.description.bodies import FlexibleLink
+from sms_online.description.schema import System
 from sms_online.model.eigenmodes import LinkMarkers, markers
 from sms_tools.exit_codes import OK
 from sms_tools.report import say, table

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sms_online.description.schema import FlexibleLink, RigidLink
+from sms_online.description.bodies import FlexibleLink, RigidLink
 from sms_online.description.tree import BASE, mounts
 from sms_online.model.chain import Configuration
 from sms_online.model.model import Model
