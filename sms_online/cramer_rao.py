@@ -37,10 +37,10 @@ from sms_online.pipeline.observer import Observer
 # Step of a bound, s. Planar example, grade B, 20 s: all bounds within 2 % of those at 1 ms (the second stator's inertia
 # within 10 %), at a tenth of the cost.
 STEP = 0.01
-# Derivatives by displacements and readings are told that often and interpolated, s: they follow the joints, while the
-# mass matrix, which carries conserved momenta, is told at every step. 0.16 s changes no bound by 2 %.
+# Derivatives by displacements and readings are evaluated that often and interpolated, s: they follow the joints. The
+# mass matrix, which carries conserved momenta, is evaluated at every step. 0.16 s changes no bound by 2 %.
 DERIVATIVES_INTERVAL = 0.08
-# Instants worked off together: enough to hide the cost of a call, little memory.
+# Instants evaluated in one call: enough to hide its overhead, little memory.
 INSTANTS_PER_CALL = 512
 # Initial standard deviations, rad or m, and of the momenta as of speeds in rad/s or m/s, that leave the initial state
 # free: ten thousand times what sensors of the coarsest grade resolve.

@@ -36,8 +36,8 @@ NORMAL_95 = 1.959963984540054
 LARGEST_RELATIVE_STD = 1.0 / 3.0
 # Mean square of rows over their predicted variance that noise alone may leave: that of the noise is estimated to 7 %.
 LARGEST_ROW_VARIANCE = 1.2
-# Noise in the columns matters where it pulls an estimate by more than this many standard deviations.
-LARGEST_PULL = 1.0
+# Attenuation bias matters where it exceeds this many standard deviations of the estimate.
+LARGEST_BIAS = 1.0
 # Quantities that cannot be negative, as the ends of names.
 POSITIVE = ("mass", "mass_per_length", "stiffness", "damping", "rotor_inertia", "rigidity", "rigidity_y", "rigidity_z")
 
@@ -88,7 +88,7 @@ class Evaluation:
         From the residual: the larger of two answers. One takes the rows' errors as independent with the residual's
         variance, the other allows errors that last within clusters of rows. To it comes what errors add that rows of an
         energy window share, which least squares absorbs and no residual shows; it is known while no row is forgotten.
-        Where rows have been weighed against a prior, the posterior's own covariance holds.
+        Where rows have been weighted against a prior, the posterior's own covariance holds.
         """
         return self._reported(self.estimate)
 
@@ -175,7 +175,7 @@ class Evaluation:
 
     @cached_property
     def calibration(self) -> list[Calibration]:
-        """What the session tells of its calibration better than the description's tolerances."""
+        """The calibration constants that the session determines better than the description's tolerances."""
         estimate, nuisances = self.estimate, self.statistics.setup.nuisances
         if estimate.nuisances.size != len(nuisances) or estimate.dof <= 0.0:
             return []
@@ -183,20 +183,20 @@ class Evaluation:
 
     @cached_property
     @one_blas_thread()
-    def pulled(self) -> list[str]:
-        """Names of parameters that noise in the columns pulls by more than their std: errors in variables.
+    def attenuated(self) -> list[str]:
+        """Names of parameters that noise in the columns biases by more than their std: errors in variables.
 
         The comparison is Hausman's, of least squares with an estimate that is free of this bias.
         """
         if self.statistics.method != "momentum":
             return []
         shift = np.abs(self.statistics.shift(self.estimate))
-        return [p.name for p, s, d in zip(self.parameters, shift, self.std, strict=True) if s > LARGEST_PULL * d]
+        return [p.name for p, s, d in zip(self.parameters, shift, self.std, strict=True) if s > LARGEST_BIAS * d]
 
     @cached_property
     @one_blas_thread()
     def projection(self) -> Projection | None:
-        """The parameters of real bodies that are nearest to the estimate; None where they are not found.
+        """The physically consistent parameters nearest to the estimate; None where they are not found.
 
         A finished session is not lost for it. It takes too long to be made of a session that runs, and is None then.
         """

@@ -1,7 +1,7 @@
 """Equations of motion and readings of the sensors, linearised along a motion.
 
 With the momentum p = ∂K/∂v as half of the state, s = [δx, δp] (attitude as a small inertial rotation), the balance
-d/dt(P π) - G π = Q, (33)-(38), is linearised about a motion as it stands:
+d/dt(P π) - G π = Q, (33)-(38), is linearised about a motion in this form:
 
     δv = H⁻¹ (δp - ∂Pπ/∂x δx - P δβ),    d/dt δp = ∂Gπ/∂x δx + ∂Gπ/∂v δv + G δβ + δQ,
 
@@ -56,15 +56,15 @@ def linearise(
 ) -> LinearSystem:
     """The balance and the readings, linearised at x (B, n_x), v (B, n_v).
 
-    every: derivatives by displacements and of readings are told at one instant in so many, and interpolated between.
+    every: derivatives by displacements and of readings are evaluated at one instant in so many, and interpolated.
     """
     model, layout = dynamics.model, dynamics.model.layout
     (B, n_v), joints = v.shape, len(layout.q)
     nodes = np.unique(np.append(np.arange(0, B, every), B - 1))
     weights = np.stack([np.interp(np.arange(B), nodes, unit) for unit in np.eye(nodes.size)], axis=1)
 
-    def interpolated(told: Array) -> Array:
-        return np.asarray(np.tensordot(weights, told, 1))
+    def interpolated(at_nodes: Array) -> Array:
+        return np.asarray(np.tensordot(weights, at_nodes, 1))
 
     H = dynamics.mass_matrix(x)
     derivatives, _ = Derivatives(model).at(

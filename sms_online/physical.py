@@ -1,4 +1,4 @@
-"""Physical consistency: whether parameters can belong to real bodies at all, and the nearest ones that can.
+"""Physical consistency: whether some distribution of mass has these parameters, and the nearest that one has.
 
 Masses per length, stiffnesses, dampings, rigidities and rotors' inertias are not negative. A rigid body is a
 distribution of mass that is nowhere negative if and only if its pseudo-inertia
@@ -37,7 +37,7 @@ MAX_STEPS = 500
 # Part of the predicted decrease that a step has to reach.
 ARMIJO = 0.1
 # No parameter of a body, and no other one, is larger than this many times the largest estimate of its kind (or 1 in SI
-# units): what the data leave open needs an end somewhere.
+# units): what the data do not determine must be bounded.
 FAR = 1e4
 # Eigenvalues of a correlation matrix below this share of the largest are rounding.
 CORRELATION_ROUNDING = 1e-13
@@ -237,7 +237,7 @@ def _follow(barrier: _Barrier, pi: Array) -> tuple[Array, NDArray[np.bool_]]:
 def _bodies(model: Model) -> tuple[dict[str, Array], list[int]]:
     """Pseudo-inertias (4, 4, n_pi) by body, columns of zeros where no parameter belongs to it; the other parameters.
 
-    A stator is balanced about its joint, so that mass and inertia stand for themselves.
+    A stator is balanced about its joint, so its mass and inertia are independent.
     """
     planar = model.layout.planar
     bodies: dict[str, Array] = {}

@@ -34,8 +34,8 @@ class Parameter:
     name: as in the system file, such as "joint_1.stiffness"; a combination has that of its first member. symbol: the
     paper's. unit: SI. value: the estimate. std: its standard deviation as it is reported, inf where the data determine
     nothing. determined: whether the value is three of it from zero. nominal: of the system file, None where it states
-    none. true: of a simulated capture. bound: Cramér–Rao bound of std, where it was asked for. projected: value of the
-    nearest parameters that real bodies can have, where the estimate is not such.
+    none. true: of a simulated capture. bound: Cramér–Rao bound of std, where it was asked for. projected: value in the
+    nearest physically consistent parameters, where the estimate violates consistency.
     """
 
     name: str
@@ -179,9 +179,9 @@ class Finding:
 
 @dataclass(frozen=True)
 class Consistency:
-    """Whether real bodies can have the parameters: distance of the nearest that some have, in standard deviations.
+    """Physical consistency: distance from the estimate to the nearest consistent parameters, in standard deviations.
 
-    active: the conditions in the way, as names of parameters and bodies; empty at distance 0.
+    active: the conditions that bind, as names of parameters and bodies; empty at distance 0.
     """
 
     distance: float

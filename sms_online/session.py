@@ -147,7 +147,7 @@ class Session:
 
     @property
     def result(self) -> Result:
-        """What is known now. Before `finish` it says nothing of whether real bodies can have the parameters."""
+        """What is known now. Before `finish` it does not state physical consistency."""
         if self._result is None:
             self._result = self.evaluate()
         return self._result

@@ -73,7 +73,7 @@ def test_a_force_reverses_where_it_follows_its_rate_s_sign() -> None:
 
 def test_constants_are_channels_and_what_multiplies_the_masses() -> None:
     model = build_model(paper(effects=(Effect(name="table_tilt", where="base"),)))
-    assert model.effects[0].weighs
+    assert model.effects[0].needs_masses
     for name, entry in ENTRIES.items():
         constant = entry.kind == "channel" or name == "table_tilt"
         assert is_constant(Effect(name=name, where="")) == constant, name

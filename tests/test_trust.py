@@ -80,7 +80,7 @@ def test_what_error_bars_do_not_know_of_is_a_grave_doubt(evidence: Evidence, sai
 @pytest.mark.parametrize(
     ("evidence", "said"),
     [
-        (replace(GOOD, pulled=("motor_2.mass",)), "noise pulls motor_2.mass beyond the error bar"),
+        (replace(GOOD, attenuated=("motor_2.mass",)), "noise biases motor_2.mass beyond the error bar"),
         (replace(GOOD, undecided=(19.2,)), "a change at 19.2 s"),
         (replace(GOOD, discrepancies=(Discrepancy("base", 3.0, "passed"),)), "more than noise for a time"),
         (replace(GOOD, distance=39.0), "the estimate violates physical consistency by 39 standard deviations"),
@@ -111,7 +111,7 @@ def test_what_is_explained_or_harmless_leaves_trust(evidence: Evidence) -> None:
 
 
 def test_the_named_effect_comes_before_the_residual_that_it_leaves() -> None:
-    evidence = replace(with_row("joint_2", whitened=19.0), discrepancies=(LACKING,), pulled=("motor_2.mass",))
+    evidence = replace(with_row("joint_2", whitened=19.0), discrepancies=(LACKING,), attenuated=("motor_2.mass",))
     judgement = judge(evidence)
     assert "coulomb_friction" in judgement.sentence
     assert judgement.others[0] == "the residual of joint_2 is 19 × noise"
@@ -192,7 +192,7 @@ def test_a_named_effect_makes_the_system_file_doubtful_and_the_parameters_with_i
     assert (judgement.level, judgement.grave) == ("doubt", False)
     assert "trust the parameters with it" in judgement.sentence
     assert judgement.marks == {"link_1.*": "sensor lag"}
-    caution = judge(replace(GOOD, pulled=("motor_2.mass",)))
+    caution = judge(replace(GOOD, attenuated=("motor_2.mass",)))
     assert (
         "trust the parameters with it but for what follows"
         in judge_diagnosis("named", ["slosh@base"], None, caution).sentence

@@ -51,7 +51,7 @@ STEP = 1e-3
 # is what a loaded machine makes them for seconds; until it is a step times follow the old line.
 EARLY_INTERVALS, LATE_INTERVALS = 2, 40
 # But a sender that paused, and whose clock or count did not go on meanwhile, is late by the same time ever after: by
-# more than PAUSE, s, and within SAME, s, over so many intervals. A backlog that is worked off grows less.
+# more than PAUSE, s, and within SAME, s, over so many intervals. A backlog that is read grows less.
 PAUSE, SAME, PAUSED_INTERVALS = 0.2, 5e-3, 4
 
 

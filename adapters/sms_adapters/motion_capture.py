@@ -35,7 +35,7 @@ class Tracks:
 def import_points(source: Path, system: System, capture: Path) -> tuple[int, list[str]]:
     """Write the capture of the points of a system's markers; number of samples, and what was left out.
 
-    A marker of the file is that of the system with the same `name`; what stands before its last colon, the subject, may
+    A marker of the file is that of the system with the same `name`; the part before its last colon, the subject, may
     be left out. Raises InputError where the file is none of a motion capture or holds none of the system's markers.
     """
     suffix = source.suffix.lower()

@@ -94,7 +94,7 @@ def being_recorded(directory: Path) -> bool:
             fcntl.flock(session, fcntl.LOCK_SH | fcntl.LOCK_NB)
     except BlockingIOError:
         return True
-    except OSError:  # no recording, or none that can be looked at
+    except OSError:  # no recording, or none that can be opened
         return False
     return False
 

@@ -41,7 +41,7 @@ def drive_channel(system: System, i: int) -> str:
 
 
 def strain_channel(system: System, i: int) -> str | None:
-    """Channel of the strain at the root of link i (from 1), as an angle, where that stands for the spring of joint i.
+    """Channel of the strain at the root of link i (from 1), as an angle, where it replaces the spring of joint i.
 
     A strip of which only one mode is described is a rigid link behind a flexible joint: the angle is q_i - θ_m_i. None
     where the joint is no such spring.

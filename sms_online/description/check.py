@@ -27,7 +27,7 @@ TRIANGLE_TOLERANCE = 1e-3
 # Positions of joints, rotors and nodes. The regressor of a step holds their products with every parameter: 264 of them
 # (four links of 32 elements) take 290 MB to set up, 520 take 880 MB.
 MOST_COORDINATES = 256
-# Samples under a test function. The noise of all pairs of them is weighed: 8 bytes each, 540 MB here.
+# Samples under a test function. The covariance of all pairs of them is computed: 8 bytes each, 540 MB here.
 MOST_SAMPLES = 8192
 
 RIGIDITY: dict[Deformation, str] = {

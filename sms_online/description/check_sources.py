@@ -32,7 +32,7 @@ MOST_NODES = 127  # CiA 301
 # One character between numbers that no number holds; "" means blanks.
 SEPARATOR = re.compile(r"[!-~\t]?")
 IN_NUMBERS = "0123456789+-.eE*$"
-# Words that count or tell the time.
+# Words that hold a count or a time.
 UNSIGNED = ("u8", "u16", "u32")
 # What a field says of the number of a channel; of the others only where it wraps.
 CONVERSION = ("scale", "offset", "minimum", "maximum", "wrap")

@@ -39,7 +39,7 @@ RECORDS: dict[str, type[BaseModel]] = {
     "tolerances": schema.Tolerances,
     "trackers": schema.TrackerChoice,
 }
-# Records that a key of the table tells apart, by its values; a serial source needs two such keys.
+# Records that a key of the table distinguishes, by its values; a serial source needs two such keys.
 LINKS: dict[str, type[BaseModel]] = {
     "rigid": bodies.RigidLink,
     "cross": bodies.RigidLink,
@@ -176,7 +176,7 @@ def _tags(loc: tuple[int | str, ...]) -> tuple[int | str, ...]:
 
 
 def _keys_beside(loc: tuple[int | str, ...]) -> tuple[str, ...]:
-    """Keys that are allowed where the unknown key `loc` stands."""
+    """Keys that are allowed in place of the unknown key `loc`."""
     if loc[-2] in INERTIAS:
         record: type[BaseModel] = bodies.Inertia
     elif loc[0] == "links":

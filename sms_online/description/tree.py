@@ -29,7 +29,7 @@ def parent_of(mount: Mount, i: int) -> int:
 
 @dataclass(frozen=True)
 class Tree:
-    """Links by their numbers from 0; BASE stands for the base.
+    """Links by their numbers from 0; BASE denotes the base.
 
     parents: of each link. last: the link of the last joint that moves, which a payload is mounted on.
     """

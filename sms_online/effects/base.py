@@ -64,8 +64,8 @@ class Shape:
 class Entry:
     """What the catalogue says of an effect.
 
-    coefficients: those that may be declared and are reported, name to unit ("": a ratio); on a prismatic joint m stands
-    for rad and N for N m. separated_by: the motion that tells it from its look-alikes. shapes: shape constants.
+    coefficients: those that may be declared and are reported, name to unit ("": a ratio); on a prismatic joint, m is
+    for rad and N for N m. separated_by: the motion that separates it from similar effects. shapes: shape constants.
     further: coefficients that may be declared but are not reported. relative_to: place that coefficients are relative
     to where no parameter is known, so that as much the other way there is the same. said: the finding in words, of its
     place and coefficients. over: variables that a curve of it may be over, with its traits there. forms: of a curve,
@@ -164,7 +164,7 @@ class Force:
     entry: ClassVar[Entry]
     needs_torque = False
     n_states = 0
-    weighs = False
+    needs_masses = False
 
     def __init__(
         self, site: Site, linear: Mapping[str, tuple[str, str, float]], shapes: Mapping[str, float] | None = None

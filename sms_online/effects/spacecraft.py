@@ -91,7 +91,7 @@ class TableTilt(Constant, Force):
         "a base that turns by a quarter turn or more: gravity does not turn with it, a leak does",
         traits=Traits(signed=True, course="smooth"),
     )  # fmt: skip
-    weighs = True
+    needs_masses = True
 
     def __init__(self, site: Site, given: Mapping[str, float]) -> None:
         names = ("gravity_x", "gravity_y")

@@ -104,8 +104,8 @@ class Dynamics:
         shape_rates = configuration.shape_rates(v)
         loads = []
         for term, p, g in model.loads(configuration, v, shape_rates, self._bodies):
-            weigh = self.pi[list(term.parameters), None] if isinstance(term, LinkTerm) else np.ones((1, 1))
-            loads.append((term, 0, p @ weigh, g @ weigh))
+            pi = self.pi[list(term.parameters), None] if isinstance(term, LinkTerm) else np.ones((1, 1))
+            loads.append((term, 0, p @ pi, g @ pi))
         p, g = project(configuration, v, shape_rates, loads, 1)[..., 0]
         return p, g + self.spring_force(x, v) + self.effect_force(x, v, inputs)
 

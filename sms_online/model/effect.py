@@ -34,7 +34,7 @@ class ForceEffect(Protocol):
     parameters: the linear coefficients as they enter π. shapes: shape constants. relative_to: names of the model's
     parameters that reported coefficients are divided by. n_states: number of internal states. smooth: whether it is as
     smooth as the motion, which is thinned then. reversing: whether it jumps with the sign of its joint's motor's rate.
-    dry: whether at a standstill it is any value up to that of its law. weighs: whether its columns hold the reference
+    dry: whether at a standstill it is any value up to that of its law. needs_masses: whether its columns hold reference
     masses of the model. A joint's force and internal states depend on that joint's positions, rates and torque.
     """
 
@@ -48,7 +48,7 @@ class ForceEffect(Protocol):
     smooth: bool
     reversing: bool
     dry: bool
-    weighs: bool
+    needs_masses: bool
 
     def force(self, layout: Layout, x: Array, v: Array, inputs: Inputs | None) -> Array:
         """Columns f_j (B, n_v, coefficients): generalized force of one unit of each coefficient."""

@@ -136,7 +136,7 @@ def markers(system: System, modes: int = 2) -> tuple[LinkMarkers, ...]:
     """Markers of every flexible link that bends, from its lowest `modes` clamped-loaded modes in each plane.
 
     N_s = f_s L rounded up, (6), with the spatial frequency f = β/2π of a mode, but no fewer than `modes`: a heavy load
-    bends its link into a fraction of a wave, and displacements at fewer points cannot tell that many modes apart.
+    bends its link into a fraction of a wave, and displacements at fewer points cannot distinguish that many modes.
     """
     out = []
     for i, link in enumerate(system.links, start=1):

@@ -43,7 +43,7 @@ class Model:
     def __init__(self, system: System, effects_of: EffectsOf, reference: Array | None = None) -> None:
         """effects_of: makes the effects that the system declares; `sms_online.effects.build.build_model` states it.
 
-        reference: π whose masses `weight` weighs, the nominal ones unless given.
+        reference: π whose masses `weight` uses, the nominal ones unless given.
         """
         self.system = system
         self._effects_of = effects_of

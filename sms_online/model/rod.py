@@ -187,8 +187,8 @@ class ExactRod:
         """Strain coefficients q_f (B, n_f) that reproduce the markers' readings, by Newton's method."""
         q_f = np.linalg.solve(self._linear_map, markers.T).T
         for _ in range(NEWTON_STEPS):
-            told, by_q_f = self._read(q_f)
-            q_f = q_f + np.linalg.solve(by_q_f, (markers - told)[..., None])[..., 0]
+            predicted, by_q_f = self._read(q_f)
+            q_f = q_f + np.linalg.solve(by_q_f, (markers - predicted)[..., None])[..., 0]
         return q_f
 
     def stacked(self, others: Sequence[ExactRod], repeats: Sequence[int]) -> ExactRod:
@@ -202,7 +202,7 @@ class ExactRod:
 class _OneFieldMarkers:
     """Markers of a rod that turns about one axis: sines and cosines of its angles, times constant matrices.
 
-    As what every sample of a session is inverted by, they are told without the rest of the shape.
+    Every sample of a session is inverted by them, so they are computed without the rest of the shape.
     """
 
     def __init__(self, angles: Array, integrate: Array, displacement: Array, rotation: Array) -> None:

@@ -44,9 +44,9 @@ class SensedShape:
         q_f = np.zeros((readings.shape[0], self._kinematics.n_f))
         for _ in range(NEWTON_STEPS):
             J = self._kinematics.marker_jacobian(q_f)[:, self._measured]
-            told = readings - self._kinematics.markers(q_f)[:, self._measured]
+            residual = readings - self._kinematics.markers(q_f)[:, self._measured]
             bent = self._compliance @ J.swapaxes(1, 2)
-            ahead = told[..., None] + J @ q_f[..., None]
+            ahead = residual[..., None] + J @ q_f[..., None]
             q_f = (bent @ np.linalg.solve(J @ bent, ahead))[..., 0]
         return q_f
 

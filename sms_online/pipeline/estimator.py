@@ -404,7 +404,7 @@ class Estimator(Stage):
         return self._balanced()
 
     def _balanced(self) -> Estimate:
-        """What the balances tell of the base parameters."""
+        """The base parameters as the balances determine them."""
         if self.momentum is not None and self.by_momentum:
             return self.momentum.estimate(self.end)
         return self.energy_tracker.estimate()
@@ -413,7 +413,7 @@ class Estimator(Stage):
 def _refuse_unknown_masses(model: Model) -> None:
     """InputError on a declared effect whose columns hold masses that are yet to be found."""
     for effect in model.effects:
-        if effect.weighs:
+        if effect.needs_masses:
             place, found = f"effect {effect.name}@{effect.where}", "a product with masses, which are unknown"
             expected = "the system's gravity, or a tilt that is found from a whole capture"
             raise InputError(model.system.name, place, found, expected)

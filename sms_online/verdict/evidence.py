@@ -53,7 +53,7 @@ class Evidence:
     silent: since when, s, nothing has come of sources or channels; -inf where it never has.
     residual: of each type of rows.
     negative: names of parameters that are negative and must not be.
-    pulled: names of parameters that noise in the columns pulls beyond their error bars.
+    attenuated: names of parameters that noise in the columns biases beyond their error bars.
     alarm: type of the rows in which the sequential test finds more than noise, of a session without diagnosis.
     disputed: parameters that the data pull away from their prior.
     undecided: times, s, of changes that the session ended too early to decide on.
@@ -78,7 +78,7 @@ class Evidence:
     silent: Mapping[str, float] = field(default_factory=dict)
     residual: Residuals = field(default_factory=dict)
     negative: tuple[str, ...] = ()
-    pulled: tuple[str, ...] = ()
+    attenuated: tuple[str, ...] = ()
     alarm: str | None = None
     disputed: tuple[Dispute, ...] = ()
     undecided: tuple[float, ...] = ()

@@ -33,7 +33,7 @@ def evidence_of(evaluation: Evaluation, discrepancies: Sequence[Discrepancy], tr
         silent=_silent(now),
         residual=evaluation.residuals,
         negative=tuple(evaluation.negative),
-        pulled=tuple(evaluation.pulled),
+        attenuated=tuple(evaluation.attenuated),
         alarm=None if momentum is None else momentum.alarm,
         disputed=tuple(disputes(evaluation)),
         undecided=tuple(event.time for event in now.events if event.kind == "undecided"),
@@ -60,7 +60,7 @@ def _unconverged(evaluation: Evaluation) -> str:
         return f"no parameter is determined by the motion of {now.duration:.3g} s"
     smoother, momentum = now.smoother, now.momentum
     if smoother is not None and smoother.spans == 0 and not smoother.failures:
-        return "the smoother has not worked off its first span"
+        return "the smoother has not processed its first span"
     if now.method == "smoother":
         return ""
     if momentum is None:

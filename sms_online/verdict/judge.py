@@ -72,7 +72,7 @@ def _cautions(evidence: Evidence) -> list[Reason]:
     out += [each for each in evidence.miscalibrated if not each.grave]
     out += [Reason(text, False) for text in (*evidence.troubles, *evidence.weaknesses)]
     out += [*reasons.beyond_noise(evidence.residual), *reasons.apart(evidence.comparison)]
-    out += [*reasons.undetermined(evidence.undetermined), *reasons.pulled(evidence.pulled)]
+    out += [*reasons.undetermined(evidence.undetermined), *reasons.attenuated(evidence.attenuated)]
     out += reasons.undecided_changes(evidence.undecided)
     out += reasons.passed(evidence.discrepancies)
     return out + reasons.inconsistent_physics(evidence.distance)

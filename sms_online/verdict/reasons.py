@@ -267,12 +267,12 @@ def undetermined(names: Sequence[str]) -> list[Reason]:
     return [Reason(f"not determined: {listed(vital)}", False, place_of(vital[0]), "not determined", then=MOVE)]
 
 
-def pulled(names: Sequence[str]) -> list[Reason]:
+def attenuated(names: Sequence[str]) -> list[Reason]:
     """Parameters that errors in variables bias."""
     if not names:
         return []
-    text = f"sensor noise pulls {listed(names)} beyond the error bar"
-    full = f"sensor noise in the columns pulls {', '.join(names)} by more than the error bar"
+    text = f"sensor noise biases {listed(names)} beyond the error bar"
+    full = f"sensor noise in the columns biases {', '.join(names)} by more than the error bar"
     return [Reason(text, False, full=full)]
 
 
@@ -282,7 +282,7 @@ def undecided_changes(times: Sequence[float]) -> list[Reason]:
 
 
 def undecided(said: str, where: str, other: str) -> Reason:
-    """That what is said of one place may as well be the other way at another: all parameters depend on which."""
+    """That a finding at one place may as well be its opposite at another: all parameters depend on which."""
     return Reason(said, False, (where, other), UNDECIDED, then=WEIGH)
 
 

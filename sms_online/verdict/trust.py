@@ -28,7 +28,7 @@ Residuals = Mapping[str, Residual]  # by type of the rows
 
 @dataclass(frozen=True)
 class Reason:
-    """Why to doubt: a short sentence; grave where the error bars cannot tell how wrong the numbers are.
+    """Why to doubt: a short sentence; grave where the numbers may be wrong by more than their error bars say.
 
     places: where on the arm it sits, `joint_i`, `link_i`, `base`, `tip` or a channel; empty where nowhere. mark: a word
     or two for there. full: the same with what it means, for results.json's warnings; empty where they say it otherwise.

@@ -50,7 +50,7 @@ class Showing:
         return self._view.warnings
 
     def watch(self, blocks: Iterable[Block]) -> Iterator[Block]:
-        """The same blocks, looked at on their way."""
+        """The same blocks, drawn as they pass."""
         return iter(self._history.watch(self._view.watch(blocks)))
 
     def follow(self, say: Callable[[str], None] = lambda text: None) -> None:

@@ -32,7 +32,7 @@ class Mover(Protocol):
 
 @dataclass(frozen=True)
 class Watched:
-    """A source whose blocks move a bar when they are worked off. console: where to write above the bar."""
+    """A source whose blocks move a bar when they are processed. console: where to write above the bar."""
 
     source: Source
     blocks: Iterable[Block]

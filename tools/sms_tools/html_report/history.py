@@ -57,7 +57,7 @@ class History:
         self._recent = RecentResidual()
 
     def watch(self, blocks: Iterable[Block]) -> Iterator[Block]:
-        """The same samples, in pieces no longer than the interval; each is looked at once it has been used."""
+        """The same samples, in pieces no longer than the interval; each is recorded once it has been used."""
         longest = max(1, round(self._estimator.system.sample_rate / RATE))
         for block in blocks:
             for piece in block.pieces(longest):

@@ -19,7 +19,7 @@ from sms_online.errors import InputError
 READ_TIMEOUT = 0.1
 # Waits before a lost device is tried again, s: each twice the one before, from the first to the longest.
 FIRST_RETRY, LONGEST_RETRY = 0.1, 1.0
-# Where the loop is behind, a reader has so long to fetch what came before a tick, s, and is looked at so often.
+# Where the loop is behind, a reader has so long to fetch what came before a tick, s, and is polled so often.
 FETCHING, LOOK = 0.05, 5e-4
 # A reader leaves what has come with the driver while the loop computes, at most so long, s: a block takes less, and the
 # usual buffers of a socket hold 300 frames.
@@ -94,7 +94,7 @@ class Feed:
         self._queued = queued
         self._queue: list[Raw] = []
         self._waiting = 0
-        self._earliest = 0.0  # no arrival may be before this, s: the last one, or the tick that has been worked off
+        self._earliest = 0.0  # no arrival may be before this, s: the last one, or the tick that has been processed
         self._lock = threading.Lock()
         self._stopping = threading.Event()
         self._thread = threading.Thread(target=self._run, name=f"read {self.name}", daemon=True)

@@ -13,7 +13,7 @@ RECENT = 10.0
 class Latencies:
     """Distribution of the time from a sample's arrival to the estimate that it is in, the filter's lag included.
 
-    A sample is in the estimate from the first window on that ends at it or after it, whose last samples weigh little;
+    A sample is in the estimate from the first window on that ends at it or after it, whose last samples count little;
     that the window waits for the samples that its filter needs beyond its end counts as latency.
 
     It forgets: quantiles are of the last RECENT to 2 RECENT s. The start, when samples wait until the filter's width is

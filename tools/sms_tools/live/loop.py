@@ -27,7 +27,7 @@ from sms_tools.live.status import Leading, News, StatusWriter
 # A session that is killed loses no more of the estimate than this, s; its raw items are on disk all the same.
 CHECKPOINT_INTERVAL = 5.0
 CHECKPOINT = "checkpoint.msgpack"
-# Devices are given so long to be opened before the session's first tick is worked off, s.
+# Devices are given so long to be opened before the session's first tick is processed, s.
 OPENING = 2.0
 # News is made so often, s.
 NEWS_INTERVAL = 0.5
@@ -147,7 +147,7 @@ class LiveSession:
         return block is not None
 
     def _look_around(self, worked: bool) -> None:
-        """What is done now and then; worked: rows were worked off just now, so that the next ones are furthest off."""
+        """What is done now and then; worked: rows were processed just now, so that the next ones are furthest off."""
         now = self._clock() if worked else self._clock() - LONGEST_BLOCK
         if now - self._looked >= NEWS_INTERVAL:
             self._looked = now

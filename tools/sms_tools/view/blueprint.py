@@ -26,7 +26,7 @@ TRAIL = 4.0
 MOST_PLOTS = 6
 # Distance of the eye over the radius of what is to be seen: the viewer's field of view is 55° high.
 EYE_DISTANCE = 2.2
-# In space the arm is looked at where it begins, with so much room around it.
+# In space the camera looks at the arm's first pose, with so much room around it.
 ROOM = 1.15
 # Direction from the arm to the eye of a spatial system, from above one side.
 OBLIQUE = np.array((0.35, -0.8, 0.5))
