@@ -29,7 +29,7 @@ from tests.prescribed_motion import prescribed
 SPAN = 0.4  # s
 # m, rad, s and so on: rows are linear in it, and it is large against rounding.
 STEP = 1e-5
-# Share of the largest entry of a column: derivatives by positions are told at every other instant and interpolated.
+# Share of the largest entry of a column: derivatives by positions are computed at every other instant and interpolated.
 AGREEMENT = 1e-3
 ROUNDING = 1e-6  # N s and so on for a unit of a nuisance
 SYSTEMS: dict[str, Callable[[], System]] = {
@@ -61,12 +61,14 @@ class Rows:
         pi = balance.rough.without(self.base.physical_values(self.beta))
         found, instants = self._windows(balance, self.sensing, self.exact)
         calibration = CalibrationColumns(self.model, self.sensing, balance.span)
-        told = Sensitivities(self.model, self.sensing.displacements, balance.span / INSTANTS, calibration.geometries)
+        sensitivities = Sensitivities(
+            self.model, self.sensing.displacements, balance.span / INSTANTS, calibration.geometries
+        )
         for piece in instants:
-            by_geometry = told.tell(pi, piece.x, piece.v, piece.signals)
-            calibration.tell(piece.x, piece.signals, told.rates(len(piece.x)), by_geometry)
+            by_geometry = sensitivities.extend(pi, piece.x, piece.v, piece.signals)
+            calibration.extend(piece.x, piece.signals, sensitivities.rates(len(piece.x)), by_geometry)
         starts = np.array([window.start for window in found])
-        sensitivity = told.windows(starts)
+        sensitivity = sensitivities.windows(starts)
         responses = np.array([window.rough for window in found])
         rough = balance.rough.kernels(responses, self.base.physical_values(self.beta), sensitivity.displacements)
         return np.concatenate(calibration.windows(starts, sensitivity, rough))

@@ -13,7 +13,7 @@ from numpy.testing import assert_allclose
 from sms_adapters.system_file import load_system
 from sms_online.description.schema import Effect
 from sms_online.diagnosis.candidates import CandidateColumns
-from sms_online.diagnosis.constants import corrected, deviations, improved, stands
+from sms_online.diagnosis.constants import corrected, deviations, improved, possible
 from sms_online.diagnosis.evidence import angle, basis, free_of, gain, threshold
 from sms_online.diagnosis.followed import FollowedMotion
 from sms_online.diagnosis.record import SampleRecord, Segment, excerpts
@@ -115,7 +115,7 @@ def test_internal_states_follow_a_motion_from_its_first_sample() -> None:
 
 
 def test_what_is_unexplained_acts_on_the_row_that_had_and_has_residual() -> None:
-    """A stand-in that cleared most of joint 2 and threw link 1 off, which had been near its noise."""
+    """A substitute that cleared most of joint 2 and threw link 1 off, which had been near its noise."""
     _, rows = session()
     residual = np.random.default_rng(3).standard_normal(rows.b.shape)
     layout = rows.model.layout
@@ -159,21 +159,21 @@ def test_what_takes_the_course_of_something_found_belongs_to_its_row() -> None:
         ("viscous_friction", {}, [20.0], False),
     ],
 )
-def test_noise_of_a_phase_is_told_to_first_order(
+def test_noise_of_a_phase_is_predicted_to_first_order(
     name: str, shape: dict[str, float], coefficients: list[float], both: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Against sixty draws of the sensors' noise: in all to 5 %, and single rows as a χ² of so many scatters."""
     _, rows = session()
     make = CandidateColumns(rows, rows.model.system)
     candidate = make.of(Effect(name=name, where="joint_1", coefficients=shape))
-    told = make.left_open(candidate, np.array(coefficients)).own
+    predicted = make.unmodelled(candidate, np.array(coefficients)).own
     monkeypatch.setattr("sms_online.diagnosis.rows.NOISES", 60)
     drawn = [make.within(weak).of(candidate.effect).columns - candidate.columns for weak in rows.noisy()]
     acts = [rows.model.layout.q[0], rows.model.layout.theta_m[0]] if both else [rows.model.layout.theta_m[0]]
-    ratio = np.mean(np.square(drawn @ np.array(coefficients)), axis=0)[:, acts] / told[:, acts]
+    ratio = np.mean(np.square(drawn @ np.array(coefficients)), axis=0)[:, acts] / predicted[:, acts]
     assert_allclose(np.mean(ratio, axis=0), 1.0, atol=0.05)
     assert np.all(np.std(ratio, axis=0) < 1.3 * np.sqrt(2.0 / 60.0))
-    assert np.flatnonzero(told.any(axis=0)).tolist() == acts
+    assert np.flatnonzero(predicted.any(axis=0)).tolist() == acts
 
 
 def test_a_gain_is_what_least_squares_takes_off_the_residual() -> None:
@@ -223,7 +223,7 @@ def test_constants_are_improved_by_what_is_left_of_them() -> None:
     assert improved(lag, np.array([0.002])).coefficients["corner"] == pytest.approx(np.sqrt(2.0) / (2 * np.pi * 0.012))
     late = improved(Effect(name="torque_delay", where="joint_1"), np.array([0.02]))
     assert improved(late, np.array([-0.004])).coefficients == {"time": pytest.approx(0.016)}
-    assert not stands(improved(late, np.array([-0.03])), 1000.0)
+    assert not possible(improved(late, np.array([-0.03])), 1000.0)
     disc = improved(Effect(name="encoder_eccentricity", where="q_1"), np.array([3e-3, 0.0]))
     disc = improved(disc, np.array([0.0, 4e-3]))
     assert disc.coefficients["amplitude"] == pytest.approx(5e-3)

@@ -1,4 +1,4 @@
-"""Noise of momentum rows, told from the sensors', is what rows of noisy readings scatter by; whitening removes it."""
+"""Predicted noise of momentum rows is what rows of noisy readings scatter by; whitening removes it."""
 
 from __future__ import annotations
 
@@ -100,10 +100,10 @@ def scatter(system: System, draws: int, seed: int) -> Scatter:
     def windows(values: Array) -> tuple[list[Window], Sensitivities]:
         balance = MomentumBalance(model, base, system.sample_rate, SPAN)
         found, instants = balance.push(np.arange(len(values)), [sensing.motion(values)] * COPIES, coordinates)
-        told = Sensitivities(model, sensing.displacements, balance.span / INSTANTS)
+        sensitivities = Sensitivities(model, sensing.displacements, balance.span / INSTANTS)
         for piece in instants if values is exact else []:
-            told.tell(balance.rough.without(model.nominal), piece.x, piece.v, piece.signals)
-        return found, told
+            sensitivities.extend(balance.rough.without(model.nominal), piece.x, piece.v, piece.signals)
+        return found, sensitivities
 
     def residual(found: list[Window]) -> Array:
         dense = np.zeros((len(found), model.layout.n_v, base.n))
@@ -111,10 +111,10 @@ def scatter(system: System, draws: int, seed: int) -> Scatter:
             Y[probe.rows, probe.columns] = window.Y[0]
         return np.concatenate([Y @ beta - window.b[0] for Y, window in zip(dense, found, strict=True)])
 
-    found, told = windows(exact)
+    found, sensitivities = windows(exact)
     noise, whitener = RowNoise(model.layout.theta_m, probe.span), Whitener(draws)
     density = POSITION_NOISE**2 / system.sample_rate, TORQUE_NOISE**2 / system.sample_rate
-    sensitivity = told.windows(np.array([window.start for window in found]))
+    sensitivity = sensitivities.windows(np.array([window.start for window in found]))
     kernels = noise.kernels(sensitivity)
     responses = np.array([window.rough for window in found])
     kernels += probe.rough.kernels(responses, model.nominal, sensitivity.displacements)
@@ -161,7 +161,9 @@ def test_a_clock_that_is_off_moves_rows_by_the_rates_of_its_readings() -> None:
     motion = prescribed(model, 800, seed=1)
     sensors, late = (model.layout.position_names.index("q_1"), model.layout.position_names.index("q_2")), 1e-6  # s
     balance = MomentumBalance(model, base, system.sample_rate, SPAN)
-    told = Sensitivities(model, lambda x: np.tile(np.eye(model.layout.n_v), (len(x), 1, 1)), balance.span / INSTANTS)
+    sensitivities = Sensitivities(
+        model, lambda x: np.tile(np.eye(model.layout.n_v), (len(x), 1, 1)), balance.span / INSTANTS
+    )
 
     def windows(delay: float) -> list[Array]:
         x = motion.x.copy()
@@ -170,7 +172,7 @@ def test_a_clock_that_is_off_moves_rows_by_the_rates_of_its_readings() -> None:
         signals = np.zeros((len(x), len(model.layout.q)))
         found, instants = balance.push(np.arange(len(x)), [np.concatenate((x, signals), axis=1)] * COPIES, np.ones(15))
         for piece in instants if delay == 0.0 else []:
-            told.tell(model.nominal, piece.x, piece.v, piece.signals)
+            sensitivities.extend(model.nominal, piece.x, piece.v, piece.signals)
         dense = np.zeros((len(found), model.layout.n_v, base.n))
         for Y, window in zip(dense, found, strict=True):
             Y[balance.rows, balance.columns] = window.Y[0]
@@ -183,7 +185,7 @@ def test_a_clock_that_is_off_moves_rows_by_the_rates_of_its_readings() -> None:
     clock = SourceGroup("encoders", sensors, (), ())
     noise = RowNoise(model.layout.theta_m, balance.span, (clock,))
     nothing = np.zeros(model.layout.n_x), np.zeros(len(model.layout.q))
-    sensitivity = told.windows(np.array(starts))
+    sensitivity = sensitivities.windows(np.array(starts))
     kernels = noise.kernels(sensitivity)
     lateness = noise.lateness(kernels, sensitivity.rates)
     W = len(starts)
@@ -198,7 +200,7 @@ def test_a_clock_that_is_off_moves_rows_by_the_rates_of_its_readings() -> None:
     np.testing.assert_allclose(own, 4.0 * found[-1][-1], rtol=1e-12)
 
 
-def test_what_windows_hold_beside_a_force_that_nobody_knows_is_still_told() -> None:
+def test_windows_inform_beside_an_unmodelled_force() -> None:
     """A constant force of 2 N m, beside any force from 1 to 1.3 s: by windows together, though all of them see that.
 
     Ten times as well as if it were another error in each window.
@@ -252,7 +254,7 @@ def test_windows_together_have_the_covariances_of_one_after_the_other() -> None:
 def random_banded(n_v: int, windows: int, seed: int) -> list[list[Array]]:
     """Covariances of windows that share noise with HOPS - 1 windows before: moving averages of white noise."""
     rng = np.random.default_rng(seed)
-    # Window i weighs sources i … i + HOPS - 1 with n_v rows of their own, three sources a hop.
+    # Window i weights sources i … i + HOPS - 1 with n_v rows of their own, three sources a hop.
     weights = rng.standard_normal((windows, n_v, 3 * HOPS))
     dense = np.zeros((windows, n_v, 3 * (windows + HOPS)))
     for i in range(windows):
@@ -299,10 +301,10 @@ def test_whitening_after_a_break_does_not_remember_what_was_before() -> None:
     [(1000.0, 1000.0), (240.0, 240.0), (250.0, 1000.0), (240.0, 1000.0)],
     ids=lambda rate: f"{rate:g} Hz",
 )
-def test_noise_is_told_from_a_sensors_own_samples_however_slow_it_is(rate: float, grid: float) -> None:
+def test_noise_is_estimated_from_a_sensors_own_samples_at_any_rate(rate: float, grid: float) -> None:
     """An angle sampled at `rate`, in rows of a capture at `grid`; of noise only the density σ² T_s matters. Seed 7.
 
-    1000 samples tell σ to 5 % and so the density to 10 %; three times that is allowed.
+    1000 samples give σ to 5 % and so the density to 10 %; three times that is allowed.
     """
     sensing = Sensing(build_model(AXIS_SYSTEM), ("force_1", "q_1"), "test")
     estimate = NoiseEstimate(sensing, AXIS_SYSTEM.sample_rate, 5.0)

@@ -9,7 +9,7 @@ import pytest
 from numpy.typing import NDArray
 
 from sms_online.description.schema import Effect
-from sms_online.diagnosis.candidate import Candidate, LeftOpen
+from sms_online.diagnosis.candidate import Candidate, Unmodelled
 from sms_online.diagnosis.folds import Folds
 from sms_online.diagnosis.trace import Tracing
 from sms_online.diagnosis.weak_rows import WeakRows
@@ -35,17 +35,17 @@ def made_up_rows(Y: Array, b: Array) -> WeakRows:
 
 @dataclass
 class Sticking:
-    """What friction leaves open where its axis is stuck, in a share of the session: so many times its law."""
+    """Stiction's covariance where an axis is stuck, in a share of the session: so many times its law."""
 
     stuck: NDArray[np.bool_]
     share: float
     times: float
 
-    def left_open(self, candidate: Candidate, coefficients: Array) -> LeftOpen:
+    def unmodelled(self, candidate: Candidate, coefficients: Array) -> Unmodelled:
         free = np.zeros((WINDOWS, HOPS, SPEEDS))
         if ENTRIES[candidate.effect.name].traits.dry:
             free[:, 0, 0] = np.where(self.stuck, self.times * coefficients[0], 0.0) ** 2
-        return LeftOpen(np.zeros((WINDOWS, SPEEDS)), free)
+        return Unmodelled(np.zeros((WINDOWS, SPEEDS)), free)
 
     def at_rest(self, candidate: Candidate) -> float:
         return self.share

@@ -1,4 +1,4 @@
-"""A chain of rows knows what all windows before it told: one that begins anew has to be told enough of them first."""
+"""Sequential whitening uses all windows before: a filter that begins anew has to receive enough of them first."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ from sms_online.pipeline.momentum_fit import WARM_UP
 from sms_online.pipeline.momentum_windows import COPIES, HOPS
 from sms_online.pipeline.sensing import Sensing
 from sms_online.pipeline.sensor_noise import SensorNoise
-from sms_online.pipeline.weighing import Weighing
 from sms_online.pipeline.window_noise import WindowNoise
+from sms_online.pipeline.window_whitening import WindowWhitening
 from sms_online.stream import Array
 from sms_sim.plant import Plant
 from tests.model_systems import paper
@@ -28,7 +28,7 @@ def _information(rows: Array) -> Array:
     return np.asarray(np.sum(rows**2, axis=0))
 
 
-def test_a_chain_that_was_told_enough_windows_weighs_like_one_that_knows_them_all() -> None:
+def test_a_warmed_up_filter_whitens_like_one_that_saw_all() -> None:
     system = paper()
     model = build_model(system)
     base = find_base_parameters(model)
@@ -49,18 +49,18 @@ def test_a_chain_that_was_told_enough_windows_weighs_like_one_that_knows_them_al
     grid = np.full(n_x + joints, POSITION_NOISE)
     noise = SensorNoise(np.full(n_x, density[0]), np.full(joints, density[1]), coordinates, grid, False)
 
-    def told_from(first: int) -> Array:
-        """Information about each parameter in the windows compared, by a chain that begins with window `first`."""
-        chain = Weighing(WindowNoise(model, base, balance, sensing.displacements), COPIES * (base.n + 1))
+    def information_from(first: int) -> Array:
+        """Information about each parameter in the windows compared, by a filter that begins with window `first`."""
+        chain = WindowWhitening(WindowNoise(model, base, balance, sensing.displacements), COPIES * (base.n + 1))
         chain.begin(base.values(model.nominal), noise, np.zeros(model.layout.n_v), windows[first].start)
-        chain.noise.tell(0, x, v, signals)
+        chain.noise.extend(0, x, v, signals)
         chosen = windows[first : late + COMPARED]
         rows = np.zeros((len(chosen), model.layout.n_v, COPIES * (base.n + 1)))
         rows[:, balance.rows, balance.columns] = [window.Y[0] for window in chosen]
         white = chain.push(chosen, rows, np.zeros((len(chosen), model.layout.n_v)))
         return _information(np.concatenate([each.rows[:, : base.n] for each in white[late - first :]]))
 
-    whole, warmed, cold = told_from(0), told_from(late - warm), told_from(late)
+    whole, warmed, cold = information_from(0), information_from(late - warm), information_from(late)
     assert np.all(np.abs(warmed / whole - 1.0) < 0.25)
     # Parameters of the whole arm's momentum, which noise of a single window hides.
     assert np.median(cold / whole) < 1.0

@@ -79,7 +79,7 @@ class CalibrationColumns(Stage):
         self.forget(0)
 
     def forget(self, next_instant: int) -> None:
-        """Begin anew: `next_instant` is the number of the first one to be told."""
+        """Begin anew: `next_instant` is the number of the first one to come."""
         layout = self._model.layout
         sensors = len(self._sensing.position_columns)
         widths = [sum(len(each.nuisances) for each in family) for family in (self._positions, self._torques)]
@@ -91,7 +91,7 @@ class CalibrationColumns(Stage):
             *np.empty((2, 0, layout.n_v, moved)),
         )
 
-    def tell(self, x: Array, signals: Array, rates: Array, by_geometry: Array) -> None:
+    def extend(self, x: Array, signals: Array, rates: Array, by_geometry: Array) -> None:
         """Take the next instants: x (K, n_x), signals as in `Instants`, rates (K, sensors) of the readings.
 
         by_geometry (2, K, n_v, c): what geometries change momentum and force by.
@@ -131,8 +131,8 @@ class CalibrationColumns(Stage):
         if not self.count:
             return np.empty((W, n_v, 0))
         now, inside = self.state, (starts - self.state.first)[:, None] + np.arange(INSTANTS + 1)
-        told = np.concatenate((sensitivity.H, sensitivity.P_x, sensitivity.G_v, sensitivity.G_x), axis=1)
-        weights = self._kernels[sensitivity.offset] @ told.reshape(W, -1, n_v * sensors)
+        parts = np.concatenate((sensitivity.H, sensitivity.P_x, sensitivity.G_v, sensitivity.G_x), axis=1)
+        weights = self._kernels[sensitivity.offset] @ parts.reshape(W, -1, n_v * sensors)
         if rough.any():
             weights += self._to_steps.T @ rough.reshape(W, STEPS + 1, -1)
         flat = weights.reshape(W, -1, n_v, sensors).swapaxes(1, 2).reshape(W, n_v, -1)

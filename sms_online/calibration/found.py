@@ -47,7 +47,7 @@ SCALES = {
 
 @dataclass(frozen=True)
 class Calibration:
-    """A number of the description that the samples tell better than its tolerance; estimates are corrected by it.
+    """A number of the description that the samples determine better than its tolerance; estimates are corrected by it.
 
     name: of a tolerance in the system file. where: `base`, `joint_i`, `link_i`, a channel or a device; part: an axis,
     or the sine or cosine of an error once per turn. estimate: by how much the description is off, unit; std: its

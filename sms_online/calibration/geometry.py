@@ -61,7 +61,7 @@ def own_axis(joint: Mount) -> int | None:
 def geometries(system: System) -> Iterator[Geometry]:
     """Those of a system that have a tolerance; of a planar one only what keeps it planar.
 
-    Not those that other readings stand for: see `channels`.
+    Not those that other readings replace: see `channels`.
     """
     planar, tolerances, tree = system.motion == "planar", system.tolerances, tree_of(system)
     for i, link in enumerate(system.links):

@@ -86,8 +86,8 @@ class Acceptance(CandidateRows):
             return False
         if self._laws is None or not candidate.traits.limits:
             return True
-        told = self._laws.reported(candidate.effect, solution[: self.rows.Y.shape[2]], own)
-        return candidate.traits.within(told)
+        reported = self._laws.reported(candidate.effect, solution[: self.rows.Y.shape[2]], own)
+        return candidate.traits.within(reported)
 
     def _one_too_many(self, chosen: Sequence[int], asked: Sequence[int]) -> list[int]:
         """Those whose coefficients are correlated with those of another effect, declared or chosen."""
@@ -116,13 +116,13 @@ class Acceptance(CandidateRows):
         return [k for k in asked if np.all(np.abs(solution[places[k]]) < SIGNIFICANT * std[places[k]])]
 
     def _idle(self, chosen: Sequence[int], asked: Sequence[int]) -> list[int]:
-        """Those whose blocks are predicted as well without them, weighed as without what they do not predict."""
+        """Those whose blocks are predicted as well without them, whitened as without what they do not predict."""
         idle = []
         for k in asked:
             others = [other for other in chosen if other != k]
             if self.candidates[k].traits.dry:
-                self.settle(others)
+                self.reweight(others)
             if self.improvement(others, k).share < self.candidates[k].traits.least_improvement:
                 idle.append(k)
-            self.settle(chosen)
+            self.reweight(chosen)
         return idle

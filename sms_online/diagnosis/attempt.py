@@ -32,14 +32,14 @@ from sms_online.pipeline.sensor_noise import SensorNoise
 from sms_online.stream import Array
 from sms_online.trackers.interface import Prior
 
-# Part of a session that tells which kinematics of links are nearer, and improves channels' constants, s.
+# Part of a session that decides which kinematics of links are nearer, and improves channels' constants, s.
 SOME = 8.0
 # Times that all candidates are fitted together for the first weights of the rows: without weights, then with those.
 STARTS = 2
 # Rows for a column at least, for all candidates to be fitted together.
 LEAST_ROWS = 4
 # Parameters with which a coordinate's rows without a torque are smaller than this share of what the described values
-# make of them, or as much larger, are none to weigh by: rows that hold more than noise have drawn them there.
+# make of them, or as much larger, give no weights: rows that hold more than noise have drawn them there.
 SHRUNK = 0.1
 # Weights are the same where the size of the rows' terms changes by less than this share.
 SAME_WEIGHTS = 0.1
@@ -90,7 +90,7 @@ class Step:
     relative: dict[str, float]
 
 
-# Is told what is being done, a few words, and the share of all that is done, roughly.
+# Receives what is being done, a few words, and the share of all that is done, roughly.
 Progress = Callable[[str, float], None]
 # Shares of the time of a diagnosis that are over when the described model is fitted, its residual traced, and searched;
 # what is found is fitted in the rest. Measured on the planar example of 20 s.
@@ -129,7 +129,7 @@ def _noise_behind(described: Estimator, case: Case) -> SensorNoise:
 
 
 def _start(rows: SessionRows, candidates: Sequence[Candidate], prior: Prior | None) -> None:
-    """Weigh the rows with what the model and all candidates together make of them.
+    """Whiten the rows with parameters from a joint fit of the model and all candidates.
 
     Weights of a model that lacks a large force are no start: most rows are homogeneous in π, and where it cannot
     explain them it shrinks π, with π their noise, and with that their weight grows without end.
@@ -139,17 +139,17 @@ def _start(rows: SessionRows, candidates: Sequence[Candidate], prior: Prior | No
         columns = rows.Y
     std = np.ones_like(rows.b)
     for _ in range(STARTS):
-        rows.weigh(together(columns / std[..., None], rows.b / std, prior)[: rows.base.n])
+        rows.reweight(together(columns / std[..., None], rows.b / std, prior)[: rows.base.n])
         std = rows.std
-    _weigh(rows, rows.beta)
+    _reweight(rows, rows.beta)
 
 
-def _weigh(rows: SessionRows, beta: Array) -> None:
-    """Weigh the rows with parameters beta (n,), or with the described ones where these cannot be."""
+def _reweight(rows: SessionRows, beta: Array) -> None:
+    """Whiten the rows with parameters beta (n,), or with the described ones where these cannot be."""
     described = rows.base.values(rows.model.nominal)
     sizes, expected = (_sizes(rows, each)[~np.any(rows.b, axis=0)] for each in (beta, described))
     likely = np.all((expected == 0.0) | ((sizes >= SHRUNK * expected) & (SHRUNK * sizes <= expected)))
-    rows.weigh(beta if likely else described)
+    rows.reweight(beta if likely else described)
 
 
 def _sizes(rows: SessionRows, beta: Array) -> Array:
@@ -208,7 +208,7 @@ class Attempt(Hypothesis):
         if beta is None:
             _start(rows, [candidate for candidate in made if not candidate.traits.learned], prior)
         else:
-            _weigh(rows, beta)
+            _reweight(rows, beta)
         self._most_found = 0
         super().__init__(make, [*make.seen(self._lasting), *made], folds, prior, constants)
 
@@ -230,7 +230,7 @@ class Attempt(Hypothesis):
         return self.case.stop()
 
     def search(self) -> list[int]:
-        """Numbers of the candidates found, with rows weighed by what was found if it explains them."""
+        """Numbers of the candidates found, with rows whitened by what was found if it explains them."""
         chosen = self.run()
         for _ in range(REWEIGHED):
             beta = self.solution(chosen)[: self.rows.base.n]
@@ -238,21 +238,21 @@ class Attempt(Hypothesis):
                 beta = np.where(self.prior.known, self.prior.value, beta)
             if self._same_weights(beta) or self.excess(chosen) > LARGEST_SHARE_LEFT * self.excess([]):
                 break
-            self.rows.weigh(beta)
+            self.rows.reweight(beta)
             forces = [candidate for candidate in self.tracing.candidates if not candidate.constant]
             self.trace([*self.make.seen(self._lasting), *forces])
             chosen = self.run()
         return chosen
 
     def _same_weights(self, beta: Array) -> bool:
-        """Whether rows would be weighed alike with beta (n,): their noise goes with the size of their terms."""
+        """Whether beta (n,) would give the same weights: the rows' noise goes with the size of their terms."""
         sizes = [_sizes(self.rows, values) for values in (beta, self.rows.beta)]
         return bool(np.all(np.abs(sizes[0] - sizes[1]) <= SAME_WEIGHTS * sizes[1]))
 
     def conclude(self, chosen: Sequence[int]) -> None:
         """Improve the constants by all the rows, once more: they were found on stretches.
 
-        The rows stay, whose columns tell to second order what so small a change makes of them.
+        The rows stay: their columns give to second order what so small a change makes of them.
         """
         self.constants = self.improved(self.solution(chosen))
 
@@ -268,13 +268,13 @@ class Attempt(Hypothesis):
 
     def test(self, chosen: Sequence[int]) -> dict[str, RowResidual]:
         """Residuals of the model with the effects chosen, by row type, against noise."""
-        self.tracing.settle(chosen)
+        self.tracing.reweight(chosen)
         return ResidualTest(self.rows).of(self.residual(chosen))
 
     def state(self, chosen: Sequence[int]) -> State:
         """Residuals of the model with the effects chosen."""
         rows, tracing = self.rows, self.tracing
-        tracing.settle(chosen)
+        tracing.reweight(chosen)
         solution, without = self.solution(chosen), tracing.solutions(chosen)
         residual = tracing.residual(chosen, solution)
         effects = [tracing.candidates[k].effect for k in chosen]
@@ -315,7 +315,7 @@ class Attempt(Hypothesis):
             calibrated=rows.calibrated,
         )
         everything = range(len(effects))
-        held.settle(everything, solution)
+        held.reweight(everything, solution)
         joints = RelativeResiduals(rows, make)
         joints.declare([*self.constants, *effects])
         return Part(whitened(rows, held.residual(everything, solution)), joints.of(solution))

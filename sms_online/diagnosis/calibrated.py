@@ -34,7 +34,7 @@ def sayable(system: System) -> frozenset[str]:
 
 @dataclass(frozen=True)
 class Calibrated:
-    """Nuisances (m) with their columns (W, n_v, m) in the rows, as `SessionRows` has them once it is weighed.
+    """Nuisances (m) with their columns (W, n_v, m) in the rows, as `SessionRows` has them once it is whitened.
 
     sayable: see that function.
     """
@@ -64,7 +64,7 @@ class Calibrated:
         return np.diag(1.0 / (self.tolerance * np.where(held, HELD, 1.0)))
 
     def said_by(self, effects: Iterable[Effect]) -> NDArray[np.bool_]:
-        """Which of them (m,) the effects stand for: an effect in the model leaves no second unknown for the same."""
+        """Which of them (m,) the effects replace: an effect in the model leaves no second unknown for the same."""
         effects = list(effects)
         return np.array([any(_says(effect, each) for effect in effects) for each in self.nuisances], dtype=np.bool_)
 

@@ -40,10 +40,10 @@ class Candidate:
 
 
 @dataclass(frozen=True)
-class LeftOpen:
-    """What the law of a candidate leaves open of the rows.
+class Unmodelled:
+    """Covariance of what the law of a candidate does not determine in the rows.
 
-    own (W, n_v): variance by noise. free (W, HOPS, n_v): covariances by forces that it does not tell, where the rate's
+    own (W, n_v): variance by noise. free (W, HOPS, n_v): covariances by forces it does not give, where the rate's
     sign changes, at a standstill, and where the rate is blurred. See `WeakWindows.free`.
     """
 
@@ -52,13 +52,13 @@ class LeftOpen:
 
 
 class Laws(Protocol):
-    """Tells what candidates' laws leave open."""
+    """What candidates' laws do not determine."""
 
-    def left_open(self, candidate: Candidate, coefficients: Array) -> LeftOpen:
+    def unmodelled(self, candidate: Candidate, coefficients: Array) -> Unmodelled:
         """Of the rows, for a candidate with coefficients (c,)."""
 
     def at_rest(self, candidate: Candidate) -> float:
-        """Share of the session in which the axis of a law of dry friction stands still."""
+        """Share of the session in which the axis of a law of dry friction is at rest."""
 
     def reported(self, effect: Effect, beta: Array, coefficients: Array) -> dict[str, float]:
         """Coefficients as a person reads them, for parameters β (n,) and an effect's own coefficients (c,)."""

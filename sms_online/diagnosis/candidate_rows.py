@@ -1,4 +1,4 @@
-"""Rows weighed for a model and the candidates beside it: gains, solutions, predictions of held-out blocks."""
+"""Rows whitened for a model and the candidates beside it: gains, solutions, predictions of held-out blocks."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ ACTS = 0.01
 LARGEST_RATIO = 1.5
 # Rows for a column at least, for curves to be fitted together.
 LEAST_ROWS = 4
-# Share of a row's variance by which that of the effects chosen has to change for rows to be weighed anew.
+# Share of a row's variance by which that of the effects chosen has to change for rows to be whitened anew.
 SMALL_CHANGE = 0.1
 
 
@@ -50,7 +50,7 @@ class CandidateRows:
         calibrated: Calibrated | None = None,
     ) -> None:
         """fixed: effects of the model already, whose columns come right after its parameters'. laws: without them
-        candidates leave nothing open. declared: keys of the effects that the model has. types: speeds of each type of
+        candidates determine all. declared: keys of the effects that the model has. types: speeds of each type of
         rows, each its own unless given. of_effects (n,): which of the model's parameters are coefficients of effects;
         positive (n,): which cannot be negative. calibrated: what the description may be off by, nothing by default;
         its m unknowns come last in a solution.
@@ -71,10 +71,10 @@ class CandidateRows:
         self._free = np.zeros((len(rows.b), HOPS, self._n_v))
         # Speeds whose rows have no such covariance, with these effects chosen.
         self._loud: tuple[frozenset[int], NDArray[np.bool_]] = frozenset(), np.zeros(self._n_v, dtype=np.bool_)
-        self.weigh()
+        self._whiten()
 
-    def settle(self, chosen: Sequence[int], solution: Array | None = None) -> bool:
-        """Weigh the rows with what the laws of the chosen effects do not determine too; whether the weights change.
+    def reweight(self, chosen: Sequence[int], solution: Array | None = None) -> bool:
+        """Whiten the rows with what the laws of the chosen effects do not determine too; whether the weights change.
 
         solution (n + c,): from all windows unless given.
         """
@@ -84,9 +84,9 @@ class CandidateRows:
         at, solution = self._model.shape[2], self.solution(chosen) if solution is None else solution
         for k in chosen:
             c = len(self.candidates[k].parameters)
-            told = self._laws.left_open(self.candidates[k], solution[at : at + c])
-            own += told.own
-            free += told.free
+            unmodelled = self._laws.unmodelled(self.candidates[k], solution[at : at + c])
+            own += unmodelled.own
+            free += unmodelled.free
             at += c
         if self._loud[0] == frozenset(chosen):
             own[:, self._loud[1]], free[..., self._loud[1]] = 0.0, 0.0
@@ -94,18 +94,18 @@ class CandidateRows:
         if not np.any(np.abs(wanted - used) > SMALL_CHANGE * (self.rows.std**2 + used)):
             return False
         self._own, self._free = own, free
-        self.weigh()
+        self._whiten()
         # Rows that leave more than noise even so are uncertain by that: what the laws do not determine there would grow
         # with their coefficients, and these with it.
         loud = (self.floor > 0.0) & np.any(wanted, axis=0)
         if np.any(loud):
             own[:, loud], free[..., loud] = 0.0, 0.0
             self._loud = frozenset(chosen), loud
-            self.weigh()
+            self._whiten()
         return True
 
-    def weigh(self) -> None:
-        """Weigh the rows, and whiten them, with what the laws of the effects of the last `settle` do not determine."""
+    def _whiten(self) -> None:
+        """Whiten the rows with what the laws of the effects of the last `reweight` do not determine."""
         rows = self.rows
         self._forget()
         self.std = np.sqrt(rows.std**2 + self._own + self._free[:, 0])
@@ -230,7 +230,7 @@ class CandidateRows:
     def solution(self, chosen: Sequence[int], beside: Sequence[int] | None = None) -> Array:
         """Parameters, coefficients and calibration (n + c + m,) of the model with those chosen; beside: see `_columns`.
 
-        Kept until rows are weighed anew.
+        Kept until rows are whitened anew.
         """
         key = tuple(chosen), None if beside is None else frozenset(beside)
         if key not in self._solved:
@@ -285,7 +285,7 @@ class CandidateRows:
         return np.asarray(np.sqrt((n - 1) / n * squares))[: squares.size - self.calibrated.count]
 
     def covariance(self, chosen: Sequence[int], further: Array | None = None) -> Array:
-        """Of the solution (n + c, n + c) from all windows, infinite where they tell nothing.
+        """Of the solution (n + c, n + c) from all windows, infinite where they determine nothing.
 
         further (W, n_v, s): columns of unknowns beside it, which come last.
         """
@@ -293,10 +293,10 @@ class CandidateRows:
         columns = self._columns(chosen)
         known = columns.shape[1] - self.calibrated.count
         covariance = solve(np.column_stack((columns, beside, self._b))).covariance()
-        told = np.delete(np.arange(len(covariance)), slice(known, columns.shape[1]))
-        return covariance[np.ix_(told, told)]
+        wanted = np.delete(np.arange(len(covariance)), slice(known, columns.shape[1]))
+        return covariance[np.ix_(wanted, wanted)]
 
     def residual(self, chosen: Sequence[int], solution: Array) -> Array:
-        """What is left of every row (W, n_v) over its own deviation, see `settle`."""
+        """What is left of every row (W, n_v) over its own deviation, see `reweight`."""
         plain = [self._plain_model, *(self._plain[k] for k in chosen), self._plain_calibration]
         return np.asarray(self.rows.b / self.std - np.concatenate(plain, axis=2) @ solution)

@@ -11,7 +11,7 @@ from itertools import product
 import numpy as np
 
 from sms_online.description.schema import Effect, System
-from sms_online.diagnosis.candidate import Candidate, LeftOpen
+from sms_online.diagnosis.candidate import Candidate, Unmodelled
 from sms_online.diagnosis.constants import is_constant
 from sms_online.diagnosis.followed import FollowedMotion
 from sms_online.diagnosis.quadratic_forms import QuadraticForms
@@ -45,7 +45,7 @@ class CandidateColumns:
         self, rows: SessionRows, system: System, weak: WeakWindows | None = None, since: int = 0, resting: bool = False
     ) -> None:
         """weak: windows that columns are wanted in, in place of the rows'. since: number of the first segment whose
-        length tells frequencies apart. resting: whether dry friction has its law at a standstill too.
+        length separates frequencies. resting: whether dry friction has its law at a standstill too.
         """
         self.rows, self.system = rows, system
         self._since, self._resting = since, resting
@@ -95,7 +95,7 @@ class CandidateColumns:
     def all(self) -> list[Candidate]:
         """Each effect at each place, with each shape constant of its grid, those that become constants first.
 
-        The rows have to be weighed for these.
+        The rows have to be whitened for these.
         """
         return self.seen(sorted(self.effects(), key=lambda effect: not is_constant(effect)))
 
@@ -198,9 +198,9 @@ class CandidateColumns:
                 return None, along(motion.v)
             G = self._reversals(force.where).mean(along, motion)
             if force.dry and not self._resting:
-                # What holds the axis is no matter of the law but just before it gives way.
+                # Stiction is no matter of the law but just before breakaway.
                 held = self._standstill(force.where)
-                still, leaving = (told(motion.segment, motion.samples) for told in (held.at, held.leaving))
+                still, leaving = (each(motion.segment, motion.samples) for each in (held.at, held.leaving))
                 v = motion.v.copy()
                 v[:, held.motor] = leaving * MOVING_OFF
                 G = np.where(still[:, None, None], along(v), G)
@@ -208,24 +208,24 @@ class CandidateColumns:
 
         return self._weak.columns(columns, dense=not force.smooth)
 
-    def left_open(self, candidate: Candidate, coefficients: Array) -> LeftOpen:
-        """What the sensors' noise makes of a force with coefficients (c,), and what its law does not tell.
+    def unmodelled(self, candidate: Candidate, coefficients: Array) -> Unmodelled:
+        """What the sensors' noise makes of a force with coefficients (c,), and what its law does not determine.
 
-        Noise to first order where a joint's positions and rates tell the force; that of a torque which a gain or a
+        Noise to first order where a joint's positions and rates give the force; that of a torque which a gain or a
         ripple takes in is left out beside the torque's own. Else by a few draws of it in every window, averaged over
-        the windows that a window overlaps. What a law that jumps with a rate's sign does not tell is where it jumps,
-        and at a standstill any value up to that of its law: with as much of it as they hold, draws tell no more.
+        the windows that a window overlaps. What a law that jumps with a rate's sign does not give is where it jumps,
+        and at a standstill any value up to that of its law: with as much of it as they hold, draws add nothing.
         """
         effect = candidate.effect
         nothing = np.zeros((len(self.rows.b), HOPS, self.rows.b.shape[1]))
         if ENTRIES[effect.name].kind != "force" or is_constant(effect) or self.rows.noise.exact:
-            return LeftOpen(nothing[:, 0], nothing)
+            return Unmodelled(nothing[:, 0], nothing)
         model = self._model(effect)
         force = model.effects[-1]
         law = _law(effect)
         if effect.where.startswith("joint_") and not force.reversing and not force.n_states:
             spread = partial(self._spread, model)
-            return LeftOpen(self._forms.at(("spread", *law), spread, coefficients), nothing)
+            return Unmodelled(self._forms.at(("spread", *law), spread, coefficients), nothing)
         squares = self._forms.at(("draws", *law), self._drawn(candidate), coefficients)
         near = slice(HOPS - 1, HOPS - 1 + len(squares))
         sums = [np.convolve(column, np.ones(2 * HOPS - 1))[near] for column in (np.ones(len(squares)), *squares.T)]
@@ -234,7 +234,7 @@ class CandidateColumns:
         if force.reversing:
             untold = self._forms.at(("untold", *law), partial(self._untold, model), coefficients)
             free = self._weak.shared(np.sqrt(untold))
-        return LeftOpen(np.maximum(own - free[:, 0], 0.0), free)
+        return Unmodelled(np.maximum(own - free[:, 0], 0.0), free)
 
     def _drawn(self, candidate: Candidate) -> Callable[[Array], Array]:
         """Gives the mean squares (W, n_v) of what draws of noise change of a force with coefficients (c,)."""
@@ -269,7 +269,7 @@ class CandidateColumns:
                 return jumps
             v = motion.v.copy()
             v[:, held.motor] = MOVING_OFF
-            still, leaving = (told(motion.segment, motion.samples)[:, None] for told in (held.at, held.leaving))
+            still, leaving = (each(motion.segment, motion.samples)[:, None] for each in (held.at, held.leaving))
             times = np.where(leaving != 0.0, leaving_for * WINDING**2, self._weak.alike)
             return np.where(still, times * along(v) ** 2, jumps)
 
@@ -286,8 +286,8 @@ class CandidateColumns:
         def slopes(motion: Motion) -> tuple[Array, Array]:
             inputs = self._inputs(model, motion)
             signals = np.concatenate((inputs.torque, inputs.states), axis=1)
-            told = rough.slopes(motion.x, motion.v, signals, np.zeros_like(motion.v))
-            by_position, by_rate = np.split(told, 2, axis=1)
+            both = rough.slopes(motion.x, motion.v, signals, np.zeros_like(motion.v))
+            by_position, by_rate = np.split(both, 2, axis=1)
             # A reading of the motor moves the joint too where that is read as an angle beyond it.
             along = sensing.displacements(motion.x[:1])[0][rough.coordinates[own]] * noise.grid[: motion.x.shape[1]]
             sensors = np.flatnonzero(np.any(along, axis=0))
@@ -311,7 +311,7 @@ class CandidateColumns:
         return force.reported(np.append(coefficients, [known[name] for name in force.relative_to]))
 
     def at_rest(self, candidate: Candidate) -> float:
-        """Share of the session in which the axis of a law of dry friction stands still."""
+        """Share of the session in which the axis of a law of dry friction is at rest."""
         return self._standstill(candidate.effect.where).share
 
     def _standstill(self, where: str) -> SessionStandstill:
@@ -352,7 +352,7 @@ class CandidateColumns:
         return self._weak.columns(columns, dense=True)[..., 0]
 
     def _channel(self, effect: Effect) -> Candidate:
-        """What is added to readings, times the rows' response to it; other windows than the rows' tell torques alone.
+        """What is added to readings, times the rows' response to it; other windows than the rows' give torques alone.
 
         An effect y = x + c d(x) on a reading y is taken off by y - c d, so rows of readings lack -c times the response.
         """

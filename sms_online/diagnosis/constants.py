@@ -26,7 +26,7 @@ def improved(effect: Effect, increments: Array) -> Effect:
     return effect.model_copy(update={"coefficients": changed})
 
 
-def stands(effect: Effect, sample_rate: float) -> bool:
+def possible(effect: Effect, sample_rate: float) -> bool:
     """Whether constants that were improved are still of an effect, on samples at so many Hz."""
     return CONSTANTS[effect.name].possible(effect.coefficients, sample_rate)
 

@@ -13,7 +13,7 @@ from sms_online.description.schema import Effect, System
 from sms_online.diagnosis.attempt import FITTED_ONCE, SEARCHED, TRACED, Attempt, Case, PriorOf, Progress, State, Step
 from sms_online.diagnosis.calibrated import sayable
 from sms_online.diagnosis.candidate import Finding, Ranked
-from sms_online.diagnosis.constants import stands
+from sms_online.diagnosis.constants import possible
 from sms_online.diagnosis.hypothesis import corrections, share_left, verdict
 from sms_online.diagnosis.late_sensors import LateSensor, find_late
 from sms_online.diagnosis.mistakes import Corrected, Mistake, find_mistakes, wrong_clock
@@ -136,10 +136,10 @@ def _with_constants(
         trial = partial(_trial, attempt, forces)
         for correction in corrections(trial, constants, beta):
             constants, beta = correction.constants, correction.solution[:n]
-            if correction.settled:
+            if correction.converged:
                 break
         keys = {(effect.name, effect.where) for effect in constants}
-        constants = [effect for effect in constants if stands(effect, case.session.system.sample_rate)]
+        constants = [effect for effect in constants if possible(effect, case.session.system.sample_rate)]
         tried = [candidate.effect for candidate in attempt.tracing.candidates]
         others = [effect for effect in tried if (effect.name, effect.where) not in keys]
         attempt = Attempt(case, attempt.system, constants, beta, others)
@@ -206,12 +206,12 @@ def diagnose(
     progress("searching for effects", TRACED)
     chosen = attempt.search()
     if late:
-        # Weighed alike, so that before and after are in the same measure.
+        # With the same weights, so that before and after are in the same measure.
         described = Attempt(case, system, (), attempt.rows.beta, ())
     bare = described.state([])
-    attempt.tracing.settle([])
+    attempt.tracing.reweight([])
     ranking = attempt.tracing.ranking()
-    attempt.tracing.settle(chosen)
+    attempt.tracing.reweight(chosen)
     attempt, chosen, constants = _with_constants(case, attempt, chosen, progress)
     beyond = not stop() and any(row.beyond for row in attempt.test(chosen).values())
     if beyond and kinematic_candidates(attempt.system):

@@ -101,7 +101,7 @@ def diagnosis_document(
         ],
         "warnings": [
             *warnings,
-            # Those of a session are of the session's parameters, which with a prior are not what is told.
+            # Those of a session are of the session's parameters, which with a prior are not those reported.
             *(_after(diagnosis, sessions["after"]).warnings if given else sessions["after"].warnings),
         ],
     }
@@ -326,15 +326,15 @@ def coefficients(diagnosis: Diagnosis, finding: Finding) -> Coefficients:
             return of_constant(constant, covariance)
     batch, model = _batch(attempt, diagnosis.chosen), diagnosis.estimator_after.model
     names = [p.name for p in batch.parameters]
-    told = of_unknowns(effect, finding.candidate.parameters, model, names, batch.values, batch.covariance)
+    reported = of_unknowns(effect, finding.candidate.parameters, model, names, batch.values, batch.covariance)
     shapes = {name: std for (key, name), std in batch.shapes.items() if key == finding.candidate.key}
-    return {name: (value, shapes.get(name, std)) for name, (value, std) in told.items()}
+    return {name: (value, shapes.get(name, std)) for name, (value, std) in reported.items()}
 
 
 def _posterior(attempt: Attempt, chosen: Sequence[int]) -> list[dict[str, Any]]:
-    """Parameters as in results.json, from the rows of the diagnosis: these bear a prior where the model lacks much.
+    """Parameters as in results.json, from the rows of the diagnosis: these tolerate a prior where the model lacks much.
 
-    A session weighs rows by the sensors' noise alone until it knows better, and against that no prior counts.
+    A session whitens rows by the sensors' noise alone until it knows better, and against that no prior counts.
     """
     batch = _batch(attempt, chosen)
     parameters, values, stds = batch.parameters, batch.values, np.sqrt(np.diag(batch.covariance))
@@ -359,7 +359,7 @@ def _posterior(attempt: Attempt, chosen: Sequence[int]) -> list[dict[str, Any]]:
 class _Batch:
     """Parameters of the model and of the effects chosen (k,), with values and covariance (k, k) from all rows.
 
-    shapes: deviations of shape constants, by key of the effect and name; the others' bear what these leave open.
+    shapes: deviations of shape constants, by key of the effect and name; those of the others include their error.
     """
 
     parameters: list[Parameter]
@@ -375,12 +375,12 @@ def _batch(attempt: Attempt, chosen: Sequence[int]) -> _Batch:
     kept = [k for k, p in enumerate(parameters) if p.name not in constants]
     shapes, moved = slopes(attempt.tracing, attempt.make, chosen)
     covariance = attempt.tracing.covariance(chosen, moved)
-    # Rows that leave more than noise tell coefficients no better than the blocks of the session agree on them.
+    # Rows that leave more than noise determine coefficients no better than the blocks of the session agree on them.
     white, blocks = np.sqrt(np.diag(covariance)), np.zeros(len(covariance))
     blocks[: len(parameters)] = attempt.tracing.spread(chosen)
     wider = np.maximum(1.0, np.divide(blocks, white, out=np.ones_like(white), where=np.isfinite(white) & (white > 0.0)))
     covariance = covariance * wider * wider[:, None]
     stds = np.sqrt(np.diag(covariance)[len(parameters) :]).tolist()
-    told = {shape: std for shape, std in zip(shapes, stds, strict=True) if np.isfinite(std)}
+    known = {shape: std for shape, std in zip(shapes, stds, strict=True) if np.isfinite(std)}
     values = attempt.solution(chosen)[kept]
-    return _Batch([parameters[k] for k in kept], values, covariance[np.ix_(kept, kept)], told)
+    return _Batch([parameters[k] for k in kept], values, covariance[np.ix_(kept, kept)], known)

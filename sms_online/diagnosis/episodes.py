@@ -48,13 +48,13 @@ def line(episode: Episode) -> str:
     """What there is to say of an episode."""
     where = f"more than noise in the rows of {episode.row} since {episode.noticed:.2f} s"
     if episode.verdict == "named":
-        told = ", ".join(_told(named) for named in episode.named)
+        effects = ", ".join(_described(named) for named in episode.named)
         taken = ""
         if episode.adopted is not None:
             taken = f"; added to the model at {episode.adopted:.2f} s"
         elif episode.refused is not None:
             taken = f"; not added to the model: {episode.refused}"
-        return f"{where}: the model lacks {told}{taken}"
+        return f"{where}: the model lacks {effects}{taken}"
     if episode.verdict == "unexplained":
         nearest = ""
         if episode.evidence and (last := episode.evidence[-1].outcome).keys:
@@ -76,7 +76,7 @@ def discrepancy(episode: Episode) -> Discrepancy:
     return Discrepancy(episode.row, episode.noticed, episode.verdict, named, episode.adopted is not None)
 
 
-def _told(named: Named) -> str:
+def _described(named: Named) -> str:
     values = ", ".join(
         f"{name} {value:.4g}" + ("" if std is None else f" ± {std:.2g}") + f" {unit}".rstrip()
         for name, (value, std, unit) in named.coefficients.items()

@@ -16,7 +16,7 @@ from sms_online.pipeline.sensing import Sensing
 from sms_online.pipeline.smoothing import HALF_WIDTHS
 from sms_online.stream import Array
 
-# States are advanced once in so many samples: at 1 kHz what changes at 3 Hz is told 80 times a period.
+# States are advanced once in so many samples: at 1 kHz what changes at 3 Hz is computed 80 times a period.
 STEP = 4
 
 

@@ -21,11 +21,11 @@ from sms_online.row_types import row_types
 from sms_online.stream import Array
 from sms_online.trackers.interface import Prior
 
-# Constants are improved as far as the data tell when they move by less than this share of their deviation.
-SETTLED = 0.1
+# Constants have converged when they move by less than this share of their deviation.
+CONVERGED = 0.1
 # Times that constants are improved, each with samples corrected by those found before.
 CORRECTIONS = 3
-# Times at most that rows are weighed anew by what was found, to search again.
+# Times at most that rows are whitened anew by what was found, to search again.
 REWEIGHED = 2
 # A verdict names effects that take away all but this share of what is beyond noise: a wrong one that is 10° from the
 # right one leaves sin² 10°.
@@ -109,12 +109,12 @@ class Hypothesis:
         places = self.places([])
         return [improved(effect, solution[own]) for effect, own in zip(self.constants, places, strict=True)]
 
-    def settled(self, solution: Array) -> bool:
+    def converged(self, solution: Array) -> bool:
         """Whether there is nothing more to improve in the constants."""
         n = self.rows.base.n
         own = slice(n, n + sum(len(candidate.parameters) for candidate in self.fixed))
         std = np.sqrt(np.diag(self.tracing.covariance(self.everything))[own])
-        return bool(np.all(np.abs(solution[own]) < SETTLED * std))
+        return bool(np.all(np.abs(solution[own]) < CONVERGED * std))
 
     def found(self, chosen: Sequence[int], solution: Array) -> tuple[list[Effect], list[Effect]]:
         """Of the effects chosen, those that become constants, with their values, and the others."""
@@ -126,16 +126,16 @@ class Hypothesis:
 
 @dataclass(frozen=True)
 class Correction:
-    """One improvement of constants: what tells it, its solution (n + c,), and the constants improved."""
+    """One improvement of constants: its hypothesis, its solution (n + c,), and the constants improved."""
 
     hypothesis: Hypothesis
     solution: Array
     constants: list[Effect]
 
     @property
-    def settled(self) -> bool:
+    def converged(self) -> bool:
         """Whether the next one would change nothing."""
-        return self.hypothesis.settled(self.solution)
+        return self.hypothesis.converged(self.solution)
 
 
 def corrections(
@@ -143,7 +143,7 @@ def corrections(
 ) -> Iterator[Correction]:
     """Constants improved, each time with samples free of those found before.
 
-    trial: makes the hypothesis of constants, rows weighed with beta (n,); its candidates are all chosen.
+    trial: makes the hypothesis of constants, rows whitened with beta (n,); its candidates are all chosen.
     """
     for _ in range(CORRECTIONS):
         some = trial(constants, beta)

@@ -1,4 +1,4 @@
-"""Sensors that are so late that no parameters fit the motion they tell, found before any force is looked for.
+"""Sensors that are so late that no parameters fit the motion they measure, found before any force is searched.
 
 Rows without a torque say that what springs are measured to pull is what moves the masses behind them, whatever friction
 the motors have. They are homogeneous in π: against a sensor that is far behind the others, least squares shrinks masses
@@ -38,11 +38,11 @@ FOLLOWED = 0.02
 LARGEST_LEFT = 0.5
 # Probability that any sensor seems late by accident.
 FALSE_ALARM = 0.01
-# Lags whose gain differs by less than this share are not told apart.
+# Lags whose gain differs by less than this share are not distinguished.
 SAME_SHARE = 0.03
 # Accuracy of the logarithm of a corner, and evaluations at most.
 TOLERANCE, EVALUATIONS = 3e-3, 15
-# Step of the logarithm of a corner to tell how sharp its optimum is.
+# Step of the logarithm of a corner that shows how sharp its optimum is.
 SHARPNESS_STEP = 0.05
 # One block in so many checks what the others say.
 CHECKED = 3

@@ -1,4 +1,4 @@
-"""Diagnosis while a session runs: more than noise is noticed, the effect behind it is named, and taken up if wanted.
+"""Diagnosis while a session runs: it notices more than noise, names the effect, and updates the model if wanted.
 
 Samples are remembered for some seconds. Where the sequential test or the detector of changes alarms, they are searched,
 again as more come, until two searches in a row name the same. Everything is decided between internal blocks and at
@@ -35,16 +35,16 @@ from sms_online.verdict.evidence import Discrepancy
 
 # Times are in units of the windows of the momentum balance, those of 0.4 s at least.
 SHORTEST_UNIT = 0.4
-# Samples that are remembered, and those before an effect that tell the parameters: 16 s and 6 s at the usual width.
+# Samples that are remembered, and those before an effect that give the parameters: 16 s and 6 s at the usual width.
 REMEMBERED, BEFORE = 40.0, 15.0
-# Fewer before an effect tell nothing beside it: it may as well have been there from the start.
+# Fewer before an effect determine nothing beside it: it may as well have been there from the start.
 LEAST_BEFORE = 5.0
 # A search is made when there are so many after an effect has begun: 1.2, 2, 3.2, 4.8, 7.2 and 12 s; and of one that may
 # have been there all the time, when so many are remembered: 4, 6, 8, 12 and 16 s.
 DUE = (3.0, 5.0, 8.0, 12.0, 18.0, 30.0)
 DUE_FROM_THE_START = (10.0, 15.0, 20.0, 30.0, 40.0)
 
-# Episodes whose effects are taken up at most: what is left of a real rig then is for a person.
+# Episodes whose effects are added to the model at most: what is left of a real rig then is for a person.
 MOST_ADOPTED = 8
 
 
@@ -88,8 +88,8 @@ class _Onset:
 class OnlineDiagnosis(Observer):
     """Watches one session, from before its first sample.
 
-    searcher: may be replaced until then. adopt: take up what is named. on_verdict (t, text), on_evidence (t, gain by
-    candidate): are told what is new.
+    searcher: may be replaced until then. adopt: add what is named to the model. on_verdict (t, text), on_evidence (t,
+    gain by candidate): receive what is new.
     """
 
     def __init__(self, estimator: Estimator, searcher: Searcher, adopt: bool) -> None:
@@ -104,7 +104,7 @@ class OnlineDiagnosis(Observer):
         self._blocks = 0
         self._events = len(estimator.events)
         self._drifts = 0 if estimator.momentum is None else estimator.momentum.drifts  # that have been followed
-        self._quiet = False  # what is lacking has been said, and not taken up
+        self._quiet = False  # what is lacking has been said, and not added to the model
         self._onset: _Onset | None = None  # of the open episode
         self._due = 0  # searches of the open episode that were due so far
         self._begun = 0  # searches that were begun or left out
@@ -113,7 +113,7 @@ class OnlineDiagnosis(Observer):
 
     @property
     def system(self) -> System:
-        """The described system with the effects that were named, taken up or not, and those that events have added."""
+        """The described system with the effects that were named, adopted or not, and those that events have added."""
         system, momentum = self._estimator.system, self._estimator.momentum
         found = [named.effect for episode in self.episodes for named in episode.named]
         # A session that was resumed knows of more than its own episodes.
@@ -290,7 +290,7 @@ class OnlineDiagnosis(Observer):
             segments=(*before, *after),
             late=len(before),
             beta=beta,
-            weighed=momentum.started,
+            whitened=momentum.started,
             prior=None if momentum.prior is None else momentum.changes.prior(momentum.prior),
         )
 
@@ -360,7 +360,7 @@ class OnlineDiagnosis(Observer):
 
 
 def refusal(model: Model, named: tuple[Named, ...]) -> str | None:
-    """Why effects cannot be taken up while a session runs, None where they can: stages before the balance stay."""
+    """Why effects cannot be added while a session runs, None where they can: stages before the balance stay."""
     channels = [effect for effect in model.system.effects if ENTRIES[effect.name].kind == "channel"]
     if channels or model.n_states:
         return "the samples are corrected, or internal states followed, for what the system file declares"

@@ -1,7 +1,7 @@
 """Which effect the last seconds of a running session hold: the search of a diagnosis over a bounded record.
 
 An effect that began while the session ran has no trace before: its columns are zero in the windows of the samples
-before, which tell the parameters. Where nothing is named so, it may have been there all the time: the same columns once
+before, which give the parameters. Where nothing is named so, it may have been there all the time: the same columns once
 more, in all windows. A search is a function of its request alone, so that it may be made in another process, or again.
 """
 
@@ -13,9 +13,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from sms_online.description.schema import Effect, System
-from sms_online.diagnosis.candidate import Candidate, LeftOpen
+from sms_online.diagnosis.candidate import Candidate, Unmodelled
 from sms_online.diagnosis.candidates import CandidateColumns
-from sms_online.diagnosis.constants import applied, corrected, improved, is_constant, stands
+from sms_online.diagnosis.constants import applied, corrected, improved, is_constant, possible
 from sms_online.diagnosis.folds import Folds
 from sms_online.diagnosis.hypothesis import REWEIGHED, Hypothesis, corrections, share_left, verdict
 from sms_online.diagnosis.record import Segment, bounded, excerpts
@@ -37,10 +37,10 @@ from sms_online.trackers.interface import Prior
 # Windows that the effect acts in, in blocks of which each checks what the others say.
 LEAST_WINDOWS = 12
 # What takes less than this share of what the best effect takes is rather an error of that one's model, for real
-# friction has no corner; else it is found once the others have been taken up.
+# friction has no corner; else it is found once the others are in the model.
 LEAST_SHARE = 0.01
-# Candidates whose evidence is told, the best ones.
-TOLD = 8
+# Candidates whose evidence is reported, the best ones.
+REPORTED = 8
 
 
 @dataclass(frozen=True)
@@ -49,7 +49,7 @@ class Request:
 
     model, base: those of the session, of `model.system`. segments: gap-free samples of the session's channels as they
     came. late: number of the first segment that holds the effect, if it began at all. beta (n,): parameters behind the
-    rows' noise; weighed: they come from rows that were weighed by it. prior: what is known of them beforehand.
+    rows' noise; whitened: they come from rows that were whitened by it. prior: what is known of them beforehand.
     """
 
     model: Model
@@ -59,7 +59,7 @@ class Request:
     segments: tuple[Segment, ...]
     late: int
     beta: Array
-    weighed: bool
+    whitened: bool
     prior: Prior | None
 
 
@@ -133,16 +133,16 @@ class LateColumns(CandidateColumns):
         """The same without the windows before."""
         return replace(candidate, columns=np.where(self._before[:, None, None], 0.0, candidate.columns))
 
-    def left_open(self, candidate: Candidate, coefficients: Array) -> LeftOpen:
+    def unmodelled(self, candidate: Candidate, coefficients: Array) -> Unmodelled:
         """Of the windows that it acts in."""
-        told = super().left_open(candidate, coefficients)
+        whole = super().unmodelled(candidate, coefficients)
         acts = ~self._before[:, None, None]
-        return LeftOpen(told.own * acts[..., 0], told.free * acts)
+        return Unmodelled(whole.own * acts[..., 0], whole.free * acts)
 
 
 @one_blas_thread()
 def search(request: Request) -> Outcome | None:
-    """Trace what the record holds beyond the model; None where it is too short to tell, or its rows are degenerate."""
+    """Trace what the record holds beyond the model; None where it is too short, or its rows are degenerate."""
     try:
         return _search(_bounded(request))
     except np.linalg.LinAlgError:
@@ -157,9 +157,9 @@ def _search(request: Request) -> Outcome | None:
         return None
     everything = CandidateColumns(rows, system, since=request.late).all()
     outcome = _trace(request, rows, everything, request.late)
-    for _ in range(0 if request.weighed else REWEIGHED):
+    for _ in range(0 if request.whitened else REWEIGHED):
         # Nothing was known of the rows' noise that was worth the name, for nothing explained the torques.
-        rows.weigh(outcome.beta)
+        rows.reweight(outcome.beta)
         outcome = _trace(request, rows, everything, request.late)
     if outcome.verdict != "unexplained" or request.late == 0:
         return outcome
@@ -199,24 +199,24 @@ def _trace(request: Request, rows: SessionRows, everything: Sequence[Candidate],
     limited = [make.limited(candidate) for candidate in everything]
     some = Hypothesis(make, [c for c in limited if np.any(c.columns)], _folds(rows, late), request.prior)
     tracing = some.tracing
-    ranking = tracing.ranking()[:TOLD]
+    ranking = tracing.ranking()[:REPORTED]
     chosen = some.run()
     findings = [tracing.finding(chosen, k) for k in chosen]
     gains = {k: finding.gain.gain for k, finding in zip(chosen, findings, strict=True)}
     kept = [k for k in chosen if gains[k] >= LEAST_SHARE * max(gains.values())]
     if channels := [k for k in kept if ENTRIES[tracing.candidates[k].effect.name].kind == "channel"]:
-        # One at a time, for its column is a first approximation: what others take is told once it has been taken off.
+        # One at a time, for its column is a first approximation: what others take is known once it has been subtracted.
         best = max(channels, key=lambda k: gains[k])
         kept = [*(k for k in kept if k not in channels), best]
     if kept != chosen:
-        tracing.settle(kept)
+        tracing.reweight(kept)
         chosen, findings = kept, [tracing.finding(kept, k) for k in kept]
     before = some.excess([])
     final, used, constants = some, chosen, list[Effect]()
     if channels:
         final, constants = _corrected(request, some, chosen, late)
         used = list(final.everything)
-        if not stands(constants[0], system.sample_rate):
+        if not possible(constants[0], system.sample_rate):
             key = tracing.candidates[chosen[-1]].key
             return _trace(request, rows, [candidate for candidate in everything if candidate.key != key], late)
     left = share_left(before, final.excess(used))
@@ -231,14 +231,14 @@ def _trace(request: Request, rows: SessionRows, everything: Sequence[Candidate],
     named = []
     for finding, effect, own in zip(findings, effects, places, strict=True):
         parameters = () if effect in constants else finding.candidate.parameters
-        told = own if parameters else slice(0)
+        unknown = own if parameters else slice(0)
         named.append(
             Named(
                 effect=improved(effect, solution[own]) if parameters and is_constant(effect) else effect,
                 parameters=tuple(p.name for p in parameters),
                 units=tuple(p.unit for p in parameters),
-                values=solution[told],
-                stds=stds[told],
+                values=solution[unknown],
+                stds=stds[unknown],
                 coefficients=_coefficients(request, solution, covariance, effect, parameters, own),
                 gain=finding.gain.gain,
                 limit=finding.limit,
@@ -261,7 +261,7 @@ def _corrected(request: Request, some: Hypothesis, chosen: Sequence[int], late: 
         rows = _rows(request, beta, late, constants)
         make = LateColumns(rows, applied(request.model.system, constants), late)
         trial = Hypothesis(make, [make.of(force) for force in forces], _folds(rows, late), request.prior, constants)
-        trial.tracing.settle(trial.everything)
+        trial.tracing.reweight(trial.everything)
         return trial
 
     *_, best = corrections(trial, [constant], solution[: request.base.n])
@@ -279,8 +279,8 @@ def _coefficients(
         model = build_model(declared, base.physical_values(solution[: base.n]))
         known = [*range(base.n), *range(own.start, own.stop)]
         names = [p.name for p in (*base.parameters, *parameters)]
-        told = of_unknowns(effect, parameters, model, names, solution[known], covariance[np.ix_(known, known)])
+        reported = of_unknowns(effect, parameters, model, names, solution[known], covariance[np.ix_(known, known)])
         units = {p.quantity: p.unit for p in parameters} | units
     else:
-        told = of_constant(effect, covariance[own, own])
-    return {name: (value, std, units.get(name, "")) for name, (value, std) in told.items()}
+        reported = of_constant(effect, covariance[own, own])
+    return {name: (value, std, units.get(name, "")) for name, (value, std) in reported.items()}

@@ -59,7 +59,7 @@ def joined(pieces: Sequence[GridSamples]) -> dict[int, Segment]:
 
 
 def bounded(system: System) -> tuple[int, int]:
-    """Samples of a stretch, and most samples, of a session that is used in part: more windows tell nothing new."""
+    """Samples of a stretch, and most samples, of a session that is used in part: more windows add nothing new."""
     windows, rate = system.windows, system.sample_rate
     return round(STRETCH * windows.momentum * rate), round(MOST_WINDOWS * windows.momentum / HOPS * rate)
 

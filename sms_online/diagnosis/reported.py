@@ -37,7 +37,7 @@ def of_unknowns(
             wanted = [*(p.name for p in force.parameters), *force.relative_to]
             absent = [name for name in wanted if name not in names]
             more = (0, len(absent))
-            told = report(force, [*names, *absent], np.pad(values, more), np.pad(covariance, more))
-            return {name: (value, None if name in force.shapes else std) for name, (value, std) in told.items()}
+            reported = report(force, [*names, *absent], np.pad(values, more), np.pad(covariance, more))
+            return {name: (value, None if name in force.shapes else std) for name, (value, std) in reported.items()}
     places = [list(names).index(p.name) for p in own]
     return {p.quantity: (float(values[k]), float(np.sqrt(covariance[k, k]))) for p, k in zip(own, places, strict=True)}

@@ -1,9 +1,9 @@
-"""The rate of a motor as forces need it that jump with its sign, and how well its reversals are told.
+"""The rate of a motor as forces need it that jump with its sign, and how well its reversals are located.
 
 What dry friction does when its motor turns round bends the motor's rate, and a filter as wide as the smooth motion
-allows rounds the bend off: the zero of the rate is told milliseconds beside the true one, in every reversal on the same
-side. So the rate comes through a filter as narrow as its noise allows, and what is left of both is told by that noise
-and by what a wider filter says. And an integral over samples knows a jump to half a sample; forces are averaged over
+allows rounds the bend off: the zero of the rate is milliseconds beside the true one, in every reversal on the same
+side. So the rate comes through a filter as narrow as its noise allows, and what is left of both follows from that noise
+and from a wider filter. And an integral over samples knows a jump to half a sample; forces are averaged over
 instants between them.
 """
 
@@ -28,7 +28,7 @@ from sms_online.stream import Array
 
 # What these leave of a jump's place, samples: they are a fifth apart.
 RESOLVED = 0.2 / np.sqrt(12.0)
-# A reversal is off by no more than this, s: an axis that turns round more slowly stands still.
+# A reversal is off by no more than this, s: an axis that turns round more slowly is at rest.
 LARGEST = 0.06
 # Rates on both sides of a jump, in multiples of what counts as standstill.
 BESIDE = 10.0
@@ -52,9 +52,9 @@ class Reversals:
 
     @cached_property
     def _half_width(self) -> int:
-        """Of the filter that tells all changes of sign best, which are the more the narrower it is.
+        """Of the filter that locates all changes of sign best, which are the more the narrower it is.
 
-        Where the motor stands still noise alone changes it.
+        Where the motor is at rest noise alone changes it.
         """
         # Twice the width has to lie within the segments.
         shortest = min(len(angle) for angle in self._angles)

@@ -31,11 +31,11 @@ from sms_online.pipeline.smoothing import smooth_all, stride
 from sms_online.pipeline.window_noise import WindowNoise
 from sms_online.stream import Array
 
-# Instants that the sensitivity to noise is told at in one call.
-TOLD = 64
-# The synthetic noise that tells what noise does beyond first order is the same in every diagnosis.
+# Instants at which the sensitivity to noise is computed in one call.
+TOGETHER = 64
+# The synthetic noise that measures second-order noise is the same in every diagnosis.
 SEED = 6
-# How many times it is added to tell what it makes of a force: averaged over the windows that a window overlaps, a row's
+# How many times it is added to see what it makes of a force: averaged over the windows that a window overlaps, a row's
 # variance is then known to two fifths.
 NOISES = 4
 # Beyond any force times a second; squares of it are numbers still.
@@ -50,7 +50,7 @@ def _displacements(readings: Array, rates: Array) -> Array:
 
 
 @dataclass(frozen=True)
-class _Told:
+class _SegmentRows:
     """What the balance makes of one segment: windows, instants, rows [Y b] of all copies (W, copies, n_v, n + 1).
 
     displacements (W, 4, STEPS + 1, sensors): of the readings, see DISPLACEMENTS, along each window.
@@ -65,7 +65,7 @@ class _Told:
 class SessionRows(WeakRows):
     """Rows of the windows of a session.
 
-    time (W,): the windows' middles, s since grid index 0. weak: evaluates further columns. Once they are weighed: beta
+    time (W,): the windows' middles, s since grid index 0. weak: evaluates further columns. Once they are whitened: beta
     (n,), values behind their noise; second_order: variance of what noise does beyond first order; responses, name to
     (W, n_v, sensors): of the rows to so much added to each position sensor's reading; calibrated: columns of what the
     description may be off by.
@@ -85,7 +85,7 @@ class SessionRows(WeakRows):
         beta: Array | None = None,
         second_order: SecondOrderNoise | None = None,
     ) -> None:
-        """beta (n,): to weigh the rows with at once. second_order: as of other rows of the session, from synthetic
+        """beta (n,): to whiten the rows with at once. second_order: as of other rows of the session, from synthetic
         noise unless given, which takes three times as long. Raises numpy.linalg.LinAlgError on readings that no shape
         of the links gives, from which rows are no numbers.
         """
@@ -98,12 +98,12 @@ class SessionRows(WeakRows):
         if second_order is not None:
             self.second_order = second_order
         added = self._noise_samples(np.random.default_rng(SEED))
-        self._told = [self._of_segment(k, *part) for k, part in enumerate(zip(self.segments, added, strict=True))]
-        if not all(np.all(np.abs(told.copies) < LARGEST) for told in self._told):
+        self._parts = [self._of_segment(k, *part) for k, part in enumerate(zip(self.segments, added, strict=True))]
+        if not all(np.all(np.abs(part.copies) < LARGEST) for part in self._parts):
             raise np.linalg.LinAlgError("readings that no shape of the links gives")
-        windows = [(number, window) for number, told in enumerate(self._told) for window in told.windows]
+        windows = [(number, window) for number, part in enumerate(self._parts) for window in part.windows]
         n_v = model.layout.n_v
-        stacked = np.concatenate([np.empty((0, n_v, base.n + 1)), *(told.copies[:, 0] for told in self._told)])
+        stacked = np.concatenate([np.empty((0, n_v, base.n + 1)), *(part.copies[:, 0] for part in self._parts)])
         super().__init__(stacked[..., :-1], stacked[..., -1], rate)
         half = balance.width / 2
         self.time = np.array([window.end - half for _, window in windows]) / rate
@@ -118,7 +118,7 @@ class SessionRows(WeakRows):
         )
         self.weak = WeakWindows(where, model.layout, sensing, self.segments, rate)
         if beta is not None:
-            self.weigh(beta)
+            self.reweight(beta)
 
     def _noise_samples(self, random: np.random.Generator) -> list[Array]:
         """Noise of position sensors and torques, for each segment's samples (B, channels)."""
@@ -128,7 +128,7 @@ class SessionRows(WeakRows):
             added[:, columns] = random.standard_normal((len(added), len(columns))) * self.noise.grid
         return out
 
-    def _of_segment(self, number: int, segment: Segment, added: Array) -> _Told:
+    def _of_segment(self, number: int, segment: Segment, added: Array) -> _SegmentRows:
         noise, balance = self.noise, self._balance
         balance.begin_segment()
         followed = self.followed.states(self.model, number)
@@ -148,10 +148,10 @@ class SessionRows(WeakRows):
             at = begin[:, None] + np.arange(STEPS + 1) * balance.span / STEPS
             added = _displacements(*readings(at.ravel()))
             displacements = added.reshape(len(DISPLACEMENTS), len(windows), STEPS + 1, -1).swapaxes(0, 1)
-        return _Told(windows, instants, dense, displacements)
+        return _SegmentRows(windows, instants, dense, displacements)
 
-    def weigh(self, beta: Array) -> None:
-        """Tell the noise of the rows for parameters beta (n,), and make them independent of each other."""
+    def reweight(self, beta: Array) -> None:
+        """Propagate noise to the rows with parameters beta (n,), and whiten them."""
         model, balance = self.model, self._balance
         self.beta = beta
         if self._given is None:
@@ -169,15 +169,15 @@ class SessionRows(WeakRows):
         covariances: list[list[Array]] = []
         responses: list[Array] = []
         columns: list[Array] = []
-        for told in self._told:
+        for part in self._parts:
             noise.begin(beta, self.noise, 0)
-            self._tell(noise, told.instants)
-            largest = np.maximum.accumulate(size(told.copies[:, 0], beta), axis=0)
+            self._extend(noise, part.instants)
+            largest = np.maximum.accumulate(size(part.copies[:, 0], beta), axis=0)
             errors = rounding(largest)
-            errors += np.array([self.second_order.variance(window.half_width) for window in told.windows]).reshape(
+            errors += np.array([self.second_order.variance(window.half_width) for window in part.windows]).reshape(
                 errors.shape
             )
-            for propagated, added in zip(noise.push(told.windows, errors), told.displacements, strict=True):
+            for propagated, added in zip(noise.push(part.windows, errors), part.displacements, strict=True):
                 covariances.append(propagated.covariances)
                 columns.append(propagated.calibration)
                 # Sums over the steps, sensor by sensor.
@@ -191,18 +191,18 @@ class SessionRows(WeakRows):
 
     def _second_order(self) -> SecondOrderNoise:
         """As in the fit."""
-        samples = [beyond_first_order(told.copies, self.beta) for told in self._told if told.windows]
+        samples = [beyond_first_order(part.copies, self.beta) for part in self._parts if part.windows]
         squares = np.concatenate(samples) ** 2
         widths = self.weak.windows.half_width
         return SecondOrderNoise({M: squares[widths == M].mean(axis=0) for M in np.unique(widths).tolist()})
 
     @staticmethod
-    def _tell(noise: WindowNoise, instants: list[Instants]) -> None:
+    def _extend(noise: WindowNoise, instants: list[Instants]) -> None:
         if instants:
             x, v, signals = (np.concatenate([getattr(p, part) for p in instants]) for part in ("x", "v", "signals"))
-            for start in range(0, len(x), TOLD):
-                some = slice(start, start + TOLD)
-                noise.tell(start, x[some], v[some], signals[some])
+            for start in range(0, len(x), TOGETHER):
+                some = slice(start, start + TOGETHER)
+                noise.extend(start, x[some], v[some], signals[some])
 
     def _readings(self, segment: Segment, half_width: int) -> Callable[[Array], tuple[Array, Array]]:
         """Smoothed readings (T, sensors) of the position sensors, and their rates, at instants (T,) of a segment, s."""

@@ -14,14 +14,14 @@ from sms_online.diagnosis.trace import Tracing
 from sms_online.effects.catalogue import ENTRIES
 from sms_online.stream import Array
 
-# Relative accuracy of a shape constant: twenty seconds tell the frequency of a mass that rings with 100 N to 1e-7, and
+# Relative accuracy of a shape constant: twenty seconds give the frequency of a mass that rings with 100 N to 1e-7, and
 # a phase that is off moves the parameters. And evaluations at most.
 TOLERANCE = 1e-7
 EVALUATIONS = 40
 # Relative step of slopes by a shape constant: twenty seconds of a slow ringing turn on by a milliradian.
 STEP = 1e-5
 # Times that a shape constant follows from coefficients, which follow from it: the second is off by the first's square.
-SETTLED = 2
+ITERATIONS = 2
 
 
 def refine(tracing: Tracing, make: CandidateColumns, chosen: Sequence[int], k: int) -> None:
@@ -32,11 +32,11 @@ def refine(tracing: Tracing, make: CandidateColumns, chosen: Sequence[int], k: i
     for shape, constant in ENTRIES[tracing.candidates[k].effect.name].shapes.items():
         if shape in tracing.candidates[k].effect.coefficients and not constant.counted:
             _refine_one(tracing, make, chosen, k, shape)
-    _settle(tracing, make, chosen, k)
+    _follow_coefficients(tracing, make, chosen, k)
 
 
 def slopes(tracing: Tracing, make: CandidateColumns, chosen: Sequence[int]) -> tuple[list[tuple[str, str]], Array]:
-    """Shape constants of those chosen that the rows tell, key of the effect and name, and slopes of the rows by them.
+    """Shape constants of those chosen that the rows determine, key of effect and name, and slopes of the rows by them.
 
     (W, n_v, shapes). What follows from coefficients is none of them.
     """
@@ -46,7 +46,7 @@ def slopes(tracing: Tracing, make: CandidateColumns, chosen: Sequence[int]) -> t
     for candidate in (tracing.candidates[k] for k in chosen):
         effect, own = candidate.effect, solution[at : at + len(candidate.parameters)]
         at += own.size
-        for shape in _told_by_rows(effect):
+        for shape in _refined_by_rows(effect):
             value = effect.coefficients[shape]
             there, back = (
                 make.of(effect.model_copy(update={"coefficients": effect.coefficients | {shape: moved}})).columns @ own
@@ -57,31 +57,31 @@ def slopes(tracing: Tracing, make: CandidateColumns, chosen: Sequence[int]) -> t
     return names, np.concatenate(found, axis=2)
 
 
-def _told_by_rows(effect: Effect) -> list[str]:
+def _refined_by_rows(effect: Effect) -> list[str]:
     """Shape constants of an effect that are refined for themselves."""
     shapes = ENTRIES[effect.name].shapes
-    told = [s for s, constant in shapes.items() if effect.coefficients.get(s, 0.0) > 0.0 and not constant.counted]
+    refined = [s for s, constant in shapes.items() if effect.coefficients.get(s, 0.0) > 0.0 and not constant.counted]
     # A gap is reported for itself, where others have a coefficient too.
-    return told if set(ENTRIES[effect.name].coefficients) - set(shapes) else []
+    return refined if set(ENTRIES[effect.name].coefficients) - set(shapes) else []
 
 
-def _settle(tracing: Tracing, make: CandidateColumns, chosen: Sequence[int], k: int) -> None:
+def _follow_coefficients(tracing: Tracing, make: CandidateColumns, chosen: Sequence[int], k: int) -> None:
     """Give shape constants the values that a person reads, where these follow from coefficients beside them.
 
-    A gap where the spring is soft is as much as it takes off beyond, over the joint's stiffness: rows beyond tell that
+    A gap where the spring is soft is as much as it takes off beyond, over the joint's stiffness: rows beyond give that
     to 1e-4, and the gap itself, with a stiffness of its own inside, to percents where the spring is seldom in it.
     """
     entry = ENTRIES[tracing.candidates[k].effect.name]
     if entry.kind != "force" or all(constant.counted for constant in entry.shapes.values()):
         return
-    for _ in range(SETTLED):
+    for _ in range(ITERATIONS):
         effect = tracing.candidates[k].effect
         solution = tracing.solution(chosen)
         sizes = [len(tracing.candidates[other].parameters) for other in chosen]
         first = tracing.n_model + sum(sizes[: chosen.index(k)])
         own = solution[first : first + sizes[chosen.index(k)]]
-        told = make.reported(effect, solution[: tracing.rows.Y.shape[2]], own)
-        moved = effect.coefficients | {name: told[name] for name in effect.coefficients.keys() & told.keys()}
+        reported = make.reported(effect, solution[: tracing.rows.Y.shape[2]], own)
+        moved = effect.coefficients | {name: reported[name] for name in effect.coefficients.keys() & reported.keys()}
         if moved == effect.coefficients or min(moved.values()) <= 0.0:
             return
         tracing.put(k, make.of(effect.model_copy(update={"coefficients": moved})))

@@ -1,4 +1,4 @@
-"""Where a motor stands still in a whole session."""
+"""Where a motor is at rest in a whole session."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ LEAVING = 0.025
 
 
 class SessionStandstill:
-    """Where one motor stands still in a session.
+    """Where one motor is at rest in a session.
 
-    joint: of the motor, by number from 0. noise: σ of its position, rad. slow: the rate below which it stands still,
+    joint: of the motor, by number from 0. noise: σ of its position, rad. slow: the rate below which it is at rest,
     rad/s.
     """
 
@@ -58,6 +58,6 @@ def _leaving(still: NDArray[np.bool_], angle: Array, sample_rate: float) -> Arra
     out = np.zeros(still.size)
     beyond = rate_filter(sample_rate)
     for end in (np.flatnonzero(np.diff(still.astype(np.int8)) < 0) + 1).tolist():
-        # Standstill is told by a filter that reaches so far, and lasts for longer than this.
+        # A filter that reaches so far detects standstill, which lasts for longer than this.
         out[end - round(LEAVING * sample_rate) : end] = np.sign(angle[end + beyond] - angle[end])
     return out

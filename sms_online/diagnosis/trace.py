@@ -21,7 +21,7 @@ from sms_online.diagnosis.evidence import Gain, basis, free_of, gain, threshold
 
 # Probability that a session without any effect beyond the model shows one.
 FALSE_ALARM = 0.01
-# Candidates whose columns differ by less than 10°, sin² = 0.03 of the gain, are not told apart; nor are those whose
+# Candidates whose columns differ by less than 10°, sin² = 0.03 of the gain, are ambiguous; so are those whose
 # likelihoods differ by less than a factor of e^5.
 SAME_SHARE = 0.03
 DECISIVE = 10.0
@@ -29,11 +29,11 @@ DECISIVE = 10.0
 SAME_PART = 0.5
 # A curve is as smooth as leaves at most this multiple of what the best leaves of held-out rows.
 HARDLY_MORE = 1.02
-# Dry friction is told by what it leaves open where its axis stands still for at least this share of a session.
+# Dry friction is found by its stiction where its axis is at rest for at least this share of a session.
 MUCH_REST = 0.05
 # Laws of it that are compared, with their shape constants, those that explain most.
 RIVALS = 3
-# Times at most that rows are weighed anew for a set of effects: weights follow coefficients, and these the weights.
+# Times at most that rows are whitened anew for a set of effects: weights follow coefficients, and these the weights.
 ROUNDS = 3
 # At most so many effects are looked for in turn.
 MOST_EFFECTS = 8
@@ -104,7 +104,7 @@ class Tracing(Acceptance):
                 return chosen
             self._refused.add(self.candidates[failing].key)
             chosen = [k for k in chosen if k != failing]
-            self.settle(chosen)
+            self.reweight(chosen)
             self._take(chosen)
 
     def _grown(
@@ -132,21 +132,21 @@ class Tracing(Acceptance):
             if law is not None:
                 best = law
                 self._held.add(law)
-            # What it leaves open may be what others were taken for, at a standstill say.
-            self.settle([*chosen, best])
+            # What its law does not determine may be what others were taken for, at a standstill say.
+            self.reweight([*chosen, best])
             for _ in range(ROUNDS):
                 refine([*chosen, best], best)
-                if not self.settle([*chosen, best]):
+                if not self.reweight([*chosen, best]):
                     break
             self._take([*chosen, best])
             chosen = self._revised([*chosen, best])
-            self.settle(chosen)
+            self.reweight(chosen)
             self._take(chosen)
             # In the new weights, beside the others, an effect may have to be what it cannot be, or be none.
             while gone := [k for k in chosen if self._taken[k] <= self._least(k)]:
                 self._refused |= {self.candidates[k].key for k in gone}
                 chosen = [k for k in chosen if k not in gone]
-                self.settle(chosen)
+                self.reweight(chosen)
                 self._take(chosen)
             if self.candidates[best].key in self._refused:
                 continue
@@ -162,10 +162,10 @@ class Tracing(Acceptance):
         return chosen
 
     def _holding(self, chosen: Sequence[int], best: int, gains: Sequence[Gain], allowed: Sequence[int]) -> int | None:
-        """The dry friction that holds its axis much of the time where that tells held-out rows better than the best.
+        """The dry friction that holds its axis much of the time where it predicts held-out rows better than the best.
 
-        Friction that holds an axis is any value, which many a column explains better than its law does. So these are
-        compared by their likelihoods, with what each leaves open.
+        Stiction is any value up to breakaway, which many a column explains better than its law does. So these are
+        compared by their likelihoods, with the covariance of what each does not determine.
         """
         acts = self._acts(best)
         beside = [k for k in allowed if self._excess(k, gains[k]) > 0.0 and np.any(acts & self._acts(k))]
@@ -183,13 +183,13 @@ class Tracing(Acceptance):
             law = min(deviances, key=lambda k: deviances[k])
             others = [self._deviance(each) for each in ([*chosen, best], chosen) if law not in each]
             found = law if deviances[law] < min(others) - DECISIVE else None
-        self.settle(chosen)
+        self.reweight(chosen)
         return found
 
     def _iterated(self, chosen: Sequence[int]) -> None:
-        """Weigh the rows for those chosen until the weights are those of their coefficients."""
+        """Reweight the rows for those chosen until the weights are those of their coefficients."""
         for _ in range(ROUNDS):
-            if not self.settle(chosen):
+            if not self.reweight(chosen):
                 break
 
     def _holds(self, k: int) -> bool:
@@ -199,7 +199,7 @@ class Tracing(Acceptance):
     def _deviance(self, chosen: Sequence[int]) -> float:
         """Minus twice the log of the likelihood of held-out rows beside those before them, up to a constant.
 
-        Fitted to the other windows; what is left open goes with the coefficients from all of them.
+        Fitted to the other windows; what is not determined goes with the coefficients from all of them.
         """
         self._iterated(chosen)
         columns, deviance = self._columns(chosen), np.log(self.rows.white_std) * 2.0
@@ -219,7 +219,7 @@ class Tracing(Acceptance):
             self._taken[k] = self._plausible(self.candidates[k], found).gain
 
     def _least(self, k: int) -> float:
-        """Gain that one of those chosen must have in the end: of dry friction what it leaves open may leave little."""
+        """Gain that one of those chosen must have in the end: stiction may leave little of dry friction's."""
         dry = self.candidates[k].traits.dry
         return 0.0 if dry else threshold(FALSE_ALARM, self.trials, self._Z[k].shape[1])
 
@@ -236,9 +236,9 @@ class Tracing(Acceptance):
     def _revised(self, chosen: list[int]) -> list[int]:
         """The same effects without those that the last one has made superfluous, each in its best form beside them.
 
-        What takes an effect's place has to lower the residual of held-out rows. The last one stays though what it
-        leaves open, which the rows bear by now, may leave little of its gain; and so do those held, which their
-        likelihood has chosen.
+        What takes an effect's place has to lower the residual of held-out rows. The last one stays though what it does
+        not determine, which the rows' covariance includes by now, may leave little of its gain; so do those held, which
+        their likelihood has chosen.
         """
         last = chosen[-1]
         for k in list(chosen):

@@ -26,7 +26,7 @@ POINTS = 25
 
 @dataclass(frozen=True)
 class Unexplained:
-    """A force that stands in for what is not known.
+    """A force in place of what is not known.
 
     row: row type with most of the residual, before and after what was found, or in which something was found that takes
     the same course. speed: the generalized speed whose rows hold it still. variable: what the force depends on most
@@ -99,7 +99,7 @@ def _taken_aside(rows: SessionRows, columns: Array, left: Array, speed: int) -> 
 def _variables(rows: SessionRows, speed: int) -> dict[str, Variable]:
     """What a force on a speed may depend on: positions and speeds, deflections of joints, torques, time.
 
-    Not the torque on that very speed, which explains itself, with an arm that weighs nothing.
+    Not the torque on that very speed, which explains itself, with an arm that has no mass.
     """
     layout = rows.model.layout
     offset = layout.n_base_positions - layout.n_base_speeds
@@ -135,7 +135,7 @@ def _torque(i: int) -> Variable:
 
 
 def _knots(rows: SessionRows, variable: Variable) -> Array | None:
-    """Knots over the range that the variable goes through, None where it stands still."""
+    """Knots over the range that the variable goes through, None where it is constant."""
     values = np.concatenate([variable(motion) for motion, _ in rows.weak.motions()])
     low, high = float(values.min()), float(values.max())
     if not high > low:

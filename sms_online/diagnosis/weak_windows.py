@@ -138,9 +138,9 @@ class WeakWindows:
         for (motion, which), (by_force, _) in zip(self.motions(dense=True), self._sums(dense=True), strict=True):
             # The last sample, where the test function is zero, is the first of the next half hop.
             seen, weights = (part.reshape(which.size, -1)[:, :-1] for part in (by_force.indices, by_force.data))
-            told = squares(motion)
-            for row in np.flatnonzero(np.any(told, axis=0)):
-                inside = weights**2 * told[seen, row]
+            off = squares(motion)
+            for row in np.flatnonzero(np.any(off, axis=0)):
+                inside = weights**2 * off[seen, row]
                 parts[which, :, row] = inside.reshape(which.size, INSTANTS, -1).sum(axis=2)
         return parts
 

@@ -24,7 +24,7 @@ Kind = Literal["force", "inertia", "channel", "kinematics"]
 Place = Literal[
     "joint", "driven joint", "flexible joint", "later joint", "link", "linear link", "base", "tip", "angle", "position",
 ]  # fmt: skip
-# Speed below which an axis stands still, rad/s (m/s): an integrator cannot follow a jump, and encoders resolve no less.
+# Speed below which an axis is at rest, rad/s (m/s): an integrator cannot follow a jump, and encoders resolve no less.
 STANDSTILL = 1e-4
 # Kinds of events that effects are named after.
 CHANGES = ("stiffness", "friction", "offset", "damping")
@@ -226,7 +226,7 @@ def report(
     at, spread = values[columns], covariance[np.ix_(columns, columns)]
     steps = DIFFERENCE * np.maximum(np.abs(at), np.sqrt(np.diag(spread)))
     steps[steps == 0.0] = DIFFERENCE
-    told = effect.reported(at)
+    reported = effect.reported(at)
     slopes = np.array(
         [
             [
@@ -241,4 +241,4 @@ def report(
         ]
     )
     variance = np.einsum("ic,ij,jc->c", slopes, spread, slopes)
-    return {name: (value, float(np.sqrt(v))) for (name, value), v in zip(told.items(), variance, strict=True)}
+    return {name: (value, float(np.sqrt(v))) for (name, value), v in zip(reported.items(), variance, strict=True)}

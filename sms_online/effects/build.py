@@ -22,14 +22,14 @@ NUMBERED = re.compile(r"(?:joint|link)_(\d+)")
 def build_model(system: System, reference: Array | None = None) -> Model:
     """Model of a system with the effects that it declares.
 
-    reference (n_pi,): π whose masses effects of gravity weigh, the nominal ones unless given. InputError on an unknown
+    reference (n_pi,): π whose masses effects of gravity use, the nominal ones unless given. InputError on an unknown
     name, place or coefficient of an effect.
     """
     return Model(with_kinematics(system), build_effects, reference)
 
 
 def changed_model(model: Model, system: System) -> Model:
-    """Model of a changed system, with the reference of `model` by the parameters' names; what is new weighs 0."""
+    """Model of a changed system, with the reference of `model` by the parameters' names; what is new has mass 0."""
     reference = dict(zip((p.name for p in model.parameters), model.reference, strict=True))
     other = build_model(system)
     other.reference = np.array([reference.get(p.name, 0.0) for p in other.parameters])

@@ -34,7 +34,7 @@ class Linear(NamedTuple):
 
 
 class ChannelEffect(Constant):
-    """What stands between a true channel and its samples; without a latency and a filter of its own.
+    """How the samples of a channel differ from its true values; without a latency and a filter of its own.
 
     where: a channel, or a shell pattern of channels. coefficients: as declared, shape constants included. linear: its
     linear coefficients. filtered: whether a simulator passes exact values through `filter`, in place of `distort`.

@@ -18,7 +18,7 @@ from sms_online.model.layout import Layout
 from sms_online.stream import Array
 
 # Torque sensors, and models of what a torque moves, are right to a thousandth at best: a gain or ripple below that is
-# no fault of theirs. With a gain of -1 a measured torque explains itself and the arm weighs nothing.
+# no fault of theirs. With a gain of -1 a measured torque explains itself and the arm has no mass.
 LEAST_RATIO, LARGEST_RATIO = 1e-3, 0.5
 # Torque constants of two drives differ by a tenth or two; more is a mistake of unit or gear, or not of the drive.
 LARGEST_GAIN = 0.3

@@ -16,7 +16,7 @@ from sms_online.model.effect import Inputs
 from sms_online.model.layout import Layout
 from sms_online.stream import Array
 
-# Effects and their coefficients that stand for the attributes of <dynamics> in a URDF, friction of a joint as they are.
+# Effects and their coefficients for the attributes of <dynamics> in a URDF, friction of a joint as they are.
 URDF_DYNAMICS = {"damping": ("viscous_friction", "damping"), "friction": ("coulomb_friction", "torque")}
 
 
@@ -141,7 +141,7 @@ class DirectionFriction(MotorSide):
     """Viscous friction that depends on the direction of travel: f = -c_± θ̇_m, c_+ for θ̇_m > 0, in N m s/rad.
 
     Equal coefficients `plus` and `minus` are viscous friction. Coulomb friction with a torque for each direction is
-    Coulomb friction and a torque offset, of which no motion can tell it.
+    Coulomb friction and a torque offset, from which no motion distinguishes it.
     """
 
     entry = Entry(

@@ -82,7 +82,7 @@ class TableTilt(Constant, Force):
     """Uniform gravity in the plane on every mass, m/s²: `gravity_x`, `gravity_y`, in inertial axes.
 
     The product of gravity and masses is linear in one of them only: columns are those of 1 m/s² on the masses of the
-    model's reference π, so the masses have to be known well, from a fit without this effect or by weighing.
+    model's reference π, so the masses have to be known well, from a fit without this effect or from a scale.
     Limitations: the error of the reference masses is left out.
     """
 
@@ -160,7 +160,7 @@ class CableSpring(Force):
 # Frequencies of the liquid in small tanks, rad/s: a tenth of a hertz to three, by default half a hertz.
 SLOSH_LOWEST, SLOSH_HIGHEST = 2.0 * np.pi * 0.1, 2.0 * np.pi * 3.0
 SLOSH_DEFAULT = 2.0 * np.pi * 0.5
-# An undamped mass rings on, so in T seconds a frequency is told from another that is 2 π / T away. Those tried are this
+# An undamped mass rings on, so T seconds separate a frequency from another that is 2 π / T away. Those tried are this
 # share of it apart, or in a long session so many.
 SLOSH_APART, SLOSH_MOST = 0.75, 96
 

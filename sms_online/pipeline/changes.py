@@ -169,7 +169,7 @@ class Changes(Stage):
         return max(0, samples // (2 * self._half_hop))
 
     def decide(self, noise: SensorNoise, start_time: float, last: bool) -> Adoption | None:
-        """The event, once the windows after it are enough to tell; last: in this segment no more of them come.
+        """The event, once the windows after it suffice to decide; last: in this segment no more of them come.
 
         start_time: s of grid index 0.
         """
@@ -290,7 +290,7 @@ class Changes(Stage):
     ) -> Adoption:
         """Go on with effects that the model lacked: forces without internal states, or a payload.
 
-        event: what is to be told of it; its parameters are the effects' own. known: from rows that they had no part
+        event: what is reported of it; its parameters are the effects' own. known: from rows that they had no part
         in. weights (n + c,): of the parameters, then the effects'. samples: those of the session's last segment that
         hold the effects.
         """

@@ -43,7 +43,7 @@ RANK_TOLERANCE = 1e-10
 CONVERGED, MOST_STEPS = 1e-8, 100
 # Curvature of the criterion is no less than this share of that of its squares, for the length of a step.
 LEAST_CURVATURE = 1e-2
-# Noise in whitened rows below this share of their variance is none: they are weighed by what else they are off by.
+# Noise in whitened rows below this share of their variance is none: their weights follow from the rest of it.
 LEAST_NOISE = 0.1
 # Rounding of a sum of products, in units of its last place.
 ROUNDED = 16.0

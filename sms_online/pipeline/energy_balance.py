@@ -104,7 +104,7 @@ class EnergyState(State):
     """What an energy balance keeps of its segment.
 
     x (B, n_x), v (B, n_v), power (B, columns + 1): of the last 2 SIDE - 1 samples; the instant up to which the
-    integral is known is number SIDE - 1 of them. instant: its number in the segment. noise_told: variance of the work's
+    integral is known is number SIDE - 1 of them. instant: its number in the segment. row_noise: variance of the work's
     noise up to the last row. window_start: balance at the window's first instant.
     """
 
@@ -113,7 +113,7 @@ class EnergyState(State):
     power: Array
     integral: Array
     instant: int = 0
-    noise_told: float = 0.0
+    row_noise: float = 0.0
     window_start: Array | None = None
 
 
@@ -176,9 +176,9 @@ class EnergyBalance(Stage):
             balance[:, :-1] = self.model.energy_columns(x[SIDE - 1 + chosen], v[SIDE - 1 + chosen])
         balance[:, self._columns] += integral[chosen, :-1]
         self.state.integral, self.state.instant = integral[-1], int(instants[-1])
-        q = np.diff(integral[chosen, -1], prepend=self.state.noise_told)
+        q = np.diff(integral[chosen, -1], prepend=self.state.row_noise)
         if chosen.size:
-            self.state.noise_told = float(integral[chosen[-1], -1])
+            self.state.row_noise = float(integral[chosen[-1], -1])
         grid = index[-1] - SIDE + 1 - intervals + chosen
         differences = np.empty_like(balance)
         # A segment's first instant is no row: it is what the others are compared with.

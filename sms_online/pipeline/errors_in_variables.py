@@ -148,7 +148,7 @@ class NoiseBias(State):
 
 
 def unbiased(estimate: Estimate, bias: NoiseBias) -> Estimate:
-    """An estimate free of what noise in the columns does; one that was weighed against a prior stays as it is."""
+    """An estimate free of what noise in the columns does; one that was weighted against a prior stays as it is."""
     if estimate.scale is not None:
         return estimate
     shift, covariance = bias.correction(estimate.determined)

@@ -68,7 +68,7 @@ class Estimator(Stage):
 
     channels: what the source's blocks hold. source: its name, for messages. Raises InputError when a channel is missing
     that the model needs, or where the system declares a tilt of the table and there is no reference.
-    reference: π (n_pi,) of the system whose masses that tilt pulls at, from an estimate without it or from weighing.
+    reference: π (n_pi,) of the system whose masses that tilt acts on, from an estimate without it or from a scale.
     observers: watch what passes, in this order.
     """
 
@@ -104,7 +104,7 @@ class Estimator(Stage):
         self._rates = RatesStage(system.sample_rate, *self.sensing.deciding)
         self._followed = FollowedStates(model, self.sensing, system.sample_rate)
         self._energy = EnergyBalance(model, base, system.sample_rate)
-        # A balance of forces does not hold in a shape that is not the link's; energies bear it best.
+        # A balance of forces does not hold in a shape that is not the link's; energies tolerate it best.
         by_energy = system.balance == "energy" or self.sensing.missing or (self.smoother is not None and self._slow)
         self.momentum = None if by_energy else Momentum(model, base, self.sensing, self._begin_joints)
         if by_energy and not all(choice.static for choice in system.trackers):
@@ -146,7 +146,7 @@ class Estimator(Stage):
 
     @one_blas_thread()
     def set_prior(self, prior: Prior) -> None:
-        """Weigh the rows against what is known of the base parameters beforehand; before the first sample."""
+        """Add what is known of the base parameters beforehand as a prior; before the first sample."""
         self.prior, self._setup = prior, None
         self.energy_tracker = session_tracker(self.base.n, prior)
         if self.momentum is not None:

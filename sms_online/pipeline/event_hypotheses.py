@@ -60,7 +60,7 @@ class Jump:
 class Explanation:
     """The best of several hypotheses about the rows after an event.
 
-    jump: None where no hypothesis can be told from the rows. sizes, stds: of each jump (p,). beta (n,): the parameters
+    jump: None where the rows determine no hypothesis. sizes, stds: of each jump (p,). beta (n,): the parameters
     as they were before, from all rows. explained: whether it leaves little but noise. decisive: whether the next best
     leaves clearly more.
     """

@@ -4,7 +4,7 @@ Two statistics, both of the residuals against the estimate from the windows befo
 - χ² of a window's rows over their own covariance, for what is large: two windows in a row that noise cannot explain;
 - the cumulative sum of what χ² exceeds its expectation by (Page, Biometrika 41 (1954) 100), for what is small and
   lasts.
-Rows that are whitened across windows would tell more, but their errors burst where the filter's width changes from one
+Rows whitened across windows would detect more, but their errors burst where the filter's width changes from one
 window to the next, since what the two widths pass of the same noise differs in second order.
 """
 
@@ -47,8 +47,8 @@ class Event:
     """A change of the system while the session ran.
 
     time: s. kind: `payload`, `stiffness`, `damping`, `friction`, `offset` or `inertia`; `unexplained` where no jump
-    explains what followed, so that the estimate began anew; `undecided` where the session ended too early to tell, so
-    that the estimate is that of before; `effect` where one that the model lacked was taken up. parameters: the names of
+    explains what followed, so that the estimate began anew; `undecided` where the session ended too early to decide, so
+    that the estimate is that of before; `effect` where one was added to the model. parameters: the names of
     what jumped, with unit, size and std (1σ) of each jump in that unit. dropped_windows: windows of rows that reach
     across the event and were left out.
     """

@@ -26,7 +26,7 @@ LARGEST_HOP = 0.4
 class SquaredResidual(State):
     """Sums that give the rms of Y β - b for any β: the Gram matrix of [Y b], (n + 1, n + 1), and the measured signal's.
 
-    A Gram matrix tells a residual down to 1e-8 of b, which is enough for a share of the signal. It is replaced, never
+    A Gram matrix gives a residual down to 1e-8 of b, which is enough for a share of the signal. It is replaced, never
     written, so whoever keeps one has the sum of then.
     """
 

@@ -1,4 +1,4 @@
-"""Constant latencies of sources that a system file does not state, told by the momentum balance.
+"""Constant latencies of sources that a system file does not state, estimated by the momentum balance.
 
 Samples that are δ later than their times say read x - ẋ δ, so a row's residual changes by δ ∫ c ẋ dt, with the c of
 `row_noise`. Such a column beside those of the parameters gives δ with an error bar. When all sources are equally late
@@ -43,7 +43,7 @@ class SourceGroup:
 class Latency:
     """A source whose samples are `size` ± `std` s later than the system file says; effects: it is known as these.
 
-    Less than zero where all others are late by the same, which nobody can tell from one source that is early.
+    Less than zero where all others are late by the same, which cannot be distinguished from one early source.
     """
 
     source: str
@@ -69,7 +69,7 @@ def _group(sensing: Sensing, name: str, channels: Sequence[str]) -> SourceGroup:
 
 
 def source_groups(sensing: Sensing) -> tuple[SourceGroup, ...]:
-    """The sources of a session whose latencies can be told apart; none where not exactly one delivers torques."""
+    """The sources of a session whose latencies are distinguishable; none where not exactly one delivers torques."""
     every = [_group(sensing, source.name, source_channels(source)) for source in sensing.model.system.sources]
     groups = [group for group in every if group.sensors or group.joints]
     positions = len(sensing.position_columns)

@@ -52,7 +52,7 @@ class MomentumState(State):
     """What a momentum balance keeps beside its stages.
 
     known (k, m + n + 1): what is known from before an event, as rows [N Y b] of unit variance. misfit (n_v,): behind
-    the rows that came last. sensor_noise: as estimated at grid index `noise_told`. waiting: samples, until the noise is
+    the rows that came last. sensor_noise: as estimated at grid index `noise_at`. waiting: samples, until the noise is
     known. newest_row: time of the last window's end, s. start_time: of grid index 0, s. random: gives the synthetic
     noise. drift: known to windows to come.
     """
@@ -61,7 +61,7 @@ class MomentumState(State):
     misfit: Array
     random: np.random.Generator
     sensor_noise: SensorNoise | None = None
-    noise_told: int = 0
+    noise_at: int = 0
     waiting: list[GridSamples] = msgspec.field(default_factory=list)
     segment: int = -1
     start_time: float = np.nan
@@ -169,7 +169,7 @@ class Momentum(Stage):
         return self.state.start_time + end / self._sample_rate - 0.5 * self._window
 
     def set_prior(self, prior: Prior) -> None:
-        """Weigh the rows against what is known of the base parameters beforehand; before the first sample."""
+        """Add what is known of the base parameters beforehand as a prior; before the first sample."""
         self.prior = prior
         self.tracker, self.bank = self._new_tracker(), self._new_bank()
 
@@ -179,7 +179,7 @@ class Momentum(Stage):
         return self.fit.weights is not None
 
     @property
-    def settled(self) -> bool:
+    def testable(self) -> bool:
         """Whether there are rows enough since the last event for a test of what they leave."""
         return self.started and self.fit.plain.windows * self._balance.span / HOPS >= TESTED
 
@@ -235,7 +235,7 @@ class Momentum(Stage):
         return nearer(self._own(), *self.fit.described)
 
     def observe(self, t: Array, values: Array) -> None:
-        """Take the channels' own samples (B, channels) at t (B,), NaN where there is none, to tell their noise."""
+        """Take the channels' own samples (B, channels) at t (B,), NaN where there is none, to estimate their noise."""
         self._estimate.push(t, values)
 
     def push(self, piece: GridSamples, start_time: float, periods: Array) -> None:
@@ -245,10 +245,10 @@ class Momentum(Stage):
         """
         self.state.start_time = start_time
         self.state.waiting.append(piece)
-        due = self.state.noise_told + round(NOISE_RENEWED * self._sample_rate)
+        due = self.state.noise_at + round(NOISE_RENEWED * self._sample_rate)
         if (self.state.sensor_noise is None or piece.index[-1] >= due) and self._estimate.ready:
             self.state.sensor_noise = self._estimate.noise(periods)
-            self.state.noise_told = int(piece.index[-1])
+            self.state.noise_at = int(piece.index[-1])
         if self.state.sensor_noise is None:
             return
         waiting, self.state.waiting = self.state.waiting, []
@@ -273,7 +273,7 @@ class Momentum(Stage):
         self._absorb(self.fit.push(windows, instants, noise))
 
     def _decide(self, noise: SensorNoise, last: bool) -> None:
-        """Where rows are held back for an event: decide on it, when there is enough to tell, and go on."""
+        """Where rows are held back for an event: decide on it, once there are enough of them, and go on."""
         if not last and self._drift_decided(noise):
             return
         adoption = self.changes.decide(noise, self.state.start_time, last)
@@ -443,7 +443,7 @@ class Momentum(Stage):
             bias=state_copy(self.bias),
             rows=state_copy(self.fit.plain),
             started=self.started,
-            tested=self.settled,
+            tested=self.testable,
             alarm=None if alarm is None else alarm.row,
             scale_free=self.scale_free,
             latency=self.latencies.found,

@@ -33,7 +33,7 @@ from sms_online.pipeline.weak_form import test_function
 from sms_online.state import Stage, State
 from sms_online.stream import Array
 
-# Random states that tell which entries of a row are zero by structure.
+# Random states that show which entries of a row are zero by structure.
 PATTERN_STATES = 8
 # A hop compares the widths of the filter at so many instants.
 COMPARED = 5
@@ -96,7 +96,7 @@ class MomentumBalanceState(State):
     """What a momentum balance keeps of its segment.
 
     samples (B, ·): of all copies, from number `first` in the segment on. skip: samples of the segment that are in no
-    window, None before the first. window: number of the next window's first sample; told: of the next instant, in half
+    window, None before the first. window: number of the next window's first sample; instant: of the next one, in half
     hops. compared: squares of the hops from the next window on. thinned, dense: of all columns and of rough forces, by
     the filter's half width.
     """
@@ -105,7 +105,7 @@ class MomentumBalanceState(State):
     skip: int | None = None
     first: int = 0
     window: int = 0
-    told: int = 0
+    instant: int = 0
     compared: list[Array] = msgspec.field(default_factory=list)
     thinned: dict[int, _Smoothed] = msgspec.field(default_factory=dict)
     dense: dict[int, _Smoothed] = msgspec.field(default_factory=dict)
@@ -183,9 +183,9 @@ class MomentumBalance(Stage):
             chosen.append((self.state.window, self._choose(sigma)))
             self.state.window += self.hop
             self.state.compared.pop(0)
-        instants = [piece for window, half_width in chosen for piece in self._tell(window, half_width)]
+        instants = [piece for window, half_width in chosen for piece in self._instants(window, half_width)]
         windows: list[Window] = []
-        # Windows of one width in a row are worked off together.
+        # Windows of one width in a row are processed together.
         for half_width, run in groupby(chosen, key=itemgetter(1)):
             rows = self._rows(half_width, [window for window, _ in run], grid)
             if self.rough.columns.size:
@@ -209,16 +209,16 @@ class MomentumBalance(Stage):
             self.state.compared.append(self._choice.squares(self.state.samples[:, :n_x], centres))
         return self._choice.widest(np.sum(self.state.compared, axis=0) / ((HOPS - 1) * COMPARED), sigma)
 
-    def _tell(self, window: int, half_width: int) -> list[Instants]:
-        """States at the instants up to the end of a window that have not been told yet."""
+    def _instants(self, window: int, half_width: int) -> list[Instants]:
+        """States at the instants up to the end of a window that have not been delivered yet."""
         last = (window + self.width) // self.half_hop
-        numbers = np.arange(self.state.told, last + 1)
+        numbers = np.arange(self.state.instant, last + 1)
         if numbers.size == 0:
             return []
         widths = np.minimum(half_width, self.margin + (last - numbers) * self.half_hop)
         apart = [(numbers[widths == M] * self.half_hop, M) for M in np.unique(widths)[::-1].tolist()]
         x, v, signals = self._states(apart)
-        self.state.told = last + 1
+        self.state.instant = last + 1
         return [Instants(int(numbers[0]), x[0], v[0], signals[0])]
 
     def _states(self, samples: _Samples) -> tuple[Array, Array, Array]:
@@ -254,14 +254,14 @@ class MomentumBalance(Stage):
         return out
 
     def _with_rough(self, half_width: int, rows: list[Window]) -> list[Window]:
-        """Rows with the columns of rough forces, and what these leave open."""
+        """Rows with the columns of rough forces, and what these leave undetermined."""
         phi, _ = self._phi[1]
         windows = [row.start * self.half_hop for row in rows]
         parts = np.cumsum([COPIES * (self._rough.size + self.model.layout.n_v), 2 * self.rough.rows.size])
         kept = self._kept(self.state.dense, half_width, 1, windows[0], int(parts[-1]) + self.rough.dry.size)
         offset = self.model.layout.n_base_positions - self.model.layout.n_base_speeds
         motor_of = np.searchsorted(self._motors, self.rough.motors + offset)
-        # Entries of columns and slopes by laws of dry friction: at a standstill they tell noise's sign for friction's.
+        # Entries of columns and slopes by laws of dry friction: at a standstill their sign is noise's, not friction's.
         by_law = [
             places[:, None] == self.rough.dry for places in (self._physical[self._rough], self.rough.coefficients)
         ]
@@ -280,9 +280,9 @@ class MomentumBalance(Stage):
             moment = row.moment.copy()
             if self.with_moments:
                 moment[self._rough] = -self._moment_weights(1)[0] @ columns[:, 0, : self._rough.size]
-            told = responses(slopes, phi * self.sample_rate, half_width, self.sample_rate, STEPS)
+            rough = responses(slopes, phi * self.sample_rate, half_width, self.sample_rate, STEPS)
             rest = open_at_rest(breaking, still, phi)
-            out.append(replace(row, Y=Y, b=row.b - weak[:, self._rough.size :], rough=told, rest=rest, moment=moment))
+            out.append(replace(row, Y=Y, b=row.b - weak[:, self._rough.size :], rough=rough, rest=rest, moment=moment))
         return out
 
     def _kept(self, kept: dict[int, _Smoothed], half_width: int, step: int, first: int, entries: int) -> _Smoothed:
@@ -342,8 +342,8 @@ class MomentumBalance(Stage):
         change = self._change(samples, v[0])
         force = self.rough.force(own[0], own[1], own[2], np.tile(change, (len(own[0]) // K, 1)))
         measured = x[0], v[0], signals[0]
-        told = self.rough.slopes(*measured, change), self.rough.breaking(*measured)
-        return np.concatenate((self._packed(force, self._rough, K), *told), axis=1)
+        by_law = self.rough.slopes(*measured, change), self.rough.breaking(*measured)
+        return np.concatenate((self._packed(force, self._rough, K), *by_law), axis=1)
 
     def _change(self, samples: _Samples, v: Array) -> Array:
         """What the rates of joints with rough forces change by from the sample before (K, n_v), of the motion v."""

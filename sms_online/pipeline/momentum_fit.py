@@ -2,8 +2,8 @@
 
 Weights follow from the sensors' noise and the parameters, never from residuals: those collapse where noise is high. The
 parameters come from the fit itself: the first windows that move are held back, fitted without weights and then with
-them; from then on the estimate so far is taken where it would weigh rows otherwise. A start that is 70 % off gives the
-same answer. Where such a fit leaves more than noise, for it had to tell too many parameters apart without weights, the
+them; from then on the estimate so far is taken where it would change the weights. A start that is 70 % off gives the
+same answer. Where such a fit leaves more than noise, for it had to separate too many parameters without weights, the
 described values are tried as its start, and stay in the weights until the rows determine better ones. Where that does
 too, the model lacks something, and weights come from a fit that no such lack draws to zero, see `criterion`.
 
@@ -40,8 +40,8 @@ from sms_online.pipeline.plain_rows import PlainRows
 from sms_online.pipeline.second_order import SecondOrderNoise, beyond_first_order, rounding, size
 from sms_online.pipeline.sensor_noise import SensorNoise
 from sms_online.pipeline.smoothing import HALF_WIDTHS
-from sms_online.pipeline.weighing import Weighed, Weighing
 from sms_online.pipeline.window_noise import WindowNoise
+from sms_online.pipeline.window_whitening import WhitenedWindow, WindowWhitening
 from sms_online.state import Stage, State
 from sms_online.stream import Array
 
@@ -49,7 +49,7 @@ from sms_online.stream import Array
 FIRST_MOTION = 1.6
 # Less does where a gap or the end of the session leaves no more.
 LEAST_MOTION = 0.4
-# What is held back at most, s; the oldest goes, for an arm that rests tells nothing.
+# What is held back at most, s; the oldest goes, for an arm at rest gives no information.
 HELD_BACK = 16.0
 # Weighted fits of the windows held back before their rows are handed on.
 PASSES = 2
@@ -59,25 +59,25 @@ PASSES_DESCRIBED = 1
 DETERMINED = 3.0
 # A window moves when a coordinate spans this many σ in it; noise alone spans 6.
 MOTION = 20.0
-# Multiple of the square of one sample of what noise does beyond first order in a row that stands for its variance in
+# Multiple of the square of one sample of what noise does beyond first order in a row that estimates its variance in
 # the row's own covariance.
 UNSTEADY = 4.0
 # Windows of one filter's width over which the square of such a sample is averaged. The samples of windows that overlap
 # are nearly one, so a mean over few of them follows its own luck: rows in which it is low would be trusted too much.
 MOST_SAMPLES = 100
-# Time from one look at the weights to the next, s: it doubles from the first to the latest.
+# Time from one check of the weights to the next, s: it doubles from the first to the latest.
 FIRST_RENEWAL = 1.0
 LATEST_RENEWAL = 4.0
 # Weights are renewed where a speed's rows change by this share of their size, or a sensor's density of noise by more
-# than what estimates of it scatter by. Less is not worth it: chains whose weights differ by the scatter of an estimate
+# than what estimates of it scatter by. Less is not worth it: filters whose weights differ by the scatter of an estimate
 # take some of that for information.
 SAME_ROWS = 2e-3
 SAME_NOISE = 0.25
 # Parameters with which a speed's rows are smaller than this share of what they were explain nothing.
 SHRUNK = 0.5
-# A chain begins anew where what rows leave beyond noise changes by this share of their variance.
+# Whitening begins anew where what rows leave beyond noise changes by this share of their variance.
 SAME_MISFIT = 0.1
-# Time that new weights are told windows before their rows are taken, s: see `weighing`.
+# Time for which new weights whiten windows before their rows are taken, s: see `window_whitening`.
 WARM_UP = 3.2
 # Windows whose rows are made together.
 TOGETHER = 64
@@ -113,8 +113,8 @@ class WhiteRows:
 class MomentumFitState(State):
     """What a fit keeps of the windows so far.
 
-    moving: windows with motion since the segment began. since: windows since the weights were looked at; renewal:
-    windows from one look to the next. warm: windows that the weighing to come has been told, None where none is to
+    moving: windows with motion since the segment began. since: windows since the weights were checked; renewal:
+    windows from one check to the next. warm: windows that the whitening to come has received, None where none is to
     come. held: windows held back. last: first instant that a window to come asks for, at least; x, v, signals: states
     at the instants from number `first` on. sampled: windows behind the second-order noise, by the filter's half width.
     largest (n_v,): largest sum of a row's terms.
@@ -140,7 +140,7 @@ class MomentumFit(Stage):
     new_noise: makes what propagates noise, for the same model, base and balance. solve: gives the estimate so far of
     nuisances and β (m + n,), which weights follow. sources: whose latencies are estimated. calibration: rows
     [N Y b] (k, m + n + 1) of what is known of the nuisances beforehand. beforehand: gives all that is known beside the
-    rows. drift: gives the known drift in the window that ends at a grid index. weighing: who weighs now.
+    rows. drift: gives the known drift in the window that ends at a grid index. whitening: that of now.
     """
 
     def __init__(
@@ -169,8 +169,8 @@ class MomentumFit(Stage):
         self._solve, self._drift = solve, drift
         self._beforehand = beforehand if beforehand is not None else lambda: Beforehand.none(self._nuisances + base.n)
         self._new_noise, self._sources = new_noise, sources
-        self.weighing = self._new_weighing()
-        self._next: Weighing | None = None  # with new weights, that takes over when it has been told enough windows
+        self.whitening = self._new_whitening()
+        self._next: WindowWhitening | None = None  # with new weights; takes over when it has received enough windows
         layout = model.layout
         widths = (layout.n_x, layout.n_v, len(layout.q) + model.n_states)
         x, v, signals = (np.empty((0, columns)) for columns in widths)
@@ -180,10 +180,10 @@ class MomentumFit(Stage):
 
     def renew(self) -> None:
         """See Stage."""
-        self._next = None if self.state.warm is None else self._new_weighing()
+        self._next = None if self.state.warm is None else self._new_whitening()
 
-    def _new_weighing(self) -> Weighing:
-        return Weighing(self._new_noise(), COPIES * (self.base.n + 1) + self._ramps, self._sources)
+    def _new_whitening(self) -> WindowWhitening:
+        return WindowWhitening(self._new_noise(), COPIES * (self.base.n + 1) + self._ramps, self._sources)
 
     @property
     def _ramps(self) -> int:
@@ -191,7 +191,7 @@ class MomentumFit(Stage):
         return self.base.n if self._balance.with_moments else 0
 
     def end_segment(self, noise: SensorNoise) -> list[WhiteRows]:
-        """Rows of the windows held back, if they tell enough for weights; the next ones share no samples with them."""
+        """Rows of the windows held back, if they suffice for weights; the next ones share no samples with them."""
         out = self.flush(noise) if self.state.held and self.state.moving >= self._count(LEAST_MOTION) else []
         self._begin_segment()
         return out
@@ -201,13 +201,13 @@ class MomentumFit(Stage):
         now.held, now.moving, now.last, now.first = [], 0, 0, 0
         now.x, now.v, now.signals = now.x[:0], now.v[:0], now.signals[:0]
         if self._next is not None:
-            # A chain that begins anew need not be warmed up.
+            # A filter that begins anew need not be warmed up.
             self._take_over(self._next)
-        self.weighing.begin_segment()
+        self.whitening.begin_segment()
 
-    def _take_over(self, weighing: Weighing) -> None:
-        """Go on with the weighing that was to come."""
-        self.weighing, self._next, self.state.warm = weighing, None, None
+    def _take_over(self, whitening: WindowWhitening) -> None:
+        """Go on with the whitening that was to come."""
+        self.whitening, self._next, self.state.warm = whitening, None, None
 
     def push(self, windows: list[Window], instants: list[Instants], noise: SensorNoise) -> list[WhiteRows]:
         """Rows of the windows that a push completed, and of those held back before."""
@@ -216,8 +216,8 @@ class MomentumFit(Stage):
         self.state.signals = np.concatenate((self.state.signals, *(piece.signals for piece in instants)))
         if self.weights is not None:
             if windows:
-                self._look(noise, windows[0])
-            self._tell()
+                self._check_weights(noise, windows[0])
+            self._extend()
             out = self._white(windows)
         else:
             self.state.held += windows
@@ -229,36 +229,36 @@ class MomentumFit(Stage):
 
     def go_on(self, weights: Array, noise: SensorNoise) -> None:
         """Begin with weights β (n,) that are known."""
-        self.weighing.begin(weights, noise, self.plain.misfit, self.state.first)
+        self.whitening.begin(weights, noise, self.plain.misfit, self.state.first)
         self.state.renewal = self._count(FIRST_RENEWAL)
 
     def flush(self, noise: SensorNoise) -> list[WhiteRows]:
         """Fit the windows held back, without weights and then with those of the fit before, and return their rows."""
         self.state.moving = 0
         unweighted, _ = _least_squares(np.concatenate(self._balance.dense(self.state.held)[:, 0]))
-        weights = self._settled(unweighted, noise, PASSES, partly=False)
+        weights = self._iterated(unweighted, noise, PASSES, partly=False)
         if self.plain.misfit.any():
             misfit, nominal = self.plain.misfit, self.base.values(self.model.nominal)
-            described = self._settled(nominal, noise, PASSES_DESCRIBED, partly=True)
+            described = self._iterated(nominal, noise, PASSES_DESCRIBED, partly=True)
             if self.plain.misfit.sum() < misfit.sum():
                 weights = described
             if self.plain.misfit.any() and misfit.any():
                 weights = self._scale_free([unweighted, nominal], noise)
-        self._retell(weights, noise)
+        self._restart(weights, noise)
         out = self._white(self.state.held)
         self.state.since = 0
         self.state.renewal = self._count(FIRST_RENEWAL)
         self.state.held = []
         return out
 
-    def _settled(self, weights: Array, noise: SensorNoise, passes: int, partly: bool) -> Array:
+    def _iterated(self, weights: Array, noise: SensorNoise, passes: int, partly: bool) -> Array:
         """Weights (n,) from fits of the windows held back, each with those of the fit before.
 
         weights: of the first fit. partly: they take what the rows determine, and keep the rest.
         """
         self.plain.misfit = np.zeros(self.model.layout.n_v)
         for _ in range(passes):
-            self._retell(weights, noise)
+            self._restart(weights, noise)
             white = [rows.Y for rows in self._white(self.state.held)]
             white += [self._calibration] if len(self._calibration) else []
             fitted, determined = _least_squares(np.concatenate(white))
@@ -283,7 +283,7 @@ class MomentumFit(Stage):
             joint = self._least(grams, lacking, starts)
             # What the rows leave of the new weights' noise, and the rows whitened with it.
             for _ in range(2):
-                self._retell(joint[m:], noise)
+                self._restart(joint[m:], noise)
                 white = self._white(self.state.held)
                 self.plain.judge(joint)
             grams = RowGrams.none(n_v, m + self.base.n)
@@ -310,7 +310,7 @@ class MomentumFit(Stage):
     @property
     def weights(self) -> Array | None:
         """β (n,) behind the weights, None while there are none."""
-        return self.weighing.beta
+        return self.whitening.beta
 
     @property
     def _known_weights(self) -> Array:
@@ -325,11 +325,11 @@ class MomentumFit(Stage):
         inside = slice(window.start - self.state.first, window.start - self.state.first + INSTANTS + 1)
         return bool(np.any(np.ptp(self.state.x[inside], axis=0) > MOTION * noise.coordinates))
 
-    def _look(self, noise: SensorNoise, window: Window) -> None:
-        """Now and then, with the window to come: begin to weigh with the estimate and the noise so far, if it matters.
+    def _check_weights(self, noise: SensorNoise, window: Window) -> None:
+        """Now and then, with the window to come: begin to whiten with the estimate and noise so far, if it matters.
 
-        The chain so far goes on until the new one has been told enough windows. What the model lacks counts at once: it
-        is each row's own, and chains of such rows are short.
+        The filter so far goes on until the new one has received enough windows. What the model lacks counts at once: it
+        is each row's own, and the memory of such rows is short.
         """
         if self.state.since < self.state.renewal:
             return
@@ -340,12 +340,12 @@ class MomentumFit(Stage):
         self.plain.judge(joint)
         if self.plain.misfit.any() and self._nuisances:
             beta = self._calibrated(joint)[self._nuisances :]
-        used, misfit = self.weighing, self.plain.misfit
+        used, misfit = self.whitening, self.plain.misfit
         if np.any(np.abs(misfit - used.misfit) > SAME_MISFIT * (1.0 + used.misfit)):
             self._next = self.state.warm = None
             used.begin(beta, noise, misfit, window.start)
         elif self._next is None and self._matters(beta, noise):
-            self._next, self.state.warm = self._new_weighing(), 0
+            self._next, self.state.warm = self._new_whitening(), 0
             self._next.begin(beta, noise, self.plain.misfit, window.start)
 
     def _calibrated(self, joint: Array) -> Array:
@@ -363,8 +363,8 @@ class MomentumFit(Stage):
         return joint
 
     def _matters(self, beta: Array, noise: SensorNoise) -> bool:
-        """Whether β (n,) and the noise of now would weigh rows otherwise."""
-        used = self.weighing.noise
+        """Whether β (n,) and the noise of now would change the weights."""
+        used = self.whitening.noise
         assert used.sensor_noise is not None
         squares = np.einsum("vii->vi", self.plain.gram)[:, self._nuisances : -1]
         changed, size = (np.sqrt(squares @ values**2) for values in (beta - self._known_weights, beta))
@@ -372,27 +372,27 @@ class MomentumFit(Stage):
         louder = any(np.any(np.abs(now - then) > SAME_NOISE * then) for now, then in densities)
         return bool(np.any(changed > SAME_ROWS * size) or louder)
 
-    def _retell(self, weights: Array, noise: SensorNoise) -> None:
-        """Work off the windows held back from the first one on, with weights β (n,)."""
+    def _restart(self, weights: Array, noise: SensorNoise) -> None:
+        """Whiten from the first of the windows held back again, with weights β (n,)."""
         self.plain.clear()
         self.state.sampled = dict.fromkeys(HALF_WIDTHS, 0)
         self.state.largest = np.zeros_like(
             self.state.largest
         )  # a fit that fails may have made them larger than any row is
-        self.weighing.begin(weights, noise, self.plain.misfit, self.state.first)
-        self._tell()
+        self.whitening.begin(weights, noise, self.plain.misfit, self.state.first)
+        self._extend()
 
-    def _tell(self) -> None:
-        """Have the states of the instants known to who weighs."""
-        for weighing in self._weighings:
-            weighing.noise.tell(self.state.first, self.state.x, self.state.v, self.state.signals)
+    def _extend(self) -> None:
+        """Pass the states of the instants on to what propagates noise."""
+        for whitening in self._whitenings:
+            whitening.noise.extend(self.state.first, self.state.x, self.state.v, self.state.signals)
 
     @property
-    def _weighings(self) -> list[Weighing]:
-        return [self.weighing] if self._next is None else [self.weighing, self._next]
+    def _whitenings(self) -> list[WindowWhitening]:
+        return [self.whitening] if self._next is None else [self.whitening, self._next]
 
     def _white(self, windows: Sequence[Window]) -> list[WhiteRows]:
-        """Rows of the next windows; the weighing to come takes over when it has received enough of them."""
+        """Rows of the next windows; the whitening to come takes over when it has received enough of them."""
         out: list[WhiteRows] = []
         while len(out) < len(windows):
             count = TOGETHER if self._next is None else self._count(WARM_UP) - (self.state.warm or 0)
@@ -405,13 +405,13 @@ class MomentumFit(Stage):
         # Columns of parameters that change evenly, from the grid's beginning on.
         moments, centres = self._balance.moments(windows), self._centres(windows)
         ramp = (centres * rows[:, 0, :, :-1] + moments)[..., : self._ramps]
-        weights, misfit = self._known_weights, self.weighing.misfit
+        weights, misfit = self._known_weights, self.whitening.misfit
         samples = beyond_first_order(rows, weights)
         errors = self._errors(windows, samples, size(rows[:, 0], weights))
         columns = np.concatenate((rows.swapaxes(1, 2).reshape(W, n_v, -1), ramp), axis=2)
-        weighed = self._weigh(windows, columns, errors)
+        whitened = self._whiten(windows, columns, errors)
         raw, noisy = rows[:, 0], 0.5 * (rows[:, 1] - rows[:, 2])
-        white = np.array([each.rows for each in weighed])
+        white = np.array([each.rows for each in whitened])
         ramp = white[..., COPIES * (n + 1) :]
         white = white[..., : COPIES * (n + 1)].reshape(W, n_v, COPIES, -1).swapaxes(1, 2)
         ramp = ramp - centres * white[:, 0, :, : self._ramps]
@@ -421,15 +421,15 @@ class MomentumFit(Stage):
                 # Behind the whitening, for what it subtracts of earlier windows must have the same reference.
                 white[k], raw[k] = drift.removed(white[k], ramp[k]), drift.removed(raw[k], moments[k])
         if self._nuisances:
-            before = np.array([each.calibration[0] for each in weighed])
-            behind = np.array([each.calibration[1] for each in weighed])[:, None]
+            before = np.array([each.calibration[0] for each in whitened])
+            behind = np.array([each.calibration[1] for each in whitened])[:, None]
             raw = np.concatenate((before, raw), axis=2)
             white = np.concatenate((np.broadcast_to(behind, (W, COPIES, n_v, self._nuisances)), white), axis=3)
             noisy = np.pad(noisy, ((0, 0), (0, 0), (self._nuisances, 0)))
             weights = np.pad(weights, (self._nuisances, 0))
         raw, white = np.ascontiguousarray(raw), np.ascontiguousarray(white)
         out = []
-        for k, (window, each) in enumerate(zip(windows, weighed, strict=True)):
+        for k, (window, each) in enumerate(zip(windows, whitened, strict=True)):
             self.plain.add(raw[k], noisy[k], np.diag(each.noise), weights)
             unsteady = np.diag(UNSTEADY * samples[k] ** 2)
             covariance, noise = each.covariance + unsteady, each.noise + unsteady
@@ -461,18 +461,18 @@ class MomentumFit(Stage):
         ends = np.array([window.end for window in windows])[:, None, None]
         return np.asarray(ends / self._balance.sample_rate - 0.5 * self._balance.span)
 
-    def _weigh(self, windows: Sequence[Window], rows: Array, errors: Array) -> list[Weighed]:
-        """Rows (W, n_v, width) of the next windows; the weighing to come receives them too, and then may take over."""
+    def _whiten(self, windows: Sequence[Window], rows: Array, errors: Array) -> list[WhitenedWindow]:
+        """Rows (W, n_v, width) of the next windows; the whitening to come receives them too, and then may take over."""
         self.state.last = windows[-1].start
         self.state.since += len(windows)
-        weighed = self.weighing.push(windows, rows, errors)
+        whitened = self.whitening.push(windows, rows, errors)
         if self._next is not None:
             self._next.push(windows, rows, errors)
             self.state.warm = (self.state.warm or 0) + len(windows)
             if self.state.warm >= self._count(WARM_UP):
                 self._take_over(self._next)
                 self.state.since = 0
-        return weighed
+        return whitened
 
     def _forget_instants(self) -> None:
         """Drop the states that no window to come asks for."""
@@ -485,8 +485,8 @@ class MomentumFit(Stage):
             self.state.signals[drop:],
         )
         if self.weights is not None:
-            for weighing in self._weighings:
-                weighing.noise.drop(needed)
+            for whitening in self._whitenings:
+                whitening.noise.drop(needed)
 
 
 def _least_squares(rows: Array) -> tuple[Array, NDArray[np.bool_]]:

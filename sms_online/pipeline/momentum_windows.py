@@ -21,7 +21,7 @@ def _overlap() -> float:
 
 # Windows whose rows are not whitened among themselves: so many of them count as one.
 OVERLAP = _overlap()
-# Instants of a window at which the sensitivity to noise is told, two a hop: it changes as slowly as the motion.
+# Instants of a window at which the sensitivity to noise is computed, two a hop: it changes as slowly as the motion.
 INSTANTS = 2 * HOPS
 # Steps of a window at which it is known what noise adds to its rows: two for each instant.
 STEPS = 2 * INSTANTS

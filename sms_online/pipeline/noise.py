@@ -40,7 +40,7 @@ CONSISTENT = 0.35
 # Samples in a mean, the first of them to ask whether there is any colour; and fewest means.
 MEANS = (4, 2, 8)
 FEWEST_MEANS = 60
-# Order of differences at which noise of such colour is told from a slower signal.
+# Order of differences at which noise of such colour is distinguished from a slower signal.
 TYPICAL_ORDER = 4
 _CORRELATIONS = np.linspace(0.0, 1.0, 1001)[:-1]
 
@@ -49,7 +49,7 @@ def noise_std(values: Array, times: Array | None = None) -> Array:
     """1σ of the white noise of each channel, (C,), from consecutive samples, values (B, C).
 
     times (B,): their instants, s, ascending; None on a uniform grid. The spread is the root mean square of the
-    differences within three standard deviations, told by their median absolute deviation: a few jumps do not count.
+    differences within three standard deviations by their median absolute deviation: a few jumps do not count.
     Where more than half of the differences vanish it is their plain root mean square. A channel whose values lie on a
     grid of width r has at least the rounding noise r/√12 (and up to twice that where it creeps from level to level). A
     constant channel has none. Scatter of the estimate about 3.5 % over 1000 samples.
@@ -81,7 +81,7 @@ def correlation(values: Array, sigma: float) -> float:
     """Correlation a from one sample to the next of a channel's first-order noise, from its samples (B,); 0 if white.
 
     sigma: what `noise_std` says of them. Differences of means of m samples see the noise's density near f_s / 2m. Those
-    of a first-order process, e_{k+1} = a e_k + white noise, stand in ratios that a alone decides. Where they do not,
+    of a first-order process, e_{k+1} = a e_k + white noise, have ratios that depend on a alone. Where they do not,
     the slower bands hold the signal, and nothing is known of the noise's colour there: 0.
     """
     if values.size < max(MEANS) * FEWEST_MEANS or sigma == 0.0:

@@ -27,7 +27,7 @@ STEPS = 3.0
 ALONE = 4.0
 # Samples of its channel on either side that predict a sample.
 SIDE = 2
-# Outliers next to each other that are told apart.
+# Outliers next to each other that are distinguished.
 PASSES = 4
 # Rows wait no longer than this for samples that a channel still owes, s. Channels that are too slow for that are not
 # judged: their neighbours do not predict them either.

@@ -49,13 +49,13 @@ class Periods(Stage):
                 return
             count = np.count_nonzero(~np.isnan(first))
             if interval > LONGEST_HOLE:
-                self.settle(channel)
+                self.decide(channel)
             else:
                 first[count] = interval
                 if count + 1 == PERIOD_INTERVALS:
-                    self.settle(channel)
+                    self.decide(channel)
 
-    def settle(self, channel: int) -> None:
+    def decide(self, channel: int) -> None:
         """Take the period from the intervals so far, where there are any."""
         first = self.state.intervals[channel]
         if not np.isnan(first[0]):
@@ -63,7 +63,7 @@ class Periods(Stage):
             self.state.known[channel] = np.nanmedian(first)
 
     def is_gap(self, interval: Array, channel: int) -> NDArray[np.bool_]:
-        """Which intervals are gaps. Before the period is known only the absolute limit can tell."""
+        """Which intervals are gaps. Before the period is known only the absolute limit decides."""
         gap = interval > LONGEST_HOLE
         period = self.state.known[channel]
         return gap if np.isnan(period) else gap | (np.rint(interval / period) > self._gap_limit)

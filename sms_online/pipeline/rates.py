@@ -49,7 +49,7 @@ ROUNDINGS = 64.0
 # Samples in which σ is estimated and M is chosen. Counted in samples, not seconds, as the accuracy of both is: σ to
 # 5 %.
 WARM_UP = 1000
-# Work that one push may do, in samples filtered for each sample pushed. What waited for M is worked off at this pace,
+# Work that one push may do, in samples filtered for each sample pushed. What waited for M is processed at this pace,
 # so that no push takes much longer than the others; estimating the noise or choosing M costs as much as so many
 # samples.
 PACE = 1.5

@@ -134,20 +134,20 @@ class RoughForces:
         return np.asarray(np.abs((rest * pi[self.dry]) @ by_motor))
 
     def without(self, pi: Array) -> Array:
-        """π (n_pi,) without the forces that `slopes` tells."""
+        """π (n_pi,) without the forces that `slopes` covers."""
         out = pi.copy()
         out[self.coefficients] = 0.0
         return out
 
-    def kernels(self, told: Array, pi: Array, readings: Array) -> Array:
+    def kernels(self, responses: Array, pi: Array, readings: Array) -> Array:
         """What these forces add to `RowNoise.kernels` (W, steps, n_v, sensors), for parameters π (n_pi,).
 
-        told (W, steps, E): windows' `responses`. readings (W, n_v, sensors): displacements by each sensor's reading.
+        responses (W, steps, E): of the windows. readings (W, n_v, sensors): displacements by each sensor's reading.
         """
-        out = np.zeros((*told.shape[:2], *readings.shape[1:]))
+        out = np.zeros((*responses.shape[:2], *readings.shape[1:]))
         for row in np.unique(self.rows):
             own = self.rows == row
-            out[:, :, row] = (told[..., own] * pi[self.coefficients[own]]) @ readings[:, self.coordinates[own]]
+            out[:, :, row] = (responses[..., own] * pi[self.coefficients[own]]) @ readings[:, self.coordinates[own]]
         return out
 
 

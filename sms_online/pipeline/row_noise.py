@@ -6,7 +6,7 @@ balance; and ∫ φ n_τ dt from the noise of the torque. White noise of 1σ per
 windows that overlap share noise, so their covariance is block-banded; see `whitening`.
 
 A force that nobody knows, as dry friction's at a standstill, is an error of all windows that see it: what it adds to
-one says what it adds to the others, and what they hold beside it is still told.
+one says what it adds to the others, and what they hold beside it is still informative.
 
 Devices with clocks of their own are all a little early or late against each other, by the same for seconds. Over a
 window that is an error of the row in proportion to the rates of that device's readings.
@@ -30,7 +30,7 @@ STEPS_A_HOP = STEPS // HOPS
 # Share of the variance by sensors that is added to a row alone, for the rounding of the factorisation.
 OWN_SHARE = 1e-7
 # What the clock of a device is off by, 1σ, s, when it has been watched for CLOCK_KNOWN, s, and before. The line behind
-# it is told by the least delayed samples, which reach the loop some 100 µs late, give or take 50; few tell less.
+# it is fitted to the least delayed samples, which reach the loop some 100 µs late, give or take 50; few give less.
 CLOCK_ERROR, YOUNG_CLOCK_ERROR, CLOCK_KNOWN = 5e-5, 1e-4, 10.0
 
 
@@ -58,14 +58,14 @@ class RowNoise(Stage):
         self._clocks = [(list(clock.sensors), [joint_rows[i - 1] for i in clock.joints]) for clock in clocks]
         self._step = span / STEPS
         self._phi, self._phi_dot, self._phi_ddot = test_function(STEPS, span, EXPONENT)
-        self._weights = [self._told(offset, span) for offset in range(SPARSE)]
+        self._weights = [self._kernel_weights(offset, span) for offset in range(SPARSE)]
         # ∫ φ(t) φ(t + k hops) dt.
         shifted = [self._phi[: STEPS + 1 - k * STEPS_A_HOP] @ self._phi[k * STEPS_A_HOP :] for k in range(HOPS)]
         self._overlap = self._step * np.array(shifted)
         self.state = RowNoiseState()
 
-    def _told(self, offset: int, span: float) -> Array:
-        """Weights (STEPS + 1, ·) that make c out of H, Ḣ, ∂Pπ/∂x, ∂Gπ/∂v and ∂Gπ/∂x where they are told."""
+    def _kernel_weights(self, offset: int, span: float) -> Array:
+        """Weights (STEPS + 1, ·) that make c out of H, Ḣ, ∂Pπ/∂x, ∂Gπ/∂v and ∂Gπ/∂x where they are computed."""
         steps, instants = np.arange(STEPS + 1.0), np.arange(0.0, STEPS + 1.0, STEPS // INSTANTS)
         dense = _interpolation(steps, instants)
         sparse = _interpolation(steps, instants[nodes(offset)])
@@ -93,7 +93,7 @@ class RowNoise(Stage):
 
         rates (W, INSTANTS + 1, sensors): of the readings.
         """
-        # Every other step stands between two instants and counts half for each.
+        # Every other step lies between two instants and counts half for each.
         weights = kernels[:, ::2].copy()
         weights[:, :-1] += 0.5 * kernels[:, 1::2]
         weights[:, 1:] += 0.5 * kernels[:, 1::2]

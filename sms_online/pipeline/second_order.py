@@ -1,4 +1,4 @@
-"""What noise does to rows beyond first order, which nothing propagates: told by rows of noisy copies of the samples."""
+"""Second-order noise of rows, which nothing propagates: estimated from rows of noisy copies of the samples."""
 
 from __future__ import annotations
 

@@ -18,7 +18,7 @@ from sms_online.model.static_shape import PointedShape, SensedShape
 from sms_online.state import Stage, State
 from sms_online.stream import Array, Block
 
-# Of points whose noise is not stated, m; it weighs them against what is known of a link's frame and shape.
+# Noise of points that state none, m; it weights them against what is known of a link's frame and shape.
 USUAL_NOISE = 1e-4
 EULER_PARAMETERS = ("eps_x", "eps_y", "eps_z", "eta")
 
@@ -47,7 +47,7 @@ def stated_period(system: System, channels: Sequence[str]) -> float:
 def is_slow(period: float, window: float) -> bool:
     """Whether samples of some period, s, are too few for windows of the momentum balance of some length, s.
 
-    Between them the motion is interpolated by polynomials. A window weighs its middle half, in which these must follow.
+    Between them the motion is interpolated by polynomials. A window weights its middle half: these must follow there.
     """
     return window < LEAST_IN_WINDOW * period
 
@@ -56,7 +56,7 @@ class Sensing:
     """Which of a source's channels give each coordinate and torque of a model.
 
     channels: those it takes, in an order of its own. torque_columns: the torques' among them, drive by drive.
-    unused: the source's others. In place of q_i a flexible joint may have the strain of the strip that it stands for,
+    unused: the source's others. In place of q_i a flexible joint may have the strain of the strip that it represents,
     an angle beyond θ_m_i. A flexible link needs one marker at least, in its own frame or, where nothing is read there,
     in the laboratory's; where it has fewer readings than coordinates, or points, its shape is the static one, and
     `missing` names what is not read. Not so on a spatial free base, where every marker is needed.
@@ -168,7 +168,7 @@ class Sensing:
 
     @property
     def position_columns(self) -> list[int]:
-        """Channels of the position sensors, in the order of the coordinates that they stand for, where none is missing.
+        """Channels of the position sensors, in the order of the coordinates that they measure, where none is missing.
 
         There are n_x then, and `displacements` and `coordinate_noise` hold.
         """

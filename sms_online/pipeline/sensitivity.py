@@ -16,8 +16,8 @@ from sms_online.pipeline.momentum_windows import INSTANTS
 from sms_online.state import Stage, State
 from sms_online.stream import Array
 
-# Derivatives of the force and of the momentum by displacements, which weigh little beside the mass matrix, are told at
-# every other instant and interpolated: on the planar example with strong noise that costs 3 % in accuracy, telling them
+# Derivatives of the force and of the momentum by displacements, small beside the mass matrix, are computed at
+# every other instant and interpolated: on the planar example with strong noise that costs 3 % in accuracy, doing so
 # at every fourth one 17 %.
 SPARSE = 2
 
@@ -42,7 +42,7 @@ class Sensitivity:
 
 
 def nodes(offset: int) -> NDArray[np.int64]:
-    """Instants of a window that derivatives of the force are told at."""
+    """Instants of a window at which derivatives of the force are computed."""
     return np.arange(offset, INSTANTS + 1, SPARSE)
 
 
@@ -83,7 +83,7 @@ class Sensitivities(Stage):
         self.forget(0)
 
     def forget(self, next_instant: int) -> None:
-        """Begin anew: `next_instant` is the number of the first one to be told."""
+        """Begin anew: `next_instant` is the number of the first one to come."""
         n_v, n_x = self.model.layout.n_v, self.model.layout.n_x
         self.state = SensitivityState(
             first=next_instant,
@@ -95,10 +95,10 @@ class Sensitivities(Stage):
 
     @property
     def next_instant(self) -> int:
-        """Number of the instant after the last one told."""
+        """Number of the instant after the last one taken."""
         return self.state.first + len(self.state.dense)
 
-    def tell(self, pi: Array, x: Array, v: Array, signals: Array) -> Array:
+    def extend(self, pi: Array, x: Array, v: Array, signals: Array) -> Array:
         """Take the next instants: x (K, n_x), v (K, n_v), signals (K, joints + n_states), with parameters π.
 
         What geometries change momentum and force by there (2, K, n_v, c).
@@ -113,9 +113,9 @@ class Sensitivities(Stage):
         # The rates of the readings themselves, of which Euler parameters are one more than speeds.
         inverse = np.linalg.inv(readings) if v.shape[1] == readings.shape[2] else np.linalg.pinv(readings)
         now.rates = np.concatenate((now.rates, (inverse @ v[:, :, None])[:, :, 0]))
-        told, by_geometry = self._derivatives.at(pi, x, v, signals, H, sparse)
+        derivatives, by_geometry = self._derivatives.at(pi, x, v, signals, H, sparse)
         now.numbers = np.concatenate((now.numbers, numbers[sparse]))
-        now.derivatives = np.concatenate((now.derivatives, told))
+        now.derivatives = np.concatenate((now.derivatives, derivatives))
         return by_geometry
 
     @property
@@ -136,8 +136,8 @@ class Sensitivities(Stage):
         H_dot = (self._slope @ H.reshape(len(starts), INSTANTS + 1, -1)).reshape(H.shape)
         offset = int(-starts[0] % SPARSE)
         at = nodes(offset)
-        told = now.derivatives[np.searchsorted(now.numbers, starts)[:, None] + np.arange(at.size)]
-        P_x, G_v, G_x = (told[..., k * n_v : (k + 1) * n_v] @ readings[:, at] for k in range(3))
+        derivatives = now.derivatives[np.searchsorted(now.numbers, starts)[:, None] + np.arange(at.size)]
+        P_x, G_v, G_x = (derivatives[..., k * n_v : (k + 1) * n_v] @ readings[:, at] for k in range(3))
         middle = readings[:, INSTANTS // 2]
         return Sensitivity(H @ readings, H_dot @ readings, P_x, G_v, G_x, offset, now.rates[inside], middle)
 

@@ -57,7 +57,7 @@ class NoiseEstimateState(State):
 
 
 class NoiseEstimate(Stage):
-    """Collects each channel's own samples, which are not interpolated, and tells the noise of all.
+    """Collects each channel's own samples, which are not interpolated, and estimates the noise of all.
 
     sample_rate: of the grid, Hz. pass_band: frequency that the windows let pass best, Hz.
     """
@@ -86,7 +86,7 @@ class NoiseEstimate(Stage):
         for k, column in enumerate(values.T):
             fresh = np.stack((t, column))[:, np.isfinite(column)]
             last = self.state.samples[k][0, -1:] if self.state.samples[k].size else -np.inf
-            fresh = fresh[:, np.diff(fresh[0], prepend=last) > 0.0]  # duplicates tell nothing
+            fresh = fresh[:, np.diff(fresh[0], prepend=last) > 0.0]  # duplicates hold no information
             self.state.largest[k] = max(self.state.largest[k], np.abs(fresh[1]).max(initial=0.0))
             self.state.samples[k] = np.concatenate((self.state.samples[k], fresh), axis=1)[:, -SAMPLES:]
 

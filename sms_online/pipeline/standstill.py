@@ -1,4 +1,4 @@
-"""Where an axis stands still: there dry friction takes any value up to what breaks it loose, and no law says which."""
+"""Where an axis is at rest: there stiction takes any value up to breakaway, and no law says which."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from sms_online.pipeline.smoothing import HALF_WIDTHS, kernel, smooth_all
 from sms_online.state import Stage, State
 from sms_online.stream import Array
 
-# An axis stands still where its rate is below this multiple of the rate's noise for so long, s. At a reversal it is for
+# An axis is at rest where its rate is below this multiple of the rate's noise for so long, s. At a reversal it is for
 # less, unless it sticks there, or is turned round by less than 1 rad/s² (noise of 1e-4 rad at 1 kHz).
 STILL, LASTING = 4.0, 0.06
 # Half width of the filter of that rate, s.
@@ -17,12 +17,12 @@ HALF_WIDTH = 0.028
 
 
 def rate_filter(sample_rate: float) -> int:
-    """Half width of the filter of the rate that standstill is told by, samples."""
+    """Half width of the filter of the rate that shows a standstill, samples."""
     return max(HALF_WIDTHS[0], round(HALF_WIDTH * sample_rate))
 
 
 def slowest(noise: float, half_width: int, sample_rate: float) -> float:
-    """Rate below which an axis may stand still, rad/s (m/s), for a position's noise of 1σ a sample and its filter."""
+    """Rate below which an axis may be at rest, rad/s (m/s), for a position's noise of 1σ a sample and its filter."""
     return STILL * noise * float(np.linalg.norm(kernel(half_width)[:, 1])) * sample_rate
 
 
@@ -46,7 +46,7 @@ class StandstillState(State):
 
 
 class Standstill(Stage):
-    """Where motors (D,) stand still along one gap-free motion, as far as its samples tell by now.
+    """Where motors (D,) are at rest along one gap-free motion, as far as its samples show by now.
 
     samples are numbered from 0.
     """
@@ -75,7 +75,7 @@ class Standstill(Stage):
     def drop(self, before: int) -> None:
         """Forget what nobody asks for who asks for samples from number `before` on."""
         now = self.state
-        # The newest rates are as far behind as the filter reaches, and with them what they have lasted is told.
+        # The newest rates are as far behind as the filter reaches, and what they have lasted follows from them.
         reach = 2 * self._half_width + round(LASTING * self._rate) + 1
         drop = max(0, before - reach - now.first)
         now.angles, now.still, now.first = (

@@ -177,7 +177,7 @@ class Statistics:
         return joint.without_nuisances(len(setup.nuisances))
 
     def shift(self, estimate: Estimate) -> Array:
-        """By how much noise in the columns pulls the momentum balance's estimate (n,), as far as that is known."""
+        """By how much noise in the columns biases the momentum balance's estimate (n,), as far as that is known."""
         m = len(self.setup.nuisances)
         determined = np.concatenate((np.isfinite(estimate.nuisances_std), estimate.determined))
         assert self.momentum is not None

@@ -96,7 +96,7 @@ class Synchroniser(Stage):
 
     A sample on a grid point passes bit for bit. Elsewhere a channel is interpolated from its own samples by the
     polynomial of degree 5 through the six nearest, three on each side. Off-centre or lower-degree interpolation at
-    the borders of a segment would have another error and another noise there, unknown to whoever weighs the
+    the borders of a segment would have another error and another noise there, unknown to whoever whitens the
     samples, so grid points without a full stencil are not delivered. Runs of three and more samples on neighbouring
     grid points pass up to the border, and what is interpolated beside them has its stencil in them.
     A segment is a run of grid points at which every channel has a value; a hole in any channel ends it. Whatever the
@@ -226,7 +226,7 @@ class Synchroniser(Stage):
         """Decide grid points as far as the samples allow; deliver those that every channel has."""
         silent = self.state.time[-1] - self.state.last_time > LONGEST_HOLE
         for channel in np.flatnonzero(np.isnan(self._periods.known) & (silent | final)).tolist():
-            self._periods.settle(channel)
+            self._periods.decide(channel)
         k = self._candidates()
         decided = np.ones(k.size, dtype=bool)
         complete = np.ones(k.size, dtype=bool)
@@ -324,7 +324,7 @@ class Synchroniser(Stage):
         return values
 
     def _forget(self, groups: list[_Group]) -> None:
-        """Drop the rows that no undecided grid point can need; the last row stays, it tells how late it is."""
+        """Drop the rows that no undecided grid point can need; the last row stays, for its time is the latest."""
         needed = self.state.time.size - 1
         due = self.state.next / self.sample_rate
         for group in groups:

@@ -19,7 +19,7 @@ from sms_online.pipeline.sensor_noise import SensorNoise
 from sms_online.state import Stage, State
 from sms_online.stream import Array
 
-# Numbers of the windows' kernels that are worked off together: of few sensors NumPy's calls would cost most of it, of
+# Numbers of the windows' kernels that are processed together: of few sensors NumPy's calls would cost most of it, of
 # many sensors all windows at once would fill the memory.
 TOGETHER = 2**17
 
@@ -97,17 +97,17 @@ class WindowNoise(Stage):
         """Noise that β began with."""
         return self.state.sensor_noise
 
-    def tell(self, first: int, x: Array, v: Array, signals: Array) -> None:
-        """Take the states (K, ·) of the instants from number `first` on, of which it needs those not told yet."""
+    def extend(self, first: int, x: Array, v: Array, signals: Array) -> None:
+        """Take the states (K, ·) of the instants from number `first` on, of which it needs those not taken yet."""
         fresh = self._sensitivities.next_instant - first
         assert self.state.beta is not None
         pi = self._rough.without(self._base.physical_values(self.state.beta))
         x, v, signals = x[fresh:], v[fresh:], signals[fresh:]
         if not len(x):
             return
-        by_geometry = self._sensitivities.tell(pi, x, v, signals)
+        by_geometry = self._sensitivities.extend(pi, x, v, signals)
         if self._calibration is not None:
-            self._calibration.tell(x, signals, self._sensitivities.rates(len(x)), by_geometry)
+            self._calibration.extend(x, signals, self._sensitivities.rates(len(x)), by_geometry)
 
     def drop(self, instant: int) -> None:
         """Forget what no window that starts at an instant or later asks for."""

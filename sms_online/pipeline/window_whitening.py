@@ -1,8 +1,8 @@
-"""Windows weighed one after the other with the same parameters: a chain of rows, each told apart from all before it.
+"""Sequential whitening of windows with fixed weights: each row is the innovation given all rows before it.
 
-What rows of neighbouring windows do not share is what they tell, and a row is told apart from the nine windows that
-overlap its own better with what these were themselves told apart from: the noise is a moving average whose sum over
-all windows nearly vanishes, and such a one is foreseen from its whole past only. A chain that begins anew knows less
+What rows of neighbouring windows do not share is their information. A row is predicted from the nine windows that
+overlap its own better with the windows before those too: the noise is a moving average whose sum over
+all windows nearly vanishes, and only its whole past predicts such a one. A filter that begins anew knows less
 for a second or two, and calls its rows independent of those before, which they are not.
 """
 
@@ -23,7 +23,7 @@ from sms_online.stream import Array
 
 
 @dataclass(frozen=True)
-class Weighed:
+class WhitenedWindow:
     """A window's rows (n_v, width), independent of all before and of each other, errors of unit variance.
 
     late (n_v, G): columns of the sources' latencies, likewise. calibration (n_v, m), twice: columns of what the
@@ -38,7 +38,7 @@ class Weighed:
     covariance: Array
 
 
-class WeighingState(State):
+class WindowWhiteningState(State):
     """What weights were begun with.
 
     misfit (n_v,): variance of what the model lacks in each row, over that of the noise.
@@ -47,16 +47,16 @@ class WeighingState(State):
     misfit: Array
 
 
-class Weighing(Stage):
+class WindowWhitening(Stage):
     """Whitens windows with the noise that parameters β (n,) and sensors give them, and a misfit (n_v,), see `begin`.
 
-    noise: that of the windows. sources: whose latencies are told. width: of the rows, in columns, those of calibration
-    not counted.
+    noise: that of the windows. sources: whose latencies are estimated. width: columns of the rows, without those of
+    calibration.
     """
 
     def __init__(self, noise: WindowNoise, width: int, sources: Sequence[SourceGroup] = ()) -> None:
         self.noise = noise
-        self.state = WeighingState(np.zeros(noise.n_v))
+        self.state = WindowWhiteningState(np.zeros(noise.n_v))
         self._late = LatencyColumns(sources)
         self._whitener = Whitener(width + len(sources) + noise.nuisances)
 
@@ -71,7 +71,7 @@ class Weighing(Stage):
         return self.noise.beta
 
     def begin(self, beta: Array, noise: SensorNoise, misfit: Array, instant: int) -> None:
-        """Begin a chain with the window that starts at an instant, as if no window before shared samples with it.
+        """Begin with the window that starts at an instant, as if no window before shared samples with it.
 
         misfit (n_v,): variance of what the model lacks in each row, over that of the noise.
         """
@@ -84,12 +84,12 @@ class Weighing(Stage):
         self.noise.begin_segment()
         self._whitener.begin_segment()
 
-    def push(self, windows: Sequence[Window], rows: Array, errors: Array) -> list[Weighed]:
+    def push(self, windows: Sequence[Window], rows: Array, errors: Array) -> list[WhitenedWindow]:
         """The next windows' rows (W, n_v, width); errors (W, n_v): variance of each that nothing propagates."""
         propagated = self.noise.push(windows, errors)
-        return [self._weighed(noise, own) for noise, own in zip(propagated, rows, strict=True)]
+        return [self._whitened(noise, own) for noise, own in zip(propagated, rows, strict=True)]
 
-    def _weighed(self, noise: PropagatedNoise, rows: Array) -> Weighed:
+    def _whitened(self, noise: PropagatedNoise, rows: Array) -> WhitenedWindow:
         """Of one window."""
         own = noise.covariances[-1]
         of_noise = own.copy()
@@ -103,4 +103,4 @@ class Weighing(Stage):
             rows = np.concatenate((rows, noise.calibration), axis=1)
         white = self._whitener.push(noise.covariances, rows)
         calibration = noise.calibration, white[:, calibrated:]
-        return Weighed(white[:, :width], white[:, width:calibrated], calibration, of_noise, own)
+        return WhitenedWindow(white[:, :width], white[:, width:calibrated], calibration, of_noise, own)

@@ -20,7 +20,7 @@ from sms_online.linearised import LinearSystem, Motion
 from sms_online.model.dynamics import Dynamics
 from sms_online.stream import Array
 
-# States worked off together: enough to hide the cost of a call, little memory.
+# States evaluated in one call: enough to hide its overhead, little memory.
 STATES_PER_CALL = 512
 
 

@@ -53,21 +53,21 @@ STEPS = (0.005, 0.0025, 0.00125)
 REFINED = 1.0
 # A step of the search that moves no parameter by more standard deviations than this ends it: the next one would be
 # smaller by far, as the convergence is quadratic near the end.
-SETTLED = 0.5
+CONVERGED = 0.5
 MAX_STEPS = 8
 # With white forces left, which a start that is far from the answer needs, it takes more of them.
 MORE_STEPS = 16
-# Derivatives by displacements are told that often and interpolated, s; they only steer the search.
+# Derivatives by displacements are computed that often and interpolated, s; they only steer the search.
 DERIVATIVES_INTERVAL = 0.04
 # Mean square of the whitened innovations that noise alone may leave: a span of some seconds scatters by a hundredth,
 # the noise behind it is estimated to a tenth.
 LARGEST_MEAN_SQUARE = 1.2
-# Directions of β that the rows tell less of than this share of the best told, in units of the columns' sizes, are left
+# Directions of β with less information than this share of the best one's, in units of the columns' sizes, are left
 # as they are: derivatives are good to 1e-8.
 RANK_TOLERANCE = 1e-8
 # A step of the search is halved so often, where β is no mechanism's after it.
 MOST_HALVINGS = 6
-# Mass matrices are looked at that often along the motion, s.
+# Mass matrices are checked that often along the motion, s.
 MASS_INTERVAL = 0.1
 
 
@@ -188,14 +188,14 @@ class _Search:
         for k, step in enumerate(steps):
             self.refine(step)
             before = self.beta, self.motion
-            if not self.settled(0.0):
+            if not self.converge(0.0):
                 break
             if k and np.all(np.abs(self.beta - before[0]) <= REFINED * self.std):
                 break
         for level in (0.0, *ALLOWED):
             if level:
                 self.beta, self.motion = before
-                if not self.settled(level, MORE_STEPS):
+                if not self.converge(level, MORE_STEPS):
                     continue
             if self.mean_square <= LARGEST_MEAN_SQUARE:
                 return SpanFit(self.factor, self.beta, self.rows, self.mean_square, level, step)
@@ -208,13 +208,13 @@ class _Search:
             if self.mean_square <= LARGEST_MEAN_SQUARE:
                 return
 
-    def settled(self, level: float, most: int = MAX_STEPS) -> bool:
+    def converge(self, level: float, most: int = MAX_STEPS) -> bool:
         """Search until β converges, in so many steps at most; whether it does."""
         try:
             for _ in range(most):
                 before = self.beta
                 self.advance(level, tame=False)
-                if np.all(np.abs(self.beta - before) <= SETTLED * self.std):
+                if np.all(np.abs(self.beta - before) <= CONVERGED * self.std):
                     return True
         except NO_NUMBERS:
             pass
@@ -252,7 +252,7 @@ class _Search:
         self.mean_square = float(np.mean((innovations[:, 0] - Y @ delta) ** 2))
         self.std = np.sqrt(np.diag(solution.covariance()))
         s = kalman.smooth(delta)
-        # The motion is moved by its speeds, not by its momenta: of light coordinates momenta tell the speeds badly.
+        # The motion is moved by its speeds, not by its momenta: of light coordinates momenta give the speeds badly.
         moved = [
             by_s @ s[k : k + len(by_s), :, None] + by_beta @ delta[:, None]
             for k, (by_s, by_beta) in zip(range(0, len(s), nodes), speeds, strict=True)
@@ -295,7 +295,7 @@ class _Search:
         return np.linalg.lstsq(problem[:, :n] / size, problem[:, n], rcond=RANK_TOLERANCE)[0] / size, solve(problem)
 
     def _admissible(self, beta: Array, solution: Solution, loose: bool) -> Array:
-        """β, or of real bodies the nearest while equations are loose, or as much of the step as leaves a mechanism.
+        """β; or the nearest consistent one while equations are loose, or as much of the step as leaves a mechanism.
 
         Mass matrices are linear in β, so those that are positive definite make a convex set, which the search is in.
         """

@@ -1,4 +1,4 @@
-"""The smoother of a session: samples gathered into spans, each span fitted with what the spans before it told."""
+"""The smoother of a session: samples gathered into spans, each fitted with the spans before it as its prior."""
 
 from __future__ import annotations
 
@@ -116,7 +116,7 @@ class Smoother(Stage):
         )
 
     def set_prior(self, prior: Prior) -> None:
-        """Weigh the samples against what is known of the base parameters beforehand; before the first sample."""
+        """Add what is known of the base parameters beforehand as a prior; before the first sample."""
         self.prior = prior
 
     @property
@@ -142,7 +142,7 @@ class Smoother(Stage):
         now.index, now.torque = np.concatenate((now.index, index)), np.concatenate((now.torque, piece.values))
 
     def move(self, index: NDArray[np.int64], x: Array, v: Array) -> None:
-        """Take the motion as the sensors alone tell it, at grid samples (B,): x (B, n_x), v (B, n_v)."""
+        """Take the motion as the sensors alone give it, at grid samples (B,): x (B, n_x), v (B, n_v)."""
         now = self.state
         now.moved = np.concatenate((now.moved, index))
         now.motion = np.concatenate((now.motion, np.concatenate((x, v), axis=1)))
@@ -150,7 +150,7 @@ class Smoother(Stage):
     def work(self, first_fit: Callable[[], Estimate], last: bool = False) -> None:
         """Fit the spans that are complete; `last` at the end of the session.
 
-        first_fit: gives an estimate to begin with, until a span has told one.
+        first_fit: gives an estimate to begin with, until a span has one.
         """
         if last:
             for piece in self._synchroniser.flush():
@@ -199,7 +199,7 @@ class Smoother(Stage):
         begin, end = torque_t[0], torque_t[-1]
         inside = (now.t >= begin) & (now.t <= end)
         moved = (now.moved >= now.index[0, 0]) & (now.moved <= now.index[count - 1, 0])
-        values, sigma, torque_density = self._weighed(now.t[inside], now.values[inside], now.torque[:count])
+        values, sigma, torque_density = self._with_noise(now.t[inside], now.values[inside], now.torque[:count])
         sensed = np.flatnonzero(np.isfinite(sigma))
         readings = Readings(self._model, [self.channels[k] for k in sensed])
         guess = self._guess(self._time(now.moved[moved]), now.motion[moved], now.t[inside], values)
@@ -207,7 +207,7 @@ class Smoother(Stage):
         smoother = SpanSmoother(self._model, self._base, readings, sigma[sensed], torque_density)
         try:
             if not moved.any():
-                raise DivergedError("the sensors tell no motion to begin with")
+                raise DivergedError("the sensors give no motion to begin with")
             past = now.known
             beta = past.beta if past.spans else self._realisable(first_fit())
             known = triangular_factor(prior_factor(self.prior, self._base.n), past.factor)
@@ -271,7 +271,7 @@ class Smoother(Stage):
         )
 
     def _realisable(self, estimate: Estimate) -> Array:
-        """β (n,) of the real bodies nearest to an estimate."""
+        """β (n,) of the physically consistent parameters nearest to an estimate."""
         variance = estimate.rss / estimate.dof if estimate.scale is None and estimate.dof > 0.0 else 1.0
         covariance = np.where(np.isfinite(estimate.covariance), estimate.covariance * max(variance, 1.0), np.inf)
         try:
@@ -279,7 +279,7 @@ class Smoother(Stage):
         except ArithmeticError as error:
             raise DivergedError(str(error)) from None
 
-    def _weighed(self, t: Array, values: Array, torque: Array) -> tuple[Array, Array, Array]:
+    def _with_noise(self, t: Array, values: Array, torque: Array) -> tuple[Array, Array, Array]:
         """Samples at t, their noise (C,), NaN where nothing is known of it, and the torques' density (joints,)."""
         sigma = stated_noise(self._model.system, self.channels)
         for k in np.flatnonzero(np.isnan(sigma)):

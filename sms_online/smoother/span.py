@@ -1,4 +1,4 @@
-"""What a smoother fits at once: a span of samples, and the nodes of time that its states stand at."""
+"""What a smoother fits at once: a span of samples, and the instants of its states."""
 
 from __future__ import annotations
 

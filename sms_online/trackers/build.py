@@ -32,7 +32,7 @@ class Tracked:
     """What a tracker is built for.
 
     parameters (n,): columns behind those of nuisances. prior: of nuisances and parameters (m + n,), where something is
-    known beforehand; scaled: rows are weighed against it, see `RecursiveLeastSquares`. rows_per_second: of the balance.
+    known beforehand; scaled: its scale follows the rows', see `RecursiveLeastSquares`. rows_per_second: of the balance.
     source: name of the system, for messages.
     """
 

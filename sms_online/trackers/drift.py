@@ -47,7 +47,7 @@ REMEMBERED = 32
 # From one search for ramps to the next, and from one choice of process noise to the next, knots.
 SEARCHED, CHOSEN = 2, 4
 # Knots before the first search: the first rows have weights that change.
-SETTLED = 3
+UNSEARCHED = 3
 # Times in which a rate changes by its own size, s: what process noise is chosen from, none the first; and in which it
 # decays, for what warms up, runs in or empties approaches an end.
 TIMES = (np.inf, 1e4, 1000.0, 300.0, 100.0, 30.0, 10.0, 3.0)
@@ -217,7 +217,7 @@ class LearnedTrend(Tracker):
             self.state.anchor = self.state.anchor.absorbed(gone).advanced(following)
         if not self.state.quiet:
             self.state.likeliest = self.state.suspected = None
-        elif self.state.knots > SETTLED and self.state.knots % SEARCHED == 0:
+        elif self.state.knots > UNSEARCHED and self.state.knots % SEARCHED == 0:
             self._search()
         if any(each.learned for each in self.state.moving) and self.state.knots % CHOSEN == 0:
             self._choose()

@@ -5,7 +5,7 @@ A factor is the (n + 1, n + 1) upper triangle of a QR decomposition of the white
     [ R  z ]    RᵀR = YᵀY,  Rᵀz = Yᵀb,
     [ 0  ρ ]    ρ² = residual sum of squares,
 
-so that a factor stands for its rows in every later QR. Householder QR is backward stable column by column (Higham,
+so that a factor replaces its rows in every later QR. Householder QR is backward stable column by column (Higham,
 Accuracy and Stability of Numerical Algorithms, 2002, theorem 19.4), so columns of very different units need no scaling
 before the solution; and RᵀR is never formed, which would square the condition number.
 """

@@ -101,7 +101,7 @@ class Estimate:
     infinite variance and zeros beside it. determined: (n,) bool. condition_number: of the column-scaled information
     factor, inf where its rank is not full. rows: number of rows, less where old ones count less.
     rss: residual sum of squares of the whitened rows, priors included. dof: its degrees of freedom. scale: what the
-    rows' stated std were multiplied with to weigh them against a prior; None where they were taken as stated.
+    rows' stated std were multiplied with to weight them against a prior; None where they were taken as stated.
     nuisances, nuisances_std (m,): what was estimated beside π, see `without_nuisances`; crossed (m, n): its covariance
     with π.
     """

@@ -10,7 +10,7 @@ neighbours merge by one QR. The Gram form YᵀY would add more cheaply but loses
 1e4, since Λ⁻¹ then amplifies its rounding by the condition number squared.
 
 Limitations: valid for plain least squares only. With forgetting, the weights of old rows express drift of π rather than
-noise, and no residual tells how far π has drifted. Errors must be uncorrelated over a cluster's length; in short runs
+noise, and no residual shows how far π has drifted. Errors must be uncorrelated over a cluster's length; in short runs
 (fewer than a few dozen clusters) intervals are somewhat too narrow.
 """
 

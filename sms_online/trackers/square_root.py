@@ -30,7 +30,7 @@ class RecursiveLeastSquares(Tracker):
     they were split into calls; an estimate counts the pending rows too and leaves them pending.
     A prior is not measured by the rows and does not age: it is added at each estimate and never forgotten.
     scaled_by_residual: the rows' std are right up to a common factor; it is taken from what the rows leave among
-    themselves, so that they can be weighed against a prior and covariances need no scaling afterwards.
+    themselves, so that they can be weighted against a prior and covariances need no scaling afterwards.
     Source: Bierman, Factorization Methods for Discrete Sequential Estimation, 1977, chapter IV (SRIF data processing).
     """
 
@@ -109,7 +109,7 @@ def session_tracker(n: int, prior: Prior | None, nuisances: int = 0) -> Recursiv
 
 
 def _residual_std(content: Content) -> float:
-    """Standard deviation of the whitened rows about their own solution; 1 where there are too few to tell."""
+    """Standard deviation of the whitened rows about their own solution; 1 where there are too few of them."""
     alone = solve(content.factor)
     freedom = content.rows - alone.rank
     size = float(np.linalg.norm(content.factor[:, -1]))
