@@ -1,4 +1,4 @@
-"""A tracker whose rows can be looked at afterwards."""
+"""A tracker that keeps its rows for inspection."""
 
 from __future__ import annotations
 

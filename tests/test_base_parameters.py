@@ -91,7 +91,7 @@ def test_number_of_base_parameters_of_a_rigid_arm() -> None:
 
 
 def test_known_parameters_leave_the_unknowns() -> None:
-    """With the mass of motor 1 known the spacecraft's mass stands alone, and the known masses enter as numbers."""
+    """With the mass of motor 1 known the spacecraft's mass is separable, and the known masses enter as numbers."""
     model = build_model(CASES["some known"])
     base = find_base_parameters(model)
     names = [p.name for p in base.parameters]

@@ -207,14 +207,14 @@ def test_the_linearisation_predicts_a_moved_spatial_arm(
         1e-6 * rng.standard_normal(shape) for shape in ((x.shape[0], 2), v.shape, v.shape, beta.shape)
     )
 
-    def told(sign: float) -> tuple[Array, Array, Array]:
+    def at_shifted(sign: float) -> tuple[Array, Array, Array]:
         """Momentum, its rate and the readings."""
         at = moved(model, x, sign * dx), v + sign * dv
         P, G = model.momentum_columns(*at)
         pi = base.physical_values(beta + sign * d_beta)
         return P @ pi, G @ pi + model.generalized_force(sign * torque), readings(*at)
 
-    dp, force, reading = (0.5 * (plus - minus) for plus, minus in zip(told(1.0), told(-1.0), strict=True))
+    dp, force, reading = (0.5 * (plus - minus) for plus, minus in zip(at_shifted(1.0), at_shifted(-1.0), strict=True))
     s = np.concatenate((dx, dp), axis=1)
     u = np.concatenate((torque, np.broadcast_to(d_beta, (x.shape[0], base.n))), axis=1)
     s_dot = ((linear.A @ s[..., None]) + (linear.E @ u[..., None]))[..., 0]
@@ -222,7 +222,7 @@ def test_the_linearisation_predicts_a_moved_spatial_arm(
     assert_allclose(s_dot[:, n_v:], force, rtol=1e-5, atol=1e-6 * np.abs(force).max())
     speeds = s_dot[:, :n_v].copy()
     speeds[:, 3:6] -= np.cross(v[:, 3:6], dx[:, 3:6])  # φ̇ = δω + ω × φ
-    # As momenta: a difference of momenta tells the speeds of light nodes to a thousandth, of the base to 1e-5.
+    # As momenta: a difference of momenta gives the speeds of light nodes to a thousandth, of the base to 1e-5.
     H_speeds, H_dv = ((linear.H @ part[..., None])[..., 0] for part in (speeds, dv))
     assert_allclose(H_speeds, H_dv, rtol=1e-5, atol=1e-6 * np.abs(H_dv).max())
     predicted = (linear.C @ s[..., None])[..., 0] + linear.D @ d_beta

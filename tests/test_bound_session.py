@@ -1,4 +1,4 @@
-"""What a results document says beside an estimate: the bound of its session, and the nearest real bodies."""
+"""What a results document says beside an estimate: the bound of its session, and the nearest consistent parameters."""
 
 from __future__ import annotations
 
@@ -91,7 +91,7 @@ def test_a_session_without_noise_or_without_motion_has_no_bound(simulation: Simu
     assert all(p["bound"] is None for p in document["parameters"])
 
 
-def test_estimates_of_real_bodies_stand_alone(simulation: Simulation) -> None:
+def test_consistent_estimates_get_no_second_value(simulation: Simulation) -> None:
     document = results_document(session(simulation, "A"), 1.0, [])
     assert document["physical"] == {"distance_std": 0.0, "active": []}
     assert all(p["projected"] is None for p in document["parameters"])

@@ -25,7 +25,7 @@ from sms_sim.simulate import sampled_blocks
 from tests.exactly_known import EXACTLY
 from tests.simulations import planar
 
-# Two clocks and two parameters, of rows that tell all of them.
+# Two clocks and two parameters, of rows that determine all of them.
 NUISANCES = (Nuisance("clock", "a", "s", 0.5), Nuisance("clock", "b", "s", np.inf))
 
 

@@ -1,4 +1,4 @@
-"""Captures: what is written reads back to the bit, and bad files are told apart from interrupted ones."""
+"""Captures: what is written reads back to the bit, and bad files are distinguished from interrupted ones."""
 
 from __future__ import annotations
 

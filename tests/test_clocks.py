@@ -217,7 +217,7 @@ def test_pi_is_as_good_as_on_one_clock(tmp_path: Path) -> None:
 
 
 def test_rows_come_in_the_estimators_portions_and_none_late(tmp_path: Path) -> None:
-    """Against a merger that decodes at every tick: what a portion lacks is told by the items that wait."""
+    """Against a merger that decodes at every tick: what a portion lacks is known from the items that wait."""
     system = axis_testbed(tmp_path)
     bus = AxisBus(seconds=8.0)
     in_step, eager = merger(system, tmp_path), Merger(lanes(system, tmp_path))

@@ -64,7 +64,7 @@ def test_a_closed_terminal_ends_a_session_with_results(tmp_path: Path, terminal:
         said = ""
         while running not in said and process.poll() is None:
             said += os.read(near, 4096).decode(errors="replace")
-        os.close(near)  # the kernel tells the session's first process
+        os.close(near)  # the kernel signals the session's first process
         assert process.wait(PATIENCE) == code, said
     finally:
         kill(process)

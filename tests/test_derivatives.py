@@ -37,7 +37,7 @@ def test_derivatives_are_those_of_central_differences(name: str) -> None:
     x, v, signals = states(model, 3)
     dynamics, n_v = model.dynamics(model.nominal), model.layout.n_v
     chosen = np.array([True, False, True])
-    told, _ = Derivatives(model).at(model.nominal, x, v, signals, dynamics.mass_matrix(x), chosen)
+    computed, _ = Derivatives(model).at(model.nominal, x, v, signals, dynamics.mass_matrix(x), chosen)
     inputs = model.inputs(signals)
     expected = np.zeros((len(x), n_v, 3 * n_v))
     for k, unit in enumerate(np.eye(n_v)):
@@ -49,7 +49,7 @@ def test_derivatives_are_those_of_central_differences(name: str) -> None:
         expected[:, :, 2 * n_v + k] = (by_x[0][1] - by_x[1][1]) / (2.0 * STEP)
     for part in np.split(np.arange(3 * n_v), 3):
         size = np.abs(expected[..., part]).max()
-        np.testing.assert_allclose(told[..., part], expected[chosen][..., part], rtol=0.0, atol=1e-6 * size)
+        np.testing.assert_allclose(computed[..., part], expected[chosen][..., part], rtol=0.0, atol=1e-6 * size)
 
 
 def test_a_long_motion_in_pieces_has_the_same_derivatives(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -58,7 +58,7 @@ def keys(diagnosis: Diagnosis) -> list[str]:
     return [finding.candidate.key for finding in diagnosis.findings]
 
 
-def told(diagnosis: Diagnosis) -> dict[str, float]:
+def reported(diagnosis: Diagnosis) -> dict[str, float]:
     return {name: value for name, (value, _) in coefficients(diagnosis, diagnosis.findings[0]).items()}
 
 
@@ -98,7 +98,7 @@ def test_the_missing_effect_is_named_with_its_place_and_size(text: str, accuracy
     diagnosis = diagnosed(text)
     assert diagnosis.verdict == "named"
     assert keys(diagnosis) == [f"{effect.name}@{effect.where}"]
-    found = told(diagnosis)
+    found = reported(diagnosis)
     assert {name: found[name] for name in effect.coefficients} == pytest.approx(effect.coefficients, rel=accuracy)
     assert any(row.beyond for row in diagnosis.before.test.values())
     assert not any(row.beyond for row in diagnosis.after.test.values())
@@ -200,7 +200,7 @@ def test_gaps_and_short_stretches_between_them_do_no_harm() -> None:
 
 @pytest.mark.slow
 def test_joints_at_rest_end_the_search_and_are_no_error() -> None:
-    """Encoders of joint 2 that stand still: whatever is said of such a session, it is said."""
+    """Encoders of joint 2 that are at rest: whatever is said of such a session, it is said."""
     block = block_of()
     values = block.values.copy()
     for channel in ("q_2", "theta_m_2"):

@@ -61,7 +61,7 @@ def test_a_true_effect_alone_is_named_beside_two_imperfections() -> None:
 
 @pytest.mark.slow
 def test_what_is_far_beyond_its_tolerance_is_an_effect() -> None:
-    """A gain is known to 1 %; the torque of joint 2 is read 4 % wrong, which one of the joints is nobody can tell."""
+    """A gain is known to 1 %; the torque of joint 2 is read 4 % wrong, of which joint, the data do not determine."""
     found = diagnosed(0.0, torque_gain(0.04))
     assert (found.verdict, keys(found)) == ("named", ["torque_gain@joint_2"])
 

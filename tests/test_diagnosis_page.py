@@ -167,11 +167,11 @@ def test_only_what_a_system_file_gains_is_shown() -> None:
 
 
 def test_what_was_found_is_remarked_in_the_system_file() -> None:
-    def told(name: str, estimate: float) -> dict[str, Any]:
+    def entry(name: str, estimate: float) -> dict[str, Any]:
         value = {"estimate": estimate, "std": 0.005, "unit": "N m"}
         return {"name": name, "where": "joint_1", "coefficients": {"torque": value}}
 
-    found = remarks([told("coulomb_friction", 20.0), told("coulomb_friction", 21.0), told("torque_delay", 0.02)])
+    found = remarks([entry("coulomb_friction", 20.0), entry("coulomb_friction", 21.0), entry("torque_delay", 0.02)])
     assert found["coulomb_friction@joint_1"] == "torque 20 ± 0.005 N m"
     system = load_system("paper-planar")
     late = Effect(name="torque_delay", where="joint_1", coefficients={"time": 0.02})

@@ -185,7 +185,7 @@ def test_hysteresis_saturates_and_turns_back_with_the_spring_s_slope() -> None:
     assert model.state_rate(x, v, np.zeros((1, 1)))[0, 0] == pytest.approx(0.3)
 
 
-def test_a_gap_is_told_by_what_it_takes_off_beyond() -> None:
+def test_a_gap_is_found_by_what_it_takes_off_beyond() -> None:
     """A spring that loses 4 % too much in a gap 4 % too narrow is that of the gap, unless what it loses is stated."""
     (own,) = with_effect("backlash@joint_1:gap=0.0096").effects
     assert own.relative_to == ("joint_1.stiffness",)
@@ -217,9 +217,9 @@ REPORTED = (
 def test_what_is_declared_is_what_is_reported(text: str) -> None:
     model = with_effect(text)
     names = [p.name for p in model.parameters]
-    told = report(model.effects[0], names, model.nominal, np.zeros((model.n_pi, model.n_pi)))
+    reported = report(model.effects[0], names, model.nominal, np.zeros((model.n_pi, model.n_pi)))
     for coefficient, value in model.system.effects[0].coefficients.items():
-        assert told[coefficient][0] == pytest.approx(value, rel=1e-12), coefficient
+        assert reported[coefficient][0] == pytest.approx(value, rel=1e-12), coefficient
 
 
 def test_an_amplitude_s_deviation_is_that_of_its_parts_along_it() -> None:
@@ -227,10 +227,10 @@ def test_an_amplitude_s_deviation_is_that_of_its_parts_along_it() -> None:
     model = with_effect("cogging@joint_1:amplitude=5,phase=0.9272952180016122,order=2")
     covariance = np.diag([0.01, 0.04])
     names = [p.name for p in model.effects[0].parameters]
-    told = report(model.effects[0], names, np.array([3.0, 4.0]), covariance)
-    assert told["amplitude"] == (pytest.approx(5.0), pytest.approx(np.hypot(0.06, 0.16), rel=1e-6))
-    assert told["phase"] == (pytest.approx(0.9272952180016122), pytest.approx(np.hypot(0.4, 0.6) / 25.0, rel=1e-6))
-    assert told["order"] == (2.0, 0.0)
+    reported = report(model.effects[0], names, np.array([3.0, 4.0]), covariance)
+    assert reported["amplitude"] == (pytest.approx(5.0), pytest.approx(np.hypot(0.06, 0.16), rel=1e-6))
+    assert reported["phase"] == (pytest.approx(0.9272952180016122), pytest.approx(np.hypot(0.4, 0.6) / 25.0, rel=1e-6))
+    assert reported["order"] == (2.0, 0.0)
 
 
 def test_a_ratio_needs_what_it_is_relative_to() -> None:

@@ -61,7 +61,7 @@ FORCES = (
     "torque_gain@joint_2:ratio=0.03",
     "torque_offset@joint_1:torque=0.02",
 )
-# Of those that act on the example's second joint and base, with what the estimator is told of each.
+# Of those that act on the example's second joint and base, with what is declared of each to the estimator.
 FOUND = {
     "cogging@joint_2:amplitude=2,phase=0.3,order=1": "cogging@joint_2:order=1",
     "cubic_stiffness@joint_1:stiffness=5000": "cubic_stiffness@joint_1",
@@ -218,9 +218,9 @@ def test_effects_with_internal_states_are_identified_and_survive_a_restart() -> 
     parted.finish()
     assert whole.by_momentum
     assert np.array_equal(whole.estimate().pi, parted.estimate().pi)
-    told = dict(zip([p.name for p in whole.base.parameters], whole.estimate().pi, strict=True))
-    assert told["torsional_hysteresis@joint_1.torque"] == pytest.approx(5.0, rel=0.01)
-    assert told["slosh@base.stiffness"] == pytest.approx(500.0, rel=0.01)
+    found = dict(zip([p.name for p in whole.base.parameters], whole.estimate().pi, strict=True))
+    assert found["torsional_hysteresis@joint_1.torque"] == pytest.approx(5.0, rel=0.01)
+    assert found["slosh@base.stiffness"] == pytest.approx(500.0, rel=0.01)
 
 
 @pytest.mark.slow
@@ -430,7 +430,7 @@ def test_undeclared_effects_leave_no_stage_in_the_way() -> None:
 # Command line
 
 
-def test_simulate_injects_effects_and_tells_the_truth_beside_the_parameters(tmp_path: Path) -> None:
+def test_simulate_injects_effects_and_writes_their_true_values(tmp_path: Path) -> None:
     capture = tmp_path / "session.csv"
     command = ["simulate", "--system", "paper-planar", "--capture", str(capture), "--duration", "0.1", "--grade", "0"]
     effects = ["--effect", "cubic_stiffness@joint_1:stiffness=2000", "--effect", "tip_payload@tip:mass=1"]

@@ -1,4 +1,4 @@
-"""Noise in the columns attenuates least squares by a known factor; adding more of it tells by how much."""
+"""Noise in the columns attenuates least squares by a known factor; adding more of it shows by how much."""
 
 from __future__ import annotations
 
@@ -90,7 +90,7 @@ def test_what_noise_hides_leaves_other_directions_corrected() -> None:
 def test_the_covariance_is_that_of_the_second_order(sigma: float) -> None:
     """Noise u in the column adds -β u² to the score: 2 β² σ⁴ a row, and as much again from the shift. Seed 8.
 
-    125 clusters tell a variance to 13 %.
+    125 clusters give a variance to 13 %.
     """
     bias = gathered(*scalar_problem(sigma, seed=8))
     variance = 2.0 * TRUE**2 * sigma**4 / ROWS / (1.0 + sigma**2) ** 2

@@ -90,8 +90,8 @@ def test_a_payload_that_moves_with_the_tip_is_noticed_weighed_and_disturbs_nothi
     document = results_document(estimator, 0.0, [])
     assert document["parameters"][-1]["name"] == "payload.mass"
     assert document["events"][0]["parameters"][0]["size"] == event.sizes[0]
-    told = f"event at {event.time:.3f} s: payload payload.mass {event.sizes[0]:+.4g} ±"
-    assert any(line.startswith(told) for line in trust_lines(document))
+    line = f"event at {event.time:.3f} s: payload payload.mass {event.sizes[0]:+.4g} ±"
+    assert any(each.startswith(line) for each in trust_lines(document))
 
 
 @pytest.mark.slow
@@ -107,7 +107,7 @@ def test_a_payload_is_noticed_in_time_wherever_it_falls_in_a_block(planar_sessio
 
 
 @pytest.mark.slow
-def test_a_body_at_the_tip_is_told_from_a_point_mass(planar_session: Simulation) -> None:
+def test_a_body_at_the_tip_is_distinguished_from_a_point_mass(planar_session: Simulation) -> None:
     body = RigidBody(mass=5.0, center_of_mass=(0.15, 0.05, 0.0), inertia=Inertia(zz=0.3))
     loaded = PLANAR.model_copy(update={"payload": body})
     block = noisy(PLANAR, changed_session(planar_session, loaded, CHANGE, CHANGE + 2.0), "B", 1)

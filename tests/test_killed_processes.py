@@ -1,4 +1,4 @@
-"""kill -9 of what a live session stands beside: the arm, the view's process, a viewer; the session goes on."""
+"""kill -9 of what runs beside a live session: the arm, the view's process, a viewer; the session goes on."""
 
 from __future__ import annotations
 

@@ -111,7 +111,7 @@ def test_the_column_of_a_source_is_its_sensors_together() -> None:
     np.testing.assert_allclose(columns[:, 0], -columns[:, 1] - columns[:, 2], rtol=1e-12)
 
 
-def test_latencies_are_told_from_white_rows() -> None:
+def test_latencies_are_estimated_from_white_rows() -> None:
     """Least squares on rows of unit noise: size and error bar; seed 6."""
     random = np.random.default_rng(6)
     groups = (SourceGroup("drive", (), (1,), ()), SourceGroup("encoder", (0,), (), ("q_1",)))

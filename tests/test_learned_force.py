@@ -66,7 +66,7 @@ def by_law(text: str) -> Diagnosis:
     return sms.diagnose(described(), capture(text), learned=True)
 
 
-def test_a_curve_stands_in_for_a_law_that_is_struck() -> None:
+def test_a_curve_replaces_a_law_that_is_struck() -> None:
     found, true = learned(HARDENING), by_law(HARDENING)
     curve = found.system.effects[-1]
     assert (curve.name, curve.where, curve.over) == ("learned_force", "joint_1", "deflection")
@@ -83,7 +83,7 @@ def test_a_curve_stands_in_for_a_law_that_is_struck() -> None:
 
 
 @pytest.mark.slow
-def test_a_curve_over_the_rate_stands_in_for_stribeck_friction() -> None:
+def test_a_curve_over_the_rate_replaces_stribeck_friction() -> None:
     """On the planar example of 10 s, grade B (seed 4), nominal values off by up to 1.4 (seed 2)."""
     system = disguised(sms.load_system("paper-planar"), np.random.default_rng(2))
     slipping = "stribeck_friction@joint_2:torque=10,velocity=0.15"

@@ -88,9 +88,9 @@ def test_a_live_session_and_its_replay_give_the_same_document(tmp_path: Path, mo
 
 @pytest.mark.slow
 def test_answers_that_came_late_are_used_as_late_in_the_repetition(tmp_path: Path) -> None:
-    """Not so at once, as without notes of the session: then the effect is taken up earlier."""
+    """Not so at once, as without notes of the session: then the effect is adopted earlier."""
     block = axis_block(cogging, BEGIN, seconds=14.0)
-    told = []
+    documents = []
     # The notes are there when the second session begins.
     searchers: list[Callable[[], Searcher]] = [
         lambda: Late(tmp_path, 4), lambda: searcher_of(tmp_path, adopt=True), Immediate,
@@ -102,8 +102,8 @@ def test_answers_that_came_late_are_used_as_late_in_the_repetition(tmp_path: Pat
             estimator.push(piece)
         estimator.finish()
         assert online.episodes[0].adopted is not None
-        told.append(json.dumps([online.document(), results_document(estimator, 0.0, [])]))
-    assert told[0] == told[1] != told[2]
+        documents.append(json.dumps([online.document(), results_document(estimator, 0.0, [])]))
+    assert documents[0] == documents[1] != documents[2]
 
 
 @pytest.mark.slow
@@ -243,16 +243,16 @@ def test_the_page_shows_the_verdict_and_how_the_evidence_grew(replayed: Path) ->
 
 def test_the_view_plots_the_evidence_and_logs_the_verdict(replayed: Path) -> None:
     scores: dict[str, list[float]] = {}
-    told: list[str] = []
+    lines: list[str] = []
     for chunk in RrdReader(str(replayed / "session.rrd")).stream():
         for row in chunk.to_record_batch().to_pylist():
             if chunk.entity_path.startswith("/evidence/") and row.get("Scalars:scalars"):
                 scores.setdefault(chunk.entity_path, []).extend(row["Scalars:scalars"])
-            told += row.get("TextLog:text") or []
+            lines += row.get("TextLog:text") or []
     (cogs,) = (values for path, values in scores.items() if "cogging" in path)
     gains = [search["candidates"]["cogging@joint_1"] for search in _evidence(replayed)]
     assert cogs == pytest.approx(np.log10(gains).tolist())
-    assert any("the model lacks cogging@joint_1" in text and "added to the model" in text for text in told)
+    assert any("the model lacks cogging@joint_1" in text and "added to the model" in text for text in lines)
 
 
 def _evidence(folder: Path) -> list[dict[str, dict[str, float]]]:

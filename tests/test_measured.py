@@ -94,11 +94,11 @@ def emps_signals(capture: Path) -> tuple[Array, Array, Array]:
 
 
 def test_why_the_energy_fit_of_emps_differs(emps_capture: Path) -> None:
-    """The energy balance is the force balance times the speed, so it weighs what the model misses by the speed.
+    """The energy balance is the force balance times the speed, so it weights what the model misses by the speed.
 
     On the same signals the force balance reproduces the published numbers, and multiplying its rows by the speed,
     nothing else, moves mass down and offset beyond -3.8 N as in the energy fit. Friction that depends on the direction
-    of travel, which the model lacks, is what there is to be weighed: allowing it lowers the residual by a fifth.
+    of travel, which the model lacks, is what weights can reduce: allowing it lowers the residual by a fifth.
     """
     v, a, force = emps_signals(emps_capture)
     columns = np.stack((a, v, np.sign(v), np.ones_like(v)), axis=1)

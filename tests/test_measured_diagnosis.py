@@ -61,7 +61,7 @@ def test_the_friction_of_emps_is_found_from_its_mass_alone(tmp_path: Path) -> No
 def test_the_lag_and_the_friction_of_the_quanser_rig_are_found(tmp_path: Path) -> None:
     """Fitted to the first half, checked on the second: hubs fall from nearly all of the torque to below a quarter.
 
-    What the strain gauges tell comes through a low-pass at 1.7 Hz; without it no masses fit what they show.
+    The strain gauges' readings come through a low-pass at 1.7 Hz; without it no masses fit what they show.
     """
     if not QUANSER.exists():
         pytest.skip(f"measured data {QUANSER.name} is not beside the checkout")
@@ -79,7 +79,7 @@ def test_the_lag_and_the_friction_of_the_quanser_rig_are_found(tmp_path: Path) -
     assert after["joint_1"]["relative"] < 0.25
     assert before["joint_2"]["relative"] > 0.9
     assert after["joint_2"]["relative"] < 0.25
-    # Signs that real bodies and springs have, and a first strip near the maker's older test, 27 N m/rad.
+    # Signs that physical bodies and springs have, and a first strip near the maker's older test, 27 N m/rad.
     parameters = {p["name"]: (p["estimate"], p["std"]) for p in document["after"]["parameters"]}
     physical = [p for name, p in parameters.items() if name.endswith(("inertia", "stiffness", "damping"))]
     assert min(estimate / std for estimate, std in physical) > -2.0

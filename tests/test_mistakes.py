@@ -145,7 +145,7 @@ def test_a_stuck_encoder_is_left_out_and_one_at_rest_is_not() -> None:
     assert undoing.name == "stuck"
     (segment,) = one(undoing.apply(("q_1",), stuck[:, None])[:, 0])
     assert [part.index.size for part in without_gaps(segment)] == [2500, 1500]
-    # Slows down, stands still, to the last bit of its encoder, and starts again.
+    # Slows down, is at rest, to the last bit of its encoder, and starts again.
     resting = np.round(np.where(t < 5.0 * np.pi / 2.0, np.sin(t), 1.0) / 1e-4) * 1e-4
     assert list(shown(["q_1"], one(resting))) == []
 

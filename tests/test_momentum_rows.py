@@ -62,7 +62,7 @@ def dense(balance: MomentumBalance, window: Window) -> Array:
 
 @all_systems
 def test_rows_are_the_equations_of_motion_on_any_motion(system: System) -> None:
-    """Y β = ∫ φ Q dt for the forces that H v̇ + C = Q asks for; the balance is told those of the motors."""
+    """Y β = ∫ φ Q dt for the forces that H v̇ + C = Q asks for; the balance receives those of the motors."""
     model = build_model(system)
     balance = MomentumBalance(model, find_base_parameters(model), system.sample_rate, SPAN)
     motion = prescribed(model, balance.width + balance.lead + balance.margin + 2 * balance.hop + 1, seed=1)
@@ -219,7 +219,7 @@ def test_a_session_restored_at_any_time_gives_the_same_bits(cut: float) -> None:
 
 
 @pytest.mark.slow
-def test_a_session_restored_while_new_weights_are_told_windows_gives_the_same_bits(
+def test_a_session_restored_while_weights_warm_up_gives_the_same_bits(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(momentum_fit, "SAME_NOISE", 0.0)

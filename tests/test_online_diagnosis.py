@@ -1,4 +1,4 @@
-"""Effects noticed, named and taken up while a session runs; the same however its samples come."""
+"""Effects noticed, named and added to the model while a session runs; the same however its samples come."""
 
 from __future__ import annotations
 
@@ -77,7 +77,7 @@ def test_an_effect_of_the_base_that_begins_in_mid_session_is_named_and_disturbs_
     assert estimate.pi[-1] == pytest.approx(60.0, rel=1e-3)
 
 
-def test_an_effect_that_begins_is_dated_sized_and_taken_up() -> None:
+def test_an_effect_that_begins_is_dated_sized_and_adopted() -> None:
     estimator, online = cogged(True)
     (episode,) = online.episodes
     assert episode.verdict == "named"
@@ -94,7 +94,7 @@ def test_an_effect_that_begins_is_dated_sized_and_taken_up() -> None:
     assert not estimator.momentum.misfit
 
 
-def test_without_adopt_it_is_only_told() -> None:
+def test_without_adopt_it_is_only_reported() -> None:
     estimator, online = cogged(False)
     (episode,) = online.episodes
     assert (episode.verdict, episode.adopted) == ("named", None)
@@ -121,12 +121,12 @@ def test_an_effect_that_was_there_from_the_start_is_named_and_leaves_no_bias() -
 
 def test_the_evidence_grows_with_the_samples() -> None:
     _, online = cogged(True)
-    told = online.document()[0]
-    first, second = told["evidence"]
-    assert first["time"] < second["time"] <= told["adopted"]
+    episode = online.document()[0]
+    first, second = episode["evidence"]
+    assert first["time"] < second["time"] <= episode["adopted"]
     assert second["candidates"]["cogging@joint_1"] > first["candidates"]["cogging@joint_1"]
     assert max(second["candidates"], key=second["candidates"].get) == "cogging@joint_1"
-    assert told["effects"][0]["evidence"]["gain"] > told["effects"][0]["evidence"]["limit"]
+    assert episode["effects"][0]["evidence"]["gain"] > episode["effects"][0]["evidence"]["limit"]
 
 
 def test_a_session_without_anything_missing_says_nothing() -> None:
@@ -189,7 +189,7 @@ def test_pickled_statistics_say_the_same_after_an_adoption() -> None:
     assert elsewhere(Statistics.of(estimator)) == results_document(estimator, 0.0, [])
 
 
-def test_what_acts_before_the_balance_is_not_taken_up_while_running() -> None:
+def test_what_acts_before_the_balance_is_not_adopted_live() -> None:
     """A constant of a channel, and an effect with a state of its own, say why."""
     (named,) = cogged(True)[1].episodes[0].named
     model = build_model(PLANAR)

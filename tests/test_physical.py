@@ -1,4 +1,4 @@
-"""Projection onto parameters that real bodies can have: against closed forms, brute force and the laws of convexity."""
+"""Projection onto physically consistent parameters: against closed forms, brute force and the laws of convexity."""
 
 from __future__ import annotations
 
@@ -114,7 +114,7 @@ def test_the_nearest_pendulum_is_that_of_brute_force() -> None:
 
 
 def consistent_pi(model: Model, rng: np.random.Generator) -> Array:
-    """Random parameters of real bodies: clouds of point masses, and positive numbers."""
+    """Random consistent parameters: clouds of point masses, and positive numbers."""
     pi: Array = np.abs(model.nominal) * rng.uniform(0.0, 2.0, model.n_pi)
     parameters = [parameter.name for parameter in model.parameters]
     for owner in {parameter.owner for parameter in model.parameters}:

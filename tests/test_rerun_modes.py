@@ -71,20 +71,20 @@ def test_every_verb_goes_with_every_view(
             command, cwd=tmp_path, stdout=subprocess.DEVNULL, stderr=said, env=screenless, start_new_session=True
         )
     started.append(process)
-    told = (tmp_path / "said").read_text
+    output = (tmp_path / "said").read_text
     if mode == "serve":
-        until(lambda: STAYS in told() or process.poll() is not None, told)
-        assert STAYS in told()
+        until(lambda: STAYS in output() or process.poll() is not None, output)
+        assert STAYS in output()
         process.send_signal(signal.SIGINT)
     code = process.wait(PATIENCE)
     if (verb, mode) == ("show", "spawn"):  # there is no session that could go on
-        assert (code, told().count("\n")) == (2, 1)
-        assert "no screen to open a viewer on" in told()
+        assert (code, output().count("\n")) == (2, 1)
+        assert "no screen to open a viewer on" in output()
         return
-    # Of a few seconds on a busy machine nothing may be determined; Ctrl-C at the end of a live session is told of.
-    assert code in ({130} if (verb, mode) == ("live", "serve") else {0, 3}), told()
-    assert "Traceback" not in told()
-    assert ("no view: " in told()) == (mode == "spawn"), told()
+    # Of a few seconds on a busy machine nothing may be determined; Ctrl-C at the end of a live session is reported.
+    assert code in ({130} if (verb, mode) == ("live", "serve") else {0, 3}), output()
+    assert "Traceback" not in output()
+    assert ("no view: " in output()) == (mode == "spawn"), output()
     written = WRITTEN.get(verb, "results.json")
     assert written is None or (tmp_path / "done" / written).is_file()
     assert (tmp_path / "done" / "session.rrd").exists() == (mode == "save")

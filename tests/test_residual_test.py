@@ -24,14 +24,14 @@ N = 3  # parameters
 
 
 def after(errors: Array, known: int = 40, seed: int = 1) -> SequentialTest:
-    """The test after windows of rows Y β + errors (W, n_v), with as many windows before that tell β."""
+    """The test after windows of rows Y β + errors (W, n_v), with as many windows before that give β."""
     rng = np.random.default_rng(seed)
     n_v = errors.shape[1]
     test = SequentialTest(LAYOUT if n_v > 1 else build_layout(parse_system(AXIS, "axis")), HOP)
     beta = np.arange(1.0, N + 1.0)
     factor = np.zeros((N + 1, N + 1))
-    told = rng.standard_normal((known * n_v, N))
-    factor = triangular_factor(factor, np.column_stack((told, told @ beta + rng.standard_normal(len(told)))))
+    before = rng.standard_normal((known * n_v, N))
+    factor = triangular_factor(factor, np.column_stack((before, before @ beta + rng.standard_normal(len(before)))))
     for k, error in enumerate(errors):
         Y = rng.standard_normal((n_v, N))
         raw = np.column_stack((Y, Y @ beta + error))

@@ -1,4 +1,4 @@
-"""Forces that jump or turn fast in the rows of a session: their noise, batches, and axes that stand still."""
+"""Forces that jump or turn fast in the rows of a session: their noise, batches, and axes at rest."""
 
 from __future__ import annotations
 
@@ -64,11 +64,11 @@ def predicted(window: Window, sigma: float) -> float:
 def test_a_reversal_of_friction_scatters_as_predicted(
     amplitude: float, sigma: float, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """In the middle of a window, at 3.2 and 0.25 rad/s²; 200 draws tell it to 5 %, samples to some more.
+    """In the middle of a window, at 3.2 and 0.25 rad/s²; 200 draws give it to 5 %, samples to some more.
 
-    Where noise turns the rate round several times it is told for too large: by 1.8 at 0.25 rad/s² and 1e-4 rad.
+    Where noise turns the rate round several times the prediction is too large: by 1.8 at 0.25 rad/s² and 1e-4 rad.
     """
-    # The noise that the balance is told of, for a wide filter, would make a standstill of it.
+    # The noise that the balance receives, for a wide filter, would make a standstill of it.
     monkeypatch.setattr("sms_online.pipeline.standstill.LASTING", 10.0)
     balance = MomentumBalance(MODEL, BASE, RATE, SPAN)
     count = balance.width + balance.lead + balance.margin + 1
@@ -81,8 +81,8 @@ def test_a_reversal_of_friction_scatters_as_predicted(
         # So much more of the one sign is in the middle of the test function, where it is one.
         off.append(of_friction(drawn[-1]) + 2.0 * earlier)
     found = np.std(off)
-    told = np.sqrt(np.mean([predicted(window, sigma) ** 2 for window in drawn]))
-    assert found == pytest.approx(told, rel=0.2)
+    stated = np.sqrt(np.mean([predicted(window, sigma) ** 2 for window in drawn]))
+    assert found == pytest.approx(stated, rel=0.2)
 
 
 def test_rows_of_a_backlog_are_those_of_hop_after_hop() -> None:
@@ -110,7 +110,7 @@ def test_rows_of_a_backlog_are_those_of_hop_after_hop() -> None:
             np.testing.assert_allclose(getattr(b, part), value, rtol=0.0, atol=1e-9 * np.abs(value).max())
 
 
-def test_what_friction_may_be_at_a_standstill_is_open() -> None:
+def test_stiction_at_a_standstill_is_undetermined() -> None:
     """A motor that rests from 0.8 to 1.4 s: all of what breaks it loose in a window within, nothing in one far off."""
     t = np.arange(2400) / RATE
     rate = np.where((t > 0.8) & (t < 1.4), 0.0, 0.5)
@@ -135,8 +135,8 @@ def test_what_friction_may_be_at_a_standstill_is_open() -> None:
 
 
 @pytest.mark.parametrize("hop", [2, 10, 40])
-def test_an_axis_that_turns_round_does_not_stand_still(hop: int) -> None:
-    """At 3.2 rad/s², told block after block, as short windows ask for it; one that stays does, nearly always."""
+def test_an_axis_that_turns_round_is_not_at_rest(hop: int) -> None:
+    """At 3.2 rad/s², asked block after block, as short windows ask for it; one that stays does, nearly always."""
     t = np.arange(8000) / RATE
     noise = 1e-4 * np.random.default_rng(4).standard_normal((t.size, 1))
     turning, staying = Standstill(1, RATE), Standstill(1, RATE)

@@ -97,8 +97,8 @@ def test_a_fast_pole_costs_no_steps_once_it_has_decayed() -> None:
     solution = solve(
         lambda t, y: pole * (y - np.cos(t)[:, None]) - np.sin(t)[:, None], np.array([0.0]), 10.0, np.full(1, 1e-10)
     )
-    settled = solution.t > 0.01
-    assert_allclose(solution.y[settled, 0], np.cos(solution.t[settled]), rtol=0, atol=1e-9)
+    decayed = solution.t > 0.01
+    assert_allclose(solution.y[decayed, 0], np.cos(solution.t[decayed]), rtol=0, atol=1e-9)
     assert solution.t.size < 50
 
 
@@ -202,8 +202,8 @@ def test_noise_free_samples_are_smooth_enough_to_be_differentiated(planar_sessio
     x = values[:, [channels.index(name) for name in layout.position_names]]
     rates = np.stack([np.convolve(column, EIGHTH_ORDER[::-1] * 1000.0, mode="valid") for column in x.T], axis=1)
     exact = exact_states(planar_session, t[4:-4])
-    settled = t[4:-4] > 2.0  # the step in torque at t = 0 rings beyond what 1 kHz resolves
-    assert_allclose(rates[settled], exact.v[settled], rtol=0, atol=2e-8)
+    decayed = t[4:-4] > 2.0  # the step in torque at t = 0 rings beyond what 1 kHz resolves
+    assert_allclose(rates[decayed], exact.v[decayed], rtol=0, atol=2e-8)
 
 
 def test_without_sensor_errors_channels_are_the_exact_motion(short: Simulation) -> None:

@@ -105,14 +105,14 @@ def test_a_weighed_part_sharpens_what_hangs_on_it(simulation: Simulation, first:
     value, std = np.full((2, first.base.n), np.nan)
     value[k], std[k] = 3.0, 3e-4
     block = recorded(simulation, 0)
-    weighed = Estimator(one_link("linear"), block.channels, "simulation")
-    weighed.set_prior(Prior(value, std))
-    weighed.push(block)
-    weighed.finish()
-    assert weighed.by_smoother
-    assert np.all(standard_deviation(weighed)[1:] < 0.5 * standard_deviation(first)[1:])
-    assert np.all(np.abs(normalised(weighed)) < 4.0)
-    assert session_bound(weighed, MotionRecord(500.0)) is None
+    sharpened = Estimator(one_link("linear"), block.channels, "simulation")
+    sharpened.set_prior(Prior(value, std))
+    sharpened.push(block)
+    sharpened.finish()
+    assert sharpened.by_smoother
+    assert np.all(standard_deviation(sharpened)[1:] < 0.5 * standard_deviation(first)[1:])
+    assert np.all(np.abs(normalised(sharpened)) < 4.0)
+    assert session_bound(sharpened, MotionRecord(500.0)) is None
 
 
 def test_nominal_values_play_no_part(simulation: Simulation, first: Estimator) -> None:
@@ -221,7 +221,7 @@ def test_all_coordinates_measured_are_smoothed_only_where_that_is_asked_for(simu
 
 
 def test_the_smoother_is_not_asked_where_effects_on_channels_are_declared() -> None:
-    """It reads channels as they come: the momentum balance tells then, and without all coordinates nothing does."""
+    """It reads channels as they come: the momentum balance estimates then, and without all coordinates nothing does."""
     offset = Effect(name="encoder_offset", where="theta_m_1", coefficients={"offset": 0.01})
     system = load_system("paper-planar").model_copy(update={"balance": "smoother", "effects": (offset,)})
     names = tuple(channels(system))

@@ -97,7 +97,7 @@ def chosen(signal: Array, sigma: float) -> int:
 def test_what_the_chosen_width_loses_of_a_motion_is_less_than_the_noise_of_the_next_narrower(
     frequency: float, sigma: float
 ) -> None:
-    """That neighbour agreed, as far as its noise let it tell; the one after would have lost twenty times as much."""
+    """That neighbour agreed, as far as its noise can show; the one after would have lost twenty times as much."""
     t = np.arange(560) / RATE
     signal = np.sin(2.0 * np.pi * frequency * t)
     half_width = chosen(signal, sigma)

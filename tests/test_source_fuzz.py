@@ -1,4 +1,4 @@
-"""Whatever comes over a wire or stands in a file: no crash, no hang, no memory without bound, everything counted.
+"""Whatever comes over a wire or is in a file: no crash, no hang, no memory without bound, everything counted.
 
 The suite draws a few hundred examples of each kind; the same with a million frames, lines and pieces is marked slow.
 """

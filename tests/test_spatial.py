@@ -89,7 +89,7 @@ def test_seven_joint_arm_gives_what_the_motion_excites() -> None:
     reason="the seven-joint arm is not honest yet: some determined parameters are tens of their error bars off",
 )
 def test_seven_joint_arm_at_250_hz_and_grade_b() -> None:
-    """A first fit without weights cannot tell 91 parameters apart; values twice the true ones start it well enough."""
+    """A first fit without weights cannot separate 91 parameters; values twice the true ones start it well enough."""
     system = load_system("seven-joint").model_copy(update={"sample_rate": 250.0})
     # The same motion, read less often.
     motion = until(simulated(load_system("seven-joint"), position_tolerance=1e-13), 20.0).solution
@@ -100,11 +100,11 @@ def test_seven_joint_arm_at_250_hz_and_grade_b() -> None:
     estimator.finish()
     truth = true_parameters(system)
     std, error = standard_deviation(estimator), np.abs(estimator.estimate().pi - truth)
-    told = (truth != 0.0) & (std < np.abs(truth) / 3.0)
+    determined = (truth != 0.0) & (std < np.abs(truth) / 3.0)
     assert estimator.by_momentum
-    assert told.sum() >= 50
-    assert np.median(error[told] / np.abs(truth[told])) < 0.01
+    assert determined.sum() >= 50
+    assert np.median(error[determined] / np.abs(truth[determined])) < 0.01
     # The wrist's last spring bends by less than the encoders' noise: its stiffness is pulled towards zero.
     names = [parameter.name for parameter in estimator.base.parameters]
-    others = told & ~np.array([name.startswith("joint_7.") for name in names])
+    others = determined & ~np.array([name.startswith("joint_7.") for name in names])
     assert (error[others] < 4.0 * std[others]).all()

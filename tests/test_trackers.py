@@ -209,7 +209,7 @@ def test_a_window_forgets_what_was_known_beforehand() -> None:
 
 
 @pytest.mark.parametrize("name", TRACKERS)
-def test_reset_starts_afresh_and_disabled_stands_still(name: str) -> None:
+def test_reset_starts_afresh_and_disabled_changes_nothing(name: str) -> None:
     tracker, fresh = TRACKERS[name](), TRACKERS[name]()
     rows = exciting_rows(seed=15, count=333)
     tracker.update(exciting_rows(seed=16, count=500, pi=-PI_TRUE))
@@ -243,7 +243,7 @@ def test_kalman_without_process_noise_is_recursive_least_squares_with_the_same_p
     np.testing.assert_allclose(other.rss, one.rss, rtol=1e-6)
 
 
-def test_what_the_rows_cannot_tell_apart_is_flagged_and_nothing_else() -> None:
+def test_what_the_rows_cannot_separate_is_flagged_and_nothing_else() -> None:
     rng = np.random.default_rng(32)
     Y = rng.normal(size=(500, N)) * 10.0 ** np.linspace(-6, 6, N)
     Y[:, 3] = 1e5 * Y[:, 1]  # only π_1 + 1e5 π_3 acts

@@ -26,7 +26,7 @@ def with_row(row: str, **values: float) -> Evidence:
     return replace(GOOD, residual={**QUIET, row: QUIET[row]._replace(**values)})
 
 
-def test_what_nothing_speaks_against_is_trusted_and_its_reach_is_told() -> None:
+def test_what_nothing_speaks_against_is_trusted_as_far_as_stated() -> None:
     judgement = judge(GOOD)
     assert (judgement.level, judgement.grave, judgement.marks) == ("trust", False, {})
     assert judgement.sentence == "Trust: 15 of 16 parameters determined, residual at most 1.1 × noise"
@@ -136,7 +136,7 @@ def test_residuals_of_an_unconverged_estimate_show_nothing() -> None:
 def test_an_alarm_is_that_of_what_the_diagnosis_looks_into_and_a_doubt_of_its_own_else() -> None:
     looked_into = judge(replace(GOOD, alarm="joint_2", discrepancies=(Discrepancy("joint_2", 3.0, "noticed"),)))
     assert len(looked_into.reasons) == 1
-    # What was taken up is in the model, and the test began anew with it.
+    # What was adopted is in the model, and the test began anew with it.
     assert judge(replace(GOOD, alarm="joint_1", discrepancies=(replace(LACKING, adopted=True),))).grave
 
 
@@ -149,7 +149,7 @@ def test_a_prior_that_data_pull_from_is_a_grave_doubt() -> None:
 
 
 def test_the_energy_balance_alone_is_never_trusted() -> None:
-    """Its residual is scaled by itself: nothing tells a lacking effect from noise."""
+    """Its residual is scaled by itself: nothing distinguishes a lacking effect from noise."""
     block = axis_block(0.1)
     session = Estimator(parse_system('balance = "energy"\n' + AXIS, "axis.toml"), block.channels, "axis")
     session.push(block)
@@ -258,7 +258,7 @@ def test_a_judgement_is_plain_data_in_results() -> None:
     }
 
 
-def test_beside_every_grave_doubt_stands_what_to_do_next() -> None:
+def test_every_grave_doubt_states_what_to_do_next() -> None:
     for evidence in (
         with_row("joint_2", whitened=62.0),
         with_row("joint_1", relative=0.96, whitened=2.0),

@@ -1,4 +1,4 @@
-"""What a diagnosis may say: verdicts of made-up residuals, links that stiffen, axes that stand still."""
+"""What a diagnosis may say: verdicts of made-up residuals, links that stiffen, axes at rest."""
 
 from __future__ import annotations
 
@@ -100,7 +100,7 @@ def test_links_stiffen_that_take_something_away(
 
 
 @pytest.mark.parametrize("noise", [1e-5, 1e-4])
-def test_an_axis_stands_still_where_its_rate_is_noise_for_longer_than_a_reversal(noise: float) -> None:
+def test_an_axis_is_at_rest_where_its_rate_is_noise_for_long(noise: float) -> None:
     """A position that reverses at 0.25 and 0.75 s, rests from 1 to 1.6 s, sticks for 0.1 s at 2.5 s and goes back."""
     t = np.arange(3000) / 1000.0
     rest = ((t >= 1.0) & (t < 1.6)) | ((t >= 2.5) & (t < 2.6))
@@ -124,7 +124,7 @@ def test_an_axis_stands_still_where_its_rate_is_noise_for_longer_than_a_reversal
 
 
 @pytest.mark.parametrize("noise", [1e-6, 1e-5, 1e-4])
-def test_the_integral_of_a_sign_is_known_as_well_as_it_is_told(noise: float) -> None:
+def test_the_integral_of_a_sign_is_as_uncertain_as_stated(noise: float) -> None:
     """A rate that falls by 6 rad/s² to zero and by 2 beyond, as of a motor that dry friction has slowed down."""
     random = np.random.default_rng(8)
     layout = SimpleNamespace(theta_m=(0,), n_base_positions=3, n_base_speeds=3)
@@ -135,7 +135,7 @@ def test_the_integral_of_a_sign_is_known_as_well_as_it_is_told(noise: float) -> 
     segments = [Segment(np.arange(t.size), (a + noise * random.standard_normal(t.size))[:, None]) for a in angles]
     reversals = Reversals(sensing, segments, 0, noise, 1000.0, SessionStandstill(sensing, segments, 0, noise, 1000.0))
     samples = np.arange(100, 300)
-    off, told = [], []
+    off, predicted = [], []
     for k, turn in enumerate(turns):
         nothing = np.zeros((samples.size, 1))
         motion = Motion(k, 80, samples, nothing, nothing, nothing)
@@ -143,6 +143,6 @@ def test_the_integral_of_a_sign_is_known_as_well_as_it_is_told(noise: float) -> 
         # Cells of half a sample beyond both ends.
         true = (turn - t[100] + 0.5e-3) - (t[299] + 0.5e-3 - turn)
         off.append(sign.sum() / 1000.0 - true)
-        told.append(np.sqrt(reversals.squares(lambda v: np.tanh(v / 1e-4), motion).sum()) / 1000.0)
-    share = np.sqrt(np.mean(np.square(off))) / np.sqrt(np.mean(np.square(told)))
+        predicted.append(np.sqrt(reversals.squares(lambda v: np.tanh(v / 1e-4), motion).sum()) / 1000.0)
+    share = np.sqrt(np.mean(np.square(off))) / np.sqrt(np.mean(np.square(predicted)))
     assert 0.4 < share < 1.5

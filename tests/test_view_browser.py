@@ -60,7 +60,7 @@ def address(tmp_path: Path, planar_session: Simulation) -> Iterator[str]:
     for line in session.stderr:
         if found := re.search(r"http://\S+", line):
             break
-    assert found is not None, "no address was told"
+    assert found is not None, "no address was printed"
     yield found[0]
     session.send_signal(signal.SIGINT)
     assert session.wait(20.0) == 0

@@ -62,8 +62,8 @@ def test_evidence_is_drawn_and_the_effect_has_the_most(diagnosed: Path, document
 
 
 def test_the_verdict_is_in_the_log(diagnosed: Path, document: dict[str, Any]) -> None:
-    told = [row["TextLog:text"][0] for row in columns(diagnosed / "session.rrd", "/log") if row.get("TextLog:text")]
-    assert f"11.99 s: {document['summary']}" in told
+    lines = [row["TextLog:text"][0] for row in columns(diagnosed / "session.rrd", "/log") if row.get("TextLog:text")]
+    assert f"11.99 s: {document['summary']}" in lines
 
 
 def test_the_judgement_is_on_top_and_marked_on_the_arm(diagnosed: Path, document: dict[str, Any]) -> None:

@@ -62,15 +62,15 @@ def test_a_parameter_that_an_event_has_added_is_recorded(shown: Path) -> None:
     found = {p["name"]: p["estimate"] for p in results["parameters"]}
     assert "payload.inertia" in found
     last: dict[str, float] = {}
-    told: list[str] = []
+    lines: list[str] = []
     for chunk in RrdReader(str(shown / "session.rrd")).stream():
         for row in chunk.to_record_batch().to_pylist():
             if chunk.entity_path.endswith("/estimate") and row.get("Scalars:scalars"):
                 last[chunk.entity_path] = row["Scalars:scalars"][0]
-            told += row.get("TextLog:text") or []
+            lines += row.get("TextLog:text") or []
     (payload,) = (value for path, value in last.items() if path.startswith("/parameters/payload"))
     assert payload == found["payload.inertia"]
-    assert any(re.search(r"s: event at 10\.0\d+ s: payload payload.inertia", text) for text in told)
+    assert any(re.search(r"s: event at 10\.0\d+ s: payload payload.inertia", text) for text in lines)
 
 
 def test_an_event_is_marked_in_every_plot(shown: Path) -> None:

@@ -43,16 +43,16 @@ def serve(folder: Path, started: list[subprocess.Popen[Any]], choice: str) -> tu
             [sys.executable, "-m", "sms_tools", *replay], cwd=folder, stdout=subprocess.DEVNULL, stderr=file
         )
     started.append(process)
-    told = (folder / "said").read_text
-    until(lambda: STAYS in told() or process.poll() is not None, told)
-    assert STAYS in told()
-    found = re.search(r"http://\S+", told())
+    output = (folder / "said").read_text
+    until(lambda: STAYS in output() or process.poll() is not None, output)
+    assert STAYS in output()
+    found = re.search(r"http://\S+", output())
     assert found is not None
     page = urlsplit(found[0])
     data = urlsplit(unquote(page.query).removeprefix("url="))
     assert page.port is not None
     assert data.port is not None
-    return told(), page.port, data.port
+    return output(), page.port, data.port
 
 
 def listens(address: str, port: int) -> bool:

@@ -106,8 +106,8 @@ def test_rerun_verifies_the_recording(recorded: Path) -> None:
 def test_events_are_logged_when_they_happen(recorded: Path) -> None:
     rows = [row for row in columns(recorded / "session.rrd", "/log") if row.get("TextLog:text")]
     lines = [row["TextLog:text"][0].split(" s: ")[1] for row in rows]
-    told = {line.split(" is ")[0] for line in lines if "is determined" in line}
-    assert told >= {p["name"] for p in results(recorded)["parameters"] if p["identifiable"]}
+    named = {line.split(" is ")[0] for line in lines if "is determined" in line}
+    assert named >= {p["name"] for p in results(recorded)["parameters"] if p["identifiable"]}
 
 
 @pytest.mark.slow
@@ -134,8 +134,8 @@ def test_statistics_stay_those_of_when_they_were_taken(samples: Block) -> None:
 @pytest.mark.slow
 def test_health_of_a_live_source_is_recorded(samples: Block, tmp_path: Path) -> None:
     estimator = Estimator(load_system("paper-planar"), samples.channels, "test")
-    told = {"latency": {"p99": 12.5}, "clocks": {"can": -0.25}}
-    with open_view("save", estimator, samples.channels, tmp_path, patient=True, health=lambda: told) as view:
+    health = {"latency": {"p99": 12.5}, "clocks": {"can": -0.25}}
+    with open_view("save", estimator, samples.channels, tmp_path, patient=True, health=lambda: health) as view:
         for block in view.watch([samples]):
             estimator.push(block)
     for entity, value in (("/health/latency/p99", 12.5), ("/health/clocks/can", -0.25)):

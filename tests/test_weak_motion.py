@@ -36,7 +36,7 @@ def test_without_a_described_size_weights_follow_the_rows() -> None:
 
 @pytest.mark.parametrize("beta", [0.5, 1.0, 3.0])
 def test_noise_that_grows_with_the_parameters_is_no_misfit(beta: float) -> None:
-    """Rows of a column that is noise alone, weighed with β = 1: 3 β leaves nine times their variance. Seed 2."""
+    """Rows of a column that is noise alone, whitened with β = 1: 3 β leaves nine times their variance. Seed 2."""
     rng = np.random.default_rng(2)
     plain = PlainRows.none(1, 1)
     for noise, sample in rng.standard_normal((400, 2)):

@@ -244,7 +244,7 @@ interface = "virtual"
 signals = { "AXIS.FORCE" = "force_1", "AXIS.ANGLE" = "q_1" }
 counters = ["AXIS.COUNT"]
 """
-# Ticks worked off at once, so that a day takes minutes: still less than what a session waits for a source.
+# Ticks processed at once, so that a day takes minutes: still less than what a session waits for a source.
 TICKS = 10
 
 

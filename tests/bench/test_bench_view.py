@@ -98,12 +98,13 @@ def test_an_hour(tmp_path: Path) -> None:
                     continue
             wall[choice] = perf_counter() - start
             out.seek(0)
-            told = out.read()
-        assert replay.returncode == 0, told
-        own, view = map(float, told.rsplit("cpu", 1)[1].split())
+            output = out.read()
+        assert replay.returncode == 0, output
+        own, view = map(float, output.rsplit("cpu", 1)[1].split())
         cpu[choice] = own
         print(
-            f"--rerun {choice}: {wall[choice]:.1f} s, CPU {own:.1f} s and {view:.1f} s of the view\n{told}", flush=True
+            f"--rerun {choice}: {wall[choice]:.1f} s, CPU {own:.1f} s and {view:.1f} s of the view\n{output}",
+            flush=True,
         )
     print(
         f"ratio {wall['save'] / wall['off']:.2f} by the clock, {cpu['save'] / cpu['off']:.2f} by the estimator's CPU "

@@ -50,7 +50,7 @@ SYSTEM = "paper-planar"
 GRADE = "B"
 # Worth of an effect, share of the rms of the rows it acts on.
 WORTH = (0.02, 0.2)
-# Columns nearer than this, rad, are not told apart.
+# Columns nearer than this, rad, are ambiguous.
 SAME_ANGLE = np.deg2rad(10.0)
 # Noise of grade B is 1e-4 m and rad: motions are simulated to a ten-thousandth of it.
 TOLERANCE = 1e-8
@@ -99,8 +99,8 @@ class Draw:
             return drawn
         wanted = float(np.exp(rng.uniform(*np.log(WORTH))))
         shapes = {}
-        for shape, told in ENTRIES[name].shapes.items():
-            grid = told.grid(self.make.ranges(drawn.where))
+        for shape, constant in ENTRIES[name].shapes.items():
+            grid = constant.grid(self.make.ranges(drawn.where))
             if shape in drawn.coefficients and name != "sensor_lag":
                 counted = shape == "order" or min(grid) <= 0.0
                 between = np.log([grid[0], grid[-1]]) if not counted else (0.0, 0.0)
@@ -219,7 +219,7 @@ def _case(system: System, block: Block, effect: Effect) -> Record:
     start = process_time()
     found = diagnose(disguised(system), [block], "case", lambda _: None)
     seconds = process_time() - start
-    told = {
+    reported = {
         finding.candidate.key: {name: value for name, (value, _) in coefficients(found, finding).items()}
         for finding in found.findings
     }
@@ -229,7 +229,7 @@ def _case(system: System, block: Block, effect: Effect) -> Record:
         "true": effect.coefficients,
         "verdict": found.verdict,
         "found": _keys(found),
-        "told": told,
+        "told": reported,
         "ambiguous": {finding.candidate.key: list(finding.ambiguous) for finding in found.findings},
         "before": {row: test.whitened for row, test in found.before.test.items()},
         "after": {row: test.whitened for row, test in found.after.test.items()},
@@ -245,16 +245,16 @@ def _declared(system: System, block: Block, effect: Effect) -> dict[str, float]:
     """Errors of the parameters where the effect is declared from the start; of none where it cannot be."""
     if effect.name == TableTilt.entry.name:
         return {}
-    told = Estimator(disguised(system.model_copy(update={"effects": (effect,)})), block.channels, "declared")
-    told.push(block)
-    told.finish()
-    return _errors(system, told)
+    declared = Estimator(disguised(system.model_copy(update={"effects": (effect,)})), block.channels, "declared")
+    declared.push(block)
+    declared.finish()
+    return _errors(system, declared)
 
 
 def _left(session: Estimator) -> dict[str, float]:
     """What the rows of a session leave, over the noise predicted for them, by kind of row."""
     rows = Evaluation(Statistics.of(session)).residuals
-    return {name: told.whitened for name, told in rows.items() if told.whitened is not None}
+    return {name: row.whitened for name, row in rows.items() if row.whitened is not None}
 
 
 def _errors(system: System, session: Estimator) -> dict[str, float]:
@@ -317,8 +317,8 @@ def summary(records: list[Record]) -> str:
         for coefficient, value in r["told"].get(key, {}).items():
             if r["true"].get(coefficient):
                 ratios.setdefault(r["name"], []).append(abs(value / r["true"][coefficient] - 1.0))
-        told = r["told"].get(key, {})
-        lines.append(f"{'ok ' if first else 'grp' if inside else 'BAD'} {key:36} {r['true']} → {r['found']} {told}")
+        reported = r["told"].get(key, {})
+        lines.append(f"{'ok ' if first else 'grp' if inside else 'BAD'} {key:36} {r['true']} → {r['found']} {reported}")
     if singles:
         n = len(singles)
         lines.append(f"{n} single: right first {100 * right / n:.1f} %, inside the group {100 * group / n:.1f} %")
@@ -326,8 +326,8 @@ def summary(records: list[Record]) -> str:
         lines.append(f"median relative error of coefficients: {medians}")
         held = [max(r["holdout"].values()) for r in singles]
         within = sum(times <= MOST_OVER_FLOOR for times in held)
-        told = f"median {np.median(held):.2f}, worst {max(held):.2f} times predicted noise, {within} of {n} within"
-        lines.append(f"held-out residual: {told} {MOST_OVER_FLOOR:g}")
+        times = f"median {np.median(held):.2f}, worst {max(held):.2f} times predicted noise, {within} of {n} within"
+        lines.append(f"held-out residual: {times} {MOST_OVER_FLOOR:g}")
         lines += _in_sessions(singles)
         lines += _over_floor(singles, [r for r in records if r["kind"] == "clean" and r["name"] == GRADE])
         lines.append(f"seconds: median {np.median([r['seconds'] for r in singles]):.1f}")
@@ -353,8 +353,8 @@ def _in_sessions(singles: list[Record]) -> list[str]:
     """What sessions leave that declare what was found, and which of them more than noise."""
     left = {f"{r['name']} {r['seed']}": max(r["session"].values()) for r in singles}
     more = {name: round(worst, 2) for name, worst in left.items() if worst > MOST_IN_A_SESSION}
-    told = f"median {np.median(list(left.values())):.2f}, worst {max(left.values()):.2f} times predicted noise"
-    return [f"residual of a session that declares what was found: {told}, above {MOST_IN_A_SESSION:g}: {more}"]
+    times = f"median {np.median(list(left.values())):.2f}, worst {max(left.values()):.2f} times predicted noise"
+    return [f"residual of a session that declares what was found: {times}, above {MOST_IN_A_SESSION:g}: {more}"]
 
 
 def _over_floor(singles: list[Record], cleans: list[Record]) -> list[str]:
@@ -366,8 +366,8 @@ def _over_floor(singles: list[Record], cleans: list[Record]) -> list[str]:
     if not over:
         return []
     within = sum(share <= MOST_OVER_FLOOR for share in over)
-    told = f"median {np.median(over):.2f}, worst {max(over):.2f}, {within} of {len(over)} within {MOST_OVER_FLOOR:g}"
-    return [f"held-out residual over that of a clean session with the same noise: {told}"]
+    times = f"median {np.median(over):.2f}, worst {max(over):.2f}, {within} of {len(over)} within {MOST_OVER_FLOOR:g}"
+    return [f"held-out residual over that of a clean session with the same noise: {times}"]
 
 
 def _against_declared(singles: list[Record]) -> list[str]:

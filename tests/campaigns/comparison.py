@@ -97,7 +97,7 @@ def _scaled(Y: Array, b: Array) -> tuple[Array, Array, Array]:
 
 
 def kalman(system: System, block: Block) -> Array:
-    """filterpy's Kalman filter of constant parameters on energy rows, told the variance that batch leaves."""
+    """filterpy's Kalman filter of constant parameters on energy rows, given the variance that batch leaves."""
     Y, b, unit = _scaled(*_energy_rows(system, block))
     batch = batch_least_squares(Y, b)
     tracker = KalmanFilter(dim_x=Y.shape[1], dim_z=1)
@@ -119,7 +119,7 @@ def rls(system: System, block: Block) -> Array:
 
 
 def output_error(system: System, block: Block) -> Array:
-    """SciPy's least squares on simulated output, told the sensors' noise and the parameters to 10 %, as a prior too."""
+    """SciPy's least squares on simulated output, given the sensors' noise, parameters to 10 %, also as a prior."""
     block = _first(block, SHORT)
     model = build_model(system)
     base = find_base_parameters(model)

@@ -94,7 +94,7 @@ def _record(case: Case, found: Diagnosis) -> dict[str, Any]:
     """What was found, and how far base parameters are off before and after, %."""
     keys = [finding.candidate.key for finding in found.findings]
     declared = [f"{effect.name}@{effect.where}" for effect in found.after.system.effects]
-    told = {
+    reported = {
         finding.candidate.key: {name: value for name, (value, _) in coefficients(found, finding).items()}
         for finding in found.findings
     }
@@ -102,7 +102,7 @@ def _record(case: Case, found: Diagnosis) -> dict[str, Any]:
         "verdict": found.verdict,
         "found": [*keys, *(key for key in declared if key not in keys)],
         "expected": case.found,
-        "told": told,
+        "told": reported,
         "before": {name: row.whitened for name, row in found.before.test.items()},
         "after": {name: row.whitened for name, row in found.after.test.items()},
         "holdout": found.after.holdout.whitened,

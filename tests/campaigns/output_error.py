@@ -27,7 +27,7 @@ STEPS = 5
 # Standard deviation of ln β about where it starts, a prior: left alone, the weakest parameter makes that pole too fast
 # to follow. To what the data determine it is nothing.
 PRIOR = 0.1
-# Residuals are means of so many samples, which keeps all that a motion below 50 Hz tells.
+# Residuals are means of so many samples, which keeps all information of a motion below 50 Hz.
 AVERAGED = 10
 # Samples from one linearisation of the Jacobian to the next; the links' modes at 100 and 120 Hz ask for it.
 LINEARISED = 2

@@ -97,7 +97,7 @@ def gap() -> Session:
 
 
 def change() -> Session:
-    """A drag of the base that begins at 3 s, and is taken up."""
+    """A drag of the base that begins at 3 s, and is added to the model."""
     system = load_system("paper-planar")
     drag = Effect(name="air_drag", where="base", coefficients={"damping": 60.0})
     changed = system.model_copy(update={"effects": (drag,)})
