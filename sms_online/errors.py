@@ -1,4 +1,4 @@
-"""What the program says when its input is wrong: one line with file, place, what was found and what was expected."""
+"""Errors of input: one line with file, place, what was found and what was expected."""
 
 from __future__ import annotations
 

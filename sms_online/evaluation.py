@@ -1,4 +1,4 @@
-"""What the statistics of a session say: estimate, error bars, residuals, trust, each when it is asked for.
+"""Evaluation of a session's statistics: estimate, error bars, residuals and trust, each on request.
 
 A pure function of `Statistics`, so that the estimator's process, the view's and a reader of saved statistics say the
 same. `result_of` makes one record of all of it.

@@ -42,7 +42,7 @@ class Change:
     """A session in which a parameter is not what it is in the reference sessions.
 
     session: its name. size: of the change, in the parameter's unit. deviations: the same in standard deviations of such
-    a difference. limit: what these may reach by accident.
+    a difference. limit: what these may reach by chance.
     """
 
     session: str

@@ -145,7 +145,7 @@ class Finding:
 
     name, where: as a system file declares it. coefficients: by name, in SI units. ambiguous_with: other effects,
     `name@where`, that explain as much. gain: evidence, twice the log likelihood ratio; limit: what the best of all
-    absent effects reaches by accident. held_out_improvement: share of the residual that it takes on samples that were
+    absent effects reaches by chance. held_out_improvement: share of the residual that it takes on samples that were
     not fitted; None where nothing was held out.
     """
 

@@ -1,4 +1,4 @@
-"""What each tracker of a session says of the parameters, and whether its rows agree with its error bars."""
+"""Estimates of each tracker of a session, and whether its rows agree with its error bars."""
 
 from __future__ import annotations
 

@@ -25,7 +25,7 @@ LARGEST_NOTEBOOK = 100_000  # characters
 HARMLESS = {"stream", "execute_result", "display_data"}
 # Of estimation and diagnosis the field has words of its own, see docs/explanation/glossary.md.
 RETIRED = (
-    r"(?<!\.)\b(tell|tells|telling|told)\b", r"\b(bears?|borne)\b", r"\bleaves? open\b", r"\bleft open\b", r"\bstands?\b",
+    r"(?<!\.)\b(tells?|telling|told)\b", r"\b(bears?|borne)\b", r"\bleaves? open\b", r"\bleft open\b", r"\bstands?\b",
     r"\bsettle[sd]?\b", r"\btaken up\b", r"\bworked off\b", r"\blooked at\b", r"\bholds an axis\b", r"\breal bodies\b",
 )  # fmt: skip
 

@@ -15,7 +15,7 @@ from sms_online.model.base_parameters import find_base_parameters
 from sms_online.pipeline.latency import SourceGroup
 from sms_online.pipeline.momentum_balance import MomentumBalance
 from sms_online.pipeline.momentum_windows import COPIES, EXPONENT, HOPS, INSTANTS, STEPS, Window
-from sms_online.pipeline.rough_forces import open_at_rest
+from sms_online.pipeline.rough_forces import stiction_std
 from sms_online.pipeline.row_noise import CLOCK_ERROR, CLOCK_KNOWN, RowNoise
 from sms_online.pipeline.sensing import Sensing
 from sms_online.pipeline.sensitivity import Sensitivities
@@ -221,7 +221,7 @@ def test_windows_inform_beside_an_unmodelled_force() -> None:
         noise, whitener = RowNoise((0,), SPAN), Whitener(2)
         white = []
         for inside in windows:
-            free = open_at_rest(np.full((width + 1, 1), 20.0), resting[inside, None], phi)
+            free = stiction_std(np.full((width + 1, 1), 20.0), resting[inside, None], phi)
             (covariances,) = noise.covariances(*nothing, free[None], np.array([np.inf]))
             white.append(whitener.push(covariances, np.array([[phi.sum(), phi @ force[inside]]])))
             alone += float(phi.sum() ** 2 / covariances[-1][0, 0]) if draw == 0 else 0.0

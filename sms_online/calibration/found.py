@@ -1,4 +1,4 @@
-"""What a session says of its calibration, in the words and units of the person at the testbed."""
+"""Calibration constants that a session determines, in the terms and units of the person at the testbed."""
 
 from __future__ import annotations
 

@@ -31,8 +31,8 @@ class Nuisance:
     part: str = ""
 
     @property
-    def may_give_way(self) -> bool:
-        """Whether its tolerance gives way to samples that contradict it clearly; else it counts as stated.
+    def releasable(self) -> bool:
+        """Whether samples that clearly contradict its tolerance release it; else it counts as stated.
 
         A gain sets the scale of what a torque explains: it could make the torque zero.
         """

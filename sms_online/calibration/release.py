@@ -1,6 +1,6 @@
-"""Tolerances with heavy tails: what the samples contradict clearly gives way, and is not paid for by all else.
+"""Heavy-tailed tolerances: a value that the samples clearly contradict is released, and biases nothing else.
 
-A description that is wrong by many tolerances in one number would otherwise be corrected by a part of it, and π bent by
+A description that is wrong by many tolerances in one number would otherwise be corrected in part, and π biased by
 the rest. The tails are those of Student's t, see `pipeline.beforehand`.
 """
 
@@ -46,7 +46,7 @@ def released(estimate: Estimate, nuisances: Sequence[Nuisance], squares: Array) 
     """
     m = len(nuisances)
     tolerance = np.array([each.tolerance for each in nuisances])
-    may = np.array([np.isfinite(each.tolerance) and each.may_give_way for each in nuisances], dtype=np.bool_)
+    may = np.array([np.isfinite(each.tolerance) and each.releasable for each in nuisances], dtype=np.bool_)
     known = np.flatnonzero(may & estimate.determined[:m])
     far = known[np.abs(estimate.pi[known]) > NORMAL * tolerance[known]]
     if not far.size:

@@ -1,4 +1,4 @@
-"""What no record sees alone: sizes that have to agree, names that have to exist, physics that has to be possible."""
+"""Checks across records: sizes that have to agree, names that have to exist, physics that has to be possible."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A candidate for what is missing, and what a search says of it."""
+"""A candidate for a missing effect, and what a search finds about it."""
 
 from __future__ import annotations
 

@@ -29,7 +29,7 @@ from sms_online.pipeline.momentum_windows import HOPS
 from sms_online.pipeline.rough_forces import MOVING_OFF, RoughForces
 from sms_online.stream import Array
 
-# Share of its law that friction may lack just before it gives way, 1σ: the spring winds up meanwhile.
+# Share of its law that friction may lack just before breakaway, 1σ: the spring winds up meanwhile.
 WINDING = 0.2
 # Declarations of which models and noisy columns are kept: those that a search returns to.
 KEPT = 100
@@ -232,8 +232,8 @@ class CandidateColumns:
         own = np.stack(sums[1:], axis=1) / sums[0][:, None]
         free = nothing
         if force.reversing:
-            untold = self._forms.at(("untold", *law), partial(self._untold, model), coefficients)
-            free = self._weak.shared(np.sqrt(untold))
+            undetermined = self._forms.at(("undetermined", *law), partial(self._undetermined, model), coefficients)
+            free = self._weak.shared(np.sqrt(undetermined))
         return Unmodelled(np.maximum(own - free[:, 0], 0.0), free)
 
     def _drawn(self, candidate: Candidate) -> Callable[[Array], Array]:
@@ -249,7 +249,7 @@ class CandidateColumns:
         changes: list[Array] = []
         return squares
 
-    def _untold(self, model: Model, coefficients: Array) -> Array:
+    def _undetermined(self, model: Model, coefficients: Array) -> Array:
         """Squares (W, INSTANTS, n_v) of what a model's last effect, a law of a rate's sign, does not determine.
 
         Where the sign changes, at a standstill, and by what the filter rounds off of the rate.

@@ -1,4 +1,4 @@
-"""How much of what a model leaves each candidate takes away: whitened least squares of many columns at once.
+"""How much of a model's residual each candidate explains: whitened least squares of many columns at once.
 
 With Q an orthonormal basis of the columns that the model has, r = (I - QQᵀ) b is its residual and Z⊥ = (I - QQᵀ) Z what
 a candidate adds. The candidate lowers the residual sum of squares by |P r|², P the projection on Z⊥: twice the log of

@@ -1,4 +1,4 @@
-"""Blocks of time that are held out in turn, and what they say of a residual: blocked cross-validation.
+"""Blocked cross-validation: blocks of time are held out in turn, and the rest of the session predicts them.
 
 Rows of neighbouring windows share samples, so windows are held out a block of time at once, and those that overlap it
 are not fitted either. What an effect improves is the fall of the rms of held-out rows; its standard error comes from

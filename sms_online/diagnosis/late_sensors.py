@@ -36,7 +36,7 @@ CORNERS = (delay_of(LONGEST_FOUND), 2.0, 3.5, 6.0)
 FOLLOWED = 0.02
 # A sensor is late where its lag leaves less than this share of what no masses can follow.
 LARGEST_LEFT = 0.5
-# Probability that any sensor seems late by accident.
+# Probability that any sensor seems late by chance.
 FALSE_ALARM = 0.01
 # Lags whose gain differs by less than this share are not distinguished.
 SAME_SHARE = 0.03

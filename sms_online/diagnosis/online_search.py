@@ -69,7 +69,7 @@ class Named:
 
     effect: as a system file declares it. parameters, values (c,): its unknowns of π, none where it is a constant.
     coefficients: as people read them, name to value, 1σ (None where there is none) and unit. gain: evidence, twice the
-    log likelihood ratio; limit: what the best of all absent candidates reaches by accident. ambiguous: keys of others
+    log likelihood ratio; limit: what the best of all absent candidates reaches by chance. ambiguous: keys of others
     that explain as much.
     """
 
@@ -158,7 +158,7 @@ def _search(request: Request) -> Outcome | None:
     everything = CandidateColumns(rows, system, since=request.late).all()
     outcome = _trace(request, rows, everything, request.late)
     for _ in range(0 if request.whitened else REWEIGHED):
-        # Nothing was known of the rows' noise that was worth the name, for nothing explained the torques.
+        # Hardly anything was known of the rows' noise, for nothing explained the torques.
         rows.reweight(outcome.beta)
         outcome = _trace(request, rows, everything, request.late)
     if outcome.verdict != "unexplained" or request.late == 0:

@@ -1,4 +1,4 @@
-"""What a model leaves of a session's rows, by row type, beside what noise alone would leave."""
+"""Residuals of a session's rows by row type, compared with what noise alone would leave."""
 
 from __future__ import annotations
 

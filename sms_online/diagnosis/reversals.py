@@ -1,4 +1,4 @@
-"""The rate of a motor as forces need it that jump with its sign, and how well its reversals are located.
+"""The rate of a motor for forces that jump with its sign, and how well its reversals are located.
 
 What dry friction does when its motor turns round bends the motor's rate, and a filter as wide as the smooth motion
 allows rounds the bend off: the zero of the rate is milliseconds beside the true one, in every reversal on the same

@@ -2,7 +2,7 @@
 
 Rows are those of the weak form. Each coordinate's rows count by their own size: of the torque where they hold one, else
 of the terms that nominal values make of them. So parameters that shrink to zero explain no torque, and samples that no
-parameters fit leave a large share. Friction and an offset that nobody described are allowed for at every joint.
+parameters fit leave a large share. Undescribed friction and offset are allowed for at every joint.
 """
 
 from __future__ import annotations
@@ -94,7 +94,7 @@ class RoughRows:
         self._homogeneous = torque == 0.0
         self._expected = np.sqrt(np.mean((self._Y @ self._nominal) ** 2, axis=0))
         stated: Array = np.asarray(np.where(torque > 0.0, torque, terms))
-        # Without nominal values nobody knows what counts as much.
+        # Without nominal values it is not known what counts as much.
         largest = np.sqrt(np.mean(np.sum(self._Y**2, axis=2), axis=0))
         self._size: Array = np.asarray(np.where(stated > 0.0, stated, largest))
         self._used: NDArray[np.int64] = np.flatnonzero(self._size > LEAST_SIZE * self._size.max())

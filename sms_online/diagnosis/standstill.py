@@ -14,7 +14,7 @@ from sms_online.pipeline.sensing import Sensing
 from sms_online.pipeline.standstill import Standstill, rate_filter, slowest
 from sms_online.stream import Array
 
-# An axis that breaks loose is held by what its law gives so long before its motion shows, s.
+# Before breakaway an axis is held by what its law gives so long before its motion shows, s.
 LEAVING = 0.025
 
 
@@ -49,7 +49,7 @@ class SessionStandstill:
         return self._still[number][samples]
 
     def leaving(self, number: int, samples: NDArray[np.int64]) -> Array:
-        """Sign (K,) of the motion that it breaks loose into at samples (K,) just before it does, zero elsewhere."""
+        """Sign (K,) of the motion after breakaway at samples (K,) just before it, zero elsewhere."""
         return self._leaving[number][samples]
 
 

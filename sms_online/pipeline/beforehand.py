@@ -1,7 +1,7 @@
 """What is known of calibration and parameters beside the rows, where the rows may contradict it.
 
-Tolerances of calibration have the heavier tails of Student's t: a number that the rows contradict clearly gives way at
-the cost of a logarithm, and does not bend all others. Within two deviations the distribution is nearly normal. Priors
+Tolerances of calibration have the heavier tails of Student's t: what the rows clearly contradict is released at
+the cost of a logarithm, and does not bias all others. Within two deviations the distribution is nearly normal. Priors
 of parameters hold.
 
 Columns of calibration are evaluated with some π and scale with it, as the rows do. What multiplies them is therefore

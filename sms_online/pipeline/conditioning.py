@@ -1,4 +1,4 @@
-"""Declared effects on channels and latencies of sensors, taken off the grid samples before anything is made of them.
+"""Declared effects on channels and latencies of sensors, subtracted from the grid samples before anything else.
 
 Offsets and eccentricities are functions of a sample; lags and delays ask for samples on both sides, so that every
 channel is passed on as much later, and what lies so close to a gap is lost.

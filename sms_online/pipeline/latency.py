@@ -94,7 +94,7 @@ def clock_groups(sensing: Sensing) -> tuple[SourceGroup, ...]:
 
 
 class LatencyState(State):
-    """What rows say of latencies.
+    """The information of rows about latencies.
 
     factor (n + G + 1, n + G + 1): of rows with columns of the latencies; rows: how many.
     """

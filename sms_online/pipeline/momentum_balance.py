@@ -26,7 +26,7 @@ from sms_online.pipeline.momentum_windows import (
     Instants,
     Window,
 )
-from sms_online.pipeline.rough_forces import RoughForces, open_at_rest, responses
+from sms_online.pipeline.rough_forces import RoughForces, responses, stiction_std
 from sms_online.pipeline.smoothing import HALF_WIDTHS, WidthChoice, smooth, stride
 from sms_online.pipeline.standstill import Standstill
 from sms_online.pipeline.weak_form import test_function
@@ -281,7 +281,7 @@ class MomentumBalance(Stage):
             if self.with_moments:
                 moment[self._rough] = -self._moment_weights(1)[0] @ columns[:, 0, : self._rough.size]
             rough = responses(slopes, phi * self.sample_rate, half_width, self.sample_rate, STEPS)
-            rest = open_at_rest(breaking, still, phi)
+            rest = stiction_std(breaking, still, phi)
             out.append(replace(row, Y=Y, b=row.b - weak[:, self._rough.size :], rough=rough, rest=rest, moment=moment))
         return out
 

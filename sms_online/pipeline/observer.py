@@ -1,4 +1,4 @@
-"""What can watch a session pass by."""
+"""Observers of a session's samples, motion and blocks."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Rows of a session over their own standard deviations: what they leave of an estimate beyond what noise does."""
+"""Unwhitened rows over their own standard deviations: by how much an estimate's residuals exceed noise."""
 
 from __future__ import annotations
 

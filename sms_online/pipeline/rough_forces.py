@@ -1,4 +1,4 @@
-"""Forces of effects that may jump with the motion or turn fast with it, and what noise does to them, from every sample.
+"""Nonsmooth forces of effects, which jump or vary faster than the motion, and their noise, from every sample.
 
 A thinned motion folds what such a force does between its samples back into the rows: the phase of a cogging behind a
 gear turns through a radian in a few milliseconds. And noise reaches such a force through the filter: what a row takes
@@ -123,10 +123,10 @@ class RoughForces:
         return out
 
     def at_rest(self, rest: Array, pi: Array) -> Array:
-        """What dry friction may add to rows at a standstill, any value up to what breaks it loose, in each half hop.
+        """Standard deviation of stiction in the rows: at rest any value up to breakaway, in each half hop.
 
-        (W, INSTANTS, n_v), one deviation, of parameters π (n_pi,); no half hops for a model without dry friction. rest
-        (W, INSTANTS, D): see `open_at_rest`.
+        (W, INSTANTS, n_v), of parameters π (n_pi,); no half hops for a model without dry friction. rest
+        (W, INSTANTS, D): see `stiction_std`.
         """
         by_motor = np.eye(self._model.layout.n_v)[self.motors]
         if not self.dry.size:
@@ -151,11 +151,11 @@ class RoughForces:
         return out
 
 
-def open_at_rest(breaking: Array, still: NDArray[np.bool_], phi: Array) -> Array:
-    """(INSTANTS, D): one deviation of the integrals of forces where their axes rest, a half hop at a time.
+def stiction_std(breaking: Array, still: NDArray[np.bool_], phi: Array) -> Array:
+    """Standard deviation (INSTANTS, D) of the integrals of forces where their axes rest, a half hop at a time.
 
-    As of a force that is another at each sample, so that nothing is foreseen of its course; over a window, all of which
-    its axis rests in, as large as what breaks it loose, which is more than it can be. breaking (width + 1, D):
+    As of a force that is another at each sample, so that nothing predicts its course; over a window, all of which
+    its axis rests in, as large as breakaway, which is more than it can be. breaking (width + 1, D):
     `RoughForces.breaking` along the window. still (width + 1, D): whether the axis rests. phi (width + 1,): weights of
     the integral.
     """

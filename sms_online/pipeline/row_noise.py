@@ -5,7 +5,7 @@ c = φ̈ H + φ̇ (Ḣ + ∂Gπ/∂v - ∂Pπ/∂x) + φ (d/dt ∂Gπ/∂v - ∂
 balance; and ∫ φ n_τ dt from the noise of the torque. White noise of 1σ per sample has the density σ² T_s. Rows of
 windows that overlap share noise, so their covariance is block-banded; see `whitening`.
 
-A force that nobody knows, as dry friction's at a standstill, is an error of all windows that see it: what it adds to
+An unknown force, as stiction at a standstill, is an error of all windows that see it: what it adds to
 one says what it adds to the others, and what they hold beside it is still informative.
 
 Devices with clocks of their own are all a little early or late against each other, by the same for seconds. Over a
@@ -154,7 +154,7 @@ class RowNoise(Stage):
 
 
 def common(free: Array, before: Array, hops: int) -> Array:
-    """Covariances (W, n_v) of windows with those that begin so many hops before, by forces that nobody knows.
+    """Covariances (W, n_v) of windows with those that begin so many hops before, by unknown forces.
 
     As if these stayed for a half hop, in which the test functions of either change little.
     free, before (W, INSTANTS, n_v): see `RowNoise.covariances`.

@@ -1,4 +1,4 @@
-"""How momentum and force of the weak form answer to small displacements and speeds, along a session's motion."""
+"""Sensitivity of the weak form's momentum and force to small displacements and speeds, along a session's motion."""
 
 from __future__ import annotations
 

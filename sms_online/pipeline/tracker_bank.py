@@ -22,7 +22,7 @@ from sms_online.trackers.drift_search import Ramp
 from sms_online.trackers.information import Information
 from sms_online.trackers.interface import Estimate, Prior, Rows, Tracker
 
-# Path of a judged tracker that is no learned trend: from one look at it to the next, s.
+# Path of a judged tracker that is no learned trend: from one check of it to the next, s.
 LOOKED = 1.0
 # Times behind an alarm when it is asked whether it was a drift, s, where the judged tracker is a learned trend: the
 # first shows nothing but a fast drift, the second a step too, and the last is for what is unclear till then.
@@ -67,7 +67,7 @@ class Change:
 
 @dataclass(frozen=True)
 class Suspected:
-    """A change that nobody follows: parameters that may move, since when, s; learning: whether drifts are learned."""
+    """An unfollowed change: parameters that may move, since when, s; learning: whether drifts are learned."""
 
     parameters: tuple[str, ...]
     since: float
@@ -249,7 +249,7 @@ class TrackerBank(Stage):
         return self._reading(self._chosen[0], own, bias, t).estimate
 
     def readings(self, own: Estimate, bias: NoiseBias, t: float) -> tuple[Reading, ...]:
-        """What each says of the parameters at t, s, in the order of the choice.
+        """Each tracker's estimate at t, s, in the order of the choice.
 
         own: the estimate by the session's own least squares. bias: what noise in the columns does to it.
         """

@@ -1,4 +1,4 @@
-"""What the sensors' noise makes of the rows of a session's windows: for the stream as for whole captures."""
+"""Noise of the rows of a session's windows, propagated from the sensors: for streams and for whole captures."""
 
 from __future__ import annotations
 

@@ -132,7 +132,7 @@ class LearnedTrend(Tracker):
         self.begin(Information.none(self._n))
 
     def begin(self, known: Information) -> None:
-        """Forget all rows, and go on from what others say of π; the prior stays. Drifts are learned anew."""
+        """Forget all rows, and go on from given information about π; the prior stays. Drifts are learned anew."""
         factor = triangular_factor(self._prior, checked(known, self._n).factor)
         moving = [Moving((int(k),), -1, float(self._trends[k])) for k in np.flatnonzero(self._trends)]
         anchor = DriftFilter.begin(factor, moving, self._walks, STEP)

@@ -1,4 +1,4 @@
-"""What rows say of π, in square-root information form, and what becomes of it when parameters jump or join."""
+"""Information of rows about π in square-root form, and its update when parameters jump or join."""
 
 from __future__ import annotations
 

@@ -174,11 +174,11 @@ class Tracker(Stage, ABC):
 
     @abstractmethod
     def begin(self, known: Information) -> None:
-        """Forget all rows, and go on from what others say of π; priors stay. ValueError where it is not of n."""
+        """Forget all rows, and go on from given information about π; priors stay. ValueError where it is not of n."""
 
     @property
     def information(self) -> Information:
-        """What rows and priors say of π now, for others to go on from; by default as much as the estimate holds."""
+        """Information of rows and priors about π, for others to go on from; by default what the estimate holds."""
         estimate = self.estimate()
         known = np.flatnonzero(estimate.determined)
         root = np.linalg.inv(np.linalg.cholesky(estimate.covariance[np.ix_(known, known)]))

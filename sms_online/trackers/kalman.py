@@ -115,7 +115,7 @@ class KalmanTracker(Tracker):
         self._start()
 
     def begin(self, known: Information) -> None:
-        """Forget all rows; start from the initial value and std together with what others say of π."""
+        """Forget all rows; start from the initial value and std together with given information about π."""
         checked(known, self._n)
         # In units of the initial std about the initial value, as the filter's own state.
         Y, b = (

@@ -9,7 +9,7 @@ from sms_online.trackers.interface import Estimate, Prior, Rows, Tracker
 from sms_online.trackers.kalman import KalmanTracker
 from sms_online.trackers.square_root import RecursiveLeastSquares
 
-# From one look at whether all is determined to the next: rows for each parameter.
+# From one check whether all is determined to the next: rows for each parameter.
 ROWS_A_PARAMETER = 20
 # Initial deviation, in those of the least squares that it starts from: no more than 1e-6 of their information, and the
 # deviation beyond which no parameter walks.
@@ -27,7 +27,7 @@ class WalkState(State):
 class RandomWalk(Tracker):
     """Random walk of π, process_std (n,) in units per √s, with a prior on some of it; see `KalmanTracker`.
 
-    A covariance filter needs a finite initial covariance, which nobody knows: until the rows determine all parameters
+    A covariance filter needs a finite initial covariance, which is unknown: until the rows determine all parameters
     this is recursive least squares, in square-root information form, and the filter starts from its result. Where the
     rows never determine a parameter it stays that. With scaled columns the paper's example has a condition number of
     some 1e4, so 1e8 in a covariance, which Joseph's form holds; a trend would add rates of which nothing is known,
@@ -93,6 +93,6 @@ class RandomWalk(Tracker):
         self.state = WalkState()
 
     def begin(self, known: Information) -> None:
-        """Forget all rows, and go on from what others say of π; the prior stays."""
+        """Forget all rows, and go on from given information about π; the prior stays."""
         self.reset()
         self._squares.begin(known)

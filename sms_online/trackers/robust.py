@@ -1,4 +1,4 @@
-"""Covariance of π̂ that stays honest when the errors of neighbouring rows are correlated.
+"""Covariance of π̂ that holds where the errors of neighbouring rows are correlated.
 
 Errors of an energy balance are integrals and last for many rows; the covariance from the rows' std takes them for
 independent and is too small. The cluster-robust (sandwich) covariance cuts the rows into clusters of consecutive rows,

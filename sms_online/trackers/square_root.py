@@ -91,7 +91,7 @@ class RecursiveLeastSquares(Tracker):
         self._memory = memory_for(self._forgetting, self._n)
 
     def begin(self, known: Information) -> None:
-        """Forget all rows, and go on from what others say of π, which count as older ones; the prior stays."""
+        """Forget all rows, and go on from given information about π, which counts as older rows; the prior stays."""
         checked(known, self._n)
         self.reset()
         self._memory.begin(known)

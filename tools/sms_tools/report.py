@@ -100,7 +100,7 @@ def parameter_table(document: Document, width: int, title: str | Text | None = N
 
 
 def tracker_table(document: Document) -> Table | None:
-    """What each tracker says of each parameter, where there are several; None where there is one."""
+    """Each tracker's estimate of each parameter, where there are several; None where there is one."""
     trackers = document.get("trackers", [])
     if len(trackers) < 2:
         return None
@@ -138,7 +138,7 @@ def tracker_facts(trackers: list[Document]) -> dict[str, list[str]]:
 
 
 def _in_doubt(p: Document) -> str:
-    """What the data say of a parameter that they do not determine: enough to see why, too little to copy down."""
+    """An undetermined parameter in words: enough to see why it is so, too little to copy down."""
     return "" if p["std"] is None else f"({p['estimate']:.2g} ± {p['std']:.1g})"
 
 
