@@ -31,7 +31,7 @@ class Nuisance:
     part: str = ""
 
     @property
-    def releasable(self) -> bool:
+    def may_give_way(self) -> bool:
         """Whether samples that clearly contradict its tolerance release it; else it counts as stated.
 
         A gain sets the scale of what a torque explains: it could make the torque zero.

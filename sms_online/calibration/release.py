@@ -46,7 +46,7 @@ def released(estimate: Estimate, nuisances: Sequence[Nuisance], squares: Array) 
     """
     m = len(nuisances)
     tolerance = np.array([each.tolerance for each in nuisances])
-    may = np.array([np.isfinite(each.tolerance) and each.releasable for each in nuisances], dtype=np.bool_)
+    may = np.array([np.isfinite(each.tolerance) and each.may_give_way for each in nuisances], dtype=np.bool_)
     known = np.flatnonzero(may & estimate.determined[:m])
     far = known[np.abs(estimate.pi[known]) > NORMAL * tolerance[known]]
     if not far.size:

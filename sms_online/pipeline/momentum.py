@@ -225,7 +225,7 @@ class Momentum(Stage):
         """What is known of nuisances and parameters beside the rows; tolerances may be released, within bounds."""
         m, prior = len(self.nuisances), self.current_prior
         known = np.pad(prior_factor(prior, self.changes.base.n), ((0, 0), (m, 0)))
-        may = np.array([each.releasable for each in self.nuisances if np.isfinite(each.tolerance)], dtype=np.bool_)
+        may = np.array([each.may_give_way for each in self.nuisances if np.isfinite(each.tolerance)], dtype=np.bool_)
         bounds = bound_rows(self.nuisances, self.changes.base.n)
         certain = np.concatenate((self.state.known, self._calibration[~may], bounds, known))
         return Beforehand(certain, self._calibration[may])

@@ -84,7 +84,7 @@ class SequentialTest(Stage):
 
     def __init__(self, layout: Layout, hop: float, nuisances: Sequence[Nuisance] = ()) -> None:
         self._layout = layout
-        tolerances = np.array([each.tolerance if each.releasable else np.inf for each in nuisances])
+        tolerances = np.array([each.tolerance if each.may_give_way else np.inf for each in nuisances])
         self._loose: NDArray[np.int64] = np.flatnonzero(np.isfinite(tolerances))
         self._tolerances: Array = tolerances[self._loose]
         self._types = {name: speeds for name, speeds in row_types(layout).items() if len(speeds) > 1}
