@@ -203,9 +203,7 @@ def test_a_truth_that_is_none(bench: Path, capsys: pytest.CaptureFixture[str]) -
     assert "run.csv.truth.json" in line
 
 
-def test_without_motion_nothing_is_determined_and_that_is_written(
-    bench: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_without_motion_the_result_says_nothing_is_determined(bench: Path, capsys: pytest.CaptureFixture[str]) -> None:
     still = [f"{k / 200},0.0,0.5" for k in range(1200)]
     (bench / "run.csv").write_text("\n".join(["t,force_1,q_1", *still]) + "\n")
     code, document = replayed(bench, capsys)

@@ -116,7 +116,7 @@ def test_energy_balance_is_the_same_in_base_parameters(case: tuple[Model, BasePa
         close(base.columns(Y) @ base.values(pi) + base.known_part(Y), Y @ pi)
 
 
-def test_nominal_values_of_combinations_are_those_of_nominal_parameters(case: tuple[Model, BaseParameters]) -> None:
+def test_combinations_of_nominal_parameters_are_nominal(case: tuple[Model, BaseParameters]) -> None:
     model, base = case
     np.testing.assert_allclose([p.nominal for p in base.parameters], base.values(model.nominal), rtol=1e-12, atol=1e-12)
     np.testing.assert_allclose(

@@ -52,7 +52,7 @@ def bound_of_turntable(motions: list[Motion]) -> float:
     return float(cramer_rao_bound(model.dynamics(model.nominal), base, motions, sensors)[0])
 
 
-def test_a_turntable_meets_the_closed_form_of_its_double_integral() -> None:
+def test_a_turntable_meets_its_closed_form() -> None:
     h = 1 / RATE
     t = np.linspace(0.0, 2.0, 1000, endpoint=False)
     motion = turntable_motion(t)

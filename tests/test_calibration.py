@@ -29,7 +29,7 @@ from tests.simulations import planar
 NUISANCES = (Nuisance("clock", "a", "s", 0.5), Nuisance("clock", "b", "s", np.inf))
 
 
-def test_the_prior_solution_is_that_of_rows_with_the_nuisance_marginalised() -> None:
+def test_the_prior_solution_marginalises_the_nuisance() -> None:
     """Random rows, seed 1: the same as generalised least squares whose covariance holds N P Nᵀ."""
     random = np.random.default_rng(1)
     Y, N, b = (random.standard_normal((40, k)) for k in (2, 1, 1))
@@ -91,7 +91,7 @@ def of(evaluation: Evaluation, name: str, where: str) -> Calibration:
     return found
 
 
-def test_a_late_camera_within_its_tolerance_is_said_and_corrected(exact: Block) -> None:
+def test_a_late_camera_within_tolerance_is_said_and_corrected(exact: Block) -> None:
     """By 100 µs, two tolerances."""
     evaluation = evaluated(exact, Tolerances(), late(exact, 1e-4))
     assert np.abs(off(evaluation)).max() < 4.0
@@ -103,7 +103,7 @@ def test_a_late_camera_within_its_tolerance_is_said_and_corrected(exact: Block) 
         assert str(clock).endswith("µs late")
 
 
-def test_a_change_beside_a_clock_that_may_have_moved_is_in_doubt(exact: Block) -> None:
+def test_a_change_beside_a_clock_that_may_have_moved_is_doubted(exact: Block) -> None:
     statistics = evaluated(exact, Tolerances(), late(exact, 1e-4)).statistics
     change = Event(4.0, "payload", ("payload.mass",), ("kg",), (1.0,), (0.1,), 0)
     steady, changed = (Evaluation(replace(statistics, events=events)).trust for events in ((), (change,)))

@@ -146,7 +146,7 @@ def test_columns_are_what_rows_change_by(system: Callable[[], System]) -> None:
     assert bad == {}
 
 
-def test_a_mount_turned_about_its_joint_is_as_if_the_encoders_read_less() -> None:
+def test_a_mount_turned_about_its_joint_offsets_its_encoder() -> None:
     rows = Rows(paper())
     k = [(n.name, n.where) for n in nuisances(rows.sensing)].index(("axis", "joint_2"))
     joint = rows.model.system.joints[1]

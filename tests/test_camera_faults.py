@@ -73,7 +73,7 @@ def test_a_fault_that_is_none_is_one_clear_line(wrong: str) -> None:
         parse_fault(wrong)
 
 
-def test_a_fault_of_a_marker_that_there_is_not_names_those_that_are(block: Block) -> None:
+def test_a_fault_of_an_unknown_marker_names_the_known_ones(block: Block) -> None:
     with pytest.raises(InputError, match=r"no marker 'link_3\.\*'.*link_1\.marker_1, link_1\.marker_2"):
         faulty(block, "hidden@link_3.*:begin=1,over=1")
 

@@ -151,7 +151,7 @@ def test_a_sender_that_starts_again_loses_one_frame(tmp_path: Path) -> None:
     assert faults(source) == {"late_counter": 1, "restarted_counter": 1}
 
 
-def test_a_frame_with_the_stamp_of_the_one_before_is_a_repetition(tmp_path: Path) -> None:
+def test_a_frame_with_the_same_stamp_is_a_repetition(tmp_path: Path) -> None:
     source = decoder(tmp_path, ENCODER__ANGLE="q")
     raw = counted([1, 1, 2, 3], [0] * 4)
     raw.stamp[:] = [7.0, 7.0, 7.001, np.nan]

@@ -90,7 +90,7 @@ def test_a_frame_that_waited_arrived_when_it_was_stamped(bus: tuple[CanReader, c
 
 
 @pytest.mark.realtime
-def test_a_reader_interrupted_between_clocks_makes_no_frame_early(
+def test_an_interrupted_reader_makes_no_frame_early(
     bus: tuple[CanReader, can.BusABC], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     reader, node = bus
@@ -108,7 +108,7 @@ def test_a_reader_interrupted_between_clocks_makes_no_frame_early(
     assert sent - 1e-4 < frames.arrival[0] < sent + 5e-3
 
 
-def test_a_silent_bus_gives_nothing_and_a_flooded_one_bounded_pieces(bus: tuple[CanReader, can.BusABC]) -> None:
+def test_a_flooded_bus_gives_bounded_pieces(bus: tuple[CanReader, can.BusABC]) -> None:
     reader, node = bus
     assert reader.read(0.01) == []
     for k in range(MOST_FRAMES + 100):
@@ -177,7 +177,7 @@ def test_a_bus_that_can_never_be_opened_is_bad_input(interface: str) -> None:
     assert "\n" not in str(refused.value)
 
 
-def test_one_bad_byte_on_a_serial_line_adapter_is_an_error_frame() -> None:
+def test_one_bad_byte_of_a_serial_adapter_is_an_error_frame() -> None:
     """slcan keeps what is no text and would raise on every later frame."""
     source = CanBus(name="bus", interface="slcan", channel="loop://", options={"sleep_after_open": 0})
     reader = CanReader(source, time.monotonic)
@@ -234,7 +234,7 @@ def played(source: CanSource, run: str, speed: float) -> NDArray[np.float64]:
 @pytest.mark.skipif(not DATA.is_dir(), reason="the AK80 pendulum's measurements are not at hand (shared/data)")
 @pytest.mark.parametrize("interface", [{"interface": "virtual", "channel": "ak80"}, UDP])
 @pytest.mark.parametrize("speed", [50.0, pytest.param(1.0, marks=pytest.mark.realtime)])
-def test_real_words_played_onto_a_bus_equal_the_published_numbers(interface: dict[str, object], speed: float) -> None:
+def test_real_words_on_a_bus_equal_the_published_numbers(interface: dict[str, object], speed: float) -> None:
     """The pendulum's candump, read and decoded live: every sample."""
     published = np.loadtxt(DATA / "energy_shaping.csv", delimiter=",", skiprows=1)
     decoded = played(drive(interface), "energy_shaping", speed)

@@ -136,7 +136,7 @@ def test_a_backlog_that_is_worked_off_moves_no_time() -> None:
     np.testing.assert_allclose(corrected(clock, device, np.maximum.accumulate(backlog)), t, rtol=0, atol=1e-4)
 
 
-def test_a_latency_that_changes_for_good_is_followed_and_counted() -> None:
+def test_a_lasting_change_of_latency_is_followed_and_counted() -> None:
     t, device, arrival = pairs(240.0, 60.0, 0.0, 0.0, seed=5)
     later = np.maximum.accumulate(arrival + np.where(t > 21.0, 0.01, 0.0))
     clock = DeviceClock(LATENCY)
@@ -175,7 +175,7 @@ def test_the_mean_line_predicts_better_than_the_closest_below() -> None:
 
 
 @pytest.mark.parametrize("modulus", [256, 65536])
-def test_a_count_gives_regular_times_through_roll_overs_and_losses(modulus: int) -> None:
+def test_a_count_gives_times_through_roll_overs_and_losses(modulus: int) -> None:
     random = np.random.default_rng(6)
     n = np.arange(200_000)
     arrival: Array = n * 1e-3 + random.uniform(0.0, 2e-3, n.size)
@@ -192,7 +192,7 @@ def test_frames_that_overtake_each_other_keep_their_own_times() -> None:
     assert times.tolist() == [0.0, 0.5, 1.5, 1.0, 2.0, 3.0, 2.5, 3.5]
 
 
-def test_samples_without_any_mark_are_numbered_and_holes_are_counted() -> None:
+def test_unmarked_samples_are_numbered_and_holes_counted() -> None:
     arrival = np.concatenate((np.arange(10) * 0.01, 1.0 + np.arange(10) * 0.01))
     times = NumberedTime(0.01)(arrival)
     assert np.rint(times / 0.01).tolist() == [*range(10), *range(100, 110)]
@@ -243,7 +243,7 @@ def test_rows_come_in_the_estimators_portions_and_none_late(tmp_path: Path) -> N
     assert portions[0] < 1.5 * (t[-1] - t[0]) / steps.period < portions[1]
 
 
-def test_a_sensor_that_sticks_is_noticed_and_a_coarse_encoder_is_not() -> None:
+def test_a_stuck_sensor_is_noticed_but_no_coarse_encoder() -> None:
     random = np.random.default_rng(8)
     t = np.arange(4000) / 1000.0
     fine = np.sin(t) + 1e-4 * random.standard_normal(t.size)

@@ -61,7 +61,7 @@ def test_the_slope_vanishes_at_the_minimum_but_for_priors() -> None:
     assert 1.5 < held.beta[0] < free.beta[0]
 
 
-def test_noise_of_rows_without_a_torque_does_not_shrink_the_parameters() -> None:
+def test_noise_of_rows_without_torque_shrinks_no_parameter() -> None:
     errors, squares = [], []
     for seed in range(20):
         grams = _rows(1000, 1.0, lack=0.0, seed=seed)
@@ -73,7 +73,7 @@ def test_noise_of_rows_without_a_torque_does_not_shrink_the_parameters() -> None
     assert np.all(np.abs(np.mean(errors, axis=0)) < 0.015)
 
 
-def test_a_badly_explained_torque_does_not_enlarge_the_parameters() -> None:
+def test_a_badly_explained_torque_enlarges_no_parameter() -> None:
     random = np.random.default_rng(1)
     grams = RowGrams.none(1, 1)
     for _ in range(4000):
@@ -92,7 +92,7 @@ def test_a_badly_explained_torque_does_not_enlarge_the_parameters() -> None:
     assert found.covariance[0, 0] == pytest.approx(36.0 * OVERLAP / 4000.0, rel=0.1)
 
 
-def test_a_nuisance_beyond_its_tolerance_does_not_shrink_the_parameters() -> None:
+def test_a_nuisance_beyond_its_tolerance_shrinks_no_parameter() -> None:
     """Rows u (π_2 + ν π_2) = 0 of a nuisance ν of 100 tolerances, whose column was evaluated with the true π."""
     random = np.random.default_rng(0)
     offset, tolerance = 0.05, 5e-4
@@ -144,7 +144,7 @@ def test_a_wrong_link_encoder_does_not_collapse_the_spring(corner: float | None,
 
 
 @pytest.mark.slow
-def test_undeclared_friction_beside_a_slow_encoder_costs_four_percent() -> None:
+def test_friction_beside_a_slow_encoder_costs_four_percent() -> None:
     for factor in (0.5, 2.0):
         estimator, error = _identified(40.0, 0.01, factor)
         assert np.all(np.abs(error[:3]) < 0.04)

@@ -168,7 +168,7 @@ def test_the_check_and_the_estimate_count_the_same_outliers() -> None:
     assert "q_1: 3 outliers left out, the first at 2.500 s" in found.lines
 
 
-def test_a_few_outliers_and_those_of_a_drive_are_no_reason_to_refuse() -> None:
+def test_a_few_outliers_are_no_reason_to_refuse() -> None:
     block = axis_block(coulomb=0.0)
     values = block.values.copy()
     values[700, 1] += 0.3

@@ -257,7 +257,7 @@ def test_channels_of_a_planar_free_flyer() -> None:
     )
 
 
-def test_channels_of_a_spatial_linear_link_are_its_active_coordinates() -> None:
+def test_channels_of_a_linear_link_are_its_coordinates() -> None:
     names = channels(load_system("spatial-two-link"))
     assert {"eps_x", "eps_y", "eps_z", "eta", "omega_0_x", "gyro_0_z"} <= set(names)
     fields = [name.rsplit(".", 1)[1] for name in names if name.startswith("link_2.marker_1.")]
@@ -271,7 +271,7 @@ def test_drives_are_measured_at_the_shaft_or_at_the_axis() -> None:
     assert channels(load_system("emps")) == ("force_1", "q_1")
 
 
-def test_a_sensor_fills_what_its_patterns_match_and_nothing_else() -> None:
+def test_a_sensor_fills_only_what_its_patterns_match() -> None:
     system = load_system("paper-planar-exact")
     for sensor in system.sensors:
         expected = [c for c in channels(system) if any(fnmatchcase(c, p) for p in sensor.channels)]
@@ -346,14 +346,14 @@ def test_quansers_inertias_are_the_makers() -> None:
     assert about_joint_1 == pytest.approx(0.17043, rel=1e-3)
 
 
-def test_references_of_the_spatial_arms_start_at_zero_and_the_long_arm_at_rest() -> None:
+def test_references_of_the_spatial_arms_start_at_zero() -> None:
     long_arm = load_system("seven-joint").trajectory
     assert long_arm is not None
     for series in long_arm.joints:
         assert sum(term.sine * term.frequency for term in series) == pytest.approx(0.0, abs=1e-6)
 
 
-def test_frequencies_of_the_spatial_references_are_all_different() -> None:
+def test_frequencies_of_spatial_references_all_differ() -> None:
     for name in ("spatial-two-link", "seven-joint"):
         trajectory = load_system(name).trajectory
         assert trajectory is not None

@@ -113,7 +113,7 @@ def test_two_effects_are_found_in_turn() -> None:
 
 
 @pytest.mark.slow
-def test_an_effect_that_nobody_knows_is_unexplained_where_it_acts() -> None:
+def test_an_unknown_effect_is_unexplained_where_it_acts() -> None:
     """Cubic stiffness, struck from the catalogue with what resembles it: it depends on the deflection of its joint."""
     alike = ("cubic_stiffness", "backlash", "encoder_eccentricity", "torsional_hysteresis", "encoder_offset")
     inner = CandidateColumns.effects
@@ -148,7 +148,7 @@ def test_the_adopted_system_file_holds_what_was_found() -> None:
 
 
 @pytest.mark.slow
-def test_the_document_holds_residuals_and_parameters_before_and_after() -> None:
+def test_the_document_holds_results_before_and_after() -> None:
     diagnosis = diagnosed("cubic_stiffness@joint_1:stiffness=300")
     document = diagnosis_document(diagnosis, [], None)
     assert document["verdict"] == "named"

@@ -79,7 +79,7 @@ def test_the_page_is_whole_and_well_formed(diagnosis: Diagnosis, tmp_path: Path)
         assert p["name"] in page.replace("<wbr>", "")
 
 
-def test_candidates_are_drawn_by_what_they_explain_of_everything(diagnosis: Diagnosis, tmp_path: Path) -> None:
+def test_candidates_are_drawn_by_the_share_that_they_explain(diagnosis: Diagnosis, tmp_path: Path) -> None:
     _, page = page_of(diagnosis, tmp_path, [])
     drawn = [float(width) for width in re.findall(r'class="share.*?width: ([\d.]+)%', page)]
     assert drawn == sorted(drawn, reverse=True)
@@ -154,7 +154,7 @@ def test_every_place_of_an_effect_is_marked() -> None:
         ("link_2.*", ["link_2"]), ("link_*.marker_*.u_*", ["link_1", "link_2"]), ("r_S_*", ["base"]),
     ],
 )  # fmt: skip
-def test_an_effect_on_channels_is_marked_where_their_sensors_sit(where: str, places: list[str]) -> None:
+def test_an_effect_on_channels_is_marked_at_their_sensors(where: str, places: list[str]) -> None:
     assert places_of(where, channels(load_system("paper-planar"))) == places
 
 

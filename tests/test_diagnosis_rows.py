@@ -81,7 +81,7 @@ def test_whitened_rows_give_the_estimate_of_the_stream() -> None:
         (Effect(name="torque_delay", where="joint_2", coefficients={"time": 5e-4}), 5e-4),
     ],
 )
-def test_a_channels_column_is_the_change_of_the_rows_when_it_is_corrected(effect: Effect, linear: float) -> None:
+def test_a_channels_column_is_the_change_of_corrected_rows(effect: Effect, linear: float) -> None:
     """Residuals of rows from corrected samples against those of the session: first order, so to 3 %."""
     _, rows = session()
     system = rows.model.system.model_copy(update={"effects": (effect,)})
@@ -114,7 +114,7 @@ def test_internal_states_follow_a_motion_from_its_first_sample() -> None:
     assert_allclose(relative[seen], -a * (1.0 - np.cos(18.0 * t[seen])) / 18.0**2, atol=4e-3 * a / 18.0**2)
 
 
-def test_what_is_unexplained_acts_on_the_row_that_had_and_has_residual() -> None:
+def test_the_unexplained_acts_on_the_row_that_keeps_residual() -> None:
     """A substitute that cleared most of joint 2 and threw link 1 off, which had been near its noise."""
     _, rows = session()
     residual = np.random.default_rng(3).standard_normal(rows.b.shape)
@@ -128,7 +128,7 @@ def test_what_is_unexplained_acts_on_the_row_that_had_and_has_residual() -> None
     assert describe_residual(rows, rows.Y, residual, level).row == "link_1"
 
 
-def test_what_takes_the_course_of_something_found_belongs_to_its_row() -> None:
+def test_a_residual_like_a_found_effect_belongs_to_its_row() -> None:
     """A gear's error, taken for a cogging of the motor alone, is left in the link's rows; another course is not."""
     _, rows = session()
     layout = rows.model.layout
@@ -203,7 +203,7 @@ def test_angles_are_those_beside_the_model() -> None:
     assert angle(Q, first, second) == pytest.approx(np.pi / 4)
 
 
-def test_the_best_of_many_absent_candidates_passes_the_threshold_as_rarely_as_stated() -> None:
+def test_absent_candidates_pass_the_threshold_rarely_as_stated() -> None:
     """4000 draws of 20 candidates at 5 % (seed 7): 3.9 to 6.1 % pass, four standard deviations of the count."""
     rng = np.random.default_rng(7)
     best = (rng.normal(size=(4000, 20)) ** 2).max(axis=1)

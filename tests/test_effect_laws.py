@@ -127,7 +127,7 @@ def test_link_damping_resists_bending_as_its_stiffness_would() -> None:
 
 
 @pytest.mark.parametrize("kinematics", ["linear", "exact"])
-def test_mass_damping_takes_out_twice_the_rate_times_a_link_s_own_kinetic_energy(kinematics: str) -> None:
+def test_mass_damping_dissipates_kinetic_energy_in_proportion(kinematics: str) -> None:
     """With its root held fast, c q̇_fᵀ M_f q̇_f = 2 c K."""
     model = with_effect("link_mass_damping@link_1:rate=0.7", paper(kinematics))
     x, v = random_states(model.layout, STATES, seed=3)
@@ -175,7 +175,7 @@ def test_an_effect_that_lacks_its_inputs_says_so() -> None:
             model.momentum_columns(s.x, s.v)
 
 
-def test_hysteresis_saturates_and_turns_back_with_the_spring_s_slope() -> None:
+def test_hysteresis_saturates_and_reverses_with_its_slope() -> None:
     model = with_effect("torsional_hysteresis@joint_1:torque=2,width=0.02")
     x, v = np.zeros((1, model.layout.n_x)), np.zeros((1, model.layout.n_v))
     v[0, M_1] = 0.3
@@ -242,7 +242,7 @@ def test_a_ratio_needs_what_it_is_relative_to() -> None:
 # The catalogue
 
 
-def test_every_candidate_of_a_system_can_be_declared_with_all_others() -> None:
+def test_candidates_of_a_system_can_be_declared_together() -> None:
     for system in (paper(), spatial("linear").model_copy(update={"effects": ()})):
         effects = candidates(system)
         model = build_model(system.model_copy(update={"effects": tuple(effects)}))
@@ -252,7 +252,7 @@ def test_every_candidate_of_a_system_can_be_declared_with_all_others() -> None:
         assert len({p.name for p in model.parameters}) == model.n_pi
 
 
-def test_candidates_of_the_planar_example_are_the_whole_vocabulary() -> None:
+def test_candidates_of_the_planar_example_are_complete() -> None:
     assert {effect.name for effect in candidates(paper())} == set(NAMES)
     declared = paper(effects=(Effect(name="air_drag", where="base"),))
     assert "air_drag" not in {effect.name for effect in candidates(declared)}
@@ -301,7 +301,7 @@ def test_a_wrong_effect_is_refused_in_one_line(text: str, words: str) -> None:
     assert "\n" not in str(caught.value)
 
 
-def test_geometric_stiffening_is_no_effect_of_a_link_that_is_exact_already() -> None:
+def test_an_exact_link_has_no_effect_of_geometric_stiffening() -> None:
     assert (
         build_model(paper(effects=(Effect(name="geometric_stiffening", where="link_1"),))).system.links[0].kinematics
         == "exact"
@@ -310,7 +310,7 @@ def test_geometric_stiffening_is_no_effect_of_a_link_that_is_exact_already() -> 
         parse_effect("geometric_stiffening@link_1", paper("exact"))
 
 
-def test_the_guide_lists_every_effect_with_its_coefficients_and_defaults() -> None:
+def test_the_guide_lists_every_effect_with_its_defaults() -> None:
     guide = (Path(__file__).parent.parent / "docs" / "reference" / "effects.md").read_text(encoding="utf-8")
     rows = {line.split("`")[1]: line for line in guide.splitlines() if line.startswith("| `")}
     assert set(rows) == set(NAMES)

@@ -115,7 +115,7 @@ def test_in_space_too() -> None:
     assert simulate(declaring(*texts, name="spatial-two-link"), 0.2).drift.energy < 1e-9
 
 
-def test_internal_states_are_integrated_in_step_with_the_clock_too() -> None:
+def test_internal_states_are_integrated_in_real_time_too() -> None:
     system = declaring("torsional_hysteresis@joint_1:torque=5,width=0.01", "slosh@base:mass=20,stiffness=500")
     exact = simulate(system, 0.3)
     stepper = RealTimeStepper(exact.plant)
@@ -136,7 +136,7 @@ def test_geometric_stiffening_is_a_system_with_exact_links() -> None:
     assert np.array_equal(stiffened.rate(np.zeros(5), states), exact.rate(np.zeros(5), states))
 
 
-def test_geometric_stiffening_of_one_link_is_sampled_and_estimated() -> None:
+def test_geometric_stiffening_of_one_link_is_estimated() -> None:
     """The model's own system has that link exact already, where the effect could not be declared."""
     system = declaring("geometric_stiffening@link_1")
     blocks = list(sampled_blocks(simulate(system, 0.05), "A", seed=1))
@@ -190,7 +190,7 @@ def test_reported_coefficients_are_those_that_were_injected(session: tuple[Syste
 
 
 @pytest.mark.slow
-def test_friction_by_direction_and_by_speed_is_found_without_noise() -> None:
+def test_friction_by_direction_and_speed_is_found_noise_free() -> None:
     """Within 1 %: reversals are resolved to a sample only."""
     names = "direction_friction@joint_2", "stribeck_friction@joint_1:velocity=0.3"
     true = declaring("direction_friction@joint_2:plus=2,minus=1.5", "stribeck_friction@joint_1:torque=1,velocity=0.3")
@@ -203,7 +203,7 @@ def test_friction_by_direction_and_by_speed_is_found_without_noise() -> None:
 
 
 @pytest.mark.slow
-def test_effects_with_internal_states_are_identified_and_survive_a_restart() -> None:
+def test_effects_with_internal_states_survive_a_restart() -> None:
     """Within 1 % at grade A (seed 1); saved and restored in the middle, the session ends with the same bits."""
     true = declaring("torsional_hysteresis@joint_1:torque=5,width=0.01", "slosh@base:mass=20,stiffness=500")
     stated = declaring("torsional_hysteresis@joint_1:width=0.01", "slosh@base:frequency=5")
@@ -317,7 +317,7 @@ def test_a_late_torque_is_given_back() -> None:
     assert_allclose(delay.distort(np.sin(omega * t), 1000.0)[20:], late[20:], rtol=0, atol=5e-5)
 
 
-def test_conditioning_is_the_same_however_samples_arrive_and_after_a_restart() -> None:
+def test_conditioning_is_independent_of_blocks_and_restarts() -> None:
     effects = "sensor_lag@q_1:corner=40", "encoder_offset@q_1:offset=0.1", "encoder_offset@q_2:offset=0.2"
     system = declaring(*effects, "torque_delay@joint_1:time=0.003")
     values = np.random.default_rng(8).normal(size=(400, 3))
@@ -337,7 +337,7 @@ def test_conditioning_is_the_same_however_samples_arrive_and_after_a_restart() -
     assert stage.push(GridSamples(index[: stage.margin] + 500, values[: stage.margin], 1)) == []
 
 
-def test_stated_corrections_give_the_estimate_of_a_clean_session(clean_motion: Simulation) -> None:
+def test_corrections_give_the_estimate_of_a_clean_session(clean_motion: Simulation) -> None:
     """An offset and a lag of encoder 1: declared, the stiffness of joint 1 comes out within 0.1 %, undeclared not."""
     texts = ("encoder_offset@q_1:offset=0.002", "sensor_lag@q_1:corner=60")
     blocks = list(sampled_blocks(distorted(clean_motion, *texts), "0"))
@@ -400,7 +400,7 @@ def test_constants_of_a_channel_have_to_be_stated(text: str, words: str) -> None
         channel_effects(declaring(text))
 
 
-def test_a_system_file_declares_an_effect_on_a_group_of_channels() -> None:
+def test_a_file_declares_an_effect_on_a_group_of_channels() -> None:
     text = (
         shipped_text("paper-planar")
         + """

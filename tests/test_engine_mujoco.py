@@ -63,7 +63,7 @@ def at_smaller_amplitude(factor: float) -> System:
 # A link
 
 
-def test_a_clamped_link_under_a_load_bends_as_euler_and_bernoulli_say() -> None:
+def test_a_clamped_loaded_link_bends_as_an_euler_bernoulli_beam() -> None:
     """Where the markers are, F s² (3 L - s)/6 EI, to rounding: Gauss sums are exact for polynomials of degree 3."""
     model = cantilever(link(), CELLS)
     data = mujoco.MjData(model)
@@ -123,7 +123,7 @@ def lost_energy(arm: EngineArm, motion: Motion) -> tuple[float, float]:
     return float(work - np.trapezoid(power, motion.t) - stored), float(stored)
 
 
-def test_energy_and_momentum_are_conserved_to_the_order_of_the_step() -> None:
+def test_energy_and_momentum_are_conserved_to_the_steps_order() -> None:
     energy, momentum = [], []
     for step in (STEP, 0.5 * STEP):
         arm = EngineArm(SYSTEM, CELLS, EngineEffects(), step)
@@ -160,7 +160,7 @@ def tip_speed(arm: EngineArm, motion: Motion) -> float:
     return float(np.linalg.norm(np.array([1.5, -2.0, 0.5]) @ positions / (motion.t[-1] - motion.t[-2])))
 
 
-def test_a_cubic_spring_stores_its_energy_and_a_mass_at_the_tip_is_carried() -> None:
+def test_a_cubic_spring_and_a_tip_mass_conserve_energy() -> None:
     arm = EngineArm(SYSTEM, CELLS, EngineEffects(cubic=(3e3, 0.0), tip_mass=0.5), STEP)
     motion = arm.run(0.5, every=1)
     lost, stored = lost_energy(arm, motion)
@@ -183,7 +183,7 @@ def test_dampers_in_the_links_take_their_energy() -> None:
     assert lost == pytest.approx(taken, rel=0.02)
 
 
-def test_the_integrator_for_dampers_gives_what_the_other_gives_without() -> None:
+def test_both_integrators_agree_without_dampers() -> None:
     plain, faint = (mujoco_capture(SYSTEM, 0.2, effects=EngineEffects(link_damping=eta)) for eta in (0.0, 1e-9))
     # The start's jolt leaves the links' fast modes at 1e-5 rad; their phases differ.
     assert_allclose(faint.values[:, 2:], plain.values[:, 2:], rtol=0, atol=5e-6)
@@ -239,7 +239,7 @@ def test_noise_of_a_grade_comes_on_top() -> None:
 
 
 @pytest.mark.slow
-def test_the_estimator_finds_the_parameters_that_the_engine_was_built_with(engine_capture: Block) -> None:
+def test_the_estimator_finds_the_engines_parameters(engine_capture: Block) -> None:
     estimator = Estimator(exactly_known(SYSTEM), engine_capture.channels, "engine")
     estimator.push(engine_capture)
     estimator.finish()

@@ -125,7 +125,7 @@ def test_rows_without_noise_in_their_columns_are_left_alone() -> None:
     assert bias.correction(np.array([True]))[0][0] == 0.0
 
 
-def test_a_parameter_that_nothing_determines_is_not_shifted_and_shifts_no_other() -> None:
+def test_an_undetermined_parameter_shifts_no_other() -> None:
     rows, noisy = scalar_problem(0.3, seed=4)
     empty = np.zeros(ROWS)
     wide = np.stack([np.insert(each, 1, empty, axis=1) for each in noisy])

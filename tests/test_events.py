@@ -68,7 +68,7 @@ def true_values() -> Array:
 
 
 @pytest.mark.slow
-def test_a_payload_that_moves_with_the_tip_is_noticed_weighed_and_disturbs_nothing_else(
+def test_a_payload_at_the_tip_is_sized_and_disturbs_nothing(
     planar_session: Simulation,
 ) -> None:
     """5 kg at grade B: noticed within 0.3 s, within 0.5 % two seconds after that, all else within 4 σ."""
@@ -95,7 +95,7 @@ def test_a_payload_that_moves_with_the_tip_is_noticed_weighed_and_disturbs_nothi
 
 
 @pytest.mark.slow
-def test_a_payload_is_noticed_in_time_wherever_it_falls_in_a_block(planar_session: Simulation) -> None:
+def test_a_payload_is_noticed_anywhere_in_a_block(planar_session: Simulation) -> None:
     """The same 5 kg, in sessions that begin at 3 s and up to a block later."""
     loaded = PLANAR.model_copy(update={"payload": RigidBody(mass=5.0)})
     block = noisy(PLANAR, changed_session(planar_session, loaded, CHANGE, CHANGE + DETECTED), "B", 1)
@@ -130,7 +130,7 @@ def test_a_body_at_the_tip_is_distinguished_from_a_point_mass(planar_session: Si
     ],
     ids=lambda value: value if isinstance(value, str) else "",
 )
-def test_what_changed_is_named_and_sized_and_only_that_is_opened(
+def test_what_changed_is_named_and_sized_and_nothing_else(
     planar_session: Simulation, after: System, kind: str, parameter: str, size: float
 ) -> None:
     block = noisy(PLANAR, changed_session(planar_session, after, CHANGE, CHANGE + 2.0), "B", 1)
@@ -182,7 +182,7 @@ def test_a_small_change_is_noticed_once_it_has_lasted() -> None:
     assert event.sizes[0] == pytest.approx(0.3 * DAMPING, abs=4.0 * event.stds[0])
 
 
-def test_where_payload_and_link_are_one_rigid_body_the_payload_is_named() -> None:
+def test_a_payload_that_is_one_body_with_its_link_is_named() -> None:
     estimator, _ = run(axis_session(DAMPING, 1.1 * INERTIA), system=SYSTEM)
     event = only_event(estimator)
     assert event.parameters == ("payload.inertia",)
@@ -202,7 +202,7 @@ def test_what_nothing_explains_starts_the_estimate_anew() -> None:
     assert estimator.events[0].parameters == ()
 
 
-def test_a_session_that_ends_upon_a_change_keeps_what_was_known_before() -> None:
+def test_a_session_that_ends_upon_a_change_keeps_its_estimate() -> None:
     block = axis_session(2.0 * DAMPING, INERTIA)
     early = block.t < CHANGE + 0.9
     estimator, _ = run(Block(block.t[early], block.channels, block.values[early]), system=SYSTEM)
@@ -255,7 +255,7 @@ def test_an_opened_parameter_takes_nothing_from_the_others() -> None:
     assert found.covariance() == pytest.approx(solve(batch).covariance()[:3, :3], rel=1e-9, abs=1e-12)
 
 
-def test_windows_are_only_smoothed_with_samples_of_their_own_side() -> None:
+def test_windows_are_smoothed_with_samples_of_their_side_only() -> None:
     """The first window after an event begins a filter's half width after the guard: no sample before has any part."""
     estimator, _ = run(axis_session(2.0 * DAMPING, INERTIA), system=SYSTEM)
     assert estimator.momentum is not None

@@ -92,7 +92,7 @@ def test_a_second_diagnosis_replaces_the_fitted_values(rig: Path) -> None:
     assert second.fitted != first.fitted
 
 
-def test_a_combination_is_fitted_as_the_parameter_it_is_named_after() -> None:
+def test_a_combination_is_fitted_as_its_leading_parameter() -> None:
     system = sms.load_system("paper-planar")
     found = sms.estimate(system, sms.simulate(system, duration=1.0, grade="A"))
     base = find_base_parameters(build_model(system))

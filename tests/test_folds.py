@@ -43,7 +43,7 @@ def test_other_windows_belong_to_the_nearest_block() -> None:
     np.testing.assert_array_equal(some.of_others(np.zeros(3, dtype=np.int64), np.array([0.2, 55.0, 99.4])), [0, 5, 9])
 
 
-def test_a_fall_everywhere_is_certain_and_one_in_a_single_block_is_not() -> None:
+def test_a_fall_in_a_single_block_is_uncertain() -> None:
     before = np.full(10, 4.0)
     everywhere = fall(before, np.full(10, 1.0))
     assert everywhere.share == pytest.approx(0.5)

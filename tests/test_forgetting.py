@@ -32,7 +32,7 @@ from tests.tracker_rows import (
 )
 
 
-def test_exponential_forgetting_is_least_squares_with_geometric_weights() -> None:
+def test_exponential_forgetting_has_geometric_weights() -> None:
     rows, _ = ill_conditioned_rows(seed=18, count=3000, n=8, condition=1e4)
     tracker = RecursiveLeastSquares(8, Exponential(0.998))
     tracker.update(rows)
@@ -134,7 +134,7 @@ def test_no_wind_up_in_a_million_rows_without_excitation(kind: Forgetting, quiet
     check_no_wind_up(kind, 1_000_000, QUIET[quiet])
 
 
-def test_directional_forgetting_does_not_widen_error_bars_without_excitation() -> None:
+def test_directional_forgetting_keeps_unexcited_error_bars() -> None:
     tracker = RecursiveLeastSquares(N, Directional(0.99))
     tracker.update(exciting_rows(seed=27, count=2048))
     before = tracker.estimate()
@@ -160,7 +160,7 @@ def test_the_walk_of_a_kalman_tracker_stops_at_its_initial_std() -> None:
 
 
 @pytest.mark.parametrize("kind", ALL_FORGETTING, ids=lambda kind: type(kind).__name__)
-def test_a_prior_decides_where_the_rows_say_nothing_and_never_ages(kind: Forgetting) -> None:
+def test_a_prior_decides_without_rows_and_never_ages(kind: Forgetting) -> None:
     value, std = np.full(N, np.nan), np.full(N, np.nan)
     value[5], std[5] = 1.6, 0.2
     tracker = RecursiveLeastSquares(N, kind, Prior(value, std))
@@ -174,7 +174,7 @@ def test_a_prior_decides_where_the_rows_say_nothing_and_never_ages(kind: Forgett
 
 
 @pytest.mark.parametrize("factor", [0.0, 1.0, 1.5, np.nan])
-def test_forgetting_factors_and_windows_out_of_range_are_refused(factor: float) -> None:
+def test_forgetting_out_of_range_is_refused(factor: float) -> None:
     with pytest.raises(ValueError, match="forgetting factor"):
         Exponential(factor)
     with pytest.raises(ValueError, match="forgetting factor"):

@@ -70,7 +70,7 @@ def test_a_latency_that_is_not_stated_is_reported(
 
 
 @pytest.mark.parametrize("late", [0.0, 0.003])
-def test_nothing_is_reported_where_all_are_as_late_as_stated_or_later_by_the_same(tmp_path: Path, late: float) -> None:
+def test_a_common_latency_is_not_reported(tmp_path: Path, late: float) -> None:
     estimator = estimator_of(*session(tmp_path, late, late))
     assert estimator.momentum is not None
     assert estimator.momentum.latencies.found is None

@@ -120,7 +120,7 @@ def test_the_curve_is_drawn_with_its_band() -> None:
     assert np.all(np.abs(curve.force - curve.law) < 5.0 * curve.std + 0.01 * np.abs(true).max())
 
 
-def test_a_torque_over_the_angle_is_learned_where_there_is_no_law() -> None:
+def test_a_torque_over_the_angle_is_learned_without_a_law() -> None:
     """A cable that pulls the more, the further the axis is turned to one side."""
     pull = axis_block(lambda q, rate: 0.3 * np.exp(q) - 0.3)
     found = sms.diagnose(BARE, [pull], learned=True)
@@ -137,7 +137,7 @@ def test_without_being_allowed_no_curve_is_tried() -> None:
     assert not any(candidate.name == "learned_force" for candidate in found.candidates)
 
 
-def test_the_system_file_holds_the_curve_to_predict_and_simulate(tmp_path: Path) -> None:
+def test_the_system_file_holds_the_curve(tmp_path: Path) -> None:
     (tmp_path / "axis.toml").write_text(ELASTIC_AXIS.format(stiffness=1.1 * STIFFNESS))
     found = learned(HARDENING).system
     (tmp_path / "found.toml").write_text(adopted_text(str(tmp_path / "axis.toml"), described(), found, {}))

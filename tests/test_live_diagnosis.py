@@ -87,7 +87,7 @@ def test_a_live_session_and_its_replay_give_the_same_document(tmp_path: Path, mo
 
 
 @pytest.mark.slow
-def test_answers_that_came_late_are_used_as_late_in_the_repetition(tmp_path: Path) -> None:
+def test_late_answers_are_as_late_in_the_repetition(tmp_path: Path) -> None:
     """Not so at once, as without notes of the session: then the effect is adopted earlier."""
     block = axis_block(cogging, BEGIN, seconds=14.0)
     documents = []
@@ -163,7 +163,7 @@ def test_a_search_in_another_process_says_what_it_says_here(tmp_path: Path) -> N
     assert noted == [{"adopt": True}, {"begun": 3}, {"search": 3, "block": 17}]
 
 
-def test_a_search_process_that_dies_is_named_and_nobody_waits_for_it(tmp_path: Path) -> None:
+def test_a_search_process_that_dies_is_not_waited_for(tmp_path: Path) -> None:
     searches = SearchProcess(tmp_path, adopt=False)
     searches._process.kill()
     searches._process.wait()

@@ -183,7 +183,7 @@ def test_an_unplugged_device_is_named_and_opened_again(tmp_path: Path, system: S
 
 
 @pytest.mark.realtime
-def test_ten_times_the_rate_drops_counts_and_replays_what_was_used(
+def test_ten_times_the_rate_drops_counts_and_replays_the_rest(
     tmp_path: Path, system: System, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(feed_module, "MOST_WAITING", 200)
@@ -261,7 +261,7 @@ def test_a_checkpoint_of_a_running_session_gives_the_same_bits(
     assert standard_deviation(resumed).tobytes() == standard_deviation(bench.estimator).tobytes()
 
 
-def test_arrivals_never_go_back_behind_a_tick_that_was_worked_off() -> None:
+def test_no_arrival_precedes_a_processed_tick() -> None:
     chunk = SerialChunk(0.5, b"a")
     feed = Feed(Played("encoder", [], FastClock()), None)
     assert feed.drain(1.0) == []
@@ -294,7 +294,7 @@ def test_a_loop_that_is_behind_waits_for_its_readers(monkeypatch: pytest.MonkeyP
     feed.await_fetched(0.0)
 
 
-def test_a_reader_that_never_comes_back_is_not_waited_for_for_ever(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_reader_that_never_returns_is_not_waited_for(monkeypatch: pytest.MonkeyPatch) -> None:
     released = threading.Event()
 
     class Stuck(Played):

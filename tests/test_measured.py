@@ -128,7 +128,7 @@ def quanser_capture(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.mark.slow
-def test_quanser_without_its_friction_leaves_the_residual_as_large_as_it_is(quanser_capture: Path) -> None:
+def test_quanser_without_friction_keeps_a_large_residual(quanser_capture: Path) -> None:
     with_maker = results_document(replayed("quanser-2dsfl", quanser_capture, prior=0.1), 0.0, [])
     for joint in ("joint_1", "joint_2"):
         assert 0.9 < with_maker["residual"][joint]["relative"] < 1.0

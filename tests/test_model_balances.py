@@ -70,7 +70,7 @@ def test_change_of_momentum_is_the_equation_of_motion(system: System) -> None:
 
 
 @all_systems
-def test_power_of_the_forces_is_the_change_of_energy_and_what_is_dissipated(system: System) -> None:
+def test_power_is_the_change_of_energy_plus_dissipation(system: System) -> None:
     model = build_model(system)
     x, v = random_states(model.layout, 4, seed=6)
     a = np.random.default_rng(7).normal(size=v.shape)
@@ -174,7 +174,7 @@ def free_motion(
 
 
 @pytest.mark.parametrize("kinematics", ["linear", "exact"])
-def test_work_of_the_motors_is_the_change_of_energy_along_a_motion(kinematics: str) -> None:
+def test_work_of_the_motors_is_the_change_of_energy(kinematics: str) -> None:
     """(43): work = change of K + U, plus what the dampers take."""
     model = build_model(paper(kinematics))
     pi = soften(model)

@@ -93,7 +93,7 @@ def test_traction_is_that_of_a_clamped_free_bar() -> None:
 
 
 @pytest.mark.parametrize(("kinematics", "tolerance"), [("linear", 2e-3), ("exact", 1e-7)])
-def test_a_load_at_the_tip_lowers_the_frequencies_as_the_eigenmodes_say(kinematics: str, tolerance: float) -> None:
+def test_a_tip_load_lowers_the_frequencies_like_the_eigenmodes(kinematics: str, tolerance: float) -> None:
     """The model's H and stiffness against the frequency equation of the clamped-loaded beam, section III."""
     payload = RigidBody(mass=4.0, center_of_mass=(0.2, 0.0, 0.0), inertia=Inertia(zz=0.3))
     system = cantilever(4, "bending_z", kinematics, payload)

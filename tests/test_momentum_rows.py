@@ -81,7 +81,7 @@ def test_rows_are_the_equations_of_motion_on_any_motion(system: System) -> None:
         assert (np.abs(Y @ beta - window.b[0] - impulse) <= ROUNDING * size).all()
 
 
-def test_rows_of_the_simulated_example_close_with_its_torque_alone(planar_session: Simulation) -> None:
+def test_rows_of_the_example_close_with_its_torque_alone(planar_session: Simulation) -> None:
     """A free-floater: base and links have no force of their own."""
     model = planar_session.plant.model
     balance = MomentumBalance(model, find_base_parameters(model), 1000.0, SPAN)
@@ -113,7 +113,7 @@ def test_what_is_stored_of_a_row_is_all_that_is_not_zero(system: System) -> None
     assert (np.abs(full) <= np.where(stored, np.inf, 1e-15) * size).all()
 
 
-def test_a_force_that_turns_with_the_thinned_samples_is_summed_from_every_one() -> None:
+def test_a_force_aliased_by_thinning_is_summed_at_all_samples() -> None:
     """A cogging of 450 periods a turn, at 1.4 rad/s: one period for each thinned sample."""
     cogging = Effect(name="cogging", where="joint_2", coefficients={"amplitude": 6.0, "order": 9.0})
     model = build_model(paper(effects=(cogging,)))
@@ -147,7 +147,7 @@ def test_rows_of_a_free_base_hold_no_spring_damper_or_rotor() -> None:
     assert "joint_2.stiffness" not in in_rotor_row
 
 
-def test_windows_follow_one_another_without_a_gap_and_stay_in_their_segment() -> None:
+def test_windows_are_gapless_and_stay_in_their_segment() -> None:
     system = paper()
     model = build_model(system)
     balance = MomentumBalance(model, find_base_parameters(model), system.sample_rate, SPAN)
@@ -219,7 +219,7 @@ def test_a_session_restored_at_any_time_gives_the_same_bits(cut: float) -> None:
 
 
 @pytest.mark.slow
-def test_a_session_restored_while_weights_warm_up_gives_the_same_bits(
+def test_a_session_restored_during_warm_up_has_the_same_bits(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(momentum_fit, "SAME_NOISE", 0.0)
@@ -241,7 +241,7 @@ def test_a_session_restored_while_weights_warm_up_gives_the_same_bits(
     assert not all(warm)
 
 
-def test_the_nominal_values_of_a_description_never_enter_the_estimate() -> None:
+def test_nominal_values_never_enter_the_estimate() -> None:
     block = axis_session(np.arange(800) / 200.0, noise=1e-4)
     other = parse_system(AXIS.replace(f"zz = {INERTIA}", "zz = 7.0").replace(f"= {DAMPING} }}", "= 5.0 }"), "axis.toml")
     assert build_model(other).nominal.tolist() != build_model(parse_system(AXIS, "axis.toml")).nominal.tolist()

@@ -52,7 +52,7 @@ def document(estimator: Estimator, online: OnlineDiagnosis) -> str:
 
 
 @pytest.mark.slow
-def test_an_effect_of_the_base_that_begins_in_mid_session_is_named_and_disturbs_nothing(
+def test_an_effect_of_the_base_that_begins_is_named(
     planar_session: Simulation,
 ) -> None:
     """A drag of 60 N s/m at grade B, seed 1: noticed within 2 s of data, named within 5 s, then known like the rest."""
@@ -107,7 +107,7 @@ def test_without_adopt_it_is_only_reported() -> None:
     assert results_document(plain, 0.0, []) == results_document(estimator, 0.0, [])
 
 
-def test_an_effect_that_was_there_from_the_start_is_named_and_leaves_no_bias() -> None:
+def test_an_effect_from_the_start_is_named_and_leaves_no_bias() -> None:
     """Friction that the description lacks: noticed as soon as there are weights, named at the first search."""
     estimator, online = watched(BARE, axis_block(nothing, seconds=9.0))
     (episode,) = online.episodes
@@ -167,7 +167,7 @@ def test_nothing_depends_on_how_samples_arrive() -> None:
     assert document(*watched(SYSTEM, axis_block(cogging, BEGIN), size=1)) == document(*cogged(True))
 
 
-def test_a_session_with_an_adopted_effect_is_saved_and_goes_on_to_the_same_bits() -> None:
+def test_a_session_with_an_adopted_effect_resumes_to_the_bit() -> None:
     block = axis_block(cogging, BEGIN)
     split = 13 * 200
     first, second = (Block(block.t[part], block.channels, block.values[part]) for part in np.s_[:split, split:])

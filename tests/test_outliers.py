@@ -31,7 +31,7 @@ def swinging(noise: float, seed: int = 3, seconds: float = 4.0) -> tuple[Array, 
     return t, (swing + noise * np.random.default_rng(seed).standard_normal(t.size))[:, None]
 
 
-def test_one_percent_of_outliers_is_found_and_hardly_anything_else() -> None:
+def test_one_percent_of_outliers_is_found_and_little_else() -> None:
     t, values = swinging(1e-4)
     random = np.random.default_rng(5)
     hit = random.random(t.size) < 0.01

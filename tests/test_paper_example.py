@@ -71,7 +71,7 @@ def streamed(name: str, block: Block) -> Estimator:
     return estimator
 
 
-def test_streamed_positions_and_torques_give_all_but_one_to_a_hundredth_percent(planar_block: Block) -> None:
+def test_the_stream_gives_all_but_one_to_a_hundredth_percent(planar_block: Block) -> None:
     estimator = streamed("paper-planar", planar_block)
     truth = estimator.base.values(estimator.model.nominal)
     estimate = estimator.estimate()
@@ -127,7 +127,7 @@ def test_result_does_not_depend_on_how_samples_arrive(
 
 
 @pytest.mark.slow
-def test_identified_dynamics_move_an_unseen_trajectory_to_a_tenth_of_a_millimetre(planar_block: Block) -> None:
+def test_identified_dynamics_predict_an_unseen_trajectory(planar_block: Block) -> None:
     estimator = streamed("paper-planar", planar_block)
     document = json.loads(json.dumps(results_document(estimator, 0.0, [])))
     # The document alone gives H, C and K_f of (40): the description's nominal values play no part.

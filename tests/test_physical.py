@@ -76,7 +76,7 @@ def test_a_consistent_estimate_is_returned_as_it_is(planar: Case, spatial: Case)
             assert projection.active == ()
 
 
-def test_a_negative_stiffness_goes_to_zero_and_takes_correlated_parameters_along(planar: Case) -> None:
+def test_a_negative_stiffness_moves_correlated_parameters(planar: Case) -> None:
     model, base, physical = planar
     beta = base.values(model.nominal)
     k = names(base).index("joint_1.stiffness")
@@ -198,7 +198,7 @@ def test_a_first_moment_needs_inertia_in_space_too(spatial: Case) -> None:
     assert projection.beta[h] ** 2 <= mass * 0.5 * (xx + zz - yy) * (1.0 + 1e-3)
 
 
-def test_bodies_lumped_into_combinations_with_either_sign_are_found_consistent() -> None:
+def test_bodies_in_combinations_are_found_consistent() -> None:
     # With seven joints a body alone, without what others lend to its combinations, would not be one.
     model, base, physical = case(shipped_text("seven-joint"), "seven-joint")
     assert base.mixture.min() < 0.0

@@ -13,7 +13,7 @@ from tests.plain_rig import bound_of, plain_rig
 SEED = 0
 
 
-def test_a_simulation_records_the_rates_that_are_described_at_their_own_instants() -> None:
+def test_a_simulation_records_each_rate_at_its_own_instants() -> None:
     simulation = simulate(plain_rig(), 0.1)
     (block,) = sampled_blocks(simulation, None, SEED)
     assert "gyro_0_z" in block.channels
@@ -27,7 +27,7 @@ def test_a_simulation_records_the_rates_that_are_described_at_their_own_instants
 
 
 @pytest.mark.slow
-def test_every_parameter_of_a_plain_rig_is_within_ten_times_its_bound() -> None:
+def test_parameters_of_a_plain_rig_are_within_ten_bounds() -> None:
     simulation = simulate(plain_rig())
     blocks = list(sampled_blocks(simulation, None, SEED))
     estimator = Estimator(plain_rig(), blocks[0].channels, "simulation")

@@ -200,9 +200,7 @@ def test_the_replay_of_a_recording_warns_of_a_cut_line(tmp_path: Path) -> None:
     assert "encoder.serial: the last line is cut (no newline at its end) and left out" in recording.warnings
 
 
-def test_a_full_disk_is_named_and_writing_goes_on_when_there_is_room(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_full_disk_is_named_and_writing_resumes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     room = [60]
     write = os.write
 

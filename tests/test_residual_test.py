@@ -87,7 +87,7 @@ def test_more_than_noise_is_noticed_where_it_is_and_dated(speed: int, row: str) 
     assert 40 * 150 <= alarm.since <= 40 * (200 + HOPS)
 
 
-def test_a_row_type_notices_what_none_of_its_coordinates_shows_alone() -> None:
+def test_a_row_type_detects_what_no_coordinate_shows_alone() -> None:
     """Noise of a link twice as large: its χ² alarms long before the coordinates' own sums reach the limit; seed 5."""
     errors = noise(300, 5)
     errors[100:, LAYOUT.q_f[0]] *= 2.2

@@ -71,7 +71,7 @@ def bench(tmp_path: Path) -> Bench:
     return Bench(tmp_path)
 
 
-def test_an_encoder_goes_on_in_its_turn_and_not_without_a_checkpoint(bench: Bench) -> None:
+def test_an_encoder_keeps_its_turn_with_a_checkpoint(bench: Bench) -> None:
     fresh, resumed = (merger(bench.system, bench.folder) for _ in range(2))
     bench.checkpoint.put_into_source(resumed)
     off = []
@@ -85,7 +85,7 @@ def test_an_encoder_goes_on_in_its_turn_and_not_without_a_checkpoint(bench: Benc
     np.testing.assert_allclose(turns, np.rint(turns), atol=1e-9)
 
 
-def test_the_recording_of_a_resumed_session_is_read_in_the_same_turn(bench: Bench) -> None:
+def test_a_resumed_recording_is_read_in_the_same_turn(bench: Bench) -> None:
     run = bench.folder / "run"
     recorder = Recorder(run, bench.header(), {})
     for k in range(bench.half, len(bench.items) + 1):

@@ -153,7 +153,7 @@ def test_rows_of_noisy_readings_scatter_as_predicted(system: System, draws: int)
     assert abs(np.mean(found.whitened**2) - 1.0) < 0.05
 
 
-def test_a_clock_that_is_off_moves_rows_by_the_rates_of_its_readings() -> None:
+def test_a_clock_error_moves_rows_by_its_readings_rates() -> None:
     """Against rows of samples moved in time; windows that overlap share it, and a clock just found is off by more."""
     system = paper()
     model = build_model(system)
@@ -231,7 +231,7 @@ def test_windows_inform_beside_an_unmodelled_force() -> None:
     assert np.sqrt(np.mean(np.square(errors))) < 1.5
 
 
-def test_windows_together_have_the_covariances_of_one_after_the_other() -> None:
+def test_windows_together_have_the_covariances_of_single_ones() -> None:
     rng = np.random.default_rng(5)
     W, n_v, sensors = 25, 3, 4
     clocks = (SourceGroup("a", (0, 1), (1,), ()), SourceGroup("b", (2, 3), (), ()))
@@ -286,7 +286,7 @@ def test_a_capture_is_whitened_like_a_stream() -> None:
     np.testing.assert_allclose(whole.std.ravel(), np.diag(np.linalg.cholesky(full)), rtol=1e-8)
 
 
-def test_whitening_after_a_break_does_not_remember_what_was_before() -> None:
+def test_whitening_after_a_break_remembers_nothing() -> None:
     covariances = random_banded(4, 12, seed=6)
     rows = np.random.default_rng(6).standard_normal((12, 4, 2))
     whitener = Whitener(2)
@@ -301,7 +301,7 @@ def test_whitening_after_a_break_does_not_remember_what_was_before() -> None:
     [(1000.0, 1000.0), (240.0, 240.0), (250.0, 1000.0), (240.0, 1000.0)],
     ids=lambda rate: f"{rate:g} Hz",
 )
-def test_noise_is_estimated_from_a_sensors_own_samples_at_any_rate(rate: float, grid: float) -> None:
+def test_noise_is_estimated_from_own_samples_at_any_rate(rate: float, grid: float) -> None:
     """An angle sampled at `rate`, in rows of a capture at `grid`; of noise only the density σ² T_s matters. Seed 7.
 
     1000 samples give σ to 5 % and so the density to 10 %; three times that is allowed.

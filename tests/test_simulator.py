@@ -110,7 +110,7 @@ def test_a_motion_without_continuation_is_refused() -> None:
 # Reference and controller
 
 
-def test_a_reference_starts_at_zero_and_its_rate_is_its_derivative() -> None:
+def test_the_rate_of_a_reference_is_its_derivative() -> None:
     joints = (
         (Harmonic(frequency=1.5, sine=1.3), Harmonic(frequency=4.0, cosine=-0.2)),
         (Harmonic(frequency=3.0, sine=1.0),),
@@ -133,7 +133,7 @@ def test_the_controller_pulls_towards_the_reference() -> None:
 # Conservation
 
 
-def test_the_paper_example_balances_energy_and_keeps_its_momentum(planar_session: Simulation) -> None:
+def test_the_paper_example_conserves_energy_and_momentum(planar_session: Simulation) -> None:
     drift = planar_session.drift
     assert drift.energy < 1e-9
     assert drift.linear_momentum is not None
@@ -196,7 +196,7 @@ def test_steps_of_one_millisecond_stay_with_the_exact_motion(planar_session: Sim
 # Sensors
 
 
-def test_noise_free_samples_are_smooth_enough_to_be_differentiated(planar_session: Simulation) -> None:
+def test_noise_free_samples_can_be_differentiated(planar_session: Simulation) -> None:
     t, channels, values = sampled(planar_session, "0")
     layout = planar_session.plant.model.layout
     x = values[:, [channels.index(name) for name in layout.position_names]]
@@ -264,7 +264,7 @@ def test_a_slow_sensor_fills_every_fourth_sample_of_its_own(short: Simulation) -
     assert np.isfinite(values[:, channels.index("q_1")]).all()
 
 
-def test_a_latency_delivers_the_past_and_before_the_start_the_rest(short: Simulation) -> None:
+def test_a_latency_delivers_the_past(short: Simulation) -> None:
     late = Sensor(channels=("q_1", "tau_1"), latency=0.0105)
     t, channels, values = sampled(with_sensors(short, late))
     exact = exact_states(short, t[11:] - 0.0105)

@@ -70,7 +70,7 @@ def first(simulation: Simulation) -> Estimator:
 
 
 @pytest.mark.slow
-def test_errors_agree_with_error_bars_and_error_bars_with_the_bound(simulation: Simulation, first: Estimator) -> None:
+def test_errors_agree_with_error_bars_and_these_with_the_bound(simulation: Simulation, first: Estimator) -> None:
     assert first.sensing.missing == MISSING
     sessions = [first, *(session(one_link("linear"), recorded(simulation, seed)) for seed in range(1, SEEDS))]
     assert all(estimator.by_smoother for estimator in sessions)
@@ -152,7 +152,7 @@ def test_the_same_samples_give_the_same_bits_however_they_come(
         assert_array_equal(standard_deviation(estimator), standard_deviation(first))
 
 
-def test_a_gap_of_the_torque_begins_a_new_span_and_holes_of_other_channels_do_not(simulation: Simulation) -> None:
+def test_only_a_gap_of_the_torque_begins_a_new_span(simulation: Simulation) -> None:
     block = recorded(simulation, 1)
     kept = (block.t < 2.0) | (block.t > 2.3)
     parted = session(one_link("linear"), Block(block.t[kept], block.channels, block.values[kept]))
@@ -186,7 +186,7 @@ def test_friction_that_the_model_lacks_widens_the_error_bars() -> None:
     assert np.all(np.abs(normalised(holding)) < 4.0)
 
 
-def test_samples_that_no_motion_explains_leave_the_first_fit_with_a_warning(simulation: Simulation) -> None:
+def test_inexplicable_samples_leave_the_first_fit_and_a_warning(simulation: Simulation) -> None:
     block = recorded(simulation, 3)
     values = block.values.copy()
     values[:, block.channels.index("tau_1")] *= -1.0
@@ -208,7 +208,7 @@ def test_exact_links_and_one_marker_alone_are_enough() -> None:
     assert np.all(np.abs(normalised(estimator)) < 4.0)
 
 
-def test_all_coordinates_measured_are_smoothed_only_where_that_is_asked_for(simulation: Simulation) -> None:
+def test_full_measurements_are_smoothed_only_on_request(simulation: Simulation) -> None:
     sensors = (*simulation.plant.system.sensors, Sensor(channels=("link_1.marker_*.theta_z",), noise=1e-4))
     system = simulation.plant.system.model_copy(update={"sensors": sensors})
     block = recorded(Simulation(Plant(system), simulation.solution), 5)
@@ -220,7 +220,7 @@ def test_all_coordinates_measured_are_smoothed_only_where_that_is_asked_for(simu
     assert np.all(np.abs(normalised(smoothed)) < 4.0)
 
 
-def test_the_smoother_is_not_asked_where_effects_on_channels_are_declared() -> None:
+def test_declared_effects_on_channels_exclude_the_smoother() -> None:
     """It reads channels as they come: the momentum balance estimates then, and without all coordinates nothing does."""
     offset = Effect(name="encoder_offset", where="theta_m_1", coefficients={"offset": 0.01})
     system = load_system("paper-planar").model_copy(update={"balance": "smoother", "effects": (offset,)})

@@ -42,7 +42,7 @@ def test_a_static_shape_is_that_of_a_link_held_at_its_markers(model: Model) -> N
         assert_allclose(along.T @ holders, force, atol=1e-9 * np.abs(force).max())
 
 
-def test_slopes_of_a_cantilever_with_a_load_at_its_tip_follow_from_displacements() -> None:
+def test_slopes_of_a_cantilever_follow_from_displacements() -> None:
     kinematics = build_model(one_link("linear")).chain.flexible[0]
     assert kinematics is not None
     # u = a (3 L s² - s³) of a load at the tip, L = 1 m.
@@ -59,7 +59,7 @@ def test_a_shape_with_all_readings_is_the_one_that_is_read(model: Model) -> None
     assert_allclose(SensedShape(kinematics, range(4)).coordinates(kinematics.markers(q_f)), q_f, atol=1e-12)
 
 
-def test_a_link_without_any_marker_and_a_spatial_base_with_too_few_are_refused(model: Model) -> None:
+def test_too_few_markers_are_refused(model: Model) -> None:
     drives = ("tau_1", "theta_m_1", "q_1")
     with pytest.raises(InputError, match=r"'link_1\.marker_1\.u_"):
         Sensing(model, drives, "capture")
@@ -126,7 +126,7 @@ def dense_problem(steps: Transitions, root: Array, C: Array, D: Array, e: Array)
     return solution[m + K * noises :], (state @ solution) + offset
 
 
-def test_filter_and_smoother_equal_one_dense_least_squares_problem() -> None:
+def test_filter_and_smoother_equal_dense_least_squares() -> None:
     rng = np.random.default_rng(5)
     K, m, n, n_y, noises = 12, 4, 2, 3, 1
     steps = Transitions(

@@ -16,7 +16,7 @@ half_widths = pytest.mark.parametrize("half_width", HALF_WIDTHS)
 
 
 @half_widths
-def test_values_and_rates_of_polynomials_up_to_degree_eight_are_exact(half_width: int) -> None:
+def test_polynomials_up_to_degree_eight_are_exact(half_width: int) -> None:
     """In z = t / M, so that every power is one at the end of the window."""
     samples = np.arange(4 * half_width + 1)
     z = (samples - 2 * half_width) / half_width
@@ -29,7 +29,7 @@ def test_values_and_rates_of_polynomials_up_to_degree_eight_are_exact(half_width
     np.testing.assert_allclose(rates, exact, rtol=0.0, atol=ROUNDING * RATE)
 
 
-def test_the_narrowest_kernel_is_the_eighth_order_central_difference() -> None:
+def test_the_narrowest_kernel_is_a_central_difference() -> None:
     side = np.array([4.0 / 5.0, -1.0 / 5.0, 4.0 / 105.0, -1.0 / 280.0])
     np.testing.assert_allclose(kernel(4)[:, 1], np.concatenate((-side[::-1], [0.0], side)), rtol=0.0, atol=1e-14)
     np.testing.assert_allclose(kernel(4)[:, 0], np.eye(9)[4], rtol=0.0, atol=1e-14)
@@ -61,21 +61,21 @@ def response(half_width: int, frequency: Array) -> Array:
 
 
 @half_widths
-def test_thinning_folds_less_than_1e_4_of_anything_onto_the_slow_motion(half_width: int) -> None:
+def test_thinning_aliases_less_than_1e_4(half_width: int) -> None:
     """What lies at a multiple of the thinned rate and looks like a constant then; for hops of 5 to 100 samples."""
     for s in {stride(half_width, hop) for hop in range(5, 101)} - {1}:
         assert response(half_width, np.arange(1, s // 2 + 1) / s).max() < 1e-4
 
 
 @half_widths
-def test_thinning_keeps_whole_hops_and_seven_samples_to_a_half_width(half_width: int) -> None:
+def test_thinning_keeps_whole_hops_and_seven_samples(half_width: int) -> None:
     for hop in range(1, 101):
         s = stride(half_width, hop)
         assert hop % s == 0
         assert s == 1 or 7 * s <= half_width
 
 
-def test_differences_of_neighbouring_widths_are_measured_in_units_of_noise() -> None:
+def test_differences_of_widths_are_in_units_of_noise() -> None:
     """Mean squares of unit white noise are one; 2000 independent windows, so 3 standard errors are 10 %. Seed 1."""
     reach = HALF_WIDTHS[-1]
     noise = np.random.default_rng(1).standard_normal((2 * reach + 1, 2000))
@@ -94,9 +94,7 @@ def chosen(signal: Array, sigma: float) -> int:
 
 @pytest.mark.parametrize("sigma", [1e-5, 1e-4, 1e-3])
 @pytest.mark.parametrize("frequency", [0.5, 5.0, 30.0, 80.0])
-def test_what_the_chosen_width_loses_of_a_motion_is_less_than_the_noise_of_the_next_narrower(
-    frequency: float, sigma: float
-) -> None:
+def test_the_chosen_width_loses_less_than_the_next_ones_noise(frequency: float, sigma: float) -> None:
     """That neighbour agreed, as far as its noise can show; the one after would have lost twenty times as much."""
     t = np.arange(560) / RATE
     signal = np.sin(2.0 * np.pi * frequency * t)
@@ -108,7 +106,7 @@ def test_what_the_chosen_width_loses_of_a_motion_is_less_than_the_noise_of_the_n
     assert np.sqrt(np.mean(lost**2)) < sigma * np.linalg.norm(kernel(narrower)[:, 1]) * RATE
 
 
-def test_a_calm_motion_gets_the_widest_filter_and_a_jolt_a_narrow_one() -> None:
+def test_jolts_get_narrower_filters_than_calm_motion() -> None:
     t = np.arange(560) / RATE
     calm = np.sin(3.0 * t)
     jolt = calm + 0.01 * np.exp(-(((t - 0.28) / 0.004) ** 2))

@@ -106,7 +106,7 @@ def test_a_snapshot_shares_arrays_and_no_lists() -> None:
 
 
 @pytest.mark.parametrize("name", ["gap", "effects", "smoother", "recording", "axis-event"])
-def test_a_session_that_is_resumed_again_and_again_ends_in_the_same_state(name: str) -> None:
+def test_a_session_resumed_repeatedly_ends_in_the_same_state(name: str) -> None:
     """At eight places by seed 1, in every bit of every stage's state: so no state lacks what the stage goes on with.
 
     And states that were collected there have not changed by the end: so no stage has written into an array of its own.

@@ -62,7 +62,7 @@ def test_a_clean_capture_passes_bit_for_bit(start: float) -> None:
     }
 
 
-def test_stamps_rounded_far_below_a_period_still_lie_on_the_grid() -> None:
+def test_finely_rounded_stamps_still_lie_on_the_grid() -> None:
     t = np.arange(1000) / RATE
     values = signal(t)
     _, out, _ = joined(run(t + np.tile([0.0, 16e-9, 32e-9, 8e-9], 250), values)[0])
@@ -84,7 +84,7 @@ def test_lone_missing_samples_are_interpolated_and_counted() -> None:
     assert np.array_equal(out[kept], values[kept])
 
 
-def test_polynomials_of_degree_five_are_exact_between_jittered_samples() -> None:
+def test_polynomials_of_degree_five_are_exact_despite_jitter() -> None:
     rng = np.random.default_rng(2)
     t = np.arange(1000) / RATE
     t[1:] += rng.uniform(-3e-4, 3e-4, 999)
@@ -103,7 +103,7 @@ def test_polynomials_of_degree_five_are_exact_between_jittered_samples() -> None
     assert stage.counters.interpolated_cells == index.size
 
 
-def test_a_channel_of_a_tenth_of_the_rate_is_interpolated_onto_the_grid() -> None:
+def test_a_channel_of_a_tenth_of_the_rate_is_interpolated() -> None:
     t = np.arange(2000) / RATE
     values = signal(t)
     slow = np.arange(2000) % 10 != 3
@@ -144,7 +144,7 @@ def test_a_hole_in_one_channel_ends_the_segment_of_all() -> None:
     assert np.array_equal(out, values[index])
 
 
-def test_no_grid_point_is_delivered_without_three_samples_on_either_side() -> None:
+def test_a_grid_point_needs_three_samples_on_either_side() -> None:
     """A missing sample next to a gap cannot be interpolated from both sides, so it is left out with its neighbours."""
     t = np.r_[0:1000, 1100:2000] / RATE
     values = signal(t)
@@ -171,7 +171,7 @@ def test_a_jump_of_the_clock_costs_no_memory() -> None:
     assert stage.counters.lost_samples == 10**12 - 1000
 
 
-def test_a_channel_that_falls_silent_holds_nothing_back_for_ever() -> None:
+def test_a_silent_channel_holds_nothing_back_for_ever() -> None:
     t = np.arange(50_000) / RATE
     values = signal(t)
     values[5000:, 0] = np.nan
@@ -183,7 +183,7 @@ def test_a_channel_that_falls_silent_holds_nothing_back_for_ever() -> None:
     assert delivered == 5000
 
 
-def test_one_row_per_sensor_at_the_same_instant_makes_one_grid_point() -> None:
+def test_rows_of_sensors_at_one_instant_make_one_grid_point() -> None:
     """A CAN log has a row per frame, several with one stamp."""
     t = np.repeat(np.arange(1000) / RATE, 3)
     full = np.repeat(signal(np.arange(1000) / RATE), 3, axis=0)
@@ -193,7 +193,7 @@ def test_one_row_per_sensor_at_the_same_instant_makes_one_grid_point() -> None:
     assert np.array_equal(out, signal(index / RATE))
 
 
-def test_a_second_sample_at_the_same_instant_is_dropped_and_counted() -> None:
+def test_a_second_sample_at_an_instant_is_dropped_and_counted() -> None:
     t = np.insert(np.arange(1000) / RATE, 500, 499 / RATE)
     values = signal(t)
     values[500] = 1e6
@@ -217,7 +217,7 @@ def untidy_capture(seed: int) -> tuple[Array, Array]:
     return t, values
 
 
-def test_a_hole_before_the_period_is_known_is_the_same_in_any_blocks() -> None:
+def test_a_hole_before_the_period_is_independent_of_blocks() -> None:
     """Seven samples of a slow channel, then everything is silent for longer than any period."""
     t = np.arange(400) / RATE
     t[80:] += 1.5

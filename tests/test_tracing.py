@@ -104,14 +104,14 @@ def test_the_guide_s_drag_is_named_unless_it_is_negative(
 
 
 @pytest.mark.parametrize(("share", "second"), [(0.02, []), (0.1, ["cogging"])])
-def test_what_dry_friction_is_off_its_law_by_is_no_second_effect(share: float, second: list[str]) -> None:
+def test_the_error_of_a_friction_law_is_no_second_effect(share: float, second: list[str]) -> None:
     t = np.linspace(0.0, 20.0, WINDOWS)
     sign, other = np.sign(np.sin(2.0 * t)), np.sqrt(2.0) * np.sin(7.3 * t)
     candidates = [_candidate("coulomb_friction", sign), _candidate("cogging", other)]
     assert _found(candidates, 150.0 * (sign + share * other), 1) == ["coulomb_friction", *second]
 
 
-def test_an_effect_whose_own_noise_hides_what_it_takes_stays_and_what_stood_for_it_goes() -> None:
+def test_an_effect_hidden_by_its_noise_replaces_its_substitute() -> None:
     """An axis that sticks in a tenth of the windows: there friction takes any value, and a ripple fits it better."""
     rng = np.random.default_rng(7)
     stuck = rng.random(WINDOWS) < 0.1
@@ -132,7 +132,7 @@ def test_an_effect_whose_own_noise_hides_what_it_takes_stays_and_what_stood_for_
 
 
 @pytest.mark.parametrize("ripples", [False, True])
-def test_friction_that_holds_an_axis_much_of_the_time_is_found_beside_what_fits_it_better(ripples: bool) -> None:
+def test_stiction_is_found_beside_columns_that_fit_it_better(ripples: bool) -> None:
     """It takes any value there, and moves nothing elsewhere; where a ripple explains all of it, there is none."""
     rng = np.random.default_rng(8)
     stuck = rng.random(WINDOWS) < 0.6
@@ -158,7 +158,7 @@ def test_friction_that_holds_an_axis_much_of_the_time_is_found_beside_what_fits_
 
 
 @pytest.mark.parametrize("times", [0.5, 1.0, 2.0])
-def test_what_another_effect_has_replaced_comes_back_for_what_that_leaves(times: float) -> None:
+def test_a_replaced_effect_returns_for_what_the_other_leaves(times: float) -> None:
     rng = np.random.default_rng(3)
     stuck = rng.random(WINDOWS) < 0.2
     friction = np.where(stuck, np.sign(rng.standard_normal(WINDOWS)), 0.0)

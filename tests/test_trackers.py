@@ -62,7 +62,7 @@ def assert_same_bits(one: Tracker, other: Tracker) -> None:
 
 
 @pytest.mark.parametrize("condition", [1e2, 1e5])
-def test_recursive_equals_lstsq_on_ill_conditioned_columns_of_any_unit(condition: float) -> None:
+def test_recursive_equals_lstsq_on_ill_conditioned_columns(condition: float) -> None:
     rows, _ = ill_conditioned_rows(seed=1, count=5003, n=16, condition=condition)
     tracker = RecursiveLeastSquares(16)
     for part in split(rows, seed=2, longest=300):
@@ -92,7 +92,7 @@ def test_batch_solution_is_lstsq_and_the_recursive_solution() -> None:
     np.testing.assert_allclose(batch.covariance, recursive.covariance, rtol=1e-6)
 
 
-def test_batch_without_std_takes_the_level_of_its_covariance_from_the_residual() -> None:
+def test_batch_without_std_scales_covariance_by_the_residual() -> None:
     rows = exciting_rows(seed=4, count=4000, noise=0.3)
     unweighted = batch_least_squares(rows.Y, rows.b)
     weighted = batch_least_squares(rows.Y, rows.b, rows.std)
@@ -100,7 +100,7 @@ def test_batch_without_std_takes_the_level_of_its_covariance_from_the_residual()
     np.testing.assert_allclose(unweighted.std, weighted.std, rtol=0.05)
 
 
-def test_batch_with_as_many_rows_as_parameters_has_no_error_bar_without_std() -> None:
+def test_an_exactly_determined_batch_has_no_error_bar() -> None:
     rows = exciting_rows(seed=5, count=N)
     assert np.isinf(batch_least_squares(rows.Y, rows.b).std).all()
     assert np.isfinite(batch_least_squares(rows.Y, rows.b, rows.std).std).all()
@@ -227,7 +227,7 @@ def test_reset_starts_afresh_and_disabled_changes_nothing(name: str) -> None:
     assert tracker.estimate().rows > fresh.estimate().rows or name == "SlidingWindow"
 
 
-def test_kalman_without_process_noise_is_recursive_least_squares_with_the_same_prior() -> None:
+def test_kalman_without_process_noise_is_rls_with_its_prior() -> None:
     rows, pi = ill_conditioned_rows(seed=30, count=400, n=5, condition=1e2)
     prior = Prior(0.5 * pi, np.abs(pi))
     rls = RecursiveLeastSquares(5, prior=prior)
@@ -243,7 +243,7 @@ def test_kalman_without_process_noise_is_recursive_least_squares_with_the_same_p
     np.testing.assert_allclose(other.rss, one.rss, rtol=1e-6)
 
 
-def test_what_the_rows_cannot_separate_is_flagged_and_nothing_else() -> None:
+def test_only_what_the_rows_cannot_separate_is_flagged() -> None:
     rng = np.random.default_rng(32)
     Y = rng.normal(size=(500, N)) * 10.0 ** np.linspace(-6, 6, N)
     Y[:, 3] = 1e5 * Y[:, 1]  # only π_1 + 1e5 π_3 acts
@@ -304,7 +304,7 @@ def autoregressive(rng: np.random.Generator, count: int, width: int, coefficient
 
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", [NoForgetting(), SlidingWindow(8192)], ids=lambda kind: type(kind).__name__)
-def test_robust_intervals_cover_the_truth_where_errors_are_autocorrelated(kind: Forgetting) -> None:
+def test_robust_intervals_cover_autocorrelated_errors(kind: Forgetting) -> None:
     rng = np.random.default_rng(34)
     pi = np.array([1.0, -2.0, 0.5])
     hits, classic_hits, intervals = 0, 0, 0
@@ -324,7 +324,7 @@ def test_robust_intervals_cover_the_truth_where_errors_are_autocorrelated(kind: 
     assert classic_hits / intervals < 0.6
 
 
-def test_robust_covariance_equals_the_stated_one_where_errors_are_white() -> None:
+def test_robust_covariance_equals_the_stated_one_of_white_rows() -> None:
     rng = np.random.default_rng(35)
     Y = rng.normal(size=(60_000, 4)) * [1e-6, 1.0, 1e3, 1e6]
     pi = np.array([1e6, 1.0, -1e-3, 2e-6])
@@ -359,7 +359,7 @@ def test_robust_covariance_equals_its_formula_written_out() -> None:
     np.testing.assert_allclose(estimate.covariance_robust, inverse @ meat @ inverse, rtol=1e-8)
 
 
-def test_robust_covariance_is_withheld_while_clusters_are_too_few_and_where_rows_fade() -> None:
+def test_robust_covariance_needs_enough_unfaded_clusters() -> None:
     for kind in ALL_FORGETTING:
         tracker = RecursiveLeastSquares(N, kind)
         tracker.update(exciting_rows(seed=37, count=BLOCK_ROWS * N - 1))

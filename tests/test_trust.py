@@ -26,7 +26,7 @@ def with_row(row: str, **values: float) -> Evidence:
     return replace(GOOD, residual={**QUIET, row: QUIET[row]._replace(**values)})
 
 
-def test_what_nothing_speaks_against_is_trusted_as_far_as_stated() -> None:
+def test_an_undisputed_result_is_trusted_as_far_as_stated() -> None:
     judgement = judge(GOOD)
     assert (judgement.level, judgement.grave, judgement.marks) == ("trust", False, {})
     assert judgement.sentence == "Trust: 15 of 16 parameters determined, residual at most 1.1 × noise"
@@ -110,7 +110,7 @@ def test_what_is_explained_or_harmless_leaves_trust(evidence: Evidence) -> None:
     assert judge(evidence).level == "trust"
 
 
-def test_the_named_effect_comes_before_the_residual_that_it_leaves() -> None:
+def test_the_named_effect_comes_before_its_residual() -> None:
     evidence = replace(with_row("joint_2", whitened=19.0), discrepancies=(LACKING,), attenuated=("motor_2.mass",))
     judgement = judge(evidence)
     assert "coulomb_friction" in judgement.sentence
@@ -119,7 +119,7 @@ def test_the_named_effect_comes_before_the_residual_that_it_leaves() -> None:
     assert judgement.marks == {"joint_2": "coulomb friction"}
 
 
-def test_lost_samples_come_before_the_residual_that_they_may_have_made() -> None:
+def test_lost_samples_come_before_their_residual() -> None:
     judgement = judge(replace(with_row("joint_2", whitened=19.0), lost=0.02))
     assert judgement.sentence == "Do not trust: 2 % of the samples are lost"
     assert judgement.others == ("the residual of joint_2 is 19 × noise",)
@@ -133,7 +133,7 @@ def test_residuals_of_an_unconverged_estimate_show_nothing() -> None:
     assert judge(replace(loud, alarm="joint_1")).grave
 
 
-def test_an_alarm_is_that_of_what_the_diagnosis_looks_into_and_a_doubt_of_its_own_else() -> None:
+def test_an_alarm_under_diagnosis_is_no_doubt_of_its_own() -> None:
     looked_into = judge(replace(GOOD, alarm="joint_2", discrepancies=(Discrepancy("joint_2", 3.0, "noticed"),)))
     assert len(looked_into.reasons) == 1
     # What was adopted is in the model, and the test began anew with it.
@@ -187,7 +187,7 @@ def test_a_clean_capture_is_judged_by_its_session() -> None:
     assert judge_diagnosis("clean", [], None, DOUBTED) == DOUBTED
 
 
-def test_a_named_effect_makes_the_system_file_doubtful_and_the_parameters_with_it_good() -> None:
+def test_a_named_effect_puts_the_system_file_in_doubt() -> None:
     judgement = judge_diagnosis("named", ["sensor_lag@link_1.*"], None, TRUSTED)
     assert (judgement.level, judgement.grave) == ("doubt", False)
     assert "trust the parameters with it" in judgement.sentence
@@ -233,7 +233,7 @@ def test_a_session_goes_from_too_early_to_trust() -> None:
     assert levels == ["not yet", "not yet", "trust"]
 
 
-def test_a_session_whose_model_lacks_friction_is_doubted_where_it_acts() -> None:
+def test_a_model_without_friction_is_doubted_where_it_acts() -> None:
     judgement = judged(session(0.2, 12.0))
     assert judgement.grave
     assert [*judgement.marks] == ["joint_1"]

@@ -96,7 +96,7 @@ def test_an_axis_stays_until_bars_shrink_or_estimates_leave_it() -> None:
     assert followed(scale, 60.0, [20.0, 20.0, 12.1, 12.1], 0.1)
 
 
-def test_an_axis_of_a_restless_estimate_changes_ever_more_rarely() -> None:
+def test_an_axis_of_a_restless_estimate_changes_ever_rarer() -> None:
     """What was drawn is drawn again each time, so an hour must not hold thousands of them."""
     scale = OwnScale([None] * 4)
     changes = [t for t in range(3600) if followed(scale, float(t), [1.0 + t % 2] * 4, 0.1)]
