@@ -1,6 +1,6 @@
-"""What is known of the base parameters before a session, from what a system file says about the physical ones.
+"""Priors of the base parameters, from those that a system file states for the physical ones.
 
-And the way back: estimates of base parameters as what a system file says of the physical ones they are named after.
+And the way back: estimates of base parameters as entries of a system file for the physical ones they are named after.
 """
 
 from __future__ import annotations

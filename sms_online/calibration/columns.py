@@ -2,7 +2,7 @@
 
 A reading that is n(t) too large adds ∫ c n dt to Y π, with the c of `row_noise`, so that N = -∫ c n dt. A torque that
 is read too large by n(t) adds ∫ φ n dt to b, so N. With the right geometry momentum and force are others by ∂P π and
-∂G π, and N = -∫ (φ̇ ∂P + φ ∂G) dt π. All three are linear in ν, and hold as long as ν is so small that nothing bends.
+∂G π, and N = -∫ (φ̇ ∂P + φ ∂G) dt π. All three are linear in ν, and hold to first order in ν.
 """
 
 from __future__ import annotations

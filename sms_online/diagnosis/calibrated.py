@@ -1,9 +1,9 @@
 """Calibration beside a search: what the description may be off by, in the columns and tolerances of a session.
 
-Within its tolerance a number of the description explains what it can, and no effect is needed for it. What the rows ask
-for beyond `LIMIT` tolerances is no matter of the tolerance. Where an effect of the catalogue says the same (a late
-sensor, an encoder's zero), the number is held at zero then and the effect competes for all of it. The others, of
-geometry and camera, pay for every tolerance.
+Within its tolerance a number of the description explains what it can, and no effect is needed for it. An estimate
+beyond `LIMIT` tolerances is no matter of the tolerance. Where the catalogue has an effect for it (a late sensor, an
+encoder's zero), the number is held at zero then and the effect competes for all of it. The other numbers, of geometry
+and camera, are penalised by their tolerances throughout.
 """
 
 from __future__ import annotations

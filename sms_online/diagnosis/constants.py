@@ -1,7 +1,7 @@
 """Effects that become constants of the description when they are found, and are no unknowns of π.
 
-Those on channels are taken off the samples. A tilted table is gravity, whose product with the masses is not linear in
-both. Their columns are first approximations: constants are improved by fitting what is left when they are taken off.
+Effects on channels are subtracted from the samples. A tilted table is gravity, whose product with the masses is not
+linear in both. Their columns are first-order approximations: constants are improved by fitting the corrected samples.
 """
 
 from __future__ import annotations

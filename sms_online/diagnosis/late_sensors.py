@@ -1,10 +1,10 @@
 """Sensors that are so late that no parameters fit the motion they measure, found before any force is searched.
 
-Rows without a torque say that what springs are measured to pull is what moves the masses behind them, whatever friction
-the motors have. They are homogeneous in π: against a sensor that is far behind the others, least squares shrinks masses
-and stiffness together to nothing, and every candidate beside them seems idle. So each stiffness is asked apart: the
-share of its column that no masses can follow, over windows that were not fitted. A sensor is late where readings
-without its lag bring that share down as nothing else would.
+In rows without a torque a spring's force accelerates the masses behind it, whatever friction the motors have. These
+rows are homogeneous in π. With a sensor that is far behind the others, least squares shrinks masses and stiffness
+together to nothing, and no candidate has any gain. So each stiffness is tested on its own, by the share of its column
+that no masses explain in windows that were not fitted. A sensor is late where correcting its lag reduces that share,
+and nothing else reduces it as much.
 """
 
 from __future__ import annotations

@@ -1,10 +1,9 @@
 """The rate of a motor for forces that jump with its sign, and how well its reversals are located.
 
-What dry friction does when its motor turns round bends the motor's rate, and a filter as wide as the smooth motion
-allows rounds the bend off: the zero of the rate is milliseconds beside the true one, in every reversal on the same
-side. So the rate comes through a filter as narrow as its noise allows, and what is left of both follows from that noise
-and from a wider filter. And an integral over samples knows a jump to half a sample; forces are averaged over
-instants between them.
+At a reversal dry friction bends the motor's rate. A filter as wide as the smooth motion allows rounds off the bend, and
+moves the zero of the rate by milliseconds, at every reversal to the same side. So the rate comes through a filter as
+narrow as its noise allows. The error that remains follows from that noise, and from a wider filter. An integral over
+samples resolves a jump to half a sample only, so forces are averaged over instants between them.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """What noise in the columns does to a least-squares estimate, measured by adding more of it.
 
 Noise enters the columns too, and products square it: the expectation of YᵀY and of Yᵀb is off in second order, which
-pulls the estimate. The same noise once more, added and subtracted, changes their mean by as much again, so that
+biases the estimate. The same noise once more, added and subtracted, changes their mean by as much again, so that
 2 YᵀY - ½ (Y₊ᵀY₊ + Y₋ᵀY₋) is free of it in second order. The first orders cancel in the pair.
 Sources: Cook and Stefanski, J. American Statistical Association 89 (1994) 1314 (simulation extrapolation); Novick and
 Stefanski, ibid. 97 (2002) 472 (corrected scores by simulation). The comparison of a consistent estimate with an

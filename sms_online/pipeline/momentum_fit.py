@@ -1,15 +1,15 @@
 """Weights of the momentum balance: from windows of rows to rows with independent unit errors.
 
-Weights follow from the sensors' noise and the parameters, never from residuals: those collapse where noise is high. The
-parameters come from the fit itself: the first windows that move are held back, fitted without weights and then with
-them; from then on the estimate so far is taken where it would change the weights. A start that is 70 % off gives the
-same answer. Where such a fit leaves more than noise, for it had to separate too many parameters without weights, the
-described values are tried as its start, and stay in the weights until the rows determine better ones. Where that does
-too, the model lacks something, and weights come from a fit that no such lack draws to zero, see `criterion`.
+Weights follow from the sensors' noise and the parameters. Weights from residuals would collapse where noise is high.
 
-Where rows leave clearly more than the sensors' noise, the model lacks something, and neighbouring rows that share noise
-almost fully must not be subtracted from each other as if that were all: what is left over counts as an error of each
-row's own.
+The parameters come from the fit itself. The first windows that move are held back and fitted, without weights and then
+with them; later the weights follow the estimate. A start that is 70 % off gives the same answer. With many parameters
+such a fit may leave more than noise. Then it starts from the described values, and these stay in the weights until the
+rows determine better ones. Where that leaves more than noise too, the model lacks something, and the weights come from
+the fit of `criterion`, which does not shrink the parameters to zero.
+
+Where rows leave clearly more than noise, the excess counts as an error of each row's own. Whitening would otherwise
+subtract neighbouring rows from each other, which share nearly all of their noise but not what the model lacks.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 """Nonsmooth forces of effects, which jump or vary faster than the motion, and their noise, from every sample.
 
-A thinned motion folds what such a force does between its samples back into the rows: the phase of a cogging behind a
-gear turns through a radian in a few milliseconds. And noise reaches such a force through the filter: what a row takes
-in of it in one instant cancels what it takes in a quarter of a turn later, within the filter's reach.
+Thinned samples would alias such a force: the phase of a cogging behind a gear turns through a radian in a few
+milliseconds. Noise reaches it through the filter: what it adds to a row at one instant cancels what it adds a quarter
+of a turn later, within the filter's reach.
 """
 
 from __future__ import annotations

@@ -5,8 +5,8 @@ c = φ̈ H + φ̇ (Ḣ + ∂Gπ/∂v - ∂Pπ/∂x) + φ (d/dt ∂Gπ/∂v - ∂
 balance; and ∫ φ n_τ dt from the noise of the torque. White noise of 1σ per sample has the density σ² T_s. Rows of
 windows that overlap share noise, so their covariance is block-banded; see `whitening`.
 
-An unknown force, as stiction at a standstill, is an error of all windows that see it: what it adds to
-one says what it adds to the others, and what they hold beside it is still informative.
+An unknown force, such as stiction at a standstill, is a common error of all windows that include it. It enters their
+covariances, so what the windows hold beside it is still informative.
 
 Devices with clocks of their own are all a little early or late against each other, by the same for seconds. Over a
 window that is an error of the row in proportion to the rates of that device's readings.

@@ -1,9 +1,9 @@
 """Sequential whitening of windows with fixed weights: each row is the innovation given all rows before it.
 
-What rows of neighbouring windows do not share is their information. A row is predicted from the nine windows that
-overlap its own better with the windows before those too: the noise is a moving average whose sum over
-all windows nearly vanishes, and only its whole past predicts such a one. A filter that begins anew knows less
-for a second or two, and calls its rows independent of those before, which they are not.
+The nine windows that overlap a row's own predict its error, and the windows before those improve the prediction: the
+noise is a moving average whose sum over all windows nearly vanishes, and only its whole past predicts such a one.
+A filter that begins anew predicts worse for a second or two. It also takes its rows for independent of those before,
+which they are not.
 """
 
 from __future__ import annotations
