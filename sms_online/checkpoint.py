@@ -37,7 +37,7 @@ class _File(msgspec.Struct, frozen=True):
 
 
 class _Versioned(msgspec.Struct):
-    """As much of a head as is the same in all versions."""
+    """The part of a head that is the same in all versions."""
 
     version: str
 
@@ -72,12 +72,12 @@ class Checkpoint:
         return Checkpoint(head, states if source is None else states | {SOURCE: collect(source)})
 
     def to_bytes(self) -> bytes:
-        """As it is written to files, msgpack."""
+        """The checkpoint as msgpack, for a file."""
         return encode({"head": self.head, "states": self.states})
 
     @staticmethod
     def from_bytes(data: bytes, name: str) -> Checkpoint:
-        """Of `to_bytes`; InputError where it is none, or one of another version."""
+        """The checkpoint of `to_bytes`; InputError where it is none, or one of another version."""
         try:
             found = msgspec.msgpack.decode(data, type=_AnyFile).head.version
             if found != __version__:

@@ -152,7 +152,7 @@ class Evaluation:
     @cached_property
     @one_blas_thread()
     def trackers(self) -> tuple[TrackerResult, ...]:
-        """What each chosen tracker says, the judged one first; empty where no momentum balance gives the estimate."""
+        """Results of each chosen tracker, the judged one first; empty where no momentum balance gives the estimate."""
         now = self.statistics
         if now.method != "momentum" or now.momentum is None:
             return ()

@@ -70,7 +70,7 @@ def notices(now: Statistics) -> list[str]:
 
 
 def unstated_latency(now: Statistics) -> list[str]:
-    """That a source is late against the others by more than the system file says, if one is."""
+    """A notice where a source is later against the others than the system file states."""
     found = None if now.momentum is None else now.momentum.latency
     if found is None:
         return []

@@ -61,7 +61,7 @@ class Parameter:
         return f"{self.name}: {shown(self.value)} ± {self.std:.2g} {self.unit}".rstrip()
 
     def document(self) -> dict[str, Any]:
-        """As results.json holds it."""
+        """The entry of results.json."""
         lower, upper = self.interval
         return {
             "name": self.name,

@@ -286,7 +286,7 @@ class _Blocks:
 
     @property
     def warnings(self) -> Sequence[str]:
-        """Those of a source, so far."""
+        """Warnings of the source so far."""
         return getattr(self._data, "warnings", ())
 
     def __iter__(self) -> Iterator[Block]:

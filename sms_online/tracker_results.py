@@ -35,7 +35,7 @@ class Consistency:
 
     @staticmethod
     def of(estimate: Estimate) -> Consistency:
-        """That of the rows behind an estimate."""
+        """Consistency of the rows behind an estimate."""
         if estimate.dof <= 0.0:
             return Consistency(None, 0.0, np.inf)
         width = BAND * float(np.hypot(np.sqrt(2.0 / estimate.dof), NOISE_VARIANCE_STD))

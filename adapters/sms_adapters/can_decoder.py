@@ -88,7 +88,7 @@ class CanDecoder:
         return plain
 
     def _admitted(self, k: int, message: WantedMessage, raw: CanFrames, rows: NDArray[np.intp]) -> NDArray[np.intp]:
-        """Those of the rows of message k that give a sample: of the right length, neither repeated nor late."""
+        """The rows of message k that give a sample: of the right length, neither repeated nor late."""
         whole = rows[raw.length[rows] == message.length]
         self.counters["wrong_length"] += rows.size - whole.size
         stamps = raw.stamp[whole]

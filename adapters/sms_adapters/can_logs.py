@@ -77,7 +77,7 @@ class BinaryLog:
 
     @property
     def warnings(self) -> list[str]:
-        """What is missing at the end, as far as the file says."""
+        """Warnings of what is missing at the end, as far as the file shows it."""
         return [f"{self._path.name}: its end is missing, {self._cut}"] if self._cut else []
 
     def __iter__(self) -> Iterator[LoggedFrames]:

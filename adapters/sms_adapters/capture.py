@@ -211,7 +211,7 @@ def _parse(text: memoryview, names: tuple[str, ...]) -> Array:
 
 
 def _first_malformed(lines: list[bytes], names: tuple[str, ...]) -> int:
-    """Index of the first line that does not parse, by halving: the parser itself says where, not a second grammar."""
+    """Index of the first line that does not parse, by halving: the parser itself finds it, not a second grammar."""
     good, bad = 0, len(lines)  # lines[:good] parse, lines[:bad] do not
     while bad - good > 1:
         middle = (good + bad) // 2

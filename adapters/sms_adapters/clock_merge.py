@@ -163,7 +163,7 @@ class SourceLane:
 
 
 def _arrivals(item: Raw) -> tuple[float, float]:
-    """Of the first and of the last that an item holds, s."""
+    """Arrivals of the first and the last sample that an item holds, s."""
     if isinstance(item, CanFrames):
         return float(item.arrival[0]), float(item.arrival[-1])
     return item.arrival, item.arrival

@@ -75,7 +75,7 @@ class Check(Tabled):
 
     @property
     def lines(self) -> list[str]:
-        """The remarks, grave ones first, channels of which the same is to be said together."""
+        """The remarks, grave ones first; channels with the same remark share a line."""
         return [line for _, line in joined(self.remarks)]
 
     def rows(self) -> tuple[list[str], list[list[str]]]:
@@ -116,7 +116,7 @@ class Check(Tabled):
 
 
 def joined(remarks: Iterable[Remark]) -> list[tuple[bool, str]]:
-    """Whether it is grave, and a line, for each thing that is to be said; grave ones first."""
+    """Each remark as a line, with whether it is grave; grave ones first."""
     channels: dict[tuple[bool, str], list[str]] = {}
     for remark in remarks:
         channels.setdefault((remark.grave, remark.text), []).append(remark.channel)
@@ -263,7 +263,7 @@ def check(system: Given, data: Data) -> Check:
 
 
 def _outlier_remarks(outliers: Mapping[str, LeftOut], left_out: bool) -> Iterator[Remark]:
-    """What is to be said of them, by channel; left_out: of the estimate, which suffers where they are many."""
+    """Remarks on outliers by channel; left_out: of the estimate, which suffers where they are many."""
     for channel, found in outliers.items():
         what = "outliers left out" if left_out else "outliers"
         many = left_out and found.number > MANY_OUTLIERS * found.of

@@ -38,7 +38,7 @@ class LineReader:
 
     @property
     def warnings(self) -> list[str]:
-        """That the last iteration left out a cut line, if it did."""
+        """A warning if the last iteration left out a cut line."""
         if self.cut_line is None:
             return []
         return [f"{self.path.name}: 1 line skipped, line {self.cut_line} is cut (no newline at its end)"]

@@ -87,7 +87,7 @@ class LostDevice(OSError):  # noqa: N818 - what happened to it, as KeyboardInter
 
 
 def one_line(error: BaseException) -> str:
-    """What an exception says, on one line."""
+    """The message of an exception on one line."""
     return " ".join(str(error).split())[:120] or type(error).__name__
 
 

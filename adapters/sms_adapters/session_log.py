@@ -60,7 +60,7 @@ def from_microseconds(count: int) -> float:
 
 @dataclass(frozen=True)
 class SessionHeader:
-    """What session.toml says at the session's start.
+    """The contents of session.toml at the session's start.
 
     epoch: UTC of the session's clock zero, µs. sources: name to kind, in the order of the system file. start: time of
     the clock's zero in the estimate, s; not 0 where the session resumed an earlier one. versions: of programs, by name.

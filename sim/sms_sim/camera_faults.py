@@ -37,7 +37,7 @@ class CameraFault:
     over: float = 0.0
 
     def document(self) -> dict[str, Any]:
-        """As the truth beside a capture holds it: no key without a meaning."""
+        """The entry of the truth beside a capture: no key without a meaning."""
         return {name: value for name, value in vars(self).items() if value}
 
 

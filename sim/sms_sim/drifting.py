@@ -52,7 +52,7 @@ class ParameterDrift:
         return out
 
     def document(self) -> dict[str, Any]:
-        """As the truth beside a capture holds it: no key without a meaning."""
+        """The entry of the truth beside a capture: no key without a meaning."""
         return {name: value for name, value in vars(self).items() if value}
 
 

@@ -53,7 +53,7 @@ class TorqueFamily:
 
 
 def position_families(sensing: Sensing, tolerances: Tolerances) -> list[Family]:
-    """Those of position sensors that have a tolerance."""
+    """Families of the position sensors' nuisances that have a tolerance."""
     names = [sensing.channels[column] for column in sensing.position_columns]
     every = [
         *_clocks(sensing, names, tolerances.clock),
@@ -65,7 +65,7 @@ def position_families(sensing: Sensing, tolerances: Tolerances) -> list[Family]:
 
 
 def torque_families(sensing: Sensing, tolerances: Tolerances) -> list[TorqueFamily]:
-    """Those of torques that have a tolerance, but for what the system file declares as effects."""
+    """Families of the torques' nuisances that have a tolerance, but for what the system file declares as effects."""
     effects = sensing.model.system.effects
     declared = {(name, e.where) for e in effects for name in ENTRIES[e.name].traits.calibrates}
     joints = [i for i, joint in enumerate(sensing.model.system.joints) if not joint.passive]

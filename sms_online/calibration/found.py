@@ -69,7 +69,7 @@ class Calibration:
 
     @property
     def certain(self) -> bool:
-        """Whether it is no accident that it is not zero."""
+        """Whether it differs from zero by more than chance."""
         return abs(self.estimate) > CERTAIN * self.std
 
     def __str__(self) -> str:
@@ -90,7 +90,7 @@ class Calibration:
         return f"correct the system file or the sensor, or state a larger tolerances.{self.name}"
 
     def document(self) -> dict[str, str | float | None]:
-        """As results.json holds it."""
+        """The entry of results.json."""
         return {
             "name": self.name, "where": self.where, "part": self.part, "estimate": self.estimate, "std": self.std,
             "tolerance": self.tolerance, "unit": self.unit,

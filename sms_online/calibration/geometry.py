@@ -51,7 +51,7 @@ class Geometry:
 
 
 def own_axis(joint: Mount) -> int | None:
-    """Axis of the mount that a joint turns about, of which its encoders' readings say all; None where there is none."""
+    """Axis of the mount that a joint turns about, which its encoders measure fully; None where there is none."""
     if not isinstance(joint, Joint) or joint.kind != "revolute":
         return None
     turning = np.flatnonzero(np.abs(joint.axis) == 1.0)
@@ -59,7 +59,7 @@ def own_axis(joint: Mount) -> int | None:
 
 
 def geometries(system: System) -> Iterator[Geometry]:
-    """Those of a system that have a tolerance; of a planar one only what keeps it planar.
+    """A system's nuisances of geometry that have a tolerance; of a planar one only what keeps it planar.
 
     Not those that other readings replace: see `channels`.
     """

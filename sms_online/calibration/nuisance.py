@@ -60,6 +60,6 @@ def prior_rows(nuisances: Sequence[Nuisance], n: int) -> Array:
 
 
 def bound_rows(nuisances: Sequence[Nuisance], n: int) -> Array:
-    """What `BOUNDED` says, as rows [N Y b] (k, m + n + 1) of unit variance."""
+    """The bounds of `BOUNDED` as rows [N Y b] (k, m + n + 1) of unit variance."""
     wide = [BOUND * each.tolerance if each.name in BOUNDED else np.inf for each in nuisances]
     return prior_rows([replace(each, tolerance=width) for each, width in zip(nuisances, wide, strict=True)], n)

@@ -21,7 +21,7 @@ SIGNIFICANT = 2.0
 
 
 class Acceptance(CandidateRows):
-    """Asks of effects whether rows that were not fitted speak for them, and of a joint fit whether it can have them."""
+    """Tests whether held-out rows support effects, and whether a joint fit admits them."""
 
     def improves(self, chosen: Sequence[int], candidate: int) -> bool:
         """Whether a candidate beside those chosen lowers the residual of held-out rows, and no type's rises."""
@@ -36,7 +36,7 @@ class Acceptance(CandidateRows):
         return own.share >= least and own.certain and not any(each.rises for each in types)
 
     def improvement(self, chosen: Sequence[int], candidate: int) -> Fall:
-        """Of the rms of the held-out rows that a candidate acts on, beside those chosen.
+        """Fall of the rms of the held-out rows that a candidate acts on, beside those chosen.
 
         Of calibration the same is held before and after, so that the candidate alone makes the difference.
         """
@@ -65,7 +65,7 @@ class Acceptance(CandidateRows):
         return {k: slice(end - size, end) for k, size, end in zip(chosen, sizes, ends, strict=True)}
 
     def _impossible(self, chosen: Sequence[int], asked: Sequence[int]) -> list[int]:
-        """Those that have coefficients that they cannot have, or without which a mass or spring were not negative."""
+        """Effects with impossible coefficients, or without which no mass or spring would be negative."""
         solution = self.solution(chosen)
         impossible = [k for k, own in self._places(chosen).items() if not self._possible(k, solution, solution[own])]
         if impossible or not self._negative(chosen):
@@ -73,7 +73,7 @@ class Acceptance(CandidateRows):
         return [k for k in chosen if not self._negative([other for other in chosen if other != k])]
 
     def _negative(self, chosen: Sequence[int]) -> bool:
-        """Whether the model has a negative mass, spring or damping, and that is no accident of a few blocks."""
+        """Whether the model has a negative mass, spring or damping in more than a few blocks."""
         n = self._positive.size
         value = self.solution(chosen)[:n]
         if not np.any(self._positive & (value < 0.0)):
@@ -90,7 +90,7 @@ class Acceptance(CandidateRows):
         return candidate.traits.within(reported)
 
     def _one_too_many(self, chosen: Sequence[int], asked: Sequence[int]) -> list[int]:
-        """Those whose coefficients are correlated with those of another effect, declared or chosen."""
+        """Effects whose coefficients are correlated with those of another effect, declared or chosen."""
         covariance = self.covariance(chosen)
         std = np.sqrt(np.diag(covariance))
         known = np.isfinite(std) & (std > 0.0)
@@ -108,7 +108,7 @@ class Acceptance(CandidateRows):
         return out
 
     def _insignificant(self, chosen: Sequence[int], asked: Sequence[int]) -> list[int]:
-        """Those whose coefficients are no more than what the blocks differ by."""
+        """Effects whose coefficients do not exceed what the blocks differ by."""
         if self.folds.count < LEAST_FOLDS:
             return []
         solution, std = self.solution(chosen), self.spread(chosen)
@@ -116,7 +116,7 @@ class Acceptance(CandidateRows):
         return [k for k in asked if np.all(np.abs(solution[places[k]]) < SIGNIFICANT * std[places[k]])]
 
     def _idle(self, chosen: Sequence[int], asked: Sequence[int]) -> list[int]:
-        """Those whose blocks are predicted as well without them, whitened as without what they do not predict."""
+        """Effects whose blocks are predicted as well without them, whitened as without what they do not predict."""
         idle = []
         for k in asked:
             others = [other for other in chosen if other != k]

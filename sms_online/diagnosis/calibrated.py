@@ -45,7 +45,7 @@ class Calibrated:
 
     @classmethod
     def of(cls, nuisances: Sequence[Nuisance], columns: Array, system: System) -> Calibrated:
-        """Those that have a tolerance: where nothing is known, as of a torque's zero, the effect alone says it."""
+        """Nuisances that have a tolerance: where nothing is known, as of a torque's zero, the effect replaces them."""
         known = [k for k, each in enumerate(nuisances) if np.isfinite(each.tolerance)]
         return cls(tuple(nuisances[k] for k in known), columns[..., known], sayable(system))
 
@@ -66,16 +66,16 @@ class Calibrated:
     def said_by(self, effects: Iterable[Effect]) -> NDArray[np.bool_]:
         """Which of them (m,) the effects replace: an effect in the model leaves no second unknown for the same."""
         effects = list(effects)
-        return np.array([any(_says(effect, each) for effect in effects) for each in self.nuisances], dtype=np.bool_)
+        return np.array([any(_replaces(effect, each) for effect in effects) for each in self.nuisances], dtype=np.bool_)
 
     def beyond(self, values: Array) -> NDArray[np.bool_]:
-        """Which of them (m,) an effect of the catalogue has to say, for estimates (m,)."""
+        """Which of them (m,) an effect of the catalogue has to replace, for estimates (m,)."""
         said = np.array([each.name in self.sayable for each in self.nuisances], dtype=np.bool_)
         return np.asarray(said & (np.abs(values) > LIMIT * self.tolerance))
 
 
-def _says(effect: Effect, nuisance: Nuisance) -> bool:
-    """Whether an effect says the same; places of clocks are groups of channels."""
+def _replaces(effect: Effect, nuisance: Nuisance) -> bool:
+    """Whether an effect replaces a nuisance; places of clocks are groups of channels."""
     if nuisance.name not in ENTRIES[effect.name].traits.calibrates:
         return False
     return nuisance.name == "clock" or fnmatchcase(nuisance.where, effect.where)

@@ -55,7 +55,7 @@ class Laws(Protocol):
     """What candidates' laws do not determine."""
 
     def unmodelled(self, candidate: Candidate, coefficients: Array) -> Unmodelled:
-        """Of the rows, for a candidate with coefficients (c,)."""
+        """Unmodelled covariance of the rows, for a candidate with coefficients (c,)."""
 
     def at_rest(self, candidate: Candidate) -> float:
         """Share of the session in which the axis of a law of dry friction is at rest."""

@@ -171,7 +171,7 @@ class CandidateRows:
         return np.concatenate([self._Y, *(self._Z[k] for k in chosen), self._N], axis=1)
 
     def zeroed(self, chosen: Sequence[int]) -> NDArray[np.bool_]:
-        """Which numbers of calibration (m,) are held at zero beside those chosen: effects say them, or have to."""
+        """Which numbers of calibration (m,) are held at zero beside those chosen: effects replace them, or have to."""
         m, key = self.calibrated.count, frozenset(chosen)
         if key not in self._zeroed:
             effects = (candidate.effect for candidate in (*self._fixed, *(self.candidates[k] for k in chosen)))
@@ -285,7 +285,7 @@ class CandidateRows:
         return np.asarray(np.sqrt((n - 1) / n * squares))[: squares.size - self.calibrated.count]
 
     def covariance(self, chosen: Sequence[int], further: Array | None = None) -> Array:
-        """Of the solution (n + c, n + c) from all windows, infinite where they determine nothing.
+        """Covariance of the solution (n + c, n + c) from all windows, infinite where they determine nothing.
 
         further (W, n_v, s): columns of unknowns beside it, which come last.
         """

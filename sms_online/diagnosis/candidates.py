@@ -315,7 +315,7 @@ class CandidateColumns:
         return self._standstill(candidate.effect.where).share
 
     def _standstill(self, where: str) -> SessionStandstill:
-        """Of a joint's motor."""
+        """Standstill of a joint's motor."""
         if where not in self._held:
             rows, joint = self.rows, int(where.removeprefix("joint_")) - 1
             noise = self._noise_of(joint)
@@ -323,7 +323,7 @@ class CandidateColumns:
         return self._held[where]
 
     def _reversals(self, where: str) -> Reversals:
-        """Of a joint's motor, in the windows' own samples."""
+        """Reversals of a joint's motor, in the windows' own samples."""
         if where not in self._turned:
             rows, joint = self.rows, int(where.removeprefix("joint_")) - 1
             parts = self._noise_of(joint), self.system.sample_rate, self._standstill(where)

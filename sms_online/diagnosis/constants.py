@@ -21,7 +21,7 @@ def is_constant(effect: Effect) -> bool:
 
 
 def improved(effect: Effect, increments: Array) -> Effect:
-    """An effect with its constants changed by the linear coefficients of what is left when they are taken off."""
+    """An effect with its constants changed by linear coefficients that are fitted to the corrected samples."""
     changed = CONSTANTS[effect.name].improved(effect.coefficients, increments)
     return effect.model_copy(update={"coefficients": changed})
 

@@ -266,7 +266,7 @@ def diagnose(
 
 
 def _miscalibrated(session: Estimator) -> tuple[Calibration, ...]:
-    """What a session's description is off by beyond its tolerances, and no effect of the catalogue says."""
+    """Errors of a session's description beyond its tolerances that no effect of the catalogue covers."""
     every = Evaluation(Statistics.of(session), session.estimate()).calibration
     return tuple(each for each in every if each.beyond and each.name not in sayable(session.system))
 

@@ -108,7 +108,7 @@ def diagnosis_document(
 
 
 def evaluation(session: Estimator) -> Evaluation:
-    """What a session of a diagnosis says."""
+    """The evaluation of a session of a diagnosis."""
     return Evaluation(Statistics.of(session), session.estimate())
 
 
@@ -262,7 +262,7 @@ def _curve_in_words(diagnosis: Diagnosis, curve: Effect) -> str:
 
 
 def _undecided(diagnosis: Diagnosis) -> list[Reason]:
-    """What was found that may as well be the other way elsewhere."""
+    """Findings that may as well be their opposite elsewhere."""
     system = diagnosis.after.system
     found = [(finding, either(finding.candidate.effect, system)) for finding in diagnosis.findings]
     return [

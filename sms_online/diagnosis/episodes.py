@@ -12,7 +12,7 @@ from sms_online.verdict.evidence import Discrepancy
 
 @dataclass(frozen=True)
 class Evidence:
-    """What a search said: of samples up to `time`, s, known when samples up to `known`, s, were there."""
+    """The answer of a search: of samples up to `time`, s, known when samples up to `known`, s, were there."""
 
     time: float
     known: float

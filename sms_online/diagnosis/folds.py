@@ -83,17 +83,17 @@ class Fall:
 
     @property
     def certain(self) -> bool:
-        """Whether it is no accident of a few blocks."""
+        """Whether it exceeds the scatter of the blocks."""
         return self.share > 2.0 * self.std
 
     @property
     def rises(self) -> bool:
-        """Whether the rms rises by more than any further coefficient makes it, and that is no accident."""
+        """Whether the rms rises by more than a further coefficient explains, and than the scatter of the blocks."""
         return self.share < -max(LEAST_RISE, 2.0 * self.std)
 
 
 def fall(before: Array, after: Array) -> Fall:
-    """Of sums of squares by block (B,)."""
+    """Fall of the rms, from sums of squares by block (B,)."""
     used = before + after > 0.0
     before, after = before[used], after[used]
     if before.size == 0 or not before.sum() > 0.0:

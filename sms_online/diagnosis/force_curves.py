@@ -110,7 +110,7 @@ def _curve(diagnosis: Diagnosis, where: str, curve: Curve, order: float | None, 
 
 
 def _variable(attempt: Attempt, i: int, name: str, order: float) -> Variable:
-    """Of joint i (from 0); order: periods of a phase in a motor turn."""
+    """A variable of joint i (from 0); order: periods of a phase in a motor turn."""
     model = attempt.rows.model
     layout, gear = model.layout, model.system.joints[i].gear_ratio
     motor, link = layout.theta_m[i], layout.q[i]

@@ -35,7 +35,7 @@ MOST_LEFT = 2.0
 
 
 class Hypothesis:
-    """A model, constants that are taken off its samples, and candidates for what it lacks, against a session's rows.
+    """A model, constants that its samples are corrected by, and candidates for what it lacks, against a session's rows.
 
     make: of candidates. constants: with fixed, their columns: of what they are still off by. tracing: the search.
     """
@@ -117,7 +117,7 @@ class Hypothesis:
         return bool(np.all(np.abs(solution[own]) < CONVERGED * std))
 
     def found(self, chosen: Sequence[int], solution: Array) -> tuple[list[Effect], list[Effect]]:
-        """Of the effects chosen, those that become constants, with their values, and the others."""
+        """The chosen effects that become constants, with their values, and the other chosen ones."""
         candidates = [self.tracing.candidates[k] for k in chosen]
         places = self.places(candidates)[len(self.fixed) :]
         constants = [improved(c.effect, solution[own]) for c, own in zip(candidates, places, strict=True) if c.constant]

@@ -72,7 +72,7 @@ class LateSensor:
 
     @property
     def corner(self) -> float:
-        """Of the lag, Hz."""
+        """Corner frequency of the lag, Hz."""
         return self.effect.coefficients["corner"]
 
     @property
@@ -82,7 +82,7 @@ class LateSensor:
 
 
 class Motions:
-    """Asks how well the masses can follow the springs, for readings with a lag taken off."""
+    """Measures how well masses explain the springs' forces, for readings with a lag corrected."""
 
     def __init__(self, rows: SessionRows, make: CandidateColumns, folds: Folds) -> None:
         fitted = folds.block % CHECKED != CHECKED - 1
@@ -118,7 +118,7 @@ class Motions:
         return [where for where in lags if any(fnmatchcase(name, where) for name in readings)]
 
     def unfollowed(self, where: str | None = None, corner: float = np.inf) -> tuple[float, float]:
-        """Share of the springs' columns that no masses follow, rms, in windows that were fitted and in the others."""
+        """Share of the springs' columns that no masses explain, rms, in windows that were fitted and in the others."""
         segments = list(self._rows.segments)
         if where is not None:
             segments = [self._without(where, corner, segment) for segment in segments]
@@ -138,12 +138,12 @@ class Motions:
         return float(fit), float(held)
 
     def _without(self, where: str, corner: float, segment: Segment) -> Segment:
-        """The samples of a segment with one lag more taken off."""
+        """The samples of a segment with one more lag corrected."""
         lagging = self._rows.model.system.model_copy(update={"effects": (lag(where, corner),)})
         return corrected(lagging, self._channels, segment)
 
     def _share(self, Y: Array, spring: int) -> tuple[float, float]:
-        """Of one spring's column in its rows (W, rows, n_pi)."""
+        """Unexplained share of one spring's column in its rows (W, rows, n_pi)."""
         pulled, moved = Y[..., spring], Y[..., [k for k in (*self._springs, *self._masses) if k != spring]]
         fitted = self._fitted
         A, b = moved[fitted].reshape(-1, moved.shape[2]), pulled[fitted].ravel()
@@ -163,7 +163,7 @@ class Motions:
 
 
 def find_late(rows: SessionRows, make: CandidateColumns, folds: Folds) -> LateSensor | None:
-    """The sensors whose lag, taken off, lets the masses follow the springs; None where no lag does so.
+    """The sensors whose lag, once corrected, lets masses explain the springs' forces; None where no lag does so.
 
     make: gives what declared effects need along a motion. folds: blocks of the windows, one in
     CHECKED of which checks the others.

@@ -55,7 +55,7 @@ class Searcher(Protocol):
         """Begin a search; False where this one is left out."""
 
     def outcome(self, block: int) -> tuple[int, Outcome | None] | None:
-        """Number of the search that was begun, and what it says, once, from the internal block on that may use it."""
+        """Number of the search that was begun, and its answer, once, from the internal block on that may use it."""
 
 
 class Immediate:
@@ -133,7 +133,7 @@ class OnlineDiagnosis(Observer):
 
     @property
     def notices(self) -> list[str]:
-        """What there is to say, a line for each episode."""
+        """A line for each episode."""
         return [line(episode) for episode in self.episodes]
 
     @property
@@ -307,7 +307,7 @@ class OnlineDiagnosis(Observer):
         return corrected(self._estimator.system, self._estimator.sensing.channels, segment)
 
     def _hear(self, evidence: Evidence) -> None:
-        """What a search said."""
+        """Take the answer of a search."""
         episode, outcome = self.episodes[-1], evidence.outcome
         before = episode.evidence[-1].outcome if episode.evidence else None
         episode.evidence.append(evidence)

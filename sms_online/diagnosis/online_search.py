@@ -91,7 +91,7 @@ class Named:
 
 @dataclass(frozen=True)
 class Outcome:
-    """What a search says: verdict "clean", "named" or "unexplained".
+    """The answer of a search: verdict "clean", "named" or "unexplained".
 
     named: the effects found, also where they leave more than noise. scores: gain of the best candidates alone, by key.
     left: share of what was beyond noise that is left. began: whether the effects are absent from the segments before
@@ -134,7 +134,7 @@ class LateColumns(CandidateColumns):
         return replace(candidate, columns=np.where(self._before[:, None, None], 0.0, candidate.columns))
 
     def unmodelled(self, candidate: Candidate, coefficients: Array) -> Unmodelled:
-        """Of the windows that it acts in."""
+        """Unmodelled covariance of the windows that it acts in."""
         whole = super().unmodelled(candidate, coefficients)
         acts = ~self._before[:, None, None]
         return Unmodelled(whole.own * acts[..., 0], whole.free * acts)

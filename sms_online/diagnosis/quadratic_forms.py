@@ -10,7 +10,7 @@ from sms_online.stream import Array
 
 
 class QuadraticForms:
-    """Remembers forms by key: values at unit vectors and at sums of two say all of a quadratic form."""
+    """Remembers forms by key: values at unit vectors and at sums of two determine a quadratic form."""
 
     def __init__(self) -> None:
         self._known: dict[Hashable, tuple[list[Array], dict[tuple[int, int], Array]]] = {}

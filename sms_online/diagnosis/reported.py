@@ -18,7 +18,7 @@ Coefficients = dict[str, tuple[float, float | None]]
 
 
 def of_constant(effect: Effect, covariance: Array) -> Coefficients:
-    """Of a constant, for the covariance (c, c) of what it changes by."""
+    """Coefficients of a constant, for the covariance (c, c) of its change."""
     stds = deviations(effect, covariance)
     return {name: (value, stds.get(name)) for name, value in effect.coefficients.items()}
 
@@ -26,7 +26,7 @@ def of_constant(effect: Effect, covariance: Array) -> Coefficients:
 def of_unknowns(
     effect: Effect, own: Sequence[Parameter], model: Model, names: Sequence[str], values: Array, covariance: Array
 ) -> Coefficients:
-    """Of an effect of a model whose coefficients `own` are among parameters `names` (n,), with values and covariance.
+    """Coefficients of an effect whose unknowns `own` are among parameters `names` (n,), with values and covariance.
 
     A shape constant has no deviation.
     """

@@ -20,8 +20,10 @@ FALSE_ALARM = 0.01
 
 @dataclass(frozen=True)
 class RowResidual:
-    """Of one row type: whitened is the rms over the predicted deviation, limit what noise alone exceeds in one of
-    1 / FALSE_ALARM sessions."""
+    """Residual of one row type.
+
+    whitened: rms over the predicted deviation. limit: what noise alone exceeds in one of 1 / FALSE_ALARM sessions.
+    """
 
     whitened: float
     limit: float

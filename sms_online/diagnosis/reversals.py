@@ -51,7 +51,7 @@ class Reversals:
 
     @cached_property
     def _half_width(self) -> int:
-        """Of the filter that locates all changes of sign best, which are the more the narrower it is.
+        """Half width of the filter that locates all changes of sign best, which are the more the narrower it is.
 
         Where the motor is at rest noise alone changes it.
         """

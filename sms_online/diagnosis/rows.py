@@ -190,7 +190,7 @@ class SessionRows(WeakRows):
         self.have_noise(covariances)
 
     def _second_order(self) -> SecondOrderNoise:
-        """As in the fit."""
+        """Second-order noise as in the fit."""
         samples = [beyond_first_order(part.copies, self.beta) for part in self._parts if part.windows]
         squares = np.concatenate(samples) ** 2
         widths = self.weak.windows.half_width

@@ -264,7 +264,7 @@ class Tracing(Acceptance):
         return one.extends is None and (not one.traits.learned or one.key == other.key)
 
     def finding(self, chosen: Sequence[int], k: int) -> Finding:
-        """What is to be said of one of the candidates chosen."""
+        """The finding of one of the candidates chosen."""
         others = [other for other in chosen if other != k]
         gains = self.gains(others)
         improvement = self.improvement(others, k).share

@@ -62,7 +62,7 @@ class Shape:
 
 @dataclass(frozen=True)
 class Entry:
-    """What the catalogue says of an effect.
+    """The catalogue's entry of an effect.
 
     coefficients: those that may be declared and are reported, name to unit ("": a ratio); on a prismatic joint, m is
     for rad and N for N m. separated_by: the motion that separates it from similar effects. shapes: shape constants.
@@ -138,7 +138,7 @@ class Constant:
 
     @classmethod
     def improved(cls, given: Mapping[str, float], increments: Array) -> dict[str, float]:
-        """The constants changed by the linear coefficients (c,) of what is left when they are taken off."""
+        """The constants changed by linear coefficients (c,) that are fitted to the corrected samples."""
         changes = zip(cls.entry.coefficients, increments, strict=True)
         return {name: given.get(name, 0.0) + float(change) for name, change in changes}
 

@@ -211,7 +211,7 @@ def channel_effects(system: System) -> tuple[ChannelEffect, ...]:
 
 
 def corrections(system: System) -> tuple[ChannelEffect, ...]:
-    """What a system says to take off its channels: effects as declared, then latencies of sensors."""
+    """Corrections of a system's channels: effects as declared, then latencies of sensors."""
     delays = [(sensor.channels, sensor.delay(system.sample_rate)) for sensor in system.sensors]
     return (*channel_effects(system), *(SensorLatency(channels, delay) for channels, delay in delays if delay != 0.0))
 

@@ -139,7 +139,7 @@ class EncoderEccentricity(ChannelEffect):
 
     @classmethod
     def deviations(cls, given: Mapping[str, float], covariance: Array) -> dict[str, float]:
-        """Of the parts along the phase and across it."""
+        """Deviations of the parts along the phase and across it."""
         sine, cosine = np.cos(given["phase"]), np.sin(given["phase"])
         along, across = np.array([sine, cosine]), np.array([-cosine, sine])
         radial, tangential = (float(np.sqrt(e @ covariance @ e)) for e in (along, across))
@@ -147,7 +147,7 @@ class EncoderEccentricity(ChannelEffect):
 
 
 class Convolved(ChannelEffect):
-    """What weights of the samples on both sides take off."""
+    """An effect that weights of the samples on both sides correct."""
 
     def kernel(self, sample_rate: float) -> Array:
         """Weights (2M + 1,) of the samples about an instant in what was there."""

@@ -107,7 +107,7 @@ class SensorLag(Convolved):
 
     @classmethod
     def deviations(cls, given: Mapping[str, float], covariance: Array) -> dict[str, float]:
-        """Of the corner, by way of the delay."""
+        """Deviation of the corner, by way of the delay."""
         std = np.sqrt(np.diag(covariance))
         return {"corner": float(given["corner"] * std[0] / delay_of(given["corner"]))}
 

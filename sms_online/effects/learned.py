@@ -101,7 +101,7 @@ class LearnedForce(Force):
 
     @cached_property
     def _modes(self) -> Array:
-        """Coefficients (B-splines, modes) of curves without what laws say, of unit rms, the smoothest first."""
+        """Coefficients (B-splines, modes) of curves that no law explains, of unit rms, the smoothest first."""
         u = np.linspace(self.knots[0], self.knots[-1], POINTS)
         B, bending = self._spline(u), self._spline.derivative(2)(u)
         end = self.knots[-1] if self.over in FLAT_AT_END else np.clip(0.0, self.knots[0], self.knots[-1])

@@ -68,7 +68,7 @@ class _Recursion:
 
     @property
     def _columns(self) -> slice:
-        """Of the result, those that the load has."""
+        """The result's columns that the load has."""
         return slice(self._first, self._first + self._load.shape[4])
 
     def begin(self, i: int) -> None:

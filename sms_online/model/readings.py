@@ -108,7 +108,7 @@ def position_channels(model: Model) -> tuple[str, ...]:
 
 
 def _joint_channels(model: Model) -> tuple[str, ...]:
-    """Those that need no configuration of the chain."""
+    """Channels that need no configuration of the chain."""
     layout = model.layout
     rigid = layout.n_x - sum(q_f.stop - q_f.start for q_f in layout.q_f)
     markers = [

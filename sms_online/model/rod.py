@@ -219,7 +219,7 @@ class _OneFieldMarkers:
         )
 
     def __call__(self, q_f: Array) -> tuple[Array, Array]:
-        """As `ExactRod._read`."""
+        """The same as `ExactRod._read`."""
         angle = q_f @ self._angles.T
         sine, cosine = np.sin(angle), np.cos(angle)
         markers = sine @ self._sine + (1.0 - cosine) @ self._versine + q_f @ self._rotation

@@ -13,7 +13,7 @@ from sms_online.stream import Array
 
 
 def geometry_tolerances(system: System) -> Tolerances:
-    """Those of a system; where it calls its geometry exact, what a careful assembly and a calliper give.
+    """Tolerances of a system; where it calls its geometry exact, what a careful assembly and a calliper give.
 
     A description has so many digits, and no combination of parameters follows from the last of them.
     """

@@ -120,7 +120,7 @@ class Changes(Stage):
 
     @property
     def events(self) -> list[Event]:
-        """Of the session so far."""
+        """Events of the session so far."""
         return self.state.events
 
     @property

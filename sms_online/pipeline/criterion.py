@@ -64,7 +64,7 @@ class RowGrams(State):
 
     @staticmethod
     def none(n_v: int, n: int) -> RowGrams:
-        """Of no windows, with rows of n_v speeds and n parameters."""
+        """Gram matrices of no windows, with rows of n_v speeds and n parameters."""
         return RowGrams(GramSum.none(n_v, n + 1), GramSum.none(n_v, n + 1))
 
     def add(self, rows: Array, noisy: Array) -> None:
@@ -234,7 +234,7 @@ class _Criterion:
         return np.asarray(np.maximum(noise, self._least(at.w)))
 
     def value(self, at: _Point, errors: Array) -> float:
-        """Of the criterion, with e² (n_v,) given."""
+        """Value of the criterion, with e² (n_v,) given."""
         ratio = self.squares(at) / self.predicted(at, errors)
         each = np.where(self._lacking, np.log(ratio), ratio)
         return 0.5 * float(self._count @ each)

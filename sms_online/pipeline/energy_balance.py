@@ -67,7 +67,7 @@ class SharedErrors(State):
 
     @staticmethod
     def none(n: int) -> SharedErrors:
-        """Of no rows of n parameters."""
+        """Sums of no rows of n parameters."""
         starts, walks, qPP = np.zeros((3, n, n))
         total, qP = np.zeros((2, n))
         return SharedErrors(starts, walks, total, qP, qPP)

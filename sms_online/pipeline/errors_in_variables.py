@@ -47,7 +47,7 @@ class NoiseBias(State):
 
     @staticmethod
     def none(n: int, prior: Array | None = None) -> NoiseBias:
-        """Of no rows; prior (k, n + 1): what is known beforehand, as rows [Y b] of unit variance without noise."""
+        """Bias of no rows; prior (k, n + 1): what is known beforehand, as rows [Y b] of unit variance without noise."""
         gram, last = np.zeros((2, n + 1, n + 1))
         return NoiseBias(gram if prior is None else prior.T @ prior, last)
 

@@ -113,7 +113,7 @@ class ChangeDetector(Stage):
 
     @property
     def known(self) -> Information:
-        """Of the rows taken in."""
+        """Information of the rows taken in."""
         return self.state.known
 
     @property
@@ -179,7 +179,7 @@ class ChangeDetector(Stage):
         )
 
     def seen(self) -> list[Seen]:
-        """The last windows, oldest first, with the drift that was taken off their rows."""
+        """The last windows, oldest first, with the drift that was subtracted from their rows."""
         moved = self.state.moved
         if moved is None:
             return list(self.state.history)

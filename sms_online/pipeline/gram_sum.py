@@ -23,7 +23,7 @@ class GramSum(State):
 
     @staticmethod
     def none(n_v: int, n: int) -> GramSum:
-        """Of no rows with n columns, of n_v speeds."""
+        """Sums of no rows with n columns, of n_v speeds."""
         return GramSum(np.zeros((n_v, n, n)))
 
     @property

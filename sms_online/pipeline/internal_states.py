@@ -33,7 +33,7 @@ def half_width(system: System) -> int:
 def smooth_from_the_start(
     x: Array, first: int, samples: NDArray[np.int64], M: int, sample_rate: float
 ) -> tuple[Array, Array]:
-    """As `smooth` with half width M, but near the beginning with as much of the ladder of widths as it allows.
+    """The same as `smooth` with half width M, but near the beginning with as much of the ladder of widths as it allows.
 
     A mass that rings keeps for good what it has missed of a motion's beginning. first: number of the first of x (B, ·)
     in the segment; samples (n,): numbers too.

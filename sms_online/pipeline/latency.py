@@ -41,7 +41,7 @@ class SourceGroup:
 
 @dataclass(frozen=True)
 class Latency:
-    """A source whose samples are `size` ± `std` s later than the system file says; effects: it is known as these.
+    """A source whose samples are `size` ± `std` s later than the system file states; effects: it is known as these.
 
     Less than zero where all others are late by the same, which cannot be distinguished from one early source.
     """
@@ -60,7 +60,7 @@ def source_channels(source: Source) -> list[str]:
 
 
 def _group(sensing: Sensing, name: str, channels: Sequence[str]) -> SourceGroup:
-    """Those of the channels that are used."""
+    """A source's channels that are used."""
     positions = [sensing.channels[column] for column in sensing.position_columns]
     mine = [channel for channel in channels if channel in sensing.channels]
     sensors = tuple(positions.index(channel) for channel in mine if channel in positions)

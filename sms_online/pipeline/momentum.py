@@ -106,7 +106,7 @@ class Momentum(Stage):
 
     @property
     def sensor_noise(self) -> SensorNoise | None:
-        """As estimated last, None while it is not known."""
+        """Noise of the sensors as estimated last, None while it is not known."""
         return self.state.sensor_noise
 
     def _build(self) -> None:
@@ -197,7 +197,7 @@ class Momentum(Stage):
         return self.bank.judged(own, self.bias, t) if self.bank.others else own
 
     def readings(self, t: float) -> tuple[Reading, ...]:
-        """What each chosen tracker says, the judged one first; empty where that is the session's own alone."""
+        """Readings of each chosen tracker, the judged one first; empty where that is the session's own alone."""
         return self.bank.readings(self._own(), self.bias, t) if self.bank.others else ()
 
     def _own(self) -> Estimate:
@@ -231,7 +231,7 @@ class Momentum(Stage):
         return Beforehand(certain, self._calibration[may])
 
     def _solved(self) -> Array:
-        """Nuisances and β, of the rows and, where these say little, of the description."""
+        """Nuisances and β, of the rows and, where these determine little, of the description."""
         return nearer(self._own(), *self.fit.described)
 
     def observe(self, t: Array, values: Array) -> None:
@@ -357,7 +357,7 @@ class Momentum(Stage):
                 self._begin_drift(learned.information)
 
     def _for_trackers(self, rows: WhiteRows) -> Rows:
-        """Rows with the drift that was taken off them."""
+        """Rows with the drift that was subtracted from them."""
         m, centre, b, ramp = len(self.nuisances), self._centre(rows.end), rows.Y[:, -1], None
         if self.bank.follows:
             ramp = np.pad(rows.ramp, ((0, 0), (m, 0)))

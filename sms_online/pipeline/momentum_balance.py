@@ -286,7 +286,7 @@ class MomentumBalance(Stage):
         return out
 
     def _kept(self, kept: dict[int, _Smoothed], half_width: int, step: int, first: int, entries: int) -> _Smoothed:
-        """What windows of this half width have asked for that windows from sample `first` on may ask for too."""
+        """Smoothed samples of this half width that windows from sample `first` on need too."""
         smoothed = kept.get(half_width)
         if smoothed is None or smoothed.first + len(smoothed.columns) * step < first:
             smoothed = kept[half_width] = _Smoothed(step, first, np.empty((0, entries)))

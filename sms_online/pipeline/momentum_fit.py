@@ -475,7 +475,7 @@ class MomentumFit(Stage):
         return whitened
 
     def _forget_instants(self) -> None:
-        """Drop the states that no window to come asks for."""
+        """Drop the states that no window to come needs."""
         needed = max(self.state.first, self.state.held[0].start if self.state.held else self.state.last)
         drop = needed - self.state.first
         self.state.first = needed

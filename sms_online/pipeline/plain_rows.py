@@ -37,7 +37,7 @@ class PlainRows(State):
 
     @staticmethod
     def none(n_v: int, n: int) -> PlainRows:
-        """Of no windows, with rows of n_v speeds and n parameters."""
+        """Sums of no windows, with rows of n_v speeds and n parameters."""
         return PlainRows(GramSum.none(n_v, n + 1), GramSum.none(n_v, n + 1), *np.zeros((2, n_v)))
 
     @property

@@ -143,7 +143,7 @@ class SequentialTest(Stage):
         now.root = np.concatenate((now.root, C @ (axes * np.sqrt(np.maximum(size, 0.0)))), axis=1)
 
     def _log_likelihood(self, rows: WhiteRows, variance: float) -> Array:
-        """Of every test (tests,); what nothing is known of says nothing."""
+        """Log likelihood ratio of every test (tests,); zero where nothing is known."""
         Y, n_v = rows.raw[:, :-1], self._layout.n_v
         e = rows.raw[:, -1] - Y @ self.state.beta
         spread = Y @ self.state.root

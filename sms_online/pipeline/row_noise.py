@@ -102,7 +102,7 @@ class RowNoise(Stage):
     def covariances(
         self, kernels: Array, late: Array, sensor_density: Array, torque_density: Array, free: Array, ages: Array
     ) -> list[list[Array]]:
-        """Of each of W windows in a row, covariances (n_v, n_v) with the windows before, oldest first, then its own.
+        """Covariances (n_v, n_v) of each of W windows in a row with those before, oldest first, then its own.
 
         In (N s)² and so on. kernels (W, STEPS + 1, n_v, sensors): c. late (W, n_v, sensors): `lateness`. sensor_density
         (sensors,): σ² T_s of each position sensor. torque_density (joints,): of n τ, (N m)² s. free (W, INSTANTS, n_v):

@@ -66,7 +66,7 @@ def smooth(samples: Array, centres: NDArray[np.int64], half_width: int, sample_r
 
 
 def smooth_all(samples: Array, half_width: int, sample_rate: float) -> tuple[Array, Array]:
-    """As `smooth` at every centre of samples (B, C), (B - 2M, C): of many at once, and equal up to rounding."""
+    """The same as `smooth` at every centre of samples (B, C), (B - 2M, C): many at once, equal up to rounding."""
     # Correlation is convolution with the kernel reversed.
     reversed_kernel = kernel(half_width)[::-1]
     both = [oaconvolve(samples, column[:, None], mode="valid", axes=0) for column in reversed_kernel.T]

@@ -27,7 +27,7 @@ def slowest(noise: float, half_width: int, sample_rate: float) -> float:
 
 
 def lasting(slow: NDArray[np.bool_], sample_rate: float) -> NDArray[np.bool_]:
-    """Of samples (K,) at which an axis is slow, those at which it is for long."""
+    """Samples at which an axis is slow for long, of samples (K,) at which it is slow."""
     still = np.zeros_like(slow)
     for begin, end in np.flatnonzero(np.diff(slow, prepend=False, append=False)).reshape(-1, 2).tolist():
         still[begin:end] = end - 1 - begin >= LASTING * sample_rate
@@ -73,7 +73,7 @@ class Standstill(Stage):
         return np.asarray(now.still[np.clip(samples - now.first - self._half_width, 0, len(now.still) - 1)])
 
     def drop(self, before: int) -> None:
-        """Forget what nobody asks for who asks for samples from number `before` on."""
+        """Forget what no request for samples from number `before` on needs."""
         now = self.state
         # The newest rates are as far behind as the filter reaches, and what they have lasted follows from them.
         reach = 2 * self._half_width + round(LASTING * self._rate) + 1

@@ -80,7 +80,7 @@ def _setup(packed: bytes) -> Setup:
 
 @dataclass(frozen=True)
 class MomentumStatistics:
-    """Of the momentum balance.
+    """Statistics of the momentum balance.
 
     trackers: what each chosen tracker says, the judged one first; empty where that is the session's own least squares
     alone. reference: nuisances and parameters of the rows without what the judged tracker knows of a drift, None where
@@ -135,7 +135,7 @@ class Statistics:
 
     @staticmethod
     def of(estimator: Estimator) -> Statistics:
-        """Those of now; nothing in them changes as the session goes on."""
+        """The statistics of now; nothing in them changes as the session goes on."""
         momentum, smoother = estimator.momentum, estimator.smoother
         return Statistics(
             setup=estimator.setup,
@@ -185,5 +185,5 @@ class Statistics:
 
     @one_blas_thread()
     def energy_estimate(self) -> Estimate:
-        """What the energy balance alone says."""
+        """The estimate of the energy balance alone."""
         return self.energy.estimate()

@@ -354,7 +354,7 @@ class Synchroniser(Stage):
 
 
 def _run_length(row_index: Indices) -> Indices:
-    """Of each row: how many rows lie on consecutive grid points around it, itself included; 1 off the grid."""
+    """Number of rows on consecutive grid points around each row, itself included; 1 off the grid."""
     run = np.cumsum(np.diff(row_index, prepend=NOWHERE) != 1)
     length: Indices = np.bincount(run)[run]
     return length

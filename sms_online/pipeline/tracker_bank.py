@@ -31,7 +31,7 @@ WAITED = (3.0, 4.4, 6.5)
 
 @dataclass(frozen=True)
 class Reading:
-    """What one tracker says at an instant.
+    """The reading of one tracker at an instant.
 
     label: its name for people. memory: s of rows that the estimate rests on. drifts: learned so far, by column of the
     estimate.
@@ -133,7 +133,7 @@ class TrackerBank(Stage):
 
     @property
     def others(self) -> list[Tracker]:
-        """Those beside the session's own least squares."""
+        """The trackers beside the session's own least squares."""
         return [chosen.tracker for chosen in self._chosen if chosen.tracker is not None]
 
     @property

@@ -110,13 +110,13 @@ class WindowNoise(Stage):
             self._calibration.extend(x, signals, self._sensitivities.rates(len(x)), by_geometry)
 
     def drop(self, instant: int) -> None:
-        """Forget what no window that starts at an instant or later asks for."""
+        """Forget what no window that starts at an instant or later needs."""
         self._sensitivities.drop(instant)
         if self._calibration is not None:
             self._calibration.drop(instant)
 
     def push(self, windows: Sequence[Window], errors: Array) -> list[PropagatedNoise]:
-        """Of the next windows; errors (W, n_v): variance of each row that nothing propagates."""
+        """Noise of the next windows; errors (W, n_v): variance of each row that nothing propagates."""
         size = max(1, TOGETHER // (STEPS * self.n_v * self._sensitivities.sensors))
         return [
             noise

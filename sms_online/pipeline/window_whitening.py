@@ -90,7 +90,7 @@ class WindowWhitening(Stage):
         return [self._whitened(noise, own) for noise, own in zip(propagated, rows, strict=True)]
 
     def _whitened(self, noise: PropagatedNoise, rows: Array) -> WhitenedWindow:
-        """Of one window."""
+        """Whiten one window."""
         own = noise.covariances[-1]
         of_noise = own.copy()
         diagonal = np.einsum("ii->i", own)

@@ -81,7 +81,7 @@ NO_NUMBERS = (np.linalg.LinAlgError, ArithmeticError)
 
 @dataclass(frozen=True)
 class SpanFit:
-    """What a span says: rows Y β = b with independent unit errors as a factor (n + 1, n + 1), linearised at its end.
+    """The information of a span at its end: a factor (n + 1, n + 1) of rows Y β = b with independent unit errors.
 
     beta (n,): estimate from this span and what was known before it. rows: how many innovations. mean_square: of the
     whitened innovations. level: of the white forces that are left, 0 where the equations hold. step: of the

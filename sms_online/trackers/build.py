@@ -58,7 +58,7 @@ def build_tracker(choice: TrackerChoice, tracked: Tracked) -> Tracker:
 
 
 def build_watch(tracked: Tracked) -> LearnedTrend:
-    """What follows no drift, and says where rows show one."""
+    """A watch that follows no drift, and reports where rows show one."""
     nothing = np.zeros(tracked.n)
     groups = _groups(["learned"] * len(tracked.parameters), tracked)
     return LearnedTrend(tracked.n, groups, nothing, nothing, tracked.prior, follow=False)

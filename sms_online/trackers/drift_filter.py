@@ -28,7 +28,7 @@ class Block:
 
     @staticmethod
     def of(rows: Array, knot: int, span: float) -> Block:
-        """Of whitened rows [Y, (t - knot) Y, b] (M, 2 n + 1) of `span` s."""
+        """The block of whitened rows [Y, (t - knot) Y, b] (M, 2 n + 1) of `span` s."""
         return Block(triangular_factor(rows), knot, len(rows), span)
 
 

@@ -85,7 +85,7 @@ def changes_within(anchor: DriftFilter, blocks: Sequence[Block], groups: Sequenc
 
 
 def best_ramp(tried: Tried) -> Ramp | None:
-    """The ramp that explains most, if it is no accident and no step."""
+    """The ramp that explains most, if it is neither chance nor a step."""
     ranked = sorted(tried.ramps, key=lambda each: each.gain - LEAST_GAIN * len(each.columns), reverse=True)
     if not ranked:
         return None
@@ -184,7 +184,7 @@ def _relative(block: Block, knot: int, state: DriftFilter) -> Array:
 
 
 def _explained(left: Array, sizes: Array, columns: Sequence[int]) -> tuple[float, Array]:
-    """What columns take off the sum of squares of the last one, and their coefficients."""
+    """By how much columns reduce the sum of squares of the last one, and their coefficients."""
     inside = left[:, columns]
     norm = np.linalg.norm(inside, axis=0)
     if not (norm > FREE * sizes[columns]).all():

@@ -23,7 +23,7 @@ class Information:
 
     @staticmethod
     def none(n: int) -> Information:
-        """Of no rows of n parameters."""
+        """The information of no rows about n parameters."""
         return Information(np.zeros((n + 1, n + 1)), 0)
 
     @property
@@ -32,7 +32,7 @@ class Information:
         return len(self.factor) - 1
 
     def with_rows(self, rows: Array) -> Information:
-        """That of further whitened rows [Y b] (M, n + 1) too."""
+        """The same with further whitened rows [Y b] (M, n + 1)."""
         return Information(triangular_factor(self.factor, rows), self.rows + len(rows))
 
     def solution(self) -> Solution:
@@ -40,7 +40,7 @@ class Information:
         return solve(self.factor)
 
     def shifted(self, by: Array) -> Information:
-        """Of parameters that are larger by so much (n,)."""
+        """The same about parameters that are larger by so much (n,)."""
         factor = self.factor.copy()
         factor[:, -1] += factor[:, :-1] @ by
         return Information(factor, self.rows)

@@ -120,7 +120,7 @@ class Estimate:
     crossed: Array | None = None
 
     def without_nuisances(self, m: int) -> Estimate:
-        """Of an estimate of m nuisances and then π, the marginal one of π."""
+        """The marginal estimate of π, from one of m nuisances and then π."""
         if m == 0:
             return self
         robust = self.covariance_robust

@@ -33,7 +33,7 @@ class Memory(Protocol):
     """Store of absorbed blocks, a `State` or a `Stage`; a block is (M, n + 1) whitened rows."""
 
     def begin(self, known: Information) -> None:
-        """Count what earlier rows say, before the first block."""
+        """Count the information of earlier rows, before the first block."""
 
     def absorb(self, block: Array) -> None:
         """Take in a full block of BLOCK_ROWS rows."""
@@ -51,7 +51,7 @@ class FullMemory(State):
 
     @staticmethod
     def none(n: int) -> FullMemory:
-        """Of no rows of n parameters."""
+        """Content of no rows of n parameters."""
         return FullMemory(np.zeros((n + 1, n + 1)), ClusterFactors.none(n))
 
     def begin(self, known: Information) -> None:

@@ -40,7 +40,7 @@ class ClusterFactors(State):
 
     @staticmethod
     def none(n: int) -> ClusterFactors:
-        """Of no rows of n parameters."""
+        """Clusters of no rows of n parameters."""
         return ClusterFactors(np.zeros((n + 1, n + 1)))
 
     def add(self, factor: Array) -> None:

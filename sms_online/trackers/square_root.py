@@ -81,7 +81,7 @@ class RecursiveLeastSquares(Tracker):
 
     @property
     def information(self) -> Information:
-        """What rows and prior say."""
+        """Information of rows and prior."""
         content = self._memory.with_pending(self._pending.rows)
         return Information(triangular_factor(self._prior, content.factor), int(content.rows))
 

@@ -44,7 +44,7 @@ def miscalibrated(evaluation: Evaluation) -> list[Reason]:
 
 
 def _held_torques(evaluation: Evaluation) -> list[Reason]:
-    """That torques act half a sample later than they are stamped, which commands do that are held."""
+    """A reason where torques act half a sample later than stamped, as held commands do."""
     setup = evaluation.statistics.setup
     half = 0.5 * float(np.nanmax(evaluation.statistics.periods[list(setup.sensing.torque_columns)], initial=0.0))
     clocks = [each for each in evaluation.calibration if each.name == "clock"]

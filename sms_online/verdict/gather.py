@@ -23,7 +23,7 @@ ROWS_A_PARAMETER = 10
 
 
 def evidence_of(evaluation: Evaluation, discrepancies: Sequence[Discrepancy], troubles: Sequence[str]) -> Evidence:
-    """All that an evaluated session says for or against its estimate."""
+    """All evidence of an evaluated session for or against its estimate."""
     now, flags, momentum = evaluation.statistics, evaluation.determined, evaluation.statistics.momentum
     projection, trackers = evaluation.projection, evaluation.trackers
     return Evidence(

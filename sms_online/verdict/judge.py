@@ -40,7 +40,7 @@ def judge(evidence: Evidence) -> Trust:
 
 
 def _wrong(evidence: Evidence) -> list[Reason]:
-    """What makes the numbers wrong by more than any error bar says, the strongest first."""
+    """Reasons why the numbers are wrong by more than any error bar says, the strongest first."""
     converged = not evidence.unconverged
     out = [*reasons.scaled(evidence.comparison), *reasons.lacking(evidence.discrepancies)]
     if converged:
@@ -103,7 +103,7 @@ def judge_diagnosis(
 
 
 def _unexplained(effects: Sequence[str], row: str | None, near: bool) -> list[Reason]:
-    """That something acts which no known effect explains, or not all of it."""
+    """Reasons where no known effect explains what acts, or not all of it."""
     where = "" if row is None else f" on {row}"
     like = reasons.listed(effects)
     text = f"something acts{where} that no known effect explains"

@@ -82,12 +82,12 @@ def _slow(rates: Mapping[str, float]) -> list[Reason]:
 
 
 def never_received(names: Sequence[str]) -> Reason:
-    """That nothing has ever come of sources or channels."""
+    """Sources or channels that have never delivered anything."""
     return Reason(f"nothing was received of {listed(names)}", False, then=CHECK_DEVICE)
 
 
 def silenced(since: Mapping[str, float]) -> list[Reason]:
-    """That nothing comes any more of sources or channels; since: s."""
+    """Sources or channels that deliver nothing any more; since: s."""
     if not since:
         return []
     text = f"nothing has come of {listed([*since])} since {min(since.values()):.1f} s"
@@ -100,12 +100,12 @@ def troubled(troubles: Sequence[str]) -> list[Reason]:
 
 
 def unconverged(why: str) -> Reason:
-    """That the estimate will still move by more than its error bars."""
+    """An estimate that will still move by more than its error bars."""
     return Reason(why, False, then=MOVE)
 
 
 def scaled(comparison: Comparison) -> list[Reason]:
-    """That everything is off by one factor, which rows cannot show."""
+    """One factor that everything is off by, which rows cannot show."""
     factor = comparison.common
     if factor is None:
         return []
@@ -155,7 +155,7 @@ def unexplained_torques(residual: Residuals) -> list[Reason]:
     for name, share in sorted(shares.items(), key=lambda item: -item[1]):
         if share > LARGEST_RESIDUAL and not _noise_alone(residual[name]):
             percent = f"{100.0 * share:.0f} % of the torque or force of {name} is not explained"
-            means = "the model lacks an effect there, and the parameters bend to replace it"
+            means = "the model lacks an effect there, and the parameters are biased by its absence"
             mark = f"{100.0 * share:.0f} % unexplained"
             out.append(Reason(percent, True, (name,), mark, f"{percent}: {means}", CHECK_TORQUE))
     return out
@@ -282,12 +282,12 @@ def undecided_changes(times: Sequence[float]) -> list[Reason]:
 
 
 def undecided(said: str, where: str, other: str) -> Reason:
-    """That a finding at one place may as well be its opposite at another: all parameters depend on which."""
+    """A finding at one place that may as well be its opposite at another: all parameters depend on which."""
     return Reason(said, False, (where, other), UNDECIDED, then=WEIGH)
 
 
 def inconsistent_physics(distance: float) -> list[Reason]:
-    """That no physically consistent parameters are near; distance: in standard deviations."""
+    """An estimate far from all physically consistent parameters; distance: in standard deviations."""
     if distance <= LARGEST_DISTANCE:
         return []
     return [Reason(f"the estimate violates physical consistency by {distance:.0f} standard deviations", False)]

@@ -91,7 +91,7 @@ class Trust:
         return marks
 
     def document(self) -> dict[str, Any]:
-        """As results.json holds it."""
+        """The entry of results.json."""
         return {
             "level": self.level, "grave": self.grave, "sentence": self.sentence, "reasons": list(self.reasons),
             "next_step": self.next_step,

@@ -24,7 +24,7 @@ TIME = "time, s"
 
 
 def residual_charts(diagnosis: Diagnosis) -> list[Chart]:
-    """Of each row type the coordinate that was furthest off, before and after; noise close up where it was far off."""
+    """Charts of each row type's worst coordinate, before and after; noise close up where it was far off."""
     before, after = diagnosis.before, diagnosis.after
     rows, rows_after = diagnosis.described.rows, diagnosis.attempt.rows
     names, names_after = (each.model.layout.speed_names for each in (rows, rows_after))
@@ -67,7 +67,7 @@ def _residual(state: State, windows: Windows, t: Array, speed: int, color: str) 
 
 
 def law_charts(diagnosis: Diagnosis) -> list[Chart]:
-    """Of each effect found the force that the data show over what it depends on, or its rows, beside the law."""
+    """Charts of each effect found: the force in the data over what it depends on, or its rows, beside the law."""
     charts = [_curve_chart(curve) for curve in force_curves(diagnosis)]
     charts += [_added_chart(added) for added in added_variables(diagnosis)]
     found = diagnosis.unexplained

@@ -91,7 +91,7 @@ def parameter_rows(results: Mapping[str, tuple[list[Document], str]], nominal: M
 
 
 def _deviation(estimates: Sequence[Document | None], value: float | None) -> str:
-    """Of estimates from a value other than zero, %, one after the other."""
+    """Deviations of estimates from a value other than zero, %, one after the other."""
     known = [p["estimate"] if p is not None and p["identifiable"] else None for p in estimates]
     if not value or not any(known):
         return ""

@@ -32,7 +32,7 @@ class Leading:
 
 @dataclass(frozen=True)
 class News:
-    """What there is to say. rate: samples/s; latency: p99, s, or None; lost: samples; residual: largest share of a
+    """News of a session. rate: samples/s; latency: p99, s, or None; lost: samples; residual: largest share of a
     joint's torque or force that is not explained, or None; leading: the best known parameters; troubles: what is wrong;
     trust: in the numbers, of all of it.
     """

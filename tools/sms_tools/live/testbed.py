@@ -32,7 +32,7 @@ SWITCH_INTERVAL = 1e-3
 
 
 def versions() -> dict[str, str]:
-    """Of the programs that a recording depends on, as far as they are installed."""
+    """Versions of the programs that a recording depends on, as far as they are installed."""
     found = {}
     for program in PROGRAMS:
         try:

@@ -180,7 +180,7 @@ class _Plots:
         return self._plot("Evidence for missing effects, log10 of the gain", [f"{number_log.EVIDENCE}/**"])
 
     def health(self, live: bool) -> rrb.Container:
-        """Of the data and, live, of their source."""
+        """Health of the data and, live, of their source."""
         health = number_log.HEALTH
         plots = [
             self._plot("Rate, samples/s", [f"{health}/rates/**"], legend=False),

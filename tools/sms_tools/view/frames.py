@@ -27,7 +27,7 @@ class Reference:
 
 @dataclass(frozen=True)
 class Diagnosed:
-    """That the session has been diagnosed before it is shown: verdict and evidence are in front.
+    """A diagnosis made before the session is shown: verdict and evidence are in front.
 
     parameters: estimate and standard deviation by name, to be shown in place of the session's; empty where those are
     the same. trust: of the diagnosis.
