@@ -103,7 +103,7 @@ def test_a_late_camera_within_tolerance_is_said_and_corrected(exact: Block) -> N
         assert str(clock).endswith("µs late")
 
 
-def test_a_change_beside_a_clock_that_may_have_moved_is_doubted(exact: Block) -> None:
+def test_a_change_beside_a_clock_that_may_have_moved_is_in_doubt(exact: Block) -> None:
     statistics = evaluated(exact, Tolerances(), late(exact, 1e-4)).statistics
     change = Event(4.0, "payload", ("payload.mass",), ("kg",), (1.0,), (0.1,), 0)
     steady, changed = (Evaluation(replace(statistics, events=events)).trust for events in ((), (change,)))

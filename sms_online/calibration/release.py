@@ -51,7 +51,7 @@ def released(estimate: Estimate, nuisances: Sequence[Nuisance], squares: Array) 
     far = known[np.abs(estimate.pi[known]) > NORMAL * tolerance[known]]
     if not far.size:
         return estimate
-    # Beside a prior all rows were scaled by one factor, these among them.
+    # Beside a prior all rows were weighed with one factor, these among them.
     unit = tolerance[far] * (1.0 if estimate.scale is None else estimate.scale)
     C, start = squares[:, far] / unit, estimate.pi[far] / unit
     block = C[far] / unit[:, None]

@@ -108,7 +108,7 @@ class Acceptance(CandidateRows):
         return out
 
     def _insignificant(self, chosen: Sequence[int], asked: Sequence[int]) -> list[int]:
-        """Effects whose coefficients do not exceed what the blocks differ by."""
+        """Those whose coefficients are no more than what the blocks differ by."""
         if self.folds.count < LEAST_FOLDS:
             return []
         solution, std = self.solution(chosen), self.spread(chosen)

@@ -25,7 +25,7 @@ ACTS = 0.01
 LARGEST_RATIO = 1.5
 # Rows for a column at least, for curves to be fitted together.
 LEAST_ROWS = 4
-# Share of a row's variance by which that of the effects chosen has to change for rows to be whitened anew.
+# Share of a row's variance by which that of the effects chosen has to change for rows to be weighed anew.
 SMALL_CHANGE = 0.1
 
 

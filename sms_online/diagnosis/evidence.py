@@ -104,7 +104,7 @@ class Gain:
 
 
 def gain(Q: Array, r: Array, columns: Array) -> Gain:
-    """Gain of columns (M, c), beside a model with basis Q (M, rank) and residual r (M,)."""
+    """Of columns (M, c), beside a model with basis Q (M, rank) and residual r (M,)."""
     c = columns.shape[1]
     free = free_of(Q, columns)
     size, left = np.linalg.norm(columns, axis=0), np.linalg.norm(free, axis=0)
