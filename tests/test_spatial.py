@@ -104,7 +104,7 @@ def test_seven_joint_arm_at_250_hz_and_grade_b() -> None:
     assert estimator.by_momentum
     assert determined.sum() >= 50
     assert np.median(error[determined] / np.abs(truth[determined])) < 0.01
-    # The wrist's last spring bends by less than the encoders' noise: its stiffness is pulled towards zero.
+    # The wrist's last spring bends by less than the encoders' noise: its stiffness is attenuated.
     names = [parameter.name for parameter in estimator.base.parameters]
     others = determined & ~np.array([name.startswith("joint_7.") for name in names])
     assert (error[others] < 4.0 * std[others]).all()
