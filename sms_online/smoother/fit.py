@@ -264,7 +264,7 @@ class _Search:
             weights = self._innovations.weights[piece, :, None]
             steps = transitions(linear, motion.step, drive, joints, lacking[piece])
             count = len(weights)
-            speeds.append((linear.A[:count, :n_v], linear.E[:count, :n_v, joints:]))
+            speeds.append((linear.V[:count], linear.E[:count, :n_v, joints:]))
             rows.append(kalman.push(differences[piece], weights * linear.C[:count], weights * linear.D[:count], steps))
         innovations = np.concatenate(rows)
         Y = -innovations[:, 1:]
@@ -283,7 +283,7 @@ class _Search:
             for k, (by_s, by_beta) in zip(range(0, len(s), nodes), speeds, strict=True)
         ]
         v = motion.v + np.concatenate(moved)[..., 0]
-        self.motion = Motion(motion.t, motion.x + s[:, :n_v], v)
+        self.motion = Motion(motion.t, self._model.layout.displaced(motion.x, s[:, :n_v]), v)
         self.beta = beta
         self.iterations += 1
 
