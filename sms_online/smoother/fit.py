@@ -22,7 +22,7 @@ from sms_online.model.dynamics import Dynamics
 from sms_online.model.model import Model
 from sms_online.model.readings import Readings
 from sms_online.physical import PhysicalSet
-from sms_online.pipeline.description import LOOSE, described
+from sms_online.pipeline.description import described
 from sms_online.smoother.collocation import defects, momenta_and_forces, transitions
 from sms_online.smoother.filter import FixedIntervalSmoother
 from sms_online.smoother.span import Innovations, Span, interpolated
@@ -121,7 +121,6 @@ class SpanSmoother:
         # Unit noise of each motor's mean torque to forces, (n_v, joints), N m √s.
         self._motors = model.generalized_force(np.eye(torque.size)).T * np.sqrt(torque)
         self._physical = PhysicalSet(model, base)
-        self._described = _prior_rows(*described(model, base))
 
     def fit(self, span: Span, beta: Array, known: Array, last_step: float | None) -> SpanFit:
         """Fit a span from β (n,), with what is known before it as a factor or rows (·, n + 1).
@@ -138,21 +137,25 @@ class SpanSmoother:
                 return _Search(self, span, beta, known).through(LEVELS, (last_step,))
 
     def _first(self, span: Span, beta: Array, known: Array) -> SpanFit:
-        fit = self._begun(span, beta, known).through(LEVELS[1:], STEPS)
+        search = self._begun(span, beta, known)
+        fit = search.through(LEVELS[1:], STEPS)
         if fit.level > 0.0:
             # A start that is far off may end there too. From this one, which is near, exact equations are met if they
             # hold.
             with suppress(NO_NUMBERS):
-                again = _Search(self, span, fit.beta, known).through(LEVELS, STEPS)
+                again = _Search(self, span, fit.beta, known, search.reach).through(LEVELS, STEPS)
                 return again if again.level < fit.level else fit
         return fit
 
     def _begun(self, span: Span, beta: Array, known: Array) -> _Search:
-        """A search at the first level, from β (n,) or from the description, whichever leads nearer to the samples."""
+        """A search at the first level, from β (n,) or from the description, whichever leads nearer to the samples.
+
+        From the description what loose equations do not determine is to stay near it.
+        """
         searches = []
-        for start in (beta, self._base.values(self._model.nominal)):
+        for start, reach in ((beta, None), described(self._model, self._base)):
             with suppress(NO_NUMBERS):
-                search = _Search(self, span, start, known)
+                search = _Search(self, span, start, known, reach)
                 search.loosen(LEVELS[0])
                 if search.mean_square <= LARGEST_MEAN_SQUARE:
                     return search
@@ -167,9 +170,16 @@ class SpanSmoother:
 
 
 class _Search:
-    """The state of a search: β and the motion, and what the last step was made of."""
+    """The state of a search: β and the motion, and what the last step was made of.
 
-    def __init__(self, smoother: SpanSmoother, span: Span, beta: Array, known: Array) -> None:
+    reach (n,): how far a step takes parameters that loose equations do not determine, as a standard deviation; 0 where
+    that is not known.
+    """
+
+    def __init__(
+        self, smoother: SpanSmoother, span: Span, beta: Array, known: Array, reach: Array | None = None
+    ) -> None:
+        self.reach = np.zeros(beta.size) if reach is None else reach
         self._smoother, self._span, self._known = smoother, span, known
         self._model, self._base = smoother._model, smoother._base
         self.iterations = 0
@@ -318,13 +328,13 @@ class _Search:
         return np.asarray(np.linalg.inv(np.linalg.qr(np.concatenate((of_forces, of_speeds)), mode="r")))
 
     def _step(self, level: float) -> tuple[Array, Solution]:
-        """δβ (n,) of least squares, and the solution behind it.
-
-        While equations are loose, described values hold what they do not determine.
-        """
-        rows = (self._known, self.factor, self._smoother._described) if level else (self._known, self.factor)
-        problem = triangular_factor(*rows)
+        """δβ (n,) of least squares, and the solution behind it; while equations are loose, within its reach."""
         n = self._base.n
+        within = np.flatnonzero(self.reach) if level else np.arange(0)
+        damping = np.zeros((within.size, n + 1))
+        damping[np.arange(within.size), within] = 1.0 / self.reach[within]
+        damping[:, n] = damping[:, :n] @ self.beta
+        problem = triangular_factor(self._known, self.factor, damping)
         problem[:, n] -= problem[:, :n] @ self.beta
         size = np.linalg.norm(problem[:, :n], axis=0)
         size[size == 0.0] = 1.0
@@ -357,12 +367,3 @@ def _usual(samples: Array) -> Array:
     """rms of each column of samples (B, n_v), and no less than a share of the largest."""
     rms = np.sqrt(np.mean(samples**2, axis=0))
     return np.asarray(np.maximum(rms, LEAST_USUAL * rms.max()))
-
-
-def _prior_rows(value: Array, size: Array) -> Array:
-    """Rows (·, n + 1) of described values (n,), with standard deviations of LOOSE sizes (n,); none where that is 0."""
-    known = np.flatnonzero(size > 0.0)
-    rows = np.zeros((known.size, value.size + 1))
-    rows[np.arange(known.size), known] = 1.0 / (LOOSE * size[known])
-    rows[:, -1] = value[known] / (LOOSE * size[known])
-    return rows
