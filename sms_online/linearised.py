@@ -41,13 +41,15 @@ class LinearSystem:
     """The linearised system at B instants, m = 2 n_v states.
 
     A (B, m, m): of ṡ = A s. E (B, m, joints + n): columns by which joint torques n τ and parameters β drive ṡ.
-    C (B, channels, m), D (B, channels, n): readings by s and by β. H (B, n_v, n_v): mass matrix.
+    C (B, channels, m), D (B, channels, n): readings by s and by β. V (B, n_v, m): speeds by s; by β they are the first
+    rows of E. H (B, n_v, n_v): mass matrix.
     """
 
     A: Array
     E: Array
     C: Array
     D: Array
+    V: Array
     H: Array
 
 
@@ -76,13 +78,12 @@ def linearise(
     # δv by δx, δp and δβ.
     v_p = np.linalg.inv(H)
     v_x, v_beta = -v_p @ P_x, -v_p @ P
-    A = np.concatenate(
-        (np.concatenate((v_x, v_p), axis=2), np.concatenate((G_x + G_v @ v_x, G_v @ v_p), axis=2)), axis=1
-    )
+    V = np.concatenate((v_x, v_p), axis=2)
+    A = np.concatenate((V, np.concatenate((G_x + G_v @ v_x, G_v @ v_p), axis=2)), axis=1)
     if layout.free and not layout.planar:
         # A small inertial rotation φ of the attitude obeys φ̇ = δω + ω × φ.
         A[:, 3:6, 3:6] += skew(v[:, 3:6])
     E = np.zeros((B, 2 * n_v, joints + base.n))
     E[:, n_v:, :joints] = model.generalized_force(np.eye(joints)).T
     E[:, :n_v, joints:], E[:, n_v:, joints:] = v_beta, G + G_v @ v_beta
-    return LinearSystem(A, E, np.concatenate((C_x + C_v @ v_x, C_v @ v_p), axis=2), C_v @ v_beta, H)
+    return LinearSystem(A, E, np.concatenate((C_x + C_v @ v_x, C_v @ v_p), axis=2), C_v @ v_beta, V, H)

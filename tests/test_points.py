@@ -96,12 +96,6 @@ def test_a_marker_that_is_not_in_the_capture_is_asked_for() -> None:
         Sensing(model, available, "capture")
 
 
-def test_points_alone_on_a_spatial_free_base_are_refused() -> None:
-    plant = Plant(seen_by_cameras("spatial-two-link"))
-    with pytest.raises(InputError, match="points alone, on a spatial free base; expected planar motion or a fixed"):
-        Sensing(plant.model, plant.channels, "capture")
-
-
 def test_a_static_shape_is_found_from_points_to_a_hundredth() -> None:
     """A load at the tip bends both links; the second one's frame hangs on the first one's shape."""
     plant = Plant(seen_by_cameras("paper-planar"))
@@ -126,8 +120,9 @@ def test_one_link_is_identified_from_points_alone() -> None:
 
 
 @pytest.mark.slow
-def test_an_arm_of_two_links_is_identified_from_points_alone() -> None:
-    system = seen_by_cameras("paper-planar")
+@pytest.mark.parametrize("name", ["paper-planar", "spatial-two-link"])
+def test_free_arms_of_two_links_are_identified_from_points(name: str) -> None:
+    system = seen_by_cameras(name)
     simulation = simulate(system)
     estimator = session_of(system, sampled_blocks(simulation, None, 0))
     assert estimator.by_smoother

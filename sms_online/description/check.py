@@ -59,9 +59,6 @@ def check_system(system: System, source: str) -> None:
         raise InputError(
             source, "gravity", f"{system.gravity[2]:g} m/s² along z", "gravity in the x-y plane, or motion = 'spatial'"
         )
-    if system.balance == "smoother" and system.motion == "spatial" and system.spacecraft is not None:
-        expected = "both, energy or momentum: the smoother needs planar motion or a fixed base"
-        raise InputError(source, "balance", "'smoother'", expected)
     _check_simulation(system, source)
     names = channels(system)
     _check_sensors(system, names, source)

@@ -25,7 +25,7 @@ class Sensor(Record):
 
     channels: the channels that it fills; shell patterns select several.
     rate: samples a second, Hz; none means the system's sample_rate. Fewer than eight of a pose or a marker in a window
-    of the momentum balance are too few for it: the smoother then gives the estimate, on a planar or fixed base.
+    of the momentum balance are too few for it: the smoother then gives the estimate.
     resolution: step of its readings, in the channel's unit.
     noise: 1σ of its white noise per sample, in the channel's unit; 0 means that it is estimated from the samples.
     latency: its delay behind the others, s; it is corrected, but by the smoother.

@@ -98,6 +98,13 @@ class Layout:
         omega = so3.angular_velocity(x[:, 3:6], x[:, 6], x_dot[:, 3:7])
         return np.concatenate((x_dot[:, :3], omega, x_dot[:, 7:]), axis=1)
 
+    def displaced(self, x: Array, change: Array) -> Array:
+        """Positions (B, n_x) that small displacements (B, n_v), in the order of the speeds, lead to from x (B, n_x)."""
+        moved = x + self.position_rate(x, change)
+        if self.free and not self.planar:
+            moved[:, 3:7] /= np.linalg.norm(moved[:, 3:7], axis=1)[:, None]
+        return moved
+
 
 def build_layout(system: System) -> Layout:
     """Layout of a described system."""

@@ -124,8 +124,7 @@ class Estimator(Stage):
         system = self.system
         if system.balance != "both":
             return system.balance == "smoother" or (system.balance == "momentum" and bool(self.sensing.missing))
-        planar_or_fixed = system.motion == "planar" or system.spacecraft is None
-        return bool(self.sensing.missing) or (self._slow and planar_or_fixed)
+        return bool(self.sensing.missing) or self._slow
 
     @property
     def _slow(self) -> bool:
@@ -319,11 +318,11 @@ class Estimator(Stage):
 
     def _synchronise(self, t: Array, values: Array, last: bool = False) -> None:
         t, values = self._outliers.push(t, self._identity.push(t, values), last)
+        own = len(self.sensing.channels)
+        block = self._attitude.continued(Block(t, self.sensing.channels, values[:, :own]))
         if self.smoother is not None:
-            torque = self.sensing.joint_torque(values[:, : len(self.sensing.channels)])
-            self.smoother.push(t, torque, values[:, self._smoothed_columns])
-        block = Block(t, self.sensing.channels, values[:, : len(self.sensing.channels)])
-        block = self._attitude.continued(block)
+            every = np.concatenate((block.values, values[:, own:]), axis=1)
+            self.smoother.push(t, self.sensing.joint_torque(block.values), every[:, self._smoothed_columns])
         if self.momentum is not None:
             self.momentum.observe(block.t, block.values)
         for piece in self._synchroniser.push(block):

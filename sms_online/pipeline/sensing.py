@@ -59,7 +59,7 @@ class Sensing:
     unused: the source's others. In place of q_i a flexible joint may have the strain of the strip that it represents,
     an angle beyond θ_m_i. A flexible link needs one marker at least, in its own frame or, where nothing is read there,
     in the laboratory's; where it has fewer readings than coordinates, or points, its shape is the static one, and
-    `missing` names what is not read. Not so on a spatial free base, where every marker is needed.
+    `missing` names what is not read.
     Raises InputError, naming the source, when a channel that the model needs is not there.
     """
 
@@ -88,8 +88,6 @@ class Sensing:
         self._beyond = [
             (i - 1, k) for k, i in enumerate(flexible) if channels[self._q[i - 1]] == strain_channel(model.system, i)
         ]
-        # Markers that are not there leave some of a link's coordinates to the smoother, which needs a vector of them.
-        partial = layout.planar or not layout.free
         self._links: dict[int, tuple[SensedShape, list[int]]] = {}
         self._pointed: dict[int, tuple[PointedShape, list[int]]] = {}
         missing = []
@@ -99,14 +97,11 @@ class Sensing:
             names = [f"link_{i}.{name}" for name in kinematics.marker_names]
             read = [k for k, name in enumerate(names) if name in available]
             points = point_channels(model.system, i)
-            if not partial and model.system.links[i - 1].markers:
-                found = f"link_{i} measured by points alone, on a spatial free base"
-                raise InputError(source, "header", found, "planar motion or a fixed base, or no link_i.markers")
-            if partial and (model.system.links[i - 1].markers or (not read and points[0] in available)):
+            if model.system.links[i - 1].markers or (not read and points[0] in available):
                 self._pointed[i - 1] = self._pointed_shape(i - 1), [need(name) for name in points]
                 missing.append(f"shape of link_{i} between its markers")
                 continue
-            if not partial or not read:
+            if not read:
                 read = list(range(len(names)))
             self._links[i - 1] = SensedShape(kinematics, read), [need(names[k]) for k in read]
             missing += [name for k, name in enumerate(names) if k not in read]

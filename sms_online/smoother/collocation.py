@@ -47,18 +47,21 @@ def momenta_and_forces(dynamics: Dynamics, x: Array, v: Array) -> tuple[Array, A
 def defects(dynamics: Dynamics, motion: Motion, impulse: Array, impulse_m: Array) -> Array:
     """What the K steps of a motion lack, (K, 2 n_v): h/6 (f_k + 4 f_m + f_{k+1}) - (s_{k+1} - s_k).
 
+    Of Euler parameters it is the small inertial rotation that they lack.
     impulse (K + 1, n_v), impulse_m (K, n_v): of the motors, at the nodes and at the midpoints.
     """
+    layout = dynamics.model.layout
     h, x, v = motion.step, motion.x, motion.v
+    rate = layout.position_rate(x, v)
     p, g = momenta_and_forces(dynamics, x, v)
     p = p - impulse
-    x_m = 0.5 * (x[1:] + x[:-1]) + h / 8.0 * (v[:-1] - v[1:])
+    x_m = 0.5 * (x[1:] + x[:-1]) + h / 8.0 * (rate[:-1] - rate[1:])
     p_m = 0.5 * (p[1:] + p[:-1]) + h / 8.0 * (g[:-1] - g[1:]) + impulse_m
     v_m: Array = np.asarray(np.linalg.solve(dynamics.mass_matrix(x_m), p_m[..., None])[..., 0], dtype=np.float64)
     _, g_m = momenta_and_forces(dynamics, x_m, v_m)
-    of_x = h / 6.0 * (v[:-1] + 4.0 * v_m + v[1:]) - np.diff(x, axis=0)
+    of_x = h / 6.0 * (rate[:-1] + 4.0 * layout.position_rate(x_m, v_m) + rate[1:]) - np.diff(x, axis=0)
     of_p = h / 6.0 * (g[:-1] + 4.0 * g_m + g[1:]) - np.diff(p, axis=0)
-    return np.concatenate((of_x, of_p), axis=1)
+    return np.concatenate((layout.speeds(x[1:], of_x), of_p), axis=1)
 
 
 def transitions(linear: LinearSystem, step: float, drive: Array, joints: int, defect: Array) -> Transitions:

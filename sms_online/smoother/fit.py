@@ -10,8 +10,8 @@ equations; Bell, SIAM J. Optimization 4 (1994) 626, for the iterated smoother as
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from contextlib import suppress
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 
 import numpy as np
@@ -22,6 +22,7 @@ from sms_online.model.dynamics import Dynamics
 from sms_online.model.model import Model
 from sms_online.model.readings import Readings
 from sms_online.physical import PhysicalSet
+from sms_online.pipeline.description import described
 from sms_online.smoother.collocation import defects, momenta_and_forces, transitions
 from sms_online.smoother.filter import FixedIntervalSmoother
 from sms_online.smoother.span import Innovations, Span, interpolated
@@ -54,9 +55,7 @@ REFINED = 1.0
 # A step of the search that moves no parameter by more standard deviations than this ends it: the next one would be
 # smaller by far, as the convergence is quadratic near the end.
 CONVERGED = 0.5
-MAX_STEPS = 8
-# With white forces left, which a start that is far from the answer needs, it takes more of them.
-MORE_STEPS = 16
+MAX_STEPS = 16
 # Derivatives by displacements are computed that often and interpolated, s; they only steer the search.
 DERIVATIVES_INTERVAL = 0.04
 # Mean square of the whitened innovations that noise alone may leave: a span of some seconds scatters by a hundredth,
@@ -69,6 +68,8 @@ RANK_TOLERANCE = 1e-8
 MOST_HALVINGS = 6
 # Mass matrices are checked that often along the motion, s.
 MASS_INTERVAL = 0.1
+# Steps that swing about the answer are shortened to this share of their length at least.
+LEAST_RELAXATION = 0.125
 
 
 class DivergedError(ArithmeticError):
@@ -77,6 +78,16 @@ class DivergedError(ArithmeticError):
 
 # What a search that runs away ends in.
 NO_NUMBERS = (np.linalg.LinAlgError, ArithmeticError)
+
+
+@contextmanager
+def _diverging() -> Iterator[None]:
+    """Whatever a search ends in that runs away is a DivergedError."""
+    try:
+        with np.errstate(over="raise", divide="raise", invalid="raise"):
+            yield
+    except NO_NUMBERS as error:
+        raise DivergedError(str(error)) from None
 
 
 @dataclass(frozen=True)
@@ -116,32 +127,42 @@ class SpanSmoother:
 
         last_step: of the collocation of an earlier span, s; None in the first one. Raises DivergedError.
         """
-        if last_step is None:
-            fit = self._searched(span, beta, known, LEVELS, STEPS)
-            if fit.level > 0.0:
-                # A start that is far off may end there too. From this one, which is near, exact equations are met if
-                # they hold.
-                with suppress(DivergedError):
-                    again = self._searched(span, fit.beta, known, LEVELS, STEPS)
-                    return again if again.level < fit.level else fit
-            return fit
-        try:
-            return self._searched(span, beta, known, LATER_LEVELS, (last_step,))
-        except DivergedError:
-            # Parameters are known, but not the motion, where cameras have not seen a link for a while.
-            return self._searched(span, beta, known, LEVELS, (last_step,))
+        with _diverging():
+            if last_step is None:
+                return self._first(span, beta, known)
+            try:
+                return _Search(self, span, beta, known).through(LATER_LEVELS, (last_step,))
+            except NO_NUMBERS:
+                # Parameters are known, but not the motion, where cameras have not seen a link for a while.
+                return _Search(self, span, beta, known).through(LEVELS, (last_step,))
 
-    def _searched(
-        self, span: Span, beta: Array, known: Array, levels: Sequence[float], steps: Sequence[float]
-    ) -> SpanFit:
-        try:
-            with np.errstate(over="raise", divide="raise", invalid="raise"):
-                search = _Search(self, span, beta, known)
-                for level in levels:
-                    search.loosen(level)
-                return search.tightened(steps)
-        except NO_NUMBERS as error:
-            raise DivergedError(str(error)) from None
+    def _first(self, span: Span, beta: Array, known: Array) -> SpanFit:
+        search = self._begun(span, beta, known)
+        fit = search.through(LEVELS[1:], STEPS)
+        if fit.level > 0.0:
+            # A start that is far off may end there too. From this one, which is near, exact equations are met if they
+            # hold.
+            with suppress(NO_NUMBERS):
+                again = _Search(self, span, fit.beta, known, search.reach).through(LEVELS, STEPS)
+                return again if again.level < fit.level else fit
+        return fit
+
+    def _begun(self, span: Span, beta: Array, known: Array) -> _Search:
+        """A search at the first level, from β (n,) or from the description, whichever leads nearer to the samples.
+
+        From the description what loose equations do not determine is to stay near it.
+        """
+        searches = []
+        for start, reach in ((beta, None), described(self._model, self._base)):
+            with suppress(NO_NUMBERS):
+                search = _Search(self, span, start, known, reach)
+                search.loosen(LEVELS[0])
+                if search.mean_square <= LARGEST_MEAN_SQUARE:
+                    return search
+                searches.append(search)
+        if not searches:
+            raise DivergedError("neither the balance's fit nor the description leads to the samples")
+        return min(searches, key=lambda search: search.mean_square)
 
     def dynamics(self, beta: Array) -> Dynamics:
         """The equations of motion for β (n,)."""
@@ -149,15 +170,23 @@ class SpanSmoother:
 
 
 class _Search:
-    """The state of a search: β and the motion, and what the last step was made of."""
+    """The state of a search: β and the motion, and what the last step was made of.
 
-    def __init__(self, smoother: SpanSmoother, span: Span, beta: Array, known: Array) -> None:
+    reach (n,): how far a step takes parameters that loose equations do not determine, as a standard deviation; 0 where
+    that is not known.
+    """
+
+    def __init__(
+        self, smoother: SpanSmoother, span: Span, beta: Array, known: Array, reach: Array | None = None
+    ) -> None:
+        self.reach = np.zeros(beta.size) if reach is None else reach
         self._smoother, self._span, self._known = smoother, span, known
         self._model, self._base = smoother._model, smoother._base
         self.iterations = 0
         self.beta = beta
         self.std = np.full(beta.size, np.inf)
         self.mean_square = np.inf
+        self._asked, self._relaxation = np.zeros(beta.size), 1.0
         t = span.nodes(ROUGH_STEP)
         self.motion = Motion(t, *span.guess(t))
         _, force = momenta_and_forces(smoother.dynamics(beta), self.motion.x, self.motion.v)
@@ -183,6 +212,12 @@ class _Search:
         self.motion = Motion(t, interpolated(old.t, old.x, t), interpolated(old.t, old.v, t))
         self._use_nodes()
 
+    def through(self, levels: Sequence[float], steps: Sequence[float]) -> SpanFit:
+        """The fit, by way of white forces of so many levels."""
+        for level in levels:
+            self.loosen(level)
+        return self.tightened(steps)
+
     def tightened(self, steps: Sequence[float]) -> SpanFit:
         """The fit with equations that hold, or that hold as well as the samples allow."""
         for k, step in enumerate(steps):
@@ -195,7 +230,7 @@ class _Search:
         for level in (0.0, *ALLOWED):
             if level:
                 self.beta, self.motion = before
-                if not self.converge(level, MORE_STEPS):
+                if not self.converge(level):
                     continue
             if self.mean_square <= LARGEST_MEAN_SQUARE:
                 return SpanFit(self.factor, self.beta, self.rows, self.mean_square, level, step)
@@ -208,13 +243,12 @@ class _Search:
             if self.mean_square <= LARGEST_MEAN_SQUARE:
                 return
 
-    def converge(self, level: float, most: int = MAX_STEPS) -> bool:
+    def converge(self, level: float) -> bool:
         """Search until β converges, in so many steps at most; whether it does."""
         try:
-            for _ in range(most):
-                before = self.beta
+            for _ in range(MAX_STEPS):
                 self.advance(level, tame=False)
-                if np.all(np.abs(self.beta - before) <= CONVERGED * self.std):
+                if np.all(np.abs(self._asked) <= CONVERGED * self.std):
                     return True
         except NO_NUMBERS:
             pass
@@ -240,15 +274,16 @@ class _Search:
             weights = self._innovations.weights[piece, :, None]
             steps = transitions(linear, motion.step, drive, joints, lacking[piece])
             count = len(weights)
-            speeds.append((linear.A[:count, :n_v], linear.E[:count, :n_v, joints:]))
+            speeds.append((linear.V[:count], linear.E[:count, :n_v, joints:]))
             rows.append(kalman.push(differences[piece], weights * linear.C[:count], weights * linear.D[:count], steps))
         innovations = np.concatenate(rows)
         Y = -innovations[:, 1:]
         self.rows = len(Y)
         self.factor = triangular_factor(np.column_stack((Y, innovations[:, 0] + Y @ self.beta)))
-        delta, solution = self._step()
-        beta = self._admissible(self.beta + delta, solution, level > 0.0)
-        delta = beta - self.beta
+        delta, solution = self._step(level)
+        self._relax(delta)
+        beta = self._admissible(self.beta + self._relaxation * delta, solution, level > 0.0)
+        self._asked, delta = delta, beta - self.beta
         self.mean_square = float(np.mean((innovations[:, 0] - Y @ delta) ** 2))
         self.std = np.sqrt(np.diag(solution.covariance()))
         s = kalman.smooth(delta)
@@ -258,9 +293,16 @@ class _Search:
             for k, (by_s, by_beta) in zip(range(0, len(s), nodes), speeds, strict=True)
         ]
         v = motion.v + np.concatenate(moved)[..., 0]
-        self.motion = Motion(motion.t, motion.x + s[:, :n_v], v)
+        self.motion = Motion(motion.t, self._model.layout.displaced(motion.x, s[:, :n_v]), v)
         self.beta = beta
         self.iterations += 1
+
+    def _relax(self, delta: Array) -> None:
+        """Shorten steps that go back on the last one, δβ (n,), and lengthen them again where they go on."""
+        along = (self.factor[:-1, :-1] @ delta) @ (self.factor[:-1, :-1] @ self._asked)
+        self._relaxation = (
+            max(LEAST_RELAXATION, 0.5 * self._relaxation) if along < 0.0 else min(1.0, 2.0 * self._relaxation)
+        )
 
     def _first_state(self, dynamics: Dynamics) -> Array:
         """Root of the covariance that leaves the first state free to move, (2 n_v, 2 n_v)."""
@@ -285,10 +327,14 @@ class _Search:
         of_speeds = CORRELATION / MOST_SPEED * np.linalg.inv(H) / self._usual_speed[:, None]
         return np.asarray(np.linalg.inv(np.linalg.qr(np.concatenate((of_forces, of_speeds)), mode="r")))
 
-    def _step(self) -> tuple[Array, Solution]:
-        """δβ (n,) of least squares, and the solution behind it."""
-        problem = triangular_factor(self._known, self.factor)
+    def _step(self, level: float) -> tuple[Array, Solution]:
+        """δβ (n,) of least squares, and the solution behind it; while equations are loose, within its reach."""
         n = self._base.n
+        within = np.flatnonzero(self.reach) if level else np.arange(0)
+        damping = np.zeros((within.size, n + 1))
+        damping[np.arange(within.size), within] = 1.0 / self.reach[within]
+        damping[:, n] = damping[:, :n] @ self.beta
+        problem = triangular_factor(self._known, self.factor, damping)
         problem[:, n] -= problem[:, :n] @ self.beta
         size = np.linalg.norm(problem[:, :n], axis=0)
         size[size == 0.0] = 1.0

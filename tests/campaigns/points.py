@@ -1,6 +1,6 @@
-"""Sessions of the planar example that cameras see as points: coverage, errors and error bars against the bound.
+"""Sessions of an arm that cameras see as points: coverage, errors and error bars against the bound.
 
-python -m tests.campaigns.points RESULTS.jsonl --seeds 50 [--faults]
+python -m tests.campaigns.points RESULTS.jsonl --seeds 50 [--system NAME] [--faults]
 """
 
 from __future__ import annotations
@@ -11,19 +11,21 @@ from pathlib import Path
 
 import numpy as np
 
+from sms_adapters.system_file import load_system
 from sms_online.evaluation import NORMAL_95
 from sms_sim.camera_faults import CameraFaults, parsed_faults
 from sms_sim.plant import Plant
 from sms_sim.simulate import Simulation, sampled_blocks
 from tests.camera_rig import FAULTS, bound_of, seen_by_cameras
 from tests.sessions_of import normalised, session_of
-from tests.simulations import planar
+from tests.simulations import simulated
 
 
-def run(results: Path, seeds: range, faulty: bool) -> None:
+def run(results: Path, name: str, seeds: range, faulty: bool) -> None:
     """One line a session: z of each parameter, and its standard deviation as a multiple of the bound."""
-    system = seen_by_cameras("paper-planar")
-    simulation = Simulation(Plant(system), planar().solution)
+    system = seen_by_cameras(name)
+    # Cameras play no part in the motion.
+    simulation = Simulation(Plant(system), simulated(load_system(name)).solution)
     bound = bound_of(simulation)
     for seed in seeds:
         blocks = list(sampled_blocks(simulation, None, seed))
@@ -58,9 +60,10 @@ def main() -> None:
     parser.add_argument("results", type=Path)
     parser.add_argument("--seeds", type=int, default=50)
     parser.add_argument("--first", type=int, default=0, help="number of the first seed")
+    parser.add_argument("--system", default="paper-planar", help="a shipped system")
     parser.add_argument("--faults", action="store_true", help="markers missing, hidden and swapped")
     args = parser.parse_args()
-    run(args.results, range(args.first, args.first + args.seeds), args.faults)
+    run(args.results, args.system, range(args.first, args.first + args.seeds), args.faults)
     show(args.results)
 
 
