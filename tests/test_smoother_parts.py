@@ -89,7 +89,7 @@ def test_an_exact_motion_meets_the_collocation_to_its_order(simulation: Simulati
         return np.array([np.abs(part).max() for part in np.split(lacking, 2, axis=1)])
 
     # A step errs with the fifth power of its length, in positions and in momenta.
-    ratio = largest(0.01) / largest(0.005)
+    ratio = largest(0.0025) / largest(0.00125)
     assert np.all(ratio > 24.0)
     assert np.all(ratio < 40.0)
 

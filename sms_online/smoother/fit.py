@@ -142,7 +142,7 @@ class SpanSmoother:
         if fit.level > 0.0:
             # A start that is far off may end there too. From this one, which is near, exact equations are met if they
             # hold.
-            with suppress(NO_NUMBERS):
+            with suppress(*NO_NUMBERS):
                 again = _Search(self, span, fit.beta, known, search.reach).through(LEVELS, STEPS)
                 return again if again.level < fit.level else fit
         return fit
@@ -154,7 +154,7 @@ class SpanSmoother:
         """
         searches = []
         for start, reach in ((beta, None), described(self._model, self._base)):
-            with suppress(NO_NUMBERS):
+            with suppress(*NO_NUMBERS):
                 search = _Search(self, span, start, known, reach)
                 search.loosen(LEVELS[0])
                 if search.mean_square <= LARGEST_MEAN_SQUARE:
