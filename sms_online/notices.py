@@ -64,6 +64,9 @@ def notices(now: Statistics) -> list[str]:
         for s in now.swaps
     ]
     out += unstated_latency(now)
+    for shift in () if now.momentum is None else now.momentum.shifts:
+        size = f"{1e6 * shift.size:+.0f} ± {1e6 * shift.std:.0f} µs"
+        out.append(f"{shift.device}: its clock shifted by {size} against the others' at {shift.time:.1f} s")
     if now.setup.unused:
         out.append(f"channels not used: {', '.join(now.setup.unused)}")
     return out

@@ -307,6 +307,9 @@ def test_a_reader_that_never_returns_is_not_waited_for(monkeypatch: pytest.Monke
     feed.start()
     feed.tried.wait()
     feed.await_fetched(0.0)
+    # Nor a second time.
+    monkeypatch.setattr(feed_module, "FETCHING", 60.0)
+    feed.await_fetched(0.0)
     released.set()
     feed.stop()
 

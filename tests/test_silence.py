@@ -70,6 +70,25 @@ def test_what_comes_late_after_a_silence_is_no_slow_machine(tmp_path: Path, syst
     assert not any("too slow" in warning for warning in said)
 
 
+def test_a_host_that_is_late_loses_nothing(tmp_path: Path, system: System) -> None:
+    bus = AxisBus(seconds=16.0)
+    for arrival in (bus.drive_arrival, bus.encoder_arrival):
+        arrival[(arrival > 6.0) & (arrival < 6.8)] = 6.8  # a stall of all
+        arrival[arrival > 10.0] += 0.2 * np.minimum(arrival[arrival > 10.0] - 10.0, 4.0)  # slower and slower
+    ours, blocks = merged(system, tmp_path, bus.drive(), bus.encoder(system))
+    assert ours.late == ours.missed == [0, 0]
+    for column in range(2):
+        assert sum(np.count_nonzero(~np.isnan(block.values[:, column])) for block in blocks) == bus.angle.size
+
+
+def test_a_source_that_lags_is_not_waited_for_for_ever(tmp_path: Path, system: System) -> None:
+    bus = AxisBus(seconds=10.0)
+    bus.encoder_arrival[bus.encoder_arrival > 6.0] += 0.6
+    ours, _ = merged(system, tmp_path, bus.drive(), bus.encoder(system))
+    assert ours.late[0] == 0
+    assert ours.late[1] > 0
+
+
 def test_late_estimates_after_an_absence_have_its_cause(tmp_path: Path, system: System) -> None:
     bench = Bench(tmp_path, system)
     for newest in (0.0, 3.9):

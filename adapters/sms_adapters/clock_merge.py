@@ -8,6 +8,7 @@ alone, whoever calls and whenever: a recording replayed gives the rows of the se
 from __future__ import annotations
 
 import math
+from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -29,7 +30,8 @@ TICK = TICK_MICROSECONDS * 1e-6
 # Rows wait so much longer than the slowest source's newest one, s: frames of one bus overtake each other by less, and a
 # sensor that sticks is noticed within it.
 REORDERING = 0.01
-# A source that is silent is waited for so long, s; a sender that stumbles loses nothing within it.
+# Rows wait so long after their arrival for a source that lags, s; a sender that stumbles loses nothing within it.
+# Where the whole host is late, all sources are, and none has to wait for another.
 PATIENCE = 0.3
 # A source from which nothing comes for so long is silent, s: its device may be gone without the bus saying so.
 SILENCE = 1.0
@@ -38,6 +40,8 @@ START_PATIENCE = 3.0
 # Rows are asked for this much before they are due by the delays of the last ones, s: half of what delays scatter by,
 # for asking in vain costs as much as asking, and asking late costs a tick.
 EARLY = 1e-3
+# What arrives is left aside no longer than this, s, whatever is still missing: how long it has waited counts from then.
+LONGEST_ASIDE = 0.1
 
 
 @dataclass(frozen=True)
@@ -199,6 +203,8 @@ class Merger(Stage):
         self._silent = [False for _ in lanes]
         self._started = False
         self._given = -np.inf  # time up to which rows are out
+        self._came = deque([(-np.inf, -np.inf)])  # ticks with the newest row decoded by then
+        self._patient = -np.inf  # time of the newest row that has waited for PATIENCE
         self._guards = [StuckGuard([stream.columns for stream in lane.streams]) for lane in lanes]
         self.steps = steps
         self._first_row: float | None = None  # its time
@@ -225,20 +231,22 @@ class Merger(Stage):
                 self._heard[k], self._silent[k] = now, False
                 self._first = min(self._first, _arrivals(raw[0])[0])
                 self._items[k] += raw
+        while len(self._came) > 1 and self._came[0][0] <= now - PATIENCE:
+            self._patient = max(self._patient, self._came.popleft()[1])
         if self.steps is not None and self._first_row is not None:
             wanted = self._first_row + self.steps.after(self._given - self._first_row)
-            if self._expected(now) < wanted - EARLY:
+            if self._expected() < wanted - EARLY and now - self._came[-1][0] < LONGEST_ASIDE:
                 return None
         self._decode()
         return self._give(self._due(now))
 
-    def _expected(self, now: float) -> float:
+    def _expected(self) -> float:
         """What `_due` will be once the items are decoded, if they are as much delayed as the last ones were."""
         newest = [
             _arrivals(raw[-1])[1] - lag if raw else float(lane.newest.min())
             for lane, raw, lag in zip(self.lanes, self._items, self._lag, strict=True)
         ]
-        return max(min(newest) - REORDERING, now - PATIENCE)
+        return max(min(newest) - REORDERING, self._patient)
 
     def _decode(self) -> None:
         """Decode the items that are there."""
@@ -247,6 +255,8 @@ class Merger(Stage):
             if raw:
                 self._admit(k, *lane.push(raw))
                 self._lag[k] = _arrivals(raw[-1])[1] - float(lane.newest.min())
+        # No row is of the future, whatever its stamp.
+        self._came.append((self._now, min(self._now, max(float(lane.newest.max()) for lane in self.lanes))))
 
     def finish(self) -> Block | None:
         """The rows that are left at the end of the session."""
@@ -280,7 +290,7 @@ class Merger(Stage):
             self._started = bool(np.isfinite(newest).all()) or now > self._first + START_PATIENCE
         if not self._started:
             return -np.inf
-        return max(float(newest.min()) - REORDERING, now - PATIENCE)
+        return max(float(newest.min()) - REORDERING, self._patient)
 
     def _give(self, due: float) -> Block | None:
         if due <= self._given:
@@ -339,7 +349,7 @@ class Merger(Stage):
             if self.missed[k]:
                 found.append(f"{lane.name}: {self.missed[k]} samples skipped, they came late after it had been silent")
             if self.late[k]:
-                late = f"{self.late[k]} samples skipped, they came more than {PATIENCE:g} s late"
+                late = f"{self.late[k]} samples skipped, they came more than {PATIENCE:g} s after the others"
                 found.append(f"{lane.name}: {late}: the machine is too slow, or the source")
             for channel, blanked in zip(lane.decoder.channels, guard.blanked.tolist(), strict=True):
                 if blanked:

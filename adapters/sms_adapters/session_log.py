@@ -34,7 +34,7 @@ from sms_online.stream import Array
 SCHEMA = "sms-online/recording/1"
 # Number of the rules by which raw items become rows: ticks, clocks, portions. A recording made under others replays
 # with slightly other times of the samples. Recordings without a number were made under the first ones.
-RULES = 3
+RULES = 4
 SESSION = "session.toml"
 SYSTEM = "system.toml"
 CHECKPOINT = "resumed-from.msgpack"

@@ -10,7 +10,6 @@ from __future__ import annotations
 import argparse
 import contextlib
 import heapq
-import multiprocessing
 import os
 import sys
 import threading
@@ -18,8 +17,6 @@ import time
 import tty
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from multiprocessing.connection import Connection
-from multiprocessing.process import BaseProcess
 from pathlib import Path
 from typing import Any
 
@@ -38,10 +35,10 @@ from sms_online.description.schema import System
 from sms_online.description.sources import CanBus, CanSource, SerialPort, Signal
 from sms_online.errors import InputError
 from sms_online.stream import Array, Block
-from sms_online.threads import one_blas_thread
 from sms_sim.bus_encode import CanDevice, DeviceClock, SerialDevice, devices
 from sms_sim.bus_layout import commands
 from sms_sim.bus_motion import HeldTorque, MovingArm
+from sms_sim.bus_solver import Solver
 
 # The motion is solved at most so far ahead of what is sent, s.
 AHEAD = 30.0
@@ -49,8 +46,11 @@ AHEAD = 30.0
 # sending slows it down by this much; FIRST_LEAD, s, is enough to measure its pace by.
 FIRST_LEAD = 0.5
 SLOWED = 3.0
-# Of the process that solves: what is due, and who reads it, go first.
-NICENESS = 10
+# What a port's driver keeps of what is sent faster than it is read, bytes, beside the few kB of a pseudo-terminal.
+PORT_BUFFER = 16384
+# Where the process that solves has less than this share of a core, others need the host too, and nobody knows how much
+# it will have later: all that may be is then solved before the arm sets out.
+QUIET = 0.8
 # Longest wait between two looks at what is due, s.
 PATIENCE = 0.05
 # Torque commands are fetched so often, s.
@@ -136,6 +136,7 @@ class SerialSender:
         os.set_blocking(self._descriptor, False)
         self._path.unlink(missing_ok=True)
         self._path.symlink_to(os.ttyname(self._other))
+        self._unsent = b""
 
     def payloads(self, block: Block) -> list[tuple[Array, list[Any]]]:
         """Instants and frames of a block."""
@@ -143,8 +144,10 @@ class SerialSender:
 
     def send(self, data: bytes) -> None:
         """Send a frame; it is lost where nobody reads the port and its buffer is full."""
+        if len(self._unsent) < PORT_BUFFER:
+            self._unsent += data
         with contextlib.suppress(BlockingIOError):
-            os.write(self._descriptor, data)
+            self._unsent = self._unsent[os.write(self._descriptor, self._unsent) :]
 
     def close(self) -> None:
         """Unplug."""
@@ -210,13 +213,14 @@ class Bus:
         while not (self._ended or self._full or self._solved >= self._ahead):
             time.sleep(PATIENCE)
 
-    def run(self, duration: float) -> None:
-        """Send the samples taken, `duration` s of them, in step with the clock."""
-        ahead = self._ahead
+    def run(self, duration: float, solver: Solver | None = None) -> None:
+        """Send the samples taken, `duration` s of them, in step with the clock. solver: whom they come from."""
         start: float | None = None
-        began = time.monotonic()
-        while ahead and not (self._ended or self._full or self._far_enough(time.monotonic() - began, duration)):
-            time.sleep(PATIENCE)
+        if solver is not None:
+            began = time.monotonic()
+            while not (self._ended or self._full or self._far_enough(time.monotonic() - began, duration, solver.share)):
+                time.sleep(PATIENCE)
+            solver.give_way()
         while True:
             with self._moving:
                 while not self._queue and not self._ended:
@@ -236,9 +240,12 @@ class Bus:
                 self._moving.notify()
             sender.send(payload)
 
-    def _far_enough(self, elapsed: float, duration: float) -> bool:
-        """Whether what is still to be solved will be in time, at the pace since the beginning, `elapsed` s ago."""
-        if self._solved < FIRST_LEAD:
+    def _far_enough(self, elapsed: float, duration: float, share: float) -> bool:
+        """Whether what is still to be solved will be in time, at the pace since the beginning, `elapsed` s ago.
+
+        share: of a core that solving had meanwhile.
+        """
+        if self._solved < FIRST_LEAD or share < QUIET:
             return False
         return self._solved >= AHEAD or SLOWED * (duration - self._solved) * elapsed / self._solved < duration
 
@@ -276,47 +283,6 @@ class Bus:
             sender.close()
 
 
-def in_own_process(arm: MovingArm) -> Iterator[Block]:
-    """An arm's blocks, solved in a process of its own: beside it, this one is always there to send what is due.
-
-    The process is forked at once, before there are ports and buses that it would hold open after the end of this one,
-    and begins to solve when the first block is asked for.
-    """
-    ours, theirs = multiprocessing.Pipe()
-    process = multiprocessing.get_context("fork").Process(target=_solve, args=(arm, theirs, ours), daemon=True)
-    process.start()
-    theirs.close()
-    return _solved(process, ours)
-
-
-def _solved(process: BaseProcess, pipe: Connection) -> Iterator[Block]:
-    try:
-        pipe.send(None)
-        while isinstance(item := pipe.recv(), Block):
-            yield item
-        raise item
-    except EOFError:
-        return
-    finally:
-        process.terminate()
-
-
-def _solve(arm: MovingArm, pipe: Connection, others: Connection) -> None:
-    others.close()  # or the death of the process that reads would go unnoticed
-    os.nice(NICENESS)
-    try:
-        pipe.recv()
-        with one_blas_thread():
-            for block in arm:
-                pipe.send(block)
-    except InputError as error:
-        pipe.send(error)
-    except (EOFError, ConnectionError, KeyboardInterrupt):
-        return
-    finally:
-        pipe.close()
-
-
 def capture_blocks(path: Path, duration: float, rows: int = 64) -> Iterator[Block]:
     """A capture's samples up to `duration` s, a few at a time, from t = 0."""
     first: float | None = None
@@ -328,6 +294,7 @@ def capture_blocks(path: Path, duration: float, rows: int = 64) -> Iterator[Bloc
 def main(arguments: list[str] | None = None) -> int:
     """Run the arm until its motion ends."""
     args = _parser().parse_args(arguments)
+    solver: Solver | None = None
     try:
         system = load_system(args.system)
         path = Path(args.system)
@@ -339,7 +306,7 @@ def main(arguments: list[str] | None = None) -> int:
             held = HeldTorque(len(system.joints))
             blocks = MovingArm(system, duration, args.grade, args.seed, held)
         else:
-            blocks = in_own_process(MovingArm(system, duration, args.grade, args.seed))
+            blocks = solver = Solver(MovingArm(system, duration, args.grade, args.seed))
         clock = DeviceClock(args.offset, args.drift)
         transport = Transport(args.latency, args.jitter)
         folder = path.parent if path.suffix == ".toml" else None
@@ -359,7 +326,7 @@ def main(arguments: list[str] | None = None) -> int:
             sys.stdin.readline()
         if args.capture is None:
             bus.take(blocks, ahead=0.0 if args.commanded else AHEAD)
-        bus.run(duration)
+        bus.run(duration, solver)
         if args.wait:
             # Devices whose arm rests are there still.
             print("done", flush=True)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -101,23 +102,28 @@ def _clocks(sensing: Sensing, names: Sequence[str], tolerance: float) -> Iterato
 
     So have encoders behind flexible joints, beside those of the motors: they come from other electronics.
     """
-    groups: dict[str, list[int]] = {}
+    groups: dict[tuple[str, str], list[int]] = {}
     if devices := clock_groups(sensing):
         reference = next((device for device in devices if device.joints), None)
-        groups = {device.name: list(device.sensors) for device in devices if device is not reference}
+        others = [device for device in devices if device is not reference]
+        shared = Counter(device.name for device in others)
+        for number, device in enumerate(others, start=1):
+            # Senders on one bus have a clock each.
+            part = str(number) if shared[device.name] > 1 else ""
+            groups[device.name, part] = list(device.sensors)
     else:
         base = sensing.model.layout.n_base_positions
         for k, name in enumerate(names):
             second = name.startswith("q_") and f"theta_m_{name[2:]}" in names
             encoders = "link encoders" if second else "encoders"
-            others = "gauges" if name.endswith("strain_angle") else encoders
-            kind = "base" if k < base else "markers" if MARKER.fullmatch(name) else others
-            groups.setdefault(kind, []).append(k)
+            rest = "gauges" if name.endswith("strain_angle") else encoders
+            kind = "base" if k < base else "markers" if MARKER.fullmatch(name) else rest
+            groups.setdefault((kind, ""), []).append(k)
     chosen = {name: sensors for name, sensors in groups.items() if sensors}
     select = np.zeros((len(names), len(chosen)))
     for column, sensors in zip(select.T, chosen.values(), strict=True):
         column[sensors] = -1.0
-    nuisances = tuple(Nuisance("clock", name, "s", tolerance) for name in chosen)
+    nuisances = tuple(Nuisance("clock", name, "s", tolerance, part) for name, part in chosen)
     yield Family(nuisances, lambda motion: motion.rates[:, :, None] * select)
 
 

@@ -18,6 +18,7 @@ from sms_online.model.base_parameters import BaseParameters
 from sms_online.model.model import Model
 from sms_online.pipeline.event_hypotheses import (
     Explanation,
+    Jump,
     additional,
     everything,
     explain,
@@ -26,7 +27,8 @@ from sms_online.pipeline.event_hypotheses import (
     restricted,
 )
 from sms_online.pipeline.event_instant import event_instant
-from sms_online.pipeline.events import REMEMBERED, ChangeDetector, Event, Seen
+from sms_online.pipeline.events import REMEMBERED, ChangeDetector, ClockShift, Event, Seen
+from sms_online.pipeline.latency import wandering_clocks
 from sms_online.pipeline.momentum_balance import MARGIN, MomentumBalance
 from sms_online.pipeline.momentum_fit import MomentumFit
 from sms_online.pipeline.momentum_windows import COPIES, INSTANTS
@@ -45,6 +47,10 @@ LONGEST_DECISION = 40
 LEAST_DECISION = 5
 # An instant is certain to so many half hops; samples closer to it are left out on both sides.
 GUARD = 1
+# Clocks are estimated anew where one has shifted by less than this, s: what is more they notice themselves.
+LARGEST_SHIFT = 1e-3
+# Kind of that hypothesis.
+CLOCK = "clock"
 # Times that the rows after an event are whitened, each with the jumps found before.
 PASSES = 2
 
@@ -69,12 +75,13 @@ class ChangesState(State):
 
     index (B,), values (B, ·): samples of the last segment, as far back as windows are remembered. events: so far;
     added: names of the parameters that they have added, adopted: effects among these. clear: grid index from which on
-    no sample is from before the event. wanted: windows after it that the next decision takes.
+    no sample is from before the event. wanted: windows after it that the next decision takes. shifts: of clocks.
     """
 
     index: NDArray[np.int64]
     values: Array
     events: list[Event] = msgspec.field(default_factory=list)
+    shifts: list[ClockShift] = msgspec.field(default_factory=list)
     added: list[str] = msgspec.field(default_factory=list)
     adopted: tuple[Effect, ...] = ()
     segment: int = -1
@@ -102,6 +109,7 @@ class Changes(Stage):
         self._system, self._described = model.system, base
         self._sensing = sensing
         self._renewed = renewed
+        self._clocks = wandering_clocks(sensing, self._nuisances)
         rate, span = self._system.sample_rate, self._system.windows.momentum
         self._half_hop = max(1, round(span * rate / INSTANTS))
         # Where it may have been a drift, an event is decided on later.
@@ -124,13 +132,18 @@ class Changes(Stage):
         return self.state.events
 
     @property
+    def shifts(self) -> list[ClockShift]:
+        """Of the devices' clocks so far."""
+        return self.state.shifts
+
+    @property
     def adopted(self) -> tuple[Effect, ...]:
         """Effects that the session goes on with, beside those of the system."""
         return self.state.adopted
 
     def _new_detector(self) -> ChangeDetector:
         n, hop = len(self._nuisances) + self.base.n, 2 * self._half_hop / self._system.sample_rate
-        detector = ChangeDetector(n, self.model.layout.n_v, hop, self._remembered)
+        detector = ChangeDetector(n, self.model.layout.n_v, hop, self._remembered, self._clocks)
         if self._nuisances:
             detector.begin(self.beforehand)
         return detector
@@ -186,6 +199,8 @@ class Changes(Stage):
             self.state.wanted = self.windows_after + DECISION
             return None
         self.state.wanted = DECISION
+        if explanation.jump is not None and explanation.jump.kind == CLOCK:
+            return self._follow_clocks(explanation, onset, alarm, start_time)
         return self._adopt(whole, base, explanation, onset, alarm, start_time)
 
     def abandon(self, start_time: float) -> Adoption | None:
@@ -227,11 +242,37 @@ class Changes(Stage):
             fit.go_on(weights, noise)
             rows = np.concatenate([white.Y for white in fit.push(windows, instants, noise)])
             explanation = explain(factor / left, rows / left, jumps)
+            clocks = self._of_clocks(factor / left, rows / left)
+            if clocks is not None:
+                return clocks
             weights = np.zeros(base.n)
             weights[:n] = explanation.beta[m:]
             if explanation.jump is not None:
                 weights[[k - m for k in explanation.jump.columns]] += explanation.sizes
         return explanation
+
+    def _of_clocks(self, factor: Array, rows: Array) -> Explanation | None:
+        """What shifts of clocks alone leave of the rows, where that is little but noise; see `explain`."""
+        each = [Jump(CLOCK, (k,)) for k in self._clocks]
+        found = explain(factor, rows, [*each, Jump(CLOCK, self._clocks)] if each[1:] else each)
+        small = bool((np.abs(found.sizes) < LARGEST_SHIFT).all())
+        return replace(found, decisive=True) if found.explained and small else None
+
+    def _follow_clocks(self, explanation: Explanation, onset: int, alarm: int, start_time: float) -> Adoption:
+        """Go on with the same model behind shifts of clocks, of which as much is known as they have shifted by."""
+        assert explanation.jump is not None
+        shifted, m, n = list(explanation.jump.columns), len(self._nuisances), self.base.n
+        time = start_time + 0.5 * (onset + alarm) / self._system.sample_rate
+        for k, size, std in zip(shifted, explanation.sizes.tolist(), explanation.stds.tolist(), strict=True):
+            self.state.shifts.append(ClockShift(time, self._nuisances[k].where, size, std))
+        wide = [replace(self._nuisances[k], tolerance=float(np.hypot(self._nuisances[k].tolerance, size)))
+                for k, size in zip(shifted, explanation.sizes, strict=True)]  # fmt: skip
+        again = np.zeros((len(shifted), m + n + 1))
+        again[np.arange(len(shifted)), shifted] = [1.0 / each.tolerance for each in wide]
+        known = self.detector.before(onset - MARGIN).known.without(shifted).with_rows(again)
+        self.detector = self._new_detector()
+        self.detector.begin(known)
+        return Adoption(self.model, self.base, known, explanation.beta[m : m + n], self.behind(alarm))
 
     def _adopt(
         self, whole: Model, base: BaseParameters, explanation: Explanation, onset: int, alarm: int, start_time: float

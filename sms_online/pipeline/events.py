@@ -10,12 +10,14 @@ window to the next, since what the two widths pass of the same noise differs in 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import msgspec
 import numpy as np
 import scipy.linalg
 
+from sms_online.pipeline.latency import WANDER
 from sms_online.pipeline.momentum_fit import WhiteRows
 from sms_online.state import Stage, State
 from sms_online.stream import Array
@@ -63,6 +65,19 @@ class Event:
 
 
 @dataclass(frozen=True)
+class ClockShift:
+    """The clock of a device, against the others, by which its samples are `size` ± `std` s later from `time` s on.
+
+    That is no change of the system: a host that is busy with other work does so to its clocks.
+    """
+
+    time: float
+    device: str
+    size: float
+    std: float
+
+
+@dataclass(frozen=True)
 class Seen:
     """A window that the test has seen: its rows before whitening across windows, and the information after it.
 
@@ -99,11 +114,11 @@ class DetectorState(State):
 class ChangeDetector(Stage):
     """Sequential test of windows against the estimate before them.
 
-    hop: from one window to the next, s. remembered: windows.
+    hop: from one window to the next, s. remembered: windows. clocks: columns of those that wander.
     """
 
-    def __init__(self, n: int, n_v: int, hop: float, remembered: int = REMEMBERED) -> None:
-        self._n_v, self._remembered = n_v, remembered
+    def __init__(self, n: int, n_v: int, hop: float, remembered: int = REMEMBERED, clocks: Sequence[int] = ()) -> None:
+        self._n_v, self._remembered, self._clocks = n_v, remembered, list(clocks)
         self._warm_up = round(WARM_UP / hop)
         self.begin(Information.none(n))
 
@@ -161,7 +176,8 @@ class ChangeDetector(Stage):
 
     def _excess(self, rows: WhiteRows) -> float | None:
         """χ² of the window less its expectation, in standard deviations √(2 n_v); None where the test sleeps."""
-        L = np.linalg.cholesky(rows.covariance)
+        late = WANDER * rows.raw[:, self._clocks]
+        L = np.linalg.cholesky(rows.covariance + late @ late.T)
         own = scipy.linalg.solve_triangular(L, rows.raw, lower=True, check_finite=False)
         # What the rows add to the residual sum of squares is χ² of their innovations, with the estimate's own
         # uncertainty counted; directions that nothing is known of add nothing.

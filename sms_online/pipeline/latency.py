@@ -13,6 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from sms_online.calibration.nuisance import Nuisance
 from sms_online.description.sources import LogSource, SerialFrames, SerialLines, Source
 from sms_online.effects.delay import late_keys
 from sms_online.pipeline.sensing import Sensing
@@ -25,6 +26,9 @@ from sms_online.trackers.factor import triangular_factor
 EVIDENCE = 6.0
 # And from here on, s: what clocks are off by at worst is less, and what it does to the parameters too.
 LEAST = 2e-4
+# By how much a device's clock may be off in one window and not in another, 1σ, s. Beside programs that take all cores
+# it is that much, on a quiet host a tenth of it (docs/validation/live.md). Tests of what rows leave allow for it.
+WANDER = 2e-4
 # Two sources of which either may be late explain the rows alike, up to rounding: then nobody is early.
 ALIKE = 0.99
 
@@ -91,6 +95,12 @@ def clock_groups(sensing: Sensing) -> tuple[SourceGroup, ...]:
     every = [_group(sensing, name, channels) for (name, _), channels in members.items()]
     groups = tuple(group for group in every if group.sensors or group.joints)
     return groups if len(groups) > 1 else ()
+
+
+def wandering_clocks(sensing: Sensing, nuisances: Sequence[Nuisance]) -> tuple[int, ...]:
+    """Which nuisances are clocks of devices that have their own: those wander, as the host that stamps them is late."""
+    own = bool(clock_groups(sensing))
+    return tuple(k for k, each in enumerate(nuisances) if own and each.name == "clock")
 
 
 class LatencyState(State):

@@ -18,7 +18,7 @@ from sms_online.pipeline.criterion import RowGrams, ScaleFree
 from sms_online.pipeline.description import nearer
 from sms_online.pipeline.drift_line import DriftLine
 from sms_online.pipeline.errors_in_variables import NoiseBias, unbiased
-from sms_online.pipeline.latency import Latencies, clock_groups, source_groups
+from sms_online.pipeline.latency import Latencies, clock_groups, source_groups, wandering_clocks
 from sms_online.pipeline.momentum_balance import MomentumBalance, half_hop
 from sms_online.pipeline.momentum_fit import FIRST_MOTION, MomentumFit, WhiteRows
 from sms_online.pipeline.momentum_windows import COPIES, HOPS, INSTANTS
@@ -140,7 +140,8 @@ class Momentum(Stage):
         return WindowNoise(model, self.changes.base, balance, sensing.displacements, self._clocks, calibration)
 
     def _new_test(self) -> SequentialTest:
-        return SequentialTest(self.changes.model.layout, self._balance.span / HOPS, self.nuisances)
+        clocks = wandering_clocks(self.sensing, self.nuisances)
+        return SequentialTest(self.changes.model.layout, self._balance.span / HOPS, self.nuisances, clocks)
 
     def _new_tracker(self) -> Tracker:
         tracker = session_tracker(self.changes.base.n, self.current_prior, len(self.nuisances))
@@ -450,4 +451,5 @@ class Momentum(Stage):
             coloured={} if noise is None else noise.coloured,
             # Rounding moves as it likes where samples are exact.
             suspected=None if noise is None or noise.exact else self.bank.suspected,
+            shifts=tuple(self.changes.shifts),
         )

@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 from sms_online.calibration.nuisance import BOUND, Nuisance
 from sms_online.calibration.release import release_gain
 from sms_online.model.layout import Layout
+from sms_online.pipeline.latency import WANDER
 from sms_online.pipeline.momentum_fit import WhiteRows
 from sms_online.pipeline.momentum_windows import HOPS
 from sms_online.row_types import row_types
@@ -80,10 +81,13 @@ class SequentialTest(Stage):
 
     hop: time from one window to the next, s. limit: h. nuisances: those whose columns come before the parameters'.
     Their tolerances count as `BOUND` times as wide: what they explain beyond their tolerances is reported as such.
+    clocks: which of them are clocks that wander.
     """
 
-    def __init__(self, layout: Layout, hop: float, nuisances: Sequence[Nuisance] = ()) -> None:
-        self._layout = layout
+    def __init__(
+        self, layout: Layout, hop: float, nuisances: Sequence[Nuisance] = (), clocks: Sequence[int] = ()
+    ) -> None:
+        self._layout, self._clocks = layout, list(clocks)
         tolerances = np.array([each.tolerance if each.may_give_way else np.inf for each in nuisances])
         self._loose: NDArray[np.int64] = np.flatnonzero(np.isfinite(tolerances))
         self._tolerances: Array = tolerances[self._loose]
@@ -146,7 +150,7 @@ class SequentialTest(Stage):
         """Log likelihood ratio of every test (tests,); zero where nothing is known."""
         Y, n_v = rows.raw[:, :-1], self._layout.n_v
         e = rows.raw[:, -1] - Y @ self.state.beta
-        spread = Y @ self.state.root
+        spread = np.concatenate((Y @ self.state.root, WANDER * Y[:, self._clocks]), axis=1)
         S = variance * rows.noise + spread @ spread.T
         scaled = Y / self.state.scale
         tested = np.linalg.norm(scaled @ self.state.null, axis=1) <= KNOWN * np.linalg.norm(scaled, axis=1)

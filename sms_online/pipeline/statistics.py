@@ -21,7 +21,7 @@ from sms_online.model.model import Model
 from sms_online.pipeline.criterion import ScaleFree
 from sms_online.pipeline.energy_balance import SharedErrors
 from sms_online.pipeline.errors_in_variables import NoiseBias, unbiased
-from sms_online.pipeline.events import Event
+from sms_online.pipeline.events import ClockShift, Event
 from sms_online.pipeline.joint_balance import SquaredResidual
 from sms_online.pipeline.latency import Latency
 from sms_online.pipeline.marker_identity import Swap
@@ -88,7 +88,8 @@ class MomentumStatistics:
     misfit. started: weights are known. tested: there are rows enough for a test of what they leave. alarm: type of the
     rows that the sequential test finds more than noise in. scale_free: what gives the estimate where rows leave more
     than noise. latency: source that is late against the others, if one is. coloured: see
-    `SensorNoise`. suspected: a change of parameters that the judged tracker does not follow.
+    `SensorNoise`. suspected: a change of parameters that the judged tracker does not follow. shifts: of the devices'
+    clocks.
     """
 
     trackers: tuple[Reading, ...]
@@ -103,6 +104,7 @@ class MomentumStatistics:
     latency: Latency | None
     coloured: dict[str, float]
     suspected: Suspected | None
+    shifts: tuple[ClockShift, ...]
 
 
 @dataclass(frozen=True)

@@ -19,8 +19,9 @@ from sms_online.errors import InputError
 READ_TIMEOUT = 0.1
 # Waits before a lost device is tried again, s: each twice the one before, from the first to the longest.
 FIRST_RETRY, LONGEST_RETRY = 0.1, 1.0
-# Where the loop is behind, a reader has so long to fetch what came before a tick, s, and is polled so often.
-FETCHING, LOOK = 0.05, 5e-4
+# Where the loop is behind, a reader has so long to fetch what came before a tick, s, and is polled so often. On a
+# busy host it may be its turn only after some tenths.
+FETCHING, LOOK = 0.5, 5e-4
 # A reader leaves what has come with the driver while the loop computes, at most so long, s: a block takes less, and the
 # usual buffers of a socket hold 300 frames.
 COMPUTING = 0.02
@@ -89,6 +90,7 @@ class Feed:
         self._refused: InputError | None = None
         self.tried = threading.Event()  # to open the device, at least once
         self._fetched = inf  # machine's time when the last read came back, s; infinite while nothing can be read
+        self._given_up = -inf  # what it was when the loop stopped waiting
         self._reader = reader
         self._recorder = recorder
         self._queued = queued
@@ -124,10 +126,13 @@ class Feed:
     def await_fetched(self, age: float) -> None:
         """Wait until all that came more than `age` s ago has been fetched, for FETCHING s at most.
 
-        A loop that works off a backlog keeps the interpreter from the readers, and must not overtake them.
+        A loop that works off a backlog keeps the interpreter from the readers, and must not overtake them. A reader
+        that was waited for in vain, and has fetched nothing since, is not waited for again.
         """
         began = time.monotonic()
-        while self._fetched < began - age and time.monotonic() < began + FETCHING:
+        while self._given_up < self._fetched < began - age:
+            if time.monotonic() > began + FETCHING:
+                self._given_up = self._fetched
             time.sleep(LOOK)
 
     def _run(self) -> None:

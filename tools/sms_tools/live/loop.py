@@ -112,8 +112,9 @@ class LiveSession:
             gc.unfreeze()
             for feed in self._feeds:
                 feed.stop()
-        # What arrived until then, also where the loop was behind.
-        while tick_time(self._tick) <= self._clock():
+        # What arrived until then, also where the loop was behind; what passes meanwhile is no silence.
+        end = self._clock()
+        while tick_time(self._tick) <= end:
             yield from self._advance()
         block = self._merger.finish()
         if block is not None:

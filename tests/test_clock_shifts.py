@@ -1,0 +1,50 @@
+"""Clocks that shift while a session runs, as those of a late host: no event, and the parameters as without."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+import sms_online as sms
+from sms_adapters.system_file import load_system
+from sms_online.description.schema import System
+from sms_tools.live.simulated import write_testbed
+from tests.simulations import planar_capture
+
+SECONDS, SHIFTED = 16.0, 9.0  # s
+LATE = 9e-4  # s, twice as much as in demos beside busy processes
+
+
+@pytest.fixture(scope="module")
+def rig(tmp_path_factory: pytest.TempPathFactory) -> System:
+    """The planar example with a clock for each device."""
+    folder = tmp_path_factory.mktemp("rig")
+    return load_system(str(write_testbed("paper-planar", load_system("paper-planar"), "B", folder)))
+
+
+@pytest.fixture(scope="module")
+def shifted() -> sms.Capture:
+    """A session in which the markers' samples are LATE from SHIFTED on."""
+    capture = planar_capture(SECONDS)
+    values = capture.values.copy()
+    for k, channel in enumerate(capture.channels):
+        if ".marker_" in channel:
+            late = np.interp(capture.t - LATE, capture.t, values[:, k])
+            values[:, k] = np.where(capture.t < SHIFTED, values[:, k], late)
+    return sms.Capture(capture.t, capture.channels, values)
+
+
+@pytest.mark.slow
+def test_a_clock_that_shifts_is_no_event(rig: System, shifted: sms.Capture) -> None:
+    result = sms.estimate(rig, shifted)
+    assert result.events == ()
+    assert result.trust.level == "doubt"
+    assert result.trust.sentence.startswith("Doubt: markers ")
+    known = [p for p in result.parameters.values() if p.determined and p.nominal]
+    assert max(abs(p.value - p.nominal) / p.std for p in known if p.nominal) < 5.0
+
+
+@pytest.mark.slow
+def test_on_one_clock_the_same_samples_hold_an_event(rig: System, shifted: sms.Capture) -> None:
+    (event,) = sms.estimate(rig.model_copy(update={"sources": ()}), shifted).events
+    assert event.time == pytest.approx(SHIFTED, abs=0.5)
