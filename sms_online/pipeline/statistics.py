@@ -134,8 +134,11 @@ class Statistics:
     smoother: SmootherStatistics | None
 
     @staticmethod
-    def of(estimator: Estimator) -> Statistics:
-        """Those of now; nothing in them changes as the session goes on."""
+    def of(estimator: Estimator, at: float | None = None) -> Statistics:
+        """Those of now; nothing in them changes as the session goes on.
+
+        at: instant, s, that parameters which drift hold for; by default that of the newest sample.
+        """
         momentum, smoother = estimator.momentum, estimator.smoother
         return Statistics(
             setup=estimator.setup,
@@ -153,7 +156,7 @@ class Statistics:
             energy=snapshot(estimator.energy_tracker),
             shared=state_copy(estimator.shared_errors),
             joints=tuple(state_copy(estimator.joint_residuals)),
-            momentum=None if momentum is None else momentum.statistics(estimator.end),
+            momentum=None if momentum is None else momentum.statistics(estimator.end if at is None else at),
             smoother=None if smoother is None else smoother.known,
         )
 
