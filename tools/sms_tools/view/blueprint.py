@@ -188,8 +188,8 @@ class _Plots:
         plots = [
             self._plot("Rate, samples/s", [f"{health}/rates/**"], legend=False),
             self._plot("Lost, dropped, bridged, counts", [f"{health}/counts/**"]),
-            self._plot("Innovations squared, log10: 0 as expected", [f"{INNOVATIONS}/**"]),
-            self._plot("Memory, s", [f"{MEMORY}/**"]),
+            self._plot("NIS, log10", [f"{INNOVATIONS}/**"]),
+            self._plot("Memory, s", [f"{MEMORY}/**"], legend=False),
         ]
         if live:
             plots += [

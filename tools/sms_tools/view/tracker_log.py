@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 
 import numpy as np
@@ -27,7 +28,7 @@ class TrackerLog:
     def __init__(self, numbers: NumberLog, labels: Sequence[str]) -> None:
         self._numbers = numbers
         self._labels = [f"{label}, judged" if k == 0 and len(labels) > 1 else label for k, label in enumerate(labels)]
-        self._parts = [f"{k + 1} {label}" for k, label in enumerate(labels)]
+        self._parts = [re.sub(r"\W+", "_", f"{k} {label}") for k, label in enumerate(labels, start=1)]
         self._drawn: dict[str, tuple[str, str]] = {}  # parameter to kind and title of its plot
         for k, label in enumerate(self._labels):
             color = self._color(k)
@@ -74,7 +75,7 @@ class TrackerLog:
         return style.LINES[k % len(style.LINES)]
 
     def _path(self, folder: str, k: int) -> str:
-        return f"{folder}/{rr.escape_entity_path_part(self._parts[k])}"
+        return f"{folder}/{self._parts[k]}"
 
     @staticmethod
     def _folder(name: str) -> str:
