@@ -259,7 +259,12 @@ class TrackerBank(Stage):
         tracker = chosen.tracker
         if tracker is None:
             return Reading(chosen.choice.label, own, own.rows / self._rows_per_second)
-        estimate = tracker.estimate_at(t) if isinstance(tracker, LearnedTrend) else tracker.estimate()
+        if isinstance(tracker, LearnedTrend):
+            # Rows since an alarm wait until they show what it was; a drift may have ended with it, or grown.
+            held = self.state.held if tracker is self.learned else []
+            estimate = tracker.estimate_at(t, t - float(held[0].t[0]) if held else 0.0)
+        else:
+            estimate = tracker.estimate()
         if estimate.scale is None and estimate.rows > 0.0:
             # Noise in the columns pulls every weighted mean of the rows alike; the scatter of that grows as rows fade.
             shift, covariance = bias.correction(estimate.determined)
