@@ -280,10 +280,17 @@ class Evaluation:
                 troubles=tuple(self._troubles),
                 weaknesses=tuple(self._weaknesses()),
                 suspected=None if momentum is None or now.method != "momentum" else momentum.suspected,
+                unwatched=now.duration if self._unwatched else 0.0,
                 consistency=self.trackers[0].consistency if self.trackers else None,
                 scale=now.setup.system.scale_tolerance,
             )
         )
+
+    @property
+    def _unwatched(self) -> bool:
+        """Whether a drift would show nowhere."""
+        now = self.statistics
+        return now.method == "momentum" and now.momentum is not None and now.momentum.unwatched
 
     @property
     def _lost(self) -> float:

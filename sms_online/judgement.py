@@ -55,6 +55,8 @@ GO_ON = "record for longer: a drift is followed once it is certain; then run `sm
 CHECK_DEVICE = "look at power, cable and address of what is silent, and at its table in the system file"
 CHECK_TROUBLE = "see to the devices, the recording and the machine first"
 MOVE = "move all joints, faster and over a larger range, and long enough"
+# A session of so many seconds in which no drift is watched for may hold one that matters.
+LONGEST_UNWATCHED = 60.0
 
 
 @dataclass(frozen=True)
@@ -99,8 +101,9 @@ class Facts:
     miscalibrated: what is off by more than the description's tolerances
     allow. troubles: of the devices, the recording and the machine of a live session, a short sentence each. weaknesses:
     of an estimate by the way it is made. suspected: parameters that seem to move, which the judged tracker does not
-    follow. consistency: of that tracker's rows with its error bars. scale: 1σ of the factor that all parameters have in
-    common, where nothing else fixes it.
+    follow. unwatched: s of a session in which no drift is watched for and none is followed; 0 elsewhere. consistency:
+    of that tracker's rows with its error bars. scale: 1σ of the factor that all parameters have in common, where
+    nothing else fixes it.
     """
 
     determined: tuple[int, int]
@@ -124,6 +127,7 @@ class Facts:
     troubles: tuple[str, ...] = ()
     weaknesses: tuple[str, ...] = ()
     suspected: Suspected | None = None
+    unwatched: float = 0.0
     consistency: Consistency | None = None
     scale: float | None = None
 
@@ -164,7 +168,7 @@ def judge(facts: Facts) -> Trust:
         rest = _cautions(replace(facts, troubles=()))
         return Trust("not yet", (*first, Reason(facts.settling, False, then=MOVE), *losses, *rest))
     cautions = (*losses, *alarms, *_moving(facts.suspected), *_cautions(facts))
-    cautions = cautions or tuple(_inconsistent(facts.consistency))
+    cautions = (*(cautions or _inconsistent(facts.consistency)), *_unwatched(facts.unwatched))
     return Trust("doubt", cautions) if cautions else Trust("trust", tuple(_grounds(facts)))
 
 
@@ -361,6 +365,14 @@ def _moving(suspected: Suspected | None) -> list[Reason]:
     text = f"{names} seems to move since {suspected.since:.1f} s, and is not followed"
     place = place_of(suspected.parameters[0])
     return [Reason(text, False, place, "may move", then=GO_ON if suspected.learning else FOLLOW)]
+
+
+def _unwatched(duration: float) -> list[Reason]:
+    """A long session in which a drift would show nowhere."""
+    if duration < LONGEST_UNWATCHED:
+        return []
+    text = f"a parameter may have drifted in {duration:.0f} s: clocks of several devices wander as drifts do"
+    return [Reason(text, False, then=FOLLOW)]
 
 
 def _inconsistent(consistency: Consistency | None) -> list[Reason]:

@@ -450,4 +450,5 @@ class Momentum(Stage):
             coloured={} if noise is None else noise.coloured,
             # Rounding moves as it likes where samples are exact.
             suspected=None if noise is None or noise.exact else self.bank.suspected,
+            unwatched=self.bank.unwatched,
         )

@@ -88,7 +88,8 @@ class MomentumStatistics:
     misfit. started: weights are known. tested: there are rows enough for a test of what they leave. alarm: type of the
     rows that the sequential test finds more than noise in. scale_free: what gives the estimate where rows leave more
     than noise. latency: source that is late against the others, if one is. coloured: see
-    `SensorNoise`. suspected: a change of parameters that the judged tracker does not follow.
+    `SensorNoise`. suspected: a change of parameters that the judged tracker does not follow; unwatched: none is looked
+    for.
     """
 
     trackers: tuple[Reading, ...]
@@ -103,6 +104,7 @@ class MomentumStatistics:
     latency: Latency | None
     coloured: dict[str, float]
     suspected: Suspected | None
+    unwatched: bool
 
 
 @dataclass(frozen=True)

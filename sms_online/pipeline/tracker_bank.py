@@ -123,8 +123,8 @@ class TrackerBank(Stage):
         self._names = [p.name for p in parameters]
         # A judged tracker that lets nothing move is watched: rows that show a drift speak against it.
         judged = system.trackers[0]
-        still = judged.kind != "kalman" or judged.drift == "none"
-        self._watch = build_watch(tracked) if steady and still else None
+        self._still = judged.kind != "kalman" or judged.drift == "none"
+        self._watch = build_watch(tracked) if steady and self._still else None
         # By name, for each is saved as a stage within.
         for k, chosen in enumerate(self._chosen):
             if chosen.tracker is not None:
@@ -139,6 +139,11 @@ class TrackerBank(Stage):
     @property
     def _fed(self) -> list[Tracker]:
         return self.others if self._watch is None else [*self.others, self._watch]
+
+    @property
+    def unwatched(self) -> bool:
+        """Whether the judged tracker lets nothing move, and no drift is watched for either."""
+        return self._watch is None and self._still
 
     @property
     def suspected(self) -> Suspected | None:
