@@ -77,11 +77,12 @@ class Suspected:
 class BankState(State):
     """reference (n,): parameters from which a drift counts, None where nothing has moved. held: rows since an alarm.
 
-    asked: how often it was asked what that was.
+    since: s, when what it is of may have begun. asked: how often it was asked what that was.
     """
 
     reference: Array | None = None
     held: list[Rows] = msgspec.field(default_factory=list)
+    since: float = np.inf
     asked: int = 0
 
 
@@ -175,10 +176,10 @@ class TrackerBank(Stage):
                 tracker.state.quiet = quiet
             tracker.update(rows)
 
-    def hold(self, rows: Rows) -> None:
-        """Keep rows from behind an alarm until it is known what that was."""
+    def hold(self, rows: Rows, since: float) -> None:
+        """Keep rows from behind an alarm until it is known what that was; since: s, when that may have begun."""
         if self.learned is not None:
-            self.state.held = [*self.state.held, rows]
+            self.state.held, self.state.since = [*self.state.held, rows], since
 
     def drift_behind(self, change: Change) -> Ramp | bool:
         """The drift that a change is; whether that is still to be seen, where it is none so far."""
@@ -200,7 +201,7 @@ class TrackerBank(Stage):
 
     def release(self) -> None:
         """Forget the rows held back."""
-        self.state.held, self.state.asked = [], 0
+        self.state.held, self.state.since, self.state.asked = [], np.inf, 0
 
     def hold_until(self, t: float) -> None:
         """Have estimates of parameters that drift hold at t, s."""
@@ -266,8 +267,8 @@ class TrackerBank(Stage):
             return Reading(chosen.choice.label, own, own.rows / self._rows_per_second)
         if isinstance(tracker, LearnedTrend):
             # Rows since an alarm wait until they show what it was; a drift may have ended with it, or grown.
-            held = self.state.held if tracker is self.learned else []
-            estimate = tracker.estimate_at(t, t - float(held[0].t[0]) if held else 0.0)
+            since = self.state.since if tracker is self.learned else np.inf
+            estimate = tracker.estimate_at(t, max(0.0, t - since))
         else:
             estimate = tracker.estimate()
         if estimate.scale is None and estimate.rows > 0.0:
