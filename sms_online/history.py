@@ -15,6 +15,7 @@ from sms_online.pipeline.observer import Observer
 from sms_online.pipeline.statistics import Statistics
 from sms_online.state import Stage, State
 from sms_online.stream import Array
+from sms_online.tables import finite
 
 if TYPE_CHECKING:
     import pandas
@@ -69,7 +70,10 @@ class History:
             "tracker": self.tracker,
             "judged": self.judged,
             "t": self.t[rows].tolist(),
-            "parameters": [{"name": name, "estimate": value, "std": std} for name, value, std in columns],
+            "parameters": [
+                {"name": name, "estimate": [*map(finite, values)], "std": [*map(finite, stds)]}
+                for name, values, stds in columns
+            ],
         }
 
     def columns(self) -> dict[str, Array]:
