@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from sms_online.description.schema import System
     from sms_online.diagnosis.diagnosed import Diagnosis, diagnose
     from sms_online.errors import InputError
+    from sms_online.history import History
     from sms_online.pipeline.events import Event
     from sms_online.repeatability import Comparison
     from sms_online.result import Coefficient, Finding, Parameter, Parameters, Result
@@ -45,6 +46,7 @@ _HOMES = {
     "Event": "sms_online.pipeline.events",
     "Excitation": "sms_sim.excitation",
     "Finding": "sms_online.result",
+    "History": "sms_online.history",
     "InputError": "sms_online.errors",
     "Limits": "sms_sim.motion_limits",
     "Parameter": "sms_online.result",
@@ -81,6 +83,7 @@ __all__ = [
     "Event",
     "Excitation",
     "Finding",
+    "History",
     "InputError",
     "Limits",
     "Parameter",

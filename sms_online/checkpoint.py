@@ -30,7 +30,7 @@ class Head(msgspec.Struct, frozen=True):
 
 
 class _File(msgspec.Struct, frozen=True):
-    """What is written: the head, and encoded states: of `ESTIMATOR` and, where it keeps some, of `SOURCE`."""
+    """What is written: the head, and encoded states: of `ESTIMATOR` and, where there are some, of the others."""
 
     head: Head
     states: dict[str, msgspec.Raw]
@@ -46,14 +46,14 @@ class _AnyFile(msgspec.Struct):
     head: _Versioned
 
 
-ESTIMATOR, SOURCE = "estimator", "source"
+ESTIMATOR, SOURCE, HISTORY = "estimator", "source", "history"
 
 
 @dataclass(frozen=True)
 class Checkpoint:
     """What a session of the same system and channels needs to go on, bit for bit.
 
-    states: of the estimator and, where that keeps some, of its source. name: of the file, for messages.
+    states: of the estimator and, where those keep some, of its source and its history. name: of the file, for messages.
     """
 
     head: Head
@@ -61,15 +61,20 @@ class Checkpoint:
     name: str = "saved session"
 
     @staticmethod
-    def of(estimator: Estimator, begun: Mapping[str, Any] | None = None, source: Stage | None = None) -> Checkpoint:
+    def of(
+        estimator: Estimator,
+        begun: Mapping[str, Any] | None = None,
+        source: Stage | None = None,
+        history: Stage | None = None,
+    ) -> Checkpoint:
         """The state of now, in a fraction of a millisecond: the estimator may go on before it is written.
 
         begun: how the session was begun, as plain JSON types. source: what its samples come from, where that keeps a
-        state.
+        state. history: of its estimates.
         """
         head = Head(__version__, describe(estimator.system), estimator.channels, dict(begun or {}))
-        states = {ESTIMATOR: collect(estimator)}
-        return Checkpoint(head, states if source is None else states | {SOURCE: collect(source)})
+        stages = {ESTIMATOR: estimator, SOURCE: source, HISTORY: history}
+        return Checkpoint(head, {name: collect(stage) for name, stage in stages.items() if stage is not None})
 
     def to_bytes(self) -> bytes:
         """The checkpoint as msgpack, for a file."""
@@ -98,6 +103,11 @@ class Checkpoint:
         """Have a source of the same system go on from here, if one was saved; InputError where it does not fit."""
         if SOURCE in self.states:
             self._put(SOURCE, source)
+
+    def put_into_history(self, history: Stage) -> None:
+        """Have a history of the same session go on from here, if one was saved; InputError where it does not fit."""
+        if HISTORY in self.states:
+            self._put(HISTORY, history)
 
     def _put(self, name: str, stage: Stage) -> None:
         try:

@@ -151,6 +151,17 @@ class Evaluation:
 
     @cached_property
     @one_blas_thread()
+    def estimates(self) -> tuple[tuple[Estimate, Array], ...]:
+        """Of each chosen tracker, the judged one first, its estimate and 1σ (n,) as it is reported, see `std`.
+
+        The judged one alone where no momentum balance gives the estimate.
+        """
+        momentum = self.statistics.momentum
+        others = () if self.statistics.method != "momentum" or momentum is None else momentum.trackers[1:]
+        return ((self.estimate, self.std), *((each.estimate, self._reported(each.estimate)) for each in others))
+
+    @cached_property
+    @one_blas_thread()
     def trackers(self) -> tuple[TrackerResult, ...]:
         """Results of each chosen tracker, the judged one first; empty where no momentum balance gives the estimate."""
         now = self.statistics
@@ -161,14 +172,17 @@ class Evaluation:
             rate = rows_per_second(self.model.layout.n_v, self.model.system.windows.momentum)
             readings = (Reading(now.setup.system.trackers[0].label, self.estimate, self.estimate.rows / rate),)
         out = []
-        for k, reading in enumerate(readings):
-            estimate = self.estimate if k == 0 else reading.estimate
-            std = self.std if k == 0 else self._reported(estimate)
+        for k, (reading, (estimate, std)) in enumerate(zip(readings, self.estimates, strict=True)):
             numbers = (estimate.pi.tolist(), std.tolist(), identifiable(estimate.pi, std).tolist())
             tracked = {p.name: Tracked(*each) for p, *each in zip(self.parameters, *numbers, strict=True)}
             consistency = Consistency.of(estimate)
-            moving = [(self.parameters[drift.column], drift) for drift in reading.drifts]
-            drifts = tuple(Drift(p.name, p.unit, drift.since, drift.rate, drift.std) for p, drift in moving)
+            moving = [(self.parameters[drift.column], drift, drift.column) for drift in reading.drifts]
+            drifts = tuple(
+                Drift(
+                    p.name, p.unit, drift.since, drift.rate, drift.std, float(estimate.pi[column]), float(std[column])
+                )
+                for p, drift, column in moving
+            )
             memory = min(reading.memory, now.duration)
             out.append(TrackerResult(reading.label, k == 0, tracked, consistency, memory, drifts))
         return tuple(out)

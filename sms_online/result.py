@@ -14,6 +14,7 @@ from sms_online.calibration.found import Calibration
 from sms_online.description.parse import describe
 from sms_online.description.schema import System
 from sms_online.evaluation import NORMAL_95, Evaluation
+from sms_online.history import History, Recorder
 from sms_online.pipeline.events import Event
 from sms_online.pipeline.statistics import Method
 from sms_online.stream import Array
@@ -201,6 +202,7 @@ class Result(Documented):
     than its tolerances. trackers: what each says, the judged one, whose estimate `parameters` holds, first; empty where
     no momentum balance gives the estimate.
     physical: None of a session that still runs. diagnosis: episodes of the running diagnosis, as in results.json.
+    history: of the estimates of each tracker, the judged one first.
     """
 
     system: System
@@ -221,6 +223,7 @@ class Result(Documented):
     trackers: tuple[TrackerResult, ...] = field(default=(), repr=False)
     physical: Consistency | None = field(default=None, repr=False)
     diagnosis: tuple[Mapping[str, Any], ...] = field(default=(), repr=False)
+    history: tuple[History, ...] = field(default=(), repr=False)
 
     @property
     def drifts(self) -> tuple[Drift, ...]:
@@ -251,6 +254,7 @@ class Result(Documented):
             "outliers": self.outliers,
             "warnings": list(self.warnings),
             "diagnosis": [dict(episode) for episode in self.diagnosis],
+            "history": [each.document() for each in self.history],
         }
 
     def to_frame(self) -> pandas.DataFrame:
@@ -285,12 +289,14 @@ def result_of(
     warnings: Sequence[str] = (),
     episodes: Sequence[Mapping[str, Any]] = (),
     throughput: float = 0.0,
+    history: Recorder | None = None,
 ) -> Result:
     """An evaluation as one record.
 
     truth: true values of physical parameters by name, of a simulated capture, which enter this record alone. bound (n,)
     or fewer: Cramér–Rao bound of each parameter's std. warnings: of the source. episodes: of the diagnosis that ran
-    beside the session, as results.json holds them. throughput: samples/s.
+    beside the session, as results.json holds them. throughput: samples/s. history: what
+    has looked at the estimates on the way.
     """
     now, base = evaluation.statistics, evaluation.base
     notices = evaluation.notices
@@ -344,6 +350,7 @@ def result_of(
         trackers=evaluation.trackers,
         physical=None if projection is None else Consistency(projection.distance, projection.active),
         diagnosis=tuple(episodes),
+        history=() if history is None else history.histories,
     )
 
 

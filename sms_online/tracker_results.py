@@ -53,9 +53,9 @@ class Tracked:
 
 @dataclass(frozen=True)
 class Drift:
-    """A parameter that a tracker has found to drift: since when, s, and its rate now with standard deviation.
+    """A parameter that a tracker has found to drift: since when, s, and its value and rate now.
 
-    unit: of the parameter; the rate is in it per s.
+    unit: of the parameter and its value ± value_std; the rate ± std is in it per s.
     """
 
     parameter: str
@@ -63,6 +63,8 @@ class Drift:
     since: float
     rate: float
     std: float
+    value: float
+    value_std: float
 
     def document(self) -> dict[str, Any]:
         """As results.json holds it."""
@@ -71,6 +73,8 @@ class Drift:
             "since": self.since,
             "rate": self.rate,
             "rate_std": self.std,
+            "value": self.value,
+            "value_std": self.value_std if np.isfinite(self.value_std) else None,
             "unit": self.unit,
         }
 

@@ -15,10 +15,10 @@ from sms_online.description.parse import parse_system, shipped_systems, shipped_
 from sms_tools.cli import main
 
 REFERENCE = Path(__file__).parents[1] / "docs" / "reference"
-# Keys that a session may have and the simulated one below has not: it has no change, and explains all of its residual.
-EVENTS = ("events[].",)
+# Keys that a session may have and the simulated one below has not: nothing changes or drifts in it.
+EVENTS = ("events[].", "trackers[].drifts[].")
 # Of what a diagnosis need not find.
-UNFOUND = ("unexplained.", "mistakes[].", "calibration[].")
+UNFOUND = ("drifts[].", "unexplained.", "mistakes[].", "calibration[].")
 
 
 def keys_of_page(page: str) -> set[str]:

@@ -106,6 +106,17 @@ def test_a_ramp_is_found_and_followed_within_its_bars() -> None:
     assert np.mean(np.abs(z) < 2.5) > 0.9
 
 
+def test_a_rate_that_may_be_another_widens_its_own_bar() -> None:
+    """Two seconds of a rate that may have ended are an error of two seconds times the rate."""
+    tracker = learned()
+    tracker.update(rows(20.0, lambda t: only(2, 0.5 * t)))
+    sure, unsure = tracker.estimate_at(20.0), tracker.estimate_at(20.0, unsure=2.0)
+    np.testing.assert_array_equal(unsure.pi, sure.pi)
+    assert unsure.std[2] == pytest.approx(1.0, rel=0.1)
+    others = [0, 1, 3]
+    np.testing.assert_array_equal(unsure.std[others], sure.std[others])
+
+
 def test_what_decays_is_followed_as_decaying() -> None:
     tracker, given = learned(), rows(60.0, lambda t: only(0, 3.0 * (np.exp(-t / 30.0) - 1.0)), noise=0.02)
     tracker.update(given)

@@ -6,17 +6,21 @@ import tomllib
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import cache
+from pathlib import Path
 
 import pytest
 
 import sms_online as sms
+from sms_online.pipeline.estimator import Estimator
 from sms_online.pipeline.tracker_bank import Suspected
+from sms_online.session import with_trackers
 from sms_online.tracker_results import Consistency
 from sms_online.verdict.evidence import Evidence
 from sms_online.verdict.judge import judge
 from sms_online.verdict.reasons import DIAGNOSE, FOLLOW, GO_ON
 from sms_online.verdict.trust import Residual
 from tests.axis import AXIS, MOTION
+from tests.bus_streams import axis_testbed
 
 DRIFT = "link_1.inertia:share=-0.2,over=20,begin=8.3"
 GOOD = Evidence(determined=(2, 2), residual={"joint_1": Residual(0.01, 1.0)})
@@ -58,6 +62,25 @@ def test_rows_louder_than_the_error_bars_are_not_trusted() -> None:
     assert (trust.level, trust.grave) == ("doubt", False)
     assert "innovations squared are 1.40, beyond 1.20" in trust.sentence
     assert trust.grounds[0].then == DIAGNOSE
+
+
+@pytest.mark.parametrize(("seconds", "level"), [(0.0, "trust"), (59.0, "trust"), (61.0, "doubt")])
+def test_a_long_session_that_nobody_watches_is_doubted(seconds: float, level: str) -> None:
+    trust = judge(replace(GOOD, unwatched=seconds))
+    assert (trust.level, trust.grave) == (level, False)
+    if level == "doubt":
+        assert trust.grounds[0].then == FOLLOW
+
+
+def test_drifts_are_not_watched_for_beside_wandering_clocks(tmp_path: Path) -> None:
+    """Unless a tracker follows them; from one clock they are."""
+    devices, one = axis_testbed(tmp_path), sms.load_system(tomllib.loads(AXIS))
+    unwatched = [
+        momentum.bank.unwatched
+        for system in (devices, with_trackers(devices, "kalman:drift=learned"), one)
+        if (momentum := Estimator(system, ("force_1", "q_1"), "test").momentum) is not None
+    ]
+    assert unwatched == [True, False, False]
 
 
 def test_what_is_missing_comes_before_a_suspected_drift() -> None:

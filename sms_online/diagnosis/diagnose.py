@@ -3,17 +3,29 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
 
 from sms_online.calibration.found import Calibration
 from sms_online.description.schema import Effect, System
-from sms_online.diagnosis.attempt import FITTED_ONCE, SEARCHED, TRACED, Attempt, Case, PriorOf, Progress, State, Step
+from sms_online.diagnosis.attempt import (
+    FITTED_ONCE,
+    SEARCHED,
+    TRACED,
+    Attempt,
+    Case,
+    Part,
+    PriorOf,
+    Progress,
+    State,
+    Step,
+)
 from sms_online.diagnosis.calibrated import sayable
 from sms_online.diagnosis.candidate import Finding, Ranked
 from sms_online.diagnosis.constants import possible
+from sms_online.diagnosis.drifts import explained_by_drifts, following, leaves_more
 from sms_online.diagnosis.hypothesis import corrections, share_left, verdict
 from sms_online.diagnosis.late_sensors import LateSensor, find_late
 from sms_online.diagnosis.mistakes import Corrected, Mistake, find_mistakes, wrong_clock
@@ -28,6 +40,7 @@ from sms_online.pipeline.momentum_windows import HOPS
 from sms_online.pipeline.statistics import Statistics
 from sms_online.stream import Array, Block
 from sms_online.threads import one_blas_thread
+from sms_online.tracker_results import Drift
 from sms_online.verdict.reasons import LARGEST_RESIDUAL
 
 # Exact links have to take this share of what straight ones leave beyond noise.
@@ -45,7 +58,8 @@ class Diagnosis:
     late: sensors far behind the others, whose lag the description of the last attempt states. steps: of the last
     search, its effects one after the other.
     described, attempt: first and last description against the samples; chosen: of the last one's candidates.
-    estimator_before, estimator_after: sessions of the two systems over the whole capture.
+    estimator_before, estimator_after: sessions of the two systems over the whole capture. drifts: parameters that
+    drift, which the second follows; nothing else is searched then.
     """
 
     verdict: str
@@ -64,6 +78,7 @@ class Diagnosis:
     estimator_before: Estimator
     estimator_after: Estimator
     unexplained: Unexplained | None
+    drifts: tuple[Drift, ...] = ()
 
     @property
     def left(self) -> float:
@@ -184,6 +199,15 @@ def diagnose(
         _check_measured(before, source)
     assert before.momentum is not None
     assert before.momentum.sensor_noise is not None
+    followed = before
+    if not system.trackers[0].learns and leaves_more(before):
+        progress("looking for parameters that drift", FITTED_ONCE)
+        followed, _ = _session(following(system), blocks, source, prior)
+    drifts = explained_by_drifts(followed)
+    if drifts:
+        return _drifting(
+            Case(source, before, before.momentum.sensor_noise, record.segments(), [], prior), followed, drifts, mistakes
+        )
     # Windows that nothing explained are a diagnosis's own affair; a change of parameters is not.
     changes = [event for event in before.events if event.parameters]
     if changes:
@@ -262,6 +286,37 @@ def diagnose(
         estimator_before=before,
         estimator_after=estimator_after,
         unexplained=unexplained,
+    )
+
+
+def _drifting(case: Case, followed: Estimator, drifts: tuple[Drift, ...], mistakes: tuple[Mistake, ...]) -> Diagnosis:
+    """What a session that follows drifts has found; residuals after are of its rows, with the drift taken off."""
+    before = case.session
+    attempt = Attempt(case, before.system, candidates=())
+    bare, now = attempt.state([]), Evaluation(Statistics.of(followed), followed.estimate())
+    left = {row: each for row, each in now.residuals.items() if row in bare.fit.whitened}
+    part = Part(
+        {row: each.whitened for row, each in left.items() if each.whitened is not None},
+        {row: each.relative for row, each in left.items() if each.relative is not None},
+    )
+    return Diagnosis(
+        verdict="named",
+        partial=False,
+        mistakes=mistakes,
+        calibration=(),
+        findings=[],
+        late=[],
+        ranking=[],
+        described=attempt,
+        attempt=attempt,
+        steps=[],
+        chosen=[],
+        before=bare,
+        after=replace(bare, system=followed.system, fit=part, holdout=part),
+        estimator_before=before,
+        estimator_after=followed,
+        unexplained=None,
+        drifts=drifts,
     )
 
 

@@ -25,6 +25,7 @@ from sms_online.result import Finding, Parameter, Parameters
 from sms_online.session import Data, recorded_session
 from sms_online.stream import Block
 from sms_online.tables import Documented, html_table, text_table
+from sms_online.tracker_results import Drift
 from sms_online.trackers.interface import Prior
 from sms_online.truth import true_values
 from sms_online.verdict.trust import Residual, Residuals, Trust
@@ -79,7 +80,8 @@ class Diagnosis(Documented):
     """What a capture holds that its system file does not describe.
 
     verdict: "clean", "named" or "unexplained". summary: the same in a sentence. mistakes: of units, signs and wiring,
-    undone in what follows. effects: what was found. before, after:
+    undone in what follows. effects: what was found. drifts: parameters that drift, which a tracker of `system` follows;
+    no effects are searched then. before, after:
     fits of the system as described and with what was found. candidates: effects that were tried, the best first.
     system: with what was found and the parameters after as its fitted values, to estimate with, predict and simulate.
     trust: may the parameters after, and the system file, be trusted.
@@ -98,6 +100,7 @@ class Diagnosis(Documented):
     warnings: tuple[str, ...]
     search: Search = field(repr=False, compare=False)
     _document: Mapping[str, Any] = field(repr=False, compare=False)
+    drifts: tuple[Drift, ...] = ()
 
     def document(self) -> dict[str, Any]:
         """diagnosis.json as plain lists, dictionaries and numbers."""
@@ -179,6 +182,7 @@ def diagnose(
         warnings=tuple(document["warnings"]),
         search=found,
         _document=document,
+        drifts=found.drifts,
     )
 
 

@@ -12,6 +12,7 @@ from sms_online.description.schema import Effect
 from sms_online.diagnosis.attempt import Attempt, Part
 from sms_online.diagnosis.candidate import Finding
 from sms_online.diagnosis.diagnose import Diagnosis
+from sms_online.diagnosis.drifts import sentence, summary_of, trust_with
 from sms_online.diagnosis.hypothesis import LARGEST_SHARE_LEFT
 from sms_online.diagnosis.reported import Coefficients, of_constant, of_unknowns
 from sms_online.diagnosis.shape import slopes
@@ -65,6 +66,7 @@ def diagnosis_document(
             {**each.document(), "sentence": str(each), "next_step": each.advice} for each in diagnosis.calibration
         ],
         "effects": [_effect(diagnosis, finding) for finding in diagnosis.findings] + _by_comparison(diagnosis),
+        "drifts": [{**drift.document(), "sentence": sentence(drift)} for drift in diagnosis.drifts],
         "steps": [
             {"taken": step.taken, "effects": list(step.effects), "holdout": step.relative} for step in diagnosis.steps
         ],
@@ -135,6 +137,10 @@ def trust_of(diagnosis: Diagnosis, after: Evaluation | None = None) -> Trust:
     effects = [f"{effect['name']}@{effect['where']}" for effect in _named(diagnosis)]
     row = None if diagnosis.unexplained is None else diagnosis.unexplained.row
     rest = _after(diagnosis, after)
+    if diagnosis.drifts:
+        rest = trust_with(diagnosis.drifts, diagnosis.described.system, rest)
+        if not diagnosis.mistakes:
+            return rest
     if not diagnosis.mistakes and not effects and diagnosis.verdict == "named":
         off = tuple(Reason(f"{each}: beyond its tolerance", False, then=each.advice) for each in diagnosis.calibration)
         return rest if rest.level != "trust" else Trust("doubt", off)
@@ -158,13 +164,15 @@ def _whole(diagnosis: Diagnosis) -> str:
         if mistake.or_else:
             wrong[k] = f"{wrong[k][:-1]}, or {'; or '.join(mistake.or_else)}: these data cannot decide it."
     wrong += [f"The description is off beyond its tolerance: {each}." for each in diagnosis.calibration]
-    if wrong and diagnosis.verdict == "named" and not _named(diagnosis):
+    if wrong and diagnosis.verdict == "named" and not _named(diagnosis) and not diagnosis.drifts:
         return " ".join((*wrong, "With that undone nothing but noise is left."))
     return " ".join((*wrong, *(["With that undone:"] if wrong else []), _of_effects(diagnosis)))
 
 
 def _of_effects(diagnosis: Diagnosis) -> str:
     """What is missing in a sentence."""
+    if diagnosis.drifts:
+        return summary_of(diagnosis.drifts)
     if diagnosis.verdict == "clean":
         return "Nothing but noise is left: the model explains the capture."
     if diagnosis.verdict == "unexplained" and diagnosis.unexplained is None:

@@ -49,7 +49,8 @@ class EstimatorState(State):
 
     samples: received, over `duration` s from `first_time` on. pending_t (B,), pending (B, channels): samples that
     wait for their block to be whole. unbalanced: coordinates and torques that wait for the energy balance; segment: of
-    the last that it took. newest_energy_row: time, s. dropped_rows: of the energy balance, not finite.
+    the last that it took. newest_energy_row: time, s. dropped_rows: of the energy balance, not finite. through: time of
+    the newest sample that has passed the stages, s.
     """
 
     pending_t: Array
@@ -61,6 +62,7 @@ class EstimatorState(State):
     segment: int = -1
     newest_energy_row: float = -np.inf
     dropped_rows: int = 0
+    through: float = -np.inf
 
 
 class Estimator(Stage):
@@ -329,6 +331,8 @@ class Estimator(Stage):
             self._condition(piece)
         if self.smoother is not None:
             self.smoother.work(self._balanced)
+        if t.size:
+            self.state.through = float(t[-1])
         for observer in self.observers:
             observer.block_through()
 

@@ -330,7 +330,8 @@ class Momentum(Stage):
             if noise is not None and not noise.exact:
                 self.test.push(rows, detector.known.factor, COLOURED_NOISE if noise.coloured else 1.0)
             if not detector.push(rows, self.misfit):
-                self.bank.hold(self._for_trackers(rows))
+                onset = self.state.start_time + detector.onset / self._sample_rate - self._window
+                self.bank.hold(self._for_trackers(rows), onset)
                 continue
             t = self.state.start_time + rows.end / self._sample_rate
             M = rows.Y.shape[0]
@@ -452,4 +453,5 @@ class Momentum(Stage):
             # Rounding moves as it likes where samples are exact.
             suspected=None if noise is None or noise.exact else self.bank.suspected,
             shifts=tuple(self.changes.shifts),
+            unwatched=self.bank.unwatched,
         )

@@ -88,8 +88,8 @@ class MomentumStatistics:
     misfit. started: weights are known. tested: there are rows enough for a test of what they leave. alarm: type of the
     rows that the sequential test finds more than noise in. scale_free: what gives the estimate where rows leave more
     than noise. latency: source that is late against the others, if one is. coloured: see
-    `SensorNoise`. suspected: a change of parameters that the judged tracker does not follow. shifts: of the devices'
-    clocks.
+    `SensorNoise`. suspected: a change of parameters that the judged tracker does not follow; unwatched: none is looked
+    for. shifts: of the devices' clocks.
     """
 
     trackers: tuple[Reading, ...]
@@ -105,6 +105,7 @@ class MomentumStatistics:
     coloured: dict[str, float]
     suspected: Suspected | None
     shifts: tuple[ClockShift, ...]
+    unwatched: bool
 
 
 @dataclass(frozen=True)
@@ -136,8 +137,11 @@ class Statistics:
     smoother: SmootherStatistics | None
 
     @staticmethod
-    def of(estimator: Estimator) -> Statistics:
-        """The statistics of now; nothing in them changes as the session goes on."""
+    def of(estimator: Estimator, at: float | None = None) -> Statistics:
+        """The statistics of now; nothing in them changes as the session goes on.
+
+        at: instant, s, that parameters which drift hold for; by default that of the newest sample.
+        """
         momentum, smoother = estimator.momentum, estimator.smoother
         return Statistics(
             setup=estimator.setup,
@@ -155,7 +159,7 @@ class Statistics:
             energy=snapshot(estimator.energy_tracker),
             shared=state_copy(estimator.shared_errors),
             joints=tuple(state_copy(estimator.joint_residuals)),
-            momentum=None if momentum is None else momentum.statistics(estimator.end),
+            momentum=None if momentum is None else momentum.statistics(estimator.end if at is None else at),
             smoother=None if smoother is None else smoother.known,
         )
 

@@ -77,11 +77,12 @@ class Suspected:
 class BankState(State):
     """reference (n,): parameters from which a drift counts, None where nothing has moved. held: rows since an alarm.
 
-    asked: how often it was asked what that was.
+    since: s, when what it is of may have begun. asked: how often it was asked what that was.
     """
 
     reference: Array | None = None
     held: list[Rows] = msgspec.field(default_factory=list)
+    since: float = np.inf
     asked: int = 0
 
 
@@ -123,8 +124,8 @@ class TrackerBank(Stage):
         self._names = [p.name for p in parameters]
         # A judged tracker that lets nothing move is watched: rows that show a drift speak against it.
         judged = system.trackers[0]
-        still = judged.kind != "kalman" or judged.drift == "none"
-        self._watch = build_watch(tracked) if steady and still else None
+        self._still = judged.kind != "kalman" or judged.drift == "none"
+        self._watch = build_watch(tracked) if steady and self._still else None
         # By name, for each is saved as a stage within.
         for k, chosen in enumerate(self._chosen):
             if chosen.tracker is not None:
@@ -139,6 +140,11 @@ class TrackerBank(Stage):
     @property
     def _fed(self) -> list[Tracker]:
         return self.others if self._watch is None else [*self.others, self._watch]
+
+    @property
+    def unwatched(self) -> bool:
+        """Whether the judged tracker lets nothing move, and no drift is watched for either."""
+        return self._watch is None and self._still
 
     @property
     def suspected(self) -> Suspected | None:
@@ -170,10 +176,10 @@ class TrackerBank(Stage):
                 tracker.state.quiet = quiet
             tracker.update(rows)
 
-    def hold(self, rows: Rows) -> None:
-        """Keep rows from behind an alarm until it is known what that was."""
+    def hold(self, rows: Rows, since: float) -> None:
+        """Keep rows from behind an alarm until it is known what that was; since: s, when that may have begun."""
         if self.learned is not None:
-            self.state.held = [*self.state.held, rows]
+            self.state.held, self.state.since = [*self.state.held, rows], since
 
     def drift_behind(self, change: Change) -> Ramp | bool:
         """The drift that a change is; whether that is still to be seen, where it is none so far."""
@@ -195,7 +201,7 @@ class TrackerBank(Stage):
 
     def release(self) -> None:
         """Forget the rows held back."""
-        self.state.held, self.state.asked = [], 0
+        self.state.held, self.state.since, self.state.asked = [], np.inf, 0
 
     def hold_until(self, t: float) -> None:
         """Have estimates of parameters that drift hold at t, s."""
@@ -259,7 +265,12 @@ class TrackerBank(Stage):
         tracker = chosen.tracker
         if tracker is None:
             return Reading(chosen.choice.label, own, own.rows / self._rows_per_second)
-        estimate = tracker.estimate_at(t) if isinstance(tracker, LearnedTrend) else tracker.estimate()
+        if isinstance(tracker, LearnedTrend):
+            # Rows since an alarm wait until they show what it was; a drift may have ended with it, or grown.
+            since = self.state.since if tracker is self.learned else np.inf
+            estimate = tracker.estimate_at(t, max(0.0, t - since))
+        else:
+            estimate = tracker.estimate()
         if estimate.scale is None and estimate.rows > 0.0:
             # Noise in the columns pulls every weighted mean of the rows alike; the scatter of that grows as rows fade.
             shift, covariance = bias.correction(estimate.determined)

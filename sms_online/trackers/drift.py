@@ -360,8 +360,11 @@ class LearnedTrend(Tracker):
         """π at the instant that estimates hold for; leaves the state as it is."""
         return self.estimate_at(-np.inf)
 
-    def estimate_at(self, t: float) -> Estimate:
-        """The same at a later instant, s."""
+    def estimate_at(self, t: float, unsure: float = 0.0) -> Estimate:
+        """The same at a later instant, s.
+
+        unsure: s before it since when rates that were learned may be others, by their own size.
+        """
         state = self.state.now.absorbed(self._open())
         solution = solve(state.factor)
         ahead = max(self.instant, t) - self.state.step * STEP
@@ -371,9 +374,14 @@ class LearnedTrend(Tracker):
             to_now[column, place] = reach(decay, ahead)
             determined[column] &= bool(solution.determined[place])
         root = to_now @ solution.root
+        covariance = root @ root.T
+        for each in self.state.moving if unsure > 0.0 else ():
+            if each.learned:
+                columns = list(each.columns)
+                covariance[np.ix_(columns, columns)] += np.outer(each.rates, each.rates) * unsure**2
         return Estimate(
             pi=to_now @ solution.pi,
-            covariance=masked_covariance(root @ root.T, determined),
+            covariance=masked_covariance(covariance, determined),
             covariance_robust=None,
             determined=determined,
             condition_number=solution.condition_number,

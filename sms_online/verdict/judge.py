@@ -35,7 +35,7 @@ def judge(evidence: Evidence) -> Trust:
         rest = _cautions(replace(evidence, troubles=()))
         return Trust("not yet", (*first, reasons.unconverged(evidence.unconverged), *samples, *rest))
     cautions = (*samples, *colour, *reasons.moving(evidence.suspected), *_cautions(evidence))
-    cautions = cautions or tuple(reasons.inconsistent(evidence.consistency))
+    cautions = (*(cautions or reasons.inconsistent(evidence.consistency)), *reasons.unwatched(evidence.unwatched))
     return Trust("doubt", cautions) if cautions else Trust("trust", tuple(reasons.grounds(evidence)))
 
 

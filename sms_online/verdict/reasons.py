@@ -26,6 +26,8 @@ LARGEST_LOSS = 0.01
 MANY_OUTLIERS = 1e-3
 # Further from the nearest physically consistent parameters than this, in standard deviations, noise brings no estimate.
 LARGEST_DISTANCE = 3.0
+# A session of so many seconds in which no drift is watched for may hold one that matters.
+LONGEST_UNWATCHED = 60.0
 # Names in a sentence; the others are counted.
 NAMED = 2
 # Without a spring, a mass or a rigidity nobody simulates the arm: green needs them, by the ends of their names.
@@ -301,6 +303,14 @@ def moving(suspected: Suspected | None) -> list[Reason]:
     text = f"{names} seems to move since {suspected.since:.1f} s, and is not followed"
     where = place_of(suspected.parameters[0])
     return [Reason(text, False, where, "may move", then=GO_ON if suspected.learning else FOLLOW)]
+
+
+def unwatched(duration: float) -> list[Reason]:
+    """A long session, of a duration in s, in which a drift would show nowhere."""
+    if duration < LONGEST_UNWATCHED:
+        return []
+    text = f"a parameter may have drifted in {duration:.0f} s: clocks of several devices wander as drifts do"
+    return [Reason(text, False, then=FOLLOW)]
 
 
 def inconsistent(consistency: Consistency | None) -> list[Reason]:

@@ -15,6 +15,8 @@ from sms_tools.found_effects import cells_of
 ONLINE_NAME = "adopted.toml"
 # The table of fitted values, or that of one of them.
 FITTED = re.compile(r"\s*\[fitted[\].]")
+# A table of a tracker.
+TRACKER = re.compile(r"\s*\[\[?tracker[\].]")
 
 
 def adopted_text(described: str, before: System, after: System, remarks: Mapping[str, str]) -> str:
@@ -48,6 +50,10 @@ def adopted_text(described: str, before: System, after: System, remarks: Mapping
                 lines.append(f"knots = [{', '.join(f'{knot:.9g}' for knot in effect.knots)}]")
             if remark := remarks.get(f"{effect.name}@{effect.where}"):
                 lines.append(f"# found: {remark}")
+    if after.trackers != before.trackers:
+        _remove_tables(lines, TRACKER)
+        (learned,) = after.trackers
+        lines += ["", "[tracker] # of parameters that drift", f'kind = "{learned.kind}"', f'drift = "{learned.drift}"']
     if after.fitted != before.fitted:
         _state_fitted(lines, after.fitted)
     return "\n".join(lines) + "\n"
@@ -68,13 +74,18 @@ def _state(lines: list[str], table: str, statement: str) -> None:
 
 def _state_fitted(lines: list[str], fitted: Mapping[str, Fitted]) -> None:
     """Put a table [fitted] at the end of TOML lines, in place of what they hold of one."""
-    while (begin := next((k for k, line in enumerate(lines) if FITTED.match(line)), None)) is not None:
-        end = next((k for k in range(begin + 1, len(lines)) if lines[k].lstrip().startswith("[")), len(lines))
-        del lines[begin:end]
+    _remove_tables(lines, FITTED)
     lines += ["", "[fitted] # nominal values from here on; with --prior, priors of these standard deviations"]
     for name, found in fitted.items():
         std = "" if found.std is None else f", std = {found.std:.3g}"
         lines.append(f'"{name}" = {{ value = {found.value:.9g}{std} }}')
+
+
+def _remove_tables(lines: list[str], heading: re.Pattern[str]) -> None:
+    """Remove the tables of TOML lines whose headings match."""
+    while (begin := next((k for k, line in enumerate(lines) if heading.match(line)), None)) is not None:
+        end = next((k for k in range(begin + 1, len(lines)) if lines[k].lstrip().startswith("[")), len(lines))
+        del lines[begin:end]
 
 
 def remarks(effects: Iterable[Mapping[str, Any]]) -> dict[str, str]:

@@ -157,10 +157,15 @@ def event_line(event: Document) -> str:
 def drift_lines(document: Document) -> list[str]:
     """Parameters that the judged tracker has found to drift, a line each."""
     drifts = [drift for tracker in document.get("trackers", []) if tracker["judged"] for drift in tracker["drifts"]]
-    return [
-        f"drift since {d['since']:.1f} s: {d['parameter']} {d['rate']:+.4g} ± {d['rate_std']:.2g} {d['unit']} per s"
-        for d in drifts
-    ]
+    return [_drift_line(d) for d in drifts]
+
+
+def _drift_line(d: Document) -> str:
+    rate = f"{d['rate']:+.4g} ± {d['rate_std']:.2g} {d['unit']} per s"
+    if d["value_std"] is None:
+        return f"drift since {d['since']:.1f} s: {d['parameter']} {rate}"
+    value = formatter(d["value"], d["value_std"])(d["value"])
+    return f"drift since {d['since']:.1f} s: {d['parameter']} {rate}, {value} ± {d['value_std']:.2g} {d['unit']} now"
 
 
 def _calibration(document: Document) -> list[Calibration]:

@@ -10,6 +10,8 @@ from pathlib import Path
 from rich.table import Table
 
 from sms_adapters.files import write_text
+from sms_adapters.history_file import NAME as HISTORY
+from sms_adapters.history_file import write_history
 from sms_adapters.runs import NAME as RESULTS
 from sms_adapters.system_file import load_system
 from sms_online.description.given import given_system
@@ -47,7 +49,7 @@ def feed(session: Session, blocks: Iterable[Block], interruption: Interruption) 
 
 
 def conclude(args: argparse.Namespace, result: Result, directory: Path, interrupted: bool) -> int:
-    """Write results.json, print it for people or programs, and say how the session ended."""
+    """Write results.json and the history, print it for people or programs, and say how the session ended."""
     if interrupted:
         result = replace(result, warnings=(*result.warnings, "interrupted: this is what the samples until then say"))
     document = result.document()
@@ -63,6 +65,8 @@ def conclude(args: argparse.Namespace, result: Result, directory: Path, interrup
         show(console, *parts)
         raise
     show(console, *parts, f"results: {path}")
+    if result.history:
+        show(console, f"history: {write_history(directory / HISTORY, result.history)}")
     if args.json:
         print(result.to_json())
     if interrupted:

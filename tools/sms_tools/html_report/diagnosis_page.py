@@ -35,9 +35,8 @@ def write_diagnosis(
     """
     system = diagnosis.described.system
     before, after = (document[state]["parameters"] for state in ("before", "after"))
-    columns = (
-        {"before": (before, BEFORE), "after": (after, AFTER)} if document["effects"] else {"estimate": (after, AFTER)}
-    )
+    both = bool(document["effects"] or document["drifts"])
+    columns = {"before": (before, BEFORE), "after": (after, AFTER)} if both else {"estimate": (after, AFTER)}
     found = bool(document["effects"] or document["unexplained"])
     rows = diagnosis.attempt.rows
     return write_page(
@@ -56,7 +55,8 @@ def write_diagnosis(
         look_alikes=look_alikes,
         why=why,
         laws=law_charts(diagnosis),
-        residuals=residual_charts(diagnosis),
+        # Windows of a parameter that drifts are not drawn with one value of it.
+        residuals=[] if diagnosis.drifts else residual_charts(diagnosis),
         colors={"before": BEFORE, "after": AFTER},
         changed=diagnosis.after.system != diagnosis.before.system,
         candidates=_candidates(document, diagnosis),

@@ -11,6 +11,7 @@ from sms_online.model.parameters import Parameter
 from sms_tools.html_report.arm_drawing import arm_drawings
 from sms_tools.html_report.figures import Chart, Series, chart
 from sms_tools.html_report.history import Course
+from sms_tools.html_report.moved import moved_charts
 from sms_tools.html_report.pages import write_page
 from sms_tools.html_report.parameter_rows import parameter_rows, with_subscripts
 from sms_tools.report import METHODS, Document, drift_lines, event_line, tracker_facts, value_cell
@@ -43,6 +44,7 @@ def write_report(
         events=[*map(event_line, document["events"]), *drift_lines(document)],
         parameters=parameter_rows({"estimate": (document["parameters"], "blue")}, nominal),
         trackers=_trackers(document),
+        moved=moved_charts(document),
         convergence=_convergence(document, nominal, course),
         residual=_residual(course),
         episodes=[(episode["summary"], _evidence(episode)) for episode in document.get("diagnosis", [])],

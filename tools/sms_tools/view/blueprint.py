@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 import rerun as rr
@@ -12,6 +12,7 @@ from sms_tools.view import banner, number_log, style
 from sms_tools.view.arm_log import ARM, TIMELINE, TIP
 from sms_tools.view.number_log import ParameterLog
 from sms_tools.view.scene import Drawing, Scene
+from sms_tools.view.tracker_log import INNOVATIONS, MEMORY, TrackerLog
 
 # Plots show so much of the past, s: the whole of the example's motion, and of longer sessions what a person remembers;
 # and so much beyond now, where nothing is drawn yet and the legend hides nothing: of 400 pixels it takes 60 to 130.
@@ -35,6 +36,7 @@ OBLIQUE = np.array((0.35, -0.8, 0.5))
 def layout(
     scene: Scene,
     parameters: ParameterLog,
+    trackers: TrackerLog,
     first: Drawing,
     begin: float | None,
     live: bool = False,
@@ -42,8 +44,8 @@ def layout(
 ) -> rrb.Blueprint:
     """Layout for an arm that is first seen as the first picture of `first` shows it.
 
-    begin: s, where the plots begin while the session is shorter than their window, None from then on. live: with plots
-    of the source's latency and clocks. diagnosed: verdict and evidence are in front.
+    begin: s, where the plots begin while the session is shorter than their window, None from then on. trackers: curves
+    of several. live: with plots of the source's latency and clocks. diagnosed: verdict and evidence are in front.
     """
     plots = _Plots(begin)
     shown = rrb.TextLogColumns(
@@ -55,7 +57,10 @@ def layout(
     texts = rrb.Tabs(table, log, active_tab=int(diagnosed))
     left = rrb.Vertical(arm_view(scene, first), texts, row_shares=[11, 9])
     below = rrb.Tabs(plots.residual(), plots.evidence(), plots.health(live), active_tab=int(diagnosed))
-    right = rrb.Vertical(plots.parameters(parameters), below, row_shares=[7, 3])
+    above = plots.parameters(parameters)
+    if trackers.curves():
+        above = rrb.Tabs(above, plots.trackers(trackers), active_tab=0)
+    right = rrb.Vertical(above, below, row_shares=[7, 3])
     session = rrb.Horizontal(left, right, column_shares=[2, 3])
     return rrb.Blueprint(
         rrb.Vertical(_judgement(), session, row_shares=[BANNER, 1.0 - BANNER]),
@@ -144,17 +149,15 @@ class _Plots:
             y = None if group.half_range is None else (-MARGIN * group.half_range, MARGIN * group.half_range)
             contents = [f"{path}/deviation", f"{path}/two_sigma", f"{path}/events"]
             plots.setdefault(group.kind, []).append(self._plot(group.title[:1].upper() + group.title[1:], contents, y))
-        together = [plot for kind in plots.values() for plot in kind]
-        if len(together) <= MOST_PLOTS:
-            return rrb.Grid(*together, grid_columns=2)
-        tabs: list[tuple[list[str], list[rrb.TimeSeriesView]]] = []
-        for kind, members in plots.items():
-            if tabs and len(tabs[-1][1]) + len(members) <= MOST_PLOTS:
-                tabs[-1][0].append(kind)
-                tabs[-1][1].extend(members)
-            else:
-                tabs.append(([kind], members))
-        return rrb.Tabs(*(rrb.Grid(*shown, grid_columns=2, name=", ".join(kinds)) for kinds, shown in tabs))
+        return _in_tabs(plots, "Parameters")
+
+    def trackers(self, trackers: TrackerLog) -> rrb.Container:
+        """A plot for each parameter with the curves of all trackers; a click on a name in its legend hides one."""
+        plots = {
+            kind: [self._plot(title, [f"{entity}/**"]) for title, entity in curves]
+            for kind, curves in trackers.curves().items()
+        }
+        return _in_tabs(plots, "Trackers")
 
     def residual(self) -> rrb.Container:
         """What is not explained; red where it is too much."""
@@ -185,10 +188,27 @@ class _Plots:
         plots = [
             self._plot("Rate, samples/s", [f"{health}/rates/**"], legend=False),
             self._plot("Lost, dropped, bridged, counts", [f"{health}/counts/**"]),
+            self._plot("NIS, log10", [f"{INNOVATIONS}/**"]),
+            self._plot("Memory, s", [f"{MEMORY}/**"], legend=False),
         ]
         if live:
             plots += [
                 self._plot("Latency, ms", [f"{health}/latency/**"]),
                 self._plot("Clock offsets, ms", [f"{health}/clocks/**"]),
             ]
-        return rrb.Horizontal(*plots, name="Health")
+        return rrb.Grid(*plots, grid_columns=3 if live else len(plots), name="Health")
+
+
+def _in_tabs(plots: Mapping[str, list[rrb.TimeSeriesView]], name: str) -> rrb.Container:
+    """Plots by kind side by side; in tabs where there are many."""
+    together = [plot for kind in plots.values() for plot in kind]
+    if len(together) <= MOST_PLOTS:
+        return rrb.Grid(*together, grid_columns=2, name=name)
+    tabs: list[tuple[list[str], list[rrb.TimeSeriesView]]] = []
+    for kind, members in plots.items():
+        if tabs and len(tabs[-1][1]) + len(members) <= MOST_PLOTS:
+            tabs[-1][0].append(kind)
+            tabs[-1][1].extend(members)
+        else:
+            tabs.append(([kind], members))
+    return rrb.Tabs(*(rrb.Grid(*shown, grid_columns=2, name=", ".join(kinds)) for kinds, shown in tabs), name=name)

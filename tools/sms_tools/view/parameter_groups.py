@@ -73,7 +73,7 @@ def parameter_groups(
     for k, (parameter, reference) in enumerate(zip(parameters, references, strict=True)):
         true = reference is not None and reference.is_true
         unit = parameter.unit if true and reference is not None and reference.value == 0.0 else "%"
-        sets.setdefault((_kind(parameter), unit, true), []).append(k)
+        sets.setdefault((kind_of(parameter), unit, true), []).append(k)
     groups = []
     for (kind, unit, true), members in sets.items():
         # One name whether or not there is a truth, but two where only some have one.
@@ -100,7 +100,8 @@ def shortened(symbol: str) -> str:
     return symbol if len(symbol) <= LONGEST_LABEL else symbol[: LONGEST_LABEL - 1] + "…"
 
 
-def _kind(parameter: Parameter) -> str:
+def kind_of(parameter: Parameter) -> str:
+    """Kind of body, or effects, that a parameter belongs to."""
     if "@" in parameter.owner:
         return EFFECTS
     return KINDS.get(parameter.owner.split("_")[0], parameter.owner)

@@ -41,6 +41,7 @@ from sms_tools.view.residuals import RecentResidual
 from sms_tools.view.scene import Scene
 from sms_tools.view.sink import Sink
 from sms_tools.view.table import markdown_table
+from sms_tools.view.tracker_log import TrackerLog
 
 # The table, and residuals of all rows so far, which move slowly: s of the session.
 SLOW_INTERVAL = 1.0
@@ -92,6 +93,9 @@ class Recorder:
         stream = self._sink.stream
         self._numbers = NumberLog(stream)
         self._parameters = ParameterLog(self._numbers, self._groups())
+        chosen = self._now.statistics.setup.system.trackers
+        self._trackers = TrackerLog(self._numbers, [choice.label for choice in chosen])
+        self._trackers.describe(self._now.parameters)
         self._opened(self._sink.open(self._layout()))
         self._opened = None
         self._arm_log, self._banner = ArmLog(stream, self._scene), Banner(stream)
@@ -111,7 +115,7 @@ class Recorder:
 
     def _layout(self) -> rrb.Blueprint:
         diagnosed = self._diagnosed is not None
-        return layout(self._scene, self._parameters, self._first, self._begin, self._live, diagnosed)
+        return layout(self._scene, self._parameters, self._trackers, self._first, self._begin, self._live, diagnosed)
 
     def picture(self, picture: Picture) -> None:
         """Take in the samples and, where one comes with them, the estimator's state."""
@@ -179,8 +183,10 @@ class Recorder:
             self._circumstances = circumstances
             self._judge(t, last)
         converged = self._trust is not None and self._trust.level != "not yet"
+        self._trackers.describe(now.parameters)
         self._arrange(t, more, self._scale.follow(known, converged, last))
         self._parameters.add(known)
+        self._trackers.add(t, now)
         self._residual = self._recent.push(t, state, known.estimate)
         self._numbers.add(f"{RESIDUAL}/relative", t, self._residual)
         self._name_changes(known)

@@ -1,0 +1,78 @@
+"""Parameters that drift, as a hypothesis for what a capture holds: every one of them, by a tracker that learns drifts.
+
+A drift is no force, so it is compared with the effects as a whole: a session with the same description whose judged
+tracker learns drifts. Each parameter is tried there, and a body's inertial ones together, from all starts: a ramp must
+explain more than chance, more than any step, and more than a ramp of another. Where the session that follows what it
+has found leaves no more than noise, and no event, nothing else is missing; a lack of the model leaves more, whatever
+ramps it is taken for, and is searched among the effects.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from sms_online.description.schema import System, TrackerChoice
+from sms_online.evaluation import Evaluation
+from sms_online.pipeline.estimator import Estimator
+from sms_online.pipeline.statistics import Statistics
+from sms_online.tables import formatter
+from sms_online.tracker_results import Drift
+from sms_online.trust import Reason, Trust
+from sms_online.verdict.reasons import FOLLOW
+
+LEARNED = TrackerChoice(kind="kalman", drift="learned")
+
+
+def following(system: System) -> System:
+    """The system with a judged tracker that learns drifts; the same where it has one."""
+    return system if system.trackers[0].learns else system.model_copy(update={"trackers": (LEARNED,)})
+
+
+def leaves_more(session: Estimator) -> bool:
+    """Whether a session whose parameters stay shows more than noise, a change of parameters, or one that may be."""
+    momentum = session.momentum
+    if momentum is None or not session.by_momentum:
+        return False
+    return momentum.test.alarm is not None or momentum.misfit or bool(session.events) or bool(momentum.bank.suspected)
+
+
+def explained_by_drifts(session: Estimator) -> tuple[Drift, ...]:
+    """The drifts that a session follows; none where its rows hold more than those and noise."""
+    if session.momentum is None or not session.by_momentum or session.events:
+        return ()
+    (judged, *_) = Evaluation(Statistics.of(session), session.estimate()).trackers
+    nis = judged.consistency
+    if session.momentum.test.alarm is not None or session.momentum.misfit or nis.nis is None or nis.nis > nis.upper:
+        return ()
+    return judged.drifts
+
+
+def sentence(drift: Drift) -> str:
+    """A drift in words: parameter, since when, rate and value now."""
+    value = formatter(drift.value, drift.value_std)(drift.value)
+    return (
+        f"{drift.parameter} drifts since {drift.since:.1f} s by {drift.rate:.4g} ± {drift.std:.2g} {drift.unit} per s, "
+        f"and is {value} ± {drift.value_std:.2g} {drift.unit} at the end"
+    )
+
+
+def summary_of(drifts: Sequence[Drift]) -> str:
+    """What a capture with these drifts holds, in a sentence."""
+    each = "; ".join(map(sentence, drifts))
+    return f"{each[:1].upper()}{each[1:]}. With that followed nothing but noise is left."
+
+
+def trust_with(drifts: Sequence[Drift], before: System, after: Trust) -> Trust:
+    """The judgement of a capture with drifts: of a system whose tracker follows them, as of the session.
+
+    before: as described. after: of the session that follows them.
+    """
+    if before.trackers[0].learns:
+        return after
+    names = ", ".join(drift.parameter for drift in drifts)
+    more = " but for what follows" if after.level == "doubt" else ""
+    trusted = "" if after.grave or after.level == "not yet" else f"; trust the parameters of one that does{more}"
+    text = f"the system file's tracker does not follow {names}{trusted}"
+    places = tuple(dict.fromkeys(drift.parameter.split(".")[0] for drift in drifts))
+    found = Reason(text, after.grave, places, "drifts", then=FOLLOW)
+    return Trust("doubt", (found, *(after.grounds if after.level != "trust" else ())), grave=after.grave)

@@ -1,0 +1,105 @@
+"""A drift as a hypothesis of the diagnosis: named with its rate, beside effects and steps, which stay what they are."""
+
+from __future__ import annotations
+
+import json
+import tomllib
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import sms_online as sms
+from sms_online.errors import InputError
+from sms_online.verdict.reasons import FOLLOW
+from sms_tools.cli import main
+from tests.axis import AXIS, DAMPING, INERTIA, axis_block
+
+BEGIN, SHARE, SECONDS = 6.0, 0.001, 24.0  # s, of the inertia that is lost in a second, s
+RATE = -SHARE * INERTIA
+LEARNED = "kalman:drift=learned"
+
+
+def system(more: str = "") -> sms.System:
+    return sms.load_system(tomllib.loads(AXIS + more))
+
+
+def capture(lost: np.ndarray, seed: int = 3) -> sms.Capture:
+    """The axis along two sines, of whose inertia a share (N,) is lost, with sensors' noise."""
+    t = np.arange(lost.size) / 200.0
+    q = np.sin(2 * t) + 0.3 * np.sin(5 * t)
+    rate = 2 * np.cos(2 * t) + 1.5 * np.cos(5 * t)
+    torque = np.gradient(INERTIA * (1.0 - lost) * rate, t, edge_order=2) + DAMPING * rate
+    noise = np.random.default_rng(seed).standard_normal((2, t.size))
+    return sms.Capture.from_arrays(t, {"force_1": torque + 0.01 * noise[0], "q_1": q + 1e-4 * noise[1]})
+
+
+@pytest.fixture(scope="module")
+def drifting() -> sms.Capture:
+    t = np.arange(round(200 * SECONDS)) / 200.0
+    return capture(SHARE * np.maximum(0.0, t - BEGIN))
+
+
+@pytest.fixture(scope="module")
+def found(drifting: sms.Capture) -> sms.Diagnosis:
+    return sms.diagnose(system(), drifting)
+
+
+def test_a_drift_is_named_with_rate_and_value(found: sms.Diagnosis) -> None:
+    assert found.verdict == "named"
+    assert found.effects == ()
+    (drift,) = found.drifts
+    assert drift.parameter == "link_1.inertia"
+    assert drift.since == pytest.approx(BEGIN, abs=2.0)
+    assert drift.rate == pytest.approx(RATE, abs=4.0 * drift.std)
+    assert drift.std < 0.2 * abs(RATE)
+    assert drift.value == pytest.approx(INERTIA + RATE * (SECONDS - BEGIN), abs=4.0 * drift.value_std)
+    assert found.summary.startswith("Link_1.inertia drifts since")
+    assert "nothing but noise is left" in found.summary
+
+
+def test_the_system_that_was_found_follows_the_drift(found: sms.Diagnosis, drifting: sms.Capture) -> None:
+    assert (found.trust.level, found.trust.grave) == ("doubt", False)
+    assert found.trust.grounds[0].then == FOLLOW
+    result = sms.estimate(found.system, drifting)
+    assert result.trust.level == "trust"
+    assert [drift.parameter for drift in result.drifts] == ["link_1.inertia"]
+
+
+def test_a_tracker_that_follows_it_already_is_trusted(drifting: sms.Capture) -> None:
+    again = sms.diagnose(system('[tracker]\nkind = "kalman"\ndrift = "learned"\n'), drifting)
+    assert [drift.parameter for drift in again.drifts] == ["link_1.inertia"]
+    assert again.trust.level == "trust"
+
+
+@pytest.mark.parametrize("seed", [3, 4])
+def test_a_steady_axis_has_no_drift(seed: int) -> None:
+    found = sms.diagnose(system(), capture(np.zeros(2400), seed))
+    assert (found.verdict, found.drifts) == ("clean", ())
+
+
+def test_undeclared_friction_stays_a_missing_effect() -> None:
+    block = axis_block(coulomb=0.05)
+    values = dict(zip(block.channels, block.values.T, strict=True))
+    found = sms.diagnose(system(), sms.Capture.from_arrays(block.t, values))
+    assert found.drifts == ()
+    assert [effect.name for effect in found.effects] == ["coulomb_friction"]
+
+
+def test_a_step_stays_an_event() -> None:
+    t = np.arange(3200) / 200.0
+    with pytest.raises(InputError, match="an event"):
+        sms.diagnose(system(), capture(np.where(t < 8.0, 0.0, 0.2)))
+
+
+def test_the_command_writes_a_system_file_that_follows(tmp_path: Path, drifting: sms.Capture) -> None:
+    (tmp_path / "axis.toml").write_text(AXIS, encoding="utf-8")
+    sms.write_capture(drifting, tmp_path / "run.csv")
+    options = ["--system", str(tmp_path / "axis.toml"), "--out", str(tmp_path / "found"), "--rerun", "off"]
+    assert main(["diagnose", str(tmp_path / "run.csv"), *options]) == 0
+    document = json.loads((tmp_path / "found" / "diagnosis.json").read_text(encoding="utf-8"))
+    assert [drift["parameter"] for drift in document["drifts"]] == ["link_1.inertia"]
+    assert "link_1.inertia drifts since" in document["drifts"][0]["sentence"]
+    assert sms.load_system(tmp_path / "found" / "system.toml").trackers[0].learns
+    page = (tmp_path / "found" / "diagnosis.html").read_text(encoding="utf-8")
+    assert "drifts since" in page
