@@ -42,7 +42,7 @@ def released(estimate: Estimate, nuisances: Sequence[Nuisance], squares: Array) 
 
     squares (n, n): covariance by least squares. What corrections for noise add to it is no information. That of a
     tolerance on a nuisance ν is replaced by h / tolerance², with h = (1 + NORMAL² / TAIL) / (1 + (ν / tolerance)² /
-    TAIL), see `release_gain`. Those of torques keep theirs.
+    TAIL), see `release_gain`. Those of torques keep theirs. What a tolerance no longer asks for is no residual either.
     """
     m = len(nuisances)
     tolerance = np.array([each.tolerance for each in nuisances])
@@ -65,4 +65,5 @@ def released(estimate: Estimate, nuisances: Sequence[Nuisance], squares: Array) 
         if np.max(np.abs(weight - before)) < SAME:
             break
     covariance = estimate.covariance + C @ gain @ C.T
-    return replace(estimate, pi=estimate.pi + C @ (gain @ start), covariance=covariance)
+    rss = max(0.0, estimate.rss - float(start @ gain @ start))
+    return replace(estimate, pi=estimate.pi + C @ (gain @ start), covariance=covariance, rss=rss)
