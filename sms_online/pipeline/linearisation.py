@@ -31,7 +31,9 @@ CERTAIN = 3.0
 # Nothing that is later than this, s, is so by its clock alone.
 LATEST = 0.02
 # Time that samples are remembered, s.
-REMEMBERED = 16.0
+REMEMBERED = 30.0
+# What moves with geometry that stays: one without the other would be far from every description that fits.
+COUPLED = ("base_angle",)
 # Steps at each look.
 STEPS = 4
 
@@ -61,7 +63,8 @@ class Linearisation(Stage):
         families = position_families(sensing, sensing.model.system.tolerances)
         clocks = np.array([each.name == "clock" for each in nuisances], dtype=np.bool_)
         self._largest = np.where(clocks, LATEST, np.inf)
-        self._movable = np.arange(len(nuisances)) < sum(len(each.nuisances) for each in families)
+        coupled = np.array([each.name in COUPLED for each in nuisances], dtype=np.bool_)
+        self._movable = (np.arange(len(nuisances)) < sum(len(each.nuisances) for each in families)) & ~coupled
         self._linear = np.array([getattr(LINEAR, each.name) or 0.0 for each in nuisances], dtype=np.float64)
         self.state = LinearisationState(np.zeros(len(nuisances)), first, remembers=bool(self._movable.any()))
         self._correction = self._new_correction()
@@ -100,12 +103,12 @@ class Linearisation(Stage):
         for piece in self.state.samples:
             yield from self._correction.push(piece)
 
-    def looks(self, windows: int) -> bool:
-        """Whether to look at the estimate of so many windows."""
+    def looks(self, windows: int, last: bool) -> bool:
+        """Whether to look at the estimate of so many windows; last: no more samples come."""
         now = self.state
         if not now.remembers:
             return False
-        if windows >= now.due:
+        if last or windows >= now.due:
             now.due, now.steps = 2 * now.due, STEPS
             return True
         return False

@@ -277,18 +277,20 @@ class Momentum(Stage):
         for each in waiting:
             for corrected in self.linearisation.push(each):
                 self._advance(corrected, self.state.sensor_noise)
-            self._relinearise(self.state.sensor_noise)
+            self._relinearise(self.state.sensor_noise, last=False)
 
-    def _relinearise(self, noise: SensorNoise) -> None:
+    def _relinearise(self, noise: SensorNoise, last: bool) -> None:
         """Now and then, where the estimate is far from the point that rows are linear about: go there."""
         if self.changes.events:
             self.linearisation.forget()
-        if not self.started or not self.linearisation.looks(self.fit.plain.windows):
+        if not self.started or not self.linearisation.looks(self.fit.plain.windows, last):
             return
         while self.linearisation.moves(self._joint()):
             self._begin_anew(self._solved()[len(self.nuisances) :], noise)
             for piece in self.linearisation.again():
                 self._advance(piece, noise)
+            if last:
+                self._end_segment(noise)
 
     def _begin_anew(self, weights: Array, noise: SensorNoise) -> None:
         """Forget all rows, and begin with weights β (n,) that are known."""
@@ -303,14 +305,17 @@ class Momentum(Stage):
     def _advance(self, piece: GridSamples, noise: SensorNoise) -> None:
         if piece.segment != self.state.segment:
             if self.state.segment >= 0:
-                self._absorb(self.fit.end_segment(noise))
-                self._decide(noise, last=True)
+                self._end_segment(noise)
             self._balance.begin_segment()
             self.state.segment = piece.segment
         self.changes.keep(piece)
         self.bank.hold_until(self.state.start_time + int(piece.index[-1]) / self._sample_rate)
         self._process(piece, noise)
         self._decide(noise, last=False)
+
+    def _end_segment(self, noise: SensorNoise) -> None:
+        self._absorb(self.fit.end_segment(noise))
+        self._decide(noise, last=True)
 
     def _process(self, piece: GridSamples, noise: SensorNoise) -> None:
         copies = self._copies(piece.values, noise)
@@ -360,8 +365,8 @@ class Momentum(Stage):
         if self.state.sensor_noise is None and self.state.waiting and self._estimate.ready:
             self.state.sensor_noise = self._estimate.noise(periods)
         if self.state.sensor_noise is not None:
-            self._absorb(self.fit.end_segment(self.state.sensor_noise))
-            self._decide(self.state.sensor_noise, last=True)
+            self._end_segment(self.state.sensor_noise)
+            self._relinearise(self.state.sensor_noise, last=True)
             adoption = self.changes.abandon(self.state.start_time)
             if adoption is not None:
                 self._adopt(adoption, self.state.sensor_noise)
