@@ -55,7 +55,7 @@ def released(estimate: Estimate, nuisances: Sequence[Nuisance], squares: Array) 
     unit = tolerance[known] * (1.0 if estimate.scale is None else estimate.scale)
     C, start = squares[:, known] / unit, estimate.pi[known] / unit
     block = C[known] / unit[:, None]
-    names = np.array([nuisances[k].name for k in known])
+    names = np.array([nuisances[k].name for k in known.tolist()])
     # What is wrong in one kind alone may look like a little of many: such are the minima to begin from.
     begun = [start, *(_value(start, block, np.where(names == name, LEAST, 1.0))[0] for name in dict.fromkeys(names))]
     _, gain = min((_minimum(start, block, value) for value in begun), key=itemgetter(0))

@@ -26,8 +26,9 @@ from sms_online.trackers.interface import Estimate
 
 # A nuisance is linear up to its tolerance by default: beyond first order 50 µs of a motion at 20 rad/s are a millionth.
 LINEAR = Tolerances()
-# It moves the point from so many of its standard deviations on.
-CERTAIN = 3.0
+# It moves the point from so many of its standard deviations on; once that has moved, a step goes on while it is larger
+# than this share of either.
+CERTAIN, CONVERGED = 3.0, 0.2
 # Nothing that is later than this, s, is so by its clock alone.
 LATEST = 0.02
 # Time that samples are remembered, s.
@@ -119,7 +120,8 @@ class Linearisation(Stage):
         value, std = estimate.pi[:m], np.sqrt(np.diag(estimate.covariance)[:m])
         known = self._movable & estimate.determined[:m] & (np.abs(value) < self._largest)
         by = np.where(known, np.abs(value - now.point), 0.0)
-        if not now.steps or not np.any((by > self._linear) & (by > CERTAIN * std)):
+        share = CONVERGED if now.point.any() else 1.0
+        if not now.steps or not np.any((by > share * self._linear) & (by > share * CERTAIN * std)):
             return False
         now.steps -= 1
         now.point = np.where(known, value, now.point)
