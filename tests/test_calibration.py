@@ -18,6 +18,7 @@ from sms_online.evaluation import Evaluation
 from sms_online.pipeline.estimator import Estimator
 from sms_online.pipeline.events import Event
 from sms_online.pipeline.statistics import Statistics
+from sms_online.session import Session
 from sms_online.stream import Array, Block
 from sms_online.trackers.interface import Rows
 from sms_online.trackers.square_root import session_tracker
@@ -58,17 +59,24 @@ def exact() -> Block:
     return Block(t, blocks[0].channels, values)
 
 
-def evaluated(exact: Block, tolerances: Tolerances, changed: dict[str, Array] | None = None) -> Evaluation:
-    """Of the samples with white noise of 1e-4 on positions and 0.01 N m on torques, seed 3."""
-    random = np.random.default_rng(3)
+def noisy(exact: Block, changed: dict[str, Array] | None = None, seed: int = 3) -> Block:
+    """The samples with white noise of 1e-4 on positions and 0.01 N m on torques."""
+    random = np.random.default_rng(seed)
     values = exact.values.copy()
     for name, column in (changed or {}).items():
         values[:, exact.channels.index(name)] = column
     torque = [name.startswith("tau") for name in exact.channels]
     values += np.where(torque, 1e-2, 1e-4) * random.standard_normal(values.shape)
+    return Block(exact.t, exact.channels, values)
+
+
+def evaluated(
+    exact: Block, tolerances: Tolerances, changed: dict[str, Array] | None = None, seed: int = 3
+) -> Evaluation:
+    """Of noisy samples."""
     system = load_system("paper-planar").model_copy(update={"tolerances": tolerances})
     estimator = Estimator(system, exact.channels, "test")
-    estimator.push(Block(exact.t, exact.channels, values))
+    estimator.push(noisy(exact, changed, seed))
     estimator.finish()
     return Evaluation(Statistics.of(estimator))
 
@@ -101,6 +109,52 @@ def test_a_late_camera_within_tolerance_is_said_and_corrected(exact: Block) -> N
         assert clock.std < 2e-5
         assert not clock.beyond
         assert str(clock).endswith("µs late")
+
+
+def test_a_camera_milliseconds_late_is_said_and_corrected(exact: Block) -> None:
+    """By 4 ms: rows that are linear about no lateness at all say 2.2 ms."""
+    evaluation = evaluated(exact, Tolerances(), late(exact, 4e-3))
+    assert np.abs(off(evaluation)).max() < 4.0
+    for where in ("base", "markers"):
+        clock = of(evaluation, "clock", where)
+        assert clock.estimate == pytest.approx(4e-3, abs=4.0 * clock.std)
+        assert clock.std < 2e-5
+
+
+def test_a_tracked_point_millimetres_off_is_corrected(exact: Block) -> None:
+    """By 5 mm along both axes."""
+    theta, x, y = (exact.values[:, exact.channels.index(name)] for name in ("theta_0", "r_S_x", "r_S_y"))
+    by = 5e-3 * np.array([np.cos(theta) - np.sin(theta), np.sin(theta) + np.cos(theta)])
+    evaluation = evaluated(exact, Tolerances(), {"r_S_x": x + by[0], "r_S_y": y + by[1]})
+    assert np.abs(off(evaluation)).max() < 4.0
+    found = [each for each in evaluation.calibration if each.name == "tracked_point"]
+    assert len(found) == 2
+    for each in found:
+        assert each.estimate == pytest.approx(5e-3, abs=4.0 * each.std)
+
+
+def test_a_saved_session_goes_on_where_rows_are_linear(exact: Block) -> None:
+    """A camera 4 ms late, restored after its rows were made anew and while more of them may be."""
+    system = load_system("paper-planar").model_copy(update={"tolerances": Tolerances()})
+    block = noisy(exact, late(exact, 4e-3))
+    whole, session = (Session(system, block.channels) for _ in range(2))
+    whole.update(block)
+    for piece in block.pieces(2500):
+        session.update(piece)
+        if session.estimator.samples > 4000:
+            session = Session.restore(session.save())
+    for each in (whole, session):
+        each.finish()
+    np.testing.assert_array_equal(session.estimator.estimate().joint, whole.estimator.estimate().joint)
+
+
+def test_noise_determines_no_unit_of_length(exact: Block) -> None:
+    """Lengths, scale of the camera and masses together: only tolerances say anything of these."""
+    stds = [
+        [of(evaluation, "camera_scale", "base and markers").std, of(evaluation, "length", "link_1").std]
+        for evaluation in (evaluated(exact, Tolerances(), seed=seed) for seed in (3, 4))
+    ]
+    np.testing.assert_allclose(stds[0], stds[1], rtol=0.05)
 
 
 def test_a_change_beside_a_clock_that_may_have_moved_is_in_doubt(exact: Block) -> None:

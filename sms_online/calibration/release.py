@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from operator import itemgetter
 
 import numpy as np
 
@@ -42,27 +43,43 @@ def released(estimate: Estimate, nuisances: Sequence[Nuisance], squares: Array) 
 
     squares (n, n): covariance by least squares. What corrections for noise add to it is no information. That of a
     tolerance on a nuisance ν is replaced by h / tolerance², with h = (1 + NORMAL² / TAIL) / (1 + (ν / tolerance)² /
-    TAIL), see `release_gain`. Those of torques keep theirs.
+    TAIL), see `release_gain`. Those of torques keep theirs. What a tolerance no longer asks for is no residual either.
     """
     m = len(nuisances)
     tolerance = np.array([each.tolerance for each in nuisances])
     may = np.array([np.isfinite(each.tolerance) and each.may_give_way for each in nuisances], dtype=np.bool_)
     known = np.flatnonzero(may & estimate.determined[:m])
-    far = known[np.abs(estimate.pi[known]) > NORMAL * tolerance[known]]
-    if not far.size:
+    if not np.any(np.abs(estimate.pi[known]) > NORMAL * tolerance[known]):
         return estimate
     # Beside a prior all rows were weighed with one factor, these among them.
-    unit = tolerance[far] * (1.0 if estimate.scale is None else estimate.scale)
-    C, start = squares[:, far] / unit, estimate.pi[far] / unit
-    block = C[far] / unit[:, None]
-    value, weight = start, np.ones(far.size)
-    gain = np.zeros((far.size, far.size))
+    unit = tolerance[known] * (1.0 if estimate.scale is None else estimate.scale)
+    C, start = squares[:, known] / unit, estimate.pi[known] / unit
+    block = C[known] / unit[:, None]
+    names = np.array([nuisances[k].name for k in known.tolist()])
+    # What is wrong in one kind alone may look like a little of many: such are the minima to begin from.
+    begun = [start, *(_value(start, block, np.where(names == name, LEAST, 1.0))[0] for name in dict.fromkeys(names))]
+    _, gain = min((_minimum(start, block, value) for value in begun), key=itemgetter(0))
+    covariance = estimate.covariance + C @ gain @ C.T
+    rss = max(0.0, estimate.rss - float(start @ gain @ start))
+    return replace(estimate, pi=estimate.pi + C @ (gain @ start), covariance=covariance, rss=rss)
+
+
+def _value(start: Array, block: Array, weight: Array) -> tuple[Array, Array]:
+    """Nuisances (k,) where tolerances keep a share (k,) of their information, and the gain behind them."""
+    gain = release_gain(block, weight)
+    return start + block @ (gain @ start), gain
+
+
+def _minimum(start: Array, block: Array, value: Array) -> tuple[float, Array]:
+    """What rows and tolerances leave at the minimum nearest to a value (k,), and the gain that leads there."""
+    weight = np.ones(start.size)
     for _ in range(PASSES):
         before = weight
         weight = np.clip((1.0 + NORMAL**2 / TAIL) / (1.0 + value**2 / TAIL), LEAST, 1.0)
-        gain = release_gain(block, weight)
-        value = start + block @ (gain @ start)
+        value, gain = _value(start, block, weight)
         if np.max(np.abs(weight - before)) < SAME:
             break
-    covariance = estimate.covariance + C @ gain @ C.T
-    return replace(estimate, pi=estimate.pi + C @ (gain @ start), covariance=covariance)
+    drawn = gain @ start
+    beyond = np.maximum(0.0, value**2 - NORMAL**2)
+    tails = (TAIL + NORMAL**2) * np.log1p(beyond / (TAIL + NORMAL**2)) - beyond
+    return float(drawn @ block @ drawn + tails.sum()), gain

@@ -17,8 +17,8 @@ from sms_online.pipeline.estimator import Estimator
 from sms_online.pipeline.statistics import Statistics
 from sms_online.tables import formatter
 from sms_online.tracker_results import Drift
-from sms_online.trust import Reason, Trust
 from sms_online.verdict.reasons import FOLLOW
+from sms_online.verdict.trust import Reason, Trust
 
 LEARNED = TrackerChoice(kind="kalman", drift="learned")
 

@@ -150,7 +150,7 @@ class TorqueDelay(Convolved):
 
     def kernel(self, sample_rate: float) -> Array:
         """Weights (2M + 1,) of the samples about an instant in the value d later."""
-        return _ahead(self.coefficients["time"], sample_rate)
+        return ahead(self.coefficients["time"], sample_rate)
 
     @classmethod
     def improved(cls, given: Mapping[str, float], increments: Array) -> dict[str, float]:
@@ -179,10 +179,10 @@ class SensorLatency(Convolved):
 
     def kernel(self, sample_rate: float) -> Array:
         """Weights (2M + 1,) of the samples about an instant in the value d later."""
-        return _ahead(self.coefficients["time"], sample_rate)
+        return ahead(self.coefficients["time"], sample_rate)
 
 
-def _ahead(seconds: float, sample_rate: float) -> Array:
+def ahead(seconds: float, sample_rate: float) -> Array:
     """Weights (2M + 1,) of the samples about an instant in the cubic through the four around so much later.
 
     Of less than none the instant lies before.

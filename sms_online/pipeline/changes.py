@@ -93,7 +93,8 @@ class Changes(Stage):
     """Events of one session.
 
     model, base: current ones, with what events have added to the system's own. Information is on the session's
-    nuisances and then on the parameters. renewed: called when a saved state has put other events here.
+    nuisances and then on the parameters. renewed: called when a saved state has put other events here. point: gives the
+    nuisances (m,) that samples are corrected by.
     """
 
     def __init__(
@@ -103,8 +104,10 @@ class Changes(Stage):
         sensing: Sensing,
         nuisances: Sequence[Nuisance],
         renewed: Callable[[], None],
+        point: Callable[[], Array],
     ) -> None:
         self.model, self.base = model, base
+        self._point = point
         self._nuisances = tuple(nuisances)
         self._system, self._described = model.system, base
         self._sensing = sensing
@@ -238,7 +241,7 @@ class Changes(Stage):
         for _ in range(PASSES):
             prior = prior_rows(self._nuisances, base.n)
             known = partial(np.append, np.zeros(m), weights)
-            fit = MomentumFit(model, base, balance, new_noise, known, calibration=prior)
+            fit = MomentumFit(model, base, balance, new_noise, known, calibration=prior, point=self._point)
             fit.go_on(weights, noise)
             rows = np.concatenate([white.Y for white in fit.push(windows, instants, noise)])
             explanation = explain(factor / left, rows / left, jumps)

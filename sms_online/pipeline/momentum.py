@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import msgspec
 import numpy as np
@@ -19,6 +20,7 @@ from sms_online.pipeline.description import nearer
 from sms_online.pipeline.drift_line import DriftLine
 from sms_online.pipeline.errors_in_variables import NoiseBias, unbiased
 from sms_online.pipeline.latency import Latencies, clock_groups, source_groups, wandering_clocks
+from sms_online.pipeline.linearisation import Linearisation
 from sms_online.pipeline.momentum_balance import MomentumBalance, half_hop
 from sms_online.pipeline.momentum_fit import FIRST_MOTION, MomentumFit, WhiteRows
 from sms_online.pipeline.momentum_windows import COPIES, HOPS, INSTANTS
@@ -79,25 +81,44 @@ class Momentum(Stage):
     independent, and its sums. latencies: of the sources, since the last event. test: whether rows leave more than
     noise, likewise. changes: events, and the model and parameters that the session goes on with after them. nuisances:
     what the description may be wrong in. prior: what is known of the described ones beforehand. changed: called where
-    others come to be estimated.
+    others come to be estimated. linearisation: the nuisances that rows are linear about.
     """
 
     def __init__(self, model: Model, base: BaseParameters, sensing: Sensing, changed: Callable[[], None]) -> None:
         system = model.system
         self.sensing = sensing
         self.nuisances = nuisances(sensing)
-        self.changes = Changes(model, base, sensing, self.nuisances, self._rebuild)
         self._changed = changed
         self._sample_rate = system.sample_rate
         self._span = system.windows.momentum
+        first = round(FIRST_MOTION * HOPS / self._span)
+        self.linearisation = Linearisation(sensing, self.nuisances, self._sample_rate, first)
+        self._described = model, base
+        self.changes = self._new_changes()
         self._estimate = NoiseEstimate(sensing, system.sample_rate, PASS_BAND / self._span)
         self.prior: Prior | None = None
         self._sources, self._clocks = source_groups(sensing), clock_groups(sensing)
         self.bank = self._new_bank()
         self._build()
-        n, n_v = len(self.nuisances) + base.n, model.layout.n_v
-        self.bias, self.grams = NoiseBias.none(n, self._calibration), RowGrams.none(n_v, n)
-        self.state = MomentumState(np.zeros((0, n + 1)), np.zeros(n_v), np.random.default_rng(SEED))
+        self.bias, self.grams = self._new_sums()
+        self.state = self._new_state()
+
+    def _new_changes(self) -> Changes:
+        model, base = self._described
+        return Changes(model, base, self.sensing, self.nuisances, self._rebuild, self._point)
+
+    def _point(self) -> Array:
+        """Nuisances (m,) that samples are corrected by."""
+        return self.linearisation.point
+
+    def _new_state(self) -> MomentumState:
+        model, base = self._described
+        n = len(self.nuisances) + base.n
+        return MomentumState(np.zeros((0, n + 1)), np.zeros(model.layout.n_v), np.random.default_rng(SEED))
+
+    def _new_sums(self) -> tuple[NoiseBias, RowGrams]:
+        n = len(self.nuisances) + self.changes.base.n
+        return NoiseBias.none(n, self._calibration), RowGrams.none(self.changes.model.layout.n_v, n)
 
     @property
     def newest_row(self) -> float:
@@ -118,6 +139,7 @@ class Momentum(Stage):
         self.fit = MomentumFit(
             model, base, self._balance, self._new_noise, self._solved, self._sources, self._calibration,
             self._beforehand, [k for k, each in enumerate(self.nuisances) if each.name == "drive_gain"], self._drift_at,
+            self._point,
         )  # fmt: skip
         self.tracker = self._new_tracker()
         self.fit.plain.patient = self.bank.learned is not None
@@ -254,19 +276,47 @@ class Momentum(Stage):
             return
         waiting, self.state.waiting = self.state.waiting, []
         for each in waiting:
-            self._advance(each, self.state.sensor_noise)
+            for corrected in self.linearisation.push(each):
+                self._advance(corrected, self.state.sensor_noise)
+            self._relinearise(self.state.sensor_noise, last=False)
+
+    def _relinearise(self, noise: SensorNoise, last: bool) -> None:
+        """Now and then, where the estimate is far from the point that rows are linear about: go there."""
+        if self.changes.events:
+            self.linearisation.forget()
+        if not self.started or not self.linearisation.looks(self.fit.plain.windows, last):
+            return
+        while self.linearisation.moves(self._joint()):
+            self._begin_anew(self._solved()[len(self.nuisances) :], noise)
+            for piece in self.linearisation.again():
+                self._advance(piece, noise)
+            if last:
+                self._end_segment(noise)
+
+    def _begin_anew(self, weights: Array, noise: SensorNoise) -> None:
+        """Forget all rows, and begin with weights β (n,) that are known."""
+        before = self.state
+        self.changes, self.bank, self.state = self._new_changes(), self._new_bank(), self._new_state()
+        self.state.sensor_noise, self.state.noise_told = before.sensor_noise, before.noise_told
+        self.state.start_time = before.start_time
+        self.bias, self.grams = self._new_sums()
+        self._build()
+        self.fit.go_on(weights, noise)
 
     def _advance(self, piece: GridSamples, noise: SensorNoise) -> None:
         if piece.segment != self.state.segment:
             if self.state.segment >= 0:
-                self._absorb(self.fit.end_segment(noise))
-                self._decide(noise, last=True)
+                self._end_segment(noise)
             self._balance.begin_segment()
             self.state.segment = piece.segment
         self.changes.keep(piece)
         self.bank.hold_until(self.state.start_time + int(piece.index[-1]) / self._sample_rate)
         self._process(piece, noise)
         self._decide(noise, last=False)
+
+    def _end_segment(self, noise: SensorNoise) -> None:
+        self._absorb(self.fit.end_segment(noise))
+        self._decide(noise, last=True)
 
     def _process(self, piece: GridSamples, noise: SensorNoise) -> None:
         copies = self._copies(piece.values, noise)
@@ -284,6 +334,8 @@ class Momentum(Stage):
     def adopt(self, adoption: Adoption) -> None:
         """Go on with effects that the model lacked, see `Changes.adopt`; rows are there already."""
         assert self.state.sensor_noise is not None
+        for samples in self.linearisation.corrected(adoption.samples):
+            adoption = replace(adoption, samples=samples)
         self._adopt(adoption, self.state.sensor_noise)
 
     def _adopt(self, adoption: Adoption, noise: SensorNoise) -> None:
@@ -314,8 +366,8 @@ class Momentum(Stage):
         if self.state.sensor_noise is None and self.state.waiting and self._estimate.ready:
             self.state.sensor_noise = self._estimate.noise(periods)
         if self.state.sensor_noise is not None:
-            self._absorb(self.fit.end_segment(self.state.sensor_noise))
-            self._decide(self.state.sensor_noise, last=True)
+            self._end_segment(self.state.sensor_noise)
+            self._relinearise(self.state.sensor_noise, last=True)
             adoption = self.changes.abandon(self.state.start_time)
             if adoption is not None:
                 self._adopt(adoption, self.state.sensor_noise)
@@ -409,10 +461,9 @@ class Momentum(Stage):
 
     def _begin_drift(self, known: Information) -> None:
         """Have what has judged rows by constant parameters begin anew."""
-        model, m = self.changes.model, len(self.nuisances)
-        n, n_v = m + self.changes.base.n, model.layout.n_v
+        m = len(self.nuisances)
         self.changes.detector.begin(known)
-        self.bias, self.grams = NoiseBias.none(n, self._calibration), RowGrams.none(n_v, n)
+        self.bias, self.grams = self._new_sums()
         self.fit.plain.clear()
         self.test = self._new_test()
         self.bank.refer(known.solution().pi[m:])

@@ -140,7 +140,8 @@ class MomentumFit(Stage):
     new_noise: makes what propagates noise, for the same model, base and balance. solve: gives the estimate so far of
     nuisances and β (m + n,), which weights follow. sources: whose latencies are estimated. calibration: rows
     [N Y b] (k, m + n + 1) of what is known of the nuisances beforehand. beforehand: gives all that is known beside the
-    rows. drift: gives the known drift in the window that ends at a grid index. whitening: that of now.
+    rows. drift: gives the known drift in the window that ends at a grid index. point: gives the nuisances (m,) that
+    samples are corrected by, none by default. whitening: that of now.
     """
 
     def __init__(
@@ -155,11 +156,13 @@ class MomentumFit(Stage):
         beforehand: Callable[[], Beforehand] | None = None,
         gains: Sequence[int] = (),
         drift: Callable[[int], DriftLine | None] = lambda end: None,
+        point: Callable[[], Array] | None = None,
     ) -> None:
         self.model = model
         self.base = base
         self._calibration = np.zeros((0, base.n + 1)) if calibration is None else calibration
         self._nuisances = self._calibration.shape[1] - base.n - 1
+        self._point = point if point is not None else lambda: np.zeros(self._nuisances)
         inertial = np.isin(
             np.arange(-self._nuisances, base.n), np.flatnonzero(np.isin(base.independent, model.inertial))
         )
@@ -425,6 +428,9 @@ class MomentumFit(Stage):
             behind = np.array([each.calibration[1] for each in whitened])[:, None]
             raw = np.concatenate((before, raw), axis=2)
             white = np.concatenate((np.broadcast_to(behind, (W, COPIES, n_v, self._nuisances)), white), axis=3)
+            # Samples are corrected by the point, rows are of the whole nuisances.
+            raw[..., -1] += before @ self._point()
+            white[..., -1] += behind @ self._point()
             noisy = np.pad(noisy, ((0, 0), (0, 0), (self._nuisances, 0)))
             weights = np.pad(weights, (self._nuisances, 0))
         raw, white = np.ascontiguousarray(raw), np.ascontiguousarray(white)

@@ -32,10 +32,14 @@ SYSTEM = "paper-planar"
 GRADE = "B"
 TOLERANCES = ("none", "default")
 PIECE = 1000  # samples
+WITHIN = 3.0  # standard deviations of a nuisance
 # The true arm where its geometry is another than the described one.
 LENGTH, AXIS = 1.2e-4, 5e-4  # m, rad: of link 1, and of joint 2
 
-Samples = Callable[[System, Block, np.random.Generator], None]
+# Name, place and part of a nuisance.
+Key = tuple[str, str, str]
+# Distorts samples, and returns the nuisances that they have then.
+Samples = Callable[[System, Block, np.random.Generator], dict[Key, float]]
 
 
 def _columns(block: Block, *beginnings: str) -> list[int]:
@@ -49,12 +53,13 @@ def _sign(random: np.random.Generator) -> float:
 def tracked_point(by: float) -> Samples:
     """S is elsewhere by so much along both axes of the base, m."""
 
-    def distort(system: System, block: Block, random: np.random.Generator) -> None:
+    def distort(system: System, block: Block, random: np.random.Generator) -> dict[Key, float]:
         theta = block.values[:, block.channels.index("theta_0")]
         along, across = by * _sign(random), by * _sign(random)
         x, y = block.channels.index("r_S_x"), block.channels.index("r_S_y")
         block.values[:, x] += along * np.cos(theta) - across * np.sin(theta)
         block.values[:, y] += along * np.sin(theta) + across * np.cos(theta)
+        return {("tracked_point", "base", "x"): along, ("tracked_point", "base", "y"): across}
 
     return distort
 
@@ -62,10 +67,11 @@ def tracked_point(by: float) -> Samples:
 def clock(by: float) -> Samples:
     """The camera, which sees base and markers, is late or early by so much, s."""
 
-    def distort(system: System, block: Block, random: np.random.Generator) -> None:
+    def distort(system: System, block: Block, random: np.random.Generator) -> dict[Key, float]:
         seen = _columns(block, "r_S", "theta_0", "link_")
         late = by * _sign(random)
         block.values[:, seen] = make_interp_spline(block.t, block.values[:, seen], 5)(block.t - late)
+        return {("clock", where, ""): late for where in ("base", "markers")}
 
     return distort
 
@@ -73,9 +79,14 @@ def clock(by: float) -> Samples:
 def once_per_turn(by: float) -> Samples:
     """Every encoder is off by so much once a turn, rad."""
 
-    def distort(system: System, block: Block, random: np.random.Generator) -> None:
+    def distort(system: System, block: Block, random: np.random.Generator) -> dict[Key, float]:
+        out: dict[Key, float] = {}
         for k in _columns(block, "q_", "theta_m"):
-            block.values[:, k] += by * np.sin(block.values[:, k] + random.uniform(0.0, 2.0 * np.pi))
+            phase = random.uniform(0.0, 2.0 * np.pi)
+            block.values[:, k] += by * np.sin(block.values[:, k] + phase)
+            parts = {"sine": np.cos(phase), "cosine": np.sin(phase)}
+            out |= {("once_per_turn", block.channels[k], part): by * float(share) for part, share in parts.items()}
+        return out
 
     return distort
 
@@ -83,10 +94,13 @@ def once_per_turn(by: float) -> Samples:
 def marker_zero(by: float) -> Samples:
     """Every marker's displacement has a zero of so much, m."""
 
-    def distort(system: System, block: Block, random: np.random.Generator) -> None:
+    def distort(system: System, block: Block, random: np.random.Generator) -> dict[Key, float]:
+        out: dict[Key, float] = {}
         for k in _columns(block, "link_"):
             if ".u_" in block.channels[k]:
-                block.values[:, k] += by * _sign(random)
+                zero = out["marker_zero", block.channels[k], ""] = by * _sign(random)
+                block.values[:, k] += zero
+        return out
 
     return distort
 
@@ -94,8 +108,10 @@ def marker_zero(by: float) -> Samples:
 def torque_gain(by: float) -> Samples:
     """The torque of joint 2 is read with another gain."""
 
-    def distort(system: System, block: Block, random: np.random.Generator) -> None:
-        block.values[:, block.channels.index("tau_2")] *= 1.0 + by * _sign(random)
+    def distort(system: System, block: Block, random: np.random.Generator) -> dict[Key, float]:
+        gain = by * _sign(random)
+        block.values[:, block.channels.index("tau_2")] *= 1.0 + gain
+        return {("drive_gain", "joint_2", ""): gain}
 
     return distort
 
@@ -115,10 +131,14 @@ KINDS: dict[str, tuple[float, float, tuple[Samples, ...]]] = {
     "clean": (0.0, 0.0, ()),
     "tracked point 0.2 mm": (0.0, 0.0, (tracked_point(2e-4),)),
     "tracked point 1 mm": (0.0, 0.0, (tracked_point(1e-3),)),
+    "tracked point 5 mm": (0.0, 0.0, (tracked_point(5e-3),)),
     "length 0.12 mm": (LENGTH, 0.0, ()),
     "axis 0.5 mrad": (0.0, AXIS, ()),
     "camera 50 us": (0.0, 0.0, (clock(5e-5),)),
+    "camera 0.5 ms": (0.0, 0.0, (clock(5e-4),)),
+    "camera 4 ms": (0.0, 0.0, (clock(4e-3),)),
     "once per turn 2e-5": (0.0, 0.0, (once_per_turn(2e-5),)),
+    "once per turn 1e-4": (0.0, 0.0, (once_per_turn(1e-4),)),
     "marker zero 1e-4": (0.0, 0.0, (marker_zero(1e-4),)),
     "torque gain 0.1 %": (0.0, 0.0, (torque_gain(1e-3),)),
     "all": (
@@ -154,8 +174,9 @@ def one_session(folder: Path, kind: str, tolerances: str, seed: int) -> Record:
     exact = _exact(folder, length, axis)
     block = Block(exact.t, exact.channels, exact.values.copy())
     random = np.random.default_rng(seed)
+    true: dict[Key, float] = {}
     for distort in distortions:
-        distort(described, block, random)
+        true |= distort(described, block, random)
     block = noisy_session(described, block, GRADE, seed)
     stated = Tolerances() if tolerances == "default" else Tolerances.model_validate(tolerances)
     system = disguised(described, random).model_copy(update={"tolerances": stated})
@@ -167,10 +188,12 @@ def one_session(folder: Path, kind: str, tolerances: str, seed: int) -> Record:
     evaluation = Evaluation(Statistics.of(estimator))
     estimate, nuisances = evaluation.estimate, evaluation.statistics.setup.nuisances
     found = zip(nuisances, estimate.nuisances.tolist(), estimate.nuisances_std.tolist(), strict=True)
+    said = {(each.name, each.where, each.part) for each in evaluation.calibration if each.certain}
     return {
         "estimate": estimate.pi.tolist(),
         "std": evaluation.std.tolist(),
         "nuisances": [[n.name, n.where, n.part, value, std] for n, value, std in found],
+        "true": [[*key, value, key in said] for key, value in true.items()],
         "chi2": estimate.rss / estimate.dof,
         "level": evaluation.trust.level,
         "sentence": evaluation.trust.sentence,
@@ -179,10 +202,13 @@ def one_session(folder: Path, kind: str, tolerances: str, seed: int) -> Record:
 
 
 def summary(records: list[Record]) -> str:
-    """Coverage of the 95 % intervals, root mean square of errors over their bars, and bars, kind by kind."""
+    """Coverage of the 95 % intervals, root mean square of errors over their bars, and bars, kind by kind.
+
+    said: share of what is wrong that is reported with its size; within: that is within three of its deviations.
+    """
     truth = true_parameters(load_system(SYSTEM))
     clean = _stds(records, "clean", "none")
-    names = ("sessions", "cover", "rms z", "worst z", "bars", "green", "s")
+    names = ("sessions", "cover", "rms z", "worst z", "bars", "green", "said", "within", "s")
     lines = [f"{'kind':24}{'tolerances':>12}" + "".join(f"{name:>9}" for name in names)]
     for kind in KINDS:
         for tolerances in TOLERANCES:
@@ -205,9 +231,21 @@ def _line(kind: str, tolerances: str, own: list[dict[str, Any]], truth: Array, c
     seconds = float(np.median([r["seconds"] for r in own]))
     numbers = [
         f"{len(own)}", f"{np.mean(np.abs(z) < NORMAL_95):.3f}", f"{np.sqrt(np.mean(z**2)):.2f}",
-        f"{np.abs(z).max():.1f}", f"{bars:.2f}", f"{green}", f"{seconds:.1f}",
+        f"{np.abs(z).max():.1f}", f"{bars:.2f}", f"{green}", *_calibration(own), f"{seconds:.1f}",
     ]  # fmt: skip
     return f"{kind:24}{tolerances:>12}" + "".join(f"{number:>9}" for number in numbers)
+
+
+def _calibration(own: list[dict[str, Any]]) -> tuple[str, str]:
+    """Shares of what is wrong in some sessions that are said, and within three deviations of the estimate."""
+    said, within = [], []
+    for record in own:
+        found = {tuple(key): (value, std) for *key, value, std in record["nuisances"]}
+        for *key, true, certain in record["true"]:
+            value, std = found[tuple(key)]
+            said.append(certain)
+            within.append(abs(value - true) < WITHIN * std)
+    return (f"{np.mean(said):.2f}", f"{np.mean(within):.2f}") if said else ("", "")
 
 
 if __name__ == "__main__":
