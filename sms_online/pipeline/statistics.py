@@ -135,7 +135,7 @@ class Statistics:
 
     @staticmethod
     def of(estimator: Estimator) -> Statistics:
-        """The statistics of now; nothing in them changes as the session goes on."""
+        """Those of now; nothing in them changes as the session goes on."""
         momentum, smoother = estimator.momentum, estimator.smoother
         return Statistics(
             setup=estimator.setup,
