@@ -1,10 +1,10 @@
-"""Sensors that are so late that no parameters fit the motion they measure, found before any force is searched.
+"""Sensors that are so late that no parameters fit the motion they measure, found before any force is looked for.
 
-In rows without a torque a spring's force accelerates the masses behind it, whatever friction the motors have. These
-rows are homogeneous in π. With a sensor that is far behind the others, least squares shrinks masses and stiffness
-together to nothing, and no candidate has any gain. So each stiffness is tested on its own, by the share of its column
-that no masses explain in windows that were not fitted. A sensor is late where correcting its lag reduces that share,
-and nothing else reduces it as much.
+Rows without a torque say that what springs are measured to pull is what moves the masses behind them, whatever friction
+the motors have. They are homogeneous in π: against a sensor that is far behind the others, least squares shrinks masses
+and stiffness together to nothing, and every candidate beside them seems idle. So each stiffness is asked apart: the
+share of its column that no masses can follow, over windows that were not fitted. A sensor is late where readings
+without its lag bring that share down as nothing else would.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ CORNERS = (delay_of(LONGEST_FOUND), 2.0, 3.5, 6.0)
 FOLLOWED = 0.02
 # A sensor is late where its lag leaves less than this share of what no masses can follow.
 LARGEST_LEFT = 0.5
-# Probability that any sensor seems late by chance.
+# Probability that any sensor seems late by accident.
 FALSE_ALARM = 0.01
 # Lags whose gain differs by less than this share are not distinguished.
 SAME_SHARE = 0.03
@@ -72,7 +72,7 @@ class LateSensor:
 
     @property
     def corner(self) -> float:
-        """Corner frequency of the lag, Hz."""
+        """Of the lag, Hz."""
         return self.effect.coefficients["corner"]
 
     @property
@@ -82,7 +82,7 @@ class LateSensor:
 
 
 class Motions:
-    """Measures how well masses explain the springs' forces, for readings with a lag corrected."""
+    """Asks how well the masses can follow the springs, for readings with a lag taken off."""
 
     def __init__(self, rows: SessionRows, make: CandidateColumns, folds: Folds) -> None:
         fitted = folds.block % CHECKED != CHECKED - 1
@@ -118,7 +118,7 @@ class Motions:
         return [where for where in lags if any(fnmatchcase(name, where) for name in readings)]
 
     def unfollowed(self, where: str | None = None, corner: float = np.inf) -> tuple[float, float]:
-        """Share of the springs' columns that no masses explain, rms, in windows that were fitted and in the others."""
+        """Share of the springs' columns that no masses follow, rms, in windows that were fitted and in the others."""
         segments = list(self._rows.segments)
         if where is not None:
             segments = [self._without(where, corner, segment) for segment in segments]
@@ -138,12 +138,12 @@ class Motions:
         return float(fit), float(held)
 
     def _without(self, where: str, corner: float, segment: Segment) -> Segment:
-        """The samples of a segment with one more lag corrected."""
+        """The samples of a segment with one lag more taken off."""
         lagging = self._rows.model.system.model_copy(update={"effects": (lag(where, corner),)})
         return corrected(lagging, self._channels, segment)
 
     def _share(self, Y: Array, spring: int) -> tuple[float, float]:
-        """Unexplained share of one spring's column in its rows (W, rows, n_pi)."""
+        """Of one spring's column in its rows (W, rows, n_pi)."""
         pulled, moved = Y[..., spring], Y[..., [k for k in (*self._springs, *self._masses) if k != spring]]
         fitted = self._fitted
         A, b = moved[fitted].reshape(-1, moved.shape[2]), pulled[fitted].ravel()
@@ -163,7 +163,7 @@ class Motions:
 
 
 def find_late(rows: SessionRows, make: CandidateColumns, folds: Folds) -> LateSensor | None:
-    """The sensors whose lag, once corrected, lets masses explain the springs' forces; None where no lag does so.
+    """The sensors whose lag, taken off, lets the masses follow the springs; None where no lag does so.
 
     make: gives what declared effects need along a motion. folds: blocks of the windows, one in
     CHECKED of which checks the others.
