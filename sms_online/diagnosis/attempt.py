@@ -104,7 +104,7 @@ class Case:
     """A capture to be diagnosed: its session with the system as described, samples, and those held out.
 
     progress: see `Progress`. stop: whether to end with what has been found. learned: whether curves are tried where no
-    law is selected.
+    law is selected. begins: of further captures, see `captures`.
     """
 
     source: str
@@ -116,6 +116,7 @@ class Case:
     progress: Progress = lambda what, share: None
     stop: Callable[[], bool] = lambda: False
     learned: bool = False
+    begins: tuple[float, ...] = ()
 
 
 def _noise_behind(described: Estimator, case: Case) -> SensorNoise:
@@ -200,7 +201,8 @@ class Attempt(Hypothesis):
             seconds = least / system.sample_rate + wanted * span / HOPS
             expected = f"some {seconds:.1f} s without a gap, to fit and to check"
             raise InputError(case.source, "", f"too few windows of {span:g} s: {rows.count}", expected)
-        folds = Folds.of(rows.weak.windows.segment, rows.time)
+        capture = np.searchsorted(case.begins, rows.time)
+        folds = Folds.of(rows.weak.windows.segment, rows.time, capture=capture)
         effects = list(make.effects(case.learned)) if candidates is None else candidates
         self._lasting = [effect for effect in effects if is_constant(effect)]
         forces = [effect for effect in effects if not is_constant(effect)]

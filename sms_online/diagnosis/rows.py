@@ -153,7 +153,7 @@ class SessionRows(WeakRows):
     def weigh(self, beta: Array) -> None:
         """Tell the noise of the rows for parameters beta (n,), and make them independent of each other."""
         model, balance = self.model, self._balance
-        self.beta = beta
+        self.beta = self.weights = beta
         if self._given is None:
             self.second_order = self._second_order()
         sensing = self.sensing

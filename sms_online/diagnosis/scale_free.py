@@ -1,0 +1,75 @@
+"""Rows without a torque that leave more than noise, made free of the scale of π to first order.
+
+Such rows are homogeneous in π: they leave r = -Yπ, and least squares lowers that by shrinking π wherever they hold more
+than noise. What counts is r beside the size s(π) of its terms, as in the criterion of the estimate (see
+`pipeline.criterion`). About π°
+
+    r(π) s(π°) / s(π) = r° - (Y + r° gᵀ) (π - π°) + …,    g = Mπ° / s(π°)²,    s² = πᵀ M π,
+
+which are rows of least squares again, with columns Y + r° gᵀ: π°, along which all of them shrink, is no direction of
+theirs any more, and only rows with a torque fix the scale. Solved again and again, each time about the solution before,
+they lead to where the criterion is least (Gauss and Newton).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+
+from sms_online.stream import Array
+
+# Fits about the solution before, at most, and halvings of a step that does not lower what is asked for.
+FITS, HALVINGS = 16, 6
+# Gain of the sum of logarithms below which a fit is the last.
+SAME = 1e-3
+
+
+class ScaleFree:
+    """Frees some speeds' rows (W, n_v, n) of a model."""
+
+    def __init__(self, Y: Array, speeds: Sequence[int], inertial: Array) -> None:
+        """inertial (n,): which columns are inertial forces: they may cancel each other, and so count as one."""
+        same = np.outer(inertial, inertial) | np.eye(inertial.size, dtype=bool)
+        self._Y = Y
+        self._metric = {speed: np.where(same, Y[:, speed].T @ Y[:, speed], 0.0) for speed in speeds}
+
+    def squares(self, pi: Array, left: Array, expected: Array) -> Array:
+        """Mean squares (n_v,) of what parameters (n,) leave (W, n_v), freed rows as large as expected (n,) has them."""
+        out = np.mean(left**2, axis=0)
+        for speed, M in self._metric.items():
+            out[speed] *= float(expected @ M @ expected) / max(float(pi @ M @ pi), np.finfo(np.float64).tiny)
+        return np.asarray(out)
+
+    def about(self, pi: Array, left: Array) -> tuple[Array, Array]:
+        """Columns (W, n_v, n) about parameters (n,) that leave (W, n_v), and what is added to the right-hand side."""
+        columns, added = self._Y.copy(), np.zeros_like(left)
+        for speed, M in self._metric.items():
+            squares = float(pi @ M @ pi)
+            if squares > 0.0:
+                columns[:, speed] += left[:, speed, None] * (M @ pi / squares)
+                added[:, speed] = left[:, speed]
+        return columns, added
+
+
+def converged(fit: Callable[[Array], Array], start: Array, squares: Callable[[Array], Array]) -> Array:
+    """Where fits (n + c,) about the solution before lead to, from a start.
+
+    squares: gives for a solution what each type of rows leaves, over its variance: the sum of their logarithms falls
+    from fit to fit.
+    """
+
+    def cost(solution: Array) -> float:
+        return float(np.sum(np.log(np.maximum(1.0, squares(solution)))))
+
+    solution, least = start, cost(start)
+    for _ in range(FITS):
+        step, before = fit(solution) - solution, least
+        for k in range(HALVINGS):
+            tried = solution + 0.5**k * step
+            if cost(tried) < least:
+                solution, least = tried, cost(tried)
+                break
+        if before - least < SAME:
+            break
+    return solution
