@@ -238,7 +238,10 @@ class Attempt(Hypothesis):
             beta = self.solution(chosen)[: self.rows.base.n]
             if self.prior is not None:
                 beta = np.where(self.prior.known, self.prior.value, beta)
-            if self._same_weights(beta) or self.excess(chosen) > LARGEST_SHARE_LEFT * self.excess([]):
+            # Rows that leave more than noise whatever is added are weighed by that.
+            if np.any(self.tracing.floor) or self._same_weights(beta):
+                break
+            if self.excess(chosen) > LARGEST_SHARE_LEFT * self.excess([]):
                 break
             self.rows.weigh(beta)
             forces = [candidate for candidate in self.tracing.candidates if not candidate.constant]

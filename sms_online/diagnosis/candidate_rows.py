@@ -12,7 +12,7 @@ from sms_online.diagnosis.calibrated import Calibrated
 from sms_online.diagnosis.candidate import Candidate, Laws
 from sms_online.diagnosis.evidence import Gain, basis, free_of, gains, least_squares, least_squares_without, together
 from sms_online.diagnosis.folds import Folds
-from sms_online.diagnosis.scale_free import ScaleFree, converged
+from sms_online.diagnosis.scale_free import NEAR, ScaleFree, converged
 from sms_online.diagnosis.weak_rows import WeakRows
 from sms_online.pipeline.momentum_windows import HOPS
 from sms_online.stream import Array
@@ -26,8 +26,6 @@ ACTS = 0.01
 LARGEST_RATIO = 1.5
 # Rows for a column at least, for curves to be fitted together.
 LEAST_ROWS = 4
-# What rows that leave more than noise determine to less than this share of their columns' size stays near the weights.
-NEAR = 1e-3
 # Share of a row's variance by which that of the effects chosen has to change for rows to be weighed anew.
 SMALL_CHANGE = 0.1
 
@@ -215,28 +213,12 @@ class CandidateRows:
         Each type of rows counts by what it leaves, those without a torque by their size. Last, mean squares with these
         as large as the parameters behind the weights make them.
         """
-        plain = [self._plain_model, *(self._plain[k] for k in self._beside)]
-        columns, n = np.concatenate(plain, axis=2), self._model.shape[2]
+        beside = np.concatenate([np.empty((*b.shape, 0)), *(self._plain[k] for k in self._beside)], axis=2)
         speeds = np.flatnonzero(~np.any(self.rows.b, axis=0)).tolist()
-        free, expected = ScaleFree(self._plain_model, speeds, self._inertial), self._scale_at
-
-        def squares(solution: Array) -> Array:
-            return free.squares(solution[:n], b - columns @ solution, expected)
-
-        def fit(solution: Array) -> Array:
-            left = b - columns @ solution
-            std = np.sqrt(np.maximum(1.0, np.mean(left**2, axis=0)))
-            Y, added = free.about(solution[:n], left)
-            weighed = (np.concatenate((Y, columns[..., n:]), axis=2) / std[:, None]).reshape(b.size, -1)
-            lengths = NEAR * np.linalg.norm(weighed, axis=0)
-            rows = np.concatenate((weighed, np.diag(lengths)))
-            return least_squares(rows, np.concatenate((((b + added) / std).ravel(), lengths * near)))
-
-        start, near = np.zeros((2, columns.shape[2]))
-        start[:n], near[:n] = expected, self._expected
-        solution = converged(fit, start, squares)
+        free, n = ScaleFree(self._plain_model, speeds, self._inertial), self._model.shape[2]
+        solution = free.solved(beside, b, self._scale_at, self._expected, 1.0)
         self._scale_at = solution[:n]
-        left = b - columns @ solution
+        left = b - np.concatenate((self._plain_model, beside), axis=2) @ solution
         return solution, np.mean(left**2, axis=0), free.squares(solution[:n], left, self._expected)
 
     @property

@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from itertools import chain
 
-from sms_online.pipeline.synchronise import LONGEST_HOLE
+from sms_online.pipeline.periods import LONGEST_HOLE
 from sms_online.stream import Block
 
 # Pause between two captures, s: nothing is interpolated across it.

@@ -206,7 +206,7 @@ def diagnose(
     except np.linalg.LinAlgError as error:
         raise InputError(source, "", str(error), "the links' own markers, in their frames") from error
     late: list[LateSensor] = []
-    while _explains_little(before) and (found := find_late(attempt.rows, attempt.make, attempt.folds)):
+    while _explains_little(before) and (found := find_late(attempt.rows)):
         progress("taking off a sensor's lag", TRACED)
         late.append(found)
         lagging = attempt.system.model_copy(update={"effects": (*attempt.system.effects, found.effect)})

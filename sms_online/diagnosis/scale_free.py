@@ -17,10 +17,13 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
+from sms_online.diagnosis.evidence import least_squares
 from sms_online.stream import Array
 
 # Fits about the solution before, at most, and halvings of a step that does not lower what is asked for.
 FITS, HALVINGS = 16, 6
+# What rows determine to less than this share of their columns' size stays near given parameters.
+NEAR = 1e-3
 # Gain of the sum of logarithms below which a fit is the last.
 SAME = 1e-3
 
@@ -51,6 +54,30 @@ class ScaleFree:
                 added[:, speed] = left[:, speed]
         return columns, added
 
+    def solved(self, beside: Array, b: Array, start: Array, near: Array, least: float) -> Array:
+        """Solution (n + c,) of rows b (W, n_v) with columns beside (W, n_v, c), each speed's weighed by what it leaves.
+
+        start, near (n,): parameters to begin with, and those that rows which determine nothing else stay near. least:
+        mean square of what noise alone leaves.
+        """
+        columns, n = np.concatenate((self._Y, beside), axis=2), self._Y.shape[2]
+        first, anchor = np.zeros((2, columns.shape[2]))
+        first[:n], anchor[:n] = start, near
+
+        def squares(solution: Array) -> Array:
+            return self.squares(solution[:n], b - columns @ solution, start) / least
+
+        def fit(solution: Array) -> Array:
+            left = b - columns @ solution
+            std = np.sqrt(np.maximum(least, np.mean(left**2, axis=0)))
+            Y, added = self.about(solution[:n], left)
+            weighed = (np.concatenate((Y, beside), axis=2) / std[:, None]).reshape(b.size, -1)
+            lengths = NEAR * np.linalg.norm(weighed, axis=0)
+            rows = np.concatenate((weighed, np.diag(lengths)))
+            return least_squares(rows, np.concatenate((((b + added) / std).ravel(), lengths * anchor)))
+
+        return converged(fit, first, squares)
+
 
 def converged(fit: Callable[[Array], Array], start: Array, squares: Callable[[Array], Array]) -> Array:
     """Where fits (n + c,) about the solution before lead to, from a start.
@@ -60,7 +87,9 @@ def converged(fit: Callable[[Array], Array], start: Array, squares: Callable[[Ar
     """
 
     def cost(solution: Array) -> float:
-        return float(np.sum(np.log(np.maximum(1.0, squares(solution)))))
+        with np.errstate(over="ignore", invalid="ignore"):  # of a step that is far too long
+            found = float(np.sum(np.log(np.maximum(1.0, squares(solution)))))
+        return found if np.isfinite(found) else np.inf
 
     solution, least = start, cost(start)
     for _ in range(FITS):
