@@ -224,6 +224,15 @@ class Attempt(Hypothesis):
         states = build_model(system.model_copy(update={"effects": forces})).n_states
         return Attempt(self.case, system, constants, beta, effects, LONGEST if states else SOME, self.rows.second_order)
 
+    @property
+    def by_rows(self) -> bool:
+        """Whether parameters are those of these rows, and not those of a session with what was found.
+
+        So they are with a prior, and where rows without a torque leave more than noise: a session begins anew there,
+        and may end at another scale.
+        """
+        return self.prior is not None or self.tracing.freed
+
     def watch(self, chosen: Sequence[int]) -> bool:
         """See `Hypothesis`."""
         if chosen and len(chosen) > self._most_found:

@@ -222,6 +222,11 @@ class CandidateRows:
         return solution, np.mean(left**2, axis=0), free.squares(solution[:n], left, self._expected)
 
     @property
+    def freed(self) -> bool:
+        """Whether rows without a torque leave more than noise whatever is added, and count by their size."""
+        return bool(np.any(self._homogeneous))
+
+    @property
     def n_model(self) -> int:
         """Unknowns of the model without those chosen."""
         return int(self._model.shape[2])

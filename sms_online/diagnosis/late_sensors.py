@@ -101,7 +101,7 @@ class Lags:
             return np.inf, np.inf
         checks = np.arange(rough.count) * BLOCKS // rough.count % CHECKED == CHECKED - 1
         fitted = ~checks | (not checked)
-        self._independent = np.count_nonzero(fitted) // ROUGH_HOPS
+        self._independent = int(np.count_nonzero(fitted)) // ROUGH_HOPS
         fit, held = (np.log(np.maximum(share, TINY)) for share in rough.shares(fitted))
         return float(fit.sum()), float(held.mean()) if checked else np.inf
 

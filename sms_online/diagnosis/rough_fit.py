@@ -9,21 +9,19 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from sms_online.diagnosis.evidence import least_squares
 from sms_online.diagnosis.record import Segment
+from sms_online.diagnosis.rows import SessionRows
 from sms_online.diagnosis.scale_free import ScaleFree
 from sms_online.diagnosis.weak_windows import Motion, WeakWindows, Windows
 from sms_online.effects.friction import sign
-from sms_online.model.base_parameters import BaseParameters
 from sms_online.model.effect import Inputs
-from sms_online.model.model import Model
+from sms_online.pipeline.estimator import Estimator
 from sms_online.pipeline.momentum_windows import EXPONENT
-from sms_online.pipeline.sensing import Sensing
 from sms_online.pipeline.smoothing import HALF_WIDTHS, stride
 from sms_online.stream import Array
 
@@ -48,18 +46,10 @@ class RoughFit:
     nominal: Array
 
 
-class Described(Protocol):
-    """What rows follow from, beside samples: a session, or the rows of one."""
-
-    model: Model
-    base: BaseParameters
-    sensing: Sensing
-
-
 class RoughRows:
     """Rows of some samples as a session reads them, errors and all. count: number of windows."""
 
-    def __init__(self, session: Described, segments: Sequence[Segment]) -> None:
+    def __init__(self, session: Estimator | SessionRows, segments: Sequence[Segment]) -> None:
         """Raises numpy.linalg.LinAlgError where there is no window, or rows are no numbers."""
         model, base = session.model, session.base
         layout, rate = model.layout, model.system.sample_rate

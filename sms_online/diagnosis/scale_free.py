@@ -16,6 +16,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 
 import numpy as np
+from numpy.typing import NDArray
 
 from sms_online.diagnosis.evidence import least_squares
 from sms_online.stream import Array
@@ -31,7 +32,7 @@ SAME = 1e-3
 class ScaleFree:
     """Frees some speeds' rows (W, n_v, n) of a model."""
 
-    def __init__(self, Y: Array, speeds: Sequence[int], inertial: Array) -> None:
+    def __init__(self, Y: Array, speeds: Sequence[int], inertial: NDArray[np.bool_]) -> None:
         """inertial (n,): which columns are inertial forces: they may cancel each other, and so count as one."""
         same = np.outer(inertial, inertial) | np.eye(inertial.size, dtype=bool)
         self._Y = Y

@@ -72,7 +72,7 @@ def run(args: argparse.Namespace) -> int:
     if document["effects"]:
         lines += [_effects(document), "", *filter(None, map(why, document["effects"])), ""]
     # See `diagnosis_document`.
-    origin = "from the rows of the diagnosis" if found.search.attempt.prior is not None else "by a replay with it"
+    origin = "from the rows of the diagnosis" if found.search.attempt.by_rows else "by a replay with it"
     title = f"parameters with what was found, {origin}"
     lines += [_residuals(document), "", parameter_table(document["after"], console.width, title=title), ""]
     lines += [f"warning: {warning}" for warning in document["warnings"]]
@@ -106,6 +106,7 @@ def _watched(args: argparse.Namespace, system: System, found: Diagnosis, capture
     estimates: dict[str, tuple[float, float]] = {}
     if found.search.attempt.prior is not None:
         estimator.set_prior(base_prior(after, estimator.base, args.prior))
+    if found.search.attempt.by_rows:
         # These come from the diagnosis's rows, not from a session; see `diagnosis_document`.
         estimates = {p.name: (p.value, p.std) for p in found.after.parameters.values()}
     with (
