@@ -76,7 +76,7 @@ def test_captures_of_other_channels_are_refused(rig: Path) -> None:
     b = sms.read_capture(rig / "b.csv")
     fewer = sms.Capture(b.t, b.channels[:-1], b.values[:, :-1], "fewer")
     with pytest.raises(sms.InputError, match="fewer"):
-        sms.diagnose(rig / "rig.toml", [rig / "a.csv", fewer])
+        sms.diagnose(rig / "rig.toml", [sms.read_capture(rig / "a.csv"), fewer])
 
 
 def _block(t: list[float]) -> Block:

@@ -12,7 +12,7 @@ from sms_online.diagnosis.calibrated import Calibrated
 from sms_online.diagnosis.candidate import Candidate, Laws
 from sms_online.diagnosis.evidence import Gain, basis, free_of, gains, least_squares, least_squares_without, together
 from sms_online.diagnosis.folds import Folds
-from sms_online.diagnosis.scale_free import NEAR, ScaleFree, converged
+from sms_online.diagnosis.scale_free import NEAR, ScaleFree, converged, cost_of
 from sms_online.diagnosis.weak_rows import WeakRows
 from sms_online.pipeline.momentum_windows import HOPS
 from sms_online.stream import Array
@@ -171,16 +171,18 @@ class CandidateRows:
             self._b[:size] += added.ravel()
             return self.solution(self._beside)
 
-        def squares(solution: Array) -> Array:
-            left = self._white_b - np.concatenate([self._white, *rest], axis=1) @ solution
-            return free.squares(solution[:n], left[:size].reshape(shape), self._scale_at)
-
         near = slice(size + self._known - self.calibrated.count - n, size + self._known - self.calibrated.count)
         lengths = NEAR * np.linalg.norm(self._white[:size], axis=0)
         self._white[near], self._white_b[near] = np.diag(lengths), lengths * self._expected
         start = np.zeros(n + sum(each.shape[1] for each in rest))
         start[:n] = self._scale_at
-        about(converged(about, start, squares))
+
+        def cost(solution: Array) -> float:
+            left = (self._white_b - np.concatenate([self._white, *rest], axis=1) @ solution)[:size].reshape(shape)
+            off = lengths * (solution[:n] - self._expected)
+            return cost_of(free.squares(solution[:n], left, self._scale_at), off, len(left))
+
+        about(converged(about, start, cost))
         self._forget()
 
     def _floor(self) -> tuple[Array, Array]:

@@ -64,34 +64,26 @@ class ScaleFree:
         columns, n = np.concatenate((self._Y, beside), axis=2), self._Y.shape[2]
         first, anchor = np.zeros((2, columns.shape[2]))
         first[:n], anchor[:n] = start, near
+        std = np.sqrt(np.maximum(least, np.mean((b - columns @ first) ** 2, axis=0)))
+        lengths = NEAR * np.linalg.norm(columns / std[:, None], axis=(0, 1))
 
-        def squares(solution: Array) -> Array:
-            return self.squares(solution[:n], b - columns @ solution, start) / least
+        def cost(solution: Array) -> float:
+            squares = self.squares(solution[:n], b - columns @ solution, start) / least
+            return cost_of(squares, lengths * (solution - anchor), len(b))
 
         def fit(solution: Array) -> Array:
             left = b - columns @ solution
             std = np.sqrt(np.maximum(least, np.mean(left**2, axis=0)))
             Y, added = self.about(solution[:n], left)
             weighed = (np.concatenate((Y, beside), axis=2) / std[:, None]).reshape(b.size, -1)
-            lengths = NEAR * np.linalg.norm(weighed, axis=0)
             rows = np.concatenate((weighed, np.diag(lengths)))
             return least_squares(rows, np.concatenate((((b + added) / std).ravel(), lengths * anchor)))
 
-        return converged(fit, first, squares)
+        return converged(fit, first, cost)
 
 
-def converged(fit: Callable[[Array], Array], start: Array, squares: Callable[[Array], Array]) -> Array:
-    """Where fits (n + c,) about the solution before lead to, from a start.
-
-    squares: gives for a solution what each type of rows leaves, over its variance: the sum of their logarithms falls
-    from fit to fit.
-    """
-
-    def cost(solution: Array) -> float:
-        with np.errstate(over="ignore", invalid="ignore"):  # of a step that is far too long
-            found = float(np.sum(np.log(np.maximum(1.0, squares(solution)))))
-        return found if np.isfinite(found) else np.inf
-
+def converged(fit: Callable[[Array], Array], start: Array, cost: Callable[[Array], float]) -> Array:
+    """Where fits (n + c,) about the solution before lead to, from a start; the cost falls from fit to fit."""
     solution, least = start, cost(start)
     for _ in range(FITS):
         step, before = fit(solution) - solution, least
@@ -103,3 +95,13 @@ def converged(fit: Callable[[Array], Array], start: Array, squares: Callable[[Ar
         if before - least < SAME:
             break
     return solution
+
+
+def cost_of(squares: Array, off: Array, windows: int) -> float:
+    """Twice the negative log likelihood, over the windows, up to a constant.
+
+    squares (n_v,): what each type of rows leaves, over its variance. off: from what parameters stay near, whitened.
+    """
+    with np.errstate(over="ignore", invalid="ignore"):  # of a step that is far too long
+        found = float(np.sum(np.log(np.maximum(1.0, squares))) + off @ off / windows)
+    return found if np.isfinite(found) else np.inf
