@@ -248,7 +248,7 @@ class Attempt(Hypothesis):
             if self.prior is not None:
                 beta = np.where(self.prior.known, self.prior.value, beta)
             # Rows that leave more than noise whatever is added are weighed by that.
-            if np.any(self.tracing.floor) or self._same_weights(beta):
+            if self.tracing.freed or self._same_weights(beta):
                 break
             if self.excess(chosen) > LARGEST_SHARE_LEFT * self.excess([]):
                 break

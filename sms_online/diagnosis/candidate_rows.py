@@ -78,6 +78,9 @@ class CandidateRows:
         if rows.weights is not None:
             self._scale_at[: self._n] = rows.weights
         self._expected = self._scale_at
+        # A prior gives the scale itself.
+        unknown = prior is None or not prior.known.any()
+        self._scaleless = unknown and bool(self._expected.any()) and not np.all(np.any(rows.b, axis=0))
         self.trials = len(self.candidates)
         # Covariance of what the laws of the chosen effects do not determine.
         self._own = np.zeros_like(rows.std)
@@ -107,7 +110,7 @@ class CandidateRows:
         moved = tuple(chosen) != self._beside
         self._beside = tuple(chosen)
         if not np.any(np.abs(wanted - used) > SMALL_CHANGE * (self.rows.std**2 + used)):
-            if moved and np.any(self.floor):
+            if moved and self.freed:
                 self.weigh()
             return False
         self._own, self._free = own, free
@@ -139,7 +142,7 @@ class CandidateRows:
         # What is known beforehand are rows too: of parameters, and below them of calibration.
         known = prior_factor(self._prior, self._n)
         n, width, first = self._n, self._model.shape[2], self.rows.b.size
-        near = width if np.any(self._homogeneous) else 0
+        near = width if self.freed else 0
         self._known = len(known) + near + self.calibrated.count
         candidates = (candidate.columns for candidate in self.candidates)
         parts = [self._model, rows.b[..., None], self.calibrated.columns, *candidates]
@@ -155,7 +158,7 @@ class CandidateRows:
         the last `settle`: see `scale_free`."""
         self._forget()
         self._Y, self._b = self._white, self._white_b
-        if not np.any(self._homogeneous):
+        if not self.freed:
             return
         shape, size, n = (-1, self._n_v), self.rows.b.size, self._model.shape[2]
         speeds = np.flatnonzero(self._homogeneous).tolist()
@@ -200,8 +203,8 @@ class CandidateRows:
         solution = together(plain, left, self._prior)
         ratio = np.mean((left - plain @ solution) ** 2, axis=0)
         beyond = ratio > LARGEST_RATIO
-        if beyond.any() and self._scale_at.any():
-            # Together they mimic the model's own terms, which then say nothing of a scale; those found so far do not.
+        if beyond.any() and self._scaleless:
+            # All candidates mimic the model's terms, which then say nothing of a scale; those found so far do not.
             solution, ratio, sized = self._scale_free(left)
             beyond = sized > LARGEST_RATIO
         lacking = np.maximum(0.0, (ratio - 1.0) * np.mean(self.std**2, axis=0))
@@ -226,7 +229,7 @@ class CandidateRows:
     @property
     def freed(self) -> bool:
         """Whether rows without a torque leave more than noise whatever is added, and count by their size."""
-        return bool(np.any(self._homogeneous))
+        return self._scaleless and bool(np.any(self._homogeneous))
 
     @property
     def n_model(self) -> int:
