@@ -51,7 +51,7 @@ def released(estimate: Estimate, nuisances: Sequence[Nuisance], squares: Array) 
     known = np.flatnonzero(may & estimate.determined[:m])
     if not np.any(np.abs(estimate.pi[known]) > NORMAL * tolerance[known]):
         return estimate
-    # Beside a prior all rows were weighed with one factor, these among them.
+    # Beside a prior all rows were weighted with one factor, these among them.
     unit = tolerance[known] * (1.0 if estimate.scale is None else estimate.scale)
     C, start = squares[:, known] / unit, estimate.pi[known] / unit
     block = C[known] / unit[:, None]

@@ -104,7 +104,7 @@ class Case:
     """A capture to be diagnosed: its session with the system as described, samples, and those held out.
 
     progress: see `Progress`. stop: whether to end with what has been found. learned: whether curves are tried where no
-    law is selected.
+    law is selected. begins: of further captures, see `captures`.
     """
 
     source: str
@@ -116,6 +116,7 @@ class Case:
     progress: Progress = lambda what, share: None
     stop: Callable[[], bool] = lambda: False
     learned: bool = False
+    begins: tuple[float, ...] = ()
 
 
 def _noise_behind(described: Estimator, case: Case) -> SensorNoise:
@@ -200,7 +201,8 @@ class Attempt(Hypothesis):
             seconds = least / system.sample_rate + wanted * span / HOPS
             expected = f"some {seconds:.1f} s without a gap, to fit and to check"
             raise InputError(case.source, "", f"too few windows of {span:g} s: {rows.count}", expected)
-        folds = Folds.of(rows.weak.windows.segment, rows.time)
+        capture = np.searchsorted(case.begins, rows.time)
+        folds = Folds.of(rows.weak.windows.segment, rows.time, capture=capture)
         effects = list(make.effects(case.learned)) if candidates is None else candidates
         self._lasting = [effect for effect in effects if is_constant(effect)]
         forces = [effect for effect in effects if not is_constant(effect)]
@@ -222,6 +224,15 @@ class Attempt(Hypothesis):
         states = build_model(system.model_copy(update={"effects": forces})).n_states
         return Attempt(self.case, system, constants, beta, effects, LONGEST if states else SOME, self.rows.second_order)
 
+    @property
+    def by_rows(self) -> bool:
+        """Whether parameters are those of these rows, and not those of a session with what was found.
+
+        So they are with a prior, and where rows without a torque leave more than noise: a session begins anew there,
+        and may end at another scale.
+        """
+        return self.prior is not None or self.tracing.freed
+
     def watch(self, chosen: Sequence[int]) -> bool:
         """See `Hypothesis`."""
         if chosen and len(chosen) > self._most_found:
@@ -236,7 +247,10 @@ class Attempt(Hypothesis):
             beta = self.solution(chosen)[: self.rows.base.n]
             if self.prior is not None:
                 beta = np.where(self.prior.known, self.prior.value, beta)
-            if self._same_weights(beta) or self.excess(chosen) > LARGEST_SHARE_LEFT * self.excess([]):
+            # Rows that leave more than noise whatever is added are weighted by that.
+            if self.tracing.freed or self._same_weights(beta):
+                break
+            if self.excess(chosen) > LARGEST_SHARE_LEFT * self.excess([]):
                 break
             self.rows.reweight(beta)
             forces = [candidate for candidate in self.tracing.candidates if not candidate.constant]

@@ -10,8 +10,9 @@ from numpy.typing import NDArray
 
 from sms_online.diagnosis.calibrated import Calibrated
 from sms_online.diagnosis.candidate import Candidate, Laws
-from sms_online.diagnosis.evidence import Gain, basis, free_of, gain, least_squares, least_squares_without, together
+from sms_online.diagnosis.evidence import Gain, basis, free_of, gains, least_squares, least_squares_without, together
 from sms_online.diagnosis.folds import Folds
+from sms_online.diagnosis.scale_free import NEAR, ScaleFree, converged, cost_of
 from sms_online.diagnosis.weak_rows import WeakRows
 from sms_online.pipeline.momentum_windows import HOPS
 from sms_online.stream import Array
@@ -25,8 +26,11 @@ ACTS = 0.01
 LARGEST_RATIO = 1.5
 # Rows for a column at least, for curves to be fitted together.
 LEAST_ROWS = 4
-# Share of a row's variance by which that of the effects chosen has to change for rows to be weighed anew.
+# Share of a row's variance by which that of the effects chosen has to change for rows to be whitened anew.
 SMALL_CHANGE = 0.1
+
+
+_Key = tuple[tuple[int, ...], frozenset[int] | None]
 
 
 class CandidateRows:
@@ -48,12 +52,13 @@ class CandidateRows:
         of_effects: Sequence[bool] | None = None,
         positive: Sequence[bool] | None = None,
         calibrated: Calibrated | None = None,
+        inertial: Sequence[bool] | None = None,
     ) -> None:
         """fixed: effects of the model already, whose columns come right after its parameters'. laws: without them
         candidates determine all. declared: keys of the effects that the model has. types: speeds of each type of
         rows, each its own unless given. of_effects (n,): which of the model's parameters are coefficients of effects;
         positive (n,): which cannot be negative. calibrated: what the description may be off by, nothing by default;
-        its m unknowns come last in a solution.
+        its m unknowns come last in a solution. inertial (n,): which of the model's parameters are of inertial forces.
         """
         nothing = Calibrated((), np.empty((*rows.b.shape, 0)), frozenset())
         self.calibrated, self._fixed = nothing if calibrated is None else calibrated, list(fixed)
@@ -65,6 +70,17 @@ class CandidateRows:
         self._of_effects = [*(of_effects or [False] * self._n), *(True for each in fixed for _ in each.parameters)]
         self._positive = np.array([False] * self._n if positive is None else positive, dtype=bool)
         self._model = np.concatenate([rows.Y, *(candidate.columns for candidate in fixed)], axis=2)
+        self._inertial = np.zeros(self._model.shape[2], dtype=bool)
+        self._inertial[: self._n] = False if inertial is None else inertial
+        # Those beside whose estimate rows without a torque count by their size, and that of the model.
+        self._beside: tuple[int, ...] = ()
+        self._scale_at = np.zeros(self._model.shape[2])
+        if rows.weights is not None:
+            self._scale_at[: self._n] = rows.weights
+        self._expected = self._scale_at
+        # A prior gives the scale itself.
+        unknown = prior is None or not prior.known.any()
+        self._scaleless = unknown and bool(self._expected.any()) and not np.all(np.any(rows.b, axis=0))
         self.trials = len(self.candidates)
         # Covariance of what the laws of the chosen effects do not determine.
         self._own = np.zeros_like(rows.std)
@@ -91,7 +107,11 @@ class CandidateRows:
         if self._loud[0] == frozenset(chosen):
             own[:, self._loud[1]], free[..., self._loud[1]] = 0.0, 0.0
         used, wanted = self._own + self._free[:, 0], own + free[:, 0]
+        moved = tuple(chosen) != self._beside
+        self._beside = tuple(chosen)
         if not np.any(np.abs(wanted - used) > SMALL_CHANGE * (self.rows.std**2 + used)):
+            if moved and self.freed:
+                self._whiten()
             return False
         self._own, self._free = own, free
         self._whiten()
@@ -121,21 +141,58 @@ class CandidateRows:
         rows.whiten(own, self._free if np.any(self._free) else None)
         # What is known beforehand are rows too: of parameters, and below them of calibration.
         known = prior_factor(self._prior, self._n)
-        self._known = len(known) + self.calibrated.count
         n, width, first = self._n, self._model.shape[2], self.rows.b.size
+        near = width if self.freed else 0
+        self._known = len(known) + near + self.calibrated.count
         candidates = (candidate.columns for candidate in self.candidates)
         parts = [self._model, rows.b[..., None], self.calibrated.columns, *candidates]
         white = self._whitened(np.concatenate(parts, axis=2))
         white[first : first + len(known), :n], white[first : first + len(known), width] = known[:, :-1], known[:, -1]
         ends = np.cumsum([part.shape[2] for part in parts])
-        self._Y, b, self._N, *self._Z = np.split(white, ends[:-1], axis=1)
-        self._b = b[:, 0]
+        self._white, b, self._N, *self._Z = np.split(white, ends[:-1], axis=1)
+        self._white_b = b[:, 0]
+        self._linearise()
+
+    def _linearise(self) -> None:
+        """Have rows without a torque that leave more than noise count by their size, about the estimate beside those of
+        the last `reweight`: see `scale_free`."""
+        self._forget()
+        self._Y, self._b = self._white, self._white_b
+        if not self.freed:
+            return
+        shape, size, n = (-1, self._n_v), self.rows.b.size, self._model.shape[2]
+        speeds = np.flatnonzero(self._homogeneous).tolist()
+        free = ScaleFree(self._white[:size].reshape(*shape, n), speeds, self._inertial)
+        rest = [*(self._Z[k] for k in self._beside), self._N]
+
+        def about(solution: Array) -> Array:
+            left = self._white_b - np.concatenate([self._white, *rest], axis=1) @ solution
+            Y, added = free.about(solution[:n], left[:size].reshape(shape))
+            self._forget()
+            self._Y = np.concatenate((Y.reshape(size, n), self._white[size:]))
+            self._b = self._white_b.copy()
+            self._b[:size] += added.ravel()
+            return self.solution(self._beside)
+
+        near = slice(size + self._known - self.calibrated.count - n, size + self._known - self.calibrated.count)
+        lengths = NEAR * np.linalg.norm(self._white[:size], axis=0)
+        self._white[near], self._white_b[near] = np.diag(lengths), lengths * self._expected
+        start = np.zeros(n + sum(each.shape[1] for each in rest))
+        start[:n] = self._scale_at
+
+        def cost(solution: Array) -> float:
+            left = (self._white_b - np.concatenate([self._white, *rest], axis=1) @ solution)[:size].reshape(shape)
+            off = lengths * (solution[:n] - self._expected)
+            return cost_of(free.squares(solution[:n], left, self._scale_at), off, len(left))
+
+        about(converged(about, start, cost))
+        self._forget()
 
     def _floor(self) -> tuple[Array, Array]:
         """What all candidates together leave of each speed's rows beyond their variance, (n_v,).
 
         As a share of that variance, and as a mean square; zero where it is little. Rows that leave more and hold no
-        torque are homogeneous in π: what makes π small makes their residual small, which counts against their terms.
+        torque are homogeneous in π: what makes π small makes their residual small, which counts beside their terms.
         """
         left = self.rows.b / self.std
         every = np.concatenate([self._plain_model, *self._plain, self._plain_calibration], axis=2)
@@ -144,13 +201,35 @@ class CandidateRows:
         enough = LEAST_ROWS * every.shape[2] <= left.size
         plain = every if enough else np.concatenate([self._plain_model, *laws, self._plain_calibration], axis=2)
         solution = together(plain, left, self._prior)
-        left = left - plain @ solution
-        ratio = np.mean(left**2, axis=0)
-        lacking = np.maximum(0.0, np.mean((left**2 - 1.0) * self.std**2, axis=0))
+        ratio = np.mean((left - plain @ solution) ** 2, axis=0)
         beyond = ratio > LARGEST_RATIO
+        if beyond.any() and self._scaleless:
+            # All candidates mimic the model's terms, which then say nothing of a scale; those found so far do not.
+            solution, ratio, sized = self._scale_free(left)
+            beyond = sized > LARGEST_RATIO
+        lacking = np.maximum(0.0, (ratio - 1.0) * np.mean(self.std**2, axis=0))
         self._homogeneous = beyond & ~np.any(self.rows.b, axis=0)
         self._usual = self._terms([], solution)
         return np.where(beyond, ratio - 1.0, 0.0), np.where(beyond, lacking, 0.0)
+
+    def _scale_free(self, b: Array) -> tuple[Array, Array, Array]:
+        """Solution beside those of the last `reweight`, and mean squares (n_v,) that it leaves of rows b (W, n_v).
+
+        Each type of rows counts by what it leaves, those without a torque by their size. Last, mean squares with these
+        as large as the parameters behind the weights make them.
+        """
+        beside = np.concatenate([np.empty((*b.shape, 0)), *(self._plain[k] for k in self._beside)], axis=2)
+        speeds = np.flatnonzero(~np.any(self.rows.b, axis=0)).tolist()
+        free, n = ScaleFree(self._plain_model, speeds, self._inertial), self._model.shape[2]
+        solution = free.solved(beside, b, self._scale_at, self._expected, 1.0)
+        self._scale_at = solution[:n]
+        left = b - np.concatenate((self._plain_model, beside), axis=2) @ solution
+        return solution, np.mean(left**2, axis=0), free.squares(solution[:n], left, self._expected)
+
+    @property
+    def freed(self) -> bool:
+        """Whether rows without a torque leave more than noise whatever is added, and count by their size."""
+        return self._scaleless and bool(np.any(self._homogeneous))
 
     @property
     def n_model(self) -> int:
@@ -174,6 +253,7 @@ class CandidateRows:
         """Which numbers of calibration (m,) are held at zero beside those chosen: effects replace them, or have to."""
         m, key = self.calibrated.count, frozenset(chosen)
         if key not in self._zeroed:
+            solution = None
             effects = (candidate.effect for candidate in (*self._fixed, *(self.candidates[k] for k in chosen)))
             held = self.calibrated.said_by(effects)
             while m:
@@ -183,13 +263,25 @@ class CandidateRows:
                     break
                 held = held | beyond
             self._zeroed[key] = held
+            if solution is not None:
+                self._solved[tuple(chosen), None] = solution
         return self._zeroed[key]
 
     def gains(self, chosen: Sequence[int]) -> list[Gain]:
         """What each candidate would take beside those chosen."""
-        Q = basis(self._columns(chosen))
-        r = free_of(Q, self._b[:, None])[:, 0]
-        return [self._plausible(c, gain(Q, r, Z)) for c, Z in zip(self.candidates, self._Z, strict=True)]
+        key = tuple(chosen)
+        if key not in self._gains:
+            found = gains(*self.left(chosen), self._Z)
+            self._gains[key] = [self._plausible(c, each) for c, each in zip(self.candidates, found, strict=True)]
+        return self._gains[key]
+
+    def left(self, chosen: Sequence[int]) -> tuple[Array, Array]:
+        """Basis of the white columns of the model with those chosen, and what it leaves of b. Kept as solutions are."""
+        key = tuple(chosen)
+        if key not in self._bases:
+            Q = basis(self._columns(chosen))
+            self._bases[key] = Q, free_of(Q, self._b[:, None])[:, 0]
+        return self._bases[key]
 
     def _plausible(self, candidate: Candidate, found: Gain) -> Gain:
         """The gain, none where the effect cannot have the coefficients."""
@@ -198,9 +290,7 @@ class CandidateRows:
 
     def gain_of(self, candidate: Candidate, chosen: Sequence[int]) -> Gain:
         """What any candidate would take beside those chosen."""
-        Q = basis(self._columns(chosen))
-        r = free_of(Q, self._b[:, None])[:, 0]
-        return self._plausible(candidate, gain(Q, r, self._whitened(candidate.columns)))
+        return self._plausible(candidate, gains(*self.left(chosen), [self._whitened(candidate.columns)])[0])
 
     def put(self, k: int, candidate: Candidate) -> None:
         """Put another form of an effect in the place of a candidate."""
@@ -212,7 +302,12 @@ class CandidateRows:
     def _forget(self) -> None:
         """What was solved with other weights or columns."""
         self._zeroed: dict[frozenset[int], NDArray[np.bool_]] = {}
-        self._solved: dict[tuple[tuple[int, ...], frozenset[int] | None], Array] = {}
+        self._solved: dict[_Key, Array] = {}
+        self._held_out: dict[_Key, Array] = {}
+        self._fitted: dict[_Key, Array] = {}
+        self._bases: dict[tuple[int, ...], tuple[Array, Array]] = {}
+        self._gains: dict[tuple[int, ...], list[Gain]] = {}
+        self._acting: dict[int, NDArray[np.bool_]] = {}
 
     def _whitened(self, columns: Array) -> Array:
         white = self.rows.white(columns)
@@ -220,28 +315,35 @@ class CandidateRows:
 
     def _acts(self, k: int) -> NDArray[np.bool_]:
         """Speeds (n_v,) in whose rows a candidate acts."""
-        squares = np.sum(self._plain[k] ** 2, axis=(0, 2))
-        return np.asarray(squares > ACTS * squares.max())
+        if k not in self._acting:
+            squares = np.sum(self._plain[k] ** 2, axis=(0, 2))
+            self._acting[k] = np.asarray(squares > ACTS * squares.max())
+        return self._acting[k]
 
     def columns(self, chosen: Sequence[int]) -> Array:
         """Columns (W, n_v, n + c) of the model with those chosen."""
         return np.concatenate([self._model, *(self.candidates[k].columns for k in chosen)], axis=2)
+
+    @staticmethod
+    def _key(chosen: Sequence[int], beside: Sequence[int] | None) -> _Key:
+        """Of what is kept for those chosen: in their order, and beside which they are held at zero, None for these."""
+        return tuple(chosen), None if beside is None or set(beside) == set(chosen) else frozenset(beside)
 
     def solution(self, chosen: Sequence[int], beside: Sequence[int] | None = None) -> Array:
         """Parameters, coefficients and calibration (n + c + m,) of the model with those chosen; beside: see `_columns`.
 
         Kept until rows are whitened anew.
         """
-        key = tuple(chosen), None if beside is None else frozenset(beside)
+        key = self._key(chosen, beside)
         if key not in self._solved:
             self._solved[key] = least_squares(self._columns(chosen, beside), self._b)
         return self._solved[key]
 
     def solutions(self, chosen: Sequence[int], beside: Sequence[int] | None = None) -> Array:
-        """The same without each of the blocks in turn, (B, n + c + m)."""
+        """The same without each part of the windows in turn, (parts, n + c + m)."""
         known = np.zeros(len(self._b) - self.rows.b.size, dtype=bool)
         left_out = [
-            np.concatenate((np.repeat(~self.folds.fitted(k), self._n_v), known)) for k in range(self.folds.count)
+            np.concatenate((np.repeat(~self.folds.fitted(k), self._n_v), known)) for k in range(self.folds.parts)
         ]
         return least_squares_without(self._columns(chosen, beside), self._b, left_out)
 
@@ -252,33 +354,51 @@ class CandidateRows:
         solutions = self.solutions(chosen, beside) if solutions is None else solutions
         left = self.residual(chosen, self.solution(chosen, beside=beside))
         for k, solution in enumerate(solutions):
-            held = self.folds.held(k)
+            held = self.folds.predicted(k)
             left[held] = self.residual(chosen, solution)[held]
         return left
 
+    def _sized(self, chosen: Sequence[int], solution: Array) -> Array:
+        """What is left (W, n_v), rows without a torque that leave more than noise as if they had their usual size."""
+        left = self.residual(chosen, solution)
+        if np.any(self._homogeneous):
+            terms = self._terms(chosen, solution)
+            sized = self._homogeneous & (terms > 0.0)
+            left[:, sized] *= np.sqrt(self._usual[sized] / terms[sized])
+        return left
+
     def held_out(self, chosen: Sequence[int], beside: Sequence[int] | None = None) -> Array:
-        """Sums of squares of held-out rows by block and speed, (B, n_v), relative where they leave more than noise."""
-        return self._by_block(chosen, self.predicted(chosen, beside=beside), beside)
+        """Sums of squares of held-out rows by block and speed, (B, n_v), relative where they leave more than noise.
+
+        Kept as solutions are: every candidate beside the same others asks for those of the others.
+        """
+        key = self._key(chosen, beside)
+        if key not in self._held_out:
+            left = self._sized(chosen, self.solution(chosen, beside))
+            for k, solution in enumerate(self.solutions(chosen, beside)):
+                held = self.folds.predicted(k)
+                left[held] = self._sized(chosen, solution)[held]
+            self._held_out[key] = self._by_block(left)
+        return self._held_out[key]
 
     def fitted(self, chosen: Sequence[int], beside: Sequence[int] | None = None) -> Array:
         """The same sums of the fit to all rows."""
-        return self._by_block(chosen, self.residual(chosen, self.solution(chosen, beside=beside)), beside)
+        key = self._key(chosen, beside)
+        if key not in self._fitted:
+            self._fitted[key] = self._by_block(self._sized(chosen, self.solution(chosen, beside)))
+        return self._fitted[key]
 
     def _terms(self, chosen: Sequence[int], solution: Array) -> Array:
         """Sums of squares (n_v,) of the terms of each speed's rows, over their deviations."""
         plain = np.concatenate([self._plain_model, *(self._plain[k] for k in chosen)], axis=2)
         return np.asarray(np.sum((plain * solution[: plain.shape[2]]) ** 2, axis=(0, 2)))
 
-    def _by_block(self, chosen: Sequence[int], left: Array, beside: Sequence[int] | None) -> Array:
+    def _by_block(self, left: Array) -> Array:
         squares = (left * self.std / self._scale) ** 2
-        if np.any(self._homogeneous):
-            terms = self._terms(chosen, self.solution(chosen, beside=beside))
-            shrunk = self._homogeneous & (terms > 0.0)
-            squares[:, shrunk] *= self._usual[shrunk] / terms[shrunk]
         return np.array([squares[self.folds.held(k)].sum(axis=0) for k in range(self.folds.count)])
 
     def spread(self, chosen: Sequence[int]) -> Array:
-        """Deviations (n + c,) of the solution by the jackknife over the blocks, whatever rows hold beside noise."""
+        """Deviations (n + c,) of the solution by the jackknife over the parts, whatever rows hold beside noise."""
         solutions = self.solutions(chosen)
         n = len(solutions)
         squares = np.sum((solutions - solutions.mean(axis=0)) ** 2, axis=0)

@@ -24,6 +24,7 @@ from sms_online.diagnosis.attempt import (
 )
 from sms_online.diagnosis.calibrated import sayable
 from sms_online.diagnosis.candidate import Finding, Ranked
+from sms_online.diagnosis.captures import begins, one_after_another
 from sms_online.diagnosis.constants import possible
 from sms_online.diagnosis.drifts import explained_by_drifts, following, leaves_more
 from sms_online.diagnosis.hypothesis import corrections, share_left, verdict
@@ -175,18 +176,22 @@ def diagnose(
     progress: Progress = lambda what, share: None,
     stop: Callable[[], bool] = lambda: False,
     learned: bool = False,
+    further: Sequence[Sequence[Block]] = (),
 ) -> Diagnosis:
     """Trace what a capture holds beyond its description, adopt it and fit again.
 
     blocks: samples of the capture; holdout: those of another one of the same rig, to check on. progress: see
     `Progress`. stop: whether to end with what has been found so far. learned: whether curves are tried where no law is
-    selected. Raises InputError where a channel is missing or there is too little motion for any row.
+    selected. further: captures of the same rig that are searched with the first, each predicted from the others.
+    Raises InputError where a channel is missing or there is too little motion for any row.
     """
     what = "fitting the model as described"
+    runs = [blocks, *further]
     clock = wrong_clock(system, np.concatenate([block.t for block in blocks]))
     if clock is not None:
-        blocks, holdout = (_in_seconds(each, clock.before) for each in (blocks, holdout))
-    before, record = _session(system, blocks, source, prior, lambda share: progress(what, FITTED_ONCE * share))
+        runs, holdout = [_in_seconds(run, clock.before) for run in runs], _in_seconds(holdout, clock.before)
+    runs = one_after_another(runs)
+    before, record = _session(system, runs, source, prior, lambda share: progress(what, FITTED_ONCE * share))
     _check_measured(before, source)
     progress("looking for mistakes of units, signs and wiring", FITTED_ONCE)
     corrected = find_mistakes(before, record.segments())
@@ -194,15 +199,16 @@ def diagnose(
     if corrected.mistakes:
         progress("; ".join(mistake.sentence for mistake in corrected.mistakes), FITTED_ONCE)
         system = corrected.system
-        blocks, holdout = (_undone(each, corrected) for each in (blocks, holdout))
-        before, record = _session(system, blocks, source, prior)
+        runs, holdout = [_undone(run, corrected) for run in runs], _undone(holdout, corrected)
+        before, record = _session(system, runs, source, prior)
         _check_measured(before, source)
     assert before.momentum is not None
     assert before.momentum.sensor_noise is not None
     followed = before
-    if not system.trackers[0].learns and leaves_more(before):
+    # From one capture to the next parameters may change at once.
+    if len(runs) == 1 and not system.trackers[0].learns and leaves_more(before):
         progress("looking for parameters that drift", FITTED_ONCE)
-        followed, _ = _session(following(system), blocks, source, prior)
+        followed, _ = _session(following(system), runs, source, prior)
     drifts = explained_by_drifts(followed)
     if drifts:
         return _drifting(
@@ -214,15 +220,18 @@ def diagnose(
         event = changes[0]
         expected = "a part without it: -ss or -to"
         raise InputError(source, f"{event.time:.2f} s", f"an event ({event.kind}) within the capture", expected)
-    held = _session(system, holdout, source, prior)[1].segments() if holdout else []
-    case = Case(source, before, before.momentum.sensor_noise, record.segments(), held, prior, progress, stop, learned)
+    held = _session(system, [holdout], source, prior)[1].segments() if holdout else []
+    case = Case(
+        source, before, before.momentum.sensor_noise, record.segments(), held, prior, progress, stop, learned,
+        begins(runs),
+    )  # fmt: skip
     progress("tracing what it leaves", FITTED_ONCE)
     try:
         attempt = described = Attempt(case, system)
     except np.linalg.LinAlgError as error:
         raise InputError(source, "", str(error), "the links' own markers, in their frames") from error
     late: list[LateSensor] = []
-    while _explains_little(before) and (found := find_late(attempt.rows, attempt.make, attempt.folds)):
+    while _explains_little(before) and (found := find_late(attempt.rows)):
         progress("taking off a sensor's lag", TRACED)
         late.append(found)
         lagging = attempt.system.model_copy(update={"effects": (*attempt.system.effects, found.effect)})
@@ -253,7 +262,7 @@ def diagnose(
     if named and not partial:
         what, rest = "fitting the model with what was found", 1.0 - SEARCHED
         estimator_after, _ = _session(
-            after.system, blocks, source, prior, lambda share: progress(what, SEARCHED + rest * share)
+            after.system, runs, source, prior, lambda share: progress(what, SEARCHED + rest * share)
         )
     said = verdict(
         named, share_left(bare.excess, after.excess), after.test, bare.test, [each.candidate for each in findings]
@@ -358,21 +367,27 @@ def _explains_little(estimator: Estimator) -> bool:
 
 def _session(
     system: System,
-    blocks: Sequence[Block],
+    runs: Sequence[Sequence[Block]],
     source: str,
     prior: PriorOf,
     progress: Callable[[float], None] = lambda share: None,
 ) -> tuple[Estimator, SampleRecord]:
-    """A session of the blocks and their record; progress: is called with the share of the samples processed."""
-    estimator = Estimator(system, blocks[0].channels, source)
+    """A session of the blocks of some captures, one after the other, and their record.
+
+    progress: is called with the share of the samples processed.
+    """
+    estimator = Estimator(system, runs[0][0].channels, source)
     record = SampleRecord(system.sample_rate)
     estimator.observers.append(record)
     known = prior(estimator)
     if known is not None:
         estimator.set_prior(known)
-    samples = sum(block.t.size for block in blocks)
-    for block in blocks:
-        estimator.push(block)
-        progress(estimator.samples / samples)
+    samples = sum(block.t.size for run in runs for block in run)
+    for number, run in enumerate(runs):
+        if number:
+            estimator.renew()  # what lies between two captures is not lost
+        for block in run:
+            estimator.push(block)
+            progress(estimator.samples / samples)
     estimator.finish()
     return estimator, record

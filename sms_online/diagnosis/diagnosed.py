@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from html import escape
 from typing import Any
@@ -22,7 +22,7 @@ from sms_online.model.base_parameters import find_base_parameters
 from sms_online.pipeline.estimator import Estimator
 from sms_online.priors import base_prior, with_estimates
 from sms_online.result import Finding, Parameter, Parameters
-from sms_online.session import Data, recorded_session
+from sms_online.session import Data, Recorded, recorded_session
 from sms_online.stream import Block
 from sms_online.tables import Documented, html_table, text_table
 from sms_online.tracker_results import Drift
@@ -130,7 +130,7 @@ class Diagnosis(Documented):
 
 def diagnose(
     system: Given,
-    data: Data,
+    data: Data | Sequence[Data],
     *,
     holdout: Data | None = None,
     prior: bool = False,
@@ -140,30 +140,37 @@ def diagnose(
 ) -> Diagnosis:
     """Find what recorded data hold that a system file does not describe, and describe it.
 
-    system, data: as for `estimate`. holdout: another capture of the same rig, to check on; without it blocks of the
-    data, each predicted from the others. prior: start from nominal values, each ± 10 %. progress: is called with what
-    is being done, a few words, and the share of all that is done, roughly. stop: is asked between steps whether to end
-    with a partial verdict. learned: whether a curve may be named where no law of the catalogue is.
+    system, data: as for `estimate`; a list of data, several captures of the same rig, is searched at once: parameters
+    and effects are common, initial states are each capture's own, and an effect is selected where it improves captures
+    that are predicted from the others. holdout: another capture of the same rig, to check on, of which nothing found
+    depends; without it blocks of the data, each predicted from the others. prior: start from nominal values, each
+    ± 10 %. progress: is called with what is being done, a few words, and the share of all that is done, roughly. stop:
+    is asked between steps whether to end with a partial verdict. learned: whether a curve may be named where no law of
+    the catalogue is.
     Raises InputError where the data cannot be read or do not fit the system, a coordinate is
     not measured, parameters jump within the capture, or there is too little motion.
     """
     system, folder = given_system(system)
-    recorded = recorded_session(system, data, folder)
+    recorded, *others = [recorded_session(system, each, folder) for each in _several(data)]
     check_channels(tuple(recorded.source.channels), known_channels(system), recorded.name)
     blocks = _samples(recorded.source, recorded.name)
     warnings = [*recorded.source.warnings]
-    held: list[Block] = []
-    if holdout is not None:
-        other = recorded_session(system, holdout, folder)
-        held = _samples(other.source, other.name)
-        warnings += other.source.warnings
-        if held[0].channels != blocks[0].channels:
-            raise InputError(other.name, "header", ", ".join(held[0].channels), ", ".join(blocks[0].channels))
+
+    def like_the_first(other: Recorded) -> list[Block]:
+        samples = _samples(other.source, other.name)
+        warnings.extend(other.source.warnings)
+        if samples[0].channels != blocks[0].channels:
+            raise InputError(other.name, "header", ", ".join(samples[0].channels), ", ".join(blocks[0].channels))
+        return samples
+
+    further = [like_the_first(other) for other in others]
+    held = [] if holdout is None else like_the_first(recorded_session(system, holdout, folder))
 
     def known(estimator: Estimator) -> Prior | None:
         return base_prior(system, estimator.base, prior) if prior or system.priors else None
 
-    found = search_for_effects(system, blocks, recorded.name, known, held, progress, stop, learned)
+    name = ", ".join(each.name for each in (recorded, *others))
+    found = search_for_effects(system, blocks, name, known, held, progress, stop, learned, further)
     true = None if recorded.truth is None else true_values(recorded.truth, system, found.after.system)
     document = diagnosis_document(found, warnings, true)
     after = Fit._of(document["after"])
@@ -184,6 +191,12 @@ def diagnose(
         _document=document,
         drifts=found.drifts,
     )
+
+
+def _several(data: Data | Sequence[Data]) -> list[Data]:
+    """The captures of data: one, unless it is a list of them."""
+    several = isinstance(data, list | tuple) and len(data) > 0 and not isinstance(data[0], Block)
+    return list(data) if several else [data]  # type: ignore[list-item, arg-type]
 
 
 def _samples(source: Iterable[Block], name: str) -> list[Block]:

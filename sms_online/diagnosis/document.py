@@ -116,7 +116,7 @@ def evaluation(session: Estimator) -> Evaluation:
 
 def _from_rows(diagnosis: Diagnosis) -> bool:
     """Whether parameters come from the rows of the diagnosis, not from a session."""
-    return diagnosis.attempt.prior is not None or diagnosis.partial
+    return diagnosis.attempt.by_rows or diagnosis.partial
 
 
 def _after(diagnosis: Diagnosis, session: Evaluation) -> Trust:

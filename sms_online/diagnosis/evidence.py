@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,6 +21,8 @@ from sms_online.trackers.interface import Prior
 
 # A column of which the model leaves less than this share is a combination of what it has.
 FREE = 1e-5
+# Rounding of a projection grows as what it leaves shrinks: below this share it is done twice.
+TWICE = 1e-2
 # Singular values below this share of the largest, of columns scaled to unit length, are not solved for.
 RANK_TOLERANCE = 1e-10
 # Solutions by parts of one factorisation are right to 1e-10 where no direction is smaller than this.
@@ -36,9 +39,12 @@ def basis(columns: Array) -> Array:
 
 
 def free_of(Q: Array, columns: Array) -> Array:
-    """What of columns (M, c) is orthogonal to the basis Q (M, rank); projected twice, for rounding."""
-    once = columns - Q @ (Q.T @ columns)
-    return np.asarray(once - Q @ (Q.T @ once))
+    """What of columns (M, c) is orthogonal to the basis Q (M, rank)."""
+    free = np.asarray(columns - Q @ (Q.T @ columns))
+    again = np.linalg.norm(free, axis=0) < TWICE * np.linalg.norm(columns, axis=0)
+    if again.any():
+        free[:, again] -= Q @ (Q.T @ free[:, again])
+    return free
 
 
 def least_squares(columns: Array, b: Array) -> Array:
@@ -105,21 +111,43 @@ class Gain:
 
 def gain(Q: Array, r: Array, columns: Array) -> Gain:
     """Of columns (M, c), beside a model with basis Q (M, rank) and residual r (M,)."""
-    c = columns.shape[1]
+    return gains(Q, r, [columns])[0]
+
+
+def gains(Q: Array, r: Array, candidates: Sequence[Array]) -> list[Gain]:
+    """Of the columns (M, c) of each candidate alone, beside a model with basis Q (M, rank) and residual r (M,)."""
+    if not candidates:
+        return []
+    columns = np.concatenate(candidates, axis=1)
     free = free_of(Q, columns)
     size, left = np.linalg.norm(columns, axis=0), np.linalg.norm(free, axis=0)
     seen = left > FREE * size
+    scaled = np.divide(free, left, out=free, where=seen)
+    along, start, out = scaled.T @ r, 0, []
+    for each in candidates:
+        own = np.arange(start, start + each.shape[1])
+        start += own.size
+        out.append(_gain(scaled, along, left, own, seen[own]))
+    return out
+
+
+def _gain(scaled: Array, along: Array, left: Array, own: NDArray[np.int64], seen: NDArray[np.bool_]) -> Gain:
+    """Of columns `own` of unit columns (M, ·) of sizes `left`, and what they take of the residual."""
+    c, kept = own.size, own[seen]
     coefficients, covariance = np.zeros(c), np.diag(np.full(c, np.inf))
-    if not seen.any():
+    if not kept.size:
         return Gain(0.0, coefficients, covariance, False)
-    kept = np.flatnonzero(seen)
-    scaled = free[:, kept] / left[kept]
-    U, s, Vt = np.linalg.svd(scaled, full_matrices=False)
-    rank = int(np.count_nonzero(s > FREE * s[0]))
-    part = U[:, :rank].T @ r
-    root = Vt[:rank].T / s[:rank] / left[kept, None]
-    coefficients[kept] = root @ part
-    covariance[np.ix_(kept, kept)] = root @ root.T
+    if kept.size == 1:
+        (k,) = kept
+        coefficients[seen], covariance[np.ix_(seen, seen)] = along[k] / left[k], 1.0 / left[k] ** 2
+        return Gain(float(along[k] ** 2), coefficients, covariance, True)
+    squares, vectors = np.linalg.eigh(scaled[:, kept].T @ scaled[:, kept])
+    rank = squares > FREE**2 * squares[-1]
+    root = vectors[:, rank] / np.sqrt(squares[rank])
+    part = root.T @ along[kept]
+    root = root / left[kept, None]
+    coefficients[seen] = root @ part
+    covariance[np.ix_(seen, seen)] = root @ root.T
     return Gain(float(part @ part), coefficients, covariance, True)
 
 
@@ -130,6 +158,7 @@ def angle(Q: Array, first: Array, second: Array) -> float:
     return float(np.arccos(min(1.0, cosine)))
 
 
+@cache
 def threshold(level: float, trials: int, freedom: int) -> float:
     """Gain that the best of so many absent candidates of `freedom` columns exceeds with probability `level` at most."""
     return float(chi2.isf(level / trials, freedom))

@@ -2,7 +2,8 @@
 
 Rows of neighbouring windows share samples, so windows are held out a block of time at once, and those that overlap it
 are not fitted either. What an effect improves is the fall of the rms of held-out rows; its standard error comes from
-leaving out one block after the other (jackknife), for windows of a block are no independent witnesses.
+leaving out one block after the other (jackknife), for windows of a block are no independent witnesses. Of several
+captures each is predicted from the others, which is what its next run will be.
 Sources: Burman, Chow, Nolan, Biometrika 81 (1994) 351 (blocks); Efron, Stein, Annals of Statistics 9 (1981) 586
 (variance of the jackknife).
 """
@@ -29,32 +30,54 @@ class Folds:
     """Blocks of the windows (W,) of a session.
 
     block (W,): number of the block that holds a window out, ALWAYS where none does. segment, time (W,): of the windows,
-    in the order of time within a segment.
+    in the order of time within a segment. capture (W,): number of the capture, of several; blocks are predicted from
+    the other captures then. parts: how many sets of windows are predicted from the others, captures or blocks.
     """
 
-    def __init__(self, block: NDArray[np.int64], segment: NDArray[np.int64], time: Array) -> None:
+    def __init__(
+        self,
+        block: NDArray[np.int64],
+        segment: NDArray[np.int64],
+        time: Array,
+        capture: NDArray[np.int64] | None = None,
+    ) -> None:
         self.block, self._segment, self._time = block, segment, time
         self.count = int(block.max(initial=ALWAYS)) + 1
+        self.across = capture is not None and np.unique(capture[block != ALWAYS]).size > 1
+        self._part = block
+        if capture is not None and self.across:
+            self._part = np.where(block == ALWAYS, ALWAYS, np.unique(capture, return_inverse=True)[1])
+        self.parts = int(self._part.max(initial=ALWAYS)) + 1
 
     @classmethod
-    def of(cls, segment: NDArray[np.int64], time: Array, tested: NDArray[np.bool_] | None = None) -> Folds:
+    def of(
+        cls,
+        segment: NDArray[np.int64],
+        time: Array,
+        tested: NDArray[np.bool_] | None = None,
+        capture: NDArray[np.int64] | None = None,
+    ) -> Folds:
         """Blocks of as many windows each; tested (W,): those that are held out at all, all of them by default."""
         held = np.arange(time.size) if tested is None else np.flatnonzero(tested)
         count = max(2, min(BLOCKS, held.size // HOPS))
         block = np.full(time.size, ALWAYS, dtype=np.int64)
         block[held] = np.arange(held.size) * count // max(1, held.size)
-        return cls(block, segment, time)
+        return cls(block, segment, time, capture)
 
     def held(self, k: int) -> NDArray[np.bool_]:
         """Windows (W,) of a block."""
         return np.asarray(self.block == k)
 
-    def fitted(self, k: int) -> NDArray[np.bool_]:
-        """Windows (W,) that a block is predicted from: those that share no sample with it.
+    def predicted(self, part: int) -> NDArray[np.bool_]:
+        """Windows (W,) of a part."""
+        return np.asarray(self._part == part)
 
-        All but the block where few of those that are tested are left: in a session of a second all windows overlap.
+    def fitted(self, part: int) -> NDArray[np.bool_]:
+        """Windows (W,) that a part is predicted from: those that share no sample with it.
+
+        All but the part where few of those that are tested are left: in a session of a second all windows overlap.
         """
-        held = self.held(k)
+        held = self.predicted(part)
         near = held.copy()
         for hop in range(1, HOPS):
             same = self._segment[hop:] == self._segment[:-hop]
@@ -64,13 +87,13 @@ class Folds:
         return ~near if 2 * np.count_nonzero(tested & ~near) > np.count_nonzero(tested) else ~held
 
     def of_others(self, segment: NDArray[np.int64], time: Array) -> NDArray[np.int64]:
-        """Block numbers (V,) of other windows of the same session: that of the nearest of these windows."""
+        """Numbers (V,) of the parts of other windows of the same session: that of the nearest of these windows."""
         out = np.full(time.size, ALWAYS, dtype=np.int64)
         for number in np.unique(segment):
             own, others = np.flatnonzero(self._segment == number), segment == number
             if own.size:
                 edges = 0.5 * (self._time[own][1:] + self._time[own][:-1])
-                out[others] = self.block[own][np.searchsorted(edges, time[others])]
+                out[others] = self._part[own][np.searchsorted(edges, time[others])]
         return out
 
 

@@ -20,6 +20,7 @@ from sms_online.diagnosis.evidence import basis, free_of, gain
 from sms_online.diagnosis.splines import DEGREE, Variable, design, spline_columns
 from sms_online.diagnosis.weak_windows import Motion
 from sms_online.effects.base import position
+from sms_online.effects.build import build_model
 from sms_online.effects.catalogue import periods
 from sms_online.effects.traits import Curve
 from sms_online.model.effect import Inputs
@@ -148,7 +149,8 @@ def _law(diagnosis: Diagnosis, own: list[int], variable: Variable, at: Array) ->
     """Force (P,) of the effects at values of their variable, from where the session came nearest to them."""
     attempt = diagnosis.attempt
     layout = attempt.rows.model.layout
-    forces = {(force.name, force.where): force for force in diagnosis.estimator_after.model.effects}
+    # A search that was ended has no session with what it found.
+    forces = {(force.name, force.where): force for force in build_model(diagnosis.after.system).effects}
     values, law = [], []
     for motion, _ in attempt.rows.weak.motions():
         total = np.zeros(len(motion.x))

@@ -70,6 +70,7 @@ class Hypothesis:
             of_effects=["@" in p.name for p in self.rows.base.parameters],
             positive=[p.name.endswith(POSITIVE) for p in self.rows.base.parameters],
             calibrated=self.rows.calibrated,
+            inertial=np.isin(self.rows.base.independent, model.inertial).tolist(),
         )
 
     def run(self) -> list[int]:

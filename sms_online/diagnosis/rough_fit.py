@@ -15,6 +15,8 @@ from numpy.typing import NDArray
 
 from sms_online.diagnosis.evidence import least_squares
 from sms_online.diagnosis.record import Segment
+from sms_online.diagnosis.rows import SessionRows
+from sms_online.diagnosis.scale_free import ScaleFree
 from sms_online.diagnosis.weak_windows import Motion, WeakWindows, Windows
 from sms_online.effects.friction import sign
 from sms_online.model.effect import Inputs
@@ -45,9 +47,9 @@ class RoughFit:
 
 
 class RoughRows:
-    """Rows of some samples as a session reads them, errors and all."""
+    """Rows of some samples as a session reads them, errors and all. count: number of windows."""
 
-    def __init__(self, session: Estimator, segments: Sequence[Segment]) -> None:
+    def __init__(self, session: Estimator | SessionRows, segments: Sequence[Segment]) -> None:
         """Raises numpy.linalg.LinAlgError where there is no window, or rows are no numbers."""
         model, base = session.model, session.base
         layout, rate = model.layout, model.system.sample_rate
@@ -56,7 +58,7 @@ class RoughRows:
         starts = [
             np.arange(M, each.index.size - M - width - 1, max(1, width // HOPS), dtype=np.int64) for each in segments
         ]
-        count = sum(each.size for each in starts)
+        self.count = count = sum(each.size for each in starts)
         if count <= base.n:
             raise np.linalg.LinAlgError("too few windows without a gap")
         where = Windows(
@@ -89,6 +91,7 @@ class RoughRows:
         self._torque, self._friction = driven[..., 0], driven[..., 1:]
         self._Y, self._known = base.columns(physical), base.known_part(physical)
         self._nominal = base.values(model.nominal)
+        self._inertial = np.isin(base.independent, model.inertial)
         terms = np.sqrt(np.mean(np.sum((self._Y * self._nominal) ** 2, axis=2), axis=0))
         torque = np.sqrt(np.mean(self._torque**2, axis=0))
         self._homogeneous = torque == 0.0
@@ -121,6 +124,23 @@ class RoughRows:
         followed = np.maximum(followed, alike / max(self._ratio(explained), SMALLEST * alike))
         left[self._homogeneous] *= followed[self._homogeneous]
         return RoughFit(left[self._used], by_nominal[self._used])
+
+    def shares(self, fitted: NDArray[np.bool_]) -> tuple[Array, Array]:
+        """rms shares (rows,) of what a fit of some windows (W,) leaves of them, and of the others, if there are any.
+
+        Of rows without a torque a share of the size of their terms, which no scale of the parameters changes.
+        """
+        Y, friction = self._Y / self._size[:, None], self._friction / self._size[:, None]
+        b = (self._torque - self._known) / self._size
+        speeds, n = np.flatnonzero(self._homogeneous).tolist(), Y.shape[2]
+        free = ScaleFree(Y[fitted], speeds, self._inertial)
+        solution = free.solved(friction[fitted], b[fitted], self._nominal, self._nominal, SMALLEST)
+        left = b - np.concatenate((Y, friction), axis=2) @ solution
+        squares = [
+            free.squares(solution[:n], left[some], self._nominal)[self._used]
+            for some in (fitted, ~fitted | fitted.all())
+        ]
+        return np.sqrt(squares[0]), np.sqrt(squares[1])
 
     def _ratio(self, torques: Array) -> float:
         """Geometric mean over the joints of torques (n_v,), rms, to those that nominal values make; 1 without these."""

@@ -153,7 +153,7 @@ class SessionRows(WeakRows):
     def reweight(self, beta: Array) -> None:
         """Propagate noise to the rows with parameters beta (n,), and whiten them."""
         model, balance = self.model, self._balance
-        self.beta = beta
+        self.beta = self.weights = beta
         if self._given is None:
             self.second_order = self._second_order()
         sensing = self.sensing

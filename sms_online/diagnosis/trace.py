@@ -17,7 +17,7 @@ import numpy as np
 
 from sms_online.diagnosis.acceptance import Acceptance
 from sms_online.diagnosis.candidate import Finding, Ranked, Rival
-from sms_online.diagnosis.evidence import Gain, basis, free_of, gain, threshold
+from sms_online.diagnosis.evidence import Gain, basis, free_of, gain, gains, threshold
 
 # Probability that a session without any effect beyond the model shows one.
 FALSE_ALARM = 0.01
@@ -116,16 +116,17 @@ class Tracing(Acceptance):
     ) -> list[int]:
         """Those chosen and what comes to them, one effect after the other; seen: sets of effects so far."""
         useless: set[str] = set()
+        found, deviances = self.gains(chosen), dict[int | None, float]()
         while len(chosen) < MOST_EFFECTS and not watch(chosen):
-            gains, eligible = self.gains(chosen), self._eligible(chosen, self._refused | useless)
+            eligible = self._eligible(chosen, self._refused | useless)
             laws = [k for k in eligible if not self.candidates[k].traits.learned]
             # Simple laws first, then those that refine them, and curves where no law is of use.
-            best = self._preferred(gains, [k for k in laws if self.candidates[k].extends is None])
-            best = self._preferred(gains, laws) if best is None else best
-            best = self._curve(chosen, gains, eligible) if best is None else best
+            best = self._preferred(found, [k for k in laws if self.candidates[k].extends is None])
+            best = self._preferred(found, laws) if best is None else best
+            best = self._curve(chosen, found, eligible) if best is None else best
             if best is None:
                 break
-            law = self._holding(chosen, best, gains, laws)
+            law = self._holding(chosen, best, found, laws, deviances)
             if law is None and not self.improves(chosen, best):
                 useless.add(self.candidates[best].key)
                 continue
@@ -149,6 +150,7 @@ class Tracing(Acceptance):
                 self.reweight(chosen)
                 self._take(chosen)
             if self.candidates[best].key in self._refused:
+                found, deviances = self.gains(chosen), {}
                 continue
             if frozenset(chosen) in seen:
                 break  # effects that replace each other in turn
@@ -156,35 +158,45 @@ class Tracing(Acceptance):
             self.path.append((best, list(chosen)))
             # Beside it others may be of use that were none before.
             useless = set()
+            found, deviances = self.gains(chosen), {}
             if self.candidates[best].constant:
                 # What it leaves while it is only approximately taken off must not be given to others.
                 break
         return chosen
 
-    def _holding(self, chosen: Sequence[int], best: int, gains: Sequence[Gain], allowed: Sequence[int]) -> int | None:
+    def _holding(
+        self,
+        chosen: Sequence[int],
+        best: int,
+        gains: Sequence[Gain],
+        allowed: Sequence[int],
+        known: dict[int | None, float],
+    ) -> int | None:
         """The dry friction that holds its axis much of the time where it predicts held-out rows better than the best.
 
         Stiction is any value up to breakaway, which many a column explains better than its law does. So these are
-        compared by their likelihoods, with the covariance of what each does not determine.
+        compared by their likelihoods, with the covariance of what each does not determine. known: deviances beside
+        those chosen so far, of one candidate more or of none, to be added to.
         """
         acts = self._acts(best)
         beside = [k for k in allowed if self._excess(k, gains[k]) > 0.0 and np.any(acts & self._acts(k))]
         laws = sorted((k for k in beside if self._holds(k)), key=lambda k: -gains[k].gain)[:RIVALS]
         if not laws:
             return None
-        deviances = {}
         for k in laws:
-            self._iterated([*chosen, k])
-            # Where rows leave more than noise whatever is added, any large variance at rest would make them likelier.
-            if not np.any(self.floor[self._acts(k)]):
-                deviances[k] = self._deviance([*chosen, k])
-        found = None
-        if deviances:
-            law = min(deviances, key=lambda k: deviances[k])
-            others = [self._deviance(each) for each in ([*chosen, best], chosen) if law not in each]
-            found = law if deviances[law] < min(others) - DECISIVE else None
+            if k not in known:
+                known[k] = self._deviance([*chosen, k], acting=k)
+        law = min(laws, key=lambda k: known[k])
+
+        def deviance(rival: int | None) -> float:
+            if rival not in known:
+                known[rival] = self._deviance(chosen if rival is None else [*chosen, rival])
+            return known[rival]
+
+        rivals = [rival for rival in (None, best) if rival != law]
+        decisive = known[law] < np.inf and all(known[law] < deviance(rival) - DECISIVE for rival in rivals)
         self.reweight(chosen)
-        return found
+        return law if decisive else None
 
     def _iterated(self, chosen: Sequence[int]) -> None:
         """Reweight the rows for those chosen until the weights are those of their coefficients."""
@@ -196,26 +208,29 @@ class Tracing(Acceptance):
         candidate = self.candidates[k]
         return self._laws is not None and candidate.traits.dry and self._laws.at_rest(candidate) > MUCH_REST
 
-    def _deviance(self, chosen: Sequence[int]) -> float:
+    def _deviance(self, chosen: Sequence[int], acting: int | None = None) -> float:
         """Minus twice the log of the likelihood of held-out rows beside those before them, up to a constant.
 
-        Fitted to the other windows; what is not determined goes with the coefficients from all of them.
+        Fitted to the other windows; what is not determined goes with the coefficients from all of them. acting: one of
+        those chosen; where rows that it acts on leave more than noise whatever is added, any large variance at rest
+        would make them likelier, and the deviance is infinite.
         """
         self._iterated(chosen)
+        if acting is not None and np.any(self.floor[self._acts(acting)]):
+            return np.inf
         columns, deviance = self._columns(chosen), np.log(self.rows.white_std) * 2.0
         total = 0.0
         for k, solution in enumerate(self.solutions(chosen)):
             left = self._b - columns @ solution
             squares = left[: self.std.size].reshape(self.std.shape) ** 2
-            total += float(np.sum((squares + deviance)[self.folds.held(k)]))
+            total += float(np.sum((squares + deviance)[self.folds.predicted(k)]))
         return total
 
     def _take(self, chosen: Sequence[int]) -> None:
         """Remember what each of the effects chosen takes beside the others."""
         self._taken = {}
         for k in chosen:
-            Q = basis(self._columns([other for other in chosen if other != k]))
-            found = gain(Q, free_of(Q, self._b[:, None])[:, 0], self._Z[k])
+            (found,) = gains(*self.left([other for other in chosen if other != k]), [self._Z[k]])
             self._taken[k] = self._plausible(self.candidates[k], found).gain
 
     def _least(self, k: int) -> float:
@@ -269,7 +284,7 @@ class Tracing(Acceptance):
         gains = self.gains(others)
         improvement = self.improvement(others, k).share
         own = gains[k]
-        Q = basis(self._columns(others))
+        Q, _ = self.left(others)
         part = free_of(Q, self._Z[k]) @ own.coefficients
         taken = {self.candidates[other].key for other in chosen}
         found = self.candidates[k]
@@ -300,7 +315,7 @@ class Tracing(Acceptance):
     def ranking(self) -> list[Ranked]:
         """Every effect in its best form, by what it alone takes from the residual."""
         gains = self.gains([])
-        r = free_of(basis(self._Y), self._b[:, None])[:, 0]
+        r = free_of(basis(self._Y), self._b[:, None])[:, 0]  # without calibration
         whole = max(float(r @ r), float(np.finfo(np.float64).tiny))
         best: dict[str, int] = {}
         for k, candidate in enumerate(self.candidates):

@@ -15,10 +15,12 @@ class WeakRows:
     """Rows Y β = b of W windows, n_v a window, errors and all.
 
     Y (W, n_v, n), b (W, n_v). sample_rate: of what they are from, Hz. Once their noise is known: std (W, n_v), each
-    row's own predicted deviation; white_std (W, n_v), that of a row beside those before it.
+    row's own predicted deviation; white_std (W, n_v), that of a row beside those before it. weights (n,): parameters
+    that predict it, None where it is known without any.
     """
 
     std: Array
+    weights: Array | None = None
     _covariances: Sequence[Sequence[Array]]
     _whitening: Whitening
 

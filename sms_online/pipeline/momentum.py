@@ -297,7 +297,7 @@ class Momentum(Stage):
         """Forget all rows, and begin with weights β (n,) that are known."""
         before = self.state
         self.changes, self.bank, self.state = self._new_changes(), self._new_bank(), self._new_state()
-        self.state.sensor_noise, self.state.noise_at = before.sensor_noise, before.noise_told
+        self.state.sensor_noise, self.state.noise_at = before.sensor_noise, before.noise_at
         self.state.start_time = before.start_time
         self.bias, self.grams = self._new_sums()
         self._build()

@@ -260,14 +260,15 @@ def _add_prior(parser: Parser) -> None:
 def _add_diagnose(verbs: Verbs) -> None:
     text = "Find what a recorded session holds that its system file does not describe, and describe it."
     parser = _add_verb(verbs, "diagnose", "diagnose", text)
-    _add_recorded(parser)
+    text = "a capture, log or recording, as for replay; several of the same rig are searched at once"
+    parser.add_argument("captures", metavar="CAPTURE", type=Path, nargs="+", help=text)
     _add_system(parser)
     _add_out(parser)
     _add_part(parser)
     _add_prior(parser)
     text = (
-        "check what is found on this capture; the same one means what comes after -to. "
-        "Without it blocks of time are held out in turn"
+        "check what is found on this capture, which decides nothing; the one that is searched means what comes after "
+        "-to. Without it blocks of time are held out in turn, of several captures each"
     )
     parser.add_argument("--holdout", metavar="CAPTURE", type=Path, help=text)
     text = "where no law of the catalogue is selected, try curves over a joint's rate, angle, deflection and load"

@@ -36,16 +36,16 @@ NAME = "diagnosis.json"
 
 
 def run(args: argparse.Namespace) -> int:
-    """Diagnose a capture; 0, or 3 where nothing is determined."""
+    """Diagnose captures; 0, or 3 where nothing is determined."""
     check_part(args)
     system, folder = described_system(args)
     directory = results_directory(args.out)
     console = report_console(args.json)
-    capture = _samples(args.capture, system, args.start, args.stop, folder)
+    captures = [_samples(path, system, args.start, args.stop, folder) for path in args.captures]
     holdout: Capture | None = None
     if args.holdout is not None:
         start = None
-        if args.holdout == args.capture:
+        if args.holdout in args.captures:
             if args.stop is None:
                 expected = "-to SECONDS beside it: what comes after is held out then"
                 raise InputError("--holdout", "", "the capture itself", expected)
@@ -55,7 +55,7 @@ def run(args: argparse.Namespace) -> int:
     with waiting() as progress, Interruption() as interruption:
         found = diagnose(
             system,
-            capture,
+            captures,
             holdout=holdout,
             prior=args.prior,
             progress=progress,
@@ -63,7 +63,8 @@ def run(args: argparse.Namespace) -> int:
             learned=args.learn,
         )
     document = found.document()
-    view = None if args.rerun == "off" else _watched(args, system, found, capture, directory)
+    # Shown is the first: what was found is the same in all.
+    view = None if args.rerun == "off" else _watched(args, system, found, captures[0], directory)
     if view is not None:
         document["warnings"] = [*document["warnings"], *view.warnings]
     lines: list[Table | str | Text] = ["", found.summary, ""]
@@ -71,7 +72,7 @@ def run(args: argparse.Namespace) -> int:
     if document["effects"]:
         lines += [_effects(document), "", *filter(None, map(why, document["effects"])), ""]
     # See `diagnosis_document`.
-    origin = "from the rows of the diagnosis" if found.search.attempt.prior is not None else "by a replay with it"
+    origin = "from the rows of the diagnosis" if found.search.attempt.by_rows else "by a replay with it"
     title = f"parameters with what was found, {origin}"
     lines += [_residuals(document), "", parameter_table(document["after"], console.width, title=title), ""]
     lines += [f"warning: {warning}" for warning in document["warnings"]]
@@ -85,7 +86,7 @@ def run(args: argparse.Namespace) -> int:
     # Matplotlib takes a second to be imported, which nobody should wait for before the diagnosis.
     from sms_tools.html_report.diagnosis_page import write_diagnosis
 
-    page = write_diagnosis(directory, document, found.search, args.capture.name, added)
+    page = write_diagnosis(directory, document, found.search, ", ".join(p.name for p in args.captures), added)
     show(console, *lines, f"diagnosis: {path}", f"page: {page}", "", verdict_text(document["judgement"]))
     if args.json:
         print(text)
@@ -101,10 +102,11 @@ def _watched(args: argparse.Namespace, system: System, found: Diagnosis, capture
     # What is to be seen has been found already: no diagnosis runs beside it.
     # Estimated anew: what was fitted to these samples is nothing known of them beforehand.
     after = found.search.after.system
-    estimator = Estimator(after, capture.channels, str(args.capture))
+    estimator = Estimator(after, capture.channels, str(args.captures[0]))
     estimates: dict[str, tuple[float, float]] = {}
     if found.search.attempt.prior is not None:
         estimator.set_prior(base_prior(after, estimator.base, args.prior))
+    if found.search.attempt.by_rows:
         # These come from the diagnosis's rows, not from a session; see `diagnosis_document`.
         estimates = {p.name: (p.value, p.std) for p in found.after.parameters.values()}
     with (

@@ -1,0 +1,107 @@
+"""Rows without a torque that leave more than noise, made free of the scale of π to first order.
+
+Such rows are homogeneous in π: they leave r = -Yπ, and least squares lowers that by shrinking π wherever they hold more
+than noise. What counts is r beside the size s(π) of its terms, as in the criterion of the estimate (see
+`pipeline.criterion`). About π°
+
+    r(π) s(π°) / s(π) = r° - (Y + r° gᵀ) (π - π°) + …,    g = Mπ° / s(π°)²,    s² = πᵀ M π,
+
+which are rows of least squares again, with columns Y + r° gᵀ: π°, along which all of them shrink, is no direction of
+theirs any more, and only rows with a torque fix the scale. Solved again and again, each time about the solution before,
+they lead to where the criterion is least (Gauss and Newton).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sms_online.diagnosis.evidence import least_squares
+from sms_online.stream import Array
+
+# Fits about the solution before, at most, and halvings of a step that does not lower what is asked for.
+FITS, HALVINGS = 16, 6
+# What rows determine to less than this share of their columns' size stays near given parameters.
+NEAR = 1e-3
+# Gain of the sum of logarithms below which a fit is the last.
+SAME = 1e-3
+
+
+class ScaleFree:
+    """Frees some speeds' rows (W, n_v, n) of a model."""
+
+    def __init__(self, Y: Array, speeds: Sequence[int], inertial: NDArray[np.bool_]) -> None:
+        """inertial (n,): which columns are inertial forces: they may cancel each other, and so count as one."""
+        same = np.outer(inertial, inertial) | np.eye(inertial.size, dtype=bool)
+        self._Y = Y
+        self._metric = {speed: np.where(same, Y[:, speed].T @ Y[:, speed], 0.0) for speed in speeds}
+
+    def squares(self, pi: Array, left: Array, expected: Array) -> Array:
+        """Mean squares (n_v,) of what parameters (n,) leave (W, n_v), freed rows as large as expected (n,) has them."""
+        out = np.mean(left**2, axis=0)
+        for speed, M in self._metric.items():
+            out[speed] *= float(expected @ M @ expected) / max(float(pi @ M @ pi), np.finfo(np.float64).tiny)
+        return np.asarray(out)
+
+    def about(self, pi: Array, left: Array) -> tuple[Array, Array]:
+        """Columns (W, n_v, n) about parameters (n,) that leave (W, n_v), and what is added to the right-hand side."""
+        columns, added = self._Y.copy(), np.zeros_like(left)
+        for speed, M in self._metric.items():
+            squares = float(pi @ M @ pi)
+            if squares > 0.0:
+                columns[:, speed] += left[:, speed, None] * (M @ pi / squares)
+                added[:, speed] = left[:, speed]
+        return columns, added
+
+    def solved(self, beside: Array, b: Array, start: Array, near: Array, least: float) -> Array:
+        """Solution (n + c,) of rows b (W, n_v) with columns beside (W, n_v, c), each speed's weighted by what it leaves.
+
+        start, near (n,): parameters to begin with, and those that rows which determine nothing else stay near. least:
+        mean square of what noise alone leaves.
+        """
+        columns, n = np.concatenate((self._Y, beside), axis=2), self._Y.shape[2]
+        first, anchor = np.zeros((2, columns.shape[2]))
+        first[:n], anchor[:n] = start, near
+        std = np.sqrt(np.maximum(least, np.mean((b - columns @ first) ** 2, axis=0)))
+        lengths = NEAR * np.linalg.norm(columns / std[:, None], axis=(0, 1))
+
+        def cost(solution: Array) -> float:
+            squares = self.squares(solution[:n], b - columns @ solution, start) / least
+            return cost_of(squares, lengths * (solution - anchor), len(b))
+
+        def fit(solution: Array) -> Array:
+            left = b - columns @ solution
+            std = np.sqrt(np.maximum(least, np.mean(left**2, axis=0)))
+            Y, added = self.about(solution[:n], left)
+            weighted = (np.concatenate((Y, beside), axis=2) / std[:, None]).reshape(b.size, -1)
+            rows = np.concatenate((weighted, np.diag(lengths)))
+            return least_squares(rows, np.concatenate((((b + added) / std).ravel(), lengths * anchor)))
+
+        return converged(fit, first, cost)
+
+
+def converged(fit: Callable[[Array], Array], start: Array, cost: Callable[[Array], float]) -> Array:
+    """Where fits (n + c,) about the solution before lead to, from a start; the cost falls from fit to fit."""
+    solution, least = start, cost(start)
+    for _ in range(FITS):
+        step, before = fit(solution) - solution, least
+        for k in range(HALVINGS):
+            tried = solution + 0.5**k * step
+            if cost(tried) < least:
+                solution, least = tried, cost(tried)
+                break
+        if before - least < SAME:
+            break
+    return solution
+
+
+def cost_of(squares: Array, off: Array, windows: int) -> float:
+    """Twice the negative log likelihood, over the windows, up to a constant.
+
+    squares (n_v,): what each type of rows leaves, over its variance. off: from what parameters stay near, whitened.
+    """
+    with np.errstate(over="ignore", invalid="ignore"):  # of a step that is far too long
+        found = float(np.sum(np.log(np.maximum(1.0, squares))) + off @ off / windows)
+    return found if np.isfinite(found) else np.inf
