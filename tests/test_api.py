@@ -53,7 +53,7 @@ def test_the_readme_holds_the_ten_lines() -> None:
     assert set(TEN_LINES.splitlines()) <= set(README.read_text(encoding="utf-8").splitlines())
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_the_ten_lines_run(ten: dict[str, Any]) -> None:
     assert ten["result"].trust.grave
     (finding,) = ten["found"].effects
@@ -66,7 +66,7 @@ def test_the_ten_lines_run(ten: dict[str, Any]) -> None:
             assert abs(parameter.value - parameter.true) < 5.0 * parameter.std
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_an_estimate_is_the_replay_of_the_written_capture(ten: dict[str, Any], tmp_path: Path) -> None:
     path = sms.write_capture(ten["data"], tmp_path / "run.csv")
     assert main(["replay", str(path), "--system", "paper-planar", "--out", str(tmp_path)]) == 0
@@ -77,7 +77,7 @@ def test_an_estimate_is_the_replay_of_the_written_capture(ten: dict[str, Any], t
     assert read.truth["effects"] == ten["data"].truth["effects"]
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_session_in_blocks_ends_as_the_estimate(ten: dict[str, Any]) -> None:
     session = ten["session"]
     session.finish()
@@ -88,7 +88,7 @@ def test_a_session_in_blocks_ends_as_the_estimate(ten: dict[str, Any]) -> None:
     assert without_timing(live) == without_timing(whole)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_results_are_frozen_records(ten: dict[str, Any]) -> None:
     for record in (ten["result"], ten["result"].parameters["joint_1.stiffness"], ten["found"], ten["data"]):
         with pytest.raises(dataclasses.FrozenInstanceError):
@@ -116,7 +116,7 @@ print("same bits" if documents[0] == documents[1] else documents)
 """
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_one_sample_at_a_time_gives_the_same_bits(ten: dict[str, Any], tmp_path: Path) -> None:
     data = ten["data"]
     early = data.t <= 4.0
@@ -176,6 +176,7 @@ def capture() -> sms.Capture:
     return sms.Capture(block.t, block.channels, block.values)
 
 
+@pytest.mark.slow
 def test_tables_are_captures(axis: sms.System, capture: sms.Capture) -> None:
     pandas = pytest.importorskip("pandas")
     columns = {"t": capture.t, **dict(zip(capture.channels, capture.values.T, strict=True))}
@@ -281,7 +282,7 @@ def test_results_read_as_tables(axis: sms.System, capture: sms.Capture) -> None:
         assert all(name in text for name in result.parameters)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_recorded_motion_has_bounds() -> None:
     system = sms.load_system("paper-planar")
     bounds = sms.bound(system, sms.simulate(system, 4.0, "B"))
@@ -289,6 +290,7 @@ def test_a_recorded_motion_has_bounds() -> None:
     assert "joint_1.stiffness" in str(bounds)
 
 
+@pytest.mark.slow
 def test_a_system_may_be_given_by_the_path_of_its_file(tmp_path: Path) -> None:
     path, block = tmp_path / "axis.toml", axis_block(coulomb=0.0)
     path.write_text(AXIS)

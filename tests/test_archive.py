@@ -51,7 +51,7 @@ def table(rig: Path) -> Path:
     return rig / "out" / TABLE
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_every_capture_has_a_row(table: Path) -> None:
     rows = pq.read_table(table).to_pylist()
     assert [row["capture"] for row in rows] == NAMES
@@ -62,21 +62,21 @@ def test_every_capture_has_a_row(table: Path) -> None:
         assert row["error"] is None
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_capture_that_fails_is_a_row_that_says_why(table: Path) -> None:
     row = pq.read_table(table).to_pylist()[4]
     assert "notes.csv" in row["error"]
     assert row["link_1.inertia"] is None
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_results_lie_beside_and_can_be_compared(rig: Path, table: Path) -> None:
     results = [rig / "out" / name for name in NAMES if name.startswith("0/")]
     assert sms.compare(results).changed == ()
     assert (rig / "out" / "1/1.csv" / "diagnosis.json").is_file()
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_resume_does_only_what_is_new_or_changed(rig: Path, table: Path, tmp_path: Path) -> None:
     days, out = tmp_path / "days", tmp_path / "out"
     shutil.copytree(rig / "days", days)
@@ -171,7 +171,7 @@ def scheduler(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
             process.wait(timeout=30.0)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_cluster_makes_the_same_table(rig: Path, table: Path, scheduler: str, tmp_path: Path) -> None:
     arguments = ["archive", str(rig / "days"), "--system", str(rig / "rig.toml")]
     assert main([*arguments, "--out", str(tmp_path), "--scheduler", scheduler]) == 0
@@ -179,13 +179,13 @@ def test_a_cluster_makes_the_same_table(rig: Path, table: Path, scheduler: str, 
     assert theirs.equals(ours)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_killed_worker_of_a_cluster_costs_no_row(scheduler: str, tmp_path: Path) -> None:
     rows = dict(finished(square, tasks(tmp_path / "log", task_4="once"), scheduler=scheduler))
     assert {key: row["square"] for key, row in rows.items()} == {str(k): k**2 for k in range(12)}
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_scheduler_that_is_not_there(
     rig: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -37,7 +37,7 @@ def rig(tmp_path: Path) -> Path:
     return path
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_bounds_rise_with_the_noise_and_without_a_sensor(rig: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["bound", "--system", str(rig), "--each-sensor", "--json"]) == 0
     document = json.loads(capsys.readouterr().out)
@@ -60,7 +60,7 @@ WITHOUT_NOISE = (
 )  # fmt: skip
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("name", WITHOUT_NOISE)
 def test_a_system_without_stated_noise_has_bounds_of_grade_b(
     name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
@@ -77,6 +77,7 @@ def test_a_system_without_stated_noise_has_bounds_of_grade_b(
     assert "noise: " not in said
 
 
+@pytest.mark.slow
 def test_a_replay_states_the_bound_on_demand(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     capture = tmp_path / "capture.csv"
     arguments = ["--system", "paper-planar", "--capture", str(capture), "--duration", "2", "--grade", "B"]

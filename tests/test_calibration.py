@@ -99,6 +99,7 @@ def of(evaluation: Evaluation, name: str, where: str) -> Calibration:
     return found
 
 
+@pytest.mark.slow
 def test_a_late_camera_within_tolerance_is_said_and_corrected(exact: Block) -> None:
     """By 100 µs, two tolerances."""
     evaluation = evaluated(exact, Tolerances(), late(exact, 1e-4))

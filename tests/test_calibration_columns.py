@@ -121,7 +121,7 @@ class Rows:
         return np.array(out)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("system", SYSTEMS.values(), ids=SYSTEMS.keys())
 def test_columns_are_what_rows_change_by(system: Callable[[], System]) -> None:
     """Samples or description changed, rows rebuilt, central differences: Y β - b changes by -N ν."""

@@ -116,7 +116,7 @@ def test_a_session_bridges_a_hidden_link_and_names_a_swap(system: System, block:
     assert any(warning.startswith(named) for warning in results_document(estimator, 1.0, [])["warnings"])
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_an_arm_is_identified_in_spite_of_faults() -> None:
     system = seen_by_cameras("paper-planar")
     simulation = simulate(system)

@@ -146,6 +146,7 @@ def test_channels_that_the_model_does_not_use_are_named(bench: Path) -> None:
     assert "channels not used: gyro_0_z" in document(bench / "done")["warnings"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("small", [0, 20_000_000])
 def test_a_terminal_has_a_bar_for_what_takes_more_than_a_moment(
     bench: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], small: int
@@ -165,6 +166,7 @@ def test_a_terminal_has_a_bar_for_what_takes_more_than_a_moment(
     assert re.search(r"\d:\d\d:\d\d", shown)  # the time left
 
 
+@pytest.mark.slow
 def test_every_verb_that_takes_long_has_a_bar(
     bench: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -283,6 +285,7 @@ def test_the_seed_decides_the_capture(bench: Path) -> None:
     assert capture("1") != capture("2")
 
 
+@pytest.mark.slow
 def test_the_demo_shows_the_papers_parameters_converge(bench: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (bench / "paper.toml").write_text(shipped_text("paper-planar").replace("duration = 20.0", "duration = 3.0"))
     assert main(["demo", "--system", "paper.toml", "--out", "done"]) == 0
@@ -301,7 +304,7 @@ def test_the_demo_shows_the_papers_parameters_converge(bench: Path, capsys: pyte
     assert np.median([abs(p["estimate"] / p["true"] - 1.0) for p in parameters]) < 0.1
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_at_a_terminal_the_demo_draws_its_table_again_and_again(
     bench: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -352,6 +355,7 @@ def test_markers_of_the_papers_links(bench: Path, capsys: pytest.CaptureFixture[
 # the program as a process
 
 
+@pytest.mark.slow
 def test_the_program_runs_as_a_module_and_helps(bench: Path) -> None:
     said = python("-m", "sms_online", "--help")
     assert said.returncode == 0

@@ -34,7 +34,7 @@ def shifted() -> sms.Capture:
     return sms.Capture(capture.t, capture.channels, values)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_clock_that_shifts_is_no_event(rig: System, shifted: sms.Capture) -> None:
     result = sms.estimate(rig, shifted)
     assert result.events == ()
@@ -44,7 +44,7 @@ def test_a_clock_that_shifts_is_no_event(rig: System, shifted: sms.Capture) -> N
     assert max(abs(p.value - p.nominal) / p.std for p in known if p.nominal) < 5.0
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_on_one_clock_the_same_samples_hold_an_event(rig: System, shifted: sms.Capture) -> None:
     (event,) = sms.estimate(rig.model_copy(update={"sources": ()}), shifted).events
     assert event.time == pytest.approx(SHIFTED, abs=0.5)

@@ -198,7 +198,7 @@ def test_unmarked_samples_are_numbered_and_holes_counted() -> None:
     assert np.rint(times / 0.01).tolist() == [*range(10), *range(100, 110)]
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_pi_is_as_good_as_on_one_clock(tmp_path: Path) -> None:
     # Offset 0.3 s, drifts of 20 and -30 ppm (50 between the devices), delays up to 2 ms, against none of them.
     system = axis_testbed(tmp_path)

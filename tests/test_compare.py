@@ -35,7 +35,7 @@ joint_1 = [{{ frequency = 4.0, sine = 2.0 }}, {{ frequency = 9.0, cosine = 1.0 }
 """
 
 
-pytestmark = pytest.mark.slow
+pytestmark = pytest.mark.long
 
 
 @pytest.fixture(scope="module")

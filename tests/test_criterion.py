@@ -132,7 +132,7 @@ def _identified(
     return estimator, estimator.estimate().pi / true - 1.0
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize(("corner", "once"), [(200.0, 0.0), (100.0, 0.0), (40.0, 0.0), (None, 0.02)])
 def test_a_wrong_link_encoder_does_not_collapse_the_spring(corner: float | None, once: float) -> None:
     found = [_identified(corner, 0.0, factor, once=once) for factor in (0.5, 2.0)]
@@ -143,7 +143,7 @@ def test_a_wrong_link_encoder_does_not_collapse_the_spring(corner: float | None,
     np.testing.assert_allclose(found[0][1], found[1][1], atol=1e-3)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_friction_beside_a_slow_encoder_costs_four_percent() -> None:
     for factor in (0.5, 2.0):
         estimator, error = _identified(40.0, 0.01, factor)
@@ -154,6 +154,7 @@ def test_friction_beside_a_slow_encoder_costs_four_percent() -> None:
         assert np.all(np.abs(error[:3]) < 3.0 * std)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("corner", "once"), [(40.0, 0.0), (None, 0.02)])
 def test_priors_do_not_bend_what_a_wrong_encoder_leaves(corner: float | None, once: float) -> None:
     estimator, error = _identified(corner, 0.0, 1.0, prior=True, once=once)
@@ -161,6 +162,7 @@ def test_priors_do_not_bend_what_a_wrong_encoder_leaves(corner: float | None, on
     assert judged(estimator).grave
 
 
+@pytest.mark.slow
 def test_a_prior_that_is_wrong_is_said_to_be() -> None:
     estimator, _ = _identified(None, 0.0, 2.0, prior=True)
     assert any("off its prior" in reason for reason in judged(estimator).reasons)

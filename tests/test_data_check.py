@@ -50,7 +50,7 @@ def test_a_healthy_capture_has_nothing_the_matter() -> None:
     assert "link_1.inertia" in found.motion()[0]
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize(("name", "grade"), [("paper-planar", "0"), ("spatial-two-link", "C")])
 def test_other_simulated_sessions_have_nothing_the_matter(name: str, grade: str) -> None:
     system = sms.load_system(name)
@@ -84,6 +84,7 @@ def dropped(t: Array, q: Array) -> Array:
     return q
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("change", "said"),
     [
@@ -137,6 +138,7 @@ def test_a_capture_without_motion_determines_nothing() -> None:
     assert ": the motion determines no parameter" in grave(data)
 
 
+@pytest.mark.slow
 def test_the_page_and_its_exit_codes(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "axis.toml").write_text(AXIS + SENSORS)
     sms.write_capture(capture(), tmp_path / "good.csv")
@@ -150,6 +152,7 @@ def test_the_page_and_its_exit_codes(tmp_path: Path, capsys: pytest.CaptureFixtu
     assert (document["schema"], document["passed"]) == ("sms-online/check/1", False)
 
 
+@pytest.mark.slow
 def test_a_replay_begins_with_what_is_the_matter(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "axis.toml").write_text(AXIS + SENSORS)
     sms.write_capture(capture(stuck), tmp_path / "run.csv")
@@ -160,6 +163,7 @@ def test_a_replay_begins_with_what_is_the_matter(tmp_path: Path, capsys: pytest.
     assert any(warning.startswith("q_1: stuck at") for warning in warnings)
 
 
+@pytest.mark.slow
 def test_the_check_and_the_estimate_count_the_same_outliers() -> None:
     data = capture(with_outliers)
     found, result = sms.check(SYSTEM, data), sms.estimate(SYSTEM, data)

@@ -62,7 +62,7 @@ def reported(diagnosis: Diagnosis) -> dict[str, float]:
     return {name: value for name, (value, _) in coefficients(diagnosis, diagnosis.findings[0]).items()}
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_session_that_the_model_explains_is_clean() -> None:
     diagnosis = diagnosed()
     assert (diagnosis.verdict, keys(diagnosis)) == ("clean", [])
@@ -70,7 +70,7 @@ def test_a_session_that_the_model_explains_is_clean() -> None:
     assert diagnosis.after.system == diagnosis.before.system
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("text", "accuracy"),
     [
@@ -104,7 +104,7 @@ def test_the_missing_effect_is_named_with_its_place_and_size(text: str, accuracy
     assert not any(row.beyond for row in diagnosis.after.test.values())
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_two_effects_are_found_in_turn() -> None:
     texts = "viscous_friction@joint_1:damping=2", "cubic_stiffness@joint_2:stiffness=300"
     diagnosis = diagnosed(*texts)
@@ -112,7 +112,7 @@ def test_two_effects_are_found_in_turn() -> None:
     assert set(keys(diagnosis)) == {text.partition(":")[0] for text in texts}
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_an_unknown_effect_is_unexplained_where_it_acts() -> None:
     """Cubic stiffness, struck from the catalogue with what resembles it: it depends on the deflection of its joint."""
     alike = ("cubic_stiffness", "backlash", "encoder_eccentricity", "torsional_hysteresis", "encoder_offset")
@@ -130,7 +130,7 @@ def test_an_unknown_effect_is_unexplained_where_it_acts() -> None:
     assert diagnosis.unexplained.variable == "deflection of joint_1"
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_the_adopted_system_file_holds_what_was_found() -> None:
     diagnosis = diagnosed("table_tilt@base:gravity_x=0.003,gravity_y=-0.002")
     system = load_system("paper-planar")
@@ -147,7 +147,7 @@ def test_the_adopted_system_file_holds_what_was_found() -> None:
     assert abs(value - 0.02) < 3.0 * std < 0.06 * value
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_the_document_holds_results_before_and_after() -> None:
     diagnosis = diagnosed("cubic_stiffness@joint_1:stiffness=300")
     document = diagnosis_document(diagnosis, [], None)
@@ -164,6 +164,7 @@ def test_the_document_holds_results_before_and_after() -> None:
     assert describe(diagnosis.before.system)["effects"] == []
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("samples", "words"), [(500, "too few"), (700, "too few windows")])
 def test_a_capture_that_is_too_short_is_refused(samples: int, words: str) -> None:
     block = block_of()
@@ -172,6 +173,7 @@ def test_a_capture_that_is_too_short_is_refused(samples: int, words: str) -> Non
         diagnose(unlike(load_system("paper-planar")), [short], "short.csv", lambda estimator: None)
 
 
+@pytest.mark.slow
 def test_a_second_of_samples_is_enough_where_dry_friction_acts() -> None:
     """Fewer windows than overlap one: the noise of friction's law is averaged over those that there are."""
     system = load_system("paper-planar")
@@ -189,6 +191,7 @@ def test_a_session_without_momentum_rows_is_refused() -> None:
         diagnose(system, [block_of()], "test", lambda estimator: None)
 
 
+@pytest.mark.slow
 def test_gaps_and_short_stretches_between_them_do_no_harm() -> None:
     """Two gaps of half a second with 40 samples between them: still clean."""
     block = block_of()
@@ -198,7 +201,7 @@ def test_gaps_and_short_stretches_between_them_do_no_harm() -> None:
     assert diagnosis.verdict == "clean"
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_joints_at_rest_end_the_search_and_are_no_error() -> None:
     """Encoders of joint 2 that are at rest: whatever is said of such a session, it is said."""
     block = block_of()

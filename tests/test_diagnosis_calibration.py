@@ -45,13 +45,13 @@ def keys(found: Diagnosis) -> list[str]:
     return [finding.candidate.key for finding in found.findings]
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_what_is_within_its_tolerance_is_no_effect() -> None:
     found = diagnosed(0.0, tracked_point(2e-4), clock(5e-5))
     assert (found.verdict, keys(found)) == ("clean", [])
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_true_effect_alone_is_named_beside_two_imperfections() -> None:
     found = diagnosed(1.0, tracked_point(2e-4), clock(5e-5))
     assert (found.verdict, keys(found)) == ("named", ["coulomb_friction@joint_2"])
@@ -59,14 +59,14 @@ def test_a_true_effect_alone_is_named_beside_two_imperfections() -> None:
     assert torque == pytest.approx(1.0, abs=0.05)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_what_is_far_beyond_its_tolerance_is_an_effect() -> None:
     """A gain is known to 1 %; the torque of joint 2 is read 4 % wrong, of which joint, the data do not determine."""
     found = diagnosed(0.0, torque_gain(0.04))
     assert (found.verdict, keys(found)) == ("named", ["torque_gain@joint_2"])
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_geometry_far_beyond_its_tolerance_is_said_in_words() -> None:
     """The tracked point is 5 mm elsewhere along both axes, ten tolerances; no effect of the catalogue says so."""
     found = diagnosed(0.0, tracked_point(5e-3))

@@ -53,6 +53,7 @@ def page_of(diagnosis: Diagnosis, directory: Path, added: list[str]) -> tuple[Do
     return document, write_diagnosis(directory, document, diagnosis, "run.csv", added).read_text()
 
 
+@pytest.mark.slow
 def test_the_curve_from_the_data_is_the_friction_that_was_there(diagnosis: Diagnosis) -> None:
     (curve,) = force_curves(diagnosis)
     assert [effect.name for effect in curve.effects] == ["coulomb_friction"]
@@ -99,11 +100,12 @@ def test_what_was_found_has_no_nominal_value(diagnosis: Diagnosis, tmp_path: Pat
     assert "" in nominal
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_the_same_session_gives_the_same_page(diagnosis: Diagnosis, tmp_path: Path) -> None:
     assert page_of(diagnosis, tmp_path, [])[1] == page_of(diagnosed(COULOMB), tmp_path, [])[1]
 
 
+@pytest.mark.slow
 def test_a_clean_session_has_a_page_without_effects(tmp_path: Path) -> None:
     document, page = page_of(diagnosed(0.0), tmp_path, [])
     assert document["verdict"] == "clean"
@@ -123,7 +125,7 @@ def test_what_nothing_explains_is_marked_and_drawn(diagnosis: Diagnosis, tmp_pat
     assert "force in place of what is unknown" in page
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_diagnose_writes_the_page_beside_its_document(tmp_path: Path) -> None:
     system, capture, block = tmp_path / "axis.toml", tmp_path / "run.csv", axis_block(COULOMB)
     system.write_text(AXIS)

@@ -50,7 +50,7 @@ def session() -> tuple[Estimator, SessionRows]:
     return estimator, SessionRows(estimator.model, estimator.base, estimator.sensing, noise, record.segments(), beta)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_columns_are_evaluated_as_the_balance_evaluates_them() -> None:
     """The parameters' own columns, through the windows of the diagnosis: to the rounding of sums."""
     _, rows = session()
@@ -63,6 +63,7 @@ def test_columns_are_evaluated_as_the_balance_evaluates_them() -> None:
     assert_allclose(Y, rows.Y, atol=1e-9 * np.abs(rows.Y).max())
 
 
+@pytest.mark.slow
 def test_whitened_rows_give_the_estimate_of_the_stream() -> None:
     """Their weights are those of the last estimate, the stream's of its time: half a deviation apart."""
     estimator, rows = session()
@@ -150,6 +151,7 @@ def test_a_residual_like_a_found_effect_belongs_to_its_row() -> None:
         assert (found.row, found.speed) == (row, "q_1")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "shape", "coefficients", "both"),
     [

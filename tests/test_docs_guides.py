@@ -87,6 +87,7 @@ def test_the_guides_tracker_without_fading_is_least_squares() -> None:
     np.testing.assert_allclose([getattr(one, k) for k in numbers], [getattr(other, k) for k in numbers], rtol=1e-6)
 
 
+@pytest.mark.slow
 def test_the_guides_tracker_follows_a_change() -> None:
     """Rows of seeds 2 and 3, 1 kHz: half a second after a jump a memory of 50 ms holds nothing of what was before."""
     tracker, after = fading(N, 0.05), exciting_rows(seed=3, count=500)

@@ -73,7 +73,7 @@ def capture(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_results_json_has_the_keys_of_its_page(capture: Path, tmp_path: Path) -> None:
     described = tmp_path / "rig.toml"
     described.write_text(shipped_text("paper-planar") + "\n[tolerances]\n", encoding="utf-8")
@@ -83,7 +83,7 @@ def test_results_json_has_the_keys_of_its_page(capture: Path, tmp_path: Path) ->
     check("results.md", document, EVENTS, ("system.",))
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_diagnosis_json_has_the_keys_of_its_page(capture: Path, tmp_path: Path) -> None:
     assert main(["diagnose", str(capture), "--system", "paper-planar", "--out", str(tmp_path)]) == 0
     document = json.loads((tmp_path / "diagnosis.json").read_text(encoding="utf-8"))

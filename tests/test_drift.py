@@ -141,6 +141,7 @@ def test_what_moves_together_is_one_drift() -> None:
     assert [each.columns for each in tracker.state.moving] == [(0, 1)]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(3))
 def test_ten_minutes_without_drift_move_nothing(seed: int) -> None:
     tracker = learned()

@@ -38,6 +38,7 @@ def judged(tracker: str, seed: int, drift: Sequence[str] = ()) -> sms.Trust:
     return sms.estimate(system, capture, tracker=tracker).trust
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("tracker", "then"), [("rls", FOLLOW), ("kalman:drift=learned", GO_ON)])
 @pytest.mark.parametrize("seed", [0, 1])
 def test_a_drift_that_nobody_follows_is_doubted(tracker: str, then: str, seed: int) -> None:
@@ -48,6 +49,7 @@ def test_a_drift_that_nobody_follows_is_doubted(tracker: str, then: str, seed: i
     assert trust.grounds[0].then == then
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [0, 3, 9, 15])
 def test_steady_sessions_are_trusted(seed: int) -> None:
     """Seed 9 has the loudest rows of sixteen, seed 15 the ramp that is least like chance on the way."""

@@ -28,7 +28,7 @@ def followed(data: sms.Capture) -> sms.Result:
     return sms.estimate(sms.load_system("paper-planar"), data, tracker=[LEARNED, "rls"])
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_drift_on_the_way_is_named_and_followed(followed: sms.Result) -> None:
     (drift,) = followed.drifts
     assert drift.parameter == STIFFNESS
@@ -42,7 +42,7 @@ def test_a_drift_on_the_way_is_named_and_followed(followed: sms.Result) -> None:
     assert followed.trust.level == "trust"
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_least_squares_beside_it_says_that_it_fails(followed: sms.Result) -> None:
     judged, squares = followed.trackers
     assert judged.consistency.consistent
@@ -50,7 +50,7 @@ def test_least_squares_beside_it_says_that_it_fails(followed: sms.Result) -> Non
     assert squares.drifts == ()
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_without_a_tracker_that_follows_nothing_is_green(data: sms.Capture) -> None:
     result = sms.estimate(sms.load_system("paper-planar"), data)
     stiffness = result.parameters[STIFFNESS]
@@ -59,7 +59,7 @@ def test_without_a_tracker_that_follows_nothing_is_green(data: sms.Capture) -> N
     assert result.trust.level == "doubt"
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("cut", [10.0, 14.0])
 def test_a_checkpoint_while_it_drifts_gives_the_same_bits(cut: float, data: sms.Capture, followed: sms.Result) -> None:
     session = sms.Session(sms.load_system("paper-planar"), data.channels, tracker=[LEARNED, "rls"])
@@ -77,7 +77,7 @@ def test_a_checkpoint_while_it_drifts_gives_the_same_bits(cut: float, data: sms.
     assert found.trackers[1] == followed.trackers[1]
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_step_stays_an_event() -> None:
     step = f"{STIFFNESS}:share=-0.05,over=0.001,begin=7.6"
     system = sms.load_system("paper-planar")
@@ -87,7 +87,7 @@ def test_a_step_stays_an_event() -> None:
     assert result.events[0].time == pytest.approx(7.6, abs=0.05)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_the_command_line_says_what_drifts(
     tmp_path: Path, data: sms.Capture, followed: sms.Result, capsys: pytest.CaptureFixture[str]
 ) -> None:

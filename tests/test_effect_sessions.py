@@ -162,6 +162,7 @@ def session() -> tuple[System, Estimator]:
     return true, estimator
 
 
+@pytest.mark.slow
 def test_declared_effects_are_identified_together_with_the_arm(session: tuple[System, Estimator]) -> None:
     """Within four deviations (seed 1, 26 parameters), and the effects within 1 %."""
     true, estimator = session
@@ -189,7 +190,7 @@ def test_reported_coefficients_are_those_that_were_injected(session: tuple[Syste
                 assert 0.0 < std < 0.01 * abs(value)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_friction_by_direction_and_speed_is_found_noise_free() -> None:
     """Within 1 %: reversals are resolved to a sample only."""
     names = "direction_friction@joint_2", "stribeck_friction@joint_1:velocity=0.3"
@@ -202,7 +203,7 @@ def test_friction_by_direction_and_speed_is_found_noise_free() -> None:
     assert_allclose(estimator.estimate().pi[-3:], [2.0, 1.5, 1.0], rtol=0.01)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_effects_with_internal_states_survive_a_restart() -> None:
     """Within 1 % at grade A (seed 1); saved and restored in the middle, the session ends with the same bits."""
     true = declaring("torsional_hysteresis@joint_1:torque=5,width=0.01", "slosh@base:mass=20,stiffness=500")
@@ -223,7 +224,7 @@ def test_effects_with_internal_states_survive_a_restart() -> None:
     assert found["slosh@base.stiffness"] == pytest.approx(500.0, rel=0.01)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_tilt_is_found_with_masses_from_elsewhere() -> None:
     """Of 1 mm/s² within 1 % at grade A (seed 3), with every mass 0.1 % too large, by as much too small."""
     true = declaring("table_tilt@base:gravity_x=0.001,gravity_y=-0.002")

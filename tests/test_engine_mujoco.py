@@ -238,7 +238,7 @@ def test_noise_of_a_grade_comes_on_top() -> None:
 # The fit
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_the_estimator_finds_the_engines_parameters(engine_capture: Block) -> None:
     estimator = Estimator(exactly_known(SYSTEM), engine_capture.channels, "engine")
     estimator.push(engine_capture)

@@ -174,7 +174,7 @@ SHARE, AT_A_FLEXIBLE_END = 1e-3, 1e-2
 ENDS = ("payload", "link_5")
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("name", SYSTEMS)
 def test_every_parameter_is_that_of_the_second_engine(name: str) -> None:
     """Noise-free; the engine shares no equation with the model, its links are chains of rigid segments."""

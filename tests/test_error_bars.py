@@ -33,7 +33,7 @@ def normalised_errors(torque_noise: float, position_noise: float) -> Array:
     return np.array(out)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize(("torque_noise", "position_noise"), [(0.1, 0.0), (0.01, 1e-4)])
 def test_error_bars_are_neither_too_small_nor_too_large(torque_noise: float, position_noise: float) -> None:
     """Torque noise is integrated into the work, position noise is in every rate: both have to be in the error bar.

@@ -67,7 +67,7 @@ def true_values() -> Array:
     return find_base_parameters(model).values(model.nominal)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_payload_at_the_tip_is_sized_and_disturbs_nothing(
     planar_session: Simulation,
 ) -> None:
@@ -94,7 +94,7 @@ def test_a_payload_at_the_tip_is_sized_and_disturbs_nothing(
     assert any(each.startswith(line) for each in trust_lines(document))
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_payload_is_noticed_anywhere_in_a_block(planar_session: Simulation) -> None:
     """The same 5 kg, in sessions that begin at 3 s and up to a block later."""
     loaded = PLANAR.model_copy(update={"payload": RigidBody(mass=5.0)})
@@ -106,7 +106,7 @@ def test_a_payload_is_noticed_anywhere_in_a_block(planar_session: Simulation) ->
         assert CHANGE < noticed <= CHANGE + DETECTED
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_body_at_the_tip_is_distinguished_from_a_point_mass(planar_session: Simulation) -> None:
     body = RigidBody(mass=5.0, center_of_mass=(0.15, 0.05, 0.0), inertia=Inertia(zz=0.3))
     loaded = PLANAR.model_copy(update={"payload": body})
@@ -120,7 +120,7 @@ def test_a_body_at_the_tip_is_distinguished_from_a_point_mass(planar_session: Si
     assert (np.abs(np.array(event.sizes) - true) < 4.0 * np.array(event.stds)).all()
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("after", "kind", "parameter", "size"),
     [
@@ -147,7 +147,7 @@ def test_what_changed_is_named_and_sized_and_nothing_else(
     assert (np.abs(estimate.pi[: true.size] - true) < 4.0 * estimate.std[: true.size]).all()
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("grade", ["A", "B", "C"])
 def test_nothing_is_noticed_where_nothing_changes(planar_session: Simulation, grade: str) -> None:
     block = noisy(PLANAR, changed_session(planar_session, PLANAR, CHANGE, CHANGE + 2.0), grade, 3)
@@ -212,7 +212,7 @@ def test_a_session_that_ends_upon_a_change_keeps_its_estimate() -> None:
     assert (errors < 4.0 * standard_deviation(estimator)).all()
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("size", [1, 333])
 def test_events_do_not_depend_on_how_samples_arrive(size: int) -> None:
     block = axis_session(2.0 * DAMPING, 1.1 * INERTIA)
@@ -222,7 +222,7 @@ def test_events_do_not_depend_on_how_samples_arrive(size: int) -> None:
     assert np.array_equal(whole.estimate().pi, parts.estimate().pi)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("saved_at", [9.0, 11.0, 15.0])
 def test_a_saved_session_goes_on_to_the_same_bits(saved_at: float) -> None:
     """Saved before a change, while rows are held back for it, and after it."""

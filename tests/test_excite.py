@@ -99,7 +99,7 @@ def test_without_a_described_motion_limits_are_enough() -> None:
         excite(system, limits=Limits(angle=0.5))
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_two_effects_are_separated() -> None:
     system = parse_system(ONE_SINE, "axis.toml")
     found = excite(system, separate=FRICTION, iterations=2)

@@ -126,7 +126,7 @@ def test_no_wind_up_without_excitation(kind: Forgetting, quiet: str) -> None:
     check_no_wind_up(kind, 100_000, QUIET[quiet])
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("quiet", QUIET)
 @pytest.mark.parametrize("kind", SELECTED, ids=lambda kind: type(kind).__name__)
 def test_no_wind_up_in_a_million_rows_without_excitation(kind: Forgetting, quiet: str) -> None:

@@ -72,6 +72,7 @@ def cells(page: str, label: str) -> list[str]:
     return re.findall(rf'<td data-label="{re.escape(label)}">(.*?)</td>', page)
 
 
+@pytest.mark.slow
 def test_nothing_is_fetched_from_elsewhere(page: str) -> None:
     assert not re.search(r"src=|(href=\"|url\()(?!#)|https?://|@import|<script", page)
 
@@ -102,7 +103,7 @@ def test_a_nominal_value_is_beside_each_estimate(page: str, planar_block: Block)
     np.testing.assert_allclose([float(cell) for cell in cells(page, "nominal")], nominal, rtol=1e-5)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_an_unstated_nominal_value_is_left_out(planar_block: Block, tmp_path: Path) -> None:
     estimator, history = watched(planar_block)
     document = results_document(estimator, 1000.0, [])
@@ -112,7 +113,7 @@ def test_an_unstated_nominal_value_is_left_out(planar_block: Block, tmp_path: Pa
     assert [bool(cell) for cell in cells(page, "% off nominal")] == [True] + [False] * (len(nominal) - 1)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_the_same_session_gives_the_same_page(page: str, planar_block: Block, tmp_path: Path) -> None:
     # How fast the computer was is no property of the session.
     assert report_of(*watched(planar_block), tmp_path, throughput=2000.0) == page
@@ -124,6 +125,7 @@ def test_matplotlib_waits_for_the_first_page() -> None:
     assert subprocess.run([sys.executable, "-c", code]).returncode == 0
 
 
+@pytest.mark.slow
 def test_the_page_of_a_long_session_stays_small(tmp_path: Path) -> None:
     """Of the arm with most parameters, all determined, each of them as rough as can be, with as many instants as a
     history holds."""
@@ -171,7 +173,7 @@ def test_every_estimate_is_within_the_window(page: str, tmp_path: Path, width: i
         assert box["x"] + box["width"] <= width
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_the_history_ends_with_the_results(planar_block: Block) -> None:
     estimator, history = watched(planar_block)
     last = history.instants[-1]
@@ -180,7 +182,7 @@ def test_the_history_ends_with_the_results(planar_block: Block) -> None:
     assert np.all(np.diff([instant.t for instant in history.instants]) > 0)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_remembering_changes_no_bit(planar_block: Block) -> None:
     estimator, _ = watched(planar_block)
     alone = Estimator(load_system("paper-planar"), planar_block.channels, "test")
@@ -189,7 +191,7 @@ def test_remembering_changes_no_bit(planar_block: Block) -> None:
     np.testing.assert_array_equal(estimator.estimate().pi, alone.estimate().pi)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_long_session_is_thinned_evenly(planar_block: Block, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(history_module, "MOST_INSTANTS", 20)
     _, history = watched(planar_block)

@@ -45,7 +45,7 @@ def estimator_of(system: System, blocks: list[Block]) -> Estimator:
     return estimator
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("drive", "encoder", "source", "effect"),
     [
@@ -69,6 +69,7 @@ def test_a_latency_that_is_not_stated_is_reported(
     assert warning.endswith(f"later than its stated latency ({effect})")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("late", [0.0, 0.003])
 def test_a_common_latency_is_not_reported(tmp_path: Path, late: float) -> None:
     estimator = estimator_of(*session(tmp_path, late, late))
@@ -76,7 +77,7 @@ def test_a_common_latency_is_not_reported(tmp_path: Path, late: float) -> None:
     assert estimator.momentum.latencies.found is None
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_what_is_known_of_latencies_is_saved_with_the_session(tmp_path: Path) -> None:
     system, blocks = session(tmp_path, 0.001, 0.0)
     half = len(blocks) // 2
@@ -158,7 +159,7 @@ def test_a_hold_is_of_torques_alone() -> None:
         parse_system(text, "axis.toml")
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("stated", [False, True])
 def test_torques_that_are_held_are_noticed(stated: bool) -> None:
     """The planar example, grade B; every torque is the command of half a sample earlier. Seed 0."""

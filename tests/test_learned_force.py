@@ -66,6 +66,7 @@ def by_law(text: str) -> Diagnosis:
     return sms.diagnose(described(), capture(text), learned=True)
 
 
+@pytest.mark.slow
 def test_a_curve_replaces_a_law_that_is_struck() -> None:
     found, true = learned(HARDENING), by_law(HARDENING)
     curve = found.system.effects[-1]
@@ -82,7 +83,7 @@ def test_a_curve_replaces_a_law_that_is_struck() -> None:
             )
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_curve_over_the_rate_replaces_stribeck_friction() -> None:
     """On the planar example of 10 s, grade B (seed 4), nominal values off by up to 1.4 (seed 2)."""
     system = disguised(sms.load_system("paper-planar"), np.random.default_rng(2))
@@ -120,6 +121,7 @@ def test_the_curve_is_drawn_with_its_band() -> None:
     assert np.all(np.abs(curve.force - curve.law) < 5.0 * curve.std + 0.01 * np.abs(true).max())
 
 
+@pytest.mark.slow
 def test_a_torque_over_the_angle_is_learned_without_a_law() -> None:
     """A cable that pulls the more, the further the axis is turned to one side."""
     pull = axis_block(lambda q, rate: 0.3 * np.exp(q) - 0.3)
@@ -132,6 +134,7 @@ def test_a_torque_over_the_angle_is_learned_without_a_law() -> None:
     assert found.before.held_out["joint_1"].whitened > 5.0
 
 
+@pytest.mark.slow
 def test_without_being_allowed_no_curve_is_tried() -> None:
     found = sms.diagnose(described(), capture(HARDENING))
     assert not any(candidate.name == "learned_force" for candidate in found.candidates)
@@ -180,6 +183,7 @@ def test_a_curve_that_cannot_be_is_refused(table: str, expected: str) -> None:
         build_model(parse_system(ELASTIC_AXIS.format(stiffness=STIFFNESS) + f"[[effect]]\n{table}\n", "axis.toml"))
 
 
+@pytest.mark.slow
 def test_the_verb_tries_curves_where_it_is_asked_to(tmp_path: Path) -> None:
     sms.write_capture(capture(HARDENING), tmp_path / "run.csv")
     (tmp_path / "axis.toml").write_text(ELASTIC_AXIS.format(stiffness=1.1 * STIFFNESS))

@@ -86,7 +86,7 @@ def test_a_live_session_and_its_replay_give_the_same_document(tmp_path: Path, mo
     assert json.dumps(results_document(estimator, 0.0, source.warnings)) == json.dumps(live)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_late_answers_are_as_late_in_the_repetition(tmp_path: Path) -> None:
     """Not so at once, as without notes of the session: then the effect is adopted earlier."""
     block = axis_block(cogging, BEGIN, seconds=14.0)
@@ -106,7 +106,7 @@ def test_late_answers_are_as_late_in_the_repetition(tmp_path: Path) -> None:
     assert documents[0] == documents[1] != documents[2]
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_what_falls_due_during_a_search_is_searched_after_it(tmp_path: Path) -> None:
     """An answer that takes two seconds skips one search that is due; the next one does not wait for another to be."""
     block = axis_block(cogging, BEGIN, seconds=14.0)
@@ -217,6 +217,7 @@ def replayed(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+@pytest.mark.slow
 def test_results_hold_verdict_and_evidence_of_what_was_adopted(replayed: Path) -> None:
     results = json.loads((replayed / "results.json").read_text())
     (episode,) = results["diagnosis"]

@@ -230,7 +230,7 @@ def check(s: Session, folder: Path, expected: str) -> None:
     assert (std < [0.01, 0.01]).all()
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("fault", FAULTS, ids=lambda fault: fault.__name__)
 def test_each_fault_alone(tmp_path: Path, fault: Callable[[Session], None]) -> None:
     s = session(tmp_path)
@@ -238,7 +238,7 @@ def test_each_fault_alone(tmp_path: Path, fault: Callable[[Session], None]) -> N
     check(s, tmp_path, FAULTS[fault])
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("fault", LINE_FAULTS, ids=lambda fault: fault.__name__)
 def test_each_fault_of_an_encoder_that_prints_lines(tmp_path: Path, fault: Callable[[Session], None]) -> None:
     s = session(tmp_path, LINES)

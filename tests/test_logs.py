@@ -71,6 +71,7 @@ def test_a_bag_gives_the_bits_of_the_csv(capture: sms.Capture, bagged: sms.Syste
     assert read.warnings == ()
 
 
+@pytest.mark.slow
 def test_a_bag_is_estimated_from_as_the_csv_is(
     capture: sms.Capture, bagged: sms.System, pi: list[float], tmp_path: Path
 ) -> None:
@@ -138,6 +139,7 @@ def german(path: Path, capture: sms.Capture) -> dict[str, str]:
     return {name: name for name in capture.channels}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("write", "name"),
     [(hdf5, "run.h5"), (matlab_73, "run.mat"), (matlab_7, "run.mat"), (parquet, "run.parquet"), (german, "run.csv")],

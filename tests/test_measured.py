@@ -63,7 +63,7 @@ def test_emps_energy_fit_agrees_with_the_published_force_fit(emps_capture: Path)
     assert 0.03 < relative < 0.05
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_emps_momentum_fit_agrees_with_the_published_force_fit(emps_capture: Path) -> None:
     estimator = replayed("emps", emps_capture)
     assert estimator.by_momentum
@@ -74,7 +74,7 @@ def test_emps_momentum_fit_agrees_with_the_published_force_fit(emps_capture: Pat
     assert results_document(estimator, 0.0, [])["residual"]["joint_1"]["relative"] < 0.042
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_wider_windows_let_the_mass_of_emps_drift(emps_capture: Path) -> None:
     """A window of 2 s passes the slow motion alone, where friction that the model lacks is largest beside inertia."""
     wide = replayed("emps", emps_capture, windows=Windows(relative=0.02, momentum=2.0)).estimate().pi
@@ -127,7 +127,7 @@ def quanser_capture(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return capture
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_quanser_without_friction_keeps_a_large_residual(quanser_capture: Path) -> None:
     with_maker = results_document(replayed("quanser-2dsfl", quanser_capture, prior=0.1), 0.0, [])
     for joint in ("joint_1", "joint_2"):

@@ -23,7 +23,7 @@ def diagnosis(out: Path, *arguments: str) -> dict[str, Any]:
     return document
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_the_friction_of_emps_is_found_from_its_mass_alone(tmp_path: Path) -> None:
     """Published: 95.11 kg, 20.39 N, 203.5 N s/m and an offset, which leave 4.08 % of the force; friction by direction
     of travel leaves 3.11 %, with 166.7 and 240.4 N s/m.
@@ -57,7 +57,7 @@ def test_the_friction_of_emps_is_found_from_its_mass_alone(tmp_path: Path) -> No
     assert {effect.name for effect in adopted.effects} == set(found)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_the_lag_and_the_friction_of_the_quanser_rig_are_found(tmp_path: Path) -> None:
     """Fitted to the first half, checked on the second: hubs fall from nearly all of the torque to below a quarter.
 

@@ -81,9 +81,9 @@ def test_a_session_without_a_mistake_has_none() -> None:
     [
         (times(-1.0, "tau_2"), "torque_sign@tau_2", "the other sign"),
         (times(50.0, "tau_1", "tau_2"), "joint_torque@tau_1, tau_2", "everything is 50 × its description"),
-        pytest.param(times(180.0 / np.pi, "q_2"), "degrees@q_2", "q_2 is in degrees", marks=pytest.mark.slow),
-        pytest.param(times(1e3, "r_S_x", "r_S_y"), "millimetres@r_S_*", "in mm in place of m", marks=pytest.mark.slow),
-        pytest.param(times(50.0, "theta_m_1"), "motor_angle@theta_m_1", "before the gear", marks=pytest.mark.slow),
+        pytest.param(times(180.0 / np.pi, "q_2"), "degrees@q_2", "q_2 is in degrees", marks=pytest.mark.long),
+        pytest.param(times(1e3, "r_S_x", "r_S_y"), "millimetres@r_S_*", "in mm in place of m", marks=pytest.mark.long),
+        pytest.param(times(50.0, "theta_m_1"), "motor_angle@theta_m_1", "before the gear", marks=pytest.mark.long),
         (swap("tau_1", "tau_2"), "swapped@tau_1, tau_2", "are swapped"),
     ],
 )
@@ -105,6 +105,7 @@ def test_a_wrong_gear_is_corrected_in_the_system() -> None:
     assert f"gear_ratio = {ratio:.4g} # found; the file said 50" in text
 
 
+@pytest.mark.slow
 def test_a_diagnosis_goes_on_with_the_mistake_undone() -> None:
     diagnosis = diagnose(stated(), [wrong(times(-1.0, "tau_2"))], "test", lambda estimator: None)
     document = diagnosis_document(diagnosis)

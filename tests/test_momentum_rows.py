@@ -185,6 +185,7 @@ def fitted(block: Block) -> Estimator:
     return estimator
 
 
+@pytest.mark.slow
 def test_no_window_spans_a_gap_and_none_beside_it_is_lost() -> None:
     """The motion goes on in the gap: a row across it would be off by its whole size."""
     t = np.arange(4000) / 200.0
@@ -204,6 +205,7 @@ def test_no_window_spans_a_gap_and_none_beside_it_is_lost() -> None:
     assert momentum.state.dropped_windows == 0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("cut", [0.2, 1.2, 1.6, 3.0], ids=lambda cut: f"at {cut} s")
 def test_a_session_restored_at_any_time_gives_the_same_bits(cut: float) -> None:
     """Before the noise is known, while windows are held back for the first weights, and after."""
@@ -218,7 +220,7 @@ def test_a_session_restored_at_any_time_gives_the_same_bits(cut: float) -> None:
     assert results_document(second, 0.0, []) == results_document(fitted(block), 0.0, [])
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_session_restored_during_warm_up_has_the_same_bits(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:

@@ -57,11 +57,13 @@ def trust_in(system: sms.System, capture: sms.Capture) -> Trust:
     return judged(estimator)
 
 
+@pytest.mark.slow
 def test_a_session_as_described_is_trusted(capture: sms.Capture) -> None:
     trust = trust_in(sms.load_system(RIG), capture)
     assert trust.level == "trust", trust
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("factors", "factor", "cause"),
     [

@@ -51,7 +51,7 @@ def document(estimator: Estimator, online: OnlineDiagnosis) -> str:
     return json.dumps([results_document(estimator, 0.0, []), online.document()])
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_an_effect_of_the_base_that_begins_is_named(
     planar_session: Simulation,
 ) -> None:
@@ -77,6 +77,7 @@ def test_an_effect_of_the_base_that_begins_is_named(
     assert estimate.pi[-1] == pytest.approx(60.0, rel=1e-3)
 
 
+@pytest.mark.slow
 def test_an_effect_that_begins_is_dated_sized_and_adopted() -> None:
     estimator, online = cogged(True)
     (episode,) = online.episodes
@@ -94,6 +95,7 @@ def test_an_effect_that_begins_is_dated_sized_and_adopted() -> None:
     assert not estimator.momentum.misfit
 
 
+@pytest.mark.slow
 def test_without_adopt_it_is_only_reported() -> None:
     estimator, online = cogged(False)
     (episode,) = online.episodes
@@ -137,6 +139,7 @@ def test_a_session_without_anything_missing_says_nothing() -> None:
     assert estimator.momentum.test.alarm is None
 
 
+@pytest.mark.slow
 def test_a_change_that_an_event_explains_is_named_by_it() -> None:
     """Friction twice as high: the event's jump says so, whatever a search made of the first windows."""
     block = axis_block(lambda q, rate: DAMPING * rate, BEGIN)
@@ -147,7 +150,7 @@ def test_a_change_that_an_event_explains_is_named_by_it() -> None:
     assert "viscous_friction@joint_1.damping" in online.notices[0]
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_what_no_effect_explains_is_said_to_be_unexplained() -> None:
     """A torque that depends on time alone, from the start."""
     _, online = watched(SYSTEM, _with_torque(axis_block(nothing, seconds=20.0)))
@@ -163,10 +166,12 @@ def _with_torque(block: Block) -> Block:
     return Block(block.t, block.channels, values)
 
 
+@pytest.mark.slow
 def test_nothing_depends_on_how_samples_arrive() -> None:
     assert document(*watched(SYSTEM, axis_block(cogging, BEGIN), size=1)) == document(*cogged(True))
 
 
+@pytest.mark.slow
 def test_a_session_with_an_adopted_effect_resumes_to_the_bit() -> None:
     block = axis_block(cogging, BEGIN)
     split = 13 * 200

@@ -71,7 +71,7 @@ def test_slow_channels_have_their_outliers_found_too() -> None:
     assert np.flatnonzero(np.isnan(passed[::4, 1])).tolist() == [500]
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_outliers_cost_a_session_no_trust_in_its_parameters() -> None:
     system = sms.load_system("paper-planar")
     data = planar_capture(6.0, seed=1)

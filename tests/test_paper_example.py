@@ -52,7 +52,7 @@ def exact_rows(simulation: Simulation, t: Array) -> tuple[Array, Array]:
     return energy[1:] - energy[0] + dissipated, exact.work[1:].sum(axis=1)
 
 
-@pytest.mark.parametrize("name", ["paper-planar", pytest.param("paper-planar-table-v", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("name", ["paper-planar", pytest.param("paper-planar-table-v", marks=pytest.mark.long)])
 def test_batch_of_100_exact_rows_gives_all_sixteen(name: str, planar_session: Simulation) -> None:
     simulation = planar_session if name == "paper-planar" else simulate(load_system(name), 10.0)
     base = find_base_parameters(simulation.plant.model)
@@ -71,6 +71,7 @@ def streamed(name: str, block: Block) -> Estimator:
     return estimator
 
 
+@pytest.mark.slow
 def test_the_stream_gives_all_but_one_to_a_hundredth_percent(planar_block: Block) -> None:
     estimator = streamed("paper-planar", planar_block)
     truth = estimator.base.values(estimator.model.nominal)
@@ -81,7 +82,7 @@ def test_the_stream_gives_all_but_one_to_a_hundredth_percent(planar_block: Block
     assert abs(estimate.pi[weak] - truth[weak]) < 4.0 * standard_deviation(estimator)[weak]
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_recursive_equals_batch(planar_block: Block) -> None:
     """Of the parameters alone, without tolerances."""
     exactly = {"tolerances": Tolerances.model_validate("none")}
@@ -102,7 +103,7 @@ def noisy(block: Block, sigma: float) -> Block:
     return Block(block.t, block.channels, block.values + sigma * rng.standard_normal(block.values.shape))
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("sigma", [0.0, 1e-4])
 def test_result_does_not_depend_on_how_samples_arrive(
     sigma: float, planar_block: Block, tmp_path_factory: pytest.TempPathFactory
@@ -126,7 +127,7 @@ def test_result_does_not_depend_on_how_samples_arrive(
     assert first == second
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_identified_dynamics_predict_an_unseen_trajectory(planar_block: Block) -> None:
     estimator = streamed("paper-planar", planar_block)
     document = json.loads(json.dumps(results_document(estimator, 0.0, [])))

@@ -26,7 +26,7 @@ def test_a_simulation_records_each_rate_at_its_own_instants() -> None:
     assert np.count_nonzero(np.isfinite(marker)) == 25  # 240 Hz over 0.1 s, both ends included
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_parameters_of_a_plain_rig_are_within_ten_bounds() -> None:
     simulation = simulate(plain_rig())
     blocks = list(sampled_blocks(simulation, None, SEED))

@@ -119,7 +119,7 @@ def test_one_link_is_identified_from_points_alone() -> None:
     assert_allclose(estimator.estimate().std, bound_of(simulation), rtol=0.06)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("name", ["paper-planar", "spatial-two-link"])
 def test_free_arms_of_two_links_are_identified_from_points(name: str) -> None:
     system = seen_by_cameras(name)

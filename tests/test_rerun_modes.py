@@ -42,7 +42,7 @@ def tier(verb: str, mode: str) -> tuple[pytest.MarkDecorator, ...]:
     """Of a verb with a view: live sessions and served pages, whose ports are the usual ones, are for themselves."""
     if verb == "live" or mode == "serve":
         return (pytest.mark.realtime,)
-    return () if (verb, mode) == ("demo", "save") else (pytest.mark.slow,)
+    return () if (verb, mode) == ("demo", "save") else (pytest.mark.long,)
 
 
 MODES = [
@@ -52,6 +52,7 @@ MODES = [
 ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("verb", "mode"), MODES)
 def test_every_verb_goes_with_every_view(
     tmp_path: Path, started: list[subprocess.Popen[Any]], verb: str, mode: str

@@ -59,7 +59,7 @@ def predicted(window: Window, sigma: float) -> float:
     return float(np.sqrt(np.sum(c**2) * SPAN / STEPS * sigma**2 / RATE))
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize(("amplitude", "sigma"), [(1.3, 1e-5), (1.3, 1e-4), (0.1, 1e-5)])
 def test_a_reversal_of_friction_scatters_as_predicted(
     amplitude: float, sigma: float, monkeypatch: pytest.MonkeyPatch
@@ -134,6 +134,7 @@ def test_stiction_at_a_standstill_is_undetermined() -> None:
     assert len(inside) > 1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("hop", [2, 10, 40])
 def test_an_axis_that_turns_round_is_not_at_rest(hop: int) -> None:
     """At 3.2 rad/s², asked block after block, as short windows ask for it; one that stays does, nearly always."""
@@ -153,7 +154,7 @@ def test_an_axis_that_turns_round_is_not_at_rest(hop: int) -> None:
     assert np.mean(stood) > 0.95
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_session_with_internal_states_runs_at_a_low_rate() -> None:
     """At 100 Hz no filter is narrower than that of the motion behind them."""
     system = paper().model_copy(update={"sample_rate": 100.0})

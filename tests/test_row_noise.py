@@ -50,10 +50,10 @@ ROUGH = (
 # With the number of draws: fewer where rows are dear.
 SYSTEMS = [
     pytest.param(paper(), 120, id="planar"),
-    pytest.param(paper(effects=ROUGH), 240, id="planar, rough forces", marks=pytest.mark.slow),
+    pytest.param(paper(effects=ROUGH), 240, id="planar, rough forces", marks=pytest.mark.long),
     pytest.param(paper("exact"), 30, id="planar, exact links"),
     pytest.param(load_system("spatial-two-link"), 60, id="spatial"),
-    pytest.param(spatial(free=False), 60, id="spatial, prismatic joint, gravity, effects", marks=pytest.mark.slow),
+    pytest.param(spatial(free=False), 60, id="spatial, prismatic joint, gravity, effects", marks=pytest.mark.long),
 ]
 
 

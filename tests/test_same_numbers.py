@@ -21,7 +21,7 @@ QUICKEST = ("recording", "smoother", "axis-undescribed", "quanser-2dsfl")
 
 
 @pytest.mark.parametrize(
-    "name", [pytest.param(name, marks=() if name in QUICKEST else pytest.mark.slow) for name in QUICK]
+    "name", [pytest.param(name, marks=() if name in QUICKEST else pytest.mark.long) for name in QUICK]
 )
 def test_no_number_of_a_session_moves(name: str) -> None:
     recorded, now = json.loads(RECORDED.read_text()), numbers(SESSIONS[name]())

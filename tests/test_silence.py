@@ -97,6 +97,7 @@ def test_late_estimates_after_an_absence_have_its_cause(tmp_path: Path, system: 
     assert late == ["estimates come 4.0 s late, for drive, encoder had been away"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("pause", "lost"), [(100.0, 0), (0.5, 100)])
 def test_a_pause_before_a_resumption_is_no_loss(pause: float, lost: int) -> None:
     system, block = parse_system(AXIS, "axis.toml"), axis_block(coulomb=0.0)

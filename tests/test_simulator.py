@@ -178,7 +178,7 @@ def test_gravity_and_a_fixed_base_leave_no_momentum_to_judge_by() -> None:
     assert drift.angular_momentum is None
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_steps_of_one_millisecond_stay_with_the_exact_motion(planar_session: Simulation) -> None:
     stepper = RealTimeStepper(planar_session.plant)
     samples = [stepper.step() for _ in range(5000)]

@@ -69,7 +69,7 @@ def test_a_stated_slow_rate_is_left_to_the_smoother() -> None:
     assert found.smoother is not None
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_the_smoother_bridges_what_a_slow_sensor_does_not_see() -> None:
     found = evaluated(estimator(10.0, 20.0))
     off = (found.estimate.pi - true_parameters(load_system("paper-planar"))) / found.std

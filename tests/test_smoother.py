@@ -69,7 +69,7 @@ def first(simulation: Simulation) -> Estimator:
     return session(one_link("linear"), recorded(simulation, 0))
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_errors_agree_with_error_bars_and_these_with_the_bound(simulation: Simulation, first: Estimator) -> None:
     assert first.sensing.missing == MISSING
     sessions = [first, *(session(one_link("linear"), recorded(simulation, seed)) for seed in range(1, SEEDS))]
@@ -166,7 +166,7 @@ def test_only_a_gap_of_the_torque_begins_a_new_span(simulation: Simulation) -> N
         assert np.all(np.abs(normalised(estimator)) < 4.0)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_friction_that_the_model_lacks_widens_the_error_bars() -> None:
     friction = '\n[[effect]]\nname = "coulomb_friction"\nwhere = "joint_1"\ncoefficients = { torque = 0.5 }\n'
     block = recorded(simulate(one_link("linear", friction)), 2)
@@ -198,7 +198,7 @@ def test_inexplicable_samples_leave_the_first_fit_and_a_warning(simulation: Simu
     assert any("bent statically" in warning for warning in document["warnings"])
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_exact_links_and_one_marker_alone_are_enough() -> None:
     block = recorded(simulate(one_link("exact")), 4)
     alone = [k for k, name in enumerate(block.channels) if "marker_1" not in name]

@@ -1,6 +1,6 @@
 """Whatever comes over a wire or is in a file: no crash, no hang, no memory without bound, everything counted.
 
-The suite draws a few hundred examples of each kind; the same with a million frames, lines and pieces is marked slow.
+The suite draws a few hundred examples of each kind; the same with a million frames, lines and pieces is marked long.
 """
 
 from __future__ import annotations
@@ -254,7 +254,7 @@ def test_any_damage_to_a_blf(tmp_path: Path, extra: bytes, place: int, change: i
     read_or_refused(lambda: list(open_log(path)))
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_million_frames_lines_and_pieces(tmp_path: Path) -> None:
     """Random frames of known and unknown messages, and streams in which one in a few pieces is sound; seed 11."""
     rng = np.random.default_rng(11)

@@ -37,7 +37,7 @@ def test_the_system_file_of_the_guide_is_accepted() -> None:
     assert set(system.known) | set(system.priors) == {"joint_1.damping", "motor_1.rotor_inertia"}
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_the_guides_log_gives_the_estimate_of_its_samples(tmp_path: Path) -> None:
     """Twelve seconds of a described axis, noise of seed 3."""
     scope: dict[str, Any] = {"__name__": "guide"}

@@ -37,7 +37,7 @@ def streamed(simulation: Simulation) -> tuple[Estimator, Array]:
     return estimator, estimator.base.values(simulation.plant.model.nominal)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_two_link_arm_gives_every_parameter_that_is_not_zero() -> None:
     estimator, truth = streamed(simulate(load_system("spatial-two-link")))
     estimate = estimator.estimate()
@@ -63,7 +63,7 @@ def relative_bound(simulation: Simulation, step: float) -> Array:
     return np.where(truth == 0.0, np.inf, bound / np.where(truth == 0.0, 1.0, np.abs(truth)))
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_seven_joint_arm_gives_what_the_motion_excites() -> None:
     # Some parameters move the energy by parts in 1e9, so the simulation has to be exact beyond that.
     simulation = simulated(load_system("seven-joint"), position_tolerance=1e-13)
@@ -82,7 +82,7 @@ def test_seven_joint_arm_gives_what_the_motion_excites() -> None:
     assert (~identifiable(estimate.pi, std) | (error < 5.0 * std))[~excited].all()
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.xfail(
     strict=True,
     raises=AssertionError,

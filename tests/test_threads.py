@@ -59,7 +59,7 @@ def test_the_limit_ends_with_the_last_computation() -> None:
         assert threads() == {MORE}
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_blocks_and_searches_are_worked_off_by_one_thread(monkeypatch: pytest.MonkeyPatch) -> None:
     seen: list[set[int]] = []
     searched: list[set[int]] = []
@@ -102,7 +102,7 @@ def run(capture: Path, size: int, limit: str | None) -> str:
     return subprocess.run(command, env=environment, capture_output=True, text=True, check=True).stdout
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_samples_one_by_one_give_the_bits_of_the_whole(tmp_path: Path) -> None:
     """Two seconds at grade B (seed 1). Unlimited, two threads give other bits than one."""
     system, capture = load_system("seven-joint"), tmp_path / "capture.npz"

@@ -18,7 +18,7 @@ from tests.campaigns.sessions import disguised
 
 GAIN = 1.03
 KNOWN = "link_2.mass_per_length"
-pytestmark = pytest.mark.slow
+pytestmark = pytest.mark.long
 
 
 @cache

@@ -103,6 +103,7 @@ def test_a_session_cut_by_a_checkpoint_gives_the_same_bits(data: sms.Capture, se
     assert found.trackers == several.trackers
 
 
+@pytest.mark.slow
 def test_the_system_file_and_the_command_line_choose_alike(tmp_path: Path) -> None:
     (tmp_path / "run.csv").write_text("\n".join(capture_lines()) + "\n")
     (tmp_path / "plain.toml").write_text(AXIS)

@@ -302,7 +302,7 @@ def autoregressive(rng: np.random.Generator, count: int, width: int, coefficient
     return np.asarray(lfilter([1.0], [1.0, -coefficient], drive, axis=0))
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("kind", [NoForgetting(), SlidingWindow(8192)], ids=lambda kind: type(kind).__name__)
 def test_robust_intervals_cover_autocorrelated_errors(kind: Forgetting) -> None:
     rng = np.random.default_rng(34)

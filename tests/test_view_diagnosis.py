@@ -13,7 +13,7 @@ from sms_tools.cli import main
 from tests.axis import AXIS, axis_block
 from tests.recordings import columns, scalars
 
-pytestmark = pytest.mark.slow
+pytestmark = pytest.mark.long
 COULOMB = 0.2  # N m
 
 

@@ -47,7 +47,7 @@ def shown(session: Block, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_pickled_statistics_say_the_same_after_an_event(session: Block) -> None:
     estimator = Estimator(SYSTEM, session.channels, "test")
     estimator.push(session)

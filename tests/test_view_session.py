@@ -110,7 +110,7 @@ def test_events_are_logged_when_they_happen(recorded: Path) -> None:
     assert named >= {p["name"] for p in results(recorded)["parameters"] if p["identifiable"]}
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_watching_changes_no_bit(recorded: Path, capture: Path, tmp_path: Path) -> None:
     main(["replay", str(capture), "--system", "paper-planar", "--out", str(tmp_path)])
     unseen, seen = results(tmp_path), results(recorded)
@@ -118,7 +118,7 @@ def test_watching_changes_no_bit(recorded: Path, capture: Path, tmp_path: Path) 
     assert unseen["residual"] == seen["residual"]
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_statistics_stay_those_of_when_they_were_taken(samples: Block) -> None:
     system = load_system("paper-planar")
     estimator = Estimator(system, samples.channels, "test")
@@ -131,7 +131,7 @@ def test_statistics_stay_those_of_when_they_were_taken(samples: Block) -> None:
     assert results_document(estimator, 0.0, []) != then
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_health_of_a_live_source_is_recorded(samples: Block, tmp_path: Path) -> None:
     estimator = Estimator(load_system("paper-planar"), samples.channels, "test")
     health = {"latency": {"p99": 12.5}, "clocks": {"can": -0.25}}

@@ -55,7 +55,7 @@ USUAL = Harmonic(frequency=np.pi / 2, sine=1.3)
 STILL = Harmonic(frequency=np.pi / 2)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("system", "level", "why"),
     [

@@ -56,7 +56,7 @@ class ScaleFree:
         return columns, added
 
     def solved(self, beside: Array, b: Array, start: Array, near: Array, least: float) -> Array:
-        """Solution (n + c,) of rows b (W, n_v) with columns beside (W, n_v, c), each speed's weighted by what it leaves.
+        """Solution (n + c,) of rows b (W, n_v) with columns beside (W, n_v, c), weighted by what each speed leaves.
 
         start, near (n,): parameters to begin with, and those that rows which determine nothing else stay near. least:
         mean square of what noise alone leaves.
