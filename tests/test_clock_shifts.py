@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+
 import numpy as np
 import pytest
 
@@ -48,3 +50,17 @@ def test_a_clock_that_shifts_is_no_event(rig: System, shifted: sms.Capture) -> N
 def test_on_one_clock_the_same_samples_hold_an_event(rig: System, shifted: sms.Capture) -> None:
     (event,) = sms.estimate(rig.model_copy(update={"sources": ()}), shifted).events
     assert event.time == pytest.approx(SHIFTED, abs=0.5)
+
+
+@pytest.mark.slow
+def test_a_shift_that_is_noticed_is_sized(rig: System, shifted: sms.Capture, monkeypatch: pytest.MonkeyPatch) -> None:
+    # Nothing of it is allowed for.
+    monkeypatch.setattr("sms_online.pipeline.events.WANDER", 0.0)
+    result = sms.estimate(rig, shifted)
+    assert result.events == ()
+    (said,) = (warning for warning in result.warnings if "its clock shifted" in warning)
+    found = re.fullmatch(r"markers: its clock shifted by \+(\d+) ± (\d+) µs against the others' at ([\d.]+) s", said)
+    assert found is not None, said
+    size, std, time = map(float, found.groups())
+    assert abs(size - 1e6 * LATE) < 4.0 * std < 200.0
+    assert time == pytest.approx(SHIFTED, abs=0.5)
