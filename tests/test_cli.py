@@ -62,7 +62,7 @@ def python(*arguments: str, **options: Any) -> subprocess.CompletedProcess[str]:
 def test_replay_prints_a_table_and_writes_the_document(bench: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["replay", "run.csv", "--system", "axis.toml", "--out", "done"]) == 0
     found = document(bench / "done")
-    assert sorted(path.name for path in (bench / "done").iterdir()) == ["report.html", "results.json"]
+    assert sorted(path.name for path in (bench / "done").iterdir()) == ["history.parquet", "report.html", "results.json"]
     assert list(found) == [
         "schema", "system", "samples", "duration_s", "method", "verdict", "parameters", "scale_tolerance",
         "calibration", "trackers", "events", "residual", "physical", "condition_number", "throughput_samples_per_s",
