@@ -62,11 +62,12 @@ def python(*arguments: str, **options: Any) -> subprocess.CompletedProcess[str]:
 def test_replay_prints_a_table_and_writes_the_document(bench: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["replay", "run.csv", "--system", "axis.toml", "--out", "done"]) == 0
     found = document(bench / "done")
-    assert sorted(path.name for path in (bench / "done").iterdir()) == ["report.html", "results.json"]
+    names = sorted(path.name for path in (bench / "done").iterdir())
+    assert names == ["history.parquet", "report.html", "results.json"]
     assert list(found) == [
         "schema", "system", "samples", "duration_s", "method", "verdict", "parameters", "scale_tolerance",
         "calibration", "trackers", "events", "residual", "physical", "condition_number", "throughput_samples_per_s",
-        "lost_samples", "outliers", "warnings", "diagnosis",
+        "lost_samples", "outliers", "warnings", "diagnosis", "history",
     ]  # fmt: skip
     assert found["schema"] == "sms-online/results/1"
     assert found["samples"] == 1200
