@@ -295,8 +295,8 @@ def result_of(
 
     truth: true values of physical parameters by name, of a simulated capture, which enter this record alone. bound (n,)
     or fewer: Cramér–Rao bound of each parameter's std. warnings: of the source. episodes: of the diagnosis that ran
-    beside the session, as results.json holds them. throughput: samples/s. history: what
-    has looked at the estimates on the way.
+    beside the session, as results.json holds them. throughput: samples/s. history: the
+    recorder of the estimates on the way.
     """
     now, base = evaluation.statistics, evaluation.base
     notices = evaluation.notices
