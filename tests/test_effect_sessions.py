@@ -339,7 +339,10 @@ def test_conditioning_is_independent_of_blocks_and_restarts() -> None:
 
 
 def test_corrections_give_the_estimate_of_a_clean_session(clean_motion: Simulation) -> None:
-    """An offset and a lag of encoder 1: declared, the stiffness of joint 1 comes out within 0.1 %, undeclared not."""
+    """An offset and a lag of encoder 1: declared, the stiffness of joint 1 comes out within 0.1 %.
+
+    Undeclared, tolerances of zero and clock take a part of them, and the lag leaves more than 0.5 %.
+    """
     texts = ("encoder_offset@q_1:offset=0.002", "sensor_lag@q_1:corner=60")
     blocks = list(sampled_blocks(distorted(clean_motion, *texts), "0"))
 
@@ -352,7 +355,7 @@ def test_corrections_give_the_estimate_of_a_clean_session(clean_motion: Simulati
         return float(estimator.estimate().pi[names.index("joint_1.stiffness")])
 
     assert stiffness(declaring(*texts)) == pytest.approx(1000.0, rel=1e-3)
-    assert abs(stiffness(declaring()) / 1000.0 - 1.0) > 0.02
+    assert abs(stiffness(declaring()) / 1000.0 - 1.0) > 0.005
 
 
 def test_a_stated_delay_of_a_torque_is_taken_off(clean_motion: Simulation) -> None:
