@@ -90,6 +90,10 @@ class Linearisation(Stage):
                 self.forget()
         return self._correction.push(piece)
 
+    def go_back(self, point: Array) -> None:
+        """Take a point (m,) of before."""
+        self.state.point = point
+
     def forget(self) -> None:
         """Stay at this point from now on."""
         self.state.samples, self.state.remembers = [], False

@@ -46,6 +46,8 @@ TESTED = FIRST_MOTION + 1.0
 COLOURED_NOISE = 2.0
 # Frequency that a window lets pass best, times its length.
 PASS_BAND = 2.0
+# Share of the rows' variance that a step to another point may leave, where that is more than noise alone.
+MOST_LEFT, NOISE_ALONE = 0.5, 1.5
 # Time from one estimate of the sensors' noise to the next, s.
 NOISE_RENEWED = 1.0
 
@@ -286,12 +288,35 @@ class Momentum(Stage):
             self.linearisation.forget()
         if not self.started or not self.linearisation.looks(self.fit.plain.windows, last):
             return
+        before, weights = self.linearisation.point, self._weights()
         while self.linearisation.moves(self._joint()):
-            self._begin_anew(self._solved()[len(self.nuisances) :], noise)
-            for piece in self.linearisation.again():
-                self._advance(piece, noise)
-            if last:
-                self._end_segment(noise)
+            variance = self._row_variance
+            self._make_rows_again(self._weights(), noise, last)
+            if self._row_variance > max(NOISE_ALONE, MOST_LEFT * variance):
+                # What no correction lessens is no error of calibration, whatever nuisances it looks like.
+                self.linearisation.go_back(before)
+                self._make_rows_again(weights, noise, last)
+                self.linearisation.forget()
+                return
+            before, weights = self.linearisation.point, self._weights()
+
+    @property
+    def _row_variance(self) -> float:
+        """Mean square of what the rows leave, in units of their predicted variance."""
+        estimate = self._joint()
+        return estimate.rss / max(estimate.dof, 1.0) * (1.0 + float(self.fit.plain.misfit.mean()))
+
+    def _weights(self) -> Array:
+        """β (n,) that rows are weighted with."""
+        return self._solved()[len(self.nuisances) :]
+
+    def _make_rows_again(self, weights: Array, noise: SensorNoise, last: bool) -> None:
+        """All rows of the session so far, about the point of now."""
+        self._begin_anew(weights, noise)
+        for piece in self.linearisation.again():
+            self._advance(piece, noise)
+        if last:
+            self._end_segment(noise)
 
     def _begin_anew(self, weights: Array, noise: SensorNoise) -> None:
         """Forget all rows, and begin with weights β (n,) that are known."""
