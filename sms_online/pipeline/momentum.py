@@ -530,4 +530,5 @@ class Momentum(Stage):
             suspected=None if noise is None or noise.exact else self.bank.suspected,
             shifts=tuple(self.changes.shifts),
             unwatched=self.bank.unwatched,
+            point=self.linearisation.point,
         )

@@ -89,7 +89,7 @@ class MomentumStatistics:
     rows that the sequential test finds more than noise in. scale_free: what gives the estimate where rows leave more
     than noise. latency: source that is late against the others, if one is. coloured: see
     `SensorNoise`. suspected: a change of parameters that the judged tracker does not follow; unwatched: none is looked
-    for. shifts: of the devices' clocks.
+    for. shifts: of the devices' clocks. point (m,): nuisances that samples are corrected by.
     """
 
     trackers: tuple[Reading, ...]
@@ -106,6 +106,7 @@ class MomentumStatistics:
     suspected: Suspected | None
     shifts: tuple[ClockShift, ...]
     unwatched: bool
+    point: Array
 
 
 @dataclass(frozen=True)

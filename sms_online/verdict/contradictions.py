@@ -26,12 +26,13 @@ ALIKE = 0.05
 
 
 def miscalibrated(evaluation: Evaluation) -> list[Reason]:
-    """Where the description is wrong by more than its tolerances allow; corrections are linear, up to a bound.
+    """Where the description is wrong by more than its tolerances allow.
 
+    Corrections of the rows are linear, up to a bound; samples are corrected whatever the size.
     A clock that moves on the way looks like a change of parameters: beside one, less counts.
     """
     changed = any(event.parameters for event in evaluation.statistics.events)
-    held = _held_torques(evaluation)
+    held, corrected = _held_torques(evaluation), _corrected(evaluation)
     out = list(held)
     for each in evaluation.calibration:
         if each.tolerance is None or (held and each.name == "clock"):
@@ -39,8 +40,22 @@ def miscalibrated(evaluation: Evaluation) -> list[Reason]:
         tolerances = abs(each.estimate) / each.tolerance
         if each.beyond or (changed and each.name == "clock" and tolerances > MOVED):
             text = f"{each}: {tolerances:.0f} tolerances"
-            out.append(Reason(text, tolerances > BOUND, full=f"{each}: {each.advice}", then=each.advice))
+            grave = tolerances > BOUND and (each.name, each.where, each.part) not in corrected
+            out.append(Reason(text, grave, full=f"{each}: {each.advice}", then=each.advice))
     return out
+
+
+def _corrected(evaluation: Evaluation) -> set[tuple[str, str, str]]:
+    """Name, place and part of calibrations that samples are corrected by, to what is linear."""
+    momentum, estimate = evaluation.statistics.momentum, evaluation.estimate
+    if momentum is None or estimate.nuisances.size != momentum.point.size:
+        return set()
+    each = zip(evaluation.statistics.setup.nuisances, momentum.point, estimate.nuisances, strict=True)
+    return {
+        (nuisance.name, nuisance.where, nuisance.part)
+        for nuisance, point, value in each
+        if point and abs(value - point) <= BOUND * nuisance.tolerance
+    }
 
 
 def _held_torques(evaluation: Evaluation) -> list[Reason]:
