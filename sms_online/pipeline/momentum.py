@@ -46,8 +46,8 @@ TESTED = FIRST_MOTION + 1.0
 COLOURED_NOISE = 2.0
 # Frequency that a window lets pass best, times its length.
 PASS_BAND = 2.0
-# Share of the rows' variance that a step to another point may leave, where that is more than noise alone.
-MOST_LEFT, NOISE_ALONE = 0.5, 1.5
+# Mean square of rows over their predicted variance up to which nuisances of first order explain what they hold.
+EXPLAINED = 1.5
 # Time from one estimate of the sensors' noise to the next, s.
 NOISE_RENEWED = 1.0
 
@@ -288,12 +288,13 @@ class Momentum(Stage):
             self.linearisation.forget()
         if not self.started or not self.linearisation.looks(self.fit.plain.windows, last):
             return
+        # Where rows hold more than noise and errors of calibration, these look like what the model lacks.
+        if self._row_variance > EXPLAINED:
+            return
         before, weights = self.linearisation.point, self._weights()
         while self.linearisation.moves(self._joint()):
-            variance = self._row_variance
             self._make_rows_again(self._weights(), noise, last)
-            if self._row_variance > max(NOISE_ALONE, MOST_LEFT * variance):
-                # What no correction lessens is no error of calibration, whatever nuisances it looks like.
+            if self._row_variance > EXPLAINED:
                 self.linearisation.go_back(before)
                 self._make_rows_again(weights, noise, last)
                 self.linearisation.forget()
