@@ -28,7 +28,7 @@ ALIKE = 0.05
 def miscalibrated(evaluation: Evaluation) -> list[Reason]:
     """Where the description is wrong by more than its tolerances allow.
 
-    Corrections of the rows are linear, up to a bound; samples are corrected whatever the size.
+    Corrections of the rows are linear, up to a bound; samples are moved in time by whatever a clock is late.
     A clock that moves on the way looks like a change of parameters: beside one, less counts.
     """
     changed = any(event.parameters for event in evaluation.statistics.events)
@@ -40,21 +40,21 @@ def miscalibrated(evaluation: Evaluation) -> list[Reason]:
         tolerances = abs(each.estimate) / each.tolerance
         if each.beyond or (changed and each.name == "clock" and tolerances > MOVED):
             text = f"{each}: {tolerances:.0f} tolerances"
-            grave = tolerances > BOUND and (each.name, each.where, each.part) not in corrected
+            grave = tolerances > BOUND and (each.name, each.where) not in corrected
             out.append(Reason(text, grave, full=f"{each}: {each.advice}", then=each.advice))
     return out
 
 
-def _corrected(evaluation: Evaluation) -> set[tuple[str, str, str]]:
-    """Name, place and part of calibrations that samples are corrected by, to what is linear."""
+def _corrected(evaluation: Evaluation) -> set[tuple[str, str]]:
+    """Name and place of the clocks that samples are corrected by, to what is linear."""
     momentum, estimate = evaluation.statistics.momentum, evaluation.estimate
     if momentum is None or estimate.nuisances.size != momentum.point.size:
         return set()
     each = zip(evaluation.statistics.setup.nuisances, momentum.point, estimate.nuisances, strict=True)
     return {
-        (nuisance.name, nuisance.where, nuisance.part)
+        (nuisance.name, nuisance.where)
         for nuisance, point, value in each
-        if point and abs(value - point) <= BOUND * nuisance.tolerance
+        if nuisance.name == "clock" and point and abs(value - point) <= BOUND * nuisance.tolerance
     }
 
 
