@@ -221,7 +221,9 @@ class MomentumBalance(Stage):
         apart = [(numbers[widths == M] * self.half_hop, M) for M in np.unique(widths)[::-1].tolist()]
         x, v, signals = self._states(apart)
         self.state.instant = last + 1
-        if self._between >= HALF_WIDTHS[0]:
+        # The narrowest filter leaves the steps of encoders, which differences multiply; the widest, of a search that
+        # waits for it, smooths reversals away.
+        if self._prompt and self._between >= HALF_WIDTHS[1]:
             v[0] = self.model.layout.speeds(x[0], self._differences(numbers))
         return [Instants(int(numbers[0]), x[0], v[0], signals[0])]
 
