@@ -32,7 +32,7 @@ def miscalibrated(evaluation: Evaluation) -> list[Reason]:
     A clock that moves on the way looks like a change of parameters: beside one, less counts.
     """
     changed = any(event.parameters for event in evaluation.statistics.events)
-    held, corrected = _held_torques(evaluation), _corrected(evaluation)
+    held, corrected = _held_torques(evaluation), _corrected_clocks(evaluation)
     out = list(held)
     for each in evaluation.calibration:
         if each.tolerance is None or (held and each.name == "clock"):
@@ -40,19 +40,20 @@ def miscalibrated(evaluation: Evaluation) -> list[Reason]:
         tolerances = abs(each.estimate) / each.tolerance
         if each.beyond or (changed and each.name == "clock" and tolerances > MOVED):
             text = f"{each}: {tolerances:.0f} tolerances"
-            grave = tolerances > BOUND and (each.name, each.where) not in corrected
+            moved = each.name == "clock" and (each.where, each.part) in corrected
+            grave = tolerances > BOUND and not moved
             out.append(Reason(text, grave, full=f"{each}: {each.advice}", then=each.advice))
     return out
 
 
-def _corrected(evaluation: Evaluation) -> set[tuple[str, str]]:
-    """Name and place of the clocks that samples are corrected by, to what is linear."""
+def _corrected_clocks(evaluation: Evaluation) -> set[tuple[str, str]]:
+    """Device and part of each clock that samples are corrected by, to what is linear."""
     momentum, estimate = evaluation.statistics.momentum, evaluation.estimate
     if momentum is None or estimate.nuisances.size != momentum.point.size:
         return set()
     each = zip(evaluation.statistics.setup.nuisances, momentum.point, estimate.nuisances, strict=True)
     return {
-        (nuisance.name, nuisance.where)
+        (nuisance.where, nuisance.part)
         for nuisance, point, value in each
         if nuisance.name == "clock" and point and abs(value - point) <= BOUND * nuisance.tolerance
     }
