@@ -44,6 +44,12 @@ def test_a_gain_is_between_an_error_and_all_of_a_torque() -> None:
     assert not plausible("torque_gain", 2e-4)
 
 
+def test_a_zero_is_off_by_less_than_a_turn() -> None:
+    # A coordinate that nothing depends on fits any size.
+    assert plausible("encoder_offset", -3.0)
+    assert not plausible("encoder_offset", -2e6)
+
+
 def test_what_a_held_command_does_is_no_sensor_s_lag() -> None:
     assert not plausible("sensor_lag", 4e-4)
     assert plausible("sensor_lag", 4e-4, sample_rate=2000.0)

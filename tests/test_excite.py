@@ -23,12 +23,24 @@ from tests.axis import AXIS, MOTION
 
 MOVED = (AXIS + MOTION).replace("duration = 6.0", "duration = 3.0")
 ONE_SINE = MOVED.replace(", { frequency = 5.0, cosine = 0.3 }", "")
+# Its rate never changes its sign: friction is then an offset of the torque.
+ONE_WAY = (AXIS + MOTION.partition("joint_1 = [")[0]).replace("duration = 6.0", "duration = 5.0") + (
+    "joint_1 = [{ frequency = 0.25, sine = 1.0 }]"
+)
+ALIKE = ("coulomb_friction@joint_1", "torque_offset@joint_1")
 FRICTION = ("coulomb_friction@joint_1:torque=0.05", "stribeck_friction@joint_1:torque=0.05")
 
 
 @pytest.fixture(scope="module")
 def designed() -> Excitation:
     return excite(parse_system(MOVED, "axis.toml"), seed=1, iterations=4)
+
+
+@pytest.fixture(scope="module")
+def one_way() -> Excitation:
+    """A motion for two effects that the described one cannot tell apart."""
+    separate = [f"{name}:torque=1" for name in ALIKE]
+    return excite(parse_system(ONE_WAY, "axis.toml"), separate=separate, limits=Limits(angle=1.0), iterations=2)
 
 
 def test_batched_motions_are_the_exact_ones() -> None:
@@ -109,6 +121,18 @@ def test_two_effects_are_separated() -> None:
     assert worst[1] < 0.6 * worst[0]
     # The file keeps what it described: the effects are hypotheses.
     assert found.system.effects == system.effects
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("present", [0, 1])
+def test_what_a_diagnosis_names_together_it_then_names_alone(one_way: Excitation, present: int) -> None:
+    acting, other = ALIKE[present], ALIKE[1 - present]
+    for system, together in ((parse_system(ONE_WAY, "axis.toml"), True), (one_way.system, False)):
+        data = sms.simulate(system, grade="B", seed=1, effects=[f"{acting}:torque=1"])
+        (found,) = sms.diagnose(system, data).effects
+        named = f"{found.name}@{found.where}"
+        assert {named, *found.ambiguous_with} >= set(ALIKE) if together else named == acting
+        assert together or other not in found.ambiguous_with
 
 
 def test_an_effect_to_separate_needs_its_size() -> None:

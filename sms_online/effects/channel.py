@@ -19,6 +19,8 @@ from sms_online.stream import Array
 INVERSIONS = 20
 # A disc's centre is off by a tenth of its radius at most.
 LARGEST_ECCENTRICITY = 0.1
+# A zero further off than a turn is no zero: such a size fits where the offset acts on next to nothing.
+LARGEST_OFFSET = 2.0 * np.pi  # rad (m)
 
 
 class Linear(NamedTuple):
@@ -77,7 +79,9 @@ class EncoderOffset(ChannelEffect):
     entry = Entry(
         "encoder_offset", "channel", "position", {"offset": "rad"},
         "the same motion about other positions of the joint",
-        traits=Traits(signed=True, calibrates=("encoder_zero", "marker_zero", "marker_zero_angle")),
+        traits=Traits(
+            signed=True, most=LARGEST_OFFSET, calibrates=("encoder_zero", "marker_zero", "marker_zero_angle")
+        ),
         said=lambda where, given: f"{where} reads {given['offset']:.3g} too much: set its zero anew",
     )  # fmt: skip
     linear = (Linear("offset", "rad", "one", -1.0),)
