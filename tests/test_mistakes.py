@@ -79,7 +79,7 @@ def test_a_session_without_a_mistake_has_none() -> None:
 @pytest.mark.parametrize(
     ("change", "key", "words"),
     [
-        (times(-1.0, "tau_2"), "torque_sign@tau_2", "the other sign"),
+        pytest.param(times(-1.0, "tau_2"), "torque_sign@tau_2", "the other sign", marks=pytest.mark.slow),
         (times(50.0, "tau_1", "tau_2"), "joint_torque@tau_1, tau_2", "everything is 50 × its description"),
         pytest.param(times(180.0 / np.pi, "q_2"), "degrees@q_2", "q_2 is in degrees", marks=pytest.mark.long),
         pytest.param(times(1e3, "r_S_x", "r_S_y"), "millimetres@r_S_*", "in mm in place of m", marks=pytest.mark.long),

@@ -65,7 +65,7 @@ class CourseRecorder:
         self._x = _Spread(estimator.model.layout.n_x)
 
     def watch(self, blocks: Iterable[Block]) -> Iterator[Block]:
-        """The same samples, in pieces no longer than the interval; each is looked at once it has been used."""
+        """The same samples, in pieces no longer than the interval; each is recorded once it has been used."""
         longest = max(1, round(self._session.system.sample_rate / RATE))
         for block in blocks:
             for piece in block.pieces(longest):
