@@ -115,6 +115,7 @@ class Recorder(Stage, Observer):
 
     def __init__(self, estimator: Estimator) -> None:
         self._estimator = estimator
+        self.latest: tuple[float, Evaluation] | None = None  # the newest instant, s, and what was known then
         self.state = HistoryState()
 
     def block_through(self) -> None:
@@ -144,6 +145,7 @@ class Recorder(Stage, Observer):
 
     def _look(self, t: float) -> None:
         now = Evaluation(Statistics.of(self._estimator, t))
+        self.latest = t, now
         upper = np.triu_indices(now.base.n)
         packed = [np.array((t, now.base.n))]
         for estimate, std in now.estimates:

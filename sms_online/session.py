@@ -76,11 +76,11 @@ class Session:
             # A prior is on the base parameters, which the estimator has found.
             self.estimator.set_prior(base_prior(system, self.estimator.base, prior))
         # Before the diagnosis, which may have the estimator go on with others.
-        self._history = Recorder(self.estimator)
-        self.estimator.observers.append(self._history)
+        self.recorder = Recorder(self.estimator)
+        self.estimator.observers.append(self.recorder)
         if checkpoint is not None:
             checkpoint.put_into(self.estimator)
-            checkpoint.put_into_history(self._history)
+            checkpoint.put_into_history(self.recorder)
         self.diagnosis = OnlineDiagnosis(self.estimator, Immediate() if searcher is None else searcher, adopt)
         self.busy = 0.0  # s of computing
         self._begun = {"channels": self.channels, "prior": prior, "adopt": adopt, "source": source}
@@ -147,7 +147,7 @@ class Session:
         start = perf_counter()
         self.estimator.finish()
         self.diagnosis.finish()
-        self._history.finish()
+        self.recorder.finish()
         self.busy += perf_counter() - start
         self._result = None
 
@@ -178,11 +178,11 @@ class Session:
         true = None if truth is None else true_values(truth, self.system, self.diagnosis.system)
         if throughput is None:
             throughput = self.estimator.samples / self.busy if self.busy else 0.0
-        return result_of(self.evaluation(), true, bound, warnings, self.diagnosis.document(), throughput, self._history)
+        return result_of(self.evaluation(), true, bound, warnings, self.diagnosis.document(), throughput, self.recorder)
 
     def checkpoint(self, source: Stage | None = None) -> Checkpoint:
         """The state of now, to go on from; takes milliseconds. source: of the samples, where that keeps a state too."""
-        return Checkpoint.of(self.estimator, self._begun, source, self._history)
+        return Checkpoint.of(self.estimator, self._begun, source, self.recorder)
 
     def save(self) -> bytes:
         """The state of now, for `restore`; the system, its channels and options are part of it."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -86,11 +86,7 @@ def write_ros2(capture: sms.Capture, path: Path, plugin: StoragePlugin = Storage
     """A ROS 2 bag, in SQLite or MCAP."""
     store = typestore(2)
     with Writer2(path, version=9, storage_plugin=plugin) as writer:
-        connections: dict[str, Any] = {}
-        for topic, kind, at, message in messages(capture, 2):
-            if topic not in connections:
-                connections[topic] = writer.add_connection(topic, kind, typestore=store)
-            writer.write(connections[topic], at, store.serialize_cdr(message, kind))
+        _write(writer, store, store.serialize_cdr, messages(capture, 2))
     return path
 
 
@@ -98,12 +94,21 @@ def write_ros1(capture: sms.Capture, path: Path) -> Path:
     """A ROS 1 bag."""
     store = typestore(1)
     with Writer1(path) as writer:
-        connections: dict[str, Any] = {}
-        for topic, kind, at, message in messages(capture, 1):
-            if topic not in connections:
-                connections[topic] = writer.add_connection(topic, kind, typestore=store)
-            writer.write(connections[topic], at, store.serialize_ros1(message, kind))
+        _write(writer, store, store.serialize_ros1, messages(capture, 1))
     return path
+
+
+def _write(
+    writer: Writer1 | Writer2,
+    store: Any,
+    serialised: Callable[[Any, str], Any],
+    sent: Iterable[tuple[Any, ...]],
+) -> None:
+    connections: dict[str, Any] = {}
+    for topic, kind, at, message in sent:
+        if topic not in connections:
+            connections[topic] = writer.add_connection(topic, kind, typestore=store)
+        writer.write(connections[topic], at, serialised(message, kind))
 
 
 def json_message(capture: sms.Capture, topic: str, row: Any) -> dict[str, Any]:

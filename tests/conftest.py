@@ -29,7 +29,7 @@ def _share_motions(tmp_path_factory: pytest.TempPathFactory, worker_id: str) -> 
 
 @pytest.fixture(scope="session")
 def planar_session() -> Simulation:
-    """The paper's example (Table III) along (46) for 20 s."""
+    """The paper's example (Table III) along (46) for 10 s, as in the paper."""
     return simulations.planar()
 
 

@@ -49,14 +49,14 @@ def _shared(key: str, system: System, duration: float | None, position_tolerance
 
 
 @cache
-def planar(seconds: float = 20.0) -> Simulation:
+def planar(seconds: float = 10.0) -> Simulation:
     """The paper's example (Table III) along (46)."""
-    whole = simulated(load_system("paper-planar"), 20.0)
+    whole = simulated(load_system("paper-planar"), max(10.0, seconds))
     return whole if seconds == whole.duration else until(whole, seconds)
 
 
 def planar_capture(seconds: float, grade: str = "B", seed: int = 0) -> Capture:
-    """The first seconds of the paper's example, at most 20, as `sms.simulate` records them."""
+    """The first seconds of the paper's example as `sms.simulate` records them."""
     session = Simulated.of(load_system("paper-planar"), duration=seconds, grade=grade, seed=seed)
     return session.capture(planar(seconds))
 

@@ -171,18 +171,22 @@ def axis() -> sms.System:
 
 @pytest.fixture(scope="module")
 def capture() -> sms.Capture:
-    """The axis with friction, 12 s."""
-    block = axis_block(0.2)
+    """The axis, 12 s."""
+    block = axis_block(coulomb=0.0)
     return sms.Capture(block.t, block.channels, block.values)
 
 
+@pytest.fixture(scope="module")
+def result(axis: sms.System, capture: sms.Capture) -> sms.Result:
+    return sms.estimate(axis, capture)
+
+
 @pytest.mark.slow
-def test_tables_are_captures(axis: sms.System, capture: sms.Capture) -> None:
+def test_tables_are_captures(axis: sms.System, capture: sms.Capture, result: sms.Result) -> None:
     pandas = pytest.importorskip("pandas")
     columns = {"t": capture.t, **dict(zip(capture.channels, capture.values.T, strict=True))}
-    expected = sms.estimate(axis, capture).document()["parameters"]
     for table in (pa.table(columns), pandas.DataFrame(columns)):
-        assert sms.estimate(axis, sms.Capture.from_table(table)).document()["parameters"] == expected
+        assert sms.estimate(axis, sms.Capture.from_table(table)).parameters == result.parameters
 
 
 def test_missing_cells_of_tables_are_nan() -> None:
@@ -193,9 +197,8 @@ def test_missing_cells_of_tables_are_nan() -> None:
     np.testing.assert_array_equal(sms.Capture.from_table(frame).values, [[np.nan], [2.0]])
 
 
-def test_a_result_is_a_frame_of_pandas(axis: sms.System, capture: sms.Capture) -> None:
+def test_a_result_is_a_frame_of_pandas(result: sms.Result) -> None:
     pytest.importorskip("pandas")
-    result = sms.estimate(axis, capture)
     frame = result.to_frame()
     assert list(frame.index) == list(result.parameters)
     assert frame["std"].tolist() == [p.std for p in result.parameters.values()]
@@ -270,13 +273,12 @@ def test_a_saved_session_goes_on_to_the_same_bits(axis: sms.System, capture: sms
         sms.Session.restore(b"nothing")
 
 
-def test_an_unknown_parameter_is_named_with_the_one_meant(axis: sms.System, capture: sms.Capture) -> None:
+def test_an_unknown_parameter_is_named_with_the_one_meant(result: sms.Result) -> None:
     with pytest.raises(KeyError, match=r"did you mean 'viscous_friction@joint_1\.damping'"):
-        sms.estimate(axis, capture).parameters["viscous_friction@joint_1.dampin"]
+        result.parameters["viscous_friction@joint_1.dampin"]
 
 
-def test_results_read_as_tables(axis: sms.System, capture: sms.Capture) -> None:
-    result = sms.estimate(axis, capture)
+def test_results_read_as_tables(result: sms.Result) -> None:
     for text in (str(result), result._repr_html_()):
         assert result.trust.sentence in text
         assert all(name in text for name in result.parameters)
@@ -291,14 +293,15 @@ def test_a_recorded_motion_has_bounds() -> None:
 
 
 @pytest.mark.slow
-def test_a_system_may_be_given_by_the_path_of_its_file(tmp_path: Path) -> None:
-    path, block = tmp_path / "axis.toml", axis_block(coulomb=0.0)
+def test_a_system_may_be_given_by_the_path_of_its_file(
+    tmp_path: Path, capture: sms.Capture, result: sms.Result
+) -> None:
+    path = tmp_path / "axis.toml"
     path.write_text(AXIS)
-    capture, system = sms.Capture(block.t, block.channels, block.values), sms.load_system(path)
-    ours, same = sms.estimate(str(path), capture), sms.estimate(system, capture)
-    assert without_timing(ours.document()) == without_timing(same.document())
+    system = sms.load_system(path)
+    assert without_timing(sms.estimate(str(path), capture).document()) == without_timing(result.document())
     for given in (path, str(path)):
-        assert sms.Session(given, block.channels).system == system
+        assert sms.Session(given, capture.channels).system == system
     assert sms.check(path, capture).system == system.name
     assert sms.bound(path, capture).parameters == sms.bound(system, capture).parameters
 

@@ -70,15 +70,30 @@ def noisy(exact: Block, changed: dict[str, Array] | None = None, seed: int = 3) 
     return Block(exact.t, exact.channels, values)
 
 
-def evaluated(
-    exact: Block, tolerances: Tolerances, changed: dict[str, Array] | None = None, seed: int = 3
-) -> Evaluation:
-    """Of noisy samples."""
-    system = load_system("paper-planar").model_copy(update={"tolerances": tolerances})
-    estimator = Estimator(system, exact.channels, "test")
-    estimator.push(noisy(exact, changed, seed))
+def estimated(block: Block) -> Estimator:
+    """With the default tolerances."""
+    system = load_system("paper-planar").model_copy(update={"tolerances": Tolerances()})
+    estimator = Estimator(system, block.channels, "test")
+    estimator.push(block)
     estimator.finish()
-    return Evaluation(Statistics.of(estimator))
+    return estimator
+
+
+def evaluated(exact: Block, changed: dict[str, Array] | None = None, seed: int = 3) -> Evaluation:
+    """Of noisy samples."""
+    return Evaluation(Statistics.of(estimated(noisy(exact, changed, seed))))
+
+
+@pytest.fixture(scope="module")
+def slightly_late(exact: Block) -> Evaluation:
+    """A camera that is 100 µs late, two tolerances."""
+    return evaluated(exact, late(exact, 1e-4))
+
+
+@pytest.fixture(scope="module")
+def very_late(exact: Block) -> Estimator:
+    """A camera that is 4 ms late."""
+    return estimated(noisy(exact, late(exact, 4e-3)))
 
 
 def off(evaluation: Evaluation) -> Array:
@@ -100,21 +115,20 @@ def of(evaluation: Evaluation, name: str, where: str) -> Calibration:
 
 
 @pytest.mark.slow
-def test_a_late_camera_within_tolerance_is_said_and_corrected(exact: Block) -> None:
-    """By 100 µs, two tolerances."""
-    evaluation = evaluated(exact, Tolerances(), late(exact, 1e-4))
-    assert np.abs(off(evaluation)).max() < 4.0
+def test_a_late_camera_within_tolerance_is_said_and_corrected(slightly_late: Evaluation) -> None:
+    assert np.abs(off(slightly_late)).max() < 4.0
     for where in ("base", "markers"):
-        clock = of(evaluation, "clock", where)
+        clock = of(slightly_late, "clock", where)
         assert clock.estimate == pytest.approx(1e-4, abs=4.0 * clock.std)
         assert clock.std < 2e-5
         assert not clock.beyond
         assert str(clock).endswith("µs late")
 
 
-def test_a_camera_milliseconds_late_is_said_and_corrected(exact: Block) -> None:
-    """By 4 ms: rows that are linear about no lateness at all say 2.2 ms."""
-    evaluation = evaluated(exact, Tolerances(), late(exact, 4e-3))
+@pytest.mark.slow
+def test_a_camera_milliseconds_late_is_said_and_corrected(very_late: Estimator) -> None:
+    """Rows that are linear about no lateness at all say 2.2 ms."""
+    evaluation = Evaluation(Statistics.of(very_late))
     assert np.abs(off(evaluation)).max() < 4.0
     for where in ("base", "markers"):
         clock = of(evaluation, "clock", where)
@@ -122,11 +136,12 @@ def test_a_camera_milliseconds_late_is_said_and_corrected(exact: Block) -> None:
         assert clock.std < 2e-5
 
 
+@pytest.mark.slow
 def test_a_tracked_point_millimetres_off_is_corrected(exact: Block) -> None:
     """By 5 mm along both axes."""
     theta, x, y = (exact.values[:, exact.channels.index(name)] for name in ("theta_0", "r_S_x", "r_S_y"))
     by = 5e-3 * np.array([np.cos(theta) - np.sin(theta), np.sin(theta) + np.cos(theta)])
-    evaluation = evaluated(exact, Tolerances(), {"r_S_x": x + by[0], "r_S_y": y + by[1]})
+    evaluation = evaluated(exact, {"r_S_x": x + by[0], "r_S_y": y + by[1]})
     assert np.abs(off(evaluation)).max() < 4.0
     found = [each for each in evaluation.calibration if each.name == "tracked_point"]
     assert len(found) == 2
@@ -134,32 +149,32 @@ def test_a_tracked_point_millimetres_off_is_corrected(exact: Block) -> None:
         assert each.estimate == pytest.approx(5e-3, abs=4.0 * each.std)
 
 
-def test_a_saved_session_goes_on_where_rows_are_linear(exact: Block) -> None:
-    """A camera 4 ms late, restored after its rows were made anew and while more of them may be."""
-    system = load_system("paper-planar").model_copy(update={"tolerances": Tolerances()})
+@pytest.mark.slow
+def test_a_saved_session_goes_on_where_rows_are_linear(exact: Block, very_late: Estimator) -> None:
+    """Restored after its rows were made anew and while more of them may be."""
     block = noisy(exact, late(exact, 4e-3))
-    whole, session = (Session(system, block.channels) for _ in range(2))
-    whole.update(block)
+    session = Session(very_late.system, block.channels)
     for piece in block.pieces(2500):
         session.update(piece)
         if session.estimator.samples > 4000:
             session = Session.restore(session.save())
-    for each in (whole, session):
-        each.finish()
-    np.testing.assert_array_equal(session.estimator.estimate().joint, whole.estimator.estimate().joint)
+    session.finish()
+    np.testing.assert_array_equal(session.estimator.estimate().joint, very_late.estimate().joint)
 
 
+@pytest.mark.slow
 def test_noise_determines_no_unit_of_length(exact: Block) -> None:
     """Lengths, scale of the camera and masses together: only tolerances say anything of these."""
     stds = [
         [of(evaluation, "camera_scale", "base and markers").std, of(evaluation, "length", "link_1").std]
-        for evaluation in (evaluated(exact, Tolerances(), seed=seed) for seed in (3, 4))
+        for evaluation in (evaluated(exact, seed=seed) for seed in (3, 4))
     ]
     np.testing.assert_allclose(stds[0], stds[1], rtol=0.05)
 
 
-def test_a_change_beside_a_clock_that_may_have_moved_is_in_doubt(exact: Block) -> None:
-    statistics = evaluated(exact, Tolerances(), late(exact, 1e-4)).statistics
+@pytest.mark.slow
+def test_a_change_beside_a_clock_that_may_have_moved_is_in_doubt(slightly_late: Evaluation) -> None:
+    statistics = slightly_late.statistics
     change = Event(4.0, "payload", ("payload.mass",), ("kg",), (1.0,), (0.1,), 0)
     steady, changed = (Evaluation(replace(statistics, events=events)).trust for events in ((), (change,)))
     assert not any("tolerances" in reason for reason in steady.reasons)
@@ -167,7 +182,9 @@ def test_a_change_beside_a_clock_that_may_have_moved_is_in_doubt(exact: Block) -
 
 
 def test_a_camera_later_than_its_tolerance_is_not_trusted(exact: Block) -> None:
-    evaluation = evaluated(exact, Tolerances(), late(exact, 5e-4))
+    """Five seconds of it."""
+    whole = noisy(exact, late(exact, 5e-4))
+    evaluation = Evaluation(Statistics.of(estimated(next(iter(whole.pieces(5001))))))
     assert evaluation.trust.level == "doubt"
     assert any("late: " in reason and "tolerances" in reason for reason in evaluation.trust.reasons)
     assert any("latency" in warning for warning in evaluation.trust.warnings)

@@ -93,7 +93,7 @@ def test_with_json_stdout_is_the_document_alone(bench: Path, capsys: pytest.Capt
 
 def test_results_go_to_a_new_directory_for_each_run(bench: Path) -> None:
     for _ in range(3):  # within one second, which names the directory
-        assert main(["replay", "run.csv", "--system", "axis.toml"]) == 0
+        assert main(["replay", "run.csv", "--system", "axis.toml", "-to", "1.5"]) == 0
     assert len(list((bench / "runs").glob("*/results.json"))) == 3
 
 
@@ -373,8 +373,10 @@ def test_the_command_line_comes_without_numpy() -> None:
 
 
 def test_a_reader_that_leaves_early_is_no_error(bench: Path) -> None:
-    command = [sys.executable, "-m", "sms_tools", "replay", "run.csv", "--system", "axis.toml", "--out", "done"]
-    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
+    replay = ["replay", "run.csv", "--system", "axis.toml", "-to", "2", "--out", "done"]
+    process = subprocess.Popen(
+        [sys.executable, "-m", "sms_tools", *replay], stdout=subprocess.PIPE, stderr=subprocess.PIPE
+    )
     assert process.stdout is not None
     assert process.stderr is not None
     process.stdout.close()

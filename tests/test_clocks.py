@@ -16,7 +16,7 @@ from sms_adapters.clock_line import LARGEST_DRIFT, DeviceClock, likely_line
 from sms_adapters.clock_merge import Merger
 from sms_adapters.clock_samples import CountedTime, NumberedTime
 from sms_adapters.recording import tick_time
-from sms_adapters.stuck import StuckGuard
+from sms_online.sample_faults import StuckGuard
 from sms_online.stream import Array
 from tests.bus_streams import AxisBus, axis_testbed, estimated, merged, ticks
 

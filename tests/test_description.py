@@ -16,6 +16,7 @@ from sms_online.description.parse import describe, parse_system, shipped_systems
 from sms_online.description.schema import System
 from sms_online.errors import InputError
 from tests.axis import AXIS
+from tests.refused import assert_refused, refusal
 
 PLANAR = """
 name = "bench"
@@ -96,12 +97,7 @@ def changed(old: str, new: str, text: str = PLANAR) -> str:
 
 
 def message(text: str) -> str:
-    with pytest.raises(InputError) as caught:
-        parse_system(text, "bench.toml")
-    line = str(caught.value)
-    assert "\n" not in line
-    assert line.startswith("bench.toml")
-    return line
+    return refusal(text, "bench.toml")
 
 
 def test_a_file_becomes_a_description_with_its_defaults() -> None:
@@ -208,11 +204,7 @@ def test_a_description_survives_its_own_json() -> None:
     ],
 )  # fmt: skip
 def test_a_wrong_file_is_refused_in_one_line(old: str, new: str, place: str, found: str, expected: str) -> None:
-    line = message(changed(old, new))
-    assert line.startswith(f"bench.toml, {place}: ")
-    said, wanted = line.removeprefix(f"bench.toml, {place}: ").split("; expected ", 1)
-    assert found in said
-    assert expected in wanted
+    assert_refused(changed(old, new), "bench.toml", place, found, expected)
 
 
 def test_broken_toml_is_located_by_line_and_column() -> None:

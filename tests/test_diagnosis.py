@@ -25,6 +25,7 @@ from sms_online.pipeline.momentum_windows import HOPS
 from sms_online.stream import Block
 from sms_sim.simulate import sampled_blocks, simulate
 from sms_tools.adopted_system import adopted_text
+from tests.simulations import planar
 
 DURATION = 6.0
 # Far below the noise.
@@ -188,7 +189,7 @@ def test_a_second_of_samples_is_enough_where_dry_friction_acts() -> None:
 def test_a_session_without_momentum_rows_is_refused() -> None:
     system = unlike(load_system("paper-planar")).model_copy(update={"balance": "energy"})
     with pytest.raises(InputError, match="no momentum balance"):
-        diagnose(system, [block_of()], "test", lambda estimator: None)
+        diagnose(system, list(sampled_blocks(planar(1.0), "B", seed=4)), "test", lambda estimator: None)
 
 
 @pytest.mark.slow

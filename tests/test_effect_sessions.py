@@ -94,6 +94,7 @@ def clean_motion() -> Simulation:
 # Motion
 
 
+@pytest.mark.slow
 def test_the_power_of_all_effects_is_the_change_of_energy() -> None:
     """Half a second with every force effect at once: motor work, energy and what is taken out close to rounding."""
     simulation = simulate(declaring(*FORCES), 0.5)

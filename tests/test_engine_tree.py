@@ -63,6 +63,10 @@ joint_2 = [
     { frequency = 6.0, cosine = -0.08 },
 ]
 """
+GEAR = """
+gear_ratio = 30.0
+stiffness = 900.0
+damping = 20.0"""
 BRACKETS = f"""
 name = "brackets"
 {BASE}
@@ -70,10 +74,7 @@ name = "brackets"
 "link_1.polar_inertia_per_length" = 0.0004
 "link_2.polar_inertia_per_length" = 0.0004{WEIGHED}
 [joint_1]
-axis = [0.0, 0.0, 1.0]
-gear_ratio = 30.0
-stiffness = 900.0
-damping = 20.0
+axis = [0.0, 0.0, 1.0]{GEAR}
 [motor_1]{MOTOR}
 [link_1]{FLEXIBLE}{TORSION}
 length = 1.0
@@ -82,10 +83,7 @@ root_rotation = [0.2, -0.3, 0.4]
 [joint_2]
 axis = [0.0, 1.0, 0.0]
 mount_position = [0.05, 0.1, 0.3]
-mount_rotation = [0.3, 0.4, -0.2]
-gear_ratio = 30.0
-stiffness = 900.0
-damping = 20.0
+mount_rotation = [0.3, 0.4, -0.2]{GEAR}
 [motor_2]{MOTOR}
 [link_2]{FLEXIBLE}{TORSION}
 length = 0.9
@@ -106,10 +104,7 @@ name = "tree"
 "link_1.polar_inertia_per_length" = 0.0004
 "link_3.polar_inertia_per_length" = 0.0004
 [joint_1]
-axis = [0.0, 0.0, 1.0]
-gear_ratio = 30.0
-stiffness = 900.0
-damping = 20.0
+axis = [0.0, 0.0, 1.0]{GEAR}
 [motor_1]{MOTOR}
 [link_1]{FLEXIBLE}{TORSION}
 length = 1.0

@@ -173,6 +173,7 @@ def axis_session(damping: float, inertia: float, seconds: float = 16.0) -> Block
     return Block(t, ("force_1", "q_1"), np.stack((torque, q), axis=1) + noise)
 
 
+@pytest.mark.slow
 def test_a_small_change_is_noticed_once_it_has_lasted() -> None:
     """Damping three tenths higher shows in no two windows alone: the cumulative sum finds it."""
     estimator, noticed = run(axis_session(1.3 * DAMPING, INERTIA, 24.0), system=SYSTEM)

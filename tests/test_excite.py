@@ -86,6 +86,7 @@ def test_a_motion_that_is_no_better_is_not_given_out(monkeypatch: pytest.MonkeyP
     assert set(found.gains().values()) == {1.0}
 
 
+@pytest.mark.slow
 def test_the_seed_decides_the_motion() -> None:
     system = parse_system(MOVED, "axis.toml")
     found = [excite(system, duration=2.0, seed=seed, iterations=1).system for seed in (1, 1, 2)]
@@ -140,6 +141,7 @@ def test_an_effect_to_separate_needs_its_size() -> None:
         excite(parse_system(MOVED, "axis.toml"), separate=(FRICTION[0], "stribeck_friction@joint_1"))
 
 
+@pytest.mark.slow
 def test_the_verb_writes_file_reference_and_table(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path, out = tmp_path / "moved.toml", tmp_path / "done"
     path.write_text(MOVED)

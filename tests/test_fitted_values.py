@@ -17,6 +17,7 @@ from sms_online.effects.build import build_model
 from sms_online.model.base_parameters import find_base_parameters
 from sms_online.priors import base_prior, with_estimates
 from sms_tools.cli import main
+from tests.simulations import planar_capture
 from tests.test_compare import ELASTIC_AXIS, STIFFNESS
 
 FRICTION = 1.2  # N m
@@ -58,6 +59,7 @@ def test_it_holds_on_another_run_without_results(rig: Path) -> None:
     assert not sms.validate(sms.load_system(rig / "rig.toml"), rig / "tuesday.csv").holds
 
 
+@pytest.mark.slow
 def test_it_is_simulated_as_found(rig: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path, capture = str(rig / "found" / "system.toml"), rig / "simulated.csv"
     assert main(["simulate", "--system", path, "--capture", str(capture), "--grade", "0"]) == 0
@@ -82,6 +84,7 @@ def test_its_deviations_are_priors_where_priors_are_asked_for(rig: Path) -> None
         assert (value, std) == (system.fitted[parameter.name].value, system.fitted[parameter.name].std)
 
 
+@pytest.mark.slow
 def test_a_second_diagnosis_replaces_the_fitted_values(rig: Path) -> None:
     path, out = rig / "found" / "system.toml", rig / "again"
     assert main(["diagnose", str(rig / "tuesday.csv"), "--system", str(path), "--out", str(out)]) == 0
@@ -94,7 +97,7 @@ def test_a_second_diagnosis_replaces_the_fitted_values(rig: Path) -> None:
 
 def test_a_combination_is_fitted_as_its_leading_parameter() -> None:
     system = sms.load_system("paper-planar")
-    found = sms.estimate(system, sms.simulate(system, duration=1.0, grade="A"))
+    found = sms.estimate(system, planar_capture(1.0, "A"))
     base = find_base_parameters(build_model(system))
     carried = with_estimates(system, base, found.parameters)
     again = find_base_parameters(build_model(carried))

@@ -8,7 +8,7 @@ from sms_online.description.bodies import FlexibleLink
 from sms_online.description.channels import channels
 from sms_online.description.parse import parse_system
 from sms_online.description.tree import BASE, tree_of
-from sms_online.errors import InputError
+from tests.refused import assert_refused, refusal
 
 # Two arms on a base: joints 1 and 2 with a bracket (link 4) on link 1, joint 3 a passive panel; an arm's U-joint.
 TREE = """
@@ -72,11 +72,7 @@ def changed(old: str, new: str) -> str:
 
 
 def message(text: str) -> str:
-    """What the one line says to which a text leads."""
-    with pytest.raises(InputError) as caught:
-        parse_system(text, "arm.toml")
-    assert "\n" not in str(caught.value)
-    return str(caught.value)
+    return refusal(text, "arm.toml")
 
 
 def test_a_tree_is_read_with_brackets_and_a_fixed_joint() -> None:
@@ -121,11 +117,7 @@ def test_a_passive_joint_has_neither_drive_nor_motor_side() -> None:
     ],
 )  # fmt: skip
 def test_what_no_arm_has_is_refused_in_one_line(old: str, new: str, place: str, found: str, expected: str) -> None:
-    line = message(changed(old, new))
-    assert line.startswith(f"arm.toml, {place}: ")
-    said, wanted = line.removeprefix(f"arm.toml, {place}: ").split("; expected ", 1)
-    assert found in said
-    assert expected in wanted
+    assert_refused(changed(old, new), "arm.toml", place, found, expected)
 
 
 def test_a_gain_on_a_passive_joint_is_refused() -> None:

@@ -7,6 +7,7 @@ import re
 import shutil
 import subprocess
 import sys
+import tomllib
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -16,19 +17,22 @@ import pytest
 from sms_adapters.capture import CaptureWriter
 from sms_adapters.system_file import load_system
 from sms_online.effects.build import build_model
+from sms_online.history import MOST_WRITTEN, History
 from sms_online.model.layout import Layout
 from sms_online.pipeline.estimator import Estimator
+from sms_online.session import Session
 from sms_online.stream import Block
 from sms_sim.simulate import Simulation
 from sms_tools.cli import main
-from sms_tools.html_report import history as history_module
+from sms_tools.html_report import course as course_module
 from sms_tools.html_report.arm_drawing import arm_drawings
+from sms_tools.html_report.course import MOST_INSTANTS, Course, CourseRecorder
 from sms_tools.html_report.figures import PALETTE, Series, chart
-from sms_tools.html_report.history import MOST_INSTANTS, Course, History
 from sms_tools.html_report.page import _residual, write_report
 from sms_tools.html_report.paper_example import figure_6
 from sms_tools.html_report.parameter_rows import error_bar
 from sms_tools.view.scene import Scene
+from tests.axis import AXIS, axis_block
 from tests.evaluated import results_document
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
@@ -37,22 +41,21 @@ WARNING = "a warning with <angle brackets>"
 LARGEST = 2_000_000
 
 
-def watched(block: Block) -> tuple[Estimator, History]:
-    """The planar example, estimated and remembered."""
-    estimator = Estimator(load_system("paper-planar"), block.channels, "test")
-    history = History(estimator, block.channels)
-    for piece in history.watch([block]):
-        estimator.push(piece)
-    estimator.finish()
-    history.finish()
-    return estimator, history
+def watched(block: Block) -> tuple[Session, Course]:
+    """The planar example, estimated, and what was seen of it."""
+    session = Session(load_system("paper-planar"), block.channels)
+    recorder = CourseRecorder(session)
+    for piece in recorder.watch([block]):
+        session.update(piece)
+    session.finish()
+    return session, recorder.course
 
 
-def report_of(estimator: Estimator, history: History, directory: Path, throughput: float = 1000.0) -> str:
-    truth = {p.name: p.nominal for p in estimator.base.physical}
-    document = results_document(estimator, throughput, [WARNING], truth)
-    nominal = {p.name: p.nominal for p in estimator.base.parameters if p.nominal}
-    return write_report(directory, document, history.course, nominal, Scene(estimator.model)).read_text()
+def report_of(session: Session, course: Course, directory: Path, throughput: float = 1000.0) -> str:
+    truth = {"parameters": session.system.nominal}
+    result = session.evaluate(truth, warnings=[WARNING], throughput=throughput)
+    nominal = {p.name: p.nominal for p in session.estimator.base.parameters if p.nominal}
+    return write_report(directory, result.document(), course, nominal, Scene(session.estimator.model)).read_text()
 
 
 @pytest.fixture(scope="module")
@@ -105,10 +108,10 @@ def test_a_nominal_value_is_beside_each_estimate(page: str, planar_block: Block)
 
 @pytest.mark.long
 def test_an_unstated_nominal_value_is_left_out(planar_block: Block, tmp_path: Path) -> None:
-    estimator, history = watched(planar_block)
-    document = results_document(estimator, 1000.0, [])
-    (stated, value), *_ = nominal = [(p.name, p.nominal) for p in estimator.base.parameters]
-    page = write_report(tmp_path, document, history.course, {stated: value}, Scene(estimator.model)).read_text()
+    session, course = watched(planar_block)
+    (stated, value), *_ = nominal = [(p.name, p.nominal) for p in session.estimator.base.parameters]
+    scene = Scene(session.estimator.model)
+    page = write_report(tmp_path, session.result.document(), course, {stated: value}, scene).read_text()
     assert cells(page, "nominal") == [f"{value:.6g}"] + [""] * (len(nominal) - 1)
     assert [bool(cell) for cell in cells(page, "% off nominal")] == [True] + [False] * (len(nominal) - 1)
 
@@ -127,8 +130,8 @@ def test_matplotlib_waits_for_the_first_page() -> None:
 
 @pytest.mark.slow
 def test_the_page_of_a_long_session_stays_small(tmp_path: Path) -> None:
-    """Of the arm with most parameters, all determined, each of them as rough as can be, with as many instants as a
-    history holds."""
+    """Of the arm with most parameters, all determined, each of them as rough as can be, with as many instants as
+    course and results.json hold."""
     system = load_system("seven-joint")
     model = build_model(system)
     channels = tuple(system_channels(model.layout))
@@ -137,14 +140,14 @@ def test_the_page_of_a_long_session_stays_small(tmp_path: Path) -> None:
     rng = np.random.default_rng(2)
     for p in document["parameters"]:
         p |= {"identifiable": True, "estimate": 1.0, "std": 0.1, "lower95": 0.8, "upper95": 1.2}
-    n = len(document["parameters"])
-    course = Course(
-        t=np.linspace(0.0, 3600.0, MOST_INSTANTS),
-        estimate=1.0 + 0.1 * rng.standard_normal((MOST_INSTANTS, n)),
-        std=0.1 * rng.random((MOST_INSTANTS, n)),
-        residual=rng.random((MOST_INSTANTS, len(system.joints))),
-        x=np.tile(np.eye(model.layout.n_x)[6], (MOST_INSTANTS, 1)),
-    )
+    t, n, size = np.linspace(0.0, 3600.0, MOST_INSTANTS), estimator.base.n, (MOST_WRITTEN, estimator.base.n)
+    names, units = zip(*((p.name, p.unit) for p in estimator.base.parameters), strict=True)
+    upper = np.zeros((MOST_WRITTEN, n * (n + 1) // 2))
+    upper[:, np.equal(*np.triu_indices(n))] = (0.1 * rng.random(size)) ** 2
+    estimate = 1.0 + 0.1 * rng.standard_normal(size)
+    document["history"] = [History("rls", True, names, units, t[:MOST_WRITTEN], estimate, upper).document()]
+    x = np.tile(np.eye(model.layout.n_x)[6], (MOST_INSTANTS, 1))
+    course = Course(t, rng.random((MOST_INSTANTS, len(system.joints))), t, x)
     assert write_report(tmp_path, document, course, {}, Scene(model)).stat().st_size < LARGEST
 
 
@@ -173,38 +176,28 @@ def test_every_estimate_is_within_the_window(page: str, tmp_path: Path, width: i
         assert box["x"] + box["width"] <= width
 
 
-@pytest.mark.long
-def test_the_history_ends_with_the_results(planar_block: Block) -> None:
-    estimator, history = watched(planar_block)
-    last = history.instants[-1]
-    np.testing.assert_array_equal(last.estimate, estimator.estimate().pi)
-    assert last.t == planar_block.t[-1]
-    assert np.all(np.diff([instant.t for instant in history.instants]) > 0)
-
-
-@pytest.mark.long
-def test_remembering_changes_no_bit(planar_block: Block) -> None:
-    estimator, _ = watched(planar_block)
-    alone = Estimator(load_system("paper-planar"), planar_block.channels, "test")
-    alone.push(planar_block)
-    alone.finish()
-    np.testing.assert_array_equal(estimator.estimate().pi, alone.estimate().pi)
-
-
-@pytest.mark.long
-def test_a_long_session_is_thinned_evenly(planar_block: Block, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(history_module, "MOST_INSTANTS", 20)
-    _, history = watched(planar_block)
-    assert 10 <= len(history.instants) <= 21
-    # All but the last step, which ends with the session.
-    steps = np.diff([instant.t for instant in history.instants])[:-1]
-    assert steps.max() <= 1.5 * steps.min()
+def test_a_course_of_a_long_session_is_thinned_evenly(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(course_module, "MOST_INSTANTS", 20)
+    block = axis_block(coulomb=0.0)
+    session = Session(load_system(tomllib.loads(AXIS)), block.channels)
+    recorder = CourseRecorder(session)
+    for piece in recorder.watch([block]):
+        session.update(piece)
+    session.finish()
+    course = recorder.course
+    for t, rows in ((course.tested, course.residual), (course.seen, course.x)):
+        assert 10 <= t.size <= 21
+        assert t.size == len(rows)
+        # All but the last step, which ends with the session.
+        steps = np.diff(t)[:-1]
+        assert 0.0 < steps.max() <= 2.0 * steps.min()
+    assert course.tested[-1] == block.t[-1]
 
 
 def test_replay_writes_it_beside_the_results(tmp_path: Path, planar_block: Block) -> None:
     capture = tmp_path / "run.csv"
     with CaptureWriter(capture, planar_block.channels) as writer:
-        writer.write(Block(planar_block.t[:6000], planar_block.channels, planar_block.values[:6000]))
+        writer.write(Block(planar_block.t[:2000], planar_block.channels, planar_block.values[:2000]))
     assert main(["replay", str(capture), "--system", "paper-planar", "--out", str(tmp_path)]) == 0
     found = json.loads((tmp_path / "results.json").read_text())
     assert found["system"]["title"] in (tmp_path / "report.html").read_text()
@@ -224,7 +217,7 @@ def test_a_gap_interrupts_a_line() -> None:
 def test_a_share_of_one_instant_is_no_chart() -> None:
     empty = np.empty((3, 0))
     shares = np.array([[np.nan, np.nan], [np.nan, 0.1], [0.2, 0.1]])
-    one, more = (Course(np.arange(3.0), empty, empty, each, empty) for each in (shares[:, :1], shares))
+    one, more = (Course(np.arange(3.0), each, np.empty(0), empty) for each in (shares[:, :1], shares))
     assert _residual(one) == []
     (drawn,) = _residual(more)
     assert [label for label, _, _ in drawn.key] == ["joint 2"]

@@ -102,10 +102,12 @@ def test_a_curve_over_the_rate_replaces_stribeck_friction() -> None:
             assert abs(one.value - value) < 1.5 * max(abs(other.value - value), 2.0 * other.std), name
 
 
+@pytest.mark.slow
 def test_a_law_of_the_catalogue_wins_where_it_is_as_good() -> None:
     assert [effect.effect for effect in by_law(HARDENING).effects] == ["cubic_stiffness@joint_1"]
 
 
+@pytest.mark.slow
 def test_the_verdict_says_what_the_curve_takes_of_unseen_data() -> None:
     found = learned(HARDENING)
     assert found.verdict == "named"
@@ -113,6 +115,7 @@ def test_the_verdict_says_what_the_curve_takes_of_unseen_data() -> None:
     assert effect["sentence"].startswith("no known law; this curve over the deflection of joint_1 takes what is left")
 
 
+@pytest.mark.slow
 def test_the_curve_is_drawn_with_its_band() -> None:
     (curve,) = force_curves(learned(HARDENING).search)
     assert curve.variable == "deflection"
@@ -140,6 +143,7 @@ def test_without_being_allowed_no_curve_is_tried() -> None:
     assert not any(candidate.name == "learned_force" for candidate in found.candidates)
 
 
+@pytest.mark.slow
 def test_the_system_file_holds_the_curve(tmp_path: Path) -> None:
     (tmp_path / "axis.toml").write_text(ELASTIC_AXIS.format(stiffness=1.1 * STIFFNESS))
     found = learned(HARDENING).system

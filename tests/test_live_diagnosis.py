@@ -229,12 +229,14 @@ def test_results_hold_verdict_and_evidence_of_what_was_adopted(replayed: Path) -
     assert amplitude == pytest.approx(COGGING, rel=0.02)
 
 
+@pytest.mark.slow
 def test_the_adopted_system_file_describes_the_effect(replayed: Path) -> None:
     described, adopted = (load_system(str(replayed / name)) for name in ("axis.toml", "adopted.toml"))
     (fresh,) = (effect for effect in adopted.effects if effect not in described.effects)
     assert (fresh.name, fresh.where, fresh.coefficients["order"]) == ("cogging", "joint_1", 6.0)
 
 
+@pytest.mark.slow
 def test_the_page_shows_the_verdict_and_how_the_evidence_grew(replayed: Path) -> None:
     page = (replayed / "report.html").read_text()
     assert "<h2>Diagnosis</h2>" in page
@@ -242,6 +244,7 @@ def test_the_page_shows_the_verdict_and_how_the_evidence_grew(replayed: Path) ->
     assert "Evidence for candidates" in page
 
 
+@pytest.mark.slow
 def test_the_view_plots_the_evidence_and_logs_the_verdict(replayed: Path) -> None:
     scores: dict[str, list[float]] = {}
     lines: list[str] = []

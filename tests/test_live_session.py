@@ -225,6 +225,7 @@ def test_a_display_that_never_reads_blocks_nobody(tmp_path: Path, system: System
     os.close(reader)  # which ends the write that waits
 
 
+@pytest.mark.slow
 def test_health_holds_the_latency_and_the_clocks(tmp_path: Path, system: System) -> None:
     bench = Bench(tmp_path, system)
     bench.run(21.0)

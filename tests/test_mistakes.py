@@ -79,12 +79,12 @@ def test_a_session_without_a_mistake_has_none() -> None:
 @pytest.mark.parametrize(
     ("change", "key", "words"),
     [
-        (times(-1.0, "tau_2"), "torque_sign@tau_2", "the other sign"),
+        pytest.param(times(-1.0, "tau_2"), "torque_sign@tau_2", "the other sign", marks=pytest.mark.slow),
         (times(50.0, "tau_1", "tau_2"), "joint_torque@tau_1, tau_2", "everything is 50 × its description"),
         pytest.param(times(180.0 / np.pi, "q_2"), "degrees@q_2", "q_2 is in degrees", marks=pytest.mark.long),
         pytest.param(times(1e3, "r_S_x", "r_S_y"), "millimetres@r_S_*", "in mm in place of m", marks=pytest.mark.long),
         pytest.param(times(50.0, "theta_m_1"), "motor_angle@theta_m_1", "before the gear", marks=pytest.mark.long),
-        (swap("tau_1", "tau_2"), "swapped@tau_1, tau_2", "are swapped"),
+        pytest.param(swap("tau_1", "tau_2"), "swapped@tau_1, tau_2", "are swapped", marks=pytest.mark.slow),
     ],
 )
 def test_a_mistake_is_named_and_nothing_else(change: Change, key: str, words: str) -> None:
@@ -145,7 +145,7 @@ def test_a_stuck_encoder_is_left_out_and_one_at_rest_is_not() -> None:
     (undoing,) = shown(["q_1"], one(stuck))
     assert undoing.name == "stuck"
     (segment,) = one(undoing.apply(("q_1",), stuck[:, None])[:, 0])
-    assert [part.index.size for part in without_gaps(segment)] == [2500, 1500]
+    assert [part.index.size for part in without_gaps(segment)] == [2501, 1500]
     # Slows down, is at rest, to the last bit of its encoder, and starts again.
     resting = np.round(np.where(t < 5.0 * np.pi / 2.0, np.sin(t), 1.0) / 1e-4) * 1e-4
     assert list(shown(["q_1"], one(resting))) == []

@@ -132,7 +132,7 @@ def test_the_evidence_grows_with_the_samples() -> None:
 
 
 def test_a_session_without_anything_missing_says_nothing() -> None:
-    estimator, online = watched(SYSTEM, axis_block(nothing, seconds=30.0))
+    estimator, online = watched(SYSTEM, axis_block(nothing))
     assert online.document() == []
     assert online.system == SYSTEM
     assert estimator.momentum is not None

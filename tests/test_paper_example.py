@@ -17,8 +17,10 @@ from sms_online.pipeline.estimator import Estimator
 from sms_online.stream import Array, Block
 from sms_sim.simulate import Simulation, exact_states, simulate
 from tests.batch_solution import batch_least_squares
+from tests.conftest import noise_free_block
 from tests.evaluated import results_document, standard_deviation
 from tests.keeping_tracker import KeepingTracker
+from tests.simulations import planar
 
 NAMES = (
     "spacecraft.inertia_about_joint_1",
@@ -50,6 +52,12 @@ def exact_rows(simulation: Simulation, t: Array) -> tuple[Array, Array]:
     exact = exact_states(simulation, np.concatenate(([0.0], t)))
     energy = model.energy_columns(exact.x, exact.v)
     return energy[1:] - energy[0] + dissipated, exact.work[1:].sum(axis=1)
+
+
+@pytest.fixture(scope="module")
+def planar_block() -> Block:
+    """Twice the paper's 10 s, as noise-free samples at 1 kHz."""
+    return noise_free_block(planar(20.0), load_system("paper-planar"))
 
 
 @pytest.mark.parametrize("name", ["paper-planar", pytest.param("paper-planar-table-v", marks=pytest.mark.long)])

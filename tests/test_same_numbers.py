@@ -17,12 +17,13 @@ ESTIMATE = re.compile(r"(whole|continued)\.parameters\[.*\]\.estimate$")
 ELSEWHERE = 1e-3
 
 
-QUICKEST = ("recording", "smoother", "axis-undescribed", "quanser-2dsfl")
+# Those that search for effects or add them take longer.
+MARKS = {"gap": pytest.mark.long, "axis-adopted": pytest.mark.long, "axis-event": pytest.mark.long} | {
+    "axis-undescribed": pytest.mark.slow
+}
 
 
-@pytest.mark.parametrize(
-    "name", [pytest.param(name, marks=() if name in QUICKEST else pytest.mark.long) for name in QUICK]
-)
+@pytest.mark.parametrize("name", [pytest.param(name, marks=MARKS.get(name, ())) for name in QUICK])
 def test_no_number_of_a_session_moves(name: str) -> None:
     recorded, now = json.loads(RECORDED.read_text()), numbers(SESSIONS[name]())
     before = recorded["sessions"][name]

@@ -43,12 +43,14 @@ def found(rig: Path) -> sms.Diagnosis:
     return sms.diagnose(rig / "rig.toml", [rig / "a.csv", rig / "b.csv"], holdout=rig / "d.csv")
 
 
+@pytest.mark.slow
 def test_two_captures_are_searched_at_once(found: sms.Diagnosis) -> None:
     assert [effect.effect for effect in found.effects] == ["coulomb_friction@joint_1"]
     assert found.effects[0].coefficients["torque"].value == pytest.approx(FRICTION, rel=0.02)
     assert found.verdict == "named"
 
 
+@pytest.mark.slow
 def test_the_error_of_the_held_out_capture_falls(found: sms.Diagnosis) -> None:
     before, after = (fit.held_out["joint_1"].relative for fit in (found.before, found.after))
     assert before is not None
@@ -56,6 +58,7 @@ def test_the_error_of_the_held_out_capture_falls(found: sms.Diagnosis) -> None:
     assert after < 0.5 * before
 
 
+@pytest.mark.slow
 def test_a_shuffled_held_out_capture_changes_nothing_found(rig: Path, found: sms.Diagnosis) -> None:
     other = sms.diagnose(rig / "rig.toml", [rig / "a.csv", rig / "b.csv"], holdout=rig / "e.csv")
     assert other.effects == found.effects
@@ -64,6 +67,7 @@ def test_a_shuffled_held_out_capture_changes_nothing_found(rig: Path, found: sms
     assert other.after.held_out != found.after.held_out
 
 
+@pytest.mark.slow
 def test_the_verb_takes_several_captures(rig: Path, tmp_path: Path) -> None:
     captures = [str(rig / f"{name}.csv") for name in ("a", "b")]
     assert main(["diagnose", *captures, "--system", str(rig / "rig.toml"), "--out", str(tmp_path)]) == 0

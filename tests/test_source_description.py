@@ -6,7 +6,7 @@ import pytest
 
 from sms_online.description.parse import parse_system
 from sms_online.description.sources import CanSource, SerialFrames
-from sms_online.errors import InputError
+from tests.refused import assert_refused, refusal
 
 RIG = """
 name = "rig"
@@ -48,14 +48,6 @@ name = "drives"
 nodes = { 1 = "a.eds" }
 signals = { "1.6064" = "q_1" }
 """
-
-
-def refusal(text: str) -> str:
-    with pytest.raises(InputError) as caught:
-        parse_system(text, "rig.toml")
-    line = str(caught.value)
-    assert "\n" not in line
-    return line
 
 
 def test_sources_are_read_with_their_defaults() -> None:
@@ -100,15 +92,12 @@ def test_a_mere_channel_is_short_for_a_signal() -> None:
 def test_a_wrong_source_is_refused_in_one_line(old: str, new: str, place: str, found: str, expected: str) -> None:
     text = CAN + SERIAL
     assert old in text
-    line = refusal(RIG + text.replace(old, new, 1))
-    assert line.startswith(f"rig.toml, {place}: ")
-    said, wanted = line.removeprefix(f"rig.toml, {place}: ").split("; expected ", 1)
-    assert found in said
-    assert expected in wanted
+    assert_refused(RIG + text.replace(old, new, 1), "rig.toml", place, found, expected)
 
 
 def test_a_single_table_is_refused() -> None:
-    assert refusal(RIG + CAN.replace("[[source]]", "[source]")).startswith("rig.toml, source: a table; expected a list")
+    line = refusal(RIG + CAN.replace("[[source]]", "[source]"), "rig.toml")
+    assert line.startswith("rig.toml, source: a table; expected a list")
 
 
 @pytest.mark.parametrize(
@@ -122,11 +111,11 @@ def test_a_single_table_is_refused() -> None:
     ],
 )
 def test_a_wrong_canopen_source_is_refused(old: str, new: str, place: str, found: str) -> None:
-    assert refusal(RIG + CANOPEN.replace(old, new)).startswith(f"rig.toml, {place}: {found}")
+    assert refusal(RIG + CANOPEN.replace(old, new), "rig.toml").startswith(f"rig.toml, {place}: {found}")
 
 
 def test_lines_need_a_separator_that_no_number_holds() -> None:
     for separator in (",", ";", "", "\\t", "|"):
         assert parse_system(f'{RIG}{LINES}separator = "{separator}"\n', "rig.toml").sources
     for separator in ("e", ".", "ab", " ", "*"):
-        assert "source 1.separator" in refusal(f'{RIG}{LINES}separator = "{separator}"\n')
+        assert "source 1.separator" in refusal(f'{RIG}{LINES}separator = "{separator}"\n', "rig.toml")

@@ -14,8 +14,10 @@ from sms_online.tracker_results import TrackerResult
 from sms_online.trackers.parse import parse_tracker
 from sms_tools.cli import main
 from tests.axis import AXIS, capture_lines
+from tests.exactly_known import exactly_known
 from tests.simulations import planar_capture
 
+SYSTEM = exactly_known(sms.load_system("paper-planar"))
 FORGETTING = "rls:forgetting=exponential,memory=3"
 CHOICES = [
     "rls",
@@ -36,7 +38,7 @@ def data() -> sms.Capture:
 @pytest.fixture(scope="module")
 def several(data: sms.Capture) -> sms.Result:
     """All choices on the same rows, the first judged."""
-    return sms.estimate(sms.load_system("paper-planar"), data, tracker=CHOICES)
+    return sms.estimate(SYSTEM, data, tracker=CHOICES)
 
 
 def of(several: sms.Result, choice: str) -> TrackerResult:
@@ -48,9 +50,9 @@ def test_the_first_tracker_gives_the_estimate(several: sms.Result) -> None:
     assert [each.judged for each in several.trackers] == [True, *[False] * (len(CHOICES) - 1)]
 
 
-@pytest.mark.parametrize("choice", [FORGETTING, "kalman"])
+@pytest.mark.parametrize("choice", [FORGETTING, pytest.param("kalman", marks=pytest.mark.slow)])
 def test_a_tracker_alone_estimates_as_beside_others(choice: str, data: sms.Capture, several: sms.Result) -> None:
-    alone = sms.estimate(sms.load_system("paper-planar"), data, tracker=choice)
+    alone = sms.estimate(SYSTEM, data, tracker=choice)
     # Alone it is judged, and what noise in the columns does is estimated about its own path.
     for here, there in zip(of(several, choice).parameters.values(), alone.parameters.values(), strict=True):
         assert here.value == pytest.approx(there.value, abs=0.1 * there.std)
@@ -58,7 +60,7 @@ def test_a_tracker_alone_estimates_as_beside_others(choice: str, data: sms.Captu
 
 
 def test_no_choice_is_least_squares_of_all_rows(data: sms.Capture, several: sms.Result) -> None:
-    plain = sms.estimate(sms.load_system("paper-planar"), data)
+    plain = sms.estimate(SYSTEM, data)
     assert list(plain.parameters.values()) == list(several.parameters.values())
     (tracker,) = plain.trackers
     assert tracker.name == "rls"
@@ -88,8 +90,9 @@ def test_forgetting_widens_error_bars_and_says_its_memory(several: sms.Result) -
         assert forgetting.memory == pytest.approx(3.0, rel=0.25)
 
 
+@pytest.mark.slow
 def test_a_session_cut_by_a_checkpoint_gives_the_same_bits(data: sms.Capture, several: sms.Result) -> None:
-    session = sms.Session(sms.load_system("paper-planar"), data.channels, tracker=CHOICES)
+    session = sms.Session(SYSTEM, data.channels, tracker=CHOICES)
     blocks = list(data)
     for k, block in enumerate(blocks):
         if k == len(blocks) // 2:
@@ -149,7 +152,7 @@ def test_a_text_that_is_no_tracker_is_refused(text: str, place: str) -> None:
 )
 def test_a_choice_that_does_not_fit_the_system_is_refused(choice: TrackerChoice, data: sms.Capture) -> None:
     with pytest.raises(sms.InputError, match="tracker"):
-        sms.Session(sms.load_system("paper-planar"), data.channels, tracker=choice)
+        sms.Session(SYSTEM, data.channels, tracker=choice)
 
 
 def test_a_system_without_momentum_rows_refuses_a_tracker(data: sms.Capture) -> None:

@@ -315,8 +315,8 @@ def test_robust_intervals_cover_autocorrelated_errors(kind: Forgetting) -> None:
         tracker.update(rows_of(Y, b, 0.1))
         estimate = tracker.estimate()
         error = np.abs(estimate.pi - pi)
-        assert estimate.std_robust is not None
-        hits += int((error < 1.96 * estimate.std_robust).sum())
+        assert estimate.covariance_robust is not None
+        hits += int((error < 1.96 * np.sqrt(np.diag(estimate.covariance_robust))).sum())
         classic_hits += int((error < 1.96 * estimate.std).sum())
         intervals += 3
     # 750 intervals: the coverage itself is known to ±0.8 %.
@@ -331,8 +331,8 @@ def test_robust_covariance_equals_the_stated_one_of_white_rows() -> None:
     tracker = RecursiveLeastSquares(4)
     tracker.update(rows_of(Y, Y @ pi + 0.1 * rng.normal(size=60_000), 0.1))
     estimate = tracker.estimate()
-    assert estimate.std_robust is not None
-    np.testing.assert_allclose(estimate.std_robust, estimate.std, rtol=0.2)
+    assert estimate.covariance_robust is not None
+    np.testing.assert_allclose(np.sqrt(np.diag(estimate.covariance_robust)), estimate.std, rtol=0.2)
 
 
 def test_robust_covariance_equals_its_formula_written_out() -> None:
@@ -363,6 +363,6 @@ def test_robust_covariance_needs_enough_unfaded_clusters() -> None:
     for kind in ALL_FORGETTING:
         tracker = RecursiveLeastSquares(N, kind)
         tracker.update(exciting_rows(seed=37, count=BLOCK_ROWS * N - 1))
-        assert tracker.estimate().std_robust is None
+        assert tracker.estimate().covariance_robust is None
         tracker.update(exciting_rows(seed=38, count=BLOCK_ROWS * N))
-        assert (tracker.estimate().std_robust is None) == isinstance(kind, Exponential | Directional)
+        assert (tracker.estimate().covariance_robust is None) == isinstance(kind, Exponential | Directional)

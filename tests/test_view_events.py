@@ -56,6 +56,7 @@ def test_pickled_statistics_say_the_same_after_an_event(session: Block) -> None:
     assert elsewhere(Statistics.of(estimator)) == results_document(estimator, 0.0, [])
 
 
+@pytest.mark.slow
 def test_a_parameter_that_an_event_has_added_is_recorded(shown: Path) -> None:
     results = json.loads((shown / "results.json").read_text())
     assert not any("view" in warning for warning in results["warnings"])
@@ -73,6 +74,7 @@ def test_a_parameter_that_an_event_has_added_is_recorded(shown: Path) -> None:
     assert any(re.search(r"s: event at 10\.0\d+ s: payload payload.inertia", text) for text in lines)
 
 
+@pytest.mark.slow
 def test_an_event_is_marked_in_every_plot(shown: Path) -> None:
     """Of each group of parameters in its last drawing, that of the parameter which the event has added too."""
     (event,) = json.loads((shown / "results.json").read_text())["events"]
@@ -90,6 +92,7 @@ def test_an_event_is_marked_in_every_plot(shown: Path) -> None:
         assert event["time"] == pytest.approx(at[0], abs=1e-6), entity
 
 
+@pytest.mark.slow
 def test_the_last_drawing_holds_what_was_before_the_event(shown: Path) -> None:
     entities = {chunk.entity_path for chunk in RrdReader(str(shown / "session.rrd")).stream()}
     drawn = [e for e in entities if e.startswith("/parameters/links/") and e.endswith("/deviation")]
@@ -100,6 +103,7 @@ def test_the_last_drawing_holds_what_was_before_the_event(shown: Path) -> None:
     np.testing.assert_allclose(values[-1], 0.0, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_the_page_draws_all_parameters_of_a_changed_session(shown: Path) -> None:
     page = (shown / "report.html").read_text()
     assert "payload: from the last estimate ± 2σ" in page

@@ -67,6 +67,7 @@ def test_health_has_innovations_with_their_band_and_memory(folder: Path) -> None
     assert short < 0.5 * whole
 
 
+@pytest.mark.slow
 def test_one_tracker_has_no_curves_of_its_own(folder: Path, tmp_path: Path) -> None:
     options = ["--system", str(folder / "axis.toml"), "--out", str(tmp_path), "--rerun", "save", "-to", "5"]
     assert main(["replay", str(folder / "run.csv"), *options]) == 0

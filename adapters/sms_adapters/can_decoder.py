@@ -9,9 +9,9 @@ from numpy.typing import NDArray
 
 from sms_adapters.can_signals import WantedMessage, decode_signal, raw_word
 from sms_adapters.conversion import Conversions, FrameCounter
-from sms_adapters.increments import increments
 from sms_adapters.raw import ERROR_FRAME, REMOTE_FRAME, CanFrames, DecodedSamples, Raw, concatenate_frames
 from sms_online.description.sources import Signal
+from sms_online.stream import increments
 
 # Unknown identifiers that are remembered, to name them.
 _SHOWN_IDS = 5

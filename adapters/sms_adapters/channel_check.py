@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from sms_online.sample_faults import TURNS, unit_of_stamps, wrapped_at
 from sms_online.stream import Array
 
 # Samples that are judged together: enough for a median, less than a phase of a motion.
@@ -18,17 +19,13 @@ INTERVALS = 512
 RATE_TOLERANCE = 0.02
 # An interval of more periods than this is a hole, as for the synchroniser.
 HOLE = 5
-# A step between two samples within this share of a whole turn is a turn.
-TURN, TURN_TOLERANCE = 2.0 * math.pi, 0.1
 # Steps are multiples of a resolution where they are so to this share of it, and no more of them fit the range.
 WHOLE, MOST_STEPS = 0.01, 1e6
 # A channel whose samples repeat less often than this shows no resolution.
 REPEATED = 0.2
 # A resolution this many times the described one is another.
 COARSER = 1.5
-# Units of time that stamps may be in by mistake, in s.
-UNITS = {"ms": 1e3, "µs": 1e6, "ns": 1e9}
-# Such a mistake is recognised to this factor.
+# Stamps in another unit of time are recognised to this factor.
 UNIT_TOLERANCE = 3.0
 # A channel of fewer samples is not judged.
 LEAST = 20
@@ -119,9 +116,9 @@ class ChannelCheck:
         x = np.concatenate(self._waiting)
         self._waiting = [x[-1:]]
         size = np.abs(np.diff(x))
-        if self.unit == "rad":
-            usual = float(np.median(size))
-            self.turns += int(np.count_nonzero(np.abs(size / TURN - 1.0) < TURN_TOLERANCE)) if usual < 0.1 * TURN else 0
+        wrapped = wrapped_at(size) if self.unit == "rad" else None
+        if wrapped is not None and wrapped[0] == TURNS[0]:
+            self.turns += wrapped[1]
         moved = size[size > 0.0]
         self._repeated += int(np.count_nonzero(size == 0.0))
         if self._whole and moved.size:
@@ -159,10 +156,10 @@ class ChannelCheck:
             return
         if self.period is not None:
             ratio = period / self.period
-            for unit, factor in UNITS.items():
-                if factor / UNIT_TOLERANCE < ratio < factor * UNIT_TOLERANCE:
-                    yield self._remark(f"time in {unit}, not in s: a sample every {period:g}", True)
-                    return
+            stamps = unit_of_stamps(ratio, UNIT_TOLERANCE)
+            if stamps is not None:
+                yield self._remark(f"time in {stamps[0]}, not in s: a sample every {period:g}", True)
+                return
             if abs(ratio - 1.0) > RATE_TOLERANCE:
                 yield self._remark(f"{1.0 / period:.5g} Hz, described as {1.0 / self.period:g} Hz", True)
         if self.holes:

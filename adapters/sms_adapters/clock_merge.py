@@ -20,7 +20,7 @@ from sms_adapters.clock_samples import CountedTime, NumberedTime
 from sms_adapters.conversion import TurnsState
 from sms_adapters.faults import sentences
 from sms_adapters.raw import CanFrames, DecodedSamples, Decoder, Raw, concatenate_frames
-from sms_adapters.stuck import StuckGuard
+from sms_online.sample_faults import StuckGuard
 from sms_online.state import Stage, State
 from sms_online.stream import Array, Block
 

@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from sms_adapters.increments import increments
-from sms_online.stream import Array
+from sms_online.stream import Array, increments
 
 # Samples that come further apart than this, s, have a hole between them whatever the delays of a bus.
 HOLE = 0.1

@@ -7,10 +7,9 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from sms_adapters.increments import increments
 from sms_online.description.sources import SerialField, Signal
 from sms_online.state import Stage, State
-from sms_online.stream import Array
+from sms_online.stream import Array, increments
 
 Counters = dict[str, int]
 

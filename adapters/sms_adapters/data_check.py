@@ -11,13 +11,13 @@ from typing import Any
 import numpy as np
 
 from sms_adapters.channel_check import ChannelCheck, Remark
-from sms_adapters.stuck import StuckGuard
 from sms_online.description.channels import channel_unit, drive_channels, sensed_channels
 from sms_online.description.given import Given, given_system
 from sms_online.description.schema import System
 from sms_online.errors import InputError
 from sms_online.pipeline.estimator import Estimator
 from sms_online.pipeline.outliers import LeftOut, Outliers
+from sms_online.sample_faults import PIECE, StuckGuard
 from sms_online.session import Data, recorded_session
 from sms_online.stream import Array, Block
 from sms_online.tables import Tabled, html_table, text_table
@@ -29,8 +29,6 @@ UNDETERMINED = "not at all"
 SIGN_UNKNOWN = 100.0
 # Relative standard deviations, %, by which parameters are grouped, and what each group is called.
 GROUPS = ((1.0, "within 1 %"), (10.0, "within 10 %"), (SIGN_UNKNOWN, "within 100 %"), (math.inf, "sign unknown"))
-# Rows in which stuck sensors are looked for at once: what was healthy before them is known then.
-PIECE = 256
 # What is the matter is said once so much of a session is there, s.
 SOON = 5.0
 # Channels that one line names.

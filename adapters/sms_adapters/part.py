@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 
 import numpy as np
 
 from sms_online.errors import InputError
-from sms_online.stream import Block, Source
+from sms_online.stream import Block, Relayed, Source
 
 
-class Part:
+class Part(Relayed):
     """The samples of a source with start <= t - origin < stop, s, with their own t: a `Source`.
 
     name: of the source, for messages. start, stop: None for all before or after. origin: None for the first sample's
@@ -21,23 +21,14 @@ class Part:
     def __init__(
         self, source: Source, name: str, start: float | None, stop: float | None, origin: float | None = None
     ) -> None:
-        self._source, self._name, self._origin = source, name, origin
+        super().__init__(source)
+        self._name, self._origin = name, origin
         self._start, self._stop = -math.inf if start is None else start, math.inf if stop is None else stop
-
-    @property
-    def channels(self) -> tuple[str, ...]:
-        """See `Source`."""
-        return self._source.channels
-
-    @property
-    def warnings(self) -> Sequence[str]:
-        """See `Source`; of all that was read."""
-        return self._source.warnings
 
     def __iter__(self) -> Iterator[Block]:
         """Yield the blocks of the part."""
         origin, empty = self._origin, True
-        for block in self._source:
+        for block in self.source:
             if not block.t.size:
                 continue
             origin = float(block.t[0]) if origin is None else origin

@@ -19,6 +19,7 @@ from sms_online.diagnosis.rough_fit import RoughFit, RoughRows
 from sms_online.diagnosis.sample_mistakes import Undoing, scaled, shown, undoings, without_gaps
 from sms_online.nominal import is_geared
 from sms_online.pipeline.estimator import Estimator
+from sms_online.sample_faults import unit_of_stamps
 from sms_online.stream import Array
 
 # Seconds of a session, in stretches, that show a mistake: it is there all the time.
@@ -38,8 +39,7 @@ LEAST_SHOWN, LEAST_COMMON = 1.2, 3.0
 SAME_RATIO = 1.5
 # Torque constants and gears differ from their data sheets by less.
 LARGEST_GAIN = 1.3
-# Units of time by how many of them are a second. Several devices stamp samples more often, and some are lost.
-CLOCKS = {"ms": 1e3, "µs": 1e6, "ns": 1e9}
+# Several devices stamp samples more often than one, and some are lost.
 SAME_CLOCK = 20.0
 # At most so many mistakes are looked for in turn.
 MOST = 3
@@ -98,12 +98,11 @@ def wrong_clock(system: System, t: Array) -> Mistake | None:
     steps = steps[steps > 0.0]
     if not steps.size:
         return None
-    ratio = float(np.median(steps)) * system.sample_rate
-    for unit, factor in CLOCKS.items():
-        if 1.0 / SAME_CLOCK < ratio / factor < SAME_CLOCK:
-            said = f"t is in {unit} in place of s"
-            return Mistake("clock_unit", "t", said, f"divide t by {factor:g}", factor, 1.0)
-    return None
+    stamps = unit_of_stamps(float(np.median(steps)) * system.sample_rate, SAME_CLOCK)
+    if stamps is None:
+        return None
+    unit, factor = stamps
+    return Mistake("clock_unit", "t", f"t is in {unit} in place of s", f"divide t by {factor:g}", factor, 1.0)
 
 
 class _Search:

@@ -8,21 +8,15 @@ from dataclasses import dataclass
 from itertools import combinations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sms_online.description.schema import System
 from sms_online.diagnosis.record import Segment
+from sms_online.sample_faults import stuck_samples, wrapped_at
 from sms_online.stream import Array
 
 DEGREE = math.pi / 180.0
-# A reading that steps by more than this multiple of its usual steps, every time by the same, is wrapped; steps are the
-# same within this share.
-JUMP, SAME_STEP = 20.0, 0.05
 # Values that repeat in runs of at least this length, most of which are equal, are those of a held command.
 HELD_RUN, MOST_RUNS = 3, 0.8
-# A reading that moves by this share of its usual step stops at once, and for so many samples says the same to the last
-# bit: it is stuck. An axis that comes to rest slows down first.
-STUCK, MOVING, BEFORE = 200, 0.3, 5
 
 
 @dataclass(frozen=True)
@@ -191,13 +185,10 @@ def _swapped(one: Sequence[str], other: Sequence[str]) -> Callable[[tuple[str, .
 def _wrapped(positions: Sequence[str], channels: Sequence[str], segments: Sequence[Segment]) -> Iterator[Undoing]:
     for name in positions:
         k = list(channels).index(name)
-        steps = np.concatenate([np.diff(each.values[:, k]) for each in segments])
-        usual = float(np.quantile(np.abs(steps), 0.9))
-        jumps = np.abs(steps[np.abs(steps) > JUMP * max(usual, 1e-12)])
-        if jumps.size and jumps.min() > (1.0 - SAME_STEP) * jumps.max():
-            turn = float(np.median(jumps))
-            turn = next((t for t in (2.0 * math.pi, math.pi, 360.0) if abs(turn / t - 1.0) < SAME_STEP), turn)
-            said = f"{name} is wrapped at {turn:.4g}: it jumps {jumps.size} times"
+        wrapped = wrapped_at(np.concatenate([np.diff(each.values[:, k]) for each in segments]))
+        if wrapped is not None:
+            turn, times = wrapped
+            said = f"{name} is wrapped at {turn:.4g}: it jumps {times} times"
             yield Undoing("wrapped", name, said, f"state wrap for {name}, or unwrap it", _unwrapped(name, turn))
 
 
@@ -213,26 +204,10 @@ def _unwrapped(name: str, turn: float) -> Callable[[tuple[str, ...], Array], Arr
     return apply
 
 
-def _stuck_rows(values: Array) -> NDArray[np.bool_]:
-    """Where a reading (B,) says the same value for long although it moved right before."""
-    out = np.zeros(values.size, dtype=bool)
-    steps = np.diff(values)
-    # Without the jump to where a stuck reading goes on.
-    usual = float(np.sqrt(np.mean(np.sort(steps**2)[: -max(1, steps.size // 200)])))
-    moves = np.flatnonzero(steps != 0.0)
-    ends = np.concatenate((moves, [values.size - 1]))
-    starts = np.concatenate(([0], moves + 1))
-    for start, end in zip(starts.tolist(), ends.tolist(), strict=True):
-        before = steps[max(0, start - BEFORE) : start]
-        if end - start >= STUCK and before.size == BEFORE and abs(float(before.mean())) > MOVING * usual:
-            out[start : end + 1] = True
-    return out
-
-
 def _stuck(positions: Sequence[str], channels: Sequence[str], segments: Sequence[Segment]) -> Iterator[Undoing]:
     for name in positions:
         k = list(channels).index(name)
-        stuck = sum(int(_stuck_rows(each.values[:, k]).sum()) for each in segments)
+        stuck = sum(int(stuck_samples(each.values[:, k]).sum()) for each in segments)
         if stuck:
             said = f"{name} is stuck at one value for {stuck} samples while it moves before"
             step = f"check encoder and cable of {name}; leave that time out with -ss and -to"
@@ -245,7 +220,7 @@ def _without_stuck(name: str) -> Callable[[tuple[str, ...], Array], Array]:
         if name in channels:
             k = channels.index(name)
             read = np.flatnonzero(np.isfinite(values[:, k]))
-            out[read[_stuck_rows(values[read, k])], k] = np.nan
+            out[read[stuck_samples(values[read, k])], k] = np.nan
         return out
 
     return apply

@@ -145,11 +145,6 @@ class Estimate:
         """(n,) standard deviations from the stated noise, inf where not determined."""
         return np.sqrt(np.diag(self.covariance))
 
-    @property
-    def std_robust(self) -> Array | None:
-        """(n,) standard deviations valid for autocorrelated errors, where defined."""
-        return None if self.covariance_robust is None else np.sqrt(np.diag(self.covariance_robust))
-
 
 class Tracker(Stage, ABC):
     """A recursive estimator of π. The result depends on the rows alone, never on how they were split into calls.

@@ -34,6 +34,7 @@ from sms_online.description.parse import shipped_text
 from sms_online.description.schema import System
 from sms_online.effects.catalogue import parse_effect
 from sms_online.pipeline.estimator import Estimator
+from sms_online.session import Session
 from sms_online.stream import Array, Block
 from sms_sim.bus_encode import DeviceClock, devices
 from sms_sim.bus_layout import messages
@@ -41,7 +42,7 @@ from sms_sim.bus_motion import MovingArm
 from sms_sim.plant import Plant
 from sms_sim.sensors import Sensors
 from sms_sim.simulate import simulate
-from sms_tools.html_report.history import History
+from sms_tools.html_report.course import CourseRecorder
 from sms_tools.live.simulated import SimulatedArm, write_testbed
 from tests.axis import AXIS, DAMPING, INERTIA
 from tests.changed_session import changed_session
@@ -276,8 +277,8 @@ def test_a_day_at_full_speed(tmp_path: Path, balance: str) -> None:
     system = load_system(str(tmp_path / "axis.toml"))
     frames = axis_round(np.random.default_rng(1))
     ours = merger(system, tmp_path)
-    estimator = Estimator(system, ours.channels, "bench")
-    history = History(estimator, ours.channels)
+    session = Session(system, ours.channels)
+    estimator, course = session.estimator, CourseRecorder(session)
     rounds = round(float(os.environ.get("HOURS", "24")) * 3600.0 / (ROUND * 1e-3))
 
     def blocks() -> Iterator[Block]:
@@ -303,8 +304,8 @@ def test_a_day_at_full_speed(tmp_path: Path, balance: str) -> None:
                 print(f"\n{hours:6.2f} h in {took:6.0f} s, resident {resident():.1f} MB, {shown}", end="", flush=True)
 
     began = perf_counter()
-    for block in history.watch(blocks()):
-        estimator.push(block)
+    for block in course.watch(blocks()):
+        session.update(block)
     print()
     print("\n".join(ours.warnings), f"events {len(estimator.events)}, lost {estimator.counters.lost_samples}")
 

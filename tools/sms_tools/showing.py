@@ -14,7 +14,7 @@ from sms_online.result import Result
 from sms_online.session import Session
 from sms_online.stream import Block
 from sms_online.truth import true_values
-from sms_tools.html_report.history import History
+from sms_tools.html_report.course import CourseRecorder
 from sms_tools.interruption import Interruption
 from sms_tools.live.loop import LiveSession
 from sms_tools.report import report_console, show, verdict_text
@@ -24,7 +24,7 @@ from sms_tools.view.session import View, open_view
 
 
 class Showing:
-    """View and history of one session, which has to be updated with the blocks as they come out of `watch`."""
+    """View and course of one session, which has to be updated with the blocks as they come out of `watch`."""
 
     def __init__(
         self,
@@ -36,7 +36,7 @@ class Showing:
         self._args = args
         self._session = session
         self._view = view
-        self._history = History(session.estimator, session.channels)
+        self._course = CourseRecorder(session)
         self._directory = directory
 
     @property
@@ -51,7 +51,7 @@ class Showing:
 
     def watch(self, blocks: Iterable[Block]) -> Iterator[Block]:
         """The same blocks, drawn as they pass."""
-        return iter(self._history.watch(self._view.watch(blocks)))
+        return iter(self._course.watch(self._view.watch(blocks)))
 
     def follow(self, say: Callable[[str], None] = lambda text: None) -> None:
         """Show what the session's diagnosis finds: evidence as a plot, verdicts in the log and in the trust.
@@ -76,11 +76,10 @@ class Showing:
         # Matplotlib takes a second to be imported, which nobody should wait for before a session.
         from sms_tools.html_report.page import write_report
 
-        self._history.finish()
         document = result.document()
         nominal = {p.name: p.nominal for p in result.parameters.values() if p.nominal is not None}
         scene = Scene(self._session.estimator.model, self._args.exaggerate)
-        page = write_report(self._directory, document, self._history.course, nominal, scene)
+        page = write_report(self._directory, document, self._course.course, nominal, scene)
         show(report_console(self._args.json), f"report: {page}", "", verdict_text(document["verdict"]))
         self._view.linger(interruption)
 

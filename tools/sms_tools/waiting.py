@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
 from time import monotonic
 from typing import Protocol
@@ -15,7 +14,7 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 from sms_adapters.sources import open_source
 from sms_online.capture import PIECE
 from sms_online.description.schema import System
-from sms_online.stream import Block, Source
+from sms_online.stream import Block, Relayed, Source
 
 # What is over before this many seconds needs no bar.
 MOMENT = 2.0
@@ -30,23 +29,12 @@ class Mover(Protocol):
     def __call__(self, done: float, name: str | None = None) -> None: ...
 
 
-@dataclass(frozen=True)
-class Watched:
+class Watched(Relayed):
     """A source whose blocks move a bar when they are processed. console: where to write above the bar."""
 
-    source: Source
-    blocks: Iterable[Block]
-    console: Console
-
-    @property
-    def channels(self) -> tuple[str, ...]:
-        """See `Source`."""
-        return self.source.channels
-
-    @property
-    def warnings(self) -> Sequence[str]:
-        """See `Source`."""
-        return self.source.warnings
+    def __init__(self, source: Source, blocks: Iterable[Block], console: Console) -> None:
+        super().__init__(source)
+        self.blocks, self.console = blocks, console
 
     def __iter__(self) -> Iterator[Block]:
         return iter(self.blocks)

@@ -27,7 +27,7 @@ def moved_charts(document: Document) -> list[Chart]:
     drifting = {drift["parameter"] for tracker in document["trackers"] for drift in tracker["drifts"]}
     far = {}
     for p in document["parameters"]:
-        furthest = max(_furthest(*_course(history, p["name"])) for history in histories)
+        furthest = max(_furthest(*estimates(history, p["name"])) for history in histories)
         if p["name"] in drifting or furthest > STEADY:
             far[p["name"]] = (p["name"] in drifting, furthest)
     chosen = sorted(far, key=lambda name: far[name], reverse=True)[:MOST_CHARTS]
@@ -35,7 +35,7 @@ def moved_charts(document: Document) -> list[Chart]:
     return [_chart(p, histories, marks) for p in document["parameters"] if p["name"] in chosen]
 
 
-def _course(history: Document, name: str) -> tuple[Array, Array]:
+def estimates(history: Document, name: str) -> tuple[Array, Array]:
     """Estimate and standard deviation (N,) of a parameter, NaN where there is none."""
     (found,) = (p for p in history["parameters"] if p["name"] == name)
     return np.array(found["estimate"], dtype=float), np.array(found["std"], dtype=float)
@@ -55,7 +55,7 @@ def _furthest(estimate: Array, std: Array) -> float:
 def _chart(p: Document, histories: list[Document], marks: list[float]) -> Chart:
     series, held = [], []
     for k, history in enumerate(histories):
-        t, (estimate, std) = np.array(history["t"]), _course(history, p["name"])
+        t, (estimate, std) = np.array(history["t"]), estimates(history, p["name"])
         color = LINES[k % len(LINES)]
         lower, upper = estimate - BOUNDS * std, estimate + BOUNDS * std
         label = history["tracker"] + (", judged" if history["judged"] and len(histories) > 1 else "")

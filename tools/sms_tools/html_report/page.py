@@ -7,11 +7,12 @@ from pathlib import Path
 
 import numpy as np
 
+from sms_online.evaluation import identifiable
 from sms_online.model.parameters import Parameter
 from sms_tools.html_report.arm_drawing import arm_drawings
+from sms_tools.html_report.course import Course
 from sms_tools.html_report.figures import Chart, Series, chart
-from sms_tools.html_report.history import Course
-from sms_tools.html_report.moved import moved_charts
+from sms_tools.html_report.moved import estimates, moved_charts
 from sms_tools.html_report.pages import write_page
 from sms_tools.html_report.parameter_rows import parameter_rows, with_subscripts
 from sms_tools.report import METHODS, Document, drift_lines, event_line, tracker_facts, value_cell
@@ -45,7 +46,7 @@ def write_report(
         parameters=parameter_rows({"estimate": (document["parameters"], "blue")}, nominal),
         trackers=_trackers(document),
         moved=moved_charts(document),
-        convergence=_convergence(document, nominal, course),
+        convergence=_convergence(document, nominal),
         residual=_residual(course),
         episodes=[(episode["summary"], _evidence(episode)) for episode in document.get("diagnosis", [])],
         view="from above" if scene.model.layout.planar else "from one side",
@@ -76,26 +77,30 @@ def _facts(document: Document) -> dict[str, str]:
     }
 
 
-def _convergence(document: Document, nominal: Mapping[str, float], course: Course) -> list[Chart]:
-    if not course.t.size:
+def _convergence(document: Document, nominal: Mapping[str, float]) -> list[Chart]:
+    judged = next((each for each in document.get("history", []) if each["judged"]), None)
+    if judged is None:
         return []
-    described = document["parameters"]
+    described, t = document["parameters"], np.array(judged["t"])
+    columns = zip(*(estimates(judged, p["name"]) for p in described), strict=True)
+    estimate, std = map(np.column_stack, columns)
+    estimate[~identifiable(estimate, std)] = np.nan
     parameters = [Parameter(p["name"], p["symbol"], p["unit"], nominal.get(p["name"], 0.0)) for p in described]
     references = [None if p["true"] is None else Reference(p["true"], True) for p in described]
     curves = []
-    basis = Basis(course.estimate[-1], "last estimate", HALF_RANGES[-1])
+    basis = Basis(estimate[-1], "last estimate", HALF_RANGES[-1])
     for group in parameter_groups(parameters, references, basis):
-        drawn = (course.estimate[:, group.indices] - group.zero) / group.scale
-        curves.append((group, drawn, BOUNDS * course.std[:, group.indices] / group.scale))
+        drawn = (estimate[:, group.indices] - group.zero) / group.scale
+        curves.append((group, drawn, BOUNDS * std[:, group.indices] / group.scale))
     # One axis for all deviations, which holds what was known at half time and at the end: between them they converge.
-    half = course.t.size // 2
+    half = t.size // 2
     reach = [np.abs(drawn) + width for group, drawn, width in curves if group.half_range is not None]
     limit = max(half_range(np.concatenate([r[k] for r in reach])) for k in (half, -1)) if reach else np.nan
     marks = [event["time"] for event in document["events"]]
     charts = []
     for group, drawn, width in curves:
         series = [
-            Series(with_subscripts(label), course.t, y, y - bound, y + bound)
+            Series(with_subscripts(label), t, y, y - bound, y + bound)
             for label, y, bound in zip(group.labels, drawn.T, width.T, strict=True)
             if np.isfinite(y[-1])
         ]
@@ -108,7 +113,7 @@ def _convergence(document: Document, nominal: Mapping[str, float], course: Cours
 def _residual(course: Course) -> list[Chart]:
     joints = enumerate(course.residual.T, start=1)
     # One instant, of a short session, is no line; the table says it.
-    series = [Series(f"joint {i}", course.t, share) for i, share in joints if np.isfinite(share).sum() > 1]
+    series = [Series(f"joint {i}", course.tested, share) for i, share in joints if np.isfinite(share).sum() > 1]
     caption = "Unexplained share of the torque or force, over the last second"
     return [chart(caption, series, "time, s", log=True)] if series else []
 
@@ -127,8 +132,7 @@ def _evidence(episode: Document) -> list[Chart]:
 
 
 def _arm(scene: Scene, course: Course) -> list[Chart]:
-    seen = np.flatnonzero(np.isfinite(course.x).all(axis=1))
-    if not seen.size:
+    if not course.seen.size:
         return []
-    chosen = np.unique(np.linspace(0, seen.size - 1, PICTURES).round().astype(int)).tolist()
-    return arm_drawings(scene, course.x[seen], chosen, [f"{course.t[seen[k]]:.2f} s" for k in chosen])
+    chosen = np.unique(np.linspace(0, course.seen.size - 1, PICTURES).round().astype(int)).tolist()
+    return arm_drawings(scene, course.x, chosen, [f"{course.seen[k]:.2f} s" for k in chosen])

@@ -1,4 +1,4 @@
-"""Stuck sensors: a channel that repeats one value more often than its own noise ever would."""
+"""What samples show to be wrong by themselves: sensors that are stuck or wrapped, stamps in another unit of time."""
 
 from __future__ import annotations
 
@@ -7,18 +7,58 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from sms_adapters.increments import increments
-from sms_online.stream import Array
+from sms_online.stream import Array, increments
 
 # Chance that a healthy sensor repeats itself so many times in a row, given how often it has repeated itself so far.
 FALSE_ALARM = 1e-12
 # A channel is judged once so many of its samples are known.
 LEARNT = 200
+# Samples of a recording in which stuck sensors are looked for at once: what was healthy before them is known then.
+PIECE = 256
 # Fewest repetitions that can be an alarm: a sensor read twice as often as it samples repeats each value once.
 LEAST_RUN = 8
 # A coarse encoder that turns back rests too, but creeps there by single steps; what stops from a change of more
 # than this many of its smallest steps has stopped all at once.
 SUDDEN = 3.0
+# Turns at which readings wrap, in rad and degrees: a step within this share of one, where others are far smaller.
+TURNS, TURN_TOLERANCE = (2.0 * np.pi, np.pi, 360.0), 0.1
+# A reading that wraps elsewhere steps by more than this multiple of its usual steps, every time by the same within
+# this share.
+JUMP, SAME_STEP = 20.0, 0.05
+# Units of time that stamps may be in by mistake, by how many of them are a second.
+CLOCKS = {"ms": 1e3, "µs": 1e6, "ns": 1e9}
+
+
+def unit_of_stamps(ratio: float, tolerance: float) -> tuple[str, float] | None:
+    """The unit that stamps are in and how many of it are a second; None where they are in seconds.
+
+    ratio: of the time between samples to the described one. tolerance: factor by which rates may differ.
+    """
+    close = ((unit, factor) for unit, factor in CLOCKS.items() if 1.0 / tolerance < ratio / factor < tolerance)
+    return next(close, None)
+
+
+def wrapped_at(steps: Array) -> tuple[float, int] | None:
+    """At what a reading wraps, and how often, by its steps (B,) from sample to sample; None where it does not."""
+    size = np.abs(steps)
+    usual = float(np.quantile(size, 0.9)) if size.size else np.inf
+    for turn in TURNS:
+        found = int(np.count_nonzero(np.abs(size / turn - 1.0) < TURN_TOLERANCE))
+        if found and usual < TURN_TOLERANCE * turn:
+            return turn, found
+    jumps = size[size > JUMP * max(usual, 1e-12)]
+    if jumps.size and jumps.min() > (1.0 - SAME_STEP) * jumps.max():
+        return float(np.median(jumps)), jumps.size
+    return None
+
+
+def stuck_samples(values: Array) -> NDArray[np.bool_]:
+    """Where a recorded reading (B,), all finite, is stuck, as `StuckGuard` finds it."""
+    kept, guard = values[:, None].copy(), StuckGuard([[0]])
+    for start in range(0, len(kept), PIECE):
+        seen = kept[: start + PIECE]
+        guard.blank(seen, len(seen) - start)
+    return np.isnan(kept[:, 0])
 
 
 class StuckGuard:
