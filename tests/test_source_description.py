@@ -67,7 +67,7 @@ def test_a_mere_channel_is_short_for_a_signal() -> None:
     ("old", "new", "place", "found", "expected"),
     [
         ('kind = "can"', 'kind = "cam"', "source 1.kind", "'cam'", "did you mean 'can'?"),
-        ('kind = "can"', "", "source 1.kind", "missing", "'can', 'canopen', 'table', 'bag' or 'serial'"),
+        ('kind = "can"', "", "source 1.kind", "missing", "'can', 'canopen', 'udp', 'table', 'bag' or 'serial'"),
         ('format = "frames"', "", "source 2.format", "missing", "'frames' or 'lines'"),
         ('name = "drives"', 'name = "my drives"', "source 1.name", "'my drives'", "letters, digits"),
         ('name = "drives"', 'name = "strain"', "source 2.name", "'strain' again", "a name of its own"),

@@ -14,6 +14,7 @@ import pytest
 import sms_online as sms
 from sms_adapters.raw import LostDevice, SerialChunk
 from sms_adapters.sources import READERS
+from sms_adapters.system_file import system_text
 from sms_online.description.parse import parse_system
 from tests.axis import AXIS, axis_block
 
@@ -28,6 +29,12 @@ def shown(page: str, language: str) -> list[str]:
 @pytest.mark.parametrize("table", [*shown("can-bench.md", "toml"), *shown("serial-bench.md", "toml")])
 def test_the_tables_of_the_guides_are_accepted(table: str) -> None:
     assert parse_system(f'name = "rig"\n{RIG}{table}', "guide").sources
+
+
+def test_the_guides_cameras_are_a_source_of_the_planar_example() -> None:
+    table = shown("motion-capture.md", "toml")[-1]
+    (source,) = parse_system(system_text("paper-planar") + table, "guide").sources
+    assert source.name == "cameras"
 
 
 def test_the_system_file_of_the_guide_is_accepted() -> None:

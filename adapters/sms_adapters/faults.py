@@ -13,6 +13,7 @@ FAULTS = {
     "repeated_time": ("frames skipped", "their time repeats that of their message's last one"),
     "framing": ("frames skipped", "their framing is broken"),
     "crc": ("frames skipped", "their checksum is wrong"),
+    "bad_frame": ("datagrams skipped", "they are no frames of the described version of NatNet"),
     "non_utf8": ("lines skipped", "they are not text"),
     "bad_number": ("lines skipped", "they are not the described numbers"),
     "too_long": ("stretches skipped", "no frame or line is as long as they are"),
@@ -22,6 +23,7 @@ FAULTS = {
     "lost_counter": ("frames lost", "their counts are missing"),
     "restarted_counter": ("restarts", "a sender's counter began again"),
     "non_finite": ("values skipped", "NaN or infinite"),
+    "hidden": ("positions skipped", "the cameras did not see all of their marker or body"),
     "out_of_range": ("values skipped", "outside the limits of their channel"),
 }
 

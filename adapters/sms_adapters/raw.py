@@ -59,7 +59,7 @@ class CanFrames:
 
 @dataclass(frozen=True)
 class SerialChunk:
-    """Bytes as they were read at once.
+    """Bytes as they were read at once from a serial port, or came in one datagram.
 
     arrival: when the last was there, s on the session's clock. No bytes mark a break: the port was opened, and what
     comes next may begin in the middle of a frame or a line.

@@ -4,6 +4,7 @@
     system.toml         the system file, where there is one
     <source>.log        CAN frames as `candump -l` writes them; the interface is the source's name
     <source>.serial     `(<seconds>) <source> <bytes in hexadecimal>`, a line for each read
+    <source>.udp        the same, a line for each datagram
     <source>.stamps     one whole number a frame, µs: the stamp of the interface, where there are stamps; - is none
     <source>.dropped    `first count`: items, counted from 0, that the estimator was too slow for
 
@@ -38,14 +39,14 @@ RULES = 4
 SESSION = "session.toml"
 SYSTEM = "system.toml"
 CHECKPOINT = "resumed-from.msgpack"
-SUFFIXES: dict[str, str] = {"can": ".log", "serial": ".serial"}
+SUFFIXES: dict[str, str] = {"can": ".log", "serial": ".serial", "udp": ".udp"}
 STAMPS, DROPPED = ".stamps", ".dropped"
 MICROSECOND = 1e-6
 # Bit of a candump identifier that marks an error frame (CAN_ERR_FLAG of linux/can.h), written with eight digits.
 _ERROR_ID = 0x2000_0000
 _NO_STAMP = b"-"
 
-Kind = Literal["can", "serial"]
+Kind = Literal["can", "serial", "udp"]
 
 
 def to_microseconds(t: float) -> int:
@@ -146,7 +147,7 @@ def stamp_lines(frames: CanFrames) -> list[str]:
 
 
 def chunk_line(name: str, epoch: int, chunk: SerialChunk) -> str:
-    """The line of <source>.serial for what was read at once."""
+    """The line of <source>.serial or .udp for what was read at once."""
     seconds, micro = divmod(epoch + to_microseconds(chunk.arrival), 1_000_000)
     return f"({seconds}.{micro:06d}) {name} {chunk.data.hex()}\n"
 
@@ -174,7 +175,7 @@ class RecordedItems:
         stamps = self._stamps()
         before = 0
         for line, text in _whole_lines(self._lines):
-            if self._kind == "serial":
+            if self._kind != "can":
                 chunks = [self._chunk(line + k, each) for k, each in enumerate(bytes(text).decode().splitlines())]
                 yield from (chunk for chunk, used in zip(chunks, self._used(before, len(chunks)), strict=True) if used)
                 before += len(chunks)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator, Sequence
+from ipaddress import AddressValueError, IPv4Address
 
 from sms_online.description.explain import hint, nearest
 from sms_online.description.schema import System
@@ -13,6 +14,7 @@ from sms_online.description.sources import (
     CanSource,
     FrameField,
     LogSource,
+    NatnetSource,
     SerialField,
     SerialFrames,
     SerialLines,
@@ -27,6 +29,7 @@ CAN_SIGNAL = re.compile(r"\w+\.\w+")
 CANOPEN_SIGNAL = re.compile(r"(?P<node>\d+)\.[0-9A-Fa-f]{4}(:[0-9A-Fa-f]{1,2})?")
 # A topic, and the path of a number in its messages: names and, in brackets, a number or a name.
 BAG_SIGNAL = re.compile(r"[^.\[\]]+(\.\w+(\[[^\[\].]+\])*)+")
+NATNET_SIGNAL = re.compile(r"\d+\.([xyz]|q[xyzw]|yaw)|\d+\.[1-9]\d*\.[xyz]")
 STAMP = re.compile(r"\w+(\.\w+)*")
 MOST_NODES = 127  # CiA 301
 # One character between numbers that no number holds; "" means blanks.
@@ -53,6 +56,8 @@ def check_sources(system: System, names: Sequence[str], source: str) -> None:
             _check_can(device, place, source)
         elif isinstance(device, CanopenSource):
             _check_canopen(device, place, source)
+        elif isinstance(device, NatnetSource):
+            _check_natnet(device, place, source)
         elif isinstance(device, LogSource):
             _check_log(device, place, source)
         else:
@@ -62,7 +67,7 @@ def check_sources(system: System, names: Sequence[str], source: str) -> None:
 
 
 def _signals(device: Source, place: str) -> Iterator[tuple[str, Signal | SerialField]]:
-    if isinstance(device, CanSource | CanopenSource | LogSource):
+    if isinstance(device, CanSource | CanopenSource | NatnetSource | LogSource):
         for name, signal in device.signals.items():
             yield f"{place}.signals.{name}", signal
     else:
@@ -135,7 +140,24 @@ def _check_log(device: LogSource, place: str, source: str) -> None:
                 raise InputError(source, f"{place}.signals", repr(name), expected)
 
 
-def _check_keys(device: CanSource | CanopenSource, place: str, form: re.Pattern[str], shown: str, source: str) -> None:
+def _check_natnet(device: NatnetSource, place: str, source: str) -> None:
+    _check_keys(
+        device, f"{place}.signals", NATNET_SIGNAL, '"ASSET.PART" or "ASSET.MARKER.AXIS", such as "3.2.x",', source
+    )
+    for key, value, several in (("group", device.group, True), ("interface", device.interface, False)):
+        if not value and several:
+            continue
+        try:
+            address = IPv4Address(value)
+        except AddressValueError:
+            raise InputError(source, f"{place}.{key}", repr(value), "an IPv4 address") from None
+        if several and not address.is_multicast:
+            raise InputError(source, f"{place}.group", repr(value), 'a multicast address, 224.0.0.0 and above, or ""')
+
+
+def _check_keys(
+    device: CanSource | CanopenSource | NatnetSource, place: str, form: re.Pattern[str], shown: str, source: str
+) -> None:
     if not device.signals:
         raise InputError(source, place, "an empty table", f'{shown} = "channel", at least once')
     for name in device.signals:

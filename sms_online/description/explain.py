@@ -48,6 +48,7 @@ LINKS: dict[str, type[BaseModel]] = {
 SOURCES: dict[str, type[BaseModel]] = {
     "can": sources.CanSource,
     "canopen": sources.CanopenSource,
+    "udp": sources.NatnetSource,
     "table": sources.TableSource,
     "bag": sources.BagSource,
 }

@@ -1,4 +1,4 @@
-"""The devices of a testbed as a system file describes them, on a CAN bus or a serial port, and what its logs mean."""
+"""The devices of a testbed as a system file describes them, on a CAN bus, a serial port or a network, and its logs."""
 
 from __future__ import annotations
 
@@ -164,6 +164,31 @@ class SerialLines(SerialPort):
     checksum: Literal["none", "xor"] = "none"
 
 
+class NatnetSource(SourceRecord):
+    """Frames that a motion capture sends as UDP datagrams, in OptiTrack's protocol NatNet, with its z axis up.
+
+    The keys of signals are "ASSET.PART", of the pose of a rigid body: x, y, z in m, its Euler parameters qx, qy, qz, qw
+    or yaw, its angle about z in rad; and "ASSET.MARKER.x", .y or .z, the place of one of its markers. An asset is named
+    by its streaming ID, a marker by its number in the asset: "1.yaw", "3.2.x".
+
+    kind: `udp`.
+    format: `natnet`.
+    version: of the protocol, as the streaming settings state it; Motive 2 sends "3.1", Motive 3 "4.0" and later.
+    group: the multicast group that is sent to; "" where datagrams come to this machine's own address.
+    port: the data port.
+    interface: address of this machine's network card; "0.0.0.0" leaves the choice to the operating system.
+    signals: where each number of a frame goes.
+    """
+
+    kind: Literal["udp"]
+    format: Literal["natnet"]
+    version: Annotated[str, Field(pattern=r"^\d+\.\d+$")]
+    group: str = "239.255.42.99"
+    port: Annotated[int, Field(gt=0, lt=65536)] = 1511
+    interface: str = "0.0.0.0"
+    signals: dict[str, Signal]
+
+
 class LogSignal(Signal):
     """Where a number of a log goes: channel value = scale · number / gear + offset, the number in its unit.
 
@@ -218,6 +243,8 @@ class BagSource(LogSource):
     stamp: str = "header.stamp"
 
 
-Device = CanSource | CanopenSource | SerialFrames | SerialLines
+Device = CanSource | CanopenSource | SerialFrames | SerialLines | NatnetSource
 SerialSource = Annotated[SerialFrames | SerialLines, Field(discriminator="format")]
-Source = Annotated[CanSource | CanopenSource | SerialSource | TableSource | BagSource, Field(discriminator="kind")]
+Source = Annotated[
+    CanSource | CanopenSource | SerialSource | NatnetSource | TableSource | BagSource, Field(discriminator="kind")
+]

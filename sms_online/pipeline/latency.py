@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from sms_online.calibration.nuisance import Nuisance
-from sms_online.description.sources import LogSource, SerialFrames, SerialLines, Source
+from sms_online.description.sources import CanopenSource, CanSource, SerialFrames, SerialLines, Source
 from sms_online.effects.delay import late_keys
 from sms_online.pipeline.sensing import Sensing
 from sms_online.state import Stage, State
@@ -87,11 +87,11 @@ def clock_groups(sensing: Sensing) -> tuple[SourceGroup, ...]:
     """What has a clock of its own: the senders on a bus, each with messages of its name, other devices, logs."""
     members: dict[tuple[str, str], list[str]] = {}
     for source in sensing.model.system.sources:
-        if isinstance(source, SerialFrames | SerialLines | LogSource):
-            members[source.name, ""] = source_channels(source)
-        else:
+        if isinstance(source, CanSource | CanopenSource):
             for key, signal in source.signals.items():
                 members.setdefault((source.name, key.partition(".")[0]), []).append(signal.channel)
+        else:
+            members[source.name, ""] = source_channels(source)
     every = [_group(sensing, name, channels) for (name, _), channels in members.items()]
     groups = tuple(group for group in every if group.sensors or group.joints)
     return groups if len(groups) > 1 else ()

@@ -12,7 +12,7 @@ from sms_adapters.raw import CanFrames, LostDevice, Raw, Reader
 from sms_adapters.recorder import Recorder
 from sms_adapters.recording import split
 from sms_adapters.session_log import Kind, from_microseconds, number_of_items, quantised
-from sms_online.description.sources import Device, SerialPort
+from sms_online.description.sources import CanBus, Device
 from sms_online.errors import InputError
 
 # Longest wait in a read, s: how late a reader notices that the session ends.
@@ -69,8 +69,8 @@ class SessionClock:
 
 
 def kind_of(source: Device) -> Kind:
-    """What its recording holds: frames or bytes."""
-    return "serial" if isinstance(source, SerialPort) else "can"
+    """What its recording holds: CAN frames, the bytes of a serial port, or datagrams."""
+    return "can" if isinstance(source, CanBus) else source.kind
 
 
 class Feed:

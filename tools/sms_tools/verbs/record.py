@@ -13,7 +13,7 @@ from can.util import cast_from_string
 from sms_adapters.devices import make_reader
 from sms_adapters.recorder import Recorder
 from sms_adapters.session_log import SessionHeader
-from sms_online.description.sources import CanSource, Device, SerialField, SerialLines, SerialPort
+from sms_online.description.sources import CanSource, Device, NatnetSource, SerialField, SerialLines, SerialPort
 from sms_online.errors import InputError
 from sms_tools.exit_codes import INTERRUPTED, NOTHING_RECEIVED, OK
 from sms_tools.interruption import Interruption
@@ -82,6 +82,8 @@ def run(args: argparse.Namespace) -> int:
 def _device(source: Device) -> str:
     if isinstance(source, SerialPort):
         return f"{source.port} at {source.baudrate} bit/s"
+    if isinstance(source, NatnetSource):
+        return f"UDP {source.group or source.interface}:{source.port}"
     options = [f"{name} {value}" for name, value in source.options.items()]
     bitrate = [] if source.bitrate is None else [f"{source.bitrate} bit/s"]
     return ", ".join([f"{source.interface} {source.channel}", *bitrate, *options])
