@@ -122,7 +122,8 @@ class Relinearisation(Stage):
 
     def _look(self, noise: SensorNoise, last: bool) -> None:
         """Now and then, where the estimate is far from the point that rows are linear about: go there."""
-        if self.momentum.changes.events:
+        if self.momentum.changes.events or self.momentum.changes.shifts:
+            # No one point is that of the samples before and after.
             self.linearisation.forget()
         if not self.momentum.started or not self.linearisation.looks(self.momentum.fit.plain.windows, last):
             return
