@@ -6,13 +6,11 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
-from scipy.spatial.transform import Rotation
 
 from sms_adapters.system_file import load_system
 from sms_online.calibration.channels import Motion, position_families, torque_families
 from sms_online.calibration.columns import CalibrationColumns, nuisances
 from sms_online.calibration.geometry import Geometry, geometries
-from sms_online.description.channels import AXES
 from sms_online.description.schema import System, Tolerances
 from sms_online.effects.build import build_model
 from sms_online.model.base_parameters import find_base_parameters
@@ -88,15 +86,8 @@ class Rows:
         return np.concatenate([rows[:, :-1] @ self.beta - rows[:, -1] for rows in dense])
 
     def moved(self, geometry: Geometry, by: float) -> Array:
-        """The same of another geometry, or of the base's frame turned against what is measured."""
-        values = self.exact.copy()
-        if geometry.nuisance.name == "base_angle":
-            # Scalar last in both.
-            own = self.sensing.position_columns[3:7]
-            turn = Rotation.from_rotvec(by * np.eye(3)[AXES.index(geometry.nuisance.part)])
-            read = (Rotation.from_quat(values[:, own]) * turn.inv()).as_quat()
-            values[:, own] = read * np.sign(np.sum(read * values[:, own], axis=1))[:, None]
-        return self.residual(values, self.model.of_geometry(geometry.moved(self.model.system, by)))
+        """The same of another geometry."""
+        return self.residual(self.exact, self.model.of_geometry(geometry.moved(self.model.system, by)))
 
     def added(self) -> Array:
         """What a unit of each channel's nuisance adds to the samples, (nuisances, samples, channels)."""

@@ -53,7 +53,6 @@ def test_on_one_clock_the_same_samples_hold_an_event(rig: System, shifted: sms.C
 
 
 @pytest.mark.long
-@pytest.mark.xfail(strict=True, reason="columns of clocks that are differences over windows do not explain the shift")
 def test_a_shift_that_is_noticed_is_sized(rig: System, shifted: sms.Capture, monkeypatch: pytest.MonkeyPatch) -> None:
     # Nothing of it is allowed for.
     monkeypatch.setattr("sms_online.pipeline.events.WANDER", 0.0)

@@ -201,7 +201,7 @@ def test_no_window_spans_a_gap_and_none_beside_it_is_lost() -> None:
     for begin, end in ((0, 1500), (1700, 2500), (2600, 4000)):
         first = begin + balance.lead + balance.width
         expected += (end - balance.margin - 1) // balance.hop - -(-first // balance.hop) + 1
-    assert momentum.grams.windows == expected
+    assert momentum.joint.grams.windows == expected
     assert momentum.state.dropped_windows == 0
 
 

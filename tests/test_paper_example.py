@@ -96,7 +96,7 @@ def test_recursive_equals_batch(planar_block: Block) -> None:
     exactly = {"tolerances": Tolerances.model_validate("none")}
     estimator = Estimator(load_system("paper-planar").model_copy(update=exactly), planar_block.channels, "simulation")
     assert estimator.momentum is not None
-    recorder = estimator.momentum.tracker = KeepingTracker(estimator.base.n)
+    recorder = estimator.momentum.joint.tracker = KeepingTracker(estimator.base.n)
     estimator.push(planar_block)
     estimator.finish()
     Y = np.concatenate([rows.Y for rows in recorder.kept])

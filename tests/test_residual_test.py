@@ -10,9 +10,9 @@ from scipy.stats import chi2
 from sms_adapters.system_file import load_system
 from sms_online.description.parse import parse_system
 from sms_online.model.layout import build_layout
-from sms_online.pipeline.momentum_fit import WhiteRows
 from sms_online.pipeline.momentum_windows import HOPS
 from sms_online.pipeline.residual_test import NOISE, SequentialTest, _ratio
+from sms_online.pipeline.white_rows import WhiteRows
 from sms_online.stream import Array
 from sms_online.trackers.factor import triangular_factor
 from tests.axis import AXIS

@@ -166,5 +166,5 @@ def test_a_session_with_internal_states_runs_at_a_low_rate() -> None:
     estimator.push(Block(motion.t, plant.channels, values))
     estimator.finish()
     assert estimator.momentum is not None
-    assert estimator.momentum.grams.windows > 100
+    assert estimator.momentum.joint.grams.windows > 100
     assert np.isfinite(estimator.estimate().pi).all()

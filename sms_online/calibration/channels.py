@@ -10,7 +10,7 @@ from functools import partial
 
 import numpy as np
 
-from sms_online.calibration.geometry import own_axis
+from sms_online.calibration.geometry import axis_tolerance, on_base, own_axis
 from sms_online.calibration.nuisance import Nuisance
 from sms_online.description.channels import AXES
 from sms_online.description.schema import Tolerances
@@ -128,7 +128,8 @@ def _clocks(sensing: Sensing, names: Sequence[str], tolerance: float) -> Iterato
 
 
 def _encoders(sensing: Sensing, names: Sequence[str], tolerances: Tolerances) -> Iterator[Family]:
-    joints = sensing.model.system.joints
+    system = sensing.model.system
+    joints = system.joints
     encoders = [k for k, name in enumerate(names) if name.startswith(("q_", "theta_m_"))]
     turning = [k for k in encoders if joints[int(names[k].rsplit("_", 1)[1]) - 1].kind == "revolute"]
     one, turn = _selection(names, encoders), _selection(names, turning)
@@ -139,12 +140,15 @@ def _encoders(sensing: Sensing, names: Sequence[str], tolerances: Tolerances) ->
     ]
     yield Family(tuple(zeros), partial(_constant, one))
     # A joint that is mounted turned about its own axis reads as if it stood elsewhere.
-    mounted = {i: axis for i, joint in enumerate(joints) if (axis := own_axis(joint)) is not None}
+    own_axes = {i: axis for i, joint in enumerate(joints) if (axis := own_axis(joint)) is not None}
+    mounted = {i: axis for i, axis in own_axes.items() if axis_tolerance(system, i) > 0.0}
     turned = np.zeros((len(names), len(mounted)))
     for column, (i, axis) in zip(turned.T, mounted.items(), strict=True):
         own = [k for k in encoders if int(names[k].rsplit("_", 1)[1]) == i + 1]
         column[own] = -np.sign(joints[i].axis[axis])
-    mounts = [Nuisance("axis", f"joint_{i + 1}", "rad", tolerances.axis, AXES[axis]) for i, axis in mounted.items()]
+    mounts = [
+        Nuisance("axis", f"joint_{i + 1}", "rad", axis_tolerance(system, i), AXES[axis]) for i, axis in mounted.items()
+    ]
     yield Family(tuple(mounts), partial(_constant, turned))
     for part, wave in (("sine", np.sin), ("cosine", np.cos)):
         waves = [Nuisance("once_per_turn", names[k], "rad", tolerances.once_per_turn, part) for k in turning]
@@ -181,20 +185,20 @@ def _camera(sensing: Sensing, names: Sequence[str], tolerances: Tolerances) -> I
         )
         seen = np.isin(np.arange(len(names)), metres)
         yield Family(scale, lambda motion: (motion.readings * seen)[:, :, None])
-    if not layout.free:
+    spacecraft = sensing.model.system.spacecraft
+    if spacecraft is None:
         return
     linear = list(layout.base_linear)
-    points = tuple(Nuisance("tracked_point", "base", "m", tolerances.tracked_point, AXES[axis]) for axis in linear)
-    yield Family(points, partial(_tracked_point, linear))
-    if layout.planar:
-        angle = (Nuisance("base_angle", "base", "rad", tolerances.base_angle, "z"),)
-        yield Family(angle, partial(_constant, _selection(names, [names.index("theta_0")])))
+    known = on_base(sensing.model.system, spacecraft.tracked_point, tolerances.tracked_point)
+    axes = [axis for axis in linear if known[axis] > 0.0]
+    points = tuple(Nuisance("tracked_point", "base", "m", float(known[axis]), AXES[axis]) for axis in axes)
+    yield Family(points, partial(_tracked_point, linear, axes))
 
 
-def _tracked_point(linear: Sequence[int], motion: Motion) -> Array:
-    """The tracked point is further along an axis of the base, and its measured position with it."""
-    out = np.zeros((*motion.readings.shape, len(linear)))
-    out[:, : len(linear)] = motion.base_rotation[:, linear][:, :, linear]
+def _tracked_point(linear: Sequence[int], axes: Sequence[int], motion: Motion) -> Array:
+    """The tracked point is further along some axes of the base, and its measured position with it."""
+    out = np.zeros((*motion.readings.shape, len(axes)))
+    out[:, : len(linear)] = motion.base_rotation[:, linear][:, :, axes]
     return out
 
 

@@ -29,7 +29,6 @@ NAMES = {
     "marker_station": "place along the link",
     "encoder_zero": "zero",
     "once_per_turn": "once per turn",
-    "base_angle": "zero of the attitude",
     "marker_zero": "zero",
     "marker_zero_angle": "zero",
     "camera_scale": "scale",

@@ -1,4 +1,4 @@
-"""Nuisances of geometry, and the systems and states that they make of a described one."""
+"""Nuisances of geometry, and the systems that they make of a described one."""
 
 from __future__ import annotations
 
@@ -13,21 +13,21 @@ from sms_online.calibration.nuisance import Nuisance
 from sms_online.description.bodies import FlexibleLink, Joint, Mount
 from sms_online.description.channels import AXES
 from sms_online.description.schema import System
-from sms_online.description.tree import mounts, tree_of
+from sms_online.description.tree import BASE, mounts, tree_of
 from sms_online.model.beam import LinearLink
 from sms_online.model.model import Model
+from sms_online.model.so3 import skew
 from sms_online.stream import Array
 
 # Step of the differences that give derivatives, m or rad: 1e-6 of them is lost to curvature, less to rounding.
 STEP = 1e-6
 
 
-# Makes states x (K, n_x), v (K, n_v) of a model to which the described one and its states are given, and by how much.
-States = Callable[[Model, Model, Array, Array, float], tuple[Array, Array]]
+def same_readings(described: Model, moved: Model, x: Array, v: Array) -> tuple[Array, Array]:
+    """States of the moved geometry that its sensors read the same in: strains of exact links follow from markers.
 
-
-def same_readings(described: Model, moved: Model, x: Array, v: Array, by: float) -> tuple[Array, Array]:
-    """States of the moved geometry that its sensors read the same in: strains of exact links follow from markers."""
+    x (K, n_x), v (K, n_v): of the described one.
+    """
     x, v = x.copy(), v.copy()
     offset = described.layout.n_base_positions - described.layout.n_base_speeds
     pairs = zip(described.chain.flexible, moved.chain.flexible, described.layout.q_f, strict=True)
@@ -41,13 +41,34 @@ def same_readings(described: Model, moved: Model, x: Array, v: Array, by: float)
     return x, v
 
 
+def on_base(system: System, place: tuple[float, float, float], tolerance: float) -> Array:
+    """Tolerance (3,) of a place on a free base, m, along its axes.
+
+    No sample distinguishes another zero of the measured attitude from places, axes and masses of the base that are all
+    turned. So its frame is the one that is measured, in which less is known of what is on it.
+    """
+    about = [2] if system.motion == "planar" else [0, 1, 2]
+    return np.asarray(
+        np.hypot(tolerance, _base_angle(system) * np.linalg.norm(skew(np.array(place))[:, about], axis=1))
+    )
+
+
+def axis_tolerance(system: System, i: int) -> float:
+    """Tolerance of where joint i (from 0) is mounted turned to, rad; see `on_base`."""
+    turned = _base_angle(system) if tree_of(system).parents[i] == BASE else 0.0
+    return float(np.hypot(system.tolerances.axis, turned))
+
+
+def _base_angle(system: System) -> float:
+    return 0.0 if system.spacecraft is None else system.tolerances.base_angle
+
+
 @dataclass(frozen=True)
 class Geometry:
-    """A nuisance of geometry; moved: the system with so much of it; states: of the system that was moved."""
+    """A nuisance of geometry; moved: the system with so much of it."""
 
     nuisance: Nuisance
     moved: Callable[[System, float], System]
-    states: States = same_readings
 
 
 def own_axis(joint: Mount) -> int | None:
@@ -75,18 +96,17 @@ def geometries(system: System) -> Iterator[Geometry]:
                 yield Geometry(nuisance, partial(_displaced, "links", i, "tip", axis))
     for i, mount in enumerate(mounts(system)):
         where = ("joints", i) if i < len(system.joints) else ("fixed_joints", i - len(system.joints))
-        if any(mount.mount_position) and tolerances.length > 0.0:
-            for axis in range(2 if planar else 3):
-                nuisance = Nuisance("length", f"joint_{i + 1}", "m", tolerances.length, AXES[axis])
+        lengths = np.full(3, tolerances.length)
+        if tree.parents[i] == BASE:
+            lengths = on_base(system, mount.mount_position, tolerances.length)
+        for axis in range(2 if planar else 3):
+            if any(mount.mount_position) and lengths[axis] > 0.0:
+                nuisance = Nuisance("length", f"joint_{i + 1}", "m", float(lengths[axis]), AXES[axis])
                 yield Geometry(nuisance, partial(_displaced, *where, "mount_position", axis))
         for axis in (2,) if planar else (0, 1, 2):
-            if tolerances.axis > 0.0 and axis != own_axis(mount):
-                nuisance = Nuisance("axis", f"joint_{i + 1}", "rad", tolerances.axis, AXES[axis])
+            if axis_tolerance(system, i) > 0.0 and axis != own_axis(mount):
+                nuisance = Nuisance("axis", f"joint_{i + 1}", "rad", axis_tolerance(system, i), AXES[axis])
                 yield Geometry(nuisance, partial(_mount_turned, *where, axis))
-    if system.spacecraft is not None and tolerances.base_angle > 0.0 and not planar:
-        for axis in range(3):
-            nuisance = Nuisance("base_angle", "base", "rad", tolerances.base_angle, AXES[axis])
-            yield Geometry(nuisance, lambda system, by: system, _base_turned(axis))
     gravity = np.array(system.gravity)
     if gravity.any() and tolerances.gravity > 0.0:
         about = [np.array([0.0, 0.0, 1.0])] if planar else [np.array(v) for v in np.linalg.svd(gravity[None])[2][1:]]
@@ -128,16 +148,3 @@ def _tilted(about: Array) -> Callable[[System, float], System]:
         return system.model_copy(update={"gravity": tuple(gravity.tolist())})
 
     return moved
-
-
-def _base_turned(axis: int) -> States:
-    """The base's frame is turned about an axis of it against the frame that is measured: ω_0 is the same."""
-
-    def states(described: Model, moved: Model, x: Array, v: Array, by: float) -> tuple[Array, Array]:
-        layout = described.layout
-        turn = np.zeros_like(v)
-        about = layout.base_pose(x)[1][:, list(layout.base_angular), axis]
-        turn[:, len(layout.base_linear) : layout.n_base_speeds] = -by * about
-        return x + layout.position_rate(x, turn), v
-
-    return states

@@ -12,7 +12,7 @@ from sms_online.trackers.factor import triangular_factor
 from sms_online.trackers.information import Information
 
 # What is measured out with a rule is wrong by so many tolerances at most, whatever samples seem to say.
-BOUNDED = ("tracked_point", "length", "axis", "gravity", "marker_station", "camera_scale", "base_angle")
+BOUNDED = ("tracked_point", "length", "axis", "gravity", "marker_station", "camera_scale")
 BOUND = 30.0
 
 

@@ -144,7 +144,8 @@ class Tolerances(Record):
     gauges and markers.
     encoder_zero: zero of an encoder, rad (m).
     once_per_turn: sine and cosine of an encoder's error once a turn, rad.
-    base_angle: zero of the base's measured attitude, rad.
+    base_angle: zero of the base's measured attitude, rad. The base's frame is the one that is measured: what this zero
+    turns adds to the tolerances of the tracked point and of joints on the base.
     marker_zero: zero of a marker's displacement, m.
     marker_zero_angle: zero of a marker's rotation, rad.
     camera_scale: scale of the base's position and the markers' displacements.

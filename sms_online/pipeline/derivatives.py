@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from sms_online.calibration.geometry import STEP, Geometry
+from sms_online.calibration.geometry import STEP, Geometry, same_readings
 from sms_online.model.dynamics import Dynamics
 from sms_online.model.model import Model
 from sms_online.model.so3 import skew
@@ -29,7 +29,6 @@ class Derivatives:
     def __init__(self, model: Model, geometries: Sequence[Geometry] = ()) -> None:
         self._model = model
         self._models = [model, *(model.of_geometry(each.moved(model.system, STEP)) for each in geometries)]
-        self._states = [each.states for each in geometries]
         pairs = [zip(each.chain.flexible, model.chain.flexible, strict=True) for each in self._models]
         # Those whose springs are others: strains of exact links follow from markers.
         self._elastic = [k for k, links in enumerate(pairs) if any(link is not own for link, own in links)]
@@ -39,7 +38,7 @@ class Derivatives:
         """Equations of motion for parameters π, of so many states of this model and of each other: rarely others."""
         if counts != self._counts or not np.array_equal(pi, self._pi):
             self._pi, self._counts = pi, counts
-            repeats = [counts[0], *[counts[1]] * len(self._states)]
+            repeats = [counts[0], *[counts[1]] * (len(self._models) - 1)]
             self._stacked = self._model.stacked(self._models, repeats).dynamics(pi)
             self._each = [model.dynamics(pi) for model in self._models]
 
@@ -66,7 +65,7 @@ class Derivatives:
         there, speeds = np.repeat(x[chosen], n_v, axis=0), np.repeat(v[chosen], n_v, axis=0)
         steps = DIFFERENCE * np.tile(np.eye(n_v), (some, 1))
         displaced = there + model.position_rate(there, steps)
-        moved = [states(model, other, x, v, STEP) for states, other in zip(self._states, self._models[1:], strict=True)]
+        moved = [same_readings(model, other, x, v) for other in self._models[1:]]
         xs, vs = zip((x, v), (displaced, speeds), *moved, strict=True)
         p, g = self._stacked.momentum_and_force(np.concatenate(xs), np.concatenate(vs))
         p_0, g_0 = p[:K], g[:K]
@@ -79,12 +78,12 @@ class Derivatives:
         if model.effects:
             by_speed, by_position = _effects(dynamics, x[chosen], v[chosen], displaced, steps, signals, chosen)
             G_v, G_x = G_v + by_speed, G_x + by_position
-        change = np.array((p, g))[:, K + some * n_v :].reshape(2, len(self._states), K, n_v)
+        change = np.array((p, g))[:, K + some * n_v :].reshape(2, len(moved), K, n_v)
         change -= np.array((p_0, g_0))[:, None]
         for k in self._elastic:
             change[1, k - 1] += self._each[k].spring_force(moved[k - 1][0], moved[k - 1][1])
             change[1, k - 1] -= dynamics.spring_force(x, v)
-        if model.effects and self._states:
+        if model.effects and moved:
             inputs_of = None if signals is None else model.inputs(signals)
             own = dynamics.effect_force(x, v, inputs_of)
             for out, each, (at_x, at_v) in zip(change[1], self._each[1:], moved, strict=True):

@@ -33,6 +33,7 @@ from sms_online.pipeline.momentum import Momentum
 from sms_online.pipeline.observer import Observer
 from sms_online.pipeline.outliers import LeftOut, Outliers
 from sms_online.pipeline.rates import RateSamples, RatesStage
+from sms_online.pipeline.relinearisation import Relinearisation
 from sms_online.pipeline.sensing import AttitudeContinuity, Sensing, is_slow, stated_period
 from sms_online.pipeline.statistics import Method, Setup
 from sms_online.pipeline.synchronise import GridSamples, SyncCounters, Synchroniser
@@ -108,7 +109,7 @@ class Estimator(Stage):
         self._energy = EnergyBalance(model, base, system.sample_rate)
         # A balance of forces does not hold in a shape that is not the link's; energies tolerate it best.
         by_energy = system.balance == "energy" or self.sensing.missing or (self.smoother is not None and self._slow)
-        self.momentum = None if by_energy else Momentum(model, base, self.sensing, self._begin_joints)
+        self._relinearisation = None if by_energy else Relinearisation(model, base, self.sensing, self._begin_joints)
         if by_energy and not all(choice.static for choice in system.trackers):
             found = "a tracker of its own, and no momentum balance"
             raise InputError(system.name, "tracker", found, "rls without forgetting, or all coordinates measured")
@@ -119,6 +120,11 @@ class Estimator(Stage):
         self.prior: Prior | None = None
         self._setup: tuple[int, Setup] | None = None  # and the number of events that it is since
         self.state = EstimatorState(np.empty(0), np.empty((0, len(self._columns))))
+
+    @property
+    def momentum(self) -> Momentum | None:
+        """The momentum balance, None where energies alone are balanced; another one where it is relinearised."""
+        return None if self._relinearisation is None else self._relinearisation.momentum
 
     @property
     def _needs_smoother(self) -> bool:
@@ -150,8 +156,8 @@ class Estimator(Stage):
         """Add what is known of the base parameters beforehand as a prior; before the first sample."""
         self.prior, self._setup = prior, None
         self.energy_tracker = session_tracker(self.base.n, prior)
-        if self.momentum is not None:
-            self.momentum.set_prior(prior)
+        if self._relinearisation is not None:
+            self._relinearisation.set_prior(prior)
         if self.smoother is not None:
             self.smoother.set_prior(prior)
 
@@ -313,8 +319,8 @@ class Estimator(Stage):
         self._balance_waiting()
         for rates in self._rates.flush():
             self._balance(rates)
-        if self.momentum is not None:
-            self.momentum.finish(self.periods)
+        if self._relinearisation is not None:
+            self._relinearisation.finish(self.periods)
         if self.smoother is not None:
             self.smoother.work(self._balanced, last=True)
 
@@ -325,8 +331,8 @@ class Estimator(Stage):
         if self.smoother is not None:
             every = np.concatenate((block.values, values[:, own:]), axis=1)
             self.smoother.push(t, self.sensing.joint_torque(block.values), every[:, self._smoothed_columns])
-        if self.momentum is not None:
-            self.momentum.observe(block.t, block.values)
+        if self._relinearisation is not None:
+            self._relinearisation.observe(block.t, block.values)
         for piece in self._synchroniser.push(block):
             self._condition(piece)
         if self.smoother is not None:
@@ -338,8 +344,8 @@ class Estimator(Stage):
 
     def adopt(self, adoption: Adoption) -> None:
         """Go on with effects that the model lacked, see `Changes.adopt`; from within `Observer.block_through` alone."""
-        assert self.momentum is not None
-        self.momentum.adopt(adoption)
+        assert self._relinearisation is not None
+        self._relinearisation.adopt(adoption)
 
     def _condition(self, piece: GridSamples) -> None:
         for observer in self.observers:
@@ -367,8 +373,8 @@ class Estimator(Stage):
 
     def _fit(self, piece: GridSamples) -> None:
         """Hand samples, with their internal states, on to the momentum balance."""
-        if self.momentum is not None:
-            self.momentum.push(piece, self._synchroniser.start_time, self.periods)
+        if self._relinearisation is not None:
+            self._relinearisation.push(piece, self._synchroniser.start_time, self.periods)
 
     def _balance(self, rates: RateSamples) -> None:
         if rates.segment != self.state.segment:

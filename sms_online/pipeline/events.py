@@ -18,7 +18,7 @@ import numpy as np
 import scipy.linalg
 
 from sms_online.pipeline.latency import WANDER
-from sms_online.pipeline.momentum_fit import WhiteRows
+from sms_online.pipeline.white_rows import WhiteRows
 from sms_online.state import Stage, State
 from sms_online.stream import Array
 from sms_online.trackers.factor import triangular_factor

@@ -33,8 +33,6 @@ CERTAIN, CONVERGED = 3.0, 0.2
 LATEST = 0.02
 # Time that samples are remembered, s.
 REMEMBERED = 30.0
-# What moves with geometry that stays: one without the other would be far from every description that fits.
-COUPLED = ("base_angle",)
 # Steps at each look.
 STEPS = 4
 
@@ -64,8 +62,7 @@ class Linearisation(Stage):
         families = position_families(sensing, sensing.model.system.tolerances)
         clocks = np.array([each.name == "clock" for each in nuisances], dtype=np.bool_)
         self._largest = np.where(clocks, LATEST, np.inf)
-        coupled = np.array([each.name in COUPLED for each in nuisances], dtype=np.bool_)
-        self._movable = (np.arange(len(nuisances)) < sum(len(each.nuisances) for each in families)) & ~coupled
+        self._movable = np.arange(len(nuisances)) < sum(len(each.nuisances) for each in families)
         self._linear = np.array([getattr(LINEAR, each.name) or 0.0 for each in nuisances], dtype=np.float64)
         self.state = LinearisationState(np.zeros(len(nuisances)), first, remembers=bool(self._movable.any()))
         self._correction = self._new_correction()

@@ -6,7 +6,7 @@ of it (windows side by side cost fifteen times the error).
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from itertools import groupby
 from operator import itemgetter
@@ -27,6 +27,7 @@ from sms_online.pipeline.momentum_windows import (
     Window,
 )
 from sms_online.pipeline.rough_forces import RoughForces, responses, stiction_std
+from sms_online.pipeline.smoothed_columns import Samples, SmoothedColumns, WindowSampling
 from sms_online.pipeline.smoothing import HALF_WIDTHS, WidthChoice, smooth, stride
 from sms_online.pipeline.standstill import Standstill
 from sms_online.pipeline.weak_form import test_function
@@ -45,8 +46,6 @@ WIDEST_SHARE = 5
 # another than that of the rows before, from which a row is subtracted. The test function is below 0.3 % of its height
 # there, and passes the windows that follow on to the wide filter.
 PROMPT_SHARE = HOPS
-# So many samples at once are smoothed and have their columns evaluated: of a long segment they would fill the memory.
-PIECE = 400
 # Samples before and after a window that its filter needs at most.
 MARGIN = HALF_WIDTHS[-1]
 
@@ -75,23 +74,6 @@ def prompt_margin(width: int) -> int:
     return max(HALF_WIDTHS[0], min(half_widths(width)[-1], width // PROMPT_SHARE))
 
 
-class _Smoothed(State):
-    """Momenta and forces at every `step` th sample, of one half width, as far as windows have asked for them.
-
-    first: number of the sample in the segment. columns (K, entries).
-    """
-
-    step: int
-    first: int
-    columns: Array
-
-
-# Numbers of samples (K,) and half width of the filter that they pass.
-_Samples = Sequence[tuple[NDArray[np.int64], int]]
-# Evaluates columns at some samples: (K, entries).
-_Evaluation = Callable[[_Samples], Array]
-
-
 class MomentumBalanceState(State):
     """What a momentum balance keeps of its segment.
 
@@ -107,8 +89,8 @@ class MomentumBalanceState(State):
     window: int = 0
     instant: int = 0
     compared: list[Array] = msgspec.field(default_factory=list)
-    thinned: dict[int, _Smoothed] = msgspec.field(default_factory=dict)
-    dense: dict[int, _Smoothed] = msgspec.field(default_factory=dict)
+    thinned: dict[int, SmoothedColumns] = msgspec.field(default_factory=dict)
+    dense: dict[int, SmoothedColumns] = msgspec.field(default_factory=dict)
 
 
 class MomentumBalance(Stage):
@@ -145,6 +127,7 @@ class MomentumBalance(Stage):
         # Half width behind the last of the differences that rates at instants come from, see `_differences`.
         self._between = self.margin - (3 * self.half_hop + 1) // 2
         self._prompt = prompt
+        self._sampling = WindowSampling(self.width, self.hop, self.margin)
         self._choice = WidthChoice(self._widths)
         self.with_moments = moments
         self._phi = {s: self._weights(s) for s in {1, *(stride(M, self.hop) for M in self._widths)}}
@@ -245,7 +228,7 @@ class MomentumBalance(Stage):
                 out += weight / len(halves) * value
         return out * self.sample_rate / (24.0 * self.half_hop)
 
-    def _states(self, samples: _Samples) -> tuple[Array, Array, Array]:
+    def _states(self, samples: Samples) -> tuple[Array, Array, Array]:
         """x (copies, K, n_x), v (copies, K, n_v) and signals (copies, K, joints + n_states) at K samples.
 
         samples: their numbers, K in all, and half width M of their filter.
@@ -261,11 +244,11 @@ class MomentumBalance(Stage):
 
     def _rows(self, half_width: int, windows: list[int], grid: int) -> list[Window]:
         s, n_v, entries = stride(half_width, self.hop), self.model.layout.n_v, self.rows.size
-        kept = self._kept(self.state.thinned, half_width, s, windows[0], self._entries)
+        kept = self._sampling.kept(self.state.thinned, half_width, s, windows[0], self._entries)
         phi, phi_dot = self._phi[s]
         width = COPIES * (entries + n_v)
         out = []
-        for window, values in zip(windows, self._seen(kept, half_width, windows, self._columns), strict=True):
+        for window, values in zip(windows, self._sampling.seen(kept, half_width, windows, self._columns), strict=True):
             weak = -(phi_dot @ values[:, :width] + phi @ values[:, width : 2 * width]).reshape(COPIES, -1)
             b = (phi @ values[:, 2 * width :]).reshape(COPIES, -1) - weak[:, entries:]
             last = grid + window + self.width + self.lead
@@ -282,7 +265,8 @@ class MomentumBalance(Stage):
         phi, _ = self._phi[1]
         windows = [row.start * self.half_hop for row in rows]
         parts = np.cumsum([COPIES * (self._rough.size + self.model.layout.n_v), 2 * self.rough.rows.size])
-        kept = self._kept(self.state.dense, half_width, 1, windows[0], int(parts[-1]) + self.rough.dry.size)
+        entries = int(parts[-1]) + self.rough.dry.size
+        kept = self._sampling.kept(self.state.dense, half_width, 1, windows[0], entries)
         offset = self.model.layout.n_base_positions - self.model.layout.n_base_speeds
         motor_of = np.searchsorted(self._motors, self.rough.motors + offset)
         # Entries of columns and slopes by laws of dry friction: at a standstill their sign is noise's, not friction's.
@@ -290,7 +274,7 @@ class MomentumBalance(Stage):
             places[:, None] == self.rough.dry for places in (self._physical[self._rough], self.rough.coefficients)
         ]
         out = []
-        seen = self._seen(kept, half_width, windows, self._rough_columns)
+        seen = self._sampling.seen(kept, half_width, windows, self._rough_columns)
         for window, row, values in zip(windows, rows, seen, strict=True):
             columns, slopes, breaking = np.split(values, parts, axis=1)
             still = self._standstill.at(np.arange(window, window + self.width + 1) + self.lead)[:, motor_of]
@@ -309,42 +293,12 @@ class MomentumBalance(Stage):
             out.append(replace(row, Y=Y, b=row.b - weak[:, self._rough.size :], rough=rough, rest=rest, moment=moment))
         return out
 
-    def _kept(self, kept: dict[int, _Smoothed], half_width: int, step: int, first: int, entries: int) -> _Smoothed:
-        """Smoothed samples of this half width that windows from sample `first` on need too."""
-        smoothed = kept.get(half_width)
-        if smoothed is None or smoothed.first + len(smoothed.columns) * step < first:
-            smoothed = kept[half_width] = _Smoothed(step, first, np.empty((0, entries)))
-        skip = max(0, (first - smoothed.first) // step)
-        smoothed.columns = smoothed.columns[skip:]
-        smoothed.first += skip * step
-        return smoothed
-
-    def _seen(self, kept: _Smoothed, half_width: int, windows: list[int], evaluate: _Evaluation) -> Iterator[Array]:
-        """For each window the columns at all its samples of a step (width / step + 1, entries)."""
-        step, known = kept.step, kept.first + len(kept.columns) * kept.step
-        s = stride(half_width, self.hop)
-        # Samples that the filter ends too late for, by their distance from the window's end: s of them share a width.
-        tail = np.arange((half_width - self.margin - 1) // s, -1, -1) * s
-        within = np.arange(s - step, -1, -step)
-        ends = np.array(windows) + self.width
-        fresh = np.arange(known, ends[-1] + step - tail.size * s, step)
-        late = [((ends - d - within[:, None]).ravel(), self.margin + d) for d in tail.tolist()]
-        *before, last = np.split(fresh, np.arange(PIECE, fresh.size, PIECE))
-        pieces = [*([(piece, half_width)] for piece in before), [(last, half_width), *late]]
-        columns = np.concatenate([evaluate(piece) for piece in pieces])
-        kept.columns = np.concatenate((kept.columns, columns[: fresh.size]))
-        tails = columns[fresh.size :].reshape(tail.size * within.size, len(windows), columns.shape[1])
-        count = self.width // step + 1 - len(tails)
-        for k, window in enumerate(windows):
-            begin = (window - kept.first) // step
-            yield np.concatenate((kept.columns[begin : begin + count], tails[:, k]))
-
     @property
     def _entries(self) -> int:
         n_v = self.model.layout.n_v
         return COPIES * (2 * self.rows.size + 3 * n_v)
 
-    def _columns(self, samples: _Samples) -> Array:
+    def _columns(self, samples: Samples) -> Array:
         """P and G, each of the base parameters, packed, and of what is known, and Q, for every copy: (K, entries).
 
         Rough forces are zero there.
@@ -359,7 +313,7 @@ class MomentumBalance(Stage):
         force = self.model.generalized_force(torque.swapaxes(0, 1).reshape(-1, torque.shape[2]))
         return np.concatenate((*packed, force.reshape(K, -1)), axis=1)
 
-    def _rough_columns(self, samples: _Samples) -> Array:
+    def _rough_columns(self, samples: Samples) -> Array:
         """G of rough forces alone, likewise, their slopes, and what breaks them loose: (K, entries)."""
         x, v, signals = self._states(samples)
         own, K = self._distinct(x, v, signals)
@@ -369,7 +323,7 @@ class MomentumBalance(Stage):
         by_law = self.rough.slopes(*measured, change), self.rough.breaking(*measured)
         return np.concatenate((self._packed(force, self._rough, K), *by_law), axis=1)
 
-    def _change(self, samples: _Samples, v: Array) -> Array:
+    def _change(self, samples: Samples, v: Array) -> Array:
         """What the rates of joints with rough forces change by from the sample before (K, n_v), of the motion v."""
         layout, before = self.model.layout, self.lead - self.state.first
         speeds = np.unique(self.rough.coordinates)

@@ -2,11 +2,8 @@
 
 Weights follow from the sensors' noise and the parameters. Weights from residuals would collapse where noise is high.
 
-The parameters come from the fit itself. The first windows that move are held back and fitted, without weights and then
-with them; later the weights follow the estimate. A start that is 70 % off gives the same answer. With many parameters
-such a fit may leave more than noise. Then it starts from the described values, and these stay in the weights until the
-rows determine better ones. Where that leaves more than noise too, the model lacks something, and the weights come from
-the fit of `criterion`, which does not shrink the parameters to zero.
+The parameters come from the fit itself. The first windows that move are held back and fitted, see `first_weights`;
+later the weights follow the estimate.
 
 Where rows leave clearly more than noise, the excess counts as an error of each row's own. Whitening would otherwise
 subtract neighbouring rows from each other, which share nearly all of their noise but not what the model lacks.
@@ -15,18 +12,17 @@ subtract neighbouring rows from each other, which share nearly all of their nois
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 
 import msgspec
 import numpy as np
-from numpy.typing import NDArray
 
 from sms_online.model.base_parameters import BaseParameters
 from sms_online.model.model import Model
 from sms_online.pipeline.beforehand import Beforehand, fitted
-from sms_online.pipeline.criterion import Columns, RowGrams, minimum
+from sms_online.pipeline.criterion import Columns
 from sms_online.pipeline.description import described
 from sms_online.pipeline.drift_line import DriftLine
+from sms_online.pipeline.first_weights import FirstWeights
 from sms_online.pipeline.latency import SourceGroup
 from sms_online.pipeline.momentum_balance import MomentumBalance
 from sms_online.pipeline.momentum_windows import (
@@ -37,9 +33,9 @@ from sms_online.pipeline.momentum_windows import (
     Window,
 )
 from sms_online.pipeline.plain_rows import PlainRows
-from sms_online.pipeline.second_order import SecondOrderNoise, beyond_first_order, rounding, size
+from sms_online.pipeline.second_order import RowErrors, beyond_first_order, size
 from sms_online.pipeline.sensor_noise import SensorNoise
-from sms_online.pipeline.smoothing import HALF_WIDTHS
+from sms_online.pipeline.white_rows import WhiteRows
 from sms_online.pipeline.window_noise import WindowNoise
 from sms_online.pipeline.window_whitening import WhitenedWindow, WindowWhitening
 from sms_online.state import Stage, State
@@ -51,20 +47,11 @@ FIRST_MOTION = 1.6
 LEAST_MOTION = 0.4
 # What is held back at most, s; the oldest goes, for an arm at rest gives no information.
 HELD_BACK = 16.0
-# Weighted fits of the windows held back before their rows are handed on.
-PASSES = 2
-# The same from described values. A second one would follow what noise in the columns does to few windows.
-PASSES_DESCRIBED = 1
-# A fit of few windows determines a parameter that is so many standard deviations from zero.
-DETERMINED = 3.0
 # A window moves when a coordinate spans this many σ in it; noise alone spans 6.
 MOTION = 20.0
 # Multiple of the square of one sample of what noise does beyond first order in a row that estimates its variance in
 # the row's own covariance.
 UNSTEADY = 4.0
-# Windows of one filter's width over which the square of such a sample is averaged. The samples of windows that overlap
-# are nearly one, so a mean over few of them follows its own luck: rows in which it is low would be trusted too much.
-MOST_SAMPLES = 100
 # Time from one check of the weights to the next, s: it doubles from the first to the latest.
 FIRST_RENEWAL = 1.0
 LATEST_RENEWAL = 4.0
@@ -81,33 +68,6 @@ SAME_MISFIT = 0.1
 WARM_UP = 3.2
 # Windows whose rows are made together.
 TOGETHER = 64
-# Singular values below this share of the largest, of columns scaled to unit length, are not solved for.
-RANK_TOLERANCE = 1e-10
-
-
-@dataclass(frozen=True)
-class WhiteRows:
-    """Rows of one window, n_v of them: Y (n_v, m + n + 1), [N Y b], independent, errors of unit variance.
-
-    N holds the columns of what the description may be wrong in, see `calibration`. noisy (2, n_v, m + n + 1): the same
-    with synthetic noise added and subtracted, but in N. raw (n_v, m + n + 1): the rows as they were,
-    with their own covariance (n_v, n_v), of which noise is the part that the sensors make. end: grid index of the
-    window's last sample. late (n_v, G): columns of the sources' latencies, independent like Y. misfit (n_v,): what the
-    model lacks in each row, over the variance of its noise, as far as it is in the covariance. ramp (n_v, n):
-    columns of the parameters' rates about the window's centre, independent like Y; none where nobody asked. drift: the
-    known drift there, of which b is free.
-    """
-
-    Y: Array
-    noisy: Array
-    raw: Array
-    covariance: Array
-    noise: Array
-    end: int
-    late: Array
-    misfit: Array
-    ramp: Array
-    drift: DriftLine | None = None
 
 
 class MomentumFitState(State):
@@ -116,15 +76,12 @@ class MomentumFitState(State):
     moving: windows with motion since the segment began. since: windows since the weights were checked; renewal:
     windows from one check to the next. warm: windows that the whitening to come has received, None where none is to
     come. held: windows held back. last: first instant that a window to come asks for, at least; x, v, signals: states
-    at the instants from number `first` on. sampled: windows behind the second-order noise, by the filter's half width.
-    largest (n_v,): largest sum of a row's terms.
+    at the instants from number `first` on.
     """
 
     x: Array
     v: Array
     signals: Array
-    sampled: dict[int, int]
-    largest: Array
     moving: int = 0
     since: int = 0
     renewal: int = 0
@@ -171,14 +128,17 @@ class MomentumFit(Stage):
         self._balance = balance
         self._solve, self._drift = solve, drift
         self._beforehand = beforehand if beforehand is not None else lambda: Beforehand.none(self._nuisances + base.n)
+        self.torque = np.isin(np.arange(model.layout.n_v), model.layout.theta_m)
+        nominal = base.values(model.nominal)
+        self._first_weights = FirstWeights(nominal, self._calibration, self.columns, self.torque, self._beforehand)
         self._new_noise, self._sources = new_noise, sources
         self.whitening = self._new_whitening()
         self._next: WindowWhitening | None = None  # with new weights; takes over when it has received enough windows
         layout = model.layout
         widths = (layout.n_x, layout.n_v, len(layout.q) + model.n_states)
         x, v, signals = (np.empty((0, columns)) for columns in widths)
-        self.state = MomentumFitState(x, v, signals, dict.fromkeys(HALF_WIDTHS, 0), np.zeros(layout.n_v))
-        self._second_order = SecondOrderNoise({half_width: np.zeros(layout.n_v) for half_width in HALF_WIDTHS})
+        self.state = MomentumFitState(x, v, signals)
+        self._errors = RowErrors(layout.n_v)
         self.plain = PlainRows.none(layout.n_v, self._nuisances + base.n)
 
     def renew(self) -> None:
@@ -235,81 +195,6 @@ class MomentumFit(Stage):
         self.whitening.begin(weights, noise, self.plain.misfit, self.state.first)
         self.state.renewal = self._count(FIRST_RENEWAL)
 
-    def flush(self, noise: SensorNoise) -> list[WhiteRows]:
-        """Fit the windows held back, without weights and then with those of the fit before, and return their rows."""
-        self.state.moving = 0
-        unweighted, _ = _least_squares(np.concatenate(self._balance.dense(self.state.held)[:, 0]))
-        weights = self._iterated(unweighted, noise, PASSES, partly=False)
-        if self.plain.misfit.any():
-            misfit, nominal = self.plain.misfit, self.base.values(self.model.nominal)
-            described = self._iterated(nominal, noise, PASSES_DESCRIBED, partly=True)
-            if self.plain.misfit.sum() < misfit.sum():
-                weights = described
-            if self.plain.misfit.any() and misfit.any():
-                weights = self._scale_free([unweighted, nominal], noise)
-        self._restart(weights, noise)
-        out = self._white(self.state.held)
-        self.state.since = 0
-        self.state.renewal = self._count(FIRST_RENEWAL)
-        self.state.held = []
-        return out
-
-    def _iterated(self, weights: Array, noise: SensorNoise, passes: int, partly: bool) -> Array:
-        """Weights (n,) from fits of the windows held back, each with those of the fit before.
-
-        weights: of the first fit. partly: they take what the rows determine, and keep the rest.
-        """
-        self.plain.misfit = np.zeros(self.model.layout.n_v)
-        for _ in range(passes):
-            self._restart(weights, noise)
-            white = [rows.Y for rows in self._white(self.state.held)]
-            white += [self._calibration] if len(self._calibration) else []
-            fitted, determined = _least_squares(np.concatenate(white))
-            beta, known = fitted[self._nuisances :], determined[self._nuisances :]
-            self.plain.judge(fitted)
-            weights = np.where(known, beta, weights) if partly else beta
-        return weights
-
-    def _scale_free(self, starts: list[Array], noise: SensorNoise) -> Array:
-        """Weights (n,) from fits of the windows held back by `criterion`, first of the rows as they are.
-
-        Weights that follow a least-squares fit of rows that hold more than noise would shrink π to zero.
-        """
-        n_v, m = self.model.layout.n_v, self._nuisances
-        grams = RowGrams.none(n_v, m + self.base.n)
-        for rows in self._balance.dense(self.state.held):
-            padded = np.pad(rows, ((0, 0), (0, 0), (m, 0)))
-            grams.add(padded[0], padded[1:])
-        lacking = np.ones(n_v, dtype=np.bool_)
-        starts = [np.pad(start, (m, 0)) for start in starts]
-        for _ in range(PASSES):
-            joint = self._least(grams, lacking, starts)
-            # What the rows leave of the new weights' noise, and the rows whitened with it.
-            for _ in range(2):
-                self._restart(joint[m:], noise)
-                white = self._white(self.state.held)
-                self.plain.judge(joint)
-            grams = RowGrams.none(n_v, m + self.base.n)
-            for each in white:
-                grams.add(each.Y, each.noisy)
-            lacking, starts = self.plain.misfit > 0.0, [joint]
-        return self._least(grams, lacking, starts)[m:]
-
-    def _least(self, grams: RowGrams, lacking: NDArray[np.bool_], starts: list[Array]) -> Array:
-        """Nuisances and β (m + n,) of the minimum as far as the rows determine them, else the described values.
-
-        Noise that follows a parameter which rows do not determine may be any.
-        """
-        found = minimum(grams, lacking, self.torque, starts, self.columns, self._beforehand())
-        determined = np.abs(found.beta) > DETERMINED * np.sqrt(np.diag(found.covariance))
-        determined[: self._nuisances] = True
-        return np.where(determined, found.beta, np.pad(self.base.values(self.model.nominal), (self._nuisances, 0)))
-
-    @property
-    def torque(self) -> NDArray[np.bool_]:
-        """Which speeds' rows hold a torque (n_v,)."""
-        return np.isin(np.arange(self.model.layout.n_v), self.model.layout.theta_m)
-
     @property
     def weights(self) -> Array | None:
         """β (n,) behind the weights, None while there are none."""
@@ -319,6 +204,21 @@ class MomentumFit(Stage):
     def _known_weights(self) -> Array:
         assert self.weights is not None
         return self.weights
+
+    def flush(self, noise: SensorNoise) -> list[WhiteRows]:
+        """Fit the windows held back, and return their rows."""
+        self.state.moving = 0
+        held = self.state.held
+
+        def white(weights: Array) -> list[WhiteRows]:
+            self._restart(weights, noise)
+            return self._white(held)
+
+        out = white(self._first_weights.of(self._balance.dense(held), self.plain, white))
+        self.state.since = 0
+        self.state.renewal = self._count(FIRST_RENEWAL)
+        self.state.held = []
+        return out
 
     def _count(self, seconds: float) -> int:
         """Windows that begin in so many seconds."""
@@ -378,10 +278,7 @@ class MomentumFit(Stage):
     def _restart(self, weights: Array, noise: SensorNoise) -> None:
         """Whiten from the first of the windows held back again, with weights β (n,)."""
         self.plain.clear()
-        self.state.sampled = dict.fromkeys(HALF_WIDTHS, 0)
-        self.state.largest = np.zeros_like(
-            self.state.largest
-        )  # a fit that fails may have made them larger than any row is
+        self._errors.begin()
         self.whitening.begin(weights, noise, self.plain.misfit, self.state.first)
         self._extend()
 
@@ -410,7 +307,8 @@ class MomentumFit(Stage):
         ramp = (centres * rows[:, 0, :, :-1] + moments)[..., : self._ramps]
         weights, misfit = self._known_weights, self.whitening.misfit
         samples = beyond_first_order(rows, weights)
-        errors = self._errors(windows, samples, size(rows[:, 0], weights))
+        widths = [window.half_width for window in windows]
+        errors = self._errors.push(widths, samples, size(rows[:, 0], weights))
         columns = np.concatenate((rows.swapaxes(1, 2).reshape(W, n_v, -1), ramp), axis=2)
         whitened = self._whiten(windows, columns, errors)
         raw, noisy = rows[:, 0], 0.5 * (rows[:, 1] - rows[:, 2])
@@ -447,21 +345,6 @@ class MomentumFit(Stage):
             )  # fmt: skip
         return out
 
-    def _errors(self, windows: Sequence[Window], samples: Array, sizes: Array) -> Array:
-        """Variance (W, n_v) of rows by what noise does beyond first order, and by rounding.
-
-        samples (W, n_v): of the former. sizes (W, n_v): sums of the rows' terms.
-        """
-        out = np.empty_like(samples)
-        means = self._second_order.means
-        for own, window, sample, terms in zip(out, windows, samples, sizes, strict=True):
-            M = window.half_width
-            self.state.sampled[M] = min(self.state.sampled[M] + 1, MOST_SAMPLES)
-            means[M] = means[M] + (sample**2 - means[M]) / self.state.sampled[M]
-            self.state.largest = np.maximum(self.state.largest, terms)
-            own[:] = self._second_order.variance(M) + rounding(self.state.largest)
-        return out
-
     def _centres(self, windows: Sequence[Window]) -> Array:
         """Centres of windows (W, 1, 1), s of the grid."""
         ends = np.array([window.end for window in windows])[:, None, None]
@@ -493,17 +376,3 @@ class MomentumFit(Stage):
         if self.weights is not None:
             for whitening in self._whitenings:
                 whitening.noise.drop(needed)
-
-
-def _least_squares(rows: Array) -> tuple[Array, NDArray[np.bool_]]:
-    """Least-squares solution (n,) of rows [Y b] (M, n + 1) of unit variance, and where they determine it.
-
-    Of minimum norm in units of the columns' sizes.
-    """
-    size = np.linalg.norm(rows, axis=0)
-    scale = np.where(size[:-1] > 0.0, size[:-1], 1.0)
-    U, S, Vt = np.linalg.svd(rows[:, :-1] / scale, full_matrices=False)
-    known = RANK_TOLERANCE * S[0] < S
-    solution = Vt[known].T @ ((U[:, known].T @ rows[:, -1]) / S[known])
-    spread = np.linalg.norm(Vt.T / np.maximum(S, RANK_TOLERANCE * S[0]), axis=1)
-    return solution / scale, np.abs(solution) > DETERMINED * spread

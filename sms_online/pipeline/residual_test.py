@@ -25,8 +25,8 @@ from sms_online.calibration.nuisance import BOUND, Nuisance
 from sms_online.calibration.release import release_gain
 from sms_online.model.layout import Layout
 from sms_online.pipeline.latency import WANDER
-from sms_online.pipeline.momentum_fit import WhiteRows
 from sms_online.pipeline.momentum_windows import HOPS
+from sms_online.pipeline.white_rows import WhiteRows
 from sms_online.row_types import row_types
 from sms_online.state import Stage, State
 from sms_online.stream import Array

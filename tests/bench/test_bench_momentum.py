@@ -62,7 +62,7 @@ def test_samples_a_second(name: str, seconds: float, rate: float) -> None:
         estimator = estimated(system, blocks)
         best = min(best, process_time() - start)
     assert estimator.by_momentum
-    windows = 0 if estimator.momentum is None else estimator.momentum.grams.windows
+    windows = 0 if estimator.momentum is None else estimator.momentum.joint.grams.windows
     print(f"\n{name}: {samples} samples, {windows} windows, {samples / best:,.0f} samples/s ({best:.2f} s)")
 
 

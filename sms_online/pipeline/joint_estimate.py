@@ -1,0 +1,112 @@
+"""Nuisances and parameters together, from a session's white rows.
+
+Least squares free of what noise in the columns does, beside the tolerances; where rows leave more than noise, the
+criterion that does not shrink the parameters to zero.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from sms_online.calibration.nuisance import Nuisance, bound_rows, known_beforehand, prior_rows
+from sms_online.calibration.release import released
+from sms_online.model.base_parameters import BaseParameters
+from sms_online.model.model import Model
+from sms_online.pipeline.beforehand import Beforehand
+from sms_online.pipeline.criterion import RowGrams, ScaleFree
+from sms_online.pipeline.errors_in_variables import NoiseBias, unbiased
+from sms_online.pipeline.momentum_fit import MomentumFit
+from sms_online.pipeline.white_rows import WhiteRows
+from sms_online.state import Stage, State, state_copy
+from sms_online.stream import Array
+from sms_online.trackers.information import Information
+from sms_online.trackers.interface import Estimate, Prior, Rows, Tracker, prior_factor
+from sms_online.trackers.square_root import session_tracker
+
+
+class JointEstimateState(State):
+    """What a joint estimate keeps beside its sums.
+
+    known (k, m + n + 1): what is known from before an event, as rows [N Y b] of unit variance. misfit (n_v,): behind
+    the rows that came last.
+    """
+
+    known: Array
+    misfit: Array
+
+
+class JointEstimate(Stage):
+    """Sums of one session's rows [N Y b], from one event to the next.
+
+    prior: of the parameters, None where there is none. tracker: fed with rows of unit variance, all of which count
+    alike. bias: what noise in the columns does to its estimate. grams: sums of rows by generalized speed, for an
+    estimate where they leave more than noise.
+    """
+
+    def __init__(self, model: Model, base: BaseParameters, nuisances: Sequence[Nuisance], prior: Prior | None) -> None:
+        self._nuisances, self._prior = tuple(nuisances), prior
+        self._n, self._n_v = base.n, model.layout.n_v
+        self._calibration = prior_rows(self._nuisances, base.n)
+        self.tracker: Tracker = session_tracker(base.n, prior, len(self._nuisances))
+        if self._nuisances:
+            self.tracker.begin(known_beforehand(self._nuisances, base.n))
+        self.bias, self.grams = self._new_sums()
+        self.state = JointEstimateState(np.zeros((0, len(self._nuisances) + base.n + 1)), np.zeros(self._n_v))
+
+    def _new_sums(self) -> tuple[NoiseBias, RowGrams]:
+        columns = len(self._nuisances) + self._n
+        return NoiseBias.none(columns, self._calibration), RowGrams.none(self._n_v, columns)
+
+    def begin_behind_event(self, known: Information, bias: NoiseBias) -> None:
+        """Go on with what is known from before an event, and what noise in the columns did by then."""
+        bias.widen(len(self._nuisances) + self._n - bias.parameters)
+        self.bias, self.state.known = bias, known.factor
+        self.tracker.begin(known)
+
+    def begin_drift(self, known: Information) -> None:
+        """Forget the sums of rows that took parameters for constant; the tracker goes on."""
+        self.bias, self.grams = self._new_sums()
+        self.state.known = known.factor
+
+    def add(self, rows: WhiteRows, t: float) -> None:
+        """Take in the rows of a window that ends at t, s."""
+        M = rows.Y.shape[0]
+        self.tracker.update(Rows(rows.Y[:, :-1], rows.Y[:, -1], np.ones(M), np.full(M, t)))
+        self.bias.add(rows.Y, rows.noisy)
+        if np.any(rows.misfit != self.state.misfit):
+            # Rows that were whitened as if the model lacked less must not outweigh those to come.
+            self.grams.weaken(np.minimum(1.0, (1.0 + self.state.misfit) / (1.0 + rows.misfit)))
+            self.state.misfit = rows.misfit
+        self.grams.add(rows.Y, rows.noisy)
+
+    def estimate(self, fit: MomentumFit) -> Estimate:
+        """The nuisances, then the base parameters; fit: that the rows come from."""
+        estimate, scale_free = self.tracker.estimate(), self.scale_free(fit)
+        if scale_free is not None:
+            return scale_free.estimate(estimate)
+        return released(unbiased(estimate, self.bias), self._nuisances, estimate.covariance)
+
+    def row_variance(self, fit: MomentumFit) -> float:
+        """Mean square of what the rows leave, in units of their predicted variance."""
+        estimate = self.estimate(fit)
+        return estimate.rss / max(estimate.dof, 1.0) * (1.0 + float(fit.plain.misfit.mean()))
+
+    def scale_free(self, fit: MomentumFit) -> ScaleFree | None:
+        """Where rows leave more than noise, what gives the estimate in place of least squares."""
+        if not fit.plain.misfit.any() or self.grams.windows == 0:
+            return None
+        assert fit.weights is not None
+        weights = np.pad(fit.weights, (len(self._nuisances), 0))
+        lacking = fit.plain.misfit > 0.0
+        known, unscaled = self.beforehand(), self._prior is None
+        return ScaleFree(state_copy(self.grams), lacking, fit.torque, weights, fit.columns, known, unscaled)
+
+    def beforehand(self) -> Beforehand:
+        """What is known of nuisances and parameters beside the rows; tolerances may be released, within bounds."""
+        known = np.pad(prior_factor(self._prior, self._n), ((0, 0), (len(self._nuisances), 0)))
+        may = np.array([each.may_give_way for each in self._nuisances if np.isfinite(each.tolerance)], dtype=np.bool_)
+        bounds = bound_rows(self._nuisances, self._n)
+        certain = np.concatenate((self.state.known, self._calibration[~may], bounds, known))
+        return Beforehand(certain, self._calibration[may])

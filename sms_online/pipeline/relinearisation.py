@@ -1,0 +1,149 @@
+"""The momentum balance about a point of the nuisances that follows what samples show, see `linearisation`.
+
+Samples wait until the noise of the sensors is known, are corrected by the point, and go to the balance. Where its
+estimate of the nuisances is far from the point, that moves, and a new balance gets all samples so far once more.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from dataclasses import replace
+
+import msgspec
+
+from sms_online.calibration.columns import nuisances
+from sms_online.model.base_parameters import BaseParameters
+from sms_online.model.model import Model
+from sms_online.pipeline.changes import Adoption
+from sms_online.pipeline.linearisation import Linearisation
+from sms_online.pipeline.momentum import Momentum
+from sms_online.pipeline.momentum_fit import FIRST_MOTION
+from sms_online.pipeline.momentum_windows import HOPS
+from sms_online.pipeline.sensing import Sensing
+from sms_online.pipeline.sensor_noise import NoiseEstimate, SensorNoise
+from sms_online.pipeline.synchronise import GridSamples
+from sms_online.state import Stage, State
+from sms_online.stream import Array
+from sms_online.trackers.interface import Prior
+
+# Frequency that a window lets pass best, times its length.
+PASS_BAND = 2.0
+# Time from one estimate of the sensors' noise to the next, s.
+NOISE_RENEWED = 1.0
+# Mean square of rows over their predicted variance up to which nuisances of first order explain what they hold.
+EXPLAINED = 1.5
+
+
+class RelinearisationState(State):
+    """What comes before the balance.
+
+    noise: of the sensors, as estimated at grid index `noise_at`. waiting: samples, until it is known. start_time: of
+    grid index 0, s.
+    """
+
+    noise: SensorNoise | None = None
+    noise_at: int = 0
+    waiting: list[GridSamples] = msgspec.field(default_factory=list)
+    start_time: float = float("nan")
+
+
+class Relinearisation(Stage):
+    """Hands corrected samples to a momentum balance, and begins another one where the correction changes.
+
+    momentum: the balance of now. changed: called where other parameters come to be estimated.
+    """
+
+    def __init__(self, model: Model, base: BaseParameters, sensing: Sensing, changed: Callable[[], None]) -> None:
+        system = model.system
+        self._described, self._sensing, self._changed = (model, base), sensing, changed
+        self._nuisances = nuisances(sensing)
+        self._prior: Prior | None = None
+        span = system.windows.momentum
+        self._estimate = NoiseEstimate(sensing, system.sample_rate, PASS_BAND / span)
+        self._renewed = round(NOISE_RENEWED * system.sample_rate)
+        first = round(FIRST_MOTION * HOPS / span)
+        self.linearisation = Linearisation(sensing, self._nuisances, system.sample_rate, first)
+        self.momentum = self._new_momentum()
+        self.state = RelinearisationState()
+
+    def _new_momentum(self) -> Momentum:
+        return Momentum(*self._described, self._sensing, self._nuisances, self._prior, self._point, self._changed)
+
+    def _point(self) -> Array:
+        """Nuisances (m,) that samples are corrected by."""
+        return self.linearisation.point
+
+    def set_prior(self, prior: Prior) -> None:
+        """Add what is known of the base parameters beforehand as a prior; before the first sample."""
+        self._prior = prior
+        self.momentum = self._new_momentum()
+
+    def observe(self, t: Array, values: Array) -> None:
+        """Take the channels' own samples (B, channels) at t (B,), NaN where there is none, to estimate their noise."""
+        self._estimate.push(t, values)
+
+    def push(self, piece: GridSamples, start_time: float, periods: Array) -> None:
+        """Take grid samples of the channels, followed by internal states of effects.
+
+        start_time: s of grid index 0. periods (channels,): sample periods, s.
+        """
+        now = self.state
+        now.start_time = start_time
+        now.waiting.append(piece)
+        if (now.noise is None or piece.index[-1] >= now.noise_at + self._renewed) and self._estimate.ready:
+            now.noise, now.noise_at = self._estimate.noise(periods), int(piece.index[-1])
+        if now.noise is None:
+            return
+        waiting, now.waiting = now.waiting, []
+        for each in waiting:
+            self._advance(self.linearisation.push(each), now.noise)
+            self._look(now.noise, last=False)
+
+    def finish(self, periods: Array) -> None:
+        """End of the session: fit what is still held back."""
+        now = self.state
+        if now.noise is None and now.waiting and self._estimate.ready:
+            now.noise = self._estimate.noise(periods)
+        if now.noise is not None:
+            self.momentum.end_segment(now.noise)
+            self._look(now.noise, last=True)
+            self.momentum.finish(now.noise)
+
+    def adopt(self, adoption: Adoption) -> None:
+        """Go on with effects that the model lacked, see `Changes.adopt`; rows are there already."""
+        assert self.state.noise is not None
+        for samples in self.linearisation.corrected(adoption.samples):
+            adoption = replace(adoption, samples=samples)
+        self.momentum.adopt(adoption, self.state.noise)
+
+    def _advance(self, corrected: Iterable[GridSamples], noise: SensorNoise) -> None:
+        for piece in corrected:
+            self.momentum.push(piece, noise, self.state.start_time)
+
+    def _look(self, noise: SensorNoise, last: bool) -> None:
+        """Now and then, where the estimate is far from the point that rows are linear about: go there."""
+        if self.momentum.changes.events or self.momentum.changes.shifts:
+            # No one point is that of the samples before and after.
+            self.linearisation.forget()
+        if not self.momentum.started or not self.linearisation.looks(self.momentum.fit.plain.windows, last):
+            return
+        # Where rows hold more than noise and errors of calibration, these look like what the model lacks.
+        if self.momentum.row_variance > EXPLAINED:
+            return
+        before, weights = self.linearisation.point, self.momentum.weights
+        while self.linearisation.moves(self.momentum.joint_estimate):
+            self._make_rows_again(self.momentum.weights, noise, last)
+            if self.momentum.row_variance > EXPLAINED:
+                self.linearisation.go_back(before)
+                self._make_rows_again(weights, noise, last)
+                self.linearisation.forget()
+                return
+            before, weights = self.linearisation.point, self.momentum.weights
+
+    def _make_rows_again(self, weights: Array, noise: SensorNoise, last: bool) -> None:
+        """All rows of the session so far, about the point of now, with weights β (n,) that are known."""
+        self.momentum = self._new_momentum()
+        self.momentum.fit.go_on(weights, noise)
+        self._advance(self.linearisation.again(), noise)
+        if last:
+            self.momentum.end_segment(noise)
