@@ -155,13 +155,15 @@ class CandidateColumns:
         joints = [int(where.removeprefix("joint_")) - 1] if where.startswith("joint_") else range(len(layout.q))
         offset = layout.n_base_positions - layout.n_base_speeds
         theta_m, q = np.array(layout.theta_m)[list(joints)], np.array(layout.q)[list(joints)]
-        speed = deflection = 0.0
-        for motion, _ in self.rows.weak.motions():
-            speed = max(speed, float(np.abs(motion.v[:, theta_m]).max()))
-            deflection = max(deflection, float(np.abs(motion.x[:, theta_m + offset] - motion.x[:, q + offset]).max()))
+        motions = [motion for motion, _ in self.rows.weak.motions()]
+        speed = max(float(np.abs(motion.v[:, theta_m]).max()) for motion in motions)
+        angles = [motion.x[:, theta_m + offset] for motion in motions]
+        swing = float(np.ptp(np.concatenate(angles), axis=0).max())
+        pairs = zip(angles, motions, strict=True)
+        deflection = max(float(np.abs(angle - motion.x[:, q + offset]).max()) for angle, motion in pairs)
         rate = self.system.sample_rate
         longest = max(segment.index.size for segment in self.rows.segments[self._since :])
-        return Ranges(speed, deflection, longest / rate, rate)
+        return Ranges(speed, swing, deflection, longest / rate, rate)
 
     def of(self, effect: Effect) -> Candidate:
         """The candidate of one declaration."""

@@ -22,6 +22,7 @@ from sms_online.effects.friction import (
     CoulombFriction,
     DirectionFriction,
     LoadFriction,
+    PreslidingFriction,
     StribeckFriction,
     ViscousFriction,
 )
@@ -35,9 +36,9 @@ from sms_online.errors import InputError
 from sms_online.model.effect import ForceEffect, InertiaEffect
 
 FORCES = (
-    CoulombFriction, ViscousFriction, StribeckFriction, LoadFriction, DirectionFriction, TorsionalHysteresis,
-    CubicStiffness, Backlash, KinematicError, Cogging, TorqueRipple, LinkDamping, LinkMassDamping, ReactionWheel,
-    ThrusterLeak, TableTilt, AirDrag, CableSpring, Slosh, TorqueGain, TorqueOffset,
+    CoulombFriction, ViscousFriction, StribeckFriction, PreslidingFriction, LoadFriction, DirectionFriction,
+    TorsionalHysteresis, CubicStiffness, Backlash, KinematicError, Cogging, TorqueRipple, LinkDamping, LinkMassDamping,
+    ReactionWheel, ThrusterLeak, TableTilt, AirDrag, CableSpring, Slosh, TorqueGain, TorqueOffset,
     LearnedForce,
 )  # fmt: skip
 CHANNELS = (EncoderOffset, EncoderEccentricity, SensorLag, TorqueDelay)
@@ -60,10 +61,10 @@ _CHANNELS: dict[str, Callable[[str, Mapping[str, float]], ChannelEffect]] = {eac
 # Linear coefficients of those on channels, and what becomes a constant of the description.
 LINEAR: dict[str, tuple[Linear, ...]] = {each.entry.name: each.linear for each in CHANNELS}
 CONSTANTS: dict[str, type[Constant]] = {each.entry.name: each for each in _CLASSES if issubclass(each, Constant)}
-# Tried at any joint where something changes while a session runs.
 # Fewest knots of a curve, two of them its ends; and variables of joints with a spring.
 LEAST_KNOTS = 3
 OF_SPRINGS = ("deflection", "load")
+# Tried at any joint where something changes while a session runs.
 BEGINNING = tuple(sorted(entry.name for entry in ENTRIES.values() if entry.traits.begins))
 
 
