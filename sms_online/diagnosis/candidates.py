@@ -182,8 +182,8 @@ class CandidateColumns:
         return self._candidate(effect, parameters, self._force(model))
 
     @staticmethod
-    def _candidate(effect: Effect, parameters: Sequence[Parameter], columns: Array) -> Candidate:
-        return Candidate(effect, tuple(parameters), columns, traits_of(effect), is_constant(effect))
+    def _candidate(effect: Effect, parameters: Sequence[Parameter], columns: Array, bend: float = np.inf) -> Candidate:
+        return Candidate(effect, tuple(parameters), columns, traits_of(effect), is_constant(effect), bend)
 
     def _force(self, model: Model) -> Array:
         """Columns (W, n_v, c) of a model's last effect."""
@@ -370,7 +370,10 @@ class CandidateColumns:
                 response = sign * self.rows.responses[displacement][:, :, acts].sum(axis=2)
             columns.append(response)
             parameters.append(Parameter(f"{effect.name}@{effect.where}.{quantity}", quantity, unit, 0.0))
-        return self._candidate(effect, parameters, np.stack(columns, axis=2))
+        # An angle turns the arm by as much; a delay counts beside the time in which rows see the motion change.
+        span = self._weak.windows.width / self.system.sample_rate
+        late = any(each.unit == "s" for each in LINEAR[effect.name])
+        return self._candidate(effect, parameters, np.stack(columns, axis=2), 2.0 * np.pi / span if late else 1.0)
 
 
 def _law(effect: Effect) -> tuple[object, ...]:
