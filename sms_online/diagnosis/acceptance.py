@@ -90,7 +90,7 @@ class Acceptance(HeldOutRows):
 
     def _possible(self, k: int, solution: Array, own: Array) -> bool:
         candidate = self.candidates[k]
-        if not candidate.traits.plausible(own, self.rows.sample_rate):
+        if not candidate.traits.plausible(own, self.rows.sample_rate) or not candidate.first_order(own):
             return False
         if self._laws is None or not candidate.traits.limits:
             return True

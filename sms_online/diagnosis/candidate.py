@@ -35,6 +35,10 @@ class Candidate:
         """Share of its gain that a constant with coefficients (c,) leaves while it is subtracted to first order."""
         return min(1.0, (self.bend * float(np.linalg.norm(coefficients))) ** 2) if self.constant else 0.0
 
+    def first_order(self, coefficients: Array) -> bool:
+        """Whether it can be subtracted to first order with coefficients (c,): an angle of a radian cannot."""
+        return not (np.isfinite(self.bend) and self.left_over(coefficients) >= 1.0)
+
     @property
     def key(self) -> str:
         """name@where."""

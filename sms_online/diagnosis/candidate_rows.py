@@ -87,6 +87,8 @@ class CandidateRows:
         self._free = np.zeros((len(rows.b), HOPS, self._n_v))
         # Speeds whose rows have no such covariance, with these effects chosen.
         self._loud: tuple[frozenset[int], NDArray[np.bool_]] = frozenset(), np.zeros(self._n_v, dtype=np.bool_)
+        # Mean square that everything together left of the rows, and with which deviations.
+        self._explained = 0.0, rows.std
         self._whiten()
 
     def reweight(self, chosen: Sequence[int], solution: Array | None = None) -> bool:
@@ -132,14 +134,15 @@ class CandidateRows:
     def stays_loud(self, chosen: Sequence[int], k: int) -> bool:
         """Whether rows that a candidate acts on clearly leave more than noise with those chosen, this one last.
 
-        By what everything together leaves of them with the variance that they would have then.
+        By what everything together leaves of them with the variance that they would have then, see `_floor`.
         """
         acts = self._acts(k)
         if self._laws is None or not self.floor[acts].any():
             return False
         own, free = self._unmodelled(self._laws, chosen)
-        _, left = self._together(np.sqrt(self.rows.std**2 + own + free[:, 0]))
-        return bool(np.any(np.mean(left[:, acts] ** 2, axis=0) > CLEARLY * LARGEST_RATIO))
+        std = np.sqrt(self.rows.std**2 + own + free[:, 0])
+        squares = self._beside_fit(chosen, std)[2] if self.freed else np.mean(self._together(std)[1] ** 2, axis=0)
+        return bool(np.any(squares[acts] > CLEARLY * LARGEST_RATIO))
 
     def _whiten(self) -> None:
         """Whiten the rows with what the laws of the effects of the last `reweight` do not determine."""
@@ -198,19 +201,33 @@ class CandidateRows:
         As a share of that variance, and as a mean square; zero where it is little. Rows that leave more and hold no
         torque are homogeneous in π: what makes π small makes their residual small, which counts beside their terms.
         """
-        solution, left = self._together(self.std)
-        ratio = np.mean(left**2, axis=0)
+        solution, ratio = np.zeros(self.n_model), np.full(self._n_v, np.inf)
+        if not (self._scale.unknown and self._surely_more()):
+            solution, left = self._together(self.std)
+            ratio = np.mean(left**2, axis=0)
+            self._explained = float(ratio.mean()), self.std
         beyond = ratio > LARGEST_RATIO
         if beyond.any() and self._scale.unknown:
             # All candidates mimic the model's terms, which then say nothing of a scale; those found so far do not.
-            beside = np.concatenate([np.empty((*left.shape, 0)), *(self._plain[k] for k in self._beside)], axis=2)
-            solution, ratio, sized = self._scale.fit(self._plain_model, beside, self.rows.b / self.std)
+            solution, ratio, sized = self._beside_fit(self._beside, self.std)
+            self._scale.at = solution[: self.n_model]
             beyond = sized > LARGEST_RATIO
         lacking = np.maximum(0.0, (ratio - 1.0) * np.mean(self.std**2, axis=0))
         self._homogeneous = beyond & self._scale.homogeneous
         self._scale.free(beyond)
         self._usual = self._terms([], solution)
         return np.where(beyond, ratio - 1.0, 0.0), np.where(beyond, lacking, 0.0)
+
+    def _beside_fit(self, chosen: Sequence[int], std: Array) -> tuple[Array, Array, Array]:
+        """What the criterion free of scale makes of rows of deviations (W, n_v) with those chosen, see `Scale.fit`."""
+        beside = self.columns(chosen)[..., self.n_model :] / std[..., None]
+        return self._scale.fit(self._model / std[..., None], beside, self.rows.b / std)
+
+    def _surely_more(self) -> bool:
+        """Whether rows clearly leave more than noise whatever is added: with these deviations what they left with those
+        of the last fit of everything together can have fallen by their largest growth alone."""
+        least, std = self._explained
+        return bool(least * np.min((std / self.std) ** 2) > CLEARLY * LARGEST_RATIO)
 
     def _together(self, std: Array) -> tuple[Array, Array]:
         """Solution of the model with all candidates, and what that leaves of every row over its deviation (W, n_v)."""
@@ -289,7 +306,7 @@ class CandidateRows:
     def _plausible(self, candidate: Candidate, found: Gain) -> Gain:
         """The gain, none where the effect cannot have the coefficients."""
         possible = candidate.traits.plausible(found.coefficients, self.rows.sample_rate)
-        return found if possible else replace(found, gain=0.0)
+        return found if possible and candidate.first_order(found.coefficients) else replace(found, gain=0.0)
 
     def gain_of(self, candidate: Candidate, chosen: Sequence[int]) -> Gain:
         """What any candidate would take beside those chosen."""

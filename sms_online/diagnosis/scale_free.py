@@ -85,7 +85,7 @@ class ScaleFree:
 class Scale:
     """Whether anything fixes the scale of π in a session's rows, and which of them count by their size as nothing does.
 
-    at (n,): parameters about which these are linear, the last solution. freed: speeds whose rows count by their size,
+    at (n,): parameters that fits begin from and rows are linear about. freed: speeds whose rows count by their size,
     because they leave more than noise whatever is added.
     """
 
@@ -108,9 +108,8 @@ class Scale:
         """
         free, n = ScaleFree(Y, np.flatnonzero(self.homogeneous).tolist(), self._inertial), Y.shape[2]
         solution = free.solved(beside, b, self.at, self._expected, 1.0)
-        self.at = solution[:n]
         left = b - np.concatenate((Y, beside), axis=2) @ solution
-        return solution, np.mean(left**2, axis=0), free.squares(self.at, left, self._expected)
+        return solution, np.mean(left**2, axis=0), free.squares(solution[:n], left, self._expected)
 
     def near(self, white: Array) -> tuple[Array, Array]:
         """Rows (n, n) and right-hand side that keep what white columns (M, n) hardly determine at what is expected."""

@@ -61,6 +61,8 @@ _CHANNELS: dict[str, Callable[[str, Mapping[str, float]], ChannelEffect]] = {eac
 # Linear coefficients of those on channels, and what becomes a constant of the description.
 LINEAR: dict[str, tuple[Linear, ...]] = {each.entry.name: each.linear for each in CHANNELS}
 CONSTANTS: dict[str, type[Constant]] = {each.entry.name: each for each in _CLASSES if issubclass(each, Constant)}
+# Numbers of joints below this are one character of a pattern.
+TEN = 10
 # Fewest knots of a curve, two of them its ends; and variables of joints with a spring.
 LEAST_KNOTS = 3
 OF_SPRINGS = ("deflection", "load")
@@ -279,4 +281,9 @@ def _groups(system: System, entry: Entry) -> Iterable[str]:
     devices = [next((p for p in DEVICES if fnmatchcase(c, p)), c) for c in positions]
     links = [f"{c.split('.')[0]}.*" if "." in c and c not in gauges else c for c in devices]
     patterns = [pattern for sensor in system.sensors for pattern in sensor.channels]
-    return dict.fromkeys([*links, *(p for p in patterns if any(fnmatchcase(c, p) for c in positions))])
+    shared = [p for p in patterns if any(fnmatchcase(c, p) for c in positions)]
+    # Encoders behind springs, where others sit on motors: they come from other electronics.
+    second = [c.removeprefix("q_") for c in positions if c.startswith("q_") and f"theta_m_{c[2:]}" in positions]
+    if 1 < len(second) < len(joints := [c for c in positions if c.startswith("q_")]) and len(joints) < TEN:
+        shared.append(f"q_[{''.join(second)}]")
+    return dict.fromkeys([*links, *shared])
