@@ -216,7 +216,8 @@ class CandidateRows:
         self._homogeneous = beyond & self._scale.homogeneous
         self._scale.free(beyond)
         self._usual = self._terms([], solution)
-        return np.where(beyond, ratio - 1.0, 0.0), np.where(beyond, lacking, 0.0)
+        # Rows that are beyond it by their size may leave less than it with parameters that are too small.
+        return np.where(beyond, np.maximum(0.0, ratio - 1.0), 0.0), np.where(beyond, lacking, 0.0)
 
     def _beside_fit(self, chosen: Sequence[int], std: Array) -> tuple[Array, Array, Array]:
         """What the criterion free of scale makes of rows of deviations (W, n_v) with those chosen, see `Scale.fit`."""
