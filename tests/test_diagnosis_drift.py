@@ -10,10 +10,12 @@ import numpy as np
 import pytest
 
 import sms_online as sms
+from sms_online.diagnosis.drifts import may_explain
 from sms_online.errors import InputError
 from sms_online.verdict.reasons import FOLLOW
 from sms_tools.cli import main
 from tests.axis import AXIS, DAMPING, INERTIA, axis_block
+from tests.test_tracing import SPEEDS, WINDOWS, made_up_rows
 
 BEGIN, SHARE, SECONDS = 6.0, 0.001, 24.0  # s, of the inertia that is lost in a second, s
 RATE = -SHARE * INERTIA
@@ -86,6 +88,16 @@ def test_undeclared_friction_stays_a_missing_effect() -> None:
     found = sms.diagnose(system(), sms.Capture.from_arrays(block.t, values))
     assert found.drifts == ()
     assert [effect.name for effect in found.effects] == ["coulomb_friction"]
+
+
+@pytest.mark.parametrize(("drifts", "lacks", "may"), [(0.0, 0.0, True), (20.0, 0.0, True), (0.0, 5.0, False)])
+def test_what_no_drift_explains_needs_no_session(drifts: float, lacks: float, may: bool) -> None:
+    """Rows of three parameters, the first of which loses so much from a third of the time on; or another force."""
+    rng = np.random.default_rng(4)
+    Y, noise = rng.standard_normal((WINDOWS, SPEEDS, 3)), rng.standard_normal((WINDOWS, SPEEDS))
+    lost = drifts * np.maximum(0.0, np.linspace(-0.5, 1.0, WINDOWS))
+    b = Y @ np.ones(3) - lost[:, None] * Y[..., 0] + lacks * rng.standard_normal(noise.shape) + noise
+    assert may_explain(made_up_rows(Y, b)) == may
 
 
 @pytest.mark.slow

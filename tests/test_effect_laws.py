@@ -61,6 +61,7 @@ LAWS: dict[str, Law] = {
     "stribeck_friction@joint_1:torque=0.4,velocity=0.7": lambda s: {
         M_1: -0.4 * np.sign(s.rate) / np.exp(s.rate * s.rate / 0.49)
     },
+    "presliding_friction@joint_1:torque=0.4,width=0.02": lambda s: {M_1: -0.4 * s.z[:, 0] / 0.02},
     "load_friction@joint_1:ratio=0.03": lambda s: {M_1: -0.03 * np.abs(K * s.delta) * np.sign(s.rate)},
     "direction_friction@joint_1:plus=0.4,minus=0.7": lambda s: {M_1: -np.where(s.rate > 0.0, 0.4, 0.7) * s.rate},
     "torsional_hysteresis@joint_1:torque=0.4,width=0.02": lambda s: spring(-0.4 * s.z[:, 0] / 0.02),
@@ -264,7 +265,7 @@ def test_a_gain_is_relative_to_the_first_joint() -> None:
 
 
 def test_grids_lie_within_the_motion_s_ranges() -> None:
-    ranges = Ranges(speed=2.0, deflection=0.05, duration=20.0, sample_rate=1000.0)
+    ranges = Ranges(speed=2.0, swing=1.0, deflection=0.05, duration=20.0, sample_rate=1000.0)
     for entry in ENTRIES.values():
         assert entry.separated_by
         for name, shape in entry.shapes.items():

@@ -41,6 +41,7 @@ FORCES = (
     "viscous_friction@joint_1:damping=2",
     "coulomb_friction@joint_2:torque=1",
     "stribeck_friction@joint_1:torque=1,velocity=0.05",
+    "presliding_friction@joint_1:torque=1,width=0.005",
     "load_friction@joint_1:ratio=0.02",
     "direction_friction@joint_1:plus=1,minus=0.5",
     "torsional_hysteresis@joint_1:torque=5,width=0.01",

@@ -6,6 +6,7 @@ import json
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from sms_adapters.importers import import_emps, import_quanser
@@ -15,6 +16,7 @@ from sms_tools.cli import main
 DATA = Path(__file__).resolve().parents[1].parent / "shared" / "data"
 EMPS = DATA / "emps" / "DATA_EMPS.mat"
 QUANSER = DATA / "quanser_2dsfl" / "lqr_full_10deg.mat"
+FACTORY = DATA / "quanser_factory" / "fsf.csv"
 
 
 def diagnosis(out: Path, *arguments: str) -> dict[str, Any]:
@@ -36,10 +38,8 @@ def test_the_friction_of_emps_is_found_from_its_mass_alone(tmp_path: Path) -> No
     (tmp_path / "mass.toml").write_text(bare)
     document = diagnosis(tmp_path / "out", str(tmp_path / "emps.csv"), "--system", str(tmp_path / "mass.toml"))
     found = {effect["name"]: effect["coefficients"] for effect in document["effects"]}
-    # The simple laws first, then the one that refines them; a lag of less than a sample is none of the encoder's.
-    taken = [step["taken"].partition("@")[0] for step in document["steps"]]
-    assert taken == ["coulomb_friction", "viscous_friction", "torque_offset", "direction_friction"]
-    assert {"coulomb_friction", "direction_friction"} <= set(found) <= set(taken)
+    # Each law once, in its last refinement; a lag of less than a sample is none of the encoder's.
+    assert set(found) == {"coulomb_friction", "direction_friction"}
     assert found["coulomb_friction"]["torque"]["estimate"] == pytest.approx(20.3935, rel=0.03)
     viscous = [found["direction_friction"][side]["estimate"] for side in ("plus", "minus")]
     assert viscous == pytest.approx([166.71, 240.42], rel=0.03)
@@ -84,8 +84,28 @@ def test_the_lag_and_the_friction_of_the_quanser_rig_are_found(tmp_path: Path) -
     physical = [p for name, p in parameters.items() if name.endswith(("inertia", "stiffness", "damping"))]
     assert min(estimate / std for estimate, std in physical) > -2.0
     stiffness, std = parameters["joint_1.stiffness"]
-    assert abs(stiffness - 27.0) < 2.0 * std
-    assert std < stiffness
+    # Runs of this unit differ by a tenth.
+    assert abs(stiffness - 27.0) < 2.0 * np.hypot(std, 2.7)
+    assert std < 0.5 * stiffness
+
+
+@pytest.mark.long
+def test_ten_seconds_of_another_unit_hold_for_the_next_ten(tmp_path: Path) -> None:
+    """The maker's own unit, whose setup low-passes the gauges at 2 Hz: few windows beside the parameters."""
+    if not FACTORY.exists():
+        pytest.skip(f"measured data {FACTORY.name} is not beside the checkout")
+    document = diagnosis(tmp_path / "out", str(FACTORY), "--system", "quanser-2dsfl", "-to", "9.7")
+    found = {(effect["name"], effect["where"]): effect for effect in document["effects"]}
+    lag = found["sensor_lag", "link_*.strain_angle"]
+    assert lag["ambiguous_with"] == []
+    assert 1.4 < lag["coefficients"]["corner"]["estimate"] < 2.3
+    assert {("presliding_friction", "joint_1"), ("presliding_friction", "joint_2")} <= set(found)
+    system, out = str(tmp_path / "out" / "system.toml"), tmp_path / "validated"
+    main(["validate", str(FACTORY), "--system", system, "-ss", "9.7", "--out", str(out)])
+    joints = json.loads((out / "validation.json").read_text())["joints"]
+    assert joints["joint_1"]["left"] < 0.28
+    assert joints["joint_2"]["left"] < 0.42
+    assert max(joint["left"] / joint["least"] for joint in joints.values()) < 1.35
 
 
 def test_a_holdout_that_is_the_capture_itself_needs_an_end(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

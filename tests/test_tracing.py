@@ -169,3 +169,53 @@ def test_a_replaced_effect_returns_for_what_the_other_leaves(times: float) -> No
     rows = made_up_rows(rng.standard_normal((WINDOWS, SPEEDS, 3)), b)
     found = Tracing(rows, candidates, FOLDS, laws=Sticking(stuck, 0.0, times)).run(lambda chosen, k: None)
     assert sorted(found) == [0, 1]
+
+
+# Constants, which rows lose to first order
+
+
+def _delay(column: Array, bend: float) -> Candidate:
+    columns = np.zeros((WINDOWS, SPEEDS, 1))
+    columns[:, 0, 0] = column
+    parameter = Parameter("sensor_lag", "", "s", 0.0)
+    effect = Effect(name="sensor_lag", where="q_1")
+    return Candidate(effect, (parameter,), columns, ENTRIES["sensor_lag"].traits, constant=True, bend=bend)
+
+
+@pytest.mark.parametrize(("bend", "found"), [(0.1, ["sensor_lag", "cogging"]), (10.0, ["sensor_lag"])])
+def test_what_a_constant_may_leave_is_no_other_effect(bend: float, found: list[str]) -> None:
+    """Of a delay of 0.1 s its square by its bend: a hundredth of a percent of its gain, or all of it."""
+    rng = np.random.default_rng(8)
+    late, other = rng.standard_normal((2, WINDOWS))
+    candidates = [_delay(100.0 * late, bend), _candidate("cogging", other)]
+    assert _found(candidates, 10.0 * late + 2.0 * other, seed=8) == found
+
+
+def test_a_search_goes_on_from_what_was_found_before() -> None:
+    """What has nothing left to explain goes; what was missed comes to it."""
+    rng = np.random.default_rng(9)
+    Y = rng.standard_normal((WINDOWS, SPEEDS, 3))
+    right, missed, spurious = rng.standard_normal((3, WINDOWS))
+    b = Y @ np.array([1.0, -2.0, 0.5]) + rng.standard_normal((WINDOWS, SPEEDS))
+    b[:, 0] += 2.0 * right + 1.5 * missed
+    names = ("cogging", "torque_offset", "cubic_stiffness")
+    candidates = [_candidate(name, c) for name, c in zip(names, (right, missed, spurious), strict=True)]
+    tracing = Tracing(made_up_rows(Y, b), candidates, FOLDS)
+    assert sorted(tracing.run(lambda chosen, k: None, start=[2, 0])) == [0, 1]
+
+
+@pytest.mark.parametrize(("half", "ambiguous"), [(0.6, ("cogging@joint_1",)), (1.0, ())])
+def test_laws_that_blocks_do_not_decide_between_are_ambiguous(half: float, ambiguous: tuple[str, ...]) -> None:
+    """A force that is one of them in a part of the session, the other in the rest: one gains clearly more in all."""
+    rng = np.random.default_rng(10)
+    Y = rng.standard_normal((WINDOWS, SPEEDS, 3))
+    first, apart, lacking = rng.standard_normal((3, WINDOWS))
+    second = (first + 0.7 * apart) / np.hypot(1.0, 0.7)
+    b = Y @ np.array([1.0, -2.0, 0.5]) + rng.standard_normal((WINDOWS, SPEEDS))
+    b[:, 0] += 10.0 * np.where(np.arange(WINDOWS) < half * WINDOWS, first, second) + 3.0 * lacking
+    candidates = [_candidate("torque_offset", first), _candidate("cogging", second)]
+    tracing = Tracing(made_up_rows(Y, b), candidates, FOLDS)
+    tracing.run(lambda chosen, k: None)
+    finding = tracing.finding([0], 0)
+    assert tracing.gains([])[1].gain < 0.97 * tracing.gains([])[0].gain
+    assert finding.ambiguous == ambiguous

@@ -6,8 +6,8 @@ from collections.abc import Container, Sequence
 
 import numpy as np
 
-from sms_online.diagnosis.candidate_rows import CandidateRows
 from sms_online.diagnosis.folds import Fall, fall
+from sms_online.diagnosis.held_out_rows import HeldOutRows
 from sms_online.stream import Array
 
 # Coefficients of effects that are correlated by more than this are those of one effect too many.
@@ -23,7 +23,7 @@ ACROSS_CAPTURES = 0.02
 SIGNIFICANT = 2.0
 
 
-class Acceptance(CandidateRows):
+class Acceptance(HeldOutRows):
     """Tests whether held-out rows support effects, and whether a joint fit admits them."""
 
     def least_improvement(self, k: int) -> float:
@@ -90,7 +90,7 @@ class Acceptance(CandidateRows):
 
     def _possible(self, k: int, solution: Array, own: Array) -> bool:
         candidate = self.candidates[k]
-        if not candidate.traits.plausible(own, self.rows.sample_rate):
+        if not candidate.traits.plausible(own, self.rows.sample_rate) or not candidate.first_order(own):
             return False
         if self._laws is None or not candidate.traits.limits:
             return True

@@ -240,9 +240,12 @@ class Attempt(Hypothesis):
             self.case.progress(f"found so far: {', '.join(self.tracing.candidates[k].key for k in chosen)}", TRACED)
         return self.case.stop()
 
-    def search(self) -> list[int]:
-        """Numbers of the candidates found, with rows whitened by what was found if it explains them."""
-        chosen = self.run()
+    def search(self, begun: Sequence[Effect] = ()) -> list[int]:
+        """Numbers of the candidates found, with rows whitened by what was found if it explains them.
+
+        begun: effects that were found before in nearly the same rows, to go on from.
+        """
+        chosen = self.run(begun)
         for _ in range(REWEIGHED):
             beta = self.solution(chosen)[: self.rows.base.n]
             if self.prior is not None:
@@ -254,8 +257,9 @@ class Attempt(Hypothesis):
                 break
             self.rows.reweight(beta)
             forces = [candidate for candidate in self.tracing.candidates if not candidate.constant]
+            begun = [self.tracing.candidates[k].effect for k in chosen]
             self.trace([*self.make.seen(self._lasting), *forces])
-            chosen = self.run()
+            chosen = self.run(begun)
         return chosen
 
     def _same_weights(self, beta: Array) -> bool:

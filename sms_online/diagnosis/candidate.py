@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Protocol
 
+import numpy as np
+
 from sms_online.description.schema import Effect
 from sms_online.diagnosis.evidence import Gain
 from sms_online.effects.traits import Traits
@@ -18,7 +20,8 @@ class Candidate:
 
     effect: as a system file would declare it, shape constants included. parameters: its linear coefficients (c,).
     columns (W, n_v, c): what one unit of each adds to the rows. traits: of the effect. constant: whether its
-    coefficients become constants of the description, no unknowns of π: see `constants`.
+    coefficients become constants of the description, no unknowns of π: see `constants`. bend: of a constant, by what
+    share of its own size a unit of its coefficients differs from first order.
     """
 
     effect: Effect
@@ -26,6 +29,15 @@ class Candidate:
     columns: Array
     traits: Traits
     constant: bool = False
+    bend: float = np.inf
+
+    def left_over(self, coefficients: Array) -> float:
+        """Share of its gain that a constant with coefficients (c,) leaves while it is subtracted to first order."""
+        return min(1.0, (self.bend * float(np.linalg.norm(coefficients))) ** 2) if self.constant else 0.0
+
+    def first_order(self, coefficients: Array) -> bool:
+        """Whether it can be subtracted to first order with coefficients (c,): an angle of a radian cannot."""
+        return not (np.isfinite(self.bend) and self.left_over(coefficients) >= 1.0)
 
     @property
     def key(self) -> str:

@@ -1,4 +1,4 @@
-"""Rows whitened for a model and the candidates beside it: gains, solutions, predictions of held-out blocks."""
+"""Rows whitened for a model and the candidates beside it: gains and solutions."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 
 from sms_online.diagnosis.calibrated import Calibrated
 from sms_online.diagnosis.candidate import Candidate, Laws
-from sms_online.diagnosis.evidence import Gain, basis, free_of, gains, least_squares, least_squares_without, together
+from sms_online.diagnosis.evidence import Gain, basis, free_of, gains, least_squares, together
 from sms_online.diagnosis.folds import Folds
-from sms_online.diagnosis.scale_free import NEAR, ScaleFree, converged, cost_of
+from sms_online.diagnosis.scale_free import Scale
 from sms_online.diagnosis.weak_rows import WeakRows
 from sms_online.pipeline.momentum_windows import HOPS
 from sms_online.stream import Array
@@ -24,13 +24,15 @@ ACTS = 0.01
 # Rows whose mean square exceeds their variance by more than this although everything that is known of has been
 # subtracted have an error of their own: friction is never quite its model.
 LARGEST_RATIO = 1.5
+# With variance that is yet to be added they clearly do where so many times as much would be left.
+CLEARLY = 4.0
 # Rows for a column at least, for curves to be fitted together.
 LEAST_ROWS = 4
 # Share of a row's variance by which that of the effects chosen has to change for rows to be whitened anew.
 SMALL_CHANGE = 0.1
 
-
-_Key = tuple[tuple[int, ...], frozenset[int] | None]
+# Of what is kept: numbers of those chosen, and beside which numbers of calibration are held at zero.
+Key = tuple[tuple[int, ...], frozenset[int] | None]
 
 
 class CandidateRows:
@@ -70,23 +72,23 @@ class CandidateRows:
         self._of_effects = [*(of_effects or [False] * self._n), *(True for each in fixed for _ in each.parameters)]
         self._positive = np.array([False] * self._n if positive is None else positive, dtype=bool)
         self._model = np.concatenate([rows.Y, *(candidate.columns for candidate in fixed)], axis=2)
-        self._inertial = np.zeros(self._model.shape[2], dtype=bool)
-        self._inertial[: self._n] = False if inertial is None else inertial
-        # Those beside whose estimate rows without a torque count by their size, and that of the model.
+        # Those beside whose estimate rows without a torque count by their size.
         self._beside: tuple[int, ...] = ()
-        self._scale_at = np.zeros(self._model.shape[2])
+        expected = np.zeros(self._model.shape[2])
         if rows.weights is not None:
-            self._scale_at[: self._n] = rows.weights
-        self._expected = self._scale_at
-        # A prior gives the scale itself.
-        unknown = prior is None or not prior.known.any()
-        self._scaleless = unknown and bool(self._expected.any()) and not np.all(np.any(rows.b, axis=0))
+            expected[: self._n] = rows.weights
+        is_inertial = np.zeros(self._model.shape[2], dtype=bool)
+        is_inertial[: self._n] = False if inertial is None else inertial
+        known = prior is not None and bool(prior.known.any())
+        self._scale = Scale(rows.b, expected, is_inertial, known)
         self.trials = len(self.candidates)
         # Covariance of what the laws of the chosen effects do not determine.
         self._own = np.zeros_like(rows.std)
         self._free = np.zeros((len(rows.b), HOPS, self._n_v))
         # Speeds whose rows have no such covariance, with these effects chosen.
         self._loud: tuple[frozenset[int], NDArray[np.bool_]] = frozenset(), np.zeros(self._n_v, dtype=np.bool_)
+        # Mean square that everything together left of the rows, and with which deviations.
+        self._explained = 0.0, rows.std
         self._whiten()
 
     def reweight(self, chosen: Sequence[int], solution: Array | None = None) -> bool:
@@ -96,14 +98,7 @@ class CandidateRows:
         """
         if self._laws is None:
             return False
-        own, free = np.zeros_like(self._own), np.zeros_like(self._free)
-        at, solution = self._model.shape[2], self.solution(chosen) if solution is None else solution
-        for k in chosen:
-            c = len(self.candidates[k].parameters)
-            unmodelled = self._laws.unmodelled(self.candidates[k], solution[at : at + c])
-            own += unmodelled.own
-            free += unmodelled.free
-            at += c
+        own, free = self._unmodelled(self._laws, chosen, solution)
         if self._loud[0] == frozenset(chosen):
             own[:, self._loud[1]], free[..., self._loud[1]] = 0.0, 0.0
         used, wanted = self._own + self._free[:, 0], own + free[:, 0]
@@ -124,6 +119,31 @@ class CandidateRows:
             self._whiten()
         return True
 
+    def _unmodelled(self, laws: Laws, chosen: Sequence[int], solution: Array | None = None) -> tuple[Array, Array]:
+        """Covariances (W, n_v) and (W, HOPS, n_v) of what the laws of the chosen effects do not determine."""
+        own, free = np.zeros_like(self._own), np.zeros_like(self._free)
+        at, solution = self._model.shape[2], self.solution(chosen) if solution is None else solution
+        for k in chosen:
+            c = len(self.candidates[k].parameters)
+            unmodelled = laws.unmodelled(self.candidates[k], solution[at : at + c])
+            own += unmodelled.own
+            free += unmodelled.free
+            at += c
+        return own, free
+
+    def stays_loud(self, chosen: Sequence[int], k: int) -> bool:
+        """Whether rows that a candidate acts on clearly leave more than noise with those chosen, this one last.
+
+        By what everything together leaves of them with the variance that they would have then, see `_floor`.
+        """
+        acts = self._acts(k)
+        if self._laws is None or not self.floor[acts].any():
+            return False
+        own, free = self._unmodelled(self._laws, chosen)
+        std = np.sqrt(self.rows.std**2 + own + free[:, 0])
+        squares = self._beside_fit(chosen, std)[2] if self.freed else np.mean(self._together(std)[1] ** 2, axis=0)
+        return bool(np.any(squares[acts] > CLEARLY * LARGEST_RATIO))
+
     def _whiten(self) -> None:
         """Whiten the rows with what the laws of the effects of the last `reweight` do not determine."""
         rows = self.rows
@@ -135,7 +155,7 @@ class CandidateRows:
         self.floor, lacking = self._floor()
         # Where everything together leaves noise, a held-out row counts by its own deviation; where much more, as does
         # every other of its coordinate: relative to the torque then.
-        self._scale = np.sqrt(self.std**2 + lacking)
+        self._counted = np.sqrt(self.std**2 + lacking)
         # Windows that overlap share the noise of the effects chosen: as errors of their own they count it once.
         own = self.floor * self.std**2 + HOPS * self._own
         rows.whiten(own, self._free if np.any(self._free) else None)
@@ -160,32 +180,19 @@ class CandidateRows:
         self._Y, self._b = self._white, self._white_b
         if not self.freed:
             return
-        shape, size, n = (-1, self._n_v), self.rows.b.size, self._model.shape[2]
-        speeds = np.flatnonzero(self._homogeneous).tolist()
-        free = ScaleFree(self._white[:size].reshape(*shape, n), speeds, self._inertial)
-        rest = [*(self._Z[k] for k in self._beside), self._N]
+        size, n = self.rows.b.size, self._model.shape[2]
+        shape, end = (len(self.rows.b), self._n_v, -1), size + self._known - self.calibrated.count
+        self._white[end - n : end], self._white_b[end - n : end] = self._scale.near(self._white[:size])
 
-        def about(solution: Array) -> Array:
-            left = self._white_b - np.concatenate([self._white, *rest], axis=1) @ solution
-            Y, added = free.about(solution[:n], left[:size].reshape(shape))
+        def solve(Y: Array, b: Array) -> Array:
             self._forget()
             self._Y = np.concatenate((Y.reshape(size, n), self._white[size:]))
-            self._b = self._white_b.copy()
-            self._b[:size] += added.ravel()
+            self._b = np.concatenate((b.ravel(), self._white_b[size:]))
             return self.solution(self._beside)
 
-        near = slice(size + self._known - self.calibrated.count - n, size + self._known - self.calibrated.count)
-        lengths = NEAR * np.linalg.norm(self._white[:size], axis=0)
-        self._white[near], self._white_b[near] = np.diag(lengths), lengths * self._expected
-        start = np.zeros(n + sum(each.shape[1] for each in rest))
-        start[:n] = self._scale_at
-
-        def cost(solution: Array) -> float:
-            left = (self._white_b - np.concatenate([self._white, *rest], axis=1) @ solution)[:size].reshape(shape)
-            off = lengths * (solution[:n] - self._expected)
-            return cost_of(free.squares(solution[:n], left, self._scale_at), off, len(left))
-
-        about(converged(about, start, cost))
+        rest = np.concatenate([*(self._Z[k] for k in self._beside), self._N], axis=1)
+        white, b, rest = (part[:size].reshape(shape) for part in (self._white, self._white_b, rest))
+        self._scale.linearise(white, b[..., 0], rest, solve)
         self._forget()
 
     def _floor(self) -> tuple[Array, Array]:
@@ -194,42 +201,50 @@ class CandidateRows:
         As a share of that variance, and as a mean square; zero where it is little. Rows that leave more and hold no
         torque are homogeneous in π: what makes π small makes their residual small, which counts beside their terms.
         """
-        left = self.rows.b / self.std
-        every = np.concatenate([self._plain_model, *self._plain, self._plain_calibration], axis=2)
-        laws = (p for p, each in zip(self._plain, self.candidates, strict=True) if not each.traits.learned)
-        # All curves at once would leave little of few rows, whatever these hold.
-        enough = LEAST_ROWS * every.shape[2] <= left.size
-        plain = every if enough else np.concatenate([self._plain_model, *laws, self._plain_calibration], axis=2)
-        solution = together(plain, left, self._prior)
-        ratio = np.mean((left - plain @ solution) ** 2, axis=0)
+        solution, ratio = np.zeros(self.n_model), np.full(self._n_v, np.inf)
+        if not (self._scale.unknown and self._surely_more()):
+            solution, left = self._together(self.std)
+            ratio = np.mean(left**2, axis=0)
+            self._explained = float(ratio.mean()), self.std
         beyond = ratio > LARGEST_RATIO
-        if beyond.any() and self._scaleless:
+        if beyond.any() and self._scale.unknown:
             # All candidates mimic the model's terms, which then say nothing of a scale; those found so far do not.
-            solution, ratio, sized = self._scale_free(left)
+            solution, ratio, sized = self._beside_fit(self._beside, self.std)
+            self._scale.at = solution[: self.n_model]
             beyond = sized > LARGEST_RATIO
         lacking = np.maximum(0.0, (ratio - 1.0) * np.mean(self.std**2, axis=0))
-        self._homogeneous = beyond & ~np.any(self.rows.b, axis=0)
+        self._homogeneous = beyond & self._scale.homogeneous
+        self._scale.free(beyond)
         self._usual = self._terms([], solution)
-        return np.where(beyond, ratio - 1.0, 0.0), np.where(beyond, lacking, 0.0)
+        # Rows that are beyond it by their size may leave less than it with parameters that are too small.
+        return np.where(beyond, np.maximum(0.0, ratio - 1.0), 0.0), np.where(beyond, lacking, 0.0)
 
-    def _scale_free(self, b: Array) -> tuple[Array, Array, Array]:
-        """Solution beside those of the last `reweight`, and mean squares (n_v,) that it leaves of rows b (W, n_v).
+    def _beside_fit(self, chosen: Sequence[int], std: Array) -> tuple[Array, Array, Array]:
+        """What the criterion free of scale makes of rows of deviations (W, n_v) with those chosen, see `Scale.fit`."""
+        beside = self.columns(chosen)[..., self.n_model :] / std[..., None]
+        return self._scale.fit(self._model / std[..., None], beside, self.rows.b / std)
 
-        Each type of rows counts by what it leaves, those without a torque by their size. Last, mean squares with these
-        as large as the parameters behind the weights make them.
-        """
-        beside = np.concatenate([np.empty((*b.shape, 0)), *(self._plain[k] for k in self._beside)], axis=2)
-        speeds = np.flatnonzero(~np.any(self.rows.b, axis=0)).tolist()
-        free, n = ScaleFree(self._plain_model, speeds, self._inertial), self._model.shape[2]
-        solution = free.solved(beside, b, self._scale_at, self._expected, 1.0)
-        self._scale_at = solution[:n]
-        left = b - np.concatenate((self._plain_model, beside), axis=2) @ solution
-        return solution, np.mean(left**2, axis=0), free.squares(solution[:n], left, self._expected)
+    def _surely_more(self) -> bool:
+        """Whether rows clearly leave more than noise whatever is added: with these deviations what they left with those
+        of the last fit of everything together can have fallen by their largest growth alone."""
+        least, std = self._explained
+        return bool(least * np.min((std / self.std) ** 2) > CLEARLY * LARGEST_RATIO)
+
+    def _together(self, std: Array) -> tuple[Array, Array]:
+        """Solution of the model with all candidates, and what that leaves of every row over its deviation (W, n_v)."""
+        plain, b = [self._model, *(c.columns for c in self.candidates), self.calibrated.columns], self.rows.b / std
+        # All curves at once would leave little of few rows, whatever these hold.
+        if LEAST_ROWS * sum(part.shape[2] for part in plain) > b.size:
+            laws = (c.columns for c in self.candidates if not c.traits.learned)
+            plain = [self._model, *laws, self.calibrated.columns]
+        columns = np.concatenate(plain, axis=2) / std[..., None]
+        solution = together(columns, b, self._prior)
+        return solution, b - columns @ solution
 
     @property
     def freed(self) -> bool:
         """Whether rows without a torque leave more than noise whatever is added, and count by their size."""
-        return self._scaleless and bool(np.any(self._homogeneous))
+        return bool(self._scale.freed)
 
     @property
     def n_model(self) -> int:
@@ -256,8 +271,14 @@ class CandidateRows:
             solution = None
             effects = (candidate.effect for candidate in (*self._fixed, *(self.candidates[k] for k in chosen)))
             held = self.calibrated.said_by(effects)
+            if m:
+                rows = np.column_stack((self._with_calibration(chosen, held), self._b))
+                # Only what is known of calibration changes: all other rows are reduced once.
+                others, known = np.linalg.qr(rows[:-m], mode="r"), np.zeros((m, rows.shape[1]))
             while m:
-                solution = least_squares(self._with_calibration(chosen, held), self._b)
+                known[:, -m - 1 : -1] = self.calibrated.information(held)
+                both = np.concatenate((others, known))
+                solution = least_squares(both[:, :-1], both[:, -1])
                 beyond = self.calibrated.beyond(solution[-m:]) & ~held
                 if not beyond.any():
                     break
@@ -286,7 +307,7 @@ class CandidateRows:
     def _plausible(self, candidate: Candidate, found: Gain) -> Gain:
         """The gain, none where the effect cannot have the coefficients."""
         possible = candidate.traits.plausible(found.coefficients, self.rows.sample_rate)
-        return found if possible else replace(found, gain=0.0)
+        return found if possible and candidate.first_order(found.coefficients) else replace(found, gain=0.0)
 
     def gain_of(self, candidate: Candidate, chosen: Sequence[int]) -> Gain:
         """What any candidate would take beside those chosen."""
@@ -302,9 +323,7 @@ class CandidateRows:
     def _forget(self) -> None:
         """What was solved with other weights or columns."""
         self._zeroed: dict[frozenset[int], NDArray[np.bool_]] = {}
-        self._solved: dict[_Key, Array] = {}
-        self._held_out: dict[_Key, Array] = {}
-        self._fitted: dict[_Key, Array] = {}
+        self._solved: dict[Key, Array] = {}
         self._bases: dict[tuple[int, ...], tuple[Array, Array]] = {}
         self._gains: dict[tuple[int, ...], list[Gain]] = {}
         self._acting: dict[int, NDArray[np.bool_]] = {}
@@ -325,7 +344,7 @@ class CandidateRows:
         return np.concatenate([self._model, *(self.candidates[k].columns for k in chosen)], axis=2)
 
     @staticmethod
-    def _key(chosen: Sequence[int], beside: Sequence[int] | None) -> _Key:
+    def _key(chosen: Sequence[int], beside: Sequence[int] | None) -> Key:
         """Of what is kept for those chosen: in their order, and beside which they are held at zero, None for these."""
         return tuple(chosen), None if beside is None or set(beside) == set(chosen) else frozenset(beside)
 
@@ -339,70 +358,10 @@ class CandidateRows:
             self._solved[key] = least_squares(self._columns(chosen, beside), self._b)
         return self._solved[key]
 
-    def solutions(self, chosen: Sequence[int], beside: Sequence[int] | None = None) -> Array:
-        """The same without each part of the windows in turn, (parts, n + c + m)."""
-        known = np.zeros(len(self._b) - self.rows.b.size, dtype=bool)
-        left_out = [
-            np.concatenate((np.repeat(~self.folds.fitted(k), self._n_v), known)) for k in range(self.folds.parts)
-        ]
-        return least_squares_without(self._columns(chosen, beside), self._b, left_out)
-
-    def predicted(
-        self, chosen: Sequence[int], solutions: Array | None = None, beside: Sequence[int] | None = None
-    ) -> Array:
-        """What is left of every row (W, n_v) over its own deviation, blocks predicted from the others."""
-        solutions = self.solutions(chosen, beside) if solutions is None else solutions
-        left = self.residual(chosen, self.solution(chosen, beside=beside))
-        for k, solution in enumerate(solutions):
-            held = self.folds.predicted(k)
-            left[held] = self.residual(chosen, solution)[held]
-        return left
-
-    def _sized(self, chosen: Sequence[int], solution: Array) -> Array:
-        """What is left (W, n_v), rows without a torque that leave more than noise as if they had their usual size."""
-        left = self.residual(chosen, solution)
-        if np.any(self._homogeneous):
-            terms = self._terms(chosen, solution)
-            sized = self._homogeneous & (terms > 0.0)
-            left[:, sized] *= np.sqrt(self._usual[sized] / terms[sized])
-        return left
-
-    def held_out(self, chosen: Sequence[int], beside: Sequence[int] | None = None) -> Array:
-        """Sums of squares of held-out rows by block and speed, (B, n_v), relative where they leave more than noise.
-
-        Kept as solutions are: every candidate beside the same others asks for those of the others.
-        """
-        key = self._key(chosen, beside)
-        if key not in self._held_out:
-            left = self._sized(chosen, self.solution(chosen, beside))
-            for k, solution in enumerate(self.solutions(chosen, beside)):
-                held = self.folds.predicted(k)
-                left[held] = self._sized(chosen, solution)[held]
-            self._held_out[key] = self._by_block(left)
-        return self._held_out[key]
-
-    def fitted(self, chosen: Sequence[int], beside: Sequence[int] | None = None) -> Array:
-        """The same sums of the fit to all rows."""
-        key = self._key(chosen, beside)
-        if key not in self._fitted:
-            self._fitted[key] = self._by_block(self._sized(chosen, self.solution(chosen, beside)))
-        return self._fitted[key]
-
     def _terms(self, chosen: Sequence[int], solution: Array) -> Array:
         """Sums of squares (n_v,) of the terms of each speed's rows, over their deviations."""
         plain = np.concatenate([self._plain_model, *(self._plain[k] for k in chosen)], axis=2)
         return np.asarray(np.sum((plain * solution[: plain.shape[2]]) ** 2, axis=(0, 2)))
-
-    def _by_block(self, left: Array) -> Array:
-        squares = (left * self.std / self._scale) ** 2
-        return np.array([squares[self.folds.held(k)].sum(axis=0) for k in range(self.folds.count)])
-
-    def spread(self, chosen: Sequence[int]) -> Array:
-        """Deviations (n + c,) of the solution by the jackknife over the parts, whatever rows hold beside noise."""
-        solutions = self.solutions(chosen)
-        n = len(solutions)
-        squares = np.sum((solutions - solutions.mean(axis=0)) ** 2, axis=0)
-        return np.asarray(np.sqrt((n - 1) / n * squares))[: squares.size - self.calibrated.count]
 
     def covariance(self, chosen: Sequence[int], further: Array | None = None) -> Array:
         """Covariance of the solution (n + c, n + c) from all windows, infinite where they determine nothing.

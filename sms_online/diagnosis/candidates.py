@@ -155,13 +155,15 @@ class CandidateColumns:
         joints = [int(where.removeprefix("joint_")) - 1] if where.startswith("joint_") else range(len(layout.q))
         offset = layout.n_base_positions - layout.n_base_speeds
         theta_m, q = np.array(layout.theta_m)[list(joints)], np.array(layout.q)[list(joints)]
-        speed = deflection = 0.0
-        for motion, _ in self.rows.weak.motions():
-            speed = max(speed, float(np.abs(motion.v[:, theta_m]).max()))
-            deflection = max(deflection, float(np.abs(motion.x[:, theta_m + offset] - motion.x[:, q + offset]).max()))
+        motions = [motion for motion, _ in self.rows.weak.motions()]
+        speed = max(float(np.abs(motion.v[:, theta_m]).max()) for motion in motions)
+        angles = [motion.x[:, theta_m + offset] for motion in motions]
+        swing = float(np.ptp(np.concatenate(angles), axis=0).max())
+        pairs = zip(angles, motions, strict=True)
+        deflection = max(float(np.abs(angle - motion.x[:, q + offset]).max()) for angle, motion in pairs)
         rate = self.system.sample_rate
         longest = max(segment.index.size for segment in self.rows.segments[self._since :])
-        return Ranges(speed, deflection, longest / rate, rate)
+        return Ranges(speed, swing, deflection, longest / rate, rate)
 
     def of(self, effect: Effect) -> Candidate:
         """The candidate of one declaration."""
@@ -180,8 +182,8 @@ class CandidateColumns:
         return self._candidate(effect, parameters, self._force(model))
 
     @staticmethod
-    def _candidate(effect: Effect, parameters: Sequence[Parameter], columns: Array) -> Candidate:
-        return Candidate(effect, tuple(parameters), columns, traits_of(effect), is_constant(effect))
+    def _candidate(effect: Effect, parameters: Sequence[Parameter], columns: Array, bend: float = np.inf) -> Candidate:
+        return Candidate(effect, tuple(parameters), columns, traits_of(effect), is_constant(effect), bend)
 
     def _force(self, model: Model) -> Array:
         """Columns (W, n_v, c) of a model's last effect."""
@@ -368,7 +370,10 @@ class CandidateColumns:
                 response = sign * self.rows.responses[displacement][:, :, acts].sum(axis=2)
             columns.append(response)
             parameters.append(Parameter(f"{effect.name}@{effect.where}.{quantity}", quantity, unit, 0.0))
-        return self._candidate(effect, parameters, np.stack(columns, axis=2))
+        # An angle turns the arm by as much; a delay counts beside the time in which rows see the motion change.
+        span = self._weak.windows.width / self.system.sample_rate
+        late = any(each.unit == "s" for each in LINEAR[effect.name])
+        return self._candidate(effect, parameters, np.stack(columns, axis=2), 2.0 * np.pi / span if late else 1.0)
 
 
 def _law(effect: Effect) -> tuple[object, ...]:

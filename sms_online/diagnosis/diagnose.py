@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import cached_property, partial
 
 import numpy as np
 
@@ -24,18 +24,20 @@ from sms_online.diagnosis.attempt import (
 )
 from sms_online.diagnosis.calibrated import sayable
 from sms_online.diagnosis.candidate import Finding, Ranked
-from sms_online.diagnosis.captures import begins, one_after_another
+from sms_online.diagnosis.captures import begins, in_seconds, one_after_another, undone
 from sms_online.diagnosis.constants import possible
-from sms_online.diagnosis.drifts import explained_by_drifts, following, leaves_more
+from sms_online.diagnosis.drifts import explained_by_drifts, following, leaves_more, may_explain
 from sms_online.diagnosis.hypothesis import corrections, share_left, verdict
 from sms_online.diagnosis.late_sensors import LateSensor, find_late
-from sms_online.diagnosis.mistakes import Corrected, Mistake, find_mistakes, wrong_clock
+from sms_online.diagnosis.mistakes import Mistake, find_mistakes, wrong_clock
 from sms_online.diagnosis.record import SampleRecord
 from sms_online.diagnosis.trace import DECISIVE
 from sms_online.diagnosis.unexplained import Unexplained, describe_residual
+from sms_online.effects.build import build_model
 from sms_online.effects.catalogue import kinematic_candidates
 from sms_online.errors import InputError
 from sms_online.evaluation import Evaluation
+from sms_online.model.model import Model
 from sms_online.pipeline.estimator import Estimator
 from sms_online.pipeline.momentum_windows import HOPS
 from sms_online.pipeline.statistics import Statistics
@@ -59,8 +61,9 @@ class Diagnosis:
     late: sensors far behind the others, whose lag the description of the last attempt states. steps: of the last
     search, its effects one after the other.
     described, attempt: first and last description against the samples; chosen: of the last one's candidates.
-    estimator_before, estimator_after: sessions of the two systems over the whole capture. drifts: parameters that
-    drift, which the second follows; nothing else is searched then.
+    estimator_before, estimator_after: sessions of the two systems over the whole capture; the first one again where the
+    search is partial or parameters come from its own rows. drifts: parameters that drift, which the second follows;
+    nothing else is searched then.
     """
 
     verdict: str
@@ -85,6 +88,12 @@ class Diagnosis:
     def left(self) -> float:
         """Share of what was beyond noise that is left with what was found."""
         return share_left(self.before.excess, self.after.excess)
+
+    @cached_property
+    def model(self) -> Model:
+        """Of the system with what was found, whether or not there was a session of it."""
+        same = self.estimator_after.system == self.after.system
+        return self.estimator_after.model if same else build_model(self.after.system)
 
 
 def _exact(system: System, links: Sequence[Effect]) -> System:
@@ -143,7 +152,7 @@ def _with_constants(
     """
     n = attempt.rows.base.n
     findings: list[Finding] = []
-    while any(attempt.tracing.candidates[k].constant for k in chosen) and not case.stop():
+    while any(attempt.tracing.candidates[k].constant for k in chosen):
         progress("improving constants", SEARCHED)
         findings += [attempt.tracing.finding(chosen, k) for k in chosen if attempt.tracing.candidates[k].constant]
         solution = attempt.solution(chosen)
@@ -152,14 +161,15 @@ def _with_constants(
         trial = partial(_trial, attempt, forces)
         for correction in corrections(trial, constants, beta):
             constants, beta = correction.constants, correction.solution[:n]
-            if correction.converged:
+            if correction.converged or case.stop():
                 break
         keys = {(effect.name, effect.where) for effect in constants}
         constants = [effect for effect in constants if possible(effect, case.session.system.sample_rate)]
         tried = [candidate.effect for candidate in attempt.tracing.candidates]
         others = [effect for effect in tried if (effect.name, effect.where) not in keys]
         attempt = Attempt(case, attempt.system, constants, beta, others)
-        chosen = attempt.search()
+        # Forces that only stood for a constant have nothing left to explain.
+        chosen = attempt.search(forces)
         attempt.conclude(chosen)
     standing = {(effect.name, effect.where) for effect in attempt.constants}
     findings = [f for f in findings if (f.candidate.effect.name, f.candidate.effect.where) in standing]
@@ -189,7 +199,7 @@ def diagnose(
     runs = [blocks, *further]
     clock = wrong_clock(system, np.concatenate([block.t for block in blocks]))
     if clock is not None:
-        runs, holdout = [_in_seconds(run, clock.before) for run in runs], _in_seconds(holdout, clock.before)
+        runs, holdout = [in_seconds(run, clock.before) for run in runs], in_seconds(holdout, clock.before)
     runs = one_after_another(runs)
     before, record = _session(system, runs, source, prior, lambda share: progress(what, FITTED_ONCE * share))
     _check_measured(before, source)
@@ -199,27 +209,11 @@ def diagnose(
     if corrected.mistakes:
         progress("; ".join(mistake.sentence for mistake in corrected.mistakes), FITTED_ONCE)
         system = corrected.system
-        runs, holdout = [_undone(run, corrected) for run in runs], _undone(holdout, corrected)
+        runs, holdout = [undone(run, corrected) for run in runs], undone(holdout, corrected)
         before, record = _session(system, runs, source, prior)
         _check_measured(before, source)
     assert before.momentum is not None
     assert before.momentum.sensor_noise is not None
-    followed = before
-    # From one capture to the next parameters may change at once.
-    if len(runs) == 1 and not system.trackers[0].learns and leaves_more(before):
-        progress("looking for parameters that drift", FITTED_ONCE)
-        followed, _ = _session(following(system), runs, source, prior)
-    drifts = explained_by_drifts(followed)
-    if drifts:
-        return _drifting(
-            Case(source, before, before.momentum.sensor_noise, record.segments(), [], prior), followed, drifts, mistakes
-        )
-    # Windows that nothing explained are a diagnosis's own affair; a change of parameters is not.
-    changes = [event for event in before.events if event.parameters]
-    if changes:
-        event = changes[0]
-        expected = "a part without it: -ss or -to"
-        raise InputError(source, f"{event.time:.2f} s", f"an event ({event.kind}) within the capture", expected)
     held = _session(system, [holdout], source, prior)[1].segments() if holdout else []
     case = Case(
         source, before, before.momentum.sensor_noise, record.segments(), held, prior, progress, stop, learned,
@@ -230,6 +224,20 @@ def diagnose(
         attempt = described = Attempt(case, system)
     except np.linalg.LinAlgError as error:
         raise InputError(source, "", str(error), "the links' own markers, in their frames") from error
+    followed = before
+    # From one capture to the next parameters may change at once.
+    if len(runs) == 1 and not system.trackers[0].learns and leaves_more(before) and may_explain(attempt.rows):
+        progress("looking for parameters that drift", FITTED_ONCE)
+        followed, _ = _session(following(system), runs, source, prior)
+    drifts = explained_by_drifts(followed)
+    if drifts:
+        return _drifting(case, followed, drifts, mistakes)
+    # Windows that nothing explained are a diagnosis's own affair; a change of parameters is not.
+    changes = [event for event in before.events if event.parameters]
+    if changes:
+        event = changes[0]
+        expected = "a part without it: -ss or -to"
+        raise InputError(source, f"{event.time:.2f} s", f"an event ({event.kind}) within the capture", expected)
     late: list[LateSensor] = []
     while _explains_little(before) and (found := find_late(attempt.rows)):
         progress("taking off a sensor's lag", TRACED)
@@ -259,7 +267,8 @@ def diagnose(
     findings = [*constants, *(attempt.tracing.finding(chosen, k) for k in chosen)]
     named, partial = after.system != system, stop()
     estimator_after = before
-    if named and not partial:
+    # Where parameters come from the rows of the diagnosis, no other session has any to give.
+    if named and not partial and not attempt.by_rows:
         what, rest = "fitting the model with what was found", 1.0 - SEARCHED
         estimator_after, _ = _session(
             after.system, runs, source, prior, lambda share: progress(what, SEARCHED + rest * share)
@@ -343,19 +352,6 @@ def _check_measured(session: Estimator, source: str) -> None:
         )
     if session.momentum.sensor_noise is None:
         raise InputError(source, "", "too few samples to estimate the sensors' noise", "a longer capture")
-
-
-def _in_seconds(blocks: Sequence[Block], unit: float) -> list[Block]:
-    """Blocks whose stamps were so many a second."""
-    return [Block(block.t / unit, block.channels, block.values) for block in blocks]
-
-
-def _undone(blocks: Sequence[Block], corrected: Corrected) -> list[Block]:
-    """Blocks without the mistakes found, as one: an encoder is unwrapped from its first sample on."""
-    if not blocks:
-        return []
-    t, values = (np.concatenate([getattr(block, part) for block in blocks]) for part in ("t", "values"))
-    return [Block(t, blocks[0].channels, corrected.samples(blocks[0].channels, values))]
 
 
 def _explains_little(estimator: Estimator) -> bool:

@@ -332,7 +332,7 @@ def coefficients(diagnosis: Diagnosis, finding: Finding) -> Coefficients:
             own = slice(at, at + len(candidate.parameters))
             covariance = attempt.tracing.covariance(diagnosis.chosen)[own, own]
             return of_constant(constant, covariance)
-    batch, model = _batch(attempt, diagnosis.chosen), diagnosis.estimator_after.model
+    batch, model = _batch(attempt, diagnosis.chosen), diagnosis.model
     names = [p.name for p in batch.parameters]
     reported = of_unknowns(effect, finding.candidate.parameters, model, names, batch.values, batch.covariance)
     shapes = {name: std for (key, name), std in batch.shapes.items() if key == finding.candidate.key}

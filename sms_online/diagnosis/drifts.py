@@ -11,7 +11,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+import numpy as np
+
 from sms_online.description.schema import System, TrackerChoice
+from sms_online.diagnosis.evidence import least_squares
+from sms_online.diagnosis.weak_rows import WeakRows
 from sms_online.evaluation import Evaluation
 from sms_online.pipeline.estimator import Estimator
 from sms_online.pipeline.statistics import Statistics
@@ -20,6 +24,10 @@ from sms_online.tracker_results import Drift
 from sms_online.verdict.reasons import FOLLOW
 from sms_online.verdict.trust import Reason, Trust
 
+# Instants between which parameters go along lines, and rows for a column at least, to see whether that may be all.
+KNOTS, LEAST_ROWS = 4, 2
+# Mean square, over the noise's, and share of what parameters that stay leave, beyond which it is not.
+MUCH_MORE, LEFT = 10.0, 0.1
 LEARNED = TrackerChoice(kind="kalman", drift="learned")
 
 
@@ -34,6 +42,24 @@ def leaves_more(session: Estimator) -> bool:
     if momentum is None or not session.by_momentum:
         return False
     return momentum.test.alarm is not None or momentum.misfit or bool(session.events) or bool(momentum.bank.suspected)
+
+
+def may_explain(rows: WeakRows) -> bool:
+    """Whether drifts may be all that the model lacks: rows of parameters that all go along lines leave hardly more.
+
+    Lines between KNOTS instants follow any drift roughly, so that most of what it leaves is gone. Where they leave much
+    of it, no session that learns drifts needs to be run. Rows too few for that say nothing, and drifts may.
+    """
+    hats = np.maximum(0.0, 1.0 - np.abs(np.linspace(0.0, KNOTS - 1.0, rows.count)[:, None] - np.arange(KNOTS)))
+    Y, b = rows.Y / rows.std[..., None], (rows.b / rows.std).ravel()
+    lines = (Y[..., None] * hats[:, None, None, :]).reshape(b.size, -1)
+    if LEAST_ROWS * lines.shape[1] > b.size:
+        return True
+    stays, goes = (
+        float(np.sum((b - columns @ least_squares(columns, b)) ** 2)) / (b.size - columns.shape[1])
+        for columns in (Y.reshape(b.size, -1), lines)
+    )
+    return goes <= max(MUCH_MORE, LEFT * stays)
 
 
 def explained_by_drifts(session: Estimator) -> tuple[Drift, ...]:

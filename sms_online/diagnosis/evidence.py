@@ -25,7 +25,7 @@ FREE = 1e-5
 TWICE = 1e-2
 # Singular values below this share of the largest, of columns scaled to unit length, are not solved for.
 RANK_TOLERANCE = 1e-10
-# Solutions by parts of one factorisation are right to 1e-10 where no direction is smaller than this.
+# Solutions by a triangular factor, or parts of one, are right to 1e-10 where no direction is smaller than this.
 WELL_CONDITIONED = 1e-6
 
 
@@ -52,7 +52,16 @@ def least_squares(columns: Array, b: Array) -> Array:
     size = np.linalg.norm(columns, axis=0)
     size[size == 0.0] = 1.0
     R = np.asarray(np.linalg.qr(np.column_stack((columns / size, b)), mode="r"))
+    n = size.size
+    if len(R) >= n and _well_conditioned(R[:n, :n]):
+        return np.asarray(solve_triangular(R[:n, :n], R[:n, n]) / size)
     return np.asarray(np.linalg.lstsq(R[:, :-1], R[:, -1], rcond=RANK_TOLERANCE)[0] / size)
+
+
+def _well_conditioned(R: Array) -> bool:
+    """Whether no direction of columns with this triangular factor (n, n) is small."""
+    diagonal = np.abs(np.diag(R))
+    return bool(diagonal.min(initial=np.inf) > WELL_CONDITIONED * diagonal.max(initial=0.0))
 
 
 def together(columns: Array, b: Array, prior: Prior | None) -> Array:
@@ -80,8 +89,8 @@ def least_squares_without(columns: Array, b: Array, left_out: Sequence[NDArray[n
     size = np.linalg.norm(columns, axis=0)
     size[size == 0.0] = 1.0
     Q, R = np.linalg.qr(columns / size)
-    n, diagonal = columns.shape[1], np.abs(np.diag(R))
-    if len(columns) < n or diagonal.min(initial=np.inf) <= WELL_CONDITIONED * diagonal.max(initial=0.0):
+    n = columns.shape[1]
+    if len(columns) < n or not _well_conditioned(R):
         return np.array([least_squares(columns[~each], b[~each]) for each in left_out])
     along = Q.T @ b
     residual, out = b - Q @ along, np.empty((len(left_out), n))

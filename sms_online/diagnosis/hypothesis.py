@@ -73,9 +73,10 @@ class Hypothesis:
             inertial=np.isin(self.rows.base.independent, model.inertial).tolist(),
         )
 
-    def run(self) -> list[int]:
-        """Numbers of the candidates found, with the rows' weights as they are."""
-        return self.tracing.run(lambda chosen, k: refine(self.tracing, self.make, chosen, k), self.watch)
+    def run(self, begun: Sequence[Effect] = ()) -> list[int]:
+        """Numbers of the candidates found, with the rows' weights as they are; begun: effects to go on from."""
+        start = [k for k, candidate in enumerate(self.tracing.candidates) if candidate.effect in begun]
+        return self.tracing.run(lambda chosen, k: refine(self.tracing, self.make, chosen, k), self.watch, start)
 
     def watch(self, chosen: Sequence[int]) -> bool:
         """Whether to end the search with those chosen so far."""
@@ -148,6 +149,7 @@ def corrections(
     """
     for _ in range(CORRECTIONS):
         some = trial(constants, beta)
+        some.tracing.reweight(some.everything)
         solution = some.solution(some.everything)
         constants, beta = some.improved(solution), solution[: beta.size]
         yield Correction(some, solution, list(constants))

@@ -3,12 +3,12 @@
 Against a sensor that is far behind the others no masses follow the springs, and every candidate beside them seems idle.
 So lags are compared by how well readings without them can be explained at all: by a rough fit, which allows for
 friction at every joint and is invariant to the scale of rows without a torque. A sensor is late where that leaves less
-of all types of rows together than without it, more than chance would, and of windows that were not fitted too.
+of windows that it was not fitted to than without it, all types of rows together, and more than chance would: a short
+capture has hardly more windows than there are parameters, and fits itself with any lag.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
 
@@ -23,11 +23,12 @@ from sms_online.diagnosis.rough_fit import RoughRows
 from sms_online.diagnosis.rows import SessionRows
 from sms_online.effects.catalogue import lag_places
 from sms_online.effects.delay import LONGEST_FOUND, delay_of, lag, late_keys
+from sms_online.stream import Array
 
 # Corners that are tried first, Hz, from that of the longest delay on; quicker lags are found to first order in their
 # delay, beside the forces.
 CORNERS = (delay_of(LONGEST_FOUND), 2.0, 3.5, 6.0)
-# Of what is left of windows that were not fitted, a lag takes this share at least, as any effect.
+# A lag takes this share of what is left at least, as any effect.
 LEAST_IMPROVEMENT = 0.1
 # Probability that any sensor seems late by accident.
 FALSE_ALARM = 0.01
@@ -37,8 +38,8 @@ SAME_SHARE = 0.03
 TOLERANCE, EVALUATIONS = 3e-3, 15
 # Step of the logarithm of a corner that shows how sharp its optimum is.
 SHARPNESS_STEP = 0.05
-# Blocks of windows, one in CHECKED of which checks what the others say.
-BLOCKS, CHECKED = 9, 3
+# Blocks of windows, and parts that these make up, each predicted from the others.
+BLOCKS, PARTS = 9, 3
 # Of rows that leave less than this share nothing is left.
 TINY = 1e-3
 
@@ -84,11 +85,10 @@ class Lags:
         lags = lag_places(self._rows.model.system)
         return [where for where in lags if any(fnmatchcase(name, where) for name in readings)]
 
-    def left(self, where: str | None = None, corner: float = np.inf, checked: bool = True) -> tuple[float, float]:
-        """Logarithm of what is left: sum over the types of rows in windows that were fitted, and mean in the others.
+    def left(self, where: str | None = None, corner: float = np.inf) -> Array:
+        """Logarithms (types,) of what is left of each type of rows, windows predicted from the others.
 
-        Without a lag unless where is given. Infinite where readings are of no shape of the links. checked: whether
-        some windows check what the others say; else all are fitted.
+        Without a lag unless where is given. Infinite where readings are of no shape of the links.
         """
         segments = self._rows.segments
         if where is not None:
@@ -98,16 +98,15 @@ class Lags:
         try:
             rough = RoughRows(self._rows, segments)
         except np.linalg.LinAlgError:
-            return np.inf, np.inf
-        checks = np.arange(rough.count) * BLOCKS // rough.count % CHECKED == CHECKED - 1
-        fitted = ~checks | (not checked)
-        self._independent = int(np.count_nonzero(fitted)) // ROUGH_HOPS
-        fit, held = (np.log(np.maximum(share, TINY)) for share in rough.shares(fitted))
-        return float(fit.sum()), float(held.mean()) if checked else np.inf
+            return np.full(1, np.inf)
+        part = np.arange(rough.count) * BLOCKS // rough.count % PARTS
+        shares = [rough.shares(part != k) for k in range(PARTS)]
+        self._independent = rough.count // ROUGH_HOPS
+        return np.asarray(np.log(np.maximum(np.sqrt(np.mean(np.square(shares), axis=0)), TINY)))
 
-    def gain(self, before: float, after: float) -> float:
-        """Twice the logarithm of the likelihood ratio of two sums, windows that do not overlap counted."""
-        return float(2.0 * self._independent * (before - after))
+    def gain(self, before: Array, after: Array) -> float:
+        """Twice the logarithm of the likelihood ratio of what is left, windows that do not overlap counted."""
+        return float(2.0 * self._independent * np.sum(before - after))
 
 
 def find_late(rows: SessionRows) -> LateSensor | None:
@@ -116,22 +115,24 @@ def find_late(rows: SessionRows) -> LateSensor | None:
     places = lags.places()
     if not places:
         return None
-    fit, held = lags.left()
-    tried = [(lags.left(where, corner)[0], where, corner) for where in places for corner in CORNERS]
-    best, where, corner = min(tried)
+    before = lags.left()
+    if not np.all(np.isfinite(before)):
+        return None
+    tried = [(lags.left(where, corner), where, corner) for where in places for corner in CORNERS]
+    best, where, corner = min(tried, key=lambda each: each[0].sum())
     limit = threshold(FALSE_ALARM, len(tried), 1)
-    if not lags.gain(fit, best) > limit:
+    if lags.gain(before, best) <= limit:
         return None
     corner = _refined(lags, where, corner)
-    best, after = lags.left(where, corner)
-    if after > held + np.log(1.0 - LEAST_IMPROVEMENT):
+    after = lags.left(where, corner)
+    if after.mean() > before.mean() + np.log(1.0 - LEAST_IMPROVEMENT):
         return None
-    gain = lags.gain(fit, best)
+    gain = lags.gain(before, after)
     alike = dict.fromkeys(
-        other for share, other, _ in tried if other != where and lags.gain(fit, share) > (1.0 - SAME_SHARE) * gain
+        other for left, other, _ in tried if other != where and lags.gain(before, left) > (1.0 - SAME_SHARE) * gain
     )
-    std = _std(lags, where, corner, best)
-    shares = float(np.exp(held)), float(np.exp(after))
+    std = _std(lags, where, corner, after)
+    shares = float(np.exp(before.mean())), float(np.exp(after.mean()))
     return LateSensor(lag(where, corner), std, gain, limit, *shares, tuple(late_keys((), alike)))
 
 
@@ -141,7 +142,7 @@ def _refined(lags: Lags, where: str, corner: float) -> float:
     low = CORNERS[max(0, here - 1)]
     high = CORNERS[here + 1] if here + 1 < len(CORNERS) else corner**2 / CORNERS[here - 1]
     result = minimize_scalar(
-        lambda log_corner: lags.left(where, float(np.exp(log_corner)), checked=False)[0],
+        lambda log_corner: float(lags.left(where, float(np.exp(log_corner))).sum()),
         bounds=(float(np.log(low)), float(np.log(high))),
         method="bounded",
         options={"xatol": TOLERANCE, "maxiter": EVALUATIONS},
@@ -149,10 +150,10 @@ def _refined(lags: Lags, where: str, corner: float) -> float:
     return float(np.exp(result.x))
 
 
-def _std(lags: Lags, where: str, corner: float, best: float) -> float:
+def _std(lags: Lags, where: str, corner: float, best: Array) -> float:
     """1σ of the corner, Hz, from the curvature of twice the log likelihood over the logarithm of the corner."""
-    sides: Sequence[float] = [
-        lags.gain(lags.left(where, corner * float(np.exp(step)))[0], best) for step in (SHARPNESS_STEP, -SHARPNESS_STEP)
+    sides = [
+        lags.gain(lags.left(where, corner * float(np.exp(step))), best) for step in (SHARPNESS_STEP, -SHARPNESS_STEP)
     ]
     curvature = sum(sides) / SHARPNESS_STEP**2
     return corner * float(np.sqrt(2.0 / curvature)) if curvature > 0.0 else np.inf

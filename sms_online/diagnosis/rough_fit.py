@@ -125,8 +125,8 @@ class RoughRows:
         left[self._homogeneous] *= followed[self._homogeneous]
         return RoughFit(left[self._used], by_nominal[self._used])
 
-    def shares(self, fitted: NDArray[np.bool_]) -> tuple[Array, Array]:
-        """rms shares (rows,) of what a fit of some windows (W,) leaves of them, and of the others, if there are any.
+    def shares(self, fitted: NDArray[np.bool_]) -> Array:
+        """rms shares (rows,) of what a fit of some windows (W,) leaves of the others.
 
         Of rows without a torque a share of the size of their terms, which no scale of the parameters changes.
         """
@@ -136,11 +136,8 @@ class RoughRows:
         free = ScaleFree(Y[fitted], speeds, self._inertial)
         solution = free.solved(friction[fitted], b[fitted], self._nominal, self._nominal, SMALLEST)
         left = b - np.concatenate((Y, friction), axis=2) @ solution
-        squares = [
-            free.squares(solution[:n], left[some], self._nominal)[self._used]
-            for some in (fitted, ~fitted | fitted.all())
-        ]
-        return np.sqrt(squares[0]), np.sqrt(squares[1])
+        squares = free.squares(solution[:n], left[~fitted], self._nominal)
+        return np.asarray(np.sqrt(squares[self._used]))
 
     def _ratio(self, torques: Array) -> float:
         """Geometric mean over the joints of torques (n_v,), rms, to those that nominal values make; 1 without these."""

@@ -82,6 +82,63 @@ class ScaleFree:
         return converged(fit, first, cost)
 
 
+class Scale:
+    """Whether anything fixes the scale of π in a session's rows, and which of them count by their size as nothing does.
+
+    at (n,): parameters that fits begin from and rows are linear about. freed: speeds whose rows count by their size,
+    because they leave more than noise whatever is added.
+    """
+
+    def __init__(self, b: Array, expected: Array, inertial: NDArray[np.bool_], known: bool) -> None:
+        """b (W, n_v): torques of the rows. expected (n,): parameters behind their weights. known: a prior gives it."""
+        self.homogeneous = ~np.any(b, axis=0)
+        self.unknown = not known and bool(expected.any()) and bool(self.homogeneous.any())
+        self.freed: list[int] = []
+        self.at, self._expected, self._inertial = expected, expected, inertial
+
+    def free(self, beyond: NDArray[np.bool_]) -> None:
+        """Free rows without a torque of speeds (n_v,) that leave more than noise."""
+        self.freed = np.flatnonzero(beyond & self.homogeneous).tolist() if self.unknown else []
+
+    def fit(self, Y: Array, beside: Array, b: Array) -> tuple[Array, Array, Array]:
+        """Solution (n + c,) of rows b (W, n_v) with columns (W, n_v, n) and beside (W, n_v, c), and what it leaves.
+
+        Each type of rows counts by what it leaves, those without a torque by their size. Mean squares (n_v,), then the
+        same with these as large as the parameters behind the weights make them.
+        """
+        free, n = ScaleFree(Y, np.flatnonzero(self.homogeneous).tolist(), self._inertial), Y.shape[2]
+        solution = free.solved(beside, b, self.at, self._expected, 1.0)
+        left = b - np.concatenate((Y, beside), axis=2) @ solution
+        return solution, np.mean(left**2, axis=0), free.squares(solution[:n], left, self._expected)
+
+    def near(self, white: Array) -> tuple[Array, Array]:
+        """Rows (n, n) and right-hand side that keep what white columns (M, n) hardly determine at what is expected."""
+        lengths = NEAR * np.linalg.norm(white, axis=0)
+        return np.diag(lengths), lengths * self._expected
+
+    def linearise(self, white: Array, b: Array, rest: Array, solve: Callable[[Array, Array], Array]) -> None:
+        """Solve whitened rows (W, n_v, n) with right-hand side (W, n_v), each time about the solution before.
+
+        rest (W, n_v, c): columns beside them. solve: takes columns and right-hand side about a point, gives the
+        solution (n + c,), that of the least cost last.
+        """
+        free, n, W = ScaleFree(white, self.freed, self._inertial), white.shape[2], len(white)
+        lengths = np.diag(self.near(white.reshape(-1, n))[0])
+
+        def left(solution: Array) -> Array:
+            return np.asarray(b - white @ solution[:n] - rest @ solution[n:])
+
+        def about(solution: Array) -> Array:
+            Y, added = free.about(solution[:n], left(solution))
+            return solve(Y, b + added)
+
+        def cost(solution: Array) -> float:
+            off = lengths * (solution[:n] - self._expected)
+            return cost_of(free.squares(solution[:n], left(solution), self.at), off, W)
+
+        about(converged(about, np.concatenate((self.at, np.zeros(rest.shape[2]))), cost))
+
+
 def converged(fit: Callable[[Array], Array], start: Array, cost: Callable[[Array], float]) -> Array:
     """Where fits (n + c,) about the solution before lead to, from a start; the cost falls from fit to fit."""
     solution, least = start, cost(start)

@@ -18,6 +18,7 @@ import numpy as np
 from sms_online.diagnosis.acceptance import Acceptance
 from sms_online.diagnosis.candidate import Finding, Ranked, Rival
 from sms_online.diagnosis.evidence import Gain, basis, free_of, gain, gains, threshold
+from sms_online.diagnosis.folds import fall
 
 # Probability that a session without any effect beyond the model shows one.
 FALSE_ALARM = 0.01
@@ -51,6 +52,11 @@ class Tracing(Acceptance):
                 limit = max(limit, self.candidates[other].traits.inexact * taken)
         return g.gain - limit
 
+    def _left_over(self, k: int) -> float:
+        """Gain that constants among those chosen may leave in the rows of a candidate."""
+        acts = self._acts(k)
+        return max((left for other, left in self._leaves.items() if np.any(acts & self._acts(other))), default=0.0)
+
     def _preferred(self, gains: Sequence[Gain], allowed: Sequence[int]) -> int | None:
         """The candidate to take: the best one, or one with fewer constants that takes nearly as much."""
         excess = {k: self._excess(k, gains[k]) for k in allowed}
@@ -75,26 +81,30 @@ class Tracing(Acceptance):
         return one >= best - max(DECISIVE, SAME_SHARE * best)
 
     def _constants(self, k: int) -> int:
+        """How many constants a candidate has, those of its shape included."""
         candidate = self.candidates[k]
-        return max(len(candidate.parameters), len(candidate.effect.coefficients))
+        return len(candidate.parameters) + len(candidate.effect.coefficients)
 
     def run(
         self,
         refine: Callable[[Sequence[int], int], None],
         watch: Callable[[Sequence[int]], bool] = lambda chosen: False,
+        start: Sequence[int] = (),
     ) -> list[int]:
         """Numbers of the candidates found, in the order of what they explain.
 
         refine: improves the shape constants of one of those chosen, before what it leaves is given to others. watch:
-        is called with those chosen before each further one; true ends the search with these.
+        is called with those chosen before each further one; true ends the search with these. start: those that a
+        search of nearly the same rows has found, to go on from.
         """
         # Which candidate each step of the search took, and all that were chosen then.
         self.path: list[tuple[int, list[int]]] = []
         self._taken: dict[int, float] = {}  # gains of the effects chosen
+        self._leaves: dict[int, float] = {}
         self._refused: set[str] = set()
         self._held: set[int] = set()
         seen: set[frozenset[int]] = {frozenset()}
-        chosen: list[int] = []
+        chosen = self._begun(start)
         while True:
             chosen = self._grown(chosen, seen, refine, watch)
             if watch(chosen) or any(self.candidates[k].constant for k in chosen):
@@ -106,6 +116,17 @@ class Tracing(Acceptance):
             chosen = [k for k in chosen if k != failing]
             self.reweight(chosen)
             self._take(chosen)
+
+    def _begun(self, start: Sequence[int]) -> list[int]:
+        """Those of a search before that are of use in these rows too, each in its best form beside the others."""
+        if not start:
+            return []
+        self._iterated(start)
+        self._take(start)
+        chosen = self._weeded(self._revised(list(start)))
+        self._refused = set()  # beside others they may be of use again
+        self.path = [(k, chosen[: n + 1]) for n, k in enumerate(chosen)]
+        return chosen
 
     def _grown(
         self,
@@ -119,6 +140,8 @@ class Tracing(Acceptance):
         found, deviances = self.gains(chosen), dict[int | None, float]()
         while len(chosen) < MOST_EFFECTS and not watch(chosen):
             eligible = self._eligible(chosen, self._refused | useless)
+            # What a constant leaves while it is only approximately taken off must not be given to others.
+            eligible = [k for k in eligible if found[k].gain > self._left_over(k)]
             laws = [k for k in eligible if not self.candidates[k].traits.learned]
             # Simple laws first, then those that refine them, and curves where no law is of use.
             best = self._preferred(found, [k for k in laws if self.candidates[k].extends is None])
@@ -140,15 +163,7 @@ class Tracing(Acceptance):
                 if not self.reweight([*chosen, best]):
                     break
             self._take([*chosen, best])
-            chosen = self._revised([*chosen, best])
-            self.reweight(chosen)
-            self._take(chosen)
-            # In the new weights, beside the others, an effect may have to be what it cannot be, or be none.
-            while gone := [k for k in chosen if self._taken[k] <= self._least(k)]:
-                self._refused |= {self.candidates[k].key for k in gone}
-                chosen = [k for k in chosen if k not in gone]
-                self.reweight(chosen)
-                self._take(chosen)
+            chosen = self._weeded(self._revised([*chosen, best]))
             if self.candidates[best].key in self._refused:
                 found, deviances = self.gains(chosen), {}
                 continue
@@ -159,9 +174,20 @@ class Tracing(Acceptance):
             # Beside it others may be of use that were none before.
             useless = set()
             found, deviances = self.gains(chosen), {}
-            if self.candidates[best].constant:
-                # What it leaves while it is only approximately taken off must not be given to others.
-                break
+        return chosen
+
+    def _weeded(self, chosen: list[int]) -> list[int]:
+        """Those chosen without what, in new weights beside the others, would have to be what it cannot be, or is none.
+
+        These are refused from then on.
+        """
+        self.reweight(chosen)
+        self._take(chosen)
+        while gone := [k for k in chosen if self._taken[k] <= self._least(k)]:
+            self._refused |= {self.candidates[k].key for k in gone}
+            chosen = [k for k in chosen if k not in gone]
+            self.reweight(chosen)
+            self._take(chosen)
         return chosen
 
     def _holding(
@@ -215,6 +241,8 @@ class Tracing(Acceptance):
         those chosen; where rows that it acts on leave more than noise whatever is added, any large variance at rest
         would make them likelier, and the deviance is infinite.
         """
+        if acting is not None and self.stays_loud(chosen, acting):
+            return np.inf
         self._iterated(chosen)
         if acting is not None and np.any(self.floor[self._acts(acting)]):
             return np.inf
@@ -227,11 +255,12 @@ class Tracing(Acceptance):
         return total
 
     def _take(self, chosen: Sequence[int]) -> None:
-        """Remember what each of the effects chosen takes beside the others."""
-        self._taken = {}
+        """Remember what each of the effects chosen takes beside the others, and what a constant leaves of that."""
+        self._taken, self._leaves = {}, {}
         for k in chosen:
             (found,) = gains(*self.left([other for other in chosen if other != k]), [self._Z[k]])
             self._taken[k] = self._plausible(self.candidates[k], found).gain
+            self._leaves[k] = self._taken[k] * self.candidates[k].left_over(found.coefficients)
 
     def _least(self, k: int) -> float:
         """Gain that one of those chosen must have in the end: stiction may leave little of dry friction's."""
@@ -299,9 +328,10 @@ class Tracing(Acceptance):
             and gains[j].seen
             # What its own noise hides has no rivals to compare it with.
             and own.gain > limit
-            and self._near(gains[j].gain, own.gain)
+            and gains[j].gain > SAME_PART * own.gain
             # Nor are two that explain as much of different rows.
             and gain(Q, part, self._Z[j]).gain > SAME_PART * float(part @ part)
+            and (self._near(gains[j].gain, own.gain) or self._undecided(others, k, j))
         )
         acts, known = self._acts(k), {*taken, *ambiguous}
         beside = (j for j, g in enumerate(gains) if g.gain > 0.0 and np.any(acts & self._acts(j)))
@@ -311,6 +341,17 @@ class Tracing(Acceptance):
         if nearest is not None:
             rival = Rival(self.candidates[nearest].key, self.improvement(others, nearest).share)
         return Finding(found, own, limit, improvement, tuple(ambiguous), rival)
+
+    def _undecided(self, others: Sequence[int], k: int, j: int) -> bool:
+        """Whether held-out rows do not decide between two candidates, where these leave more than noise.
+
+        There a likelihood, which takes all of it for noise, is surer than blocks of time are.
+        """
+        acts = self._acts(k)
+        if not np.all(self.floor[acts] > 0.0):
+            return False
+        left = (self.held_out([*others, one], others)[:, acts].sum(axis=1) for one in (j, k))
+        return not fall(*left).certain
 
     def ranking(self) -> list[Ranked]:
         """Every effect in its best form, by what it alone takes from the residual."""

@@ -36,11 +36,12 @@ DIFFERENCE = 1e-6
 class Ranges:
     """How far a motion goes where an effect sits, for grids of shape constants.
 
-    speed: largest motor rate, rad/s. deflection: largest joint deflection, rad. duration: of the longest part without a
-    gap, s. sample_rate: Hz.
+    speed: largest motor rate, rad/s. swing: from the least to the largest motor angle, rad. deflection: largest joint
+    deflection, rad. duration: of the longest part without a gap, s. sample_rate: Hz.
     """
 
     speed: float
+    swing: float
     deflection: float
     duration: float
     sample_rate: float

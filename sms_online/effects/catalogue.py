@@ -22,6 +22,7 @@ from sms_online.effects.friction import (
     CoulombFriction,
     DirectionFriction,
     LoadFriction,
+    PreslidingFriction,
     StribeckFriction,
     ViscousFriction,
 )
@@ -35,9 +36,9 @@ from sms_online.errors import InputError
 from sms_online.model.effect import ForceEffect, InertiaEffect
 
 FORCES = (
-    CoulombFriction, ViscousFriction, StribeckFriction, LoadFriction, DirectionFriction, TorsionalHysteresis,
-    CubicStiffness, Backlash, KinematicError, Cogging, TorqueRipple, LinkDamping, LinkMassDamping, ReactionWheel,
-    ThrusterLeak, TableTilt, AirDrag, CableSpring, Slosh, TorqueGain, TorqueOffset,
+    CoulombFriction, ViscousFriction, StribeckFriction, PreslidingFriction, LoadFriction, DirectionFriction,
+    TorsionalHysteresis, CubicStiffness, Backlash, KinematicError, Cogging, TorqueRipple, LinkDamping, LinkMassDamping,
+    ReactionWheel, ThrusterLeak, TableTilt, AirDrag, CableSpring, Slosh, TorqueGain, TorqueOffset,
     LearnedForce,
 )  # fmt: skip
 CHANNELS = (EncoderOffset, EncoderEccentricity, SensorLag, TorqueDelay)
@@ -60,10 +61,12 @@ _CHANNELS: dict[str, Callable[[str, Mapping[str, float]], ChannelEffect]] = {eac
 # Linear coefficients of those on channels, and what becomes a constant of the description.
 LINEAR: dict[str, tuple[Linear, ...]] = {each.entry.name: each.linear for each in CHANNELS}
 CONSTANTS: dict[str, type[Constant]] = {each.entry.name: each for each in _CLASSES if issubclass(each, Constant)}
-# Tried at any joint where something changes while a session runs.
+# Numbers of joints below this are one character of a pattern.
+TEN = 10
 # Fewest knots of a curve, two of them its ends; and variables of joints with a spring.
 LEAST_KNOTS = 3
 OF_SPRINGS = ("deflection", "load")
+# Tried at any joint where something changes while a session runs.
 BEGINNING = tuple(sorted(entry.name for entry in ENTRIES.values() if entry.traits.begins))
 
 
@@ -278,4 +281,9 @@ def _groups(system: System, entry: Entry) -> Iterable[str]:
     devices = [next((p for p in DEVICES if fnmatchcase(c, p)), c) for c in positions]
     links = [f"{c.split('.')[0]}.*" if "." in c and c not in gauges else c for c in devices]
     patterns = [pattern for sensor in system.sensors for pattern in sensor.channels]
-    return dict.fromkeys([*links, *(p for p in patterns if any(fnmatchcase(c, p) for c in positions))])
+    shared = [p for p in patterns if any(fnmatchcase(c, p) for c in positions)]
+    # Encoders behind springs, where others sit on motors: they come from other electronics.
+    second = [c.removeprefix("q_") for c in positions if c.startswith("q_") and f"theta_m_{c[2:]}" in positions]
+    if 1 < len(second) < len(joints := [c for c in positions if c.startswith("q_")]) and len(joints) < TEN:
+        shared.append(f"q_[{''.join(second)}]")
+    return dict.fromkeys([*links, *shared])

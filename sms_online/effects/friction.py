@@ -1,7 +1,8 @@
 """Friction of a motor shaft against the stator, at the output side of the gear.
 
 Source of the laws: Armstrong-Hélouvry, Dupont, Canudas de Wit, Automatica 30 (1994) 1083; load-dependent friction of
-gears: Bittencourt, Gunnarsson, J. Dynamic Systems, Measurement and Control 134 (2012) 051013.
+gears: Bittencourt, Gunnarsson, J. Dynamic Systems, Measurement and Control 134 (2012) 051013; friction with memory:
+Dahl, AIAA J. 14 (1976) 1675.
 """
 
 from __future__ import annotations
@@ -106,6 +107,40 @@ class StribeckFriction(MotorSide):
         """-sign(θ̇_m) exp(-(θ̇_m / v_s)²)."""
         rate = self.rate(layout, v)
         return -(sign(rate) * np.exp(-((rate / self.shapes["velocity"]) ** 2)))[:, None]
+
+
+def _presliding_widths(ranges: Ranges) -> tuple[float, ...]:
+    return tuple(share * ranges.swing for share in (0.0003, 0.001, 0.003, 0.01, 0.03))
+
+
+class PreslidingFriction(MotorSide):
+    """f = -c z / w with ż = θ̇_m - |θ̇_m| z / w: friction that builds up over a way, and remembers where it comes from.
+
+    c: `torque` once the axis slides, N m. w: shape constant `width`, the way over which it builds up, rad at the output
+    side. Beside Coulomb friction it is the part that contacts take up before they slide. The state z starts at 0.
+    Limitations: rate-independent; small closed motions creep.
+    """
+
+    entry = Entry(
+        "presliding_friction", "force", "joint", {"torque": "N m"},
+        "slow reversals with small and large motion between them",
+        {"width": Shape("rad", 0.001, _presliding_widths)},
+    )  # fmt: skip
+    n_states = 1
+
+    def __init__(self, site: Site, given: Mapping[str, float]) -> None:
+        linear = {"torque": (f"c_p{site.index}", "N m", given.get("torque", 0.0))}
+        super().__init__(site, linear, {"width": given["width"]})
+
+    def along(self, layout: Layout, x: Array, v: Array, inputs: Inputs | None) -> Array:
+        """-z / w."""
+        assert inputs is not None
+        return -inputs.states / self.shapes["width"]
+
+    def state_rate(self, layout: Layout, x: Array, v: Array, z: Array) -> Array:
+        """θ̇_m - |θ̇_m| z / w."""
+        rate = self.rate(layout, v)[:, None]
+        return np.asarray(rate - np.abs(rate) * z / self.shapes["width"])
 
 
 class LoadFriction(MotorSide):

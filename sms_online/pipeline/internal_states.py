@@ -2,7 +2,9 @@
 
 Every ż = A z + b is affine in z, so over a sample interval h, with A at its mean and b linear in time, z follows from
 the matrix exponential of h A, here its Padé approximant (2, 2): a liquid at ω keeps its frequency to (ω h)⁴ / 720.
-Source: Hochbruck and Ostermann, Exponential integrators, Acta Numerica 19 (2010) 209.
+Where h A is large, as of friction that forgets within a sample, that of a part of the interval is doubled.
+Source: Hochbruck and Ostermann, Exponential integrators, Acta Numerica 19 (2010) 209; doubling: Skaflestad and Wright,
+Applied Numerical Mathematics 59 (2009) 783.
 """
 
 from __future__ import annotations
@@ -81,15 +83,27 @@ class InternalStates(Stage):
         if begun:
             self.state.z = out[0] = self.model.initial_state(x[0])
         A_both, b_both = np.concatenate((self.state.A, A)), np.concatenate((self.state.b, b))
-        X = 0.5 * self._h * (A_both[:-1] + A_both[1:])
-        one, twelfth = np.eye(n), X @ X / 12.0
-        inverse = np.linalg.inv(one - 0.5 * X + twelfth)
-        step = inverse @ (one + 0.5 * X + twelfth)
+        step, mean, ramp = _exponentials(0.5 * self._h * (A_both[:-1] + A_both[1:]))
         change = (b_both[1:] - b_both[:-1])[..., None]
-        push = self._h * (inverse @ (b_both[:-1, :, None] + (0.5 * one - X / 12.0) @ change))[..., 0]
+        push = self._h * (mean @ b_both[:-1, :, None] + ramp @ change)[..., 0]
         out[begun:] = _along(step, push, self.state.z)
         self.state.z, self.state.A, self.state.b = out[-1].copy(), A[-1:], b[-1:]
         return out
+
+
+def _exponentials(X: Array) -> tuple[Array, Array, Array]:
+    """exp(X), φ₁ = (exp(X) - 1) / X and φ₂ = (φ₁ - 1) / X of matrices X (N, n, n)."""
+    halvings = np.ceil(np.log2(np.maximum(1.0, np.abs(X).max(axis=(1, 2), initial=0.0)))).astype(np.int64)
+    X = X / 2.0 ** halvings[:, None, None]
+    one, twelfth = np.eye(X.shape[1]), X @ X / 12.0
+    mean = np.asarray(np.linalg.inv(one - 0.5 * X + twelfth))
+    step, ramp = mean @ (one + 0.5 * X + twelfth), mean @ (0.5 * one - X / 12.0)
+    for k in range(halvings.max(initial=0)):
+        more = halvings > k
+        ramp[more] = 0.25 * (mean[more] @ mean[more] + 2.0 * ramp[more])
+        mean[more] = 0.5 * (step[more] + one) @ mean[more]
+        step[more] = step[more] @ step[more]
+    return step, mean, ramp
 
 
 def _along(step: Array, push: Array, z: Array) -> Array:

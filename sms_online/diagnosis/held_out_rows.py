@@ -1,0 +1,81 @@
+"""Blocks of a session's rows predicted from the others: what held-out rows leave of a model with some candidates."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from sms_online.diagnosis.candidate_rows import CandidateRows, Key
+from sms_online.diagnosis.evidence import least_squares_without
+from sms_online.stream import Array
+
+
+class HeldOutRows(CandidateRows):
+    """Solutions without each block of a session, and what they leave of it."""
+
+    def solutions(self, chosen: Sequence[int], beside: Sequence[int] | None = None) -> Array:
+        """The same without each part of the windows in turn, (parts, n + c + m)."""
+        known = np.zeros(len(self._b) - self.rows.b.size, dtype=bool)
+        left_out = [
+            np.concatenate((np.repeat(~self.folds.fitted(k), self._n_v), known)) for k in range(self.folds.parts)
+        ]
+        return least_squares_without(self._columns(chosen, beside), self._b, left_out)
+
+    def predicted(
+        self, chosen: Sequence[int], solutions: Array | None = None, beside: Sequence[int] | None = None
+    ) -> Array:
+        """What is left of every row (W, n_v) over its own deviation, blocks predicted from the others."""
+        solutions = self.solutions(chosen, beside) if solutions is None else solutions
+        left = self.residual(chosen, self.solution(chosen, beside=beside))
+        for k, solution in enumerate(solutions):
+            held = self.folds.predicted(k)
+            left[held] = self.residual(chosen, solution)[held]
+        return left
+
+    def _sized(self, chosen: Sequence[int], solution: Array) -> Array:
+        """What is left (W, n_v), rows without a torque that leave more than noise as if they had their usual size."""
+        left = self.residual(chosen, solution)
+        if np.any(self._homogeneous):
+            terms = self._terms(chosen, solution)
+            sized = self._homogeneous & (terms > 0.0)
+            left[:, sized] *= np.sqrt(self._usual[sized] / terms[sized])
+        return left
+
+    def held_out(self, chosen: Sequence[int], beside: Sequence[int] | None = None) -> Array:
+        """Sums of squares of held-out rows by block and speed, (B, n_v), relative where they leave more than noise.
+
+        Kept as solutions are: every candidate beside the same others asks for those of the others.
+        """
+        key = self._key(chosen, beside)
+        if key not in self._held_out:
+            left = self._sized(chosen, self.solution(chosen, beside))
+            for k, solution in enumerate(self.solutions(chosen, beside)):
+                held = self.folds.predicted(k)
+                left[held] = self._sized(chosen, solution)[held]
+            self._held_out[key] = self._by_block(left)
+        return self._held_out[key]
+
+    def fitted(self, chosen: Sequence[int], beside: Sequence[int] | None = None) -> Array:
+        """The same sums of the fit to all rows."""
+        key = self._key(chosen, beside)
+        if key not in self._fitted:
+            self._fitted[key] = self._by_block(self._sized(chosen, self.solution(chosen, beside)))
+        return self._fitted[key]
+
+    def _by_block(self, left: Array) -> Array:
+        squares = (left * self.std / self._counted) ** 2
+        return np.array([squares[self.folds.held(k)].sum(axis=0) for k in range(self.folds.count)])
+
+    def spread(self, chosen: Sequence[int]) -> Array:
+        """Deviations (n + c,) of the solution by the jackknife over the parts, whatever rows hold beside noise."""
+        solutions = self.solutions(chosen)
+        n = len(solutions)
+        squares = np.sum((solutions - solutions.mean(axis=0)) ** 2, axis=0)
+        return np.asarray(np.sqrt((n - 1) / n * squares))[: squares.size - self.calibrated.count]
+
+    def _forget(self) -> None:
+        """See `CandidateRows`."""
+        super()._forget()
+        self._held_out: dict[Key, Array] = {}
+        self._fitted: dict[Key, Array] = {}
