@@ -30,12 +30,14 @@ def _log(path: Path, system: System, on_bytes: Callable[[int], None] | None, dir
 
 def _csv(path: Path, system: System, on_bytes: Callable[[int], None] | None, directory: Path | None) -> Source:
     """A capture, python-can's CAN log, or a table: by the header, and by whether the system describes a table."""
-    header = LineReader(path).first_line().strip()
+    described = any(isinstance(source, TableSource) for source in system.sources)
+    # A table of another program may be in its own encoding: µ and ° in names of columns that nobody asks for.
+    header = LineReader(path).first_line(strict=not described).strip()
     if header == CSV_HEADER:
         return CanLogReader(path, system, on_bytes, directory)
     known = channels(system)
     captured = set(header.split(",")) <= {"t", *known}
-    if not captured and any(isinstance(source, TableSource) for source in system.sources):
+    if described and not captured:
         return LogReader(path, system, on_bytes)
     return CaptureReader(path, on_bytes, known)
 
@@ -74,7 +76,7 @@ def open_source(
 def _whole(path: Path, system: System, on_bytes: Callable[[int], None] | None, directory: Path | None) -> Source:
     """The reader of all of a file."""
     if (path / SESSION).is_file():
-        return Recording(path, system, directory)
+        return Recording(path, system, directory, on_bytes)
     if is_bag(path):
         return LogReader(path, system, on_bytes)
     plain = Path(path.name.removesuffix(".gz"))
