@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import signal
+import time
 from pathlib import Path
 from typing import Any
 
@@ -33,6 +34,14 @@ def square(log: Path, number: int, death: str) -> dict[str, Any]:
     if death == "input":
         raise InputError("run.csv", "line 3", "no number", "a number")
     return {"square": number**2}
+
+
+def linger(log: Path, seconds: float) -> dict[str, Any]:
+    """Sleep so long; a line of `log` with the worker's process."""
+    with log.open("a", encoding="utf-8") as file:
+        file.write(f"{os.getpid()}\n")
+    time.sleep(seconds)
+    return {}
 
 
 def identify_and_die(path: Path, system: System, directory: Path | None, out: Path) -> Row:

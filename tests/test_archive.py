@@ -5,11 +5,12 @@ from __future__ import annotations
 import json
 import os
 import shutil
+import signal
 import subprocess
 import sys
 import time
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pyarrow.parquet as pq
@@ -109,6 +110,28 @@ def test_a_line_cut_by_a_power_failure_is_one_row_to_do_again(tmp_path: Path) ->
     assert len(file.read()) == 3
 
 
+def test_a_line_cut_within_a_letter_is_one_row_to_do_again(tmp_path: Path) -> None:
+    file = RowFile(tmp_path / ROWS)
+    # Letters of two bytes, and ones that other splitters take for ends of lines.
+    texts = ["3 µm off", "one line\x85 and\u2028 the same"]
+    for text in [*texts, "± µ"]:
+        file.append({"summary": text})
+    file.path.write_bytes(file.path.read_bytes()[: -len('µ"}\n'.encode()) + 1])
+    assert [row["summary"] for row in file.read()] == texts
+    assert file.path.read_bytes().endswith(b"\n")
+
+
+def test_captures_are_what_replay_reads(tmp_path: Path) -> None:
+    wanted = ["a/run.csv", "a/run.log.gz", "b.mcap", "c.parquet", "d.mat", "rosbag", "session"]
+    others = ["e.txt", "a/run.csv.truth.json", "f.blf.gz"]
+    inside = ["rosbag/metadata.yaml", "rosbag/part_0.mcap", "session/session.toml", "session/bus.log"]
+    written = [f"out/{ROWS}", f"out/{TABLE}", "out/a/run.csv/results.json"]
+    for name in [*(name for name in wanted if "." in name), *others, *inside, *written]:
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).touch()
+    assert [str(path.relative_to(tmp_path)) for path in captures_under(tmp_path)] == wanted
+
+
 def test_a_folder_without_captures_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     for folder, expected in ((tmp_path, "no capture"), (tmp_path / "absent", "no folder")):
         assert main(["archive", str(folder), "--system", "paper-planar", "--out", str(tmp_path / "out")]) == 2
@@ -135,6 +158,45 @@ def test_what_kills_every_worker_fails_alone(tmp_path: Path) -> None:
     assert rows.pop("4") == {"error": KILLED}
     assert all(row == {"square": int(key) ** 2} for key, row in rows.items())
     assert len(rows) == 11
+
+
+RUN = """
+import sys
+from pathlib import Path
+from sms_tools.archive.runner import finished
+from tests.archive_tasks import linger
+if __name__ == "__main__":
+    list(finished(linger, {str(k): (Path(sys.argv[1]), 60.0) for k in range(4)}, workers=2))
+"""
+
+
+def alive(process: int) -> bool:
+    try:
+        os.kill(process, 0)
+    except ProcessLookupError:
+        return False
+    return True
+
+
+def until(condition: Callable[[], bool]) -> None:
+    deadline = time.monotonic() + 30.0
+    while not condition():
+        assert time.monotonic() < deadline
+        time.sleep(0.05)
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGKILL])
+def test_a_stopped_run_takes_its_workers_with_it(tmp_path: Path, number: int) -> None:
+    log = tmp_path / "log"
+    log.touch()
+    (tmp_path / "run.py").write_text(RUN)
+    paths = os.pathsep.join([os.getcwd(), *filter(None, sys.path)])
+    command = [sys.executable, str(tmp_path / "run.py"), str(log)]
+    with subprocess.Popen(command, env={**os.environ, "PYTHONPATH": paths}, stderr=subprocess.DEVNULL) as run:
+        until(lambda: len(log.read_text().split()) == 2)
+        run.send_signal(number)
+    workers = [int(process) for process in log.read_text().split()]
+    until(lambda: not any(alive(process) for process in workers))
 
 
 def test_what_a_task_raises_is_its_row(tmp_path: Path) -> None:

@@ -15,6 +15,8 @@ from rosbags.rosbag2 import StoragePlugin
 from scipy.io import savemat
 
 import sms_online as sms
+from sms_adapters.files import size_of
+from sms_adapters.sources import open_source
 from sms_online.description.parse import parse_system, shipped_text
 from sms_online.errors import InputError
 from sms_tools.cli import main
@@ -232,24 +234,6 @@ def test_what_a_bag_does_not_hold_is_one_line(
     assert said in refusal(path, described(BAG, dict(line.split("\t") for line in text.splitlines())))
 
 
-@pytest.mark.parametrize(
-    ("text", "said"),
-    [
-        ("t,a\n0,1\n1,x\n", "line 3, column a: 'x'; expected a number or nothing"),
-        ("t,a\n0,1\n1\n", "line 3: 1 cells; expected 2, as in the header"),
-        ("t,b\n0,1\n", "no column 'a'; expected one of its columns: t, b"),
-        ("t,a,a\n0,1,2\n", "line 1: column 'a' twice; expected it once"),
-        ("t,a\n0,1\n2,1\n1,1\n", "row 3 has the time 1 s, before that of the row above"),
-        ("t,a\n1700000000000.5,1\n", "a stamp of 1.7e+12 s; expected seconds, or stamp_unit"),
-        ("t,a\n0,\n1,\n", "source rig, a: no number"),
-        ("t,a\n", "no rows with a stamp"),
-    ],
-)
-def test_a_malformed_table_is_one_line(tmp_path: Path, text: str, said: str) -> None:
-    (tmp_path / "run.csv").write_text(text)
-    assert said in refusal(tmp_path / "run.csv", described(TABLE, {"a": '"tau_1"'}))
-
-
 def test_what_a_table_skips_is_counted(tmp_path: Path) -> None:
     (tmp_path / "run.csv").write_text("t,a,b\n0,1,2\n1,,2\n1,5,5\n,7,7\n2,1e40,2\n3,1,9\n")
     system = described(TABLE, {"a": '"tau_1"', "b": '{ channel = "tau_2", maximum = 8 }'})
@@ -261,6 +245,44 @@ def test_what_a_table_skips_is_counted(tmp_path: Path) -> None:
         "run.csv, source rig: 1 of 10 cells empty, NaN or infinite",
         "run.csv, source rig: 2 values skipped, outside the limits of their channel",
     )
+
+
+@pytest.mark.parametrize("separator", [";", "\t"])
+def test_a_decimal_comma_may_come_after_whole_numbers(tmp_path: Path, separator: str) -> None:
+    rows = [("t", "a", "Bemerkung"), ("0", "0", "an, aus"), ("0,001", "1,5", ""), ("1", "2", "")]
+    (tmp_path / "run.csv").write_text("\n".join(separator.join(row) for row in rows) + "\n")
+    read = sms.read_capture(tmp_path / "run.csv", described(TABLE, {"a": '"tau_1"'}))
+    np.testing.assert_array_equal(read.t, [0.0, 0.001, 1.0])
+    np.testing.assert_array_equal(read.values[:, 0], [0.0, 1.5, 2.0])
+
+
+def test_a_header_in_another_encoding_is_read(tmp_path: Path) -> None:
+    (tmp_path / "run.csv").write_bytes("t,a,Dehnung in µm/m\n0,1,2\n1,3,4\n".encode("cp1252"))
+    read = sms.read_capture(tmp_path / "run.csv", described(TABLE, {"a": '"tau_1"'}))
+    np.testing.assert_array_equal(read.values[:, 0], [1.0, 3.0])
+
+
+def test_a_cut_last_line_of_a_table_is_warned_of(tmp_path: Path) -> None:
+    (tmp_path / "run.csv").write_text("t,a\n0,1\n1,2\n2,0.0")
+    read = sms.read_capture(tmp_path / "run.csv", described(TABLE, {"a": '"tau_1"'}))
+    assert read.t.tolist() == [0.0, 1.0]
+    assert read.warnings == ("run.csv: 1 line skipped, line 4 is cut (no newline at its end)",)
+
+
+@pytest.mark.parametrize("form", ["ros 1", "ros 2 in sqlite", "ros 2 in mcap"])
+def test_reading_a_bag_ends_near_its_size(capture: sms.Capture, bagged: sms.System, tmp_path: Path, form: str) -> None:
+    path, consumed = written(capture, tmp_path, form), list[int]()
+    list(open_source(path, bagged, on_bytes=consumed.append))
+    assert consumed == sorted(consumed)
+    assert 0.7 * size_of(path) < consumed[-1] <= size_of(path)
+
+
+@pytest.mark.parametrize(("write", "name"), [(hdf5, "run.h5"), (parquet, "run.parquet")])
+def test_reading_a_table_ends_at_its_size(capture: sms.Capture, tmp_path: Path, write: Any, name: str) -> None:
+    paths, consumed = write(tmp_path / name, capture), list[int]()
+    rig = described(TABLE, {path: f'"{channel}"' for channel, path in paths.items()}, 'stamp = "motors/t"')
+    list(open_source(tmp_path / name, rig, on_bytes=consumed.append))
+    assert consumed[-1] == size_of(tmp_path / name)
 
 
 def test_a_log_without_a_meaning_of_its_columns_says_so(tmp_path: Path) -> None:

@@ -28,6 +28,12 @@ def reading(path: Path, expected: str) -> Iterator[None]:
         raise unusable(path, error, expected) from None
 
 
+def size_of(path: Path) -> int:
+    """Bytes of a file, or of those in a directory; 0 where there is none."""
+    files = path.iterdir() if path.is_dir() else [path]
+    return sum(file.stat().st_size for file in files if file.is_file())
+
+
 def part_of(path: Path) -> Path:
     """Where a file is written before it appears under its own name."""
     return path.with_name(path.name + ".part")
@@ -39,8 +45,11 @@ def writing(path: Path) -> Iterator[Path]:
     part = part_of(path)
     with reading(path, WRITABLE):
         path.parent.mkdir(parents=True, exist_ok=True)
-        yield part
-        part.replace(path)
+        try:
+            yield part
+            part.replace(path)
+        finally:
+            part.unlink(missing_ok=True)
 
 
 def write_text(path: Path, text: str) -> Path:
@@ -81,10 +90,12 @@ class WholeFile:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        self._complete()
-        self._file.close()
         part = part_of(self._path)
-        if kind is None:
-            part.replace(self._path)
-        else:
-            part.unlink()
+        try:
+            if kind is None:
+                self._complete()
+                self._file.close()
+                part.replace(self._path)
+        finally:
+            self._file.close()
+            part.unlink(missing_ok=True)

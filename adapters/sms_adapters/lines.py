@@ -67,8 +67,11 @@ class LineReader:
         elif line == 1:
             raise self._empty()
 
-    def first_line(self) -> str:
-        """The first line without its end, whole or cut; InputError as for the iteration, or where it is not UTF-8."""
+    def first_line(self, strict: bool = True) -> str:
+        """The first line without its end, whole or cut; InputError as for the iteration.
+
+        strict: InputError too where it is not UTF-8; else what is not is replaced.
+        """
         with self._open() as (_, stream):
             buffer = bytearray(CHUNK)
             size = self._fill(stream, memoryview(buffer))
@@ -76,7 +79,7 @@ class LineReader:
             raise self._empty()
         try:
             # Spreadsheets put a byte-order mark in front.
-            return buffer[:size].split(b"\n", 1)[0].decode("utf-8-sig").rstrip("\r")
+            return buffer[:size].split(b"\n", 1)[0].decode("utf-8-sig", "strict" if strict else "replace").rstrip("\r")
         except UnicodeDecodeError:
             raise InputError(str(self.path), "line 1", "bytes that are not text", "lines of text in UTF-8") from None
 

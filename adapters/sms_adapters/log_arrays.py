@@ -40,8 +40,11 @@ class ArrayTable:
     Limitation: an older .mat is read variable by variable, each as a whole.
     """
 
-    def __init__(self, path: Path) -> None:
+    warnings = ()
+
+    def __init__(self, path: Path, on_bytes: Callable[[int], None] | None) -> None:
         self._path = path
+        self._on_bytes = on_bytes
 
     def chunks(self, stamp: str, columns: Sequence[str]) -> Iterator[Chunk]:
         """See `Table`."""
@@ -99,11 +102,13 @@ class ArrayTable:
             raise InputError(str(self._path), f"column {stamp}", found, "instants, one after the other")
         count = int(np.prod(stamps.shape))
         arrays = [self._column(find, name, count) for name in columns]
-        axis = _axis(stamps.shape, count)
+        axis, size = _axis(stamps.shape, count), self._path.stat().st_size
         for start in range(0, count, ROWS):
             rows = slice(start, min(start + ROWS, count))
             values = [_rows(array, rows).astype(np.float64) for array in arrays]
             yield _rows((stamps, axis, 0), rows), np.column_stack(values)
+            if self._on_bytes is not None:
+                self._on_bytes(size * rows.stop // count)
 
     def _column(self, find: Find, name: str, count: int) -> tuple[Any, int, int]:
         """Array, axis of its samples, and place along the other; InputError where it does not fit the stamps."""

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import json
+import os
 import struct
 from collections.abc import Callable, Collection, Iterator
 from pathlib import Path
 from typing import Any, BinaryIO
 
 from sms_adapters.extras import installed
+from sms_adapters.files import size_of
 from sms_adapters.raw import one_line
 from sms_online.errors import InputError
 
@@ -19,6 +21,8 @@ Decode = Callable[[bytes], Any]
 MCAP, BAGS = ".mcap", (".bag", ".db3")
 _MAGIC = 8  # bytes that an MCAP file begins and ends with
 METADATA = "metadata.yaml"  # of the directory that is a ROS 2 bag
+# After so many messages of a ROS bag it is said how far it is read.
+OFTEN = 1000
 
 
 def is_bag(path: Path) -> bool:
@@ -29,7 +33,7 @@ def is_bag(path: Path) -> bool:
 def open_bag(path: Path, on_bytes: Callable[[int], None] | None = None) -> Bag:
     """The bag at a path; InputError where there is none.
 
-    on_bytes: called with the bytes consumed so far, of an MCAP file.
+    on_bytes: called with the bytes consumed so far; of a ROS bag, with the share of its messages.
     """
     if not path.exists():
         raise InputError(str(path), "", "no such file", "a bag")
@@ -37,7 +41,7 @@ def open_bag(path: Path, on_bytes: Callable[[int], None] | None = None) -> Bag:
     if parts and all(part.suffix == MCAP for part in parts):
         # Parts of a long bag are numbered, _2 before _10.
         return McapBag(path, sorted(parts, key=lambda part: (len(part.name), part.name)), on_bytes)
-    return RosBag(path)
+    return RosBag(path, on_bytes)
 
 
 class Bag:
@@ -65,6 +69,10 @@ class RosBag(Bag):
     Limitation: a ROS 1 bag's index is held in memory, 200 bytes a message.
     """
 
+    def __init__(self, path: Path, on_bytes: Callable[[int], None] | None) -> None:
+        super().__init__(path)
+        self._on_bytes = on_bytes
+
     def _reader(self) -> Any:
         highlevel = installed("rosbags.highlevel", str(self.path))
         typesys = installed("rosbags.typesys", str(self.path))
@@ -88,7 +96,10 @@ class RosBag(Bag):
         try:
             reader.open()
             connections = [connection for connection in reader.connections if connection.topic in topics]
-            for connection, recorded, data in reader.messages(connections):
+            count, size = sum(connection.msgcount for connection in connections), size_of(self.path)
+            for number, (connection, recorded, data) in enumerate(reader.messages(connections), start=1):
+                if self._on_bytes is not None and number % OFTEN == 0:
+                    self._on_bytes(size * number // count)
                 yield connection.topic, recorded, reader.deserialize(data, connection.msgtype)
         except InputError:
             raise
@@ -113,7 +124,7 @@ class McapBag(Bag):
         found: dict[str, None] = {}
         for part in self._parts:
             with part.open("rb") as file:
-                summary = self._mcap.make_reader(file).get_summary() if _is_whole(file) else None
+                summary = self._summary(file) if _is_whole(file) else None
                 if summary is not None and summary.channels:
                     found |= dict.fromkeys(channel.topic for channel in summary.channels.values())
                 else:
@@ -123,6 +134,7 @@ class McapBag(Bag):
     def messages(self, topics: Collection[str]) -> Iterator[Recorded]:
         """See `Bag`."""
         decoders: dict[tuple[Path, int], Decode] = {}
+        before = 0  # bytes of the parts that are read
         for part in self._parts:
             with part.open("rb") as file:
                 for schema, channel, message in self._records(file, list(topics)):
@@ -130,8 +142,16 @@ class McapBag(Bag):
                     if key not in decoders:
                         decoders[key] = self._decoder(schema, channel)
                     if self._on_bytes is not None:
-                        self._on_bytes(file.tell())
+                        self._on_bytes(before + file.tell())
                     yield channel.topic, message.log_time, self._decoded(decoders[key], message.data)
+            before += part.stat().st_size
+
+    def _summary(self, file: BinaryIO) -> Any:
+        # What a damaged file makes its library raise is Python's as often as its own, here and in `_records`.
+        try:
+            return self._mcap.make_reader(file).get_summary()
+        except Exception as error:
+            raise self._broken(error) from None
 
     def _decoded(self, decode: Decode, data: bytes) -> Any:
         # What a wrong message makes the decoders raise is Python's as often as their own.
@@ -149,12 +169,10 @@ class McapBag(Bag):
         try:
             # In the order of the file: the library's reader by index queues all chunks' messages in that order.
             yield from self._mcap.NonSeekingReader(file).iter_messages(topics, log_time_order=False)
-        # Its library names an end between records, and raises what Python does of one within a record.
-        except (exceptions.EndOfFile, struct.error) as error:
-            if whole:
+        except Exception as error:
+            # Its library names an end between records, and raises what Python does of one within a record.
+            if whole or not isinstance(error, exceptions.EndOfFile | struct.error):
                 raise self._broken(error) from None
-        except exceptions.McapError as error:
-            raise self._broken(error) from None
 
     def _decoder(self, schema: Any, channel: Any) -> Decode:
         """How the messages of a channel are read; InputError for an encoding that is not."""
@@ -174,9 +192,10 @@ class McapBag(Bag):
 
 def _is_whole(file: BinaryIO) -> bool:
     """Whether an MCAP file was closed: it then ends as it begins. The file is at its beginning afterwards."""
+    size = file.seek(0, os.SEEK_END)
+    file.seek(max(0, size - _MAGIC))
+    end = file.read(_MAGIC)
     file.seek(0)
-    magic = file.read(_MAGIC)
-    file.seek(max(0, Path(file.name).stat().st_size - _MAGIC))
-    whole = file.read(_MAGIC) == magic
+    whole = size >= 2 * _MAGIC and file.read(_MAGIC) == end
     file.seek(0)
     return whole

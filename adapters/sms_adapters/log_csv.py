@@ -7,6 +7,7 @@ import io
 import re
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +15,7 @@ import pyarrow as pa
 import pyarrow.csv
 
 from sms_adapters.lines import CHUNK, LineReader
-from sms_adapters.log_tables import Chunk, missing
+from sms_adapters.log_tables import Chunk, missing, stamps_of
 from sms_adapters.raw import one_line
 from sms_online.errors import InputError
 
@@ -28,7 +29,7 @@ _WHOLE = re.compile(r"-?\d+")
 @dataclass(frozen=True)
 class _Layout:
     """How a file is written. places: of the wanted columns among `names`, the stamp's first. whole: stamps are whole
-    numbers. comma: the decimal sign is one."""
+    numbers. comma: the decimal sign of the first row is one."""
 
     separator: str
     names: list[str]
@@ -42,13 +43,18 @@ class CsvTable:
 
     def __init__(self, path: Path, on_bytes: Callable[[int], None] | None) -> None:
         self._path = path
-        self._on_bytes = on_bytes
+        self._lines = LineReader(path, on_bytes)
+
+    @property
+    def warnings(self) -> Sequence[str]:
+        """See `Table`."""
+        return self._lines.warnings
 
     def chunks(self, stamp: str, columns: Sequence[str]) -> Iterator[Chunk]:
         """See `Table`."""
         wanted = list(dict.fromkeys((stamp, *columns)))
         layout: _Layout | None = None
-        for line, chunk in LineReader(self._path, self._on_bytes):
+        for line, chunk in self._lines:
             text = bytes(chunk)
             if layout is None:
                 number, layout = self._layout(text, wanted)
@@ -57,13 +63,12 @@ class CsvTable:
             if not text.strip():
                 continue
             table = self._parse(text, line, layout)
-            arrays = dict(zip(wanted, (column.to_numpy() for column in table.columns), strict=True))
-            values = [np.asarray(arrays[name], dtype=np.float64) for name in columns]
-            yield arrays[stamp], np.column_stack(values)
+            values = [np.asarray(table.column(wanted.index(name)).to_numpy(), dtype=np.float64) for name in columns]
+            yield stamps_of(table.column(0)), np.column_stack(values)
 
     def _layout(self, text: bytes, wanted: Sequence[str]) -> tuple[int, _Layout]:
         """Lines up to the header, it included, and how the file is written."""
-        lines = text.decode("utf-8-sig", "replace").splitlines()
+        lines = text.decode("utf-8-sig", "replace").split("\n")
         best: list[str] = []
         for number, line in enumerate(lines[:HEADER_LINES], start=1):
             for separator in SEPARATORS:
@@ -78,22 +83,24 @@ class CsvTable:
                 below = next((row for row in lines[number:] if row.strip()), "")
                 cells = next(csv.reader([below], delimiter=separator), [])
                 whole = len(cells) > places[0] and bool(_WHOLE.fullmatch(cells[places[0]].strip()))
-                return number, _Layout(separator, names, places, whole, separator == ";" and "," in below)
+                return number, _Layout(separator, names, places, whole, "," in below)
         raise missing(self._path, next(name for name in wanted if name not in best), best)
 
     def _parse(self, text: bytes, line: int, layout: _Layout) -> pa.Table:
         """The wanted columns of whole lines; InputError names the first line that does not fit."""
         stamp = str(layout.places[0])
         types = {str(k): pa.float64() for k in layout.places}
-        # Stamps of 0, 0.001, … are whole at first only.
-        for kind in (pa.int64(), pa.float64()) if layout.whole else (pa.float64(),):
+        # Stamps of 0, 0.001, … are whole at first only, and only cells that are not whole show the decimal sign.
+        kinds = (pa.int64(), pa.float64()) if layout.whole else (pa.float64(),)
+        signs = (False,) if layout.separator == "," else (layout.comma, not layout.comma)
+        for kind, comma in product(kinds, signs):
             try:
-                return self._columns(text, types | {stamp: kind}, layout)
+                return self._columns(text, types | {stamp: kind}, layout, comma)
             except pa.ArrowInvalid as error:
                 wrong = error
         raise self._explained(text, line, layout, wrong)
 
-    def _columns(self, text: bytes, types: dict[str, pa.DataType], layout: _Layout) -> pa.Table:
+    def _columns(self, text: bytes, types: dict[str, pa.DataType], layout: _Layout, comma: bool) -> pa.Table:
         return pyarrow.csv.read_csv(
             pa.py_buffer(text),
             # A block that holds the whole text; columns are named by their place, for names may come twice.
@@ -104,7 +111,7 @@ class CsvTable:
             convert_options=pyarrow.csv.ConvertOptions(
                 column_types=types,
                 include_columns=[str(k) for k in layout.places],
-                decimal_point="," if layout.comma else ".",
+                decimal_point="," if comma else ".",
             ),
         )
 
@@ -116,7 +123,7 @@ class CsvTable:
                 expected = f"{len(layout.names)}, as in the header"
                 return InputError(str(self._path), f"line {number}", f"{len(row)} cells", expected)
             for k in layout.places if row else ():
-                if not _NUMBER.fullmatch(row[k].replace(",", ".") if layout.comma else row[k]):
+                if not _NUMBER.fullmatch(row[k] if layout.separator == "," else row[k].replace(",", ".")):
                     where = f"line {number}, column {layout.names[k]}"
                     return InputError(str(self._path), where, repr(row[k][:40]), "a number or nothing")
         return InputError(str(self._path), "", one_line(error), "a table of numbers")

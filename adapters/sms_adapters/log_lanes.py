@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from sms_adapters.capture import LARGEST, LATEST
 from sms_adapters.conversion import Conversions
 from sms_adapters.log_paths import NANOSECONDS
+from sms_adapters.log_tables import NO_STAMP
 from sms_adapters.units import si_factor
 from sms_online.description.channels import channel_unit
 from sms_online.description.schema import System
@@ -34,14 +35,21 @@ class Origin:
     nanoseconds: int | None = None
 
     def seconds(self, stamps: NDArray[Any], unit: str) -> Array:
-        """Times (B,), s, of stamps (B,) in a unit, to the nearest double."""
+        """Times (B,), s, of stamps (B,) in a unit, to the nearest double; NaN where there is none.
+
+        Whole stamps beyond LATEST are returned as they are: they cannot be in this unit.
+        """
         if stamps.dtype.kind == "M":
             stamps, unit = stamps.astype("datetime64[ns]").astype(np.int64), "ns"
         if stamps.dtype.kind in "iu":
+            there = stamps != NO_STAMP
+            rough = np.where(there, stamps * (NANOSECONDS[unit] / _SECOND), np.nan)
+            if not there.any() or np.nanmax(np.abs(rough)) > LATEST:
+                return rough  # in ns they might overflow
             whole = stamps.astype(np.int64) * NANOSECONDS[unit]
             if self.nanoseconds is None:
-                self.nanoseconds = int(whole[0])
-            return (whole - self.nanoseconds) / _SECOND
+                self.nanoseconds = int(whole[there][0])
+            return np.where(there, (whole - self.nanoseconds) / _SECOND, np.nan)
         if self.nanoseconds is None:
             self.nanoseconds = 0
         seconds = stamps.astype(np.float64) / (_SECOND // NANOSECONDS[unit])
@@ -86,13 +94,14 @@ class Lane:
             expected = f'seconds, or stamp_unit = "ms", "µs" or "ns" in source {self.source.name}'
             raise InputError(str(self.path), self.place, f"a stamp of {t[np.abs(t) > LATEST][0]:g} s", expected)
         there = ~np.isnan(t)
+        read = self._rows + self._unstamped
         self._unstamped += int(np.count_nonzero(~there))
         t, numbers = t[there], numbers[there]
         # The newest time before each row, by which one that repeats it or goes back is known.
         before = np.maximum.accumulate(np.concatenate(([self._last], t)))[:-1]
         back = t < before
         if self._strict and back.any():
-            row = self._rows + self._unstamped + int(back.argmax()) + 1
+            row = read + int(np.flatnonzero(there)[back.argmax()]) + 1
             found = f"row {row} has the time {t[back][0]:g} s, before that of the row above"
             raise InputError(str(self.path), self.place, found, "times that do not go back")
         self._back += int(np.count_nonzero(back))

@@ -18,7 +18,7 @@ _SECONDS, _REST = ("sec", "secs"), ("nanosec", "nsec", "nsecs")
 
 
 class MessagePath:
-    """What lies at a path in a message; None where nothing does.
+    """What lies at a path in a message; None where nothing does, TypeError where an entry of no list is asked for.
 
     An entry in brackets is counted from 0, or named: then it is the place of the name in the message's list `name`.
     """
@@ -35,6 +35,8 @@ class MessagePath:
                 value = _field(value, step)
             else:
                 index = step if isinstance(step, int) else _place_of(message, step[0])
+                if value is not None and not isinstance(value, Sequence | np.ndarray):
+                    raise TypeError(f"{self.path} is no entry of a list")
                 if index is None or value is None or len(value) <= index:
                     return None
                 value = value[index]

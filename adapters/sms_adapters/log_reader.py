@@ -13,7 +13,7 @@ from sms_adapters.capture import BLOCK
 from sms_adapters.log_bags import Bag, is_bag, open_bag
 from sms_adapters.log_lanes import Lane, Origin
 from sms_adapters.log_merge import LogMerge
-from sms_adapters.log_tables import open_table
+from sms_adapters.log_tables import Table, open_table
 from sms_adapters.log_topics import Topic
 from sms_online.description.explain import hint, nearest
 from sms_online.description.schema import System
@@ -35,8 +35,8 @@ class LogReader:
     """A table or bag as blocks in order of time; each iteration starts from its beginning.
 
     What its columns or topics mean is said by the system's sources of kind `table` or `bag`. Stamps that are whole
-    numbers or dates count from the first one. on_bytes: called with the bytes of the file consumed so far, where these
-    are known. What is skipped is counted in `warnings`.
+    numbers or dates count from the first one. on_bytes: see `open_table` and `open_bag`. What is skipped is counted in
+    `warnings`.
     Raises InputError, on construction for a file that is not there, a system without such a source, a unit that is none
     and a topic that the bag does not hold; while iterating for what cannot be read, a column or path that is not there,
     stamps of a table that go back, and a channel without any sample.
@@ -52,6 +52,7 @@ class LogReader:
         self._system = system
         self._on_bytes = on_bytes
         self._bag = open_bag(path, on_bytes) if is_bag(path) else None
+        self._tables: list[Table] = []  # of each lane of a table
         self._topics: list[str] = []  # of each lane of a bag
         self._lanes = self._new_lanes()
         self._merge = LogMerge([len(lane.keys) for lane in self._lanes], PATIENCE)
@@ -69,6 +70,8 @@ class LogReader:
             if late:
                 why = f"their stamps are more than {PATIENCE:g} s behind those of other topics"
                 found.append(f"{self._path.name}, {lane.place}: {late} samples skipped, {why}")
+        # Of one file all tables leave out the same.
+        found += [warning for table in self._tables[:1] for warning in table.warnings]
         return found + ([self._bag.cut] if self._bag is not None and self._bag.cut else [])
 
     def __iter__(self) -> Iterator[Block]:
@@ -92,10 +95,10 @@ class LogReader:
 
     def _of_tables(self) -> Iterator[Samples]:
         """Chunks of the tables, always of the one that is furthest behind."""
+        self._tables = [open_table(self._path, None if k else self._on_bytes) for k in range(len(self._lanes))]
         readers = {}
-        for k, lane in enumerate(self._lanes):
+        for k, (lane, table) in enumerate(zip(self._lanes, self._tables, strict=True)):
             assert isinstance(lane.source, TableSource)
-            table = open_table(self._path, self._on_bytes if k == 0 else None)
             readers[k] = table.chunks(lane.source.stamp, lane.keys)
         while readers:
             k = min(readers, key=lambda each: self._merge.newest[each])

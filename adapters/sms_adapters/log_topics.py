@@ -30,7 +30,7 @@ class Topic:
         self._unit = lane.source.stamp_unit
         self._stamp = None if lane.source.stamp == RECORDED else MessagePath(lane.source.stamp)
         self._paths = [MessagePath(key) for key in lane.keys]
-        self._offset: float | None = None  # from the time of recording to the stamp, of the first message, s
+        self._offset: float | None = None  # from the time of recording to the stamp, of most of the first messages, s
         self._seen = False
         self._clear()
 
@@ -44,11 +44,11 @@ class Topic:
         if not self._seen:
             self._seen = True
             self._check(message)
-        stamp = None if self._stamp is None else self._stamp(message)
         try:
+            stamp = None if self._stamp is None else self._stamp(message)
             self._numbers.append([path.number(message) for path in self._paths])
             self._stamps.append(recorded if stamp is None else nanoseconds(stamp, self._unit))
-        except (TypeError, ValueError) as error:
+        except (TypeError, ValueError, OverflowError) as error:
             expected = "numbers, and a time as the stamp"
             raise InputError(str(self._lane.path), self._lane.place, str(error), expected) from None
         self._recorded.append(recorded)
@@ -65,7 +65,9 @@ class Topic:
             found, expected = "the same stamp in every message", f'stamp = "{RECORDED}" in its source, or another path'
             raise InputError(str(self._lane.path), self._lane.place, found, expected)
         offsets = (stamps - recorded) / _SECOND if whole else stamps - recorded / _SECOND
-        self._offset = float(offsets[0]) if self._offset is None else self._offset
+        if self._offset is None:
+            # The first message of all may have been sent before its clock was there.
+            self._offset = float(np.median(offsets[np.isfinite(offsets)])) if np.isfinite(offsets).any() else 0.0
         plausible = np.abs(offsets - self._offset) <= PLAUSIBLE
         self._lane.implausible += int(np.count_nonzero(~plausible))
         return stamps[plausible], "ns" if whole else "s", numbers[plausible]

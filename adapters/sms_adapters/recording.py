@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -46,8 +46,8 @@ class Recording:
     """What a live session recorded, as the session's own blocks: a `Source`.
 
     directory: of session.toml. system: as the session had it; its sources are those of the recording. system_directory:
-    where its file lies. origin: the session's start, s. Raises InputError where the directory is no
-    recording, or of other sources.
+    where its file lies. on_bytes: called with the bytes of the recording consumed so far. origin: the session's start,
+    s. Raises InputError where the directory is no recording, or of other sources.
     """
 
     def __init__(
@@ -55,8 +55,9 @@ class Recording:
         directory: Path,
         system: System,
         system_directory: Path | None = None,
+        on_bytes: Callable[[int], None] | None = None,
     ) -> None:
-        self._directory = directory
+        self._directory, self._on_bytes = directory, on_bytes
         self._header, self._ending = read_header(directory)
         self.origin = self._header.start
         self._system, self._system_directory = system, system_directory
@@ -91,8 +92,15 @@ class Recording:
 
     def __iter__(self) -> Iterator[Block]:
         """Yield the blocks from the beginning."""
+        consumed: dict[Path, int] = {}
+
+        def note(path: Path, count: int) -> None:
+            consumed[path] = count
+            if self._on_bytes is not None:
+                self._on_bytes(sum(consumed.values()))
+
         self._items = [
-            RecordedItems(self._directory, source.name, self._header.sources[source.name], self._header.epoch)
+            RecordedItems(self._directory, source.name, self._header.sources[source.name], self._header.epoch, note)
             for source in self._system.devices
         ]
         self._merger = ours = merger(self._system, self._system_directory, self._header.start)

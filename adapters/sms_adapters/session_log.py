@@ -15,8 +15,9 @@ from __future__ import annotations
 
 import json
 import tomllib
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from itertools import islice, repeat
 from pathlib import Path
 from typing import Any, Literal
@@ -155,15 +156,23 @@ def chunk_line(name: str, epoch: int, chunk: SerialChunk) -> str:
 class RecordedItems:
     """The raw items of one source of a recording, in order of arrival, without those the estimator never saw.
 
-    Raises InputError for a line that is none.
+    on_bytes: called with each file of them and its bytes consumed so far. Raises InputError for a line that is none.
     """
 
-    def __init__(self, directory: Path, name: str, kind: Kind, epoch: int) -> None:
+    def __init__(
+        self,
+        directory: Path,
+        name: str,
+        kind: Kind,
+        epoch: int,
+        on_bytes: Callable[[Path, int], None] = lambda path, count: None,
+    ) -> None:
         self.path = directory / (name + SUFFIXES[kind])
+        stamps = directory / (name + STAMPS)
         self._kind = kind
         self._epoch = epoch
-        self._lines = LineReader(self.path)
-        self._stamp_lines = LineReader(directory / (name + STAMPS))
+        self._lines = LineReader(self.path, partial(on_bytes, self.path))
+        self._stamp_lines = LineReader(stamps, partial(on_bytes, stamps))
         self._dropped = _ranges(directory / (name + DROPPED))
 
     @property

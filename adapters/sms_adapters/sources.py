@@ -30,12 +30,14 @@ def _log(path: Path, system: System, on_bytes: Callable[[int], None] | None, dir
 
 def _csv(path: Path, system: System, on_bytes: Callable[[int], None] | None, directory: Path | None) -> Source:
     """A capture, python-can's CAN log, or a table: by the header, and by whether the system describes a table."""
-    header = LineReader(path).first_line().strip()
+    described = any(isinstance(source, TableSource) for source in system.sources)
+    # A table of another program may be in its own encoding: µ and ° in names of columns that nobody asks for.
+    header = LineReader(path).first_line(strict=not described).strip()
     if header == CSV_HEADER:
         return CanLogReader(path, system, on_bytes, directory)
     known = channels(system)
     captured = set(header.split(",")) <= {"t", *known}
-    if not captured and any(isinstance(source, TableSource) for source in system.sources):
+    if described and not captured:
         return LogReader(path, system, on_bytes)
     return CaptureReader(path, on_bytes, known)
 
@@ -47,6 +49,18 @@ READERS: dict[str, Reader] = {
     **dict.fromkeys((*PARQUET_ENDINGS, *ARRAY_ENDINGS), _log),
 }
 COMPRESSED = (".csv", ".log", ".asc", ".trc")
+NAMES = f"a name ending in {', '.join(READERS)} (or .gz of text), .mcap, .bag or .db3, or a recording"
+
+
+def is_recorded(path: Path) -> bool:
+    """Whether a file or directory is named as one that `open_source` reads."""
+    return (path / SESSION).is_file() or is_bag(path) or _reader(path) is not None
+
+
+def _reader(path: Path) -> Reader | None:
+    """The reader of a file that is no bag."""
+    plain = Path(path.name.removesuffix(".gz"))
+    return READERS.get(plain.suffix) if plain.suffix in COMPRESSED or plain.name == path.name else None
 
 
 def open_source(
@@ -74,11 +88,10 @@ def open_source(
 def _whole(path: Path, system: System, on_bytes: Callable[[int], None] | None, directory: Path | None) -> Source:
     """The reader of all of a file."""
     if (path / SESSION).is_file():
-        return Recording(path, system, directory)
+        return Recording(path, system, directory, on_bytes)
     if is_bag(path):
         return LogReader(path, system, on_bytes)
-    plain = Path(path.name.removesuffix(".gz"))
-    if plain.suffix in READERS and (plain.suffix in COMPRESSED or plain.name == path.name):
-        return READERS[plain.suffix](path, system, on_bytes, directory)
-    expected = f"a name ending in {', '.join(READERS)} (or .gz of text), .mcap, .bag or .db3, or a recording"
-    raise InputError(str(path), "", f"a file named {path.name}", expected)
+    reader = _reader(path)
+    if reader is None:
+        raise InputError(str(path), "", f"a file named {path.name}", NAMES)
+    return reader(path, system, on_bytes, directory)

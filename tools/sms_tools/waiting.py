@@ -11,6 +11,7 @@ from typing import Protocol
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
+from sms_adapters.files import size_of
 from sms_adapters.sources import open_source
 from sms_online.capture import PIECE
 from sms_online.description.schema import System
@@ -53,7 +54,7 @@ def watched(
         source = open_source(path, system, start, stop, None, folder)
         yield Watched(source, source, console)
         return
-    size = _size(path)
+    size = size_of(path)
     bar = _bar(console)
     try:
         if size > SMALL:
@@ -90,12 +91,6 @@ def waiting() -> Iterator[Callable[[str, float], None]]:
 def _bar(console: Console) -> Progress:
     columns = (TextColumn("{task.description}"), BarColumn(), TextColumn("{task.percentage:.0f} %"))
     return Progress(*columns, TimeRemainingColumn(), console=console, transient=True)
-
-
-def _size(path: Path) -> int:
-    """Bytes of a file, or of those in a directory."""
-    files = path.iterdir() if path.is_dir() else [path]
-    return sum(file.stat().st_size for file in files if file.is_file())
 
 
 def _mover(bar: Progress, name: str, total: float) -> Mover:

@@ -15,8 +15,7 @@ import pyarrow.parquet as pq
 from sms_adapters.files import writing
 from sms_adapters.recorded import captured, recorded_at
 from sms_adapters.runs import NAME as RESULTS
-from sms_adapters.session_log import SESSION
-from sms_adapters.sources import open_source
+from sms_adapters.sources import NAMES, is_recorded, open_source
 from sms_online.description.parse import describe
 from sms_online.description.schema import System
 from sms_online.diagnosis.diagnosed import diagnose
@@ -28,8 +27,6 @@ from sms_tools.results_file import write_document
 
 ROWS, TABLE = "archive.jsonl", "archive.parquet"
 DIAGNOSIS = "diagnosis.json"
-# Ends of the names of captures and logs; what is in a folder of a live session is that session.
-ENDINGS = (".csv", ".log", ".asc", ".trc", ".csv.gz", ".log.gz", ".asc.gz", ".trc.gz", ".blf", ".mf4")
 
 
 def captures_under(folder: Path) -> list[Path]:
@@ -38,20 +35,17 @@ def captures_under(folder: Path) -> list[Path]:
         raise InputError(str(folder), "", "no folder", "a folder with captures")
     out = sorted(_captures(folder))
     if not out:
-        expected = f"files that end in {', '.join(ENDINGS)}, or recordings"
-        raise InputError(str(folder), "", "no capture in it or below it", expected)
+        raise InputError(str(folder), "", "no capture in it or below it", NAMES)
     return out
 
 
 def _captures(folder: Path) -> Iterator[Path]:
-    if (folder / SESSION).is_file():
+    """What can be read, but for what an archive has written."""
+    if is_recorded(folder):
         yield folder
-        return
-    for path in folder.iterdir():
-        if path.is_dir():
+    elif folder.is_dir() and not (folder / ROWS).is_file():
+        for path in folder.iterdir():
             yield from _captures(path)
-        elif path.name.endswith(ENDINGS):
-            yield path
 
 
 def archive(

@@ -24,13 +24,14 @@ class RowFile:
         """Finished rows, none where there is no file; what a stopped run left of its last line is taken out of it."""
         if not self.path.exists():
             return []
-        text = self.path.read_text(encoding="utf-8")
-        whole = text[: text.rfind("\n") + 1]
-        if whole != text:
-            self.path.write_text(whole, encoding="utf-8")
+        with reading(self.path, "lines that an earlier run wrote"):
+            content = self.path.read_bytes()
+            whole = content[: content.rfind(b"\n") + 1]
+            if whole != content:
+                os.truncate(self.path, len(whole))
         try:
             return [json.loads(line) for line in whole.splitlines()]
-        except json.JSONDecodeError as error:
+        except ValueError as error:
             found = f"a line that is not JSON ({error})"
             raise InputError(str(self.path), "", found, "lines that an earlier run wrote") from None
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 import multiprocessing
 import os
 import signal
+import threading
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
@@ -105,8 +106,17 @@ def _pool(work: Work, workers: int) -> ProcessPoolExecutor:
 
 
 def _initialise() -> None:
-    """Ctrl-C, which reaches the workers too, ends them without a word."""
+    """Ctrl-C, which reaches the workers too, ends them without a word; so does the end of the run itself."""
     signal.signal(signal.SIGINT, signal.SIG_DFL)
+    threading.Thread(target=_end_with_parent, name="end with parent", daemon=True).start()
+
+
+def _end_with_parent() -> None:
+    """A worker holds both ends of its queue, so it would not notice that nobody writes there any more."""
+    parent = multiprocessing.parent_process()
+    assert parent is not None  # of a worker
+    parent.join()
+    os._exit(1)
 
 
 def _on_cluster(work: Work, tasks: Tasks, scheduler: str) -> Iterator[tuple[str, Row]]:
