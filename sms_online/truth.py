@@ -14,10 +14,13 @@ from sms_online.errors import InputError
 def true_values(truth: Mapping[str, Any], described: System, adopted: System) -> dict[str, float]:
     """By name, of `truth` as read beside a capture; the effects of `adopted` that were not injected are truly zero.
 
-    Effects that were injected into a system of another kind are left out.
+    Effects that were injected into a system of another kind are left out. What `described` has found in an earlier
+    session is no truth.
     """
     injected = tuple(e for e in map(Effect.model_validate, truth.get("effects", ())) if _fits(described, e))
-    declared = described.model_copy(update={"effects": (*described.effects, *injected)})
+    places = {(effect.name, effect.where) for effect in injected}
+    others = tuple(effect for effect in described.effects if (effect.name, effect.where) not in places)
+    declared = described.model_copy(update={"effects": (*others, *injected), "fitted": {}})
     stated = {p.name: p.nominal for p in build_model(declared).parameters if "@" in p.name}
     absent = {p.name: 0.0 for p in build_model(adopted).parameters if "@" in p.name}
     return absent | stated | dict(truth["parameters"])

@@ -320,3 +320,20 @@ def test_a_system_that_is_none_is_one_clear_line(system: Any, said: str) -> None
         sms.simulate(system)
     with pytest.raises(sms.InputError, match=said):
         sms.Session(system, block.channels)
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        (
+            {"effects": ["coulomb_friction@joint_2"]},
+            "coulomb_friction@joint_2: nothing of it; expected its size, such as",
+        ),
+        ({"effects": ["coulomb_friction@joint_2:torque=0"]}, "nothing of it"),
+        ({"duration": -1.0}, "duration: -1 s; expected more than 0"),
+        ({"duration": 1e300}, r"duration: 1e\+300 s; expected .* at most"),
+    ],
+)
+def test_a_simulation_of_nothing_is_refused(given: dict[str, Any], message: str) -> None:
+    with pytest.raises(sms.InputError, match=message):
+        sms.simulate("paper-planar", **given)

@@ -339,6 +339,13 @@ def test_import_writes_a_capture_and_clears_a_truth_of_another(bench: Path, caps
     assert not truth_path(bench / "emps.csv").exists()
 
 
+def test_an_import_never_writes_over_its_source(bench: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (bench / "log.csv").write_text("t,tau_1\n0,1\n")
+    assert main(["import", "log", "log.csv", "--system", "paper-planar", "--capture", "./log.csv"]) == 2
+    assert "the source itself; expected another file" in capsys.readouterr().err
+    assert (bench / "log.csv").read_text() == "t,tau_1\n0,1\n"
+
+
 def test_markers_of_the_papers_links(bench: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["markers", "--system", "paper-planar", "--json"]) == 0
     out, err = capsys.readouterr()

@@ -17,7 +17,7 @@ from sms_adapters.capture import CaptureWriter
 from sms_adapters.system_file import load_system
 from sms_online.description.channels import channels
 from sms_online.description.parse import parse_system
-from sms_online.description.schema import Effect
+from sms_online.description.schema import Effect, Fitted
 from sms_online.diagnosis.diagnose import Diagnosis, diagnose
 from sms_online.diagnosis.document import diagnosis_document
 from sms_online.diagnosis.force_curves import added_variables, force_curves
@@ -181,6 +181,15 @@ def test_what_was_found_is_remarked_in_the_system_file() -> None:
     text = adopted_text("paper-planar", system, after, found)
     assert re.findall("# found: (.*)", text) == ["torque 20 ± 0.005 N m", "torque 0.02 ± 0.005 N m"]
     assert parse_system(text, "adopted").effects == after.effects
+
+
+def test_what_was_injected_is_true_beside_what_was_found() -> None:
+    system, name = load_system("paper-planar"), "coulomb_friction@joint_2.torque"
+    found = Effect(name="coulomb_friction", where="joint_2", coefficients={"torque": 1.4})
+    fitted = {name: Fitted(value=1.4, std=0.1)}
+    adopted = system.model_copy(update={"effects": (*system.effects, found), "fitted": fitted})
+    injected = found.model_copy(update={"coefficients": {"torque": 1.5}}).model_dump()
+    assert true_values({"parameters": {}, "effects": [injected]}, adopted, adopted)[name] == 1.5
 
 
 def test_effects_that_were_not_injected_are_truly_zero() -> None:

@@ -15,6 +15,7 @@ from rosbags.rosbag2 import StoragePlugin
 from scipy.io import savemat
 
 import sms_online as sms
+from sms_adapters import log_reader
 from sms_adapters.files import size_of
 from sms_adapters.sources import open_source
 from sms_online.description.parse import parse_system, shipped_text
@@ -71,6 +72,16 @@ def test_a_bag_gives_the_bits_of_the_csv(capture: sms.Capture, bagged: sms.Syste
     np.testing.assert_array_equal(read.values[:, order], capture.values)
     np.testing.assert_array_equal(read.t, capture.t)
     assert read.warnings == ()
+
+
+def test_topics_that_are_read_at_once_wait_for_each_other(
+    capture: sms.Capture, bagged: sms.System, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # A second and more of each topic at once, and much less patience.
+    monkeypatch.setattr(log_reader, "PATIENCE", 0.1)
+    read = sms.read_capture(written(capture, tmp_path, "ros 2 in mcap"), bagged)
+    assert read.warnings == ()
+    np.testing.assert_array_equal(read.t, capture.t)
 
 
 @pytest.mark.slow

@@ -16,6 +16,7 @@ from sms_tools.cli import main
 DATA = Path(__file__).resolve().parents[1].parent / "shared" / "data"
 EMPS = DATA / "emps" / "DATA_EMPS.mat"
 QUANSER = DATA / "quanser_2dsfl" / "lqr_full_10deg.mat"
+KUKA = DATA / "kuka_kr300"
 FACTORY = DATA / "quanser_factory" / "fsf.csv"
 
 
@@ -106,6 +107,18 @@ def test_ten_seconds_of_another_unit_hold_for_the_next_ten(tmp_path: Path) -> No
     assert joints["joint_1"]["left"] < 0.28
     assert joints["joint_2"]["left"] < 0.42
     assert max(joint["left"] / joint["least"] for joint in joints.values()) < 1.35
+
+
+@pytest.mark.long
+def test_what_is_found_of_a_robot_predicts_its_torques_no_worse(tmp_path: Path) -> None:
+    """Ten seconds of six axes: too little for their zeros, which taken whole leave many times the torque."""
+    if not KUKA.exists():
+        pytest.skip(f"measured data {KUKA.name} is not beside the checkout")
+    document = diagnosis(tmp_path, str(KUKA / "run_a.csv"), "--system", str(KUKA / "system.toml"))
+    left = [[row["relative"] or 0.0 for row in document[when]["holdout"].values()] for when in ("before", "after")]
+    before, after = np.linalg.norm(left, axis=1)
+    assert after < before
+    assert not any("offset" in effect["name"] for effect in document["effects"])
 
 
 def test_a_holdout_that_is_the_capture_itself_needs_an_end(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

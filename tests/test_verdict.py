@@ -10,8 +10,9 @@ import pytest
 
 from sms_adapters.system_file import load_system
 from sms_online.description.schema import Effect, System
-from sms_online.diagnosis import diagnose
+from sms_online.diagnosis import exact_links
 from sms_online.diagnosis.candidate import Candidate
+from sms_online.diagnosis.diagnose import predicts_worse
 from sms_online.diagnosis.hypothesis import verdict
 from sms_online.diagnosis.record import Segment
 from sms_online.diagnosis.residuals import RowResidual
@@ -91,12 +92,21 @@ def test_links_stiffen_that_take_something_away(
     def trial(system: System, constants: Any, beta: Any, effects: Any) -> Attempted:
         return Attempted(None, system)
 
-    monkeypatch.setattr(diagnose, "Attempt", Attempted)
+    monkeypatch.setattr(exact_links, "Attempt", Attempted)
     rows = SimpleNamespace(beta=np.zeros(1))
     attempt: Any = SimpleNamespace(system=load_system("paper-planar"), rows=rows, constants=(), trial=trial)
     case: Any = None
-    found: Any = diagnose._stiffened(case, attempt, [])
+    found: Any = exact_links.with_exact_links(case, attempt, [])
     assert (None if found is None else found.links) == exact
+
+
+def test_what_leaves_more_of_held_out_torques_predicts_worse() -> None:
+    before = {"joint_1": 0.2, "joint_2": 0.5}
+    assert predicts_worse(before, {"joint_1": 0.2, "joint_2": 0.8})
+    assert not predicts_worse(before, {"joint_1": 0.3, "joint_2": 0.2})
+    # Torques of noise differ by less than a tenth, and rows without a torque have no share.
+    assert not predicts_worse(before, {"joint_1": 0.2, "joint_2": 0.52})
+    assert not predicts_worse({}, {})
 
 
 @pytest.mark.parametrize("noise", [1e-5, 1e-4])

@@ -22,7 +22,10 @@ def lanes(system: System, directory: Path | None) -> list[SourceLane]:
     Raises InputError for a system without devices, and as the decoders do.
     """
     if not system.devices:
-        raise InputError(system.name, "source", "no such table", "a table [[source]] for each device of the testbed")
+        found = (
+            f"only logs: {', '.join(source.name for source in system.sources)}" if system.sources else "no such table"
+        )
+        raise InputError(system.name, "source", found, "a table [[source]] for each device of the testbed")
     return [_lane(system, source, directory) for source in system.devices]
 
 

@@ -87,13 +87,15 @@ class LogReader:
     def _merged(self) -> Iterator[tuple[Array, Array]]:
         """Times and values of all lanes, as they come to be in order."""
         origin = Origin()
-        for k, stamps, unit, numbers in self._of_tables() if self._bag is None else self._of_bag(self._bag):
-            if stamps.size:
-                self._merge.add(k, *self._lanes[k].rows(origin, stamps, unit, numbers))
-                yield self._merge.take()
+        for pieces in self._of_tables() if self._bag is None else self._of_bag(self._bag):
+            # All that was read at once, or the first topics would wait in vain for the others.
+            for k, stamps, unit, numbers in pieces:
+                if stamps.size:
+                    self._merge.add(k, *self._lanes[k].rows(origin, stamps, unit, numbers))
+            yield self._merge.take()
         yield self._merge.take(final=True)
 
-    def _of_tables(self) -> Iterator[Samples]:
+    def _of_tables(self) -> Iterator[list[Samples]]:
         """Chunks of the tables, always of the one that is furthest behind."""
         self._tables = [open_table(self._path, None if k else self._on_bytes) for k in range(len(self._lanes))]
         readers = {}
@@ -107,9 +109,9 @@ class LogReader:
                 del readers[k]
                 self._merge.newest[k] = math.inf
             else:
-                yield k, chunk[0], self._lanes[k].source.stamp_unit, chunk[1]
+                yield [(k, chunk[0], self._lanes[k].source.stamp_unit, chunk[1])]
 
-    def _of_bag(self, bag: Bag) -> Iterator[Samples]:
+    def _of_bag(self, bag: Bag) -> Iterator[list[Samples]]:
         """Numbers in the messages of each lane, some thousand messages at a time."""
         lanes: dict[str, list[Topic]] = {}
         topics = [Topic(lane) for lane in self._lanes]
@@ -119,8 +121,8 @@ class LogReader:
             for topic in lanes[name]:
                 topic.add(recorded, message)
             if number % MESSAGES == 0:
-                yield from ((k, *topic.take()) for k, topic in enumerate(topics))
-        yield from ((k, *topic.take()) for k, topic in enumerate(topics))
+                yield [(k, *topic.take()) for k, topic in enumerate(topics)]
+        yield [(k, *topic.take()) for k, topic in enumerate(topics)]
 
     def _new_lanes(self) -> list[Lane]:
         kind = TableSource if self._bag is None else BagSource

@@ -13,7 +13,7 @@ from sms_online.capture import Capture
 from sms_online.description.given import Given, given_system
 from sms_online.description.schema import Effect, System
 from sms_online.effects.build import build_model
-from sms_online.effects.catalogue import check_effect, parse_effect
+from sms_online.effects.catalogue import ENTRIES, check_effect, parse_effect
 from sms_online.errors import InputError
 from sms_online.stream import Block
 from sms_sim.camera_faults import CameraFault, CameraFaults, parsed_faults
@@ -22,6 +22,9 @@ from sms_sim.plant import Plant
 from sms_sim.sensors import Sensors
 from sms_sim.simulate import Simulation, sampled_blocks
 from sms_sim.simulate import simulate as solve
+
+# Longest simulation, s: eleven days.
+LONGEST = 1e6
 
 
 @dataclass(frozen=True)
@@ -61,6 +64,13 @@ class Simulated:
                 injected.append(effect)
             else:
                 injected.append(parse_effect(effect, whole))
+        for effect in injected:
+            if ENTRIES[effect.name].coefficients and not any(effect.coefficients.values()):
+                (first, *_) = ENTRIES[effect.name].coefficients
+                key = f"{effect.name}@{effect.where}"
+                raise InputError("effects", key, "nothing of it", f"its size, such as {key}:{first}=1")
+        if duration is not None and not 0.0 < duration <= LONGEST:
+            raise InputError("simulate", "duration", f"{duration:g} s", f"more than 0, at most {LONGEST:g} s")
         whole = system.model_copy(update={"effects": (*system.effects, *injected)})
         drifts = parsed(drift)
         model = build_model(whole) if drifts else None

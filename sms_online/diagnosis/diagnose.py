@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 
@@ -27,11 +27,11 @@ from sms_online.diagnosis.candidate import Finding, Ranked
 from sms_online.diagnosis.captures import begins, in_seconds, one_after_another, undone
 from sms_online.diagnosis.constants import possible
 from sms_online.diagnosis.drifts import explained_by_drifts, following, leaves_more, may_explain
+from sms_online.diagnosis.exact_links import with_exact_links
 from sms_online.diagnosis.hypothesis import corrections, share_left, verdict
 from sms_online.diagnosis.late_sensors import LateSensor, find_late
 from sms_online.diagnosis.mistakes import Mistake, find_mistakes, wrong_clock
 from sms_online.diagnosis.record import SampleRecord
-from sms_online.diagnosis.trace import DECISIVE
 from sms_online.diagnosis.unexplained import Unexplained, describe_residual
 from sms_online.effects.build import build_model
 from sms_online.effects.catalogue import kinematic_candidates
@@ -39,15 +39,15 @@ from sms_online.errors import InputError
 from sms_online.evaluation import Evaluation
 from sms_online.model.model import Model
 from sms_online.pipeline.estimator import Estimator
-from sms_online.pipeline.momentum_windows import HOPS
 from sms_online.pipeline.statistics import Statistics
 from sms_online.stream import Array, Block
 from sms_online.threads import one_blas_thread
 from sms_online.tracker_results import Drift
 from sms_online.verdict.reasons import LARGEST_RESIDUAL
 
-# Exact links have to take this share of what straight ones leave beyond noise.
-STIFFENING_TAKES = 0.1
+# What is found may leave so many times of the held-out torque that the description leaves: of rows without a torque it
+# may explain all, and torques of noise differ by less.
+WORSE = 1.1
 
 
 @dataclass(frozen=True)
@@ -96,64 +96,23 @@ class Diagnosis:
         return self.estimator_after.model if same else build_model(self.after.system)
 
 
-def _exact(system: System, links: Sequence[Effect]) -> System:
-    """The system with links exact, by effects that say so."""
-    return system.model_copy(update={"effects": (*system.effects, *links)})
-
-
-def _stiffened(case: Case, attempt: Attempt, chosen: Sequence[int]) -> Attempt | None:
-    """An attempt with those links exact that the samples ask for, and nothing else; None where these take too little.
-
-    All links together first, for one may hide what another lacks; then without those that take no more than chance.
-    """
-    links = kinematic_candidates(attempt.system)
-    if not links:
-        return None
-
-    beta = attempt.rows.beta
-    # What was found may be there beside it, or may only have stood for it.
-    effects = [attempt.tracing.candidates[k].effect for k in chosen]
-
-    def excess(links: Sequence[Effect]) -> float:
-        try:
-            some = attempt.trial(_exact(attempt.system, links), attempt.constants, beta, effects)
-        except np.linalg.LinAlgError:
-            return np.inf  # the readings are those of links that are straight
-        return some.excess(range(len(some.tracing.candidates)))
-
-    # Squares of rows that overlap count the same evidence once for each.
-    chance = DECISIVE * HOPS
-    least = excess(links)
-    while len(links) > 1:
-        fewer = [[*links[:k], *links[k + 1 :]] for k in range(len(links))]
-        left = [excess(some) for some in fewer]
-        if min(left) > least + chance:
-            break
-        links, least = fewer[left.index(min(left))], min(left)
-    straight = excess([])
-    if straight - least <= max(chance, STIFFENING_TAKES * straight):
-        return None
-    try:
-        return Attempt(case, _exact(attempt.system, links), (), beta)
-    except np.linalg.LinAlgError:
-        return None
-
-
 def _trial(attempt: Attempt, forces: Sequence[Effect], constants: Sequence[Effect], beta: Array) -> Attempt:
     return attempt.trial(attempt.system, constants, beta, forces)
 
 
 def _with_constants(
-    case: Case, attempt: Attempt, chosen: list[int], progress: Progress
+    case: Case, attempt: Attempt, chosen: list[int], bare: State, progress: Progress
 ) -> tuple[Attempt, list[int], list[Finding]]:
     """The attempt with constants in place of the effects found that become such, what is found beside them, and these.
 
-    Samples are corrected by the constants, and what these leave, or have hidden, is searched again.
+    Samples are corrected by the constants, and what these leave, or have hidden, is searched again; not by those with
+    which held-out torques are predicted worse than by the description alone, whose state is `bare`.
     """
     n = attempt.rows.base.n
     findings: list[Finding] = []
     while any(attempt.tracing.candidates[k].constant for k in chosen):
         progress("improving constants", SEARCHED)
+        before = attempt, [k for k in chosen if not attempt.tracing.candidates[k].constant]
         findings += [attempt.tracing.finding(chosen, k) for k in chosen if attempt.tracing.candidates[k].constant]
         solution = attempt.solution(chosen)
         fresh, forces = attempt.found(chosen, solution)
@@ -171,6 +130,9 @@ def _with_constants(
         # Forces that only stood for a constant have nothing left to explain.
         chosen = attempt.search(forces)
         attempt.conclude(chosen)
+        if predicts_worse(bare.holdout.relative, attempt.state(chosen).holdout.relative):
+            attempt, chosen = before
+            break
     standing = {(effect.name, effect.where) for effect in attempt.constants}
     findings = [f for f in findings if (f.candidate.effect.name, f.candidate.effect.where) in standing]
     return attempt, chosen, findings
@@ -249,21 +211,26 @@ def diagnose(
     if late:
         # With the same weights, so that before and after are in the same measure.
         described = Attempt(case, system, (), attempt.rows.beta, ())
+    earlier: list[tuple[Attempt, list[int]]] = [(described, []), (attempt, [])]
     bare = described.state([])
     attempt.tracing.reweight([])
     ranking = attempt.tracing.ranking()
     attempt.tracing.reweight(chosen)
-    attempt, chosen, constants = _with_constants(case, attempt, chosen, progress)
+    attempt, chosen, constants = _with_constants(case, attempt, chosen, bare, progress)
     beyond = not stop() and any(row.beyond for row in attempt.test(chosen).values())
     if beyond and kinematic_candidates(attempt.system):
         progress("comparing exact links", SEARCHED)
-        exact = _stiffened(case, attempt, chosen)
+        exact = with_exact_links(case, attempt, chosen)
         if exact is not None:
-            beside = _with_constants(case, exact, exact.search(), progress)
+            beside = _with_constants(case, exact, exact.search(), bare, progress)
             # Links that are exact because of what another effect did would keep that one from being found.
             if beside[0].excess(beside[1]) < attempt.excess(chosen):
                 attempt, chosen, constants = beside
     after = attempt.state(chosen)
+    while predicts_worse(bare.holdout.relative, after.holdout.relative) and earlier:
+        attempt, chosen = earlier.pop()
+        constants, after = [], attempt.state(chosen)
+    late = late if attempt.system != system else []
     findings = [*constants, *(attempt.tracing.finding(chosen, k) for k in chosen)]
     named, partial = after.system != system, stop()
     estimator_after = before
@@ -305,6 +272,16 @@ def diagnose(
         estimator_after=estimator_after,
         unexplained=unexplained,
     )
+
+
+def predicts_worse(before: Mapping[str, float], after: Mapping[str, float]) -> bool:
+    """Whether shares of the torque left of blocks that were not fitted, by joint, are larger after than before.
+
+    Corrections are found to first order; taken whole, they may leave more than they explained.
+    """
+    both = [(before[row], after[row]) for row in before.keys() & after.keys()]
+    squares = np.sum(np.square(both), axis=0) if both else np.zeros(2)
+    return bool(squares[1] > WORSE**2 * squares[0])
 
 
 def _drifting(case: Case, followed: Estimator, drifts: tuple[Drift, ...], mistakes: tuple[Mistake, ...]) -> Diagnosis:

@@ -16,7 +16,7 @@ from typing import Any, NoReturn
 
 from sms_online.errors import InputError
 from sms_tools.exit_codes import BAD_INPUT, INTERRUPTED, OK
-from sms_tools.option_values import positive, rerun, seconds, whole
+from sms_tools.option_values import magnification, positive, rerun, seconds, whole
 
 PROGRAM = "sms-online"
 
@@ -133,7 +133,7 @@ def _add_view(parser: Parser, default: str = "off") -> None:
     names = "off|save|serve[=ADDRESS]|spawn|connect=URL"
     parser.add_argument("--rerun", metavar=names, type=rerun, default=default, help=text)
     text = "factor on the deflections that the view draws, 1 by default"
-    parser.add_argument("--exaggerate", metavar="FACTOR", type=positive, default=1.0, help=text)
+    parser.add_argument("--exaggerate", metavar="FACTOR", type=magnification, default=1.0, help=text)
 
 
 def _add_adopt(parser: Parser) -> None:

@@ -8,6 +8,9 @@ from collections.abc import Callable
 
 from sms_tools.view.choice import parse_choice
 
+# Largest factor on deflections that are drawn: a deflection of a nanometre is seen at it.
+MOST_MAGNIFIED = 1e6
+
 
 def seconds(positive: bool = False) -> Callable[[str], float]:
     """Reader of a time that is not negative, or positive."""
@@ -36,6 +39,14 @@ def positive(text: str) -> float:
     value = _number(text)
     if not (math.isfinite(value) and value > 0.0):
         raise argparse.ArgumentTypeError(f"{text!r}; expected a number greater than 0")
+    return value
+
+
+def magnification(text: str) -> float:
+    """A positive factor that leaves a picture a picture."""
+    value = positive(text)
+    if value > MOST_MAGNIFIED:
+        raise argparse.ArgumentTypeError(f"{text!r}; expected at most {MOST_MAGNIFIED:g}")
     return value
 
 

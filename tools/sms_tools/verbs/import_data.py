@@ -28,6 +28,8 @@ def run(args: argparse.Namespace) -> int:
         return import_urdf.run(args)
     if args.capture is None:
         raise InputError(f"import {args.kind}", "", "no --capture", "--capture FILE, the capture to write")
+    if args.capture.resolve() == args.source.resolve():
+        raise InputError(f"import {args.kind}", "--capture", f"{args.capture}, the source itself", "another file")
     samples, warnings = KINDS[args.kind](args)
     # What a simulation of the same name left would pass for the truth of a measurement.
     truth_path(args.capture).unlink(missing_ok=True)
