@@ -11,6 +11,7 @@ from time import monotonic
 import can
 import pytest
 
+from sms_adapters.session_log import SESSION
 from sms_tools.cli import main
 from sms_tools.live.simulated import GROUP
 from sms_tools.verbs.record import _can
@@ -78,3 +79,5 @@ def test_an_interface_that_is_none_ends_the_verb_at_once(
     err = capsys.readouterr().err
     assert "sms-online: arm, nonesuch x: " in err
     assert "expected a bus that python-can can open here" in err
+    # The corrected command may name the same directory.
+    assert not (tmp_path / "run" / SESSION).exists()

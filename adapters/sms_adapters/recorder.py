@@ -161,6 +161,12 @@ class Recorder:
         except OSError as error:
             self.problem = error.strerror or str(error)
 
+    def abandon(self) -> None:
+        """Close a recording whose session could not begin; where nothing came yet, the directory is free again."""
+        self.close(0.0)
+        if not any(track.count for track in self._tracks.values()):
+            Path(self._session.name).unlink(missing_ok=True)
+
     def _run(self) -> None:
         while not self._closing.wait(INTERVAL):
             self._write_waiting()

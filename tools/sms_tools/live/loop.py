@@ -15,6 +15,7 @@ from sms_adapters.clock_merge import Merger
 from sms_adapters.recorder import Recorder
 from sms_adapters.recording import tick_time
 from sms_online.checkpoint import Checkpoint
+from sms_online.errors import InputError
 from sms_online.notices import unstated_latency
 from sms_online.session import Session
 from sms_online.stream import Block
@@ -96,9 +97,16 @@ class LiveSession:
         """
         for feed in self._feeds:
             feed.start()
-        for feed in self._feeds:
-            feed.tried.wait(OPENING)
-            feed.check()
+        try:
+            for feed in self._feeds:
+                feed.tried.wait(OPENING)
+                feed.check()
+        except InputError:
+            for feed in self._feeds:
+                feed.stop()
+            if self._recorder is not None:
+                self._recorder.abandon()
+            raise
         # What is there by now stays, and looking through it for garbage would stop the loop for a tenth of a second.
         gc.collect()
         gc.freeze()

@@ -48,8 +48,7 @@ def run(args: argparse.Namespace) -> int:
             feed.start()
         said = 0.0
         while not interruption.requested and clock() < end:
-            for feed in feeds:
-                feed.check()
+            _check(feeds, recorder)
             interruption.sleep(min(INTERVAL, end - clock()))
             if clock() >= said + LINE_INTERVAL:
                 said = clock()
@@ -77,6 +76,18 @@ def run(args: argparse.Namespace) -> int:
     if not received:
         return NOTHING_RECEIVED
     return INTERRUPTED if interruption.requested else OK
+
+
+def _check(feeds: list[Feed], recorder: Recorder) -> None:
+    """Raise the InputError of a device that can never be opened, with the others released."""
+    try:
+        for feed in feeds:
+            feed.check()
+    except InputError:
+        for feed in feeds:
+            feed.stop()
+        recorder.abandon()
+        raise
 
 
 def _device(source: Device) -> str:
