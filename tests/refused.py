@@ -7,6 +7,17 @@ import pytest
 from sms_online.description.parse import parse_system
 from sms_online.errors import InputError
 
+# The least that sources can be added to.
+RIG = """
+name = "rig"
+[joint_1]
+stiffness = 100.0
+[motor_1]
+rotor_inertia = 0.001
+[link_1]
+kind = "rigid"
+"""
+
 
 def refusal(text: str, file: str) -> str:
     """The line to which a system file's text leads."""

@@ -26,6 +26,7 @@ from sms_online.description.sources import NatnetSource
 from tests.axis import DAMPING, INERTIA
 from tests.bus_streams import SOURCES, AxisBus, axis_testbed
 from tests.natnet_frames import MODEL, OCCLUDED, POINT_CLOUD, Body, Mark, frame, message
+from tests.refused import RIG
 
 SIGNALS = {
     "1.x": "r_S_x",
@@ -192,15 +193,6 @@ name = "cameras"
 version = "3.1"
 latency = 0.005
 signals = { "2.yaw" = "q_1" }
-"""
-RIG = """
-name = "rig"
-[joint_1]
-stiffness = 100.0
-[motor_1]
-rotor_inertia = 0.001
-[link_1]
-kind = "rigid"
 """
 
 

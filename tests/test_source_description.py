@@ -6,17 +6,8 @@ import pytest
 
 from sms_online.description.parse import parse_system
 from sms_online.description.sources import CanSource, SerialFrames
-from tests.refused import assert_refused, refusal
+from tests.refused import RIG, assert_refused, refusal
 
-RIG = """
-name = "rig"
-[joint_1]
-stiffness = 100.0
-[motor_1]
-rotor_inertia = 0.001
-[link_1]
-kind = "rigid"
-"""
 CAN = """
 [[source]]
 kind = "can"

@@ -203,3 +203,16 @@ class Feed:
         if self.dropped:
             found.append(f"{self.name}: {self.dropped} items recorded but not used, the estimator was too slow")
         return found
+
+
+def check_feeds(feeds: Sequence[Feed], recorder: Recorder | None) -> None:
+    """Raise the InputError of a device that can never be opened, with all released and the recording abandoned."""
+    try:
+        for feed in feeds:
+            feed.check()
+    except InputError:
+        for feed in feeds:
+            feed.stop()
+        if recorder is not None:
+            recorder.abandon()
+        raise

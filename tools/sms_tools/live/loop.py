@@ -15,13 +15,12 @@ from sms_adapters.clock_merge import Merger
 from sms_adapters.recorder import Recorder
 from sms_adapters.recording import tick_time
 from sms_online.checkpoint import Checkpoint
-from sms_online.errors import InputError
 from sms_online.notices import unstated_latency
 from sms_online.session import Session
 from sms_online.stream import Block
 from sms_online.verdict.reasons import LARGEST_LOSS
 from sms_tools.interruption import Interruption
-from sms_tools.live.feed import READ_TIMEOUT, Feed, Interpreter, SessionClock
+from sms_tools.live.feed import READ_TIMEOUT, Feed, Interpreter, SessionClock, check_feeds
 from sms_tools.live.latency import RECENT, Latencies
 from sms_tools.live.status import Leading, News, StatusWriter
 
@@ -97,16 +96,9 @@ class LiveSession:
         """
         for feed in self._feeds:
             feed.start()
-        try:
-            for feed in self._feeds:
-                feed.tried.wait(OPENING)
-                feed.check()
-        except InputError:
-            for feed in self._feeds:
-                feed.stop()
-            if self._recorder is not None:
-                self._recorder.abandon()
-            raise
+        for feed in self._feeds:
+            feed.tried.wait(OPENING)
+            check_feeds(self._feeds, self._recorder)
         # What is there by now stays, and looking through it for garbage would stop the loop for a tenth of a second.
         gc.collect()
         gc.freeze()

@@ -17,7 +17,7 @@ from sms_online.description.sources import CanSource, Device, NatnetSource, Seri
 from sms_online.errors import InputError
 from sms_tools.exit_codes import INTERRUPTED, NOTHING_RECEIVED, OK
 from sms_tools.interruption import Interruption
-from sms_tools.live.feed import Feed, SessionClock, kind_of
+from sms_tools.live.feed import Feed, SessionClock, check_feeds, kind_of
 from sms_tools.live.testbed import versions
 from sms_tools.report import Document, report_console, say, show
 from sms_tools.results_file import results_directory
@@ -48,7 +48,7 @@ def run(args: argparse.Namespace) -> int:
             feed.start()
         said = 0.0
         while not interruption.requested and clock() < end:
-            _check(feeds, recorder)
+            check_feeds(feeds, recorder)
             interruption.sleep(min(INTERVAL, end - clock()))
             if clock() >= said + LINE_INTERVAL:
                 said = clock()
@@ -76,18 +76,6 @@ def run(args: argparse.Namespace) -> int:
     if not received:
         return NOTHING_RECEIVED
     return INTERRUPTED if interruption.requested else OK
-
-
-def _check(feeds: list[Feed], recorder: Recorder) -> None:
-    """Raise the InputError of a device that can never be opened, with the others released."""
-    try:
-        for feed in feeds:
-            feed.check()
-    except InputError:
-        for feed in feeds:
-            feed.stop()
-        recorder.abandon()
-        raise
 
 
 def _device(source: Device) -> str:
