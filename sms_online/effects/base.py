@@ -159,6 +159,15 @@ class Constant:
         return system.model_copy(update={"effects": (*system.effects, effect)})
 
 
+def dahl_rate(rate: Array, z: Array, width: float) -> Array:
+    """ż = r - |r| z / w (B, 1) of a state z (B, 1) that remembers where a motion of rate r (B,) comes from.
+
+    Source: Dahl, AIAA J. 14 (1976) 1675, with exponent 1.
+    """
+    r = rate[:, None]
+    return np.asarray(r - np.abs(r) * z / width)
+
+
 class Force:
     """What most force effects share: no torque, no internal state, coefficients reported as they are."""
 

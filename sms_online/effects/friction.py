@@ -11,7 +11,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from sms_online.effects.base import STANDSTILL, Entry, Force, Ranges, Shape, Site, position
+from sms_online.effects.base import STANDSTILL, Entry, Force, Ranges, Shape, Site, dahl_rate, position
 from sms_online.effects.traits import Curve, Traits
 from sms_online.model.effect import Inputs
 from sms_online.model.layout import Layout
@@ -139,8 +139,7 @@ class PreslidingFriction(MotorSide):
 
     def state_rate(self, layout: Layout, x: Array, v: Array, z: Array) -> Array:
         """θ̇_m - |θ̇_m| z / w."""
-        rate = self.rate(layout, v)[:, None]
-        return np.asarray(rate - np.abs(rate) * z / self.shapes["width"])
+        return dahl_rate(self.rate(layout, v), z, self.shapes["width"])
 
 
 class LoadFriction(MotorSide):

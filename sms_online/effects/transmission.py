@@ -10,7 +10,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from sms_online.effects.base import Entry, Force, Ranges, Shape, Site, position
+from sms_online.effects.base import Entry, Force, Ranges, Shape, Site, dahl_rate, position
 from sms_online.effects.harmonic import amplitude_and_phase, nominal_parts, phase_columns
 from sms_online.effects.traits import Curve, Traits
 from sms_online.model.effect import Inputs
@@ -70,8 +70,8 @@ class TorsionalHysteresis(Transmission):
 
     def state_rate(self, layout: Layout, x: Array, v: Array, z: Array) -> Array:
         """δ̇ - |δ̇| z / δ_s."""
-        rate = (v[:, layout.theta_m[self.index - 1]] - v[:, layout.q[self.index - 1]])[:, None]
-        return np.asarray(rate - np.abs(rate) * z / self.shapes["width"])
+        rate = v[:, layout.theta_m[self.index - 1]] - v[:, layout.q[self.index - 1]]
+        return dahl_rate(rate, z, self.shapes["width"])
 
 
 class CubicStiffness(Transmission):
