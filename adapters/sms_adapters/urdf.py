@@ -162,7 +162,10 @@ def body_of(link: Any) -> Body:
     origin = np.eye(4) if inertial.origin is None else inertial.origin
     R = origin[:3, :3]
     inertia = np.zeros((3, 3)) if inertial.inertia is None else R @ inertial.inertia @ R.T
-    return Body(float(inertial.mass or 0.0), origin[:3, 3], inertia)
+    mass, center = float(inertial.mass or 0.0), origin[:3, 3]
+    # Rounding of a shift by m c² or of a rotation may leave a negative element, which is refused, in place of a zero.
+    inertia[np.abs(inertia) <= 1e-12 * (np.trace(inertia) + mass * center @ center)] = 0.0
+    return Body(mass, center, inertia)
 
 
 def _text(name: str, file: str, root: Any, placed: Sequence[Placed]) -> str:
