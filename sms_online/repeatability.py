@@ -13,7 +13,6 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from html import escape
 from typing import Any
 
 import numpy as np
@@ -22,7 +21,7 @@ from scipy.stats import chi2, norm, t
 
 from sms_online.errors import InputError
 from sms_online.stream import Array
-from sms_online.tables import Tabled, finite, formatter, html_table, text_table
+from sms_online.tables import Tabled, finite, formatter
 
 SCHEMA = "sms-online/comparison/1"
 # Chance that a comparison without any change marks one, all its sessions and parameters together.
@@ -70,7 +69,7 @@ class Compared:
     changes: tuple[Change, ...]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Comparison(Tabled):
     """Sessions of one rig, compared. sessions: their names. parameters, calibration: by name."""
 
@@ -117,14 +116,6 @@ class Comparison(Tabled):
             "parameters": [_document(each) for each in self.parameters.values()],
             "calibration": [_document(each) for each in self.calibration.values()],
         }
-
-    def __str__(self) -> str:
-        return f"{text_table(*self.rows(), left=2)}\n\n{self.sentence}"
-
-    __repr__ = __str__
-
-    def _repr_html_(self) -> str:
-        return f"<p><b>{escape(self.sentence)}</b></p>{html_table(*self.rows())}"
 
 
 def change_text(change: Change, compared: Compared) -> str:

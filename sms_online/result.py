@@ -18,7 +18,7 @@ from sms_online.history import History, Recorder
 from sms_online.pipeline.events import Event
 from sms_online.pipeline.statistics import Method
 from sms_online.stream import Array
-from sms_online.tables import Documented, finite, formatter, html_table, text_table
+from sms_online.tables import Documented, Table, finite, formatter
 from sms_online.tracker_results import Drift, TrackerResult
 from sms_online.verdict.trust import Residual, Residuals, Trust
 
@@ -80,7 +80,7 @@ class Parameter:
         }
 
 
-class Parameters(Mapping[str, Parameter]):
+class Parameters(Mapping[str, Parameter], Table):
     """Parameters by name, in the order of the arm from its base outwards.
 
     KeyError for an unknown name says which one was probably meant.
@@ -106,7 +106,7 @@ class Parameters(Mapping[str, Parameter]):
     def __len__(self) -> int:
         return len(self._by_name)
 
-    def _rows(self) -> tuple[list[str], list[list[str]]]:
+    def rows(self) -> tuple[list[str], list[list[str]]]:
         """Headings, and a row of cells for each parameter; no column without an entry."""
         compared = "true" if any(p.true is not None for p in self.values()) else "nominal"
         headings = ["parameter", "unit", "estimate", "± std", "95 % interval", compared]
@@ -121,14 +121,6 @@ class Parameters(Mapping[str, Parameter]):
             lower, upper = map(shown, p.interval)
             rows.append([p.name, p.unit, shown(p.value), f"{p.std:.2g}", f"{lower} … {upper}", last])
         return headings, rows
-
-    def __str__(self) -> str:
-        return text_table(*self._rows(), left=2)
-
-    __repr__ = __str__
-
-    def _repr_html_(self) -> str:
-        return html_table(*self._rows())
 
 
 @dataclass(frozen=True)

@@ -75,15 +75,29 @@ class Documented:
         return json_text(self.document())
 
 
-class Tabled(Documented):
-    """A result that is read as a table, on a terminal and in a notebook; its first two columns are aligned left."""
+class Table:
+    """What is read as a table, on a terminal and in a notebook; its first `LEFT` columns are aligned left."""
+
+    LEFT = 2
 
     def rows(self) -> tuple[list[str], list[list[str]]]:
         """Headings, and a row of cells for each line of the table."""
         raise NotImplementedError
 
+    @property
+    def sentence(self) -> str:
+        """What the table says, in a sentence."""
+        return ""
+
     def __str__(self) -> str:
-        return text_table(*self.rows(), left=2)
+        return "\n\n".join(filter(None, (text_table(*self.rows(), left=self.LEFT), self.sentence)))
+
+    __repr__ = __str__
 
     def _repr_html_(self) -> str:
-        return html_table(*self.rows())
+        said = f"<p><b>{escape(self.sentence)}</b></p>" if self.sentence else ""
+        return said + html_table(*self.rows())
+
+
+class Tabled(Table, Documented):
+    """A result that is read as a table, and written as a document of JSON."""

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from html import escape
 from typing import Any
 
 import numpy as np
@@ -24,7 +23,7 @@ from sms_online.result import Parameters
 from sms_online.row_types import joint_rows
 from sms_online.session import Data, recorded_session
 from sms_online.stream import Array
-from sms_online.tables import Tabled, html_table, text_table
+from sms_online.tables import Tabled
 
 SCHEMA = "sms-online/validation/1"
 # Parameters that predict another run within this multiple of what any parameters leave there hold for both.
@@ -54,7 +53,7 @@ class Predicted:
         return self.left <= max(NEGLIGIBLE, HOLDS * self.least)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Validation(Tabled):
     """A run predicted with everything fixed.
 
@@ -66,6 +65,8 @@ class Validation(Tabled):
     duration: float
     joints: Mapping[str, Predicted]
     warnings: tuple[str, ...] = ()
+
+    LEFT = 1
 
     @property
     def holds(self) -> bool:
@@ -99,14 +100,6 @@ class Validation(Tabled):
         """Headings and cells of a table."""
         cells = [[name, f"{e.left:.3g}", f"{e.least:.3g}", f"{e.ratio:.2f}"] for name, e in self.joints.items()]
         return ["joint", "share of torque left", "fitted to this run", "ratio"], cells
-
-    def __str__(self) -> str:
-        return f"{text_table(*self.rows())}\n\n{self.sentence}"
-
-    __repr__ = __str__
-
-    def _repr_html_(self) -> str:
-        return f"{html_table(*self.rows())}<p><b>{escape(self.sentence)}</b></p>"
 
 
 def validate(system: System, data: Data, parameters: Parameters | Mapping[str, float] | None = None) -> Validation:
