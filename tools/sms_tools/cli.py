@@ -91,11 +91,11 @@ def _parser() -> Parser:
     parser = Parser(
         prog=PROGRAM,
         description="Online parameter estimation for flexible space manipulators.",
-        epilog="Exit codes: 0 done, 1 nothing was received to record or a capture is not fit, 2 bad input, 3 nothing "
-        "is determined (results are written), 130 interrupted.",
+        epilog="Exit codes: 0 done; 1 record received nothing, or check found a capture unfit; 2 bad input; 3 no "
+        "parameter is determined (results are written); 130 interrupted.",
     )
-    parser.add_argument("--version", action=Version, nargs=0, help="which version this is")
-    text = "how bash, zsh or tcsh complete what is typed, to be written where the shell looks for it"
+    parser.add_argument("--version", action=Version, nargs=0, help="print the version")
+    text = "print a completion script for the shell"
     parser.add_argument("--print-completion", action=Completion, choices=("bash", "zsh", "tcsh"), help=text)
     verbs = parser.add_subparsers(metavar="VERB", required=True)
     verb_parsers = (
@@ -113,49 +113,51 @@ Verbs = Any  # argparse's action of add_subparsers is private
 def _add_verb(verbs: Verbs, name: str, module: str, description: str) -> Parser:
     """A verb with the option that all have."""
     parser: Parser = verbs.add_parser(name, help=description, description=description)
-    parser.add_argument("--json", action="store_true", help="the result as JSON on stdout, all else on stderr")
+    parser.add_argument(
+        "--json", action="store_true", help="print the result as JSON on stdout, and all else on stderr"
+    )
     parser.set_defaults(module=module)
     return parser
 
 
 def _add_system(parser: Parser, default: str | None = None) -> None:
-    text = "a system file (.toml) or the name of a shipped system" + (f", {default} by default" if default else "")
+    text = "a system file (.toml) or the name of a shipped system" + (f"; {default} by default" if default else "")
     parser.add_argument("--system", metavar="FILE|NAME", required=default is None, default=default, help=text)
 
 
-def _add_out(parser: Parser, what: str = "results.json goes, runs/<time> by default") -> None:
-    parser.add_argument("--out", metavar="DIR", type=Path, help=f"where {what}")
+def _add_out(parser: Parser, what: str = "for results.json and report.html; runs/<time> by default") -> None:
+    parser.add_argument("--out", metavar="DIR", type=Path, help=f"directory {what}")
 
 
 def _add_view(parser: Parser, default: str = "off") -> None:
-    places = "a file in DIR, a page in the browser, a viewer started or running already"
-    text = f"view in rerun: {places}; {default} by default"
+    places = "in a file in DIR, a page in the browser, a new viewer, or one that is running"
+    text = f"show the session in rerun: {places}; {default} by default"
     names = "off|save|serve[=ADDRESS]|spawn|connect=URL"
     parser.add_argument("--rerun", metavar=names, type=rerun, default=default, help=text)
-    text = "factor on the deflections that the view draws, 1 by default"
+    text = "magnify the deflections that the view draws; 1 by default"
     parser.add_argument("--exaggerate", metavar="FACTOR", type=magnification, default=1.0, help=text)
 
 
 def _add_adopt(parser: Parser) -> None:
-    text = "add effects that the model lacks to it as soon as they are named, and write adopted.toml with them"
+    text = "add missing effects to the model as soon as they are named, and write them to adopted.toml"
     parser.add_argument("--adopt", action="store_true", help=text)
 
 
 def _add_tracker(parser: Parser) -> None:
     text = (
-        "in place of the system file's: rls, rls:forgetting=KIND,memory=SECONDS or "
-        "kalman:drift=KIND,PARAMETER=KIND/STD; may be repeated, the first gives the estimate"
+        "replaces those of the system file: rls, rls:forgetting=KIND,memory=SECONDS or "
+        "kalman:drift=KIND,PARAMETER=KIND/STD; may be repeated, and the first gives the estimate"
     )
     parser.add_argument("--tracker", metavar="TRACKER", action="append", help=text)
 
 
 def _add_noise(parser: Parser) -> None:
-    _add_grade(parser, "0 none, A, B, C ever more", "0", "A", "B", "C")
-    parser.add_argument("--seed", metavar="N", type=whole(0), default=0, help="of the noise, 0 by default")
+    _add_grade(parser, "0 is none, C the most", "0", "A", "B", "C")
+    parser.add_argument("--seed", metavar="N", type=whole(0), default=0, help="seed of the noise; 0 by default")
 
 
 def _add_grade(parser: Parser, meaning: str, *grades: str) -> None:
-    text = f"noise of all sensors in place of the described one: {meaning}"
+    text = f"noise grade of all sensors, replaces the described noise: {meaning}"
     parser.add_argument("--grade", choices=grades, help=text)
 
 
@@ -180,7 +182,7 @@ def _add_live(verbs: Verbs) -> None:
     _add_system(parser)
     _add_out(parser)
     _add_adopt(parser)
-    text = "go on from the last checkpoint of an earlier session"
+    text = "continue from the last checkpoint of the session in DIR"
     parser.add_argument("--resume", metavar="DIR", type=Path, help=text)
     _add_duration(parser)
     _add_tracker(parser)
@@ -188,36 +190,38 @@ def _add_live(verbs: Verbs) -> None:
 
 
 def _add_record(verbs: Verbs) -> None:
-    parser = _add_verb(verbs, "record", "record", "Record what devices send, without estimating anything.")
+    parser = _add_verb(verbs, "record", "record", "Record what devices send, without estimating.")
     text = (
-        "a CAN bus by python-can's names: [NAME=]INTERFACE:CHANNEL[:BITRATE][?OPTION=VALUE&…], such as "
+        "a CAN bus, as python-can names it: [NAME=]INTERFACE:CHANNEL[:BITRATE][?OPTION=VALUE&…], such as "
         "socketcan:can0?fd=true"
     )
     parser.add_argument("--can", metavar="BUS", action="append", default=[], help=text)
     text = "a serial port: [NAME=]PATH[:BAUDRATE], such as /dev/ttyUSB0:115200"
     parser.add_argument("--serial", metavar="PORT", action="append", default=[], help=text)
-    _add_out(parser, "the recording goes, runs/<time> by default")
+    _add_out(parser, "for the recording; runs/<time> by default")
     _add_duration(parser)
 
 
-def _add_duration(parser: Parser, text: str = "end after so long; Ctrl-C ends it too") -> None:
+def _add_duration(parser: Parser, text: str = "end the session after this time; Ctrl-C ends it too") -> None:
     parser.add_argument("--duration", metavar="SECONDS", type=seconds(positive=True), help=text)
 
 
 def _add_simulate(verbs: Verbs) -> None:
-    parser = _add_verb(verbs, "simulate", "simulate", "Simulate a system; write a capture, and its truth beside it.")
+    parser = _add_verb(
+        verbs, "simulate", "simulate", "Simulate a system, and write a capture with its true parameters beside it."
+    )
     _add_system(parser)
     _add_capture(parser)
-    _add_duration(parser, "length of the session, the described trajectory's by default")
-    text = "an effect that the system file does not declare, NAME@WHERE:coefficient=value,…; may be repeated"
+    _add_duration(parser, "length of the session; that of the described trajectory by default")
+    text = "add an effect that the system file does not declare: NAME@WHERE:coefficient=value,…; may be repeated"
     parser.add_argument("--effect", metavar="EFFECT", action="append", default=[], help=text)
     text = (
-        "a parameter that changes on the way: PARAMETER:share=-0.1,over=60, PARAMETER:by=5,over=60 or "
-        "PARAMETER:half_life=20, and begin=SECONDS; may be repeated"
+        "change a parameter over time: PARAMETER:share=-0.1,over=60, PARAMETER:by=5,over=60 or "
+        "PARAMETER:half_life=20, each also with begin=SECONDS; may be repeated"
     )
     parser.add_argument("--drift", metavar="DRIFT", action="append", default=[], help=text)
     text = (
-        "a fault of the cameras: missing@link_1.*:share=0.1, hidden@link_2.*:begin=8,over=2 or "
+        "add a fault of the cameras: missing@link_1.*:share=0.1, hidden@link_2.*:begin=8,over=2 or "
         "swapped@link_1.marker_1+link_1.marker_2:begin=5,over=1; may be repeated"
     )
     parser.add_argument("--fault", metavar="FAULT", action="append", default=[], help=text)
@@ -231,9 +235,9 @@ def _add_replay(verbs: Verbs) -> None:
     _add_out(parser)
     _add_part(parser)
     _add_prior(parser)
-    text = "the Cramér-Rao bound of every parameter too, as the yardstick of its estimate"
+    text = "also compute the Cramér-Rao bound of every parameter"
     parser.add_argument("--bound", action="store_true", help=text)
-    text = "as fast as it goes, or in step with the recorded time"
+    text = "max: as fast as possible; 1: at the recorded speed"
     parser.add_argument("--speed", choices=("max", "1"), default="max", help=text)
     _add_adopt(parser)
     _add_tracker(parser)
@@ -245,149 +249,155 @@ def _add_recorded(parser: Parser, text: str = "a capture, log or recording, as f
 
 
 def _add_part(parser: Parser) -> None:
-    parser.add_argument("-ss", dest="start", metavar="SECONDS", type=seconds(), help="leave out what is before")
-    parser.add_argument("-to", dest="stop", metavar="SECONDS", type=seconds(positive=True), help="and what is after")
+    parser.add_argument(
+        "-ss", dest="start", metavar="SECONDS", type=seconds(), help="leave out the samples before this time"
+    )
+    parser.add_argument(
+        "-to", dest="stop", metavar="SECONDS", type=seconds(positive=True), help="leave out the samples after this time"
+    )
 
 
 def _add_prior(parser: Parser) -> None:
     text = (
-        "start from the system file's nominal values, each ± 10 %% (those of 0 stay unknown); "
-        "priors that the file itself states hold with and without it"
+        "use the nominal values of the system file as priors, each ± 10 %% (a nominal value of 0 is none); "
+        "priors that the file states itself always hold"
     )
     parser.add_argument("--prior", action="store_true", help=text)
 
 
 def _add_diagnose(verbs: Verbs) -> None:
-    text = "Find what a recorded session holds that its system file does not describe, and describe it."
+    text = "Find effects in a recorded session that its system file does not describe, and write them to a system file."
     parser = _add_verb(verbs, "diagnose", "diagnose", text)
-    text = "a capture, log or recording, as for replay; several of the same rig are searched at once"
+    text = "a capture, log or recording, as for replay; several captures of one rig are searched together"
     parser.add_argument("captures", metavar="CAPTURE", type=Path, nargs="+", help=text)
     _add_system(parser)
-    _add_out(parser)
+    _add_out(parser, "for diagnosis.json, diagnosis.html and system.toml; runs/<time> by default")
     _add_part(parser)
     _add_prior(parser)
     text = (
-        "check what is found on this capture, which decides nothing; the one that is searched means what comes after "
-        "-to. Without it blocks of time are held out in turn, of several captures each"
+        "check the findings on this capture, which is not searched; if it is the searched capture itself, on what "
+        "comes after -to. Without it, blocks of time are held out in turn, or whole captures of several"
     )
     parser.add_argument("--holdout", metavar="CAPTURE", type=Path, help=text)
-    text = "where no law of the catalogue is selected, try curves over a joint's rate, angle, deflection and load"
+    text = "if no law of the catalogue is selected, try learned curves over a joint's rate, angle, deflection and load"
     parser.add_argument("--learn", action="store_true", help=text)
     _add_view(parser)
 
 
 def _add_validate(verbs: Verbs) -> None:
-    text = "Predict another run with everything fixed, and measure what is left of its torques."
+    text = "Predict the torques of another run with fixed parameters, and measure what is left."
     parser = _add_verb(verbs, "validate", "validate", text)
     _add_recorded(parser)
-    text = "results.json of a session or the folder of its run; or a system file, whose nominal values are taken"
+    text = "results.json of a session, the folder of its run, or a system file, whose nominal values are used"
     parser.add_argument("--system", metavar="FILE|NAME", required=True, help=text)
-    _add_out(parser, "validation.json goes, runs/<time> by default")
+    _add_out(parser, "for validation.json; runs/<time> by default")
     _add_part(parser)
 
 
 def _add_check(verbs: Verbs) -> None:
-    text = "What is the matter with a capture, and what its motion determines: before it is estimated from."
+    text = "Check a capture before estimating: faults of its channels, and which parameters its motion determines."
     parser = _add_verb(verbs, "check", "check", text)
     _add_recorded(parser)
     _add_system(parser)
-    _add_out(parser, "check.json goes; none is written by default")
+    _add_out(parser, "for check.json; nothing is written by default")
 
 
 def _add_import(verbs: Verbs) -> None:
-    text = "Turn a log, or a published measurement, into a capture, or a URDF into a system file."
+    text = "Convert a log or a published measurement to a capture, or a URDF to a system file."
     parser = _add_verb(verbs, "import", "import_data", text)
     text = "log: a bag, table, CAN log or recording; points: a motion capture (.c3d, Motive's or Nexus' .csv); "
     text += "quanser, emps: a published measurement (.mat); urdf"
     parser.add_argument("kind", metavar="KIND", choices=("log", "points", "quanser", "emps", "urdf"), help=text)
-    parser.add_argument("source", metavar="SOURCE", type=Path, help="the file as it is")
-    text = "of a log: the system file, whose [[source]] tables say what its numbers are, or whose markers have names"
+    parser.add_argument("source", metavar="SOURCE", type=Path, help="the file to import")
+    text = "for log and points: the system file, whose [[source]] tables or marker names describe the contents"
     parser.add_argument("--system", metavar="FILE|NAME", help=text)
     _add_capture(parser, required=False)
-    text = "of a URDF: the system file to write, SOURCE with the ending .toml by default"
+    text = "for urdf: the system file to write; SOURCE with the ending .toml by default"
     parser.add_argument("--out", metavar="FILE.toml", type=Path, help=text)
 
 
 def _add_export(verbs: Verbs) -> None:
-    text = "Put estimates into the URDF that a system file was imported from."
+    text = "Write estimates into the URDF that a system file was imported from."
     parser = _add_verb(verbs, "export", "export_urdf", text)
     parser.add_argument("kind", metavar="KIND", choices=("urdf",), help="urdf")
-    parser.add_argument("source", metavar="SOURCE", type=Path, help="the URDF as it was imported")
-    text = "of a session whose system file was imported from it"
+    parser.add_argument("source", metavar="SOURCE", type=Path, help="the URDF that was imported")
+    text = "results of a session whose system file was imported from SOURCE"
     parser.add_argument("--results", metavar="results.json", type=Path, required=True, help=text)
     parser.add_argument("--out", metavar="FILE.urdf", type=Path, required=True, help="the URDF to write")
 
 
 def _add_markers(verbs: Verbs) -> None:
-    parser = _add_verb(verbs, "markers", "markers", "Eigenmodes of each flexible link and the markers that they need.")
+    parser = _add_verb(
+        verbs, "markers", "markers", "List the eigenmodes of each flexible link and the number of markers they need."
+    )
     _add_system(parser)
-    text = "how many modes the markers have to resolve, 2 by default"
+    text = "number of modes that the markers have to resolve; 2 by default"
     parser.add_argument("--modes", metavar="N", type=whole(1), default=2, help=text)
 
 
 def _add_show(verbs: Verbs) -> None:
-    text = "Draw a described arm in rerun, with its frames, joints, markers and channels, before there are any data."
+    text = "Draw a described arm in rerun, with its frames, joints, markers and channels; needs no data."
     parser = _add_verb(verbs, "show", "show", text)
     _add_system(parser)
-    _add_out(parser)
+    _add_out(parser, "for session.rrd, with --rerun save; runs/show by default")
     _add_view(parser, default="spawn")
 
 
 def _add_bound(verbs: Verbs) -> None:
-    text = "The least standard deviation that a motion and its sensors allow (Cramér-Rao)."
+    text = "Compute the Cramér-Rao bound of each parameter for a motion and its sensors."
     parser = _add_verb(verbs, "bound", "bound", text)
     text = "a capture; without one the described trajectory is simulated"
     parser.add_argument("capture", metavar="CAPTURE", type=Path, nargs="?", help=text)
     _add_system(parser)
-    _add_grade(parser, "A, B, C ever more; B where none is described", "A", "B", "C")
-    text = "what the bounds would be without each of the described sensors"
+    _add_grade(parser, "A is the least, C the most; B where no noise is described", "A", "B", "C")
+    text = "also compute the bounds without each of the described sensors"
     parser.add_argument("--each-sensor", action="store_true", help=text)
 
 
 def _add_excite(verbs: Verbs) -> None:
-    text = "Design the trajectory that parameters are best estimated from, within limits, by the Cramér-Rao bound."
+    text = "Design a trajectory within limits that lowers the Cramér-Rao bounds of the parameters."
     parser = _add_verb(verbs, "excite", "excite", text)
     _add_system(parser)
-    own = "the described motion's own by default"
+    own = "that of the described motion by default"
     units = {
-        "--angle": ("RAD", f"largest angle of a joint (m on a prismatic one), {own}"),
-        "--rate": ("RAD/S", f"largest rate of a joint, {own}"),
-        "--torque": ("NM", f"largest torque of a joint after its gear, {own}"),
-        "--base-rotation": ("RAD", f"how far the base may turn, {own}"),
-        "--deflection": ("M", f"largest deflection of a marker, {own}"),
-        "--duration": ("SECONDS", f"length of the motion, {own}"),
+        "--angle": ("RAD", f"largest angle of a joint (m for a prismatic one); {own}"),
+        "--rate": ("RAD/S", f"largest rate of a joint; {own}"),
+        "--torque": ("NM", f"largest torque of a joint after its gear; {own}"),
+        "--base-rotation": ("RAD", f"largest rotation of the base; {own}"),
+        "--deflection": ("M", f"largest deflection of a marker; {own}"),
+        "--duration": ("SECONDS", f"length of the motion; {own}"),
     }
     for name, (unit, text) in units.items():
         read = seconds(positive=True) if name == "--duration" else positive
         parser.add_argument(name, metavar=unit, type=read, help=text)
     text = (
-        "two effects, NAME@WHERE:coefficient=value, that a diagnosis could not separate: the motion is designed for "
-        "their coefficients; all parameters count without it"
+        "two effects, NAME@WHERE:coefficient=value, that a diagnosis could not separate: design the motion for "
+        "their coefficients alone"
     )
     parser.add_argument("--separate", metavar="EFFECT", nargs=2, help=text)
-    _add_grade(parser, "A, B, C ever more; B where none is described", "A", "B", "C")
-    parser.add_argument("--seed", metavar="N", type=whole(0), default=0, help="of the random draw, 0 by default")
-    text = "steps of the optimiser at most, 15 by default"
+    _add_grade(parser, "A is the least, C the most; B where no noise is described", "A", "B", "C")
+    parser.add_argument("--seed", metavar="N", type=whole(0), default=0, help="seed of the random start; 0 by default")
+    text = "largest number of optimiser steps; 15 by default"
     parser.add_argument("--iterations", metavar="N", type=whole(1), default=15, help=text)
-    _add_out(parser, "system.toml, reference.csv and excitation.json go, runs/<time> by default")
+    _add_out(parser, "for system.toml, reference.csv and excitation.json; runs/<time> by default")
 
 
 def _add_compare(verbs: Verbs) -> None:
-    text = "Each parameter over sessions of one rig, and what has changed."
+    text = "Compare the parameters of several sessions of one rig, and find what has changed."
     parser = _add_verb(verbs, "compare", "compare", text)
     text = "results.json of a session, or the folder of its run"
     parser.add_argument("runs", metavar="RUN", type=Path, nargs="+", help=text)
-    _add_out(parser, "the page goes, runs/<time> by default")
+    _add_out(parser, "for the comparison; runs/<time> by default")
 
 
 def _add_archive(verbs: Verbs) -> None:
-    text = "Identify and diagnose every capture under a folder, in one table; go on where an earlier run ended."
+    text = "Estimate and diagnose every capture under a folder into one table; continues an interrupted run."
     parser = _add_verb(verbs, "archive", "archive", text)
     parser.add_argument("folder", metavar="DIR", type=Path, help="the folder with captures, logs and recordings")
     _add_system(parser)
-    _add_out(parser, "rows, table and results go, runs/archive-<name of DIR> by default")
+    _add_out(parser, "for rows, table and results; runs/archive-<name of DIR> by default")
     where = parser.add_mutually_exclusive_group()
-    text = "processes of this machine, one for each core by default"
+    text = "number of processes on this machine; one for each core by default"
     where.add_argument("--workers", metavar="N", type=whole(1), help=text)
-    text = "address of a Dask scheduler, whose workers see the same files under the same names"
+    text = "address of a Dask scheduler whose workers see the same files under the same names"
     where.add_argument("--scheduler", metavar="ADDRESS", help=text)
