@@ -134,7 +134,7 @@ class Coefficient:
 
 @dataclass(frozen=True)
 class Finding:
-    """An effect that the system file lacks and the samples show.
+    """An effect that the samples show and the system file does not describe.
 
     name, where: as a system file declares it. coefficients: by name, in SI units. ambiguous_with: other effects,
     `name@where`, that explain as much. gain: evidence, twice the log likelihood ratio; limit: what the best of all
@@ -183,12 +183,12 @@ class Consistency:
 
 @dataclass(frozen=True)
 class Result(Documented):
-    """What a session has identified, how well, and what was left over.
+    """The result of a session: parameters with their accuracy, residuals, events, findings and the verdict.
 
     system: as described. parameters: by name; after an event they, and residuals, are those since then. residuals: by
     type of the rows, "energy", "joint_i", "link_i" or "base". events: changes while the session ran. findings: effects
-    that the running diagnosis has named. trust: may the numbers be trusted, and why. warnings: a sentence each. method:
-    what the estimate comes from, "smoother", "momentum" or "energy" balance. samples, lost_samples: counts. outliers:
+    that the running diagnosis has named. trust: the verdict, and its reasons. warnings: a sentence each. method:
+    source of the estimate, "smoother", "momentum" or "energy" balance. samples, lost_samples: counts. outliers:
     how many samples were left out, by channel. duration: s. condition_number: of the scaled information, inf without
     full rank. throughput: samples/s of computing time. calibration: what the description is off by, estimated better
     than its tolerances. trackers: what each says, the judged one, whose estimate `parameters` holds, first; empty where

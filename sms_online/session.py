@@ -1,4 +1,4 @@
-"""A session: samples in, whole or one at a time, and a result at any time. `estimate` runs one over recorded data."""
+"""Sessions: samples in, many or one at a time, and a result at any time. `estimate` runs one over recorded data."""
 
 from __future__ import annotations
 
@@ -47,13 +47,13 @@ def with_trackers(system: System, tracker: Trackers) -> System:
 class Session:
     """Estimates a system's parameters while samples come, and names effects that the system file lacks.
 
-    system: described, or its name or file. channels: names, in the order of the values to come. prior: start from the
-    nominal values, each ± 10 %; priors that the system file states hold without it too. adopt: go on with effects as
-    soon as they are named. tracker: in place of the system file's, "rls:forgetting=exponential,memory=5" or
-    "kalman:drift=learned" for instance, or several, of which the first gives the estimate. source: name of what samples
-    come from, for messages. searcher: who makes the diagnosis' searches, by default at once and here. checkpoint: state
-    to go on from. The result depends on the samples alone, to the last bit, however they are cut into updates. Raises
-    InputError for a channel that the system does not have or one that is missing.
+    system: a `System`, or the name or file of one. channels: names, in the order of the values. prior: use the nominal
+    values as priors, each ± 10 %; priors that the system file states always hold. adopt: add missing effects to the
+    model as soon as they are named. tracker: replaces that of the system file, "rls:forgetting=exponential,memory=5" or
+    "kalman:drift=learned" for instance; of several the first gives the estimate. source: name of the source of the
+    samples, for messages. searcher: makes the searches of the diagnosis, by default at once in this process.
+    checkpoint: state to continue from. The result depends on the samples alone, to the last bit, however they are cut
+    into updates. Raises InputError for a channel that the system does not have, or one that is missing.
     """
 
     def __init__(
@@ -100,7 +100,7 @@ class Session:
     def update(self, t: ArrayLike, values: ArrayLike, /) -> None: ...
 
     def update(self, samples: Block | ArrayLike, values: ArrayLike | None = None, /) -> None:
-        """Take samples: a block, or t (B,), s, and values (B, C), or one instant and its values (C,).
+        """Process samples: a block, or t (B,), s, and values (B, C), or one instant and its values (C,).
 
         Values are in SI units, in the order of the session's channels, NaN where there is none. InputError where shapes
         or channels do not fit, times go back, a value is infinite, or the session is finished.
@@ -141,7 +141,7 @@ class Session:
             self._last = float(block.t[-1])
 
     def finish(self) -> None:
-        """No more samples come: use what still waits for more of them. The result is then final."""
+        """End the session: process the samples that wait for later ones. The result is then final."""
         if self.estimator.finished:
             return
         start = perf_counter()
@@ -153,13 +153,13 @@ class Session:
 
     @property
     def result(self) -> Result:
-        """What is known now. Before `finish` it does not state physical consistency."""
+        """The result of the samples so far. Before `finish` it does not state physical consistency."""
         if self._result is None:
             self._result = self.evaluate()
         return self._result
 
     def evaluation(self, troubles: Sequence[str] = ()) -> Evaluation:
-        """What is known now, evaluated only as far as it is asked for. troubles: what else speaks against it."""
+        """The evaluation of the samples so far, computed on request. troubles: further reasons to doubt."""
         statistics = Statistics.of(self.estimator)
         return Evaluation(statistics, self.estimator.estimate(), self.diagnosis.discrepancies, troubles)
 
@@ -170,7 +170,7 @@ class Session:
         warnings: Sequence[str] = (),
         throughput: float | None = None,
     ) -> Result:
-        """The result with what is known from beside the session.
+        """The result of the samples so far, with what is known from outside the session.
 
         truth: of a simulated capture, see `Capture`. bound (n,): Cramér–Rao bound of each parameter's std. warnings: of
         the source. throughput: samples/s, by default of computing alone.
@@ -181,16 +181,16 @@ class Session:
         return result_of(self.evaluation(), true, bound, warnings, self.diagnosis.document(), throughput, self.recorder)
 
     def checkpoint(self, source: Stage | None = None) -> Checkpoint:
-        """The state of now, to go on from; takes milliseconds. source: of the samples, where that keeps a state too."""
+        """The present state, to continue from; takes milliseconds. source: of the samples, if it keeps a state too."""
         return Checkpoint.of(self.estimator, self._begun, source, self.recorder)
 
     def save(self) -> bytes:
-        """The state of now, for `restore`; the system, its channels and options are part of it."""
+        """The present state as bytes for `restore`, with the system, its channels and the options."""
         return self.checkpoint().to_bytes()
 
     @staticmethod
     def restore(saved: bytes) -> Session:
-        """Go on from what `save` gave: the estimate comes out the same to the last bit.
+        """Continue from the bytes of `save`: the estimate is the same to the last bit.
 
         Limitations: the running diagnosis begins anew; samples before are no longer searched, and what it has found by
         then is in the estimate if it was adopted, but no longer among the findings. InputError where `saved` is none.
@@ -205,7 +205,7 @@ class Session:
 
 @dataclass(frozen=True)
 class Recorded:
-    """A recorded session: its samples, a name for messages, and what lies beside them.
+    """A recorded session: its samples, a name for messages, and what was recorded with them.
 
     truth: of a simulation. checkpoint: what the session resumed from. searcher: of its diagnosis, from whether effects
     are adopted. trackers: those that were asked for in place of the system file's, none where nothing was.
@@ -232,12 +232,11 @@ def estimate(
     bound: bool = False,
     tracker: Trackers = None,
 ) -> Result:
-    """Estimate the parameters of a system from recorded data; the same bits as a replay of them, or the live session.
+    """Estimate the parameters of a system from recorded data, to the same bits as a replay or the live session.
 
-    system: described, or its name or file. data: a capture, the path of one, of a log or of a recording, or blocks of
-    samples in order of time. prior, adopt, tracker: as for `Session`. bound: the Cramér–Rao bound of every parameter
-    too, as the yardstick of its standard deviation. Raises InputError where the data cannot be read or do not fit the
-    system.
+    system: a `System`, or the name or file of one. data: a capture, the path of one, of a log or of a recording, or
+    blocks of samples in order of time. prior, adopt, tracker: as for `Session`. bound: compute the Cramér–Rao bound of
+    every parameter too. Raises InputError if the data cannot be read or do not fit the system.
     """
     system, folder = given_system(system)
     recorded = recorded_session(system, data, folder)
@@ -263,7 +262,7 @@ def estimate(
 
 
 def recorded_session(system: System, data: Data, folder: Path | None = None) -> Recorded:
-    """Data as a recorded session; InputError where a path cannot be read, or there are no blocks.
+    """Data as a recorded session; InputError if a path cannot be read, or there are no blocks.
 
     folder: of the system's file, where a log finds its DBC.
     """

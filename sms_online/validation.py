@@ -34,7 +34,7 @@ NEGLIGIBLE = 0.01
 
 @dataclass(frozen=True)
 class Predicted:
-    """What is left of the torque or force of a joint, rms over its rms.
+    """The prediction error of a joint's torque or force, as a share: rms over rms.
 
     left: with everything fixed. least: with parameters fitted to this run, what the description itself lacks and noise.
     """
@@ -44,18 +44,18 @@ class Predicted:
 
     @property
     def ratio(self) -> float:
-        """How many times as much is left as has to be."""
+        """The share that is left over the least possible one."""
         return self.left / self.least if self.least > 0.0 else np.inf
 
     @property
     def holds(self) -> bool:
-        """Whether parameters fitted to this run would not be worth it."""
+        """Whether the parameters hold for this joint: fitting them to this run would gain little."""
         return self.left <= max(NEGLIGIBLE, HOLDS * self.least)
 
 
 @dataclass(frozen=True, repr=False)
 class Validation(Tabled):
-    """A run predicted with everything fixed.
+    """A run whose torques were predicted with fixed parameters.
 
     system: with which description. duration: of the run, s. joints: `joint_i` to what is left of its torque; those
     without a torque are left out. warnings: of the source, and of a motion beyond what effects are known for.
@@ -103,7 +103,7 @@ class Validation(Tabled):
 
 
 def validate(system: System, data: Data, parameters: Parameters | Mapping[str, float] | None = None) -> Validation:
-    """Predict the torques of recorded data with everything fixed, and measure what is left.
+    """Predict the torques of recorded data with fixed parameters, and measure the error.
 
     data: as for `estimate`. parameters: values by name, or those of a `Result`; the nominal ones of the system file
     unless given. Nothing is estimated from the data but for comparison.

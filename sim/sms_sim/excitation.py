@@ -65,7 +65,7 @@ ITERATIONS = 15
 
 @dataclass(frozen=True)
 class Reached:
-    """How far a motion goes of what it may.
+    """The largest magnitude that a motion reaches, beside its limit.
 
     limit: None where there is none. largest: magnitude that is reached. Both are in the unit.
     """
@@ -78,7 +78,7 @@ class Reached:
 
 @dataclass(frozen=True)
 class Excitation(Tabled):
-    """A designed motion; the described one where none was found that is better at the worst parameter.
+    """A designed motion, or the described one if none was found with a lower bound of the worst parameter.
 
     system: with it as its trajectory. before, after: bounds of the described motion, None where there is none, and of
     this one. weighed: names of the parameters that it was designed for. reached: its extremes.
@@ -91,7 +91,7 @@ class Excitation(Tabled):
     reached: tuple[Reached, ...]
 
     def gains(self) -> dict[str, float | None]:
-        """By how much each bound is lower than before, as a factor; None where there is none to compare."""
+        """Factor by which each bound is lower than before; None if there is none to compare."""
         out: dict[str, float | None] = {}
         for name, after in self.after.parameters.items():
             before = math.nan if self.before is None else self.before.parameters[name].std

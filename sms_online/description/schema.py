@@ -73,7 +73,7 @@ class Prior(Record):
 
 
 class Fitted(Record):
-    """What an earlier session has found of a parameter: its nominal value from then on.
+    """Estimate of a parameter from an earlier session, which is its nominal value from then on.
 
     value: in the parameter's unit, with the parameters that are lumped into it as described.
     std: its standard deviation, in the same unit; a prior's with `--prior`. Not stated: undetermined.
@@ -281,7 +281,7 @@ class System(Record):
 
     @property
     def scale_tolerance(self) -> float | None:
-        """1σ of the factor that all parameters have in common: that of the torques, which no residual shows.
+        """1σ of the scale common to all parameters, that of the torques, which no residual shows.
 
         None where a parameter that is known, or has a prior, fixes it.
         """
