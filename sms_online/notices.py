@@ -16,17 +16,17 @@ def smoother_warnings(now: Statistics) -> list[str]:
     setup, smoother = now.setup, now.smoother
     if smoother is None:
         asked = setup.system.balance == "smoother"
-        return ["no smoother: it does not know of the effects on channels that are declared"] if asked else []
+        return ["no smoother: it cannot correct the declared effects on channels"] if asked else []
     out = [f"the smoother left out {failure}" for failure in smoother.failures]
     missing = ", ".join(setup.sensing.missing)
     if now.method != "smoother":
-        text = f"links are taken as bent statically, for {missing} are not measured: estimates are off by percents"
+        text = f"{missing} are not measured, so links are bent statically: estimates are off by percents"
         return [*out, text] if missing else out
     if missing:
         out.append(f"not measured, but estimated by the equations of motion: {missing}")
     if smoother.level > 0.0:
         share = f"{100.0 * smoother.level:.2g} % of the usual ones"
-        out.append(f"samples do not agree with the equations of motion: unknown forces of {share} are allowed for")
+        out.append(f"samples do not agree with the equations of motion: unknown forces of {share} are added")
     return out
 
 
@@ -44,7 +44,7 @@ def notices(now: Statistics) -> list[str]:
     """What happened to the samples, a sentence each."""
     system, out = now.setup.system, []
     if now.dropped_rows:
-        out.append(f"{now.dropped_rows} rows of the balance dropped: a value in them is beyond all numbers")
+        out.append(f"{now.dropped_rows} rows of the balance dropped: a value in them is infinite or not a number")
     period = 1.0 / system.sample_rate
     fastest = float(np.nanmin(now.periods, initial=np.inf))
     if np.isfinite(fastest) and not 0.8 < fastest / period < 1.25:
@@ -68,7 +68,7 @@ def notices(now: Statistics) -> list[str]:
         size = f"{1e6 * shift.size:+.0f} ± {1e6 * shift.std:.0f} µs"
         out.append(f"{shift.device}: its clock shifted by {size} against the others' at {shift.time:.1f} s")
     if now.setup.unused:
-        out.append(f"channels not used: {', '.join(now.setup.unused)}")
+        out.append(f"unused channels: {', '.join(now.setup.unused)}")
     return out
 
 

@@ -257,6 +257,7 @@ def test_samples_that_do_not_fit_are_named(axis: sms.System, samples: tuple[Any,
         session.update(1.0, [0.0, 0.0])
 
 
+@pytest.mark.slow
 def test_a_saved_session_goes_on_to_the_same_bits(axis: sms.System, capture: sms.Capture) -> None:
     whole = sms.Session(axis, capture.channels)
     blocks = list(capture)

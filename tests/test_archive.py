@@ -185,6 +185,7 @@ def until(condition: Callable[[], bool]) -> None:
         time.sleep(0.05)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGKILL])
 def test_a_stopped_run_takes_its_workers_with_it(tmp_path: Path, number: int) -> None:
     log = tmp_path / "log"

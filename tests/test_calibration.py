@@ -24,6 +24,7 @@ from sms_online.trackers.interface import Rows
 from sms_online.trackers.square_root import session_tracker
 from sms_sim.simulate import sampled_blocks
 from tests.exactly_known import EXACTLY
+from tests.sessions_of import session_of
 from tests.simulations import planar
 
 # Two clocks and two parameters, of rows that determine all of them.
@@ -73,10 +74,7 @@ def noisy(exact: Block, changed: dict[str, Array] | None = None, seed: int = 3) 
 def estimated(block: Block) -> Estimator:
     """With the default tolerances."""
     system = load_system("paper-planar").model_copy(update={"tolerances": Tolerances()})
-    estimator = Estimator(system, block.channels, "test")
-    estimator.push(block)
-    estimator.finish()
-    return estimator
+    return session_of(system, [block])
 
 
 def evaluated(exact: Block, changed: dict[str, Array] | None = None, seed: int = 3) -> Evaluation:
@@ -181,6 +179,7 @@ def test_a_change_beside_a_clock_that_may_have_moved_is_in_doubt(slightly_late: 
     assert any("late: 2 tolerances" in reason for reason in changed.reasons)
 
 
+@pytest.mark.slow
 def test_a_camera_later_than_its_tolerance_is_not_trusted(exact: Block) -> None:
     """Five seconds of it."""
     whole = noisy(exact, late(exact, 5e-4))

@@ -97,6 +97,7 @@ def test_results_go_to_a_new_directory_for_each_run(bench: Path) -> None:
     assert len(list((bench / "runs").glob("*/results.json"))) == 3
 
 
+@pytest.mark.slow
 def test_the_truth_reaches_the_report_and_never_the_estimate(bench: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["replay", "run.csv", "--system", "axis.toml", "--out", "without"]) == 0
     names = [parameter.name for parameter in build_model(load_system("axis.toml")).parameters]
@@ -144,7 +145,7 @@ def test_channels_that_the_model_does_not_use_are_named(bench: Path) -> None:
     rows = [f"{line},{cells}" for line, cells in zip(lines, extra, strict=True)]
     (bench / "run.csv").write_text("\n".join([f"{header},r_S_x,r_S_y,theta_0,gyro_0_z", *rows]) + "\n")
     assert main(["replay", "run.csv", "--system", "free.toml", "--out", "done"]) in (0, 3)
-    assert "channels not used: gyro_0_z" in document(bench / "done")["warnings"]
+    assert "unused channels: gyro_0_z" in document(bench / "done")["warnings"]
 
 
 @pytest.mark.slow
@@ -379,6 +380,7 @@ def test_the_command_line_comes_without_numpy() -> None:
     assert python("-c", code).stdout == "False\n"
 
 
+@pytest.mark.slow
 def test_a_reader_that_leaves_early_is_no_error(bench: Path) -> None:
     replay = ["replay", "run.csv", "--system", "axis.toml", "-to", "2", "--out", "done"]
     process = subprocess.Popen(

@@ -47,6 +47,7 @@ def found(drifting: sms.Capture) -> sms.Diagnosis:
     return sms.diagnose(system(), drifting)
 
 
+@pytest.mark.slow
 def test_a_drift_is_named_with_rate_and_value(found: sms.Diagnosis) -> None:
     assert found.verdict == "named"
     assert found.effects == ()
@@ -76,6 +77,7 @@ def test_a_tracker_that_follows_it_already_is_trusted(drifting: sms.Capture) -> 
     assert again.trust.level == "trust"
 
 
+@pytest.mark.slow
 def test_a_steady_axis_has_no_drift() -> None:
     found = sms.diagnose(system(), capture(np.zeros(2400)))
     assert (found.verdict, found.drifts) == ("clean", ())

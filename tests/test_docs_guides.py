@@ -97,6 +97,7 @@ def test_the_guides_tracker_follows_a_change() -> None:
     assert (np.abs(estimate.pi - PI_TRUE) < 5.0 * estimate.std).all()
 
 
+@pytest.mark.slow
 def test_the_guides_tracker_is_chosen_by_its_name(monkeypatch: pytest.MonkeyPatch) -> None:
     """Judged, with the tolerances of clocks and sensors as its prior, it estimates as exponential forgetting does."""
     monkeypatch.setitem(KINDS, "fading", lambda choice, for_: fading(for_.n, choice.memory or 10.0, for_.prior))

@@ -35,6 +35,7 @@ from sms_sim.realtime import RealTimeStepper
 from sms_sim.simulate import Simulation, exact_states, sampled_blocks, simulate
 from sms_tools.cli import main
 from tests.saved import resumed
+from tests.sessions_of import session_of
 from tests.simulations import planar
 
 FORCES = (
@@ -155,13 +156,9 @@ def test_geometric_stiffening_of_one_link_is_estimated() -> None:
 def session() -> tuple[System, Estimator]:
     """Three seconds of grade A with the effects of FOUND, and an estimator that knows their names and the geometry."""
     true = declaring(*FOUND)
-    blocks = list(sampled_blocks(simulate(true, 3.0), "A", seed=1))
     exactly = {"tolerances": Tolerances.model_validate("none")}
-    estimator = Estimator(declaring(*FOUND.values()).model_copy(update=exactly), blocks[0].channels, "session")
-    for block in blocks:
-        estimator.push(block)
-    estimator.finish()
-    return true, estimator
+    stated = declaring(*FOUND.values()).model_copy(update=exactly)
+    return true, session_of(stated, sampled_blocks(simulate(true, 3.0), "A", seed=1))
 
 
 @pytest.mark.slow
@@ -197,11 +194,7 @@ def test_friction_by_direction_and_speed_is_found_noise_free() -> None:
     """Within 1 %: reversals are resolved to a sample only."""
     names = "direction_friction@joint_2", "stribeck_friction@joint_1:velocity=0.3"
     true = declaring("direction_friction@joint_2:plus=2,minus=1.5", "stribeck_friction@joint_1:torque=1,velocity=0.3")
-    blocks = list(sampled_blocks(simulate(true, 2.5), "0"))
-    estimator = Estimator(declaring(*names), blocks[0].channels, "session")
-    for block in blocks:
-        estimator.push(block)
-    estimator.finish()
+    estimator = session_of(declaring(*names), sampled_blocks(simulate(true, 2.5), "0"))
     assert_allclose(estimator.estimate().pi[-3:], [2.0, 1.5, 1.0], rtol=0.01)
 
 
@@ -349,10 +342,7 @@ def test_corrections_give_the_estimate_of_a_clean_session(clean_motion: Simulati
     blocks = list(sampled_blocks(distorted(clean_motion, *texts), "0"))
 
     def stiffness(system: System) -> float:
-        estimator = Estimator(system, blocks[0].channels, "session")
-        for block in blocks:
-            estimator.push(block)
-        estimator.finish()
+        estimator = session_of(system, blocks)
         names = [p.name for p in estimator.base.parameters]
         return float(estimator.estimate().pi[names.index("joint_1.stiffness")])
 
@@ -366,10 +356,7 @@ def test_a_stated_delay_of_a_torque_is_taken_off(clean_motion: Simulation) -> No
     blocks = list(sampled_blocks(distorted(clean_motion, text), "A", seed=2))
 
     def left(system: System) -> float:
-        estimator = Estimator(system, blocks[0].channels, "session")
-        for block in blocks:
-            estimator.push(block)
-        estimator.finish()
+        estimator = session_of(system, blocks)
         assert estimator.momentum is not None
         whitened = estimator.momentum.fit.plain.whitened(
             [estimator.model.layout.theta_m[1]], estimator.estimate().joint

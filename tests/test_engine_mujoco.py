@@ -13,7 +13,6 @@ from numpy.testing import assert_allclose
 from sms_adapters.system_file import load_system
 from sms_online.description.bodies import FlexibleLink
 from sms_online.description.schema import System
-from sms_online.pipeline.estimator import Estimator
 from sms_online.stream import Block
 from sms_sim.sensors import GRADES
 from sms_sim.simulate import sampled_blocks, simulate
@@ -29,6 +28,7 @@ from tests.engine_mujoco import (
     with_noise,
 )
 from tests.exactly_known import exactly_known
+from tests.sessions_of import session_of
 
 SYSTEM = load_system("paper-planar-exact")
 # Roots of the cantilever, Blevins, Formulas for Natural Frequency and Mode Shape (1979), table 8-1.
@@ -240,9 +240,7 @@ def test_noise_of_a_grade_comes_on_top() -> None:
 
 @pytest.mark.long
 def test_the_estimator_finds_the_engines_parameters(engine_capture: Block) -> None:
-    estimator = Estimator(exactly_known(SYSTEM), engine_capture.channels, "engine")
-    estimator.push(engine_capture)
-    estimator.finish()
+    estimator = session_of(exactly_known(SYSTEM), [engine_capture])
     assert estimator.by_momentum
     base, truth = estimator.base, estimator.base.values(estimator.model.nominal)
     estimate = estimator.estimate().pi

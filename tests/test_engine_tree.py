@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from sms_online.description.parse import parse_system
-from sms_online.pipeline.estimator import Estimator
 from sms_sim.simulate import sampled_blocks, simulate
 from tests.engine_tree import tree_capture
 from tests.exactly_known import exactly_known
+from tests.sessions_of import session_of
 
 # Coarse links, whose static deflections are exact: the motion starts without a jolt and is slow against their modes.
 CELLS, STEP = 8, 1.25e-4
@@ -175,9 +175,7 @@ def test_every_parameter_is_that_of_the_second_engine(name: str) -> None:
     """Noise-free; the engine shares no equation with the model, its links are chains of rigid segments."""
     system = SYSTEMS[name]
     capture = tree_capture(system, DURATION, CELLS, STEP)
-    estimator = Estimator(exactly_known(system), capture.channels, "engine")
-    estimator.push(capture)
-    estimator.finish()
+    estimator = session_of(exactly_known(system), [capture])
     assert estimator.by_momentum
     base, estimate = estimator.base, estimator.estimate()
     truth = base.values(estimator.model.nominal)

@@ -25,6 +25,7 @@ from tests.campaigns.sessions import disguised, noisy_session, true_parameters
 from tests.conftest import noise_free_block
 from tests.evaluated import judged, results_document, standard_deviation
 from tests.saved import resumed
+from tests.sessions_of import session_of
 from tests.simulations import planar
 
 
@@ -35,14 +36,6 @@ def session(folder: Path, drive: float, encoder: float) -> tuple[System, list[Bl
     bus.drive_arrival = bus.drive_arrival + drive
     bus.encoder_arrival = bus.encoder_arrival + encoder
     return system, merged(system, folder, bus.drive(), bus.encoder(system))[1]
-
-
-def estimator_of(system: System, blocks: list[Block]) -> Estimator:
-    estimator = Estimator(system, blocks[0].channels, "made up")
-    for block in blocks:
-        estimator.push(block)
-    estimator.finish()
-    return estimator
 
 
 @pytest.mark.long
@@ -57,7 +50,7 @@ def estimator_of(system: System, blocks: list[Block]) -> Estimator:
 def test_a_latency_that_is_not_stated_is_reported(
     tmp_path: Path, drive: float, encoder: float, source: str, effect: str
 ) -> None:
-    estimator = estimator_of(*session(tmp_path, drive, encoder))
+    estimator = session_of(*session(tmp_path, drive, encoder))
     assert estimator.momentum is not None
     found = estimator.momentum.latencies.found
     assert found is not None
@@ -72,7 +65,7 @@ def test_a_latency_that_is_not_stated_is_reported(
 @pytest.mark.slow
 @pytest.mark.parametrize("late", [0.0, 0.003])
 def test_a_common_latency_is_not_reported(tmp_path: Path, late: float) -> None:
-    estimator = estimator_of(*session(tmp_path, late, late))
+    estimator = session_of(*session(tmp_path, late, late))
     assert estimator.momentum is not None
     assert estimator.momentum.latencies.found is None
 
@@ -175,9 +168,7 @@ def test_torques_that_are_held_are_noticed(stated: bool) -> None:
     held = Sensor(channels=("tau_*",), hold=True)
     system = disguised(system, np.random.default_rng(0))
     system = system.model_copy(update={"sensors": (*others, held)}) if stated else system
-    estimator = Estimator(system, block.channels, "test")
-    estimator.push(block)
-    estimator.finish()
+    estimator = session_of(system, [block])
     trust = judged(estimator)
     noticed = [ground.then for ground in trust.grounds if "held over the sample" in ground.text]
     assert noticed == ([] if stated else ["state hold = true under [[sensor]] of the torques"])

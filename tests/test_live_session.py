@@ -35,6 +35,7 @@ from sms_tools.live.status import Leading, News, StatusWriter, line, screen
 from tests.axis import DAMPING, INERTIA
 from tests.bus_streams import AxisBus, axis_testbed
 from tests.evaluated import results_document, standard_deviation
+from tests.sessions_of import session_of
 
 SPEED = 10.0
 
@@ -124,10 +125,7 @@ class Bench:
     def replayed(self) -> dict[str, Any]:
         """The document of the recording."""
         source = open_source(self.directory, self.system, directory=self.folder)
-        estimator = Estimator(self.system, source.channels, "replay")
-        for block in source:
-            estimator.push(block)
-        estimator.finish()
+        estimator = session_of(self.system, source)
         return results_document(estimator, 0.0, source.warnings)
 
 
@@ -176,7 +174,7 @@ def test_an_unplugged_device_is_named_and_opened_again(tmp_path: Path, system: S
     bench.readers[1].unplugged = (8.0, 10.0)
     live = bench.run(21.0)
     assert bench.readers[1].opened == 2
-    assert "encoder: lost 1 times and opened again, the last time for: unplugged" in live["warnings"]
+    assert "encoder: lost 1 times and opened again; last reason: unplugged" in live["warnings"]
     for p, true in zip(live["parameters"], (INERTIA, DAMPING), strict=True):
         assert abs(p["estimate"] - true) < 4.0 * p["std"]
     assert json.dumps(bench.replayed()) == json.dumps(live)

@@ -23,6 +23,7 @@ from tests.evaluated import results_document
 from tests.model_systems import FRICTION, paper, spatial
 from tests.prescribed_motion import prescribed
 from tests.saved import resumed
+from tests.sessions_of import session_of
 
 SPAN = 0.4  # s
 # Of positions of some rad differenced at 1 kHz, over the sum of the sizes of a row's terms: 4e-13 found.
@@ -179,10 +180,7 @@ def axis_session(t: Array, noise: float = 0.0) -> Block:
 
 
 def fitted(block: Block) -> Estimator:
-    estimator = Estimator(parse_system(AXIS, "axis.toml"), block.channels, "axis")
-    estimator.push(block)
-    estimator.finish()
-    return estimator
+    return session_of(parse_system(AXIS, "axis.toml"), [block])
 
 
 @pytest.mark.slow
@@ -247,7 +245,5 @@ def test_nominal_values_never_enter_the_estimate() -> None:
     block = axis_session(np.arange(800) / 200.0, noise=1e-4)
     other = parse_system(AXIS.replace(f"zz = {INERTIA}", "zz = 7.0").replace(f"= {DAMPING} }}", "= 5.0 }"), "axis.toml")
     assert build_model(other).nominal.tolist() != build_model(parse_system(AXIS, "axis.toml")).nominal.tolist()
-    estimator = Estimator(other, block.channels, "axis")
-    estimator.push(block)
-    estimator.finish()
+    estimator = session_of(other, [block])
     np.testing.assert_array_equal(estimator.estimate().pi, fitted(block).estimate().pi)

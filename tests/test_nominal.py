@@ -9,9 +9,9 @@ import pytest
 
 import sms_online as sms
 from sms_online.nominal import compare, unit_factors
-from sms_online.pipeline.estimator import Estimator
 from sms_online.verdict.trust import Trust
 from tests.evaluated import judged
+from tests.sessions_of import session_of
 
 GEAR = 100.0
 # One flexible joint and a rigid link, on a fixed base; noise stated, so that a session of 12 s is enough.
@@ -50,10 +50,7 @@ def scaled(capture: sms.Capture, factors: dict[str, float]) -> sms.Capture:
 
 def trust_in(system: sms.System, capture: sms.Capture) -> Trust:
     """May the estimate of a session be trusted? Without the search for effects, which takes most of the time."""
-    estimator = Estimator(system, capture.channels, "rig")
-    for block in capture:
-        estimator.push(block)
-    estimator.finish()
+    estimator = session_of(system, capture)
     return judged(estimator)
 
 

@@ -20,6 +20,7 @@ from tests.batch_solution import batch_least_squares
 from tests.conftest import noise_free_block
 from tests.evaluated import results_document, standard_deviation
 from tests.keeping_tracker import KeepingTracker
+from tests.sessions_of import session_of
 from tests.simulations import planar
 
 NAMES = (
@@ -73,10 +74,7 @@ def test_batch_of_100_exact_rows_gives_all_sixteen(name: str, planar_session: Si
 
 
 def streamed(name: str, block: Block) -> Estimator:
-    estimator = Estimator(load_system(name), block.channels, "simulation")
-    estimator.push(block)
-    estimator.finish()
-    return estimator
+    return session_of(load_system(name), [block])
 
 
 @pytest.mark.slow

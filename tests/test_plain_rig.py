@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from sms_online.pipeline.estimator import Estimator
 from sms_sim.simulate import exact_states, sampled_blocks, simulate
 from tests.plain_rig import bound_of, plain_rig
+from tests.sessions_of import session_of
 
 SEED = 0
 
@@ -29,11 +29,7 @@ def test_a_simulation_records_each_rate_at_its_own_instants() -> None:
 @pytest.mark.long
 def test_parameters_of_a_plain_rig_are_within_ten_bounds() -> None:
     simulation = simulate(plain_rig())
-    blocks = list(sampled_blocks(simulation, None, SEED))
-    estimator = Estimator(plain_rig(), blocks[0].channels, "simulation")
-    for block in blocks:
-        estimator.push(block)
-    estimator.finish()
+    estimator = session_of(plain_rig(), sampled_blocks(simulation, None, SEED))
     assert estimator.by_smoother
     error = np.abs(estimator.estimate().pi - estimator.base.values(estimator.model.nominal))
     assert np.all(error <= 10.0 * bound_of(simulation))

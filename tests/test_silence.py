@@ -94,7 +94,7 @@ def test_late_estimates_after_an_absence_have_its_cause(tmp_path: Path, system: 
     for newest in (0.0, 3.9):
         bench.session.latencies.add(4.0, newest)
     late = [trouble for trouble in bench.session.troubles if "late" in trouble]
-    assert late == ["estimates come 4.0 s late, for drive, encoder had been away"]
+    assert late == ["estimates come 4.0 s late because drive, encoder had been away"]
 
 
 @pytest.mark.slow

@@ -16,6 +16,7 @@ from sms_online.stream import Block
 from tests.campaigns.sessions import disguised, noisy_session, true_parameters
 from tests.conftest import noise_free_block
 from tests.evaluated import evaluated
+from tests.sessions_of import session_of
 from tests.simulations import planar
 
 SLOW = 100  # samples of the grid to one of the base's pose: 10 Hz
@@ -42,10 +43,7 @@ def described(rate: float | None) -> System:
 
 def estimator(rate: float | None, seconds: float) -> Estimator:
     block = session(seconds)
-    found = Estimator(described(rate), block.channels, "test")
-    found.push(block)
-    found.finish()
-    return found
+    return session_of(described(rate), [block])
 
 
 def test_a_rate_that_nobody_stated_is_asked_for() -> None:

@@ -32,6 +32,7 @@ from sms_sim.simulate import Simulation, exact_states, sampled_blocks, simulate
 from sms_tools.cli import main
 from tests.evaluated import elsewhere, results_document, standard_deviation
 from tests.one_link import TEXT, one_link
+from tests.sessions_of import session_of
 
 SEEDS = 6
 MISSING = ("link_1.marker_1.theta_z", "link_1.marker_2.theta_z")
@@ -50,10 +51,7 @@ def recorded(simulation: Simulation, seed: int) -> Block:
 
 
 def session(system: System, block: Block) -> Estimator:
-    estimator = Estimator(system, block.channels, "simulation")
-    estimator.push(block)
-    estimator.finish()
-    return estimator
+    return session_of(system, [block])
 
 
 def truth_of(estimator: Estimator) -> Array:

@@ -21,6 +21,7 @@ from sms_sim.simulate import Simulation, exact_states, sampled_blocks, simulate
 from tests.campaigns.sessions import disguised, true_parameters
 from tests.conftest import noise_free_block
 from tests.evaluated import standard_deviation
+from tests.sessions_of import session_of
 from tests.simulations import simulated, until
 
 GRADE = "A"
@@ -31,9 +32,7 @@ EXCITED = 1e-2
 def streamed(simulation: Simulation) -> tuple[Estimator, Array]:
     """A finished session on the noise-free samples of a simulation, and the true base parameters."""
     block = noise_free_block(simulation, simulation.plant.system)
-    estimator = Estimator(simulation.plant.system, block.channels, "simulation")
-    estimator.push(block)
-    estimator.finish()
+    estimator = session_of(simulation.plant.system, [block])
     return estimator, estimator.base.values(simulation.plant.model.nominal)
 
 
@@ -93,11 +92,7 @@ def test_seven_joint_arm_at_250_hz_and_grade_b() -> None:
     system = load_system("seven-joint").model_copy(update={"sample_rate": 250.0})
     # The same motion, read less often.
     motion = until(simulated(load_system("seven-joint"), position_tolerance=1e-13), 20.0).solution
-    blocks = list(sampled_blocks(Simulation(Plant(system), motion), "B", seed=1))
-    estimator = Estimator(disguised(system), blocks[0].channels, "simulation")
-    for block in blocks:
-        estimator.push(block)
-    estimator.finish()
+    estimator = session_of(disguised(system), sampled_blocks(Simulation(Plant(system), motion), "B", seed=1))
     truth = true_parameters(system)
     std, error = standard_deviation(estimator), np.abs(estimator.estimate().pi - truth)
     determined = (truth != 0.0) & (std < np.abs(truth) / 3.0)

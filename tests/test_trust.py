@@ -15,6 +15,7 @@ from sms_online.verdict.reasons import CHECK_ROWS, MOVE, place_of
 from sms_online.verdict.trust import LONGEST_SENTENCE, Residual
 from tests.axis import AXIS, axis_block
 from tests.evaluated import judged, results_document
+from tests.sessions_of import session_of
 
 QUIET = {"energy": Residual(None, None), "joint_1": Residual(0.01, 1.1), "joint_2": Residual(0.02, 0.9)}
 GOOD = Evidence(determined=(15, 16), undetermined=("motor_2.stator_inertia",), residual=QUIET)
@@ -151,9 +152,7 @@ def test_a_prior_that_data_pull_from_is_a_grave_doubt() -> None:
 def test_the_energy_balance_alone_is_never_trusted() -> None:
     """Its residual is scaled by itself: nothing distinguishes a lacking effect from noise."""
     block = axis_block(0.1)
-    session = Estimator(parse_system('balance = "energy"\n' + AXIS, "axis.toml"), block.channels, "axis")
-    session.push(block)
-    session.finish()
+    session = session_of(parse_system('balance = "energy"\n' + AXIS, "axis.toml"), [block])
     assert judged(session).level == "doubt"
     assert "energy balance alone" in judged(session).sentence
 

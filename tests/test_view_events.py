@@ -12,13 +12,13 @@ from rerun.chunk import RrdReader
 
 from sms_adapters.capture import CaptureWriter
 from sms_online.description.parse import parse_system
-from sms_online.pipeline.estimator import Estimator
 from sms_online.pipeline.statistics import Statistics
 from sms_online.stream import Block
 from sms_tools.cli import main
 from tests.axis import AXIS, DAMPING, INERTIA
 from tests.evaluated import elsewhere, results_document
 from tests.recordings import scalars
+from tests.sessions_of import session_of
 
 RATE, CHANGE, SECONDS = 200.0, 10.0, 20.0
 SYSTEM = parse_system(AXIS, "axis.toml")
@@ -49,9 +49,7 @@ def shown(session: Block, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.mark.long
 def test_pickled_statistics_say_the_same_after_an_event(session: Block) -> None:
-    estimator = Estimator(SYSTEM, session.channels, "test")
-    estimator.push(session)
-    estimator.finish()
+    estimator = session_of(SYSTEM, [session])
     assert estimator.base.n == 3
     assert elsewhere(Statistics.of(estimator)) == results_document(estimator, 0.0, [])
 

@@ -31,6 +31,7 @@ from sms_tools.view.blueprint import _Plots
 from sms_tools.view.session import open_view, references
 from tests.evaluated import elsewhere, results_document
 from tests.recordings import columns, scalars
+from tests.sessions_of import session_of
 
 # Of the example's motion: enough for its first weights, every marker moving, and a recording of a few batches' size.
 SECONDS = 8.0
@@ -177,9 +178,7 @@ def test_a_viewer_that_never_reads_is_given_up(
         estimator.finish()
     assert view.status
     assert view.warnings
-    alone = Estimator(load_system("paper-planar"), samples.channels, "test")
-    alone.push(samples)
-    alone.finish()
+    alone = session_of(load_system("paper-planar"), [samples])
     np.testing.assert_array_equal(estimator.estimate().pi, alone.estimate().pi)
 
 

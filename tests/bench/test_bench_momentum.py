@@ -21,6 +21,7 @@ from sms_online.stream import Block
 from sms_sim.plant import Plant
 from sms_sim.simulate import sampled_blocks, simulate
 from tests.prescribed_motion import prescribed
+from tests.sessions_of import session_of
 from tests.test_base_parameters import right_angled
 
 # Live at the arm's own rate asks for 250 samples/s, replay of the planar example for 4,000.
@@ -43,10 +44,7 @@ def recorded(name: str, seconds: float, rate: float) -> tuple[System, list[Block
 
 def estimated(system: System, blocks: list[Block]) -> Estimator:
     """The full recipe: noise estimated, energy and momentum rows, weights, bias, calibration within tolerances."""
-    estimator = Estimator(system, blocks[0].channels, "bench")
-    for block in blocks:
-        estimator.push(block)
-    estimator.finish()
+    estimator = session_of(system, blocks)
     estimator.estimate()
     return estimator
 

@@ -45,6 +45,7 @@ from sms_online.stream import Array, Block
 from tests.campaigns.accuracy import flagged
 from tests.campaigns.results import append, campaign, read, summed
 from tests.campaigns.sessions import disguised, exact_session, noisy_session, true_parameters
+from tests.sessions_of import session_of
 
 SYSTEM = "paper-planar"
 GRADE = "B"
@@ -245,9 +246,7 @@ def _declared(system: System, block: Block, effect: Effect) -> dict[str, float]:
     """Errors of the parameters where the effect is declared from the start; of none where it cannot be."""
     if effect.name == TableTilt.entry.name:
         return {}
-    declared = Estimator(disguised(system.model_copy(update={"effects": (effect,)})), block.channels, "declared")
-    declared.push(block)
-    declared.finish()
+    declared = session_of(disguised(system.model_copy(update={"effects": (effect,)})), [block])
     return _errors(system, declared)
 
 

@@ -22,11 +22,11 @@ from scipy.spatial.transform import Rotation
 from sms_adapters.system_file import load_system
 from sms_online.description.schema import System, Tolerances
 from sms_online.evaluation import NORMAL_95, Evaluation
-from sms_online.pipeline.estimator import Estimator
 from sms_online.pipeline.statistics import Statistics
 from sms_online.stream import Array, Block
 from tests.campaigns.results import Record, append, campaign, read, summed
 from tests.campaigns.sessions import disguised, exact_session, noisy_session, true_parameters
+from tests.sessions_of import session_of
 
 SYSTEM = "paper-planar"
 GRADE = "B"
@@ -181,10 +181,7 @@ def one_session(folder: Path, kind: str, tolerances: str, seed: int) -> Record:
     stated = Tolerances() if tolerances == "default" else Tolerances.model_validate(tolerances)
     system = disguised(described, random).model_copy(update={"tolerances": stated})
     start = process_time()
-    estimator = Estimator(system, block.channels, "campaign")
-    for piece in block.pieces(PIECE):
-        estimator.push(piece)
-    estimator.finish()
+    estimator = session_of(system, block.pieces(PIECE))
     evaluation = Evaluation(Statistics.of(estimator))
     estimate, nuisances = evaluation.estimate, evaluation.statistics.setup.nuisances
     found = zip(nuisances, estimate.nuisances.tolist(), estimate.nuisances_std.tolist(), strict=True)

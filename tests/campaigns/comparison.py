@@ -32,6 +32,7 @@ from tests.campaigns.output_error import OutputError
 from tests.campaigns.sessions import disguised, exact_session, noisy_session, true_parameters
 from tests.exactly_known import exactly_known
 from tests.keeping_tracker import KeepingTracker
+from tests.sessions_of import session_of
 
 SYSTEM, GRADE = "paper-planar", "B"
 # As many measurements as the paper takes.
@@ -54,10 +55,7 @@ def momentum(system: System, block: Block) -> Array:
 
 
 def _session(system: System, block: Block) -> Estimator:
-    estimator = Estimator(system, block.channels, "comparison")
-    estimator.push(block)
-    estimator.finish()
-    return estimator
+    return session_of(system, [block])
 
 
 def paper(system: System, block: Block) -> Array:

@@ -21,7 +21,6 @@ from sms_online.description.schema import System
 from sms_online.effects.build import build_model
 from sms_online.evaluation import NORMAL_95
 from sms_online.model.base_parameters import find_base_parameters
-from sms_online.pipeline.estimator import Estimator
 from sms_online.stream import Block
 from sms_sim.sensors import Sensors
 from sms_sim.simulate import simulate
@@ -29,6 +28,7 @@ from tests.campaigns.results import Record, append, campaign, read
 from tests.campaigns.sessions import disguised, exact_session, true_parameters
 from tests.evaluated import standard_deviation
 from tests.plain_rig import bound_of, plain_rig
+from tests.sessions_of import session_of
 
 # Asked of each parameter: an error within so many times the bound.
 ASKED = 10.0
@@ -42,9 +42,7 @@ def noisy(system: System, exact: Block, seed: int) -> Block:
 def one_session(system: System, block: Block) -> Record:
     """Estimate of one session."""
     start = process_time()
-    estimator = Estimator(disguised(system), block.channels, "campaign")
-    estimator.push(block)
-    estimator.finish()
+    estimator = session_of(disguised(system), [block])
     smoother = estimator.smoother
     assert smoother is not None
     return {

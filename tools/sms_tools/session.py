@@ -51,7 +51,7 @@ def feed(session: Session, blocks: Iterable[Block], interruption: Interruption) 
 def conclude(args: argparse.Namespace, result: Result, directory: Path, interrupted: bool) -> int:
     """Write results.json and the history, print it for people or programs, and say how the session ended."""
     if interrupted:
-        result = replace(result, warnings=(*result.warnings, "interrupted: this is what the samples until then say"))
+        result = replace(result, warnings=(*result.warnings, "interrupted: the results use the samples until then"))
     document = result.document()
     console = report_console(args.json)
     parts: list[Table | str] = [parameter_table(document, console.width), "", *trust_lines(document)]

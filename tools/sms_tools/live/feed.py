@@ -197,9 +197,9 @@ class Feed:
         """What went wrong with the device, and what the estimator was too slow for, one sentence each."""
         found = []
         if self.losses:
-            found.append(f"{self.name}: lost {self.losses} times and opened again, the last time for: {self.last_loss}")
+            found.append(f"{self.name}: lost {self.losses} times and opened again; last reason: {self.last_loss}")
         elif self.lost is not None and not self.received:
-            found.append(f"{self.name}: never there: {self.lost}")
+            found.append(f"{self.name}: not available: {self.lost}")
         if self.dropped:
             found.append(f"{self.name}: {self.dropped} items recorded but not used, the estimator was too slow")
         return found

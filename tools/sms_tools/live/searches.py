@@ -63,7 +63,7 @@ class SearchProcess:
             self._log.write(json.dumps(entry) + "\n")
         except OSError as error:
             # No disk is worth the session.
-            self.problem = f"a search was not noted, so that a replay will differ: {error.strerror or error}"
+            self.problem = f"a search could not be recorded, so a replay will differ: {error.strerror or error}"
 
     def close(self) -> None:
         """End the process, and a search that runs."""

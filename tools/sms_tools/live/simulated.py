@@ -110,4 +110,4 @@ class SimulatedArm:
 
     def _last_words(self) -> str:
         _, said = self._process.communicate()
-        return (said.strip().splitlines() or ["it ended without a word"])[-1].removeprefix("sms_sim.bus: ")
+        return (said.strip().splitlines() or ["it ended without a message"])[-1].removeprefix("sms_sim.bus: ")

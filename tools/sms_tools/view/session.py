@@ -139,7 +139,7 @@ class View:
             self._close(self._handover)
         self._handover.close()
         if self._handover.dropped:
-            self.warnings.append(f"{self._handover.dropped} pictures of the view dropped: it does not keep up")
+            self.warnings.append(f"{self._handover.dropped} pictures of the view dropped: it is too slow")
         if not (self._serving and kind is None and not self.status):
             self._kill()
 
@@ -150,7 +150,7 @@ class View:
             if handover.taken > taken:
                 taken, since = handover.taken, perf_counter()
             elif perf_counter() - since > CLOSING:
-                self._trouble("it did not finish in time")
+                self._trouble(f"it did not finish within {CLOSING:g} s")
 
     def _show(self, blocks: tuple[Block, ...], with_state: bool) -> None:
         assert self._handover is not None
@@ -165,7 +165,7 @@ class View:
         if self._handover.put(frame, self._patience):
             self._room = perf_counter()
         elif perf_counter() - self._room > STALL:
-            self._trouble(f"nothing of it was taken for {STALL:g} s")
+            self._trouble(f"it took no data for {STALL:g} s")
 
     def _trouble(self, text: str) -> None:
         """Give the view up; the session goes on."""
