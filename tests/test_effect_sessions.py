@@ -174,6 +174,7 @@ def test_declared_effects_are_identified_together_with_the_arm(session: tuple[Sy
     assert_allclose(estimate.pi[own], truth[own], rtol=0.01)
 
 
+@pytest.mark.slow
 def test_reported_coefficients_are_those_that_were_injected(session: tuple[System, Estimator]) -> None:
     true, estimator = session
     estimate = estimator.estimate()
@@ -333,6 +334,7 @@ def test_conditioning_is_independent_of_blocks_and_restarts() -> None:
     assert stage.push(GridSamples(index[: stage.margin] + 500, values[: stage.margin], 1)) == []
 
 
+@pytest.mark.slow
 def test_corrections_give_the_estimate_of_a_clean_session(clean_motion: Simulation) -> None:
     """An offset and a lag of encoder 1: declared, the stiffness of joint 1 comes out within 0.1 %.
 

@@ -203,7 +203,7 @@ def test_a_step_too_long_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPa
 DIFFERENCES = {"r_S": 5e-6, "theta_0": 5e-6, "theta_m": 5e-6, "q": 5e-5, "link": 1.5e-4}
 
 
-@pytest.mark.parametrize("amplitude", [0.01, 1.0])
+@pytest.mark.parametrize("amplitude", [0.01, pytest.param(1.0, marks=pytest.mark.slow)])
 def test_engine_and_simulator_move_alike(amplitude: float) -> None:
     """From rest, whatever the amplitude: `exact` links are exact. Smaller cells bring every channel closer."""
     system = at_smaller_amplitude(amplitude)

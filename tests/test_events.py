@@ -192,6 +192,7 @@ def test_a_payload_that_is_one_body_with_its_link_is_named() -> None:
     assert (errors < 4.0 * standard_deviation(estimator)).all()
 
 
+@pytest.mark.slow
 def test_what_nothing_explains_starts_the_estimate_anew() -> None:
     """A sensor that begins to read four thirds of the torque and another angle is no change of one parameter."""
     block = axis_session(DAMPING, INERTIA)
@@ -256,6 +257,7 @@ def test_an_opened_parameter_takes_nothing_from_the_others() -> None:
     assert found.covariance() == pytest.approx(solve(batch).covariance()[:3, :3], rel=1e-9, abs=1e-12)
 
 
+@pytest.mark.slow
 def test_windows_are_smoothed_with_samples_of_their_side_only() -> None:
     """The first window after an event begins a filter's half width after the guard: no sample before has any part."""
     estimator, _ = run(axis_session(2.0 * DAMPING, INERTIA), system=SYSTEM)

@@ -94,6 +94,7 @@ def test_the_seed_decides_the_motion() -> None:
     assert found[0] != found[2]
 
 
+@pytest.mark.slow
 def test_a_stated_limit_holds_in_place_of_the_described_motions() -> None:
     found = excite(parse_system(MOVED, "axis.toml"), limits=Limits(rate=0.8), duration=2.0, iterations=2)
     (rate,) = [each for each in found.reached if each.name == "rate of q_1"]

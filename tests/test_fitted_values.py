@@ -39,6 +39,7 @@ def rig(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+@pytest.mark.slow
 def test_the_file_states_what_was_fitted(rig: Path) -> None:
     text = (rig / "found" / "system.toml").read_text()
     assert text.startswith("# kept\n")
@@ -53,6 +54,7 @@ def test_the_file_states_what_was_fitted(rig: Path) -> None:
     assert system.nominal[KEY] == pytest.approx(FRICTION, rel=0.02)
 
 
+@pytest.mark.slow
 def test_it_holds_on_another_run_without_results(rig: Path) -> None:
     found = sms.validate(sms.load_system(rig / "found" / "system.toml"), rig / "tuesday.csv")
     assert found.holds
@@ -75,6 +77,7 @@ def test_it_is_simulated_as_found(rig: Path, capsys: pytest.CaptureFixture[str])
     assert away(made) < 0.1 * away(described)
 
 
+@pytest.mark.slow
 def test_its_deviations_are_priors_where_priors_are_asked_for(rig: Path) -> None:
     system = sms.load_system(rig / "found" / "system.toml")
     base = find_base_parameters(build_model(system))
