@@ -144,6 +144,17 @@ def test_the_end_of_a_drift_is_seen_within_three_seconds(seed: int) -> None:
     assert drift.std < 0.01
 
 
+def test_an_alarm_behind_the_end_of_a_drift_is_of_that_end() -> None:
+    """It was taken for a change of the rate before the alarm came, and is broken off there."""
+    tracker, given = learned(), rows(40.0, lambda t: only(2, 0.5 * np.minimum(t, 20.5)), noise=0.05)
+    tracker.update(part(given, 0, round(22.0 * RATE)))
+    assert [each.bends != () for each in tracker.state.moving] == [True]
+    change = tracker.break_between(21.0, 21.2, [part(given, k, k + 1) for k in range(430, 520)]).drift
+    assert change is not None
+    assert change.columns == (2,)
+    assert change.rates[0] == pytest.approx(-0.5, abs=0.02)
+
+
 def test_a_step_is_no_drift() -> None:
     tracker = learned()
     tracker.update(rows(40.0, lambda t: only(1, 0.3 * (t > 20.0)), noise=0.02))

@@ -49,6 +49,8 @@ REMEMBERED = 32
 SEARCHED, CHOSEN = 2, 4
 # Knots before the first search: the first rows have weights that change.
 UNSEARCHED = 3
+# Knots before an alarm within which a change of rates may be what it is of.
+RECENT = 2
 # Drifts that begin together, at most.
 MOST_AT_ONCE = 4
 # Knots from the beginning within which more than noise may be a drift yet to be found.
@@ -155,20 +157,20 @@ class LearnedTrend(Tracker):
         """
         knot = _knot(alarm)
         behind = _later_half(held, alarm)
-        before = self._before(onset)
+        before, moving = self._before(onset)
         if not before or not behind:
             return Break()
         after = [self._expanded(rows) for rows in behind]
         for rows, own in zip(behind, after, strict=True):
             own[:, self._n : -1] += (rows.t - knot * STEP)[:, None] * own[:, : self._n]
-        state = self._through(before, self.state.moving, knot)[0]
+        state = self._through(before, moving, knot)[0]
         block = Block.of(np.concatenate(after), knot, behind[-1].t[-1] - knot * STEP)
         return best_break(state, block, self._groups)
 
     def go_on_behind(self, onset: float, alarm: float, drift: Ramp, held: Sequence[Rows]) -> None:
         """Go on behind the break of a drift; rows of the last knot before it are given up. held: as before."""
-        knot, begin, before = _knot(alarm), int(np.ceil(alarm / STEP)), self._before(onset)
-        moving = [each.broken(drift.columns, knot, drift.rates) for each in self.state.moving]
+        (before, moving), knot, begin = self._before(onset), _knot(alarm), int(np.ceil(alarm / STEP))
+        moving = [each.broken(drift.columns, knot, drift.rates) for each in moving]
         if not any(each.columns == drift.columns for each in moving):
             moving.append(Moving(drift.columns, knot, 0.0, tuple(drift.rates.tolist()), breaks=(knot,), begun=onset))
         now = self._through(before, moving, begin)[0]
@@ -179,9 +181,15 @@ class LearnedTrend(Tracker):
         for rows in _later_half(held, alarm):
             self.update(rows)
 
-    def _before(self, onset: float) -> list[Block]:
-        """Remembered blocks that end before an instant, s."""
-        return [block for block in self.state.blocks if (block.knot + KNOT) * STEP <= onset]
+    def _before(self, onset: float) -> tuple[list[Block], list[Moving]]:
+        """Remembered blocks that end before an instant, s, and what moves in them.
+
+        A change of rates that was taken for one shortly before may be the same change.
+        """
+        recent = [at for each in self.state.moving for at in each.bends if at > onset / STEP - RECENT * KNOT]
+        end = min([int(onset / STEP), *(at - KNOT for at in recent)])
+        moving = [each.unbent(end) for each in self.state.moving]
+        return [block for block in self.state.blocks if block.knot + KNOT <= end], moving
 
     @property
     def _knot(self) -> int:

@@ -87,6 +87,10 @@ class Moving:
         """With rates that have changed by their own size before a knot."""
         return replace(self, bends=(*self.bends, knot))
 
+    def unbent(self, knot: int) -> Moving:
+        """Without the bends behind a knot."""
+        return replace(self, bends=tuple(at for at in self.bends if at <= knot))
+
     def at(self, level: int, time: float, fading: int, decay_time: float) -> Moving:
         """With a rate that changes by its own size in `time` s, and decays in `decay_time` s."""
         return replace(self, level=level, std=1.0 / np.sqrt(time), fading=fading, decay=1.0 / decay_time)
