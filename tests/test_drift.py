@@ -9,7 +9,8 @@ import pytest
 
 from sms_online.stream import Array
 from sms_online.trackers import Prior, RecursiveLeastSquares, Rows
-from sms_online.trackers.drift import STEP, LearnedTrend
+from sms_online.trackers.drift import LearnedTrend
+from sms_online.trackers.drift_filter import STEP
 from tests.saved import resumed
 
 N = 4
@@ -126,6 +127,32 @@ def test_what_decays_is_followed_as_decaying() -> None:
     assert tracker.state.moving[0].decay == pytest.approx(1.0 / 30.0, rel=0.5)
     assert estimate.pi[0] == pytest.approx(3.0 * np.exp(-2.0), abs=4.0 * estimate.std[0])
     assert tracker.found[0].rate == pytest.approx(-0.1 * np.exp(-2.0), rel=0.1)
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_the_end_of_a_drift_is_seen_within_three_seconds(seed: int) -> None:
+    """At the old rate the value would be off by 0.3 by then; its error bar is a tenth of that."""
+    end, behind = 30.5, 33.5
+    tracker, given = learned(), rows(45.0, lambda t: only(2, 0.1 * np.minimum(t, end)), seed)
+    for span in ((0.0, behind), (behind, 45.0)):
+        tracker.update(part(given, *(round(t * RATE) for t in span)))
+        estimate = tracker.estimate()
+        assert estimate.std[2] < 0.03
+        assert estimate.pi[2] == pytest.approx(TRUE[2] + 0.1 * end, abs=4.0 * estimate.std[2])
+    (drift,) = tracker.found
+    assert drift.rate == pytest.approx(0.0, abs=4.0 * drift.std)
+    assert drift.std < 0.01
+
+
+def test_an_alarm_behind_the_end_of_a_drift_is_of_that_end() -> None:
+    """It was taken for a change of the rate before the alarm came, and is broken off there."""
+    tracker, given = learned(), rows(40.0, lambda t: only(2, 0.5 * np.minimum(t, 20.5)), noise=0.05)
+    tracker.update(part(given, 0, round(22.0 * RATE)))
+    assert [each.bends != () for each in tracker.state.moving] == [True]
+    change = tracker.break_between(21.0, 21.2, [part(given, k, k + 1) for k in range(430, 520)]).drift
+    assert change is not None
+    assert change.columns == (2,)
+    assert change.rates[0] == pytest.approx(-0.5, abs=0.02)
 
 
 def test_a_step_is_no_drift() -> None:

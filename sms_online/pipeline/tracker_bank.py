@@ -17,7 +17,8 @@ from sms_online.pipeline.momentum_windows import HOPS
 from sms_online.state import Stage, State
 from sms_online.stream import Array
 from sms_online.trackers.build import Tracked, build_tracker, build_watch
-from sms_online.trackers.drift import STEP, Found, LearnedTrend
+from sms_online.trackers.drift import Found, LearnedTrend
+from sms_online.trackers.drift_filter import STEP
 from sms_online.trackers.drift_search import Ramp
 from sms_online.trackers.information import Information
 from sms_online.trackers.interface import Estimate, Prior, Rows, Tracker

@@ -4,7 +4,8 @@ Between knots a moving parameter goes on a straight line, or on one that decays;
 random size: a random walk of the rate. Which parameters move is learned: a parameter starts to move where a ramp of it
 takes more off the rows' sum of squares than chance does, and more than any step. How freely its rate walks, and how
 fast it decays, is learned too: the choice under which the innovations of the last half minute are likeliest, neither
-unless they say more. So a steady parameter keeps the error bars of least squares.
+unless they say more; and so is when it changes at once, see `rate_change`. A steady parameter keeps the error bars of
+least squares.
 
 A rate begins with no information at all, and most parameters have none: a covariance filter needs a finite variance
 in its place, and loses the digits of what is well known to it. Information in square-root form has neither problem.
@@ -24,7 +25,8 @@ from numpy.typing import NDArray
 
 from sms_online.state import State
 from sms_online.stream import Array
-from sms_online.trackers.drift_filter import Block, DriftFilter, Moving, innovation_loss, reach
+from sms_online.trackers.drift_filter import KNOT, STEP, Block, DriftFilter, Moving, innovation_loss, reach
+from sms_online.trackers.drift_noise import likeliest
 from sms_online.trackers.drift_search import (
     LARGEST_LEFT,
     Break,
@@ -39,19 +41,16 @@ from sms_online.trackers.drift_search import (
 from sms_online.trackers.factor import masked_covariance, solve, triangular_factor
 from sms_online.trackers.information import Information
 from sms_online.trackers.interface import Estimate, Prior, Rows, Tracker, checked, prior_factor
+from sms_online.trackers.rate_change import TRIED, RateChange, branches
 
-# Time from one step of the filter to the next, s, and steps from one remembered knot to the next.
-STEP, KNOT = 0.2, 5
 # Knots that are looked back at, for ramps and for process noise.
 REMEMBERED = 32
 # From one search for ramps to the next, and from one choice of process noise to the next, knots.
 SEARCHED, CHOSEN = 2, 4
 # Knots before the first search: the first rows have weights that change.
 UNSEARCHED = 3
-# Times in which a rate changes by its own size, s: what process noise is chosen from, none the first; and in which it
-# decays, for what warms up, runs in or empties approaches an end.
-TIMES = (np.inf, 1e4, 1000.0, 300.0, 100.0, 30.0, 10.0, 3.0)
-DECAYS = (np.inf, 300.0, 100.0, 50.0, 30.0, 20.0, 10.0)
+# Knots before an alarm within which a change of rates may be what it is of.
+RECENT = 2
 # Drifts that begin together, at most.
 MOST_AT_ONCE = 4
 # Knots from the beginning within which more than noise may be a drift yet to be found.
@@ -61,8 +60,6 @@ PATIENCE = 12
 SUSPECTED = 0.07
 # Chance that the earlier of the two has at most.
 SHOWN = 0.1
-# What process noise or decay must gain in twice the log likelihood of the innovations over none.
-COST = 4.0
 
 
 @dataclass(frozen=True)
@@ -83,7 +80,7 @@ class DriftState(State):
     one, from t = 0 on; knots: since the beginning. rows: so far; newest: time of the last, s. accepted: how often
     drifts were. quiet: whether rows leave no more than noise, without which no drift is accepted. until: instant that
     estimates hold for, s; no earlier than that of the newest row. searches: so far. likeliest: change that the last one
-    found, of what does not move; suspected: where it is hardly chance.
+    found, of what does not move; suspected: where it is hardly chance. changes: of rates, that may have been.
     """
 
     anchor: DriftFilter
@@ -102,6 +99,7 @@ class DriftState(State):
     searches: int = 0
     likeliest: Suspicion | None = None
     suspected: Suspicion | None = None
+    changes: list[RateChange] = msgspec.field(default_factory=list)
 
 
 class LearnedTrend(Tracker):
@@ -124,24 +122,17 @@ class LearnedTrend(Tracker):
         self._follow = follow
         self._n, self._groups, self._prior = n, tuple(groups), prior_factor(prior, n)
         self._trends, self._walks = trends, walks
-        self.enabled = True
-        self.reset()
-
-    def reset(self) -> None:
-        """Forget all rows; the prior stays."""
         self.begin(Information.none(self._n))
 
     def begin(self, known: Information) -> None:
         """Forget all rows, and go on from given information about π; the prior stays. Drifts are learned anew."""
         factor = triangular_factor(self._prior, checked(known, self._n).factor)
         moving = [Moving((int(k),), -1, float(self._trends[k])) for k in np.flatnonzero(self._trends)]
-        anchor = DriftFilter.begin(factor, moving, self._walks, STEP)
+        anchor = DriftFilter.begin(factor, moving, self._walks)
         self.state = DriftState(anchor, anchor, moving, rows=float(known.rows))
 
     def update(self, rows: Rows) -> None:
         """Take in rows; ValueError where their width is not n."""
-        if not self.enabled:
-            return
         for row, t in zip(self._expanded(rows), rows.t.tolist(), strict=True):
             step = int(np.floor(t / STEP))
             if self.state.step < 0:
@@ -166,33 +157,39 @@ class LearnedTrend(Tracker):
         """
         knot = _knot(alarm)
         behind = _later_half(held, alarm)
-        before = self._before(onset)
+        before, moving = self._before(onset)
         if not before or not behind:
             return Break()
         after = [self._expanded(rows) for rows in behind]
         for rows, own in zip(behind, after, strict=True):
             own[:, self._n : -1] += (rows.t - knot * STEP)[:, None] * own[:, : self._n]
-        state = self._through(before, self.state.moving, knot)[0]
+        state = self._through(before, moving, knot)[0]
         block = Block.of(np.concatenate(after), knot, behind[-1].t[-1] - knot * STEP)
         return best_break(state, block, self._groups)
 
     def go_on_behind(self, onset: float, alarm: float, drift: Ramp, held: Sequence[Rows]) -> None:
         """Go on behind the break of a drift; rows of the last knot before it are given up. held: as before."""
-        knot, begin, before = _knot(alarm), int(np.ceil(alarm / STEP)), self._before(onset)
-        moving = [each.broken(drift.columns, knot, drift.rates) for each in self.state.moving]
+        (before, moving), knot, begin = self._before(onset), _knot(alarm), int(np.ceil(alarm / STEP))
+        moving = [each.broken(drift.columns, knot, drift.rates) for each in moving]
         if not any(each.columns == drift.columns for each in moving):
             moving.append(Moving(drift.columns, knot, 0.0, tuple(drift.rates.tolist()), breaks=(knot,), begun=onset))
         now = self._through(before, moving, begin)[0]
-        self.state.blocks, self.state.moving, self.state.now = before, moving, now
-        self.state.anchor = self.state.anchor.with_moving(moving)
+        self.state.blocks, self.state.changes = before, []
+        self._move(moving, now)
         self.state.pending, self.state.fresh, self.state.step = [], 0, begin
         self.state.accepted += 1
         for rows in _later_half(held, alarm):
             self.update(rows)
 
-    def _before(self, onset: float) -> list[Block]:
-        """Remembered blocks that end before an instant, s."""
-        return [block for block in self.state.blocks if (block.knot + KNOT) * STEP <= onset]
+    def _before(self, onset: float) -> tuple[list[Block], list[Moving]]:
+        """Remembered blocks that end before an instant, s, and what moves in them.
+
+        A change of rates that was taken for one shortly before may be the same change.
+        """
+        recent = [at for each in self.state.moving for at in each.bends if at > onset / STEP - RECENT * KNOT]
+        end = min([int(onset / STEP), *(at - KNOT for at in recent)])
+        moving = [each.unbent(end) for each in self.state.moving]
+        return [block for block in self.state.blocks if block.knot + KNOT <= end], moving
 
     @property
     def _knot(self) -> int:
@@ -201,10 +198,25 @@ class LearnedTrend(Tracker):
 
     def _advance(self, step: int) -> None:
         """End the open step, and go on at a later one."""
-        self.state.now = self.state.now.absorbed(self._open()).advanced(step)
-        knot, self.state.step, self.state.fresh = self._knot, step, 0
+        block, before, knot = self._open(), self.state.now, self._knot
+        after = before.absorbed(block)
+        loss = innovation_loss(before, after)
+        changes = [each.absorbed(block, loss) for each in self.state.changes]
+        self.state.now, self.state.step, self.state.fresh = after.advanced(step), step, 0
+        if self._knot > knot:
+            changes = [*changes, *branches(after, self._knot)]
+        self.state.changes = [each.advanced(step) for each in changes]
         if self._knot > knot:
             self._close(Block.of(self._rows(), knot, KNOT * STEP))
+        self._change()
+
+    def _change(self) -> None:
+        """Go on with the likeliest change of a rate where it is likelier than none; forget those of long ago."""
+        best = max(self.state.changes, key=lambda each: each.gain, default=None)
+        if best is not None and best.likelier > 0.0:
+            self.state.changes = []
+            self._move(list(best.filter.moving), best.filter)
+        self.state.changes = [each for each in self.state.changes if each.knot > self._knot - TRIED * KNOT]
 
     def _close(self, block: Block) -> None:
         """Remember a block, and look back."""
@@ -260,7 +272,7 @@ class LearnedTrend(Tracker):
         state, _ = self._filtered(found)
         before = self.state.anchor.factor[-1, -1] ** 2
         if state.factor[-1, -1] ** 2 - before < LARGEST_LEFT * sum(block.rows for block in self.state.blocks):
-            self.state.moving = found
+            self.state.moving, self.state.changes = found, []
             self._choose()
             self.state.accepted += 1
             self.state.likeliest = self.state.suspected = None
@@ -281,24 +293,15 @@ class LearnedTrend(Tracker):
         self.state.likeliest, self.state.suspected = now, now if again and hardly else None
 
     def _choose(self) -> None:
-        """Process noise and decay of each that moves, those under which the innovations are likeliest."""
-        moving = list(self.state.moving)
-        chosen, least = self._filtered(moving)
-        least += sum(_cost(each) for each in moving)
-        for k, each in enumerate(moving):
-            # What decays steadily looks like process noise, so one is tried without the other first.
-            tried = [(0, fading) for fading in range(len(DECAYS))] + [
-                (each.level + step, each.fading) for step in (-1, 1)
-            ]
-            for level, fading in tried if each.learned else ():
-                if not 0 <= level < len(TIMES):
-                    continue
-                other = [*moving[:k], each.at(level, TIMES[level], fading, DECAYS[fading]), *moving[k + 1 :]]
-                found, loss = self._filtered(other)
-                loss += sum(_cost(one) for one in other)
-                if loss < least:
-                    chosen, least, moving = found, loss, other
-        self.state.moving, self.state.now = moving, chosen
+        """Process noise and decay of each that moves."""
+        moving, now = likeliest(self.state.moving, self._filtered)
+        if moving != self.state.moving:
+            self.state.changes = []
+        self._move(moving, now)
+
+    def _move(self, moving: list[Moving], now: DriftFilter) -> None:
+        """Go on with these moving, and their filter at the newest step."""
+        self.state.moving, self.state.now = moving, now
         self.state.anchor = self.state.anchor.with_moving(moving)
 
     @property
@@ -399,8 +402,3 @@ def _later_half(held: Sequence[Rows], alarm: float) -> list[Rows]:
 def _knot(t: float) -> int:
     """Knot of the block that the next step behind an instant, s, is in."""
     return int(np.ceil(t / STEP)) // KNOT * KNOT
-
-
-def _cost(moving: Moving) -> float:
-    """What process noise and decay must gain over none."""
-    return COST * ((moving.level > 0) + (moving.fading > 0))

@@ -10,8 +10,12 @@ import numpy as np
 from sms_online.stream import Array
 from sms_online.trackers.factor import triangular_factor
 
+# Time from one step of the filter to the next, s, and steps from one knot that is looked back at to the next.
+STEP, KNOT = 0.2, 5
 # A direction of less information than this share of its column's is none, in a likelihood.
 NO_INFORMATION = 1e-9
+# Standard deviation of the time of a bend, s, which is anywhere between two knots.
+BEND = KNOT * STEP / np.sqrt(12.0)
 
 
 @dataclass(frozen=True)
@@ -48,7 +52,8 @@ class Moving:
 
     std: of each rate's walk, per √s. Where the drift was learned it is a share of the accepted `rates`. decay: of the
     rates, 1/s, as of what approaches an end. level, fading: places of both in the choice. breaks: knots at which values
-    and rates begin anew, for they may have jumped. begun: when the drift did, s, as far as that is known.
+    and rates begin anew, for they may have jumped. bends: knots before which rates have changed by their own size.
+    begun: when the drift did, s, as far as that is known.
     """
 
     columns: tuple[int, ...]
@@ -59,6 +64,7 @@ class Moving:
     level: int = 0
     fading: int = 0
     breaks: tuple[int, ...] = ()
+    bends: tuple[int, ...] = ()
     begun: float = 0.0
 
     @property
@@ -77,6 +83,14 @@ class Moving:
         largest = np.maximum(np.abs(self.rates), np.abs(rates)) if self.learned else ()
         return replace(self, breaks=(*self.breaks, knot), rates=tuple(float(rate) for rate in largest))
 
+    def bent(self, knot: int) -> Moving:
+        """With rates that have changed by their own size before a knot."""
+        return replace(self, bends=(*self.bends, knot))
+
+    def unbent(self, knot: int) -> Moving:
+        """Without the bends behind a knot."""
+        return replace(self, bends=tuple(at for at in self.bends if at <= knot))
+
     def at(self, level: int, time: float, fading: int, decay_time: float) -> Moving:
         """With a rate that changes by its own size in `time` s, and decays in `decay_time` s."""
         return replace(self, level=level, std=1.0 / np.sqrt(time), fading=fading, decay=1.0 / decay_time)
@@ -84,21 +98,20 @@ class Moving:
 
 @dataclass(frozen=True)
 class DriftFilter:
-    """Information at a knot on π (n,) and on the rates of those that move, (size + 1, size + 1).
+    """Information at a step on π (n,) and on the rates of those that move, (size + 1, size + 1).
 
-    walks (n,): process noise of values, per √s. interval: s from knot to knot. knot: number, -1 before the first.
+    walks (n,): process noise of values, per √s. knot: number of the step, -1 before the first.
     """
 
     factor: Array
     moving: tuple[Moving, ...]
     walks: Array
-    interval: float
     knot: int = -1
 
     @staticmethod
-    def begin(known: Array, moving: Sequence[Moving], walks: Array, interval: float) -> DriftFilter:
+    def begin(known: Array, moving: Sequence[Moving], walks: Array) -> DriftFilter:
         """From a factor on π, nothing known of rates."""
-        return DriftFilter(known, (), walks, interval).with_moving(moving)
+        return DriftFilter(known, (), walks).with_moving(moving)
 
     @property
     def n(self) -> int:
@@ -123,7 +136,7 @@ class DriftFilter:
     def uneven(self) -> bool:
         """Whether rates change: by process noise, because they decay, or at a break that is yet to come."""
         walks = any(
-            each.decay > 0.0 or max(each.noise()) > 0.0 or max(each.breaks, default=-1) > self.knot
+            each.decay > 0.0 or max(each.noise()) > 0.0 or max((*each.breaks, *each.bends), default=-1) > self.knot
             for each in self.moving
         )
         return bool(self.walks.any() or walks)
@@ -155,37 +168,41 @@ class DriftFilter:
 
     def advanced(self, knot: int) -> DriftFilter:
         """At a later knot."""
-        time = (knot - self.knot) * self.interval
+        time = (knot - self.knot) * STEP
         R = self.factor.copy()
-        noisy: list[tuple[int, float]] = [(int(k), float(self.walks[k])) for k in np.flatnonzero(self.walks)]
-        stds = [std for each in self.moving for std in each.noise()]
+        noisy = {int(k): float(self.walks[k]) * np.sqrt(time) for k in np.flatnonzero(self.walks)}
         for column, place, decay in self.places():
             # In terms of the later knot: rate before = rate / left, value before = value - rate before · reach.
             R[:, place] = (R[:, place] - reach(decay, time) * R[:, column]) / np.exp(-decay * time)
-            if stds[place - self.n] > 0.0:
-                noisy.append((place, stds[place - self.n]))
-        noisy += [(place, np.inf) for place in self._broken(knot)]
+        noisy |= self._rate_noise(knot)
         if not noisy:
             return replace(self, factor=R if not list(self.places()) else triangular_factor(R), knot=knot)
         # States before = states after - noise; the noise's own information comes first, and is left behind.
         p = len(noisy)
         stacked = np.zeros((p + len(R), p + len(R)))
         stacked[p:, p:] = R
-        for k, (place, std) in enumerate(noisy):
-            stacked[k, k] = 1.0 / (std * np.sqrt(time))
+        for k, (place, std) in enumerate(noisy.items()):
+            stacked[k, k] = 1.0 / std
             stacked[p:, k] = -R[:, place]
         return replace(self, factor=triangular_factor(stacked)[p:, p:], knot=knot)
 
-    def _broken(self, knot: int) -> list[int]:
-        """Places among the states of values and rates that begin anew on the way to a knot."""
-        columns = {
-            column
-            for each in self.moving
-            if any(self.knot < at <= knot for at in each.breaks)
-            for column in each.columns
-        }
-        rates = [place for column, place, _ in self.places() if column in columns]
-        return [*columns, *rates]
+    def _rate_noise(self, knot: int) -> dict[int, float]:
+        """Standard deviations that rates gain on the way to a knot, and values at breaks and bends, by their places."""
+        time, out = (knot - self.knot) * STEP, dict[int, float]()
+        places = {column: place for column, place, _ in self.places()}
+        for each in self.moving:
+            broken, bent = (sum(self.knot < at <= knot for at in knots) for knots in (each.breaks, each.bends))
+            sizes = np.sqrt(bent) * np.abs(each.rates) if each.learned else np.zeros(len(each.columns))
+            for column, walk, size in zip(each.columns, each.noise(), sizes.tolist(), strict=True):
+                if column not in places:
+                    continue
+                if broken:
+                    out[column] = out[places[column]] = np.inf
+                elif walk > 0.0 or size > 0.0:
+                    out[places[column]] = float(np.hypot(walk * np.sqrt(time), size))
+                if size > 0.0 and not broken:
+                    out[column] = float(np.hypot(self.walks[column] * np.sqrt(time), size * BEND))
+        return out
 
 
 def innovation_loss(before: DriftFilter, after: DriftFilter) -> float:

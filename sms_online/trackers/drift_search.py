@@ -9,7 +9,7 @@ import numpy as np
 from scipy.special import chdtrc
 
 from sms_online.stream import Array
-from sms_online.trackers.drift_filter import Block, DriftFilter, decaying
+from sms_online.trackers.drift_filter import STEP, Block, DriftFilter, decaying
 from sms_online.trackers.factor import triangular_factor
 
 # Starts of a ramp that are tried, knots before now.
@@ -168,7 +168,7 @@ def _left(state: DriftFilter, blocks: Sequence[Block], n: int) -> tuple[Array, A
             stacked[begun:, place] = decaying(own[:, column], own[:, n + column], decay, span)
         stacked[begun:, size:] = own
         # Ramps begin where all begins.
-        stacked[begun:, size + n : -1] += (run[0].knot - since) * state.interval * own[:, :n]
+        stacked[begun:, size + n : -1] += (run[0].knot - since) * STEP * own[:, :n]
         squares += np.sum(stacked[begun:, size:-1] ** 2, axis=0)
         state = replace(state, factor=triangular_factor(stacked))
         if k + 1 < len(runs):
@@ -179,7 +179,7 @@ def _left(state: DriftFilter, blocks: Sequence[Block], n: int) -> tuple[Array, A
 def _relative(block: Block, knot: int, state: DriftFilter) -> Array:
     """A block's factor with times relative to a knot."""
     factor, n = block.factor.copy(), state.n
-    factor[:, n : 2 * n] += (block.knot - knot) * state.interval * factor[:, :n]
+    factor[:, n : 2 * n] += (block.knot - knot) * STEP * factor[:, :n]
     return factor
 
 

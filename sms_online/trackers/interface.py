@@ -152,9 +152,6 @@ class Tracker(Stage, ABC):
     What its rows have changed lies in a `State`, whose arrays are replaced, never written: with it a session is saved.
     """
 
-    enabled: bool
-    """While False, rows are ignored and the estimate stays as it is."""
-
     @abstractmethod
     def update(self, rows: Rows) -> None:
         """Take in rows; ValueError where their width is not n."""
@@ -162,10 +159,6 @@ class Tracker(Stage, ABC):
     @abstractmethod
     def estimate(self) -> Estimate:
         """The estimate from all rows taken in so far; leaves the state as it is."""
-
-    @abstractmethod
-    def reset(self) -> None:
-        """Forget all rows; priors stay."""
 
     @abstractmethod
     def begin(self, known: Information) -> None:

@@ -50,20 +50,14 @@ class KalmanTracker(Tracker):
             raise ValueError(f"process_std of shape {process_std.shape}; expected {n} finite numbers, none negative")
         if initial.std.size != n or not initial.known.all():
             raise ValueError(f"initial value and std of {np.count_nonzero(initial.known)} parameters; expected all {n}")
-        self.enabled = True
         self._n = n
         self._initial = initial
         self._walk = (process_std / initial.std) ** 2  # scaled variance per second
         self._filter = _scaled_filter(n)
-        self._start()
-
-    def _start(self) -> None:
-        self.state = KalmanState(np.zeros((self._n, 1)), np.eye(self._n))
+        self.begin(Information.none(n))
 
     def update(self, rows: Rows) -> None:
         """Take in rows; ValueError where their width is not n (filterpy itself would take any)."""
-        if not self.enabled:
-            return
         whitened = rows.whitened(self._n)
         b = whitened[:, self._n] - whitened[:, : self._n] @ self._initial.value
         Y = whitened[:, : self._n] * self._initial.std
@@ -109,10 +103,6 @@ class KalmanTracker(Tracker):
         factor[:-1, -1] = root @ (self._initial.value + self._initial.std * self.state.x[:, 0])
         factor[-1, -1] = np.sqrt(self.state.nis)
         return Information(factor, self.state.rows)
-
-    def reset(self) -> None:
-        """Forget all rows; start again from the initial value and std."""
-        self._start()
 
     def begin(self, known: Information) -> None:
         """Forget all rows; start from the initial value and std together with given information about π."""

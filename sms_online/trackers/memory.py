@@ -127,7 +127,8 @@ class WindowMemory(State):
 
     def begin(self, known: Information) -> None:
         """See Memory; it counts as one block, the first to leave."""
-        self._append(known.factor, known.rows)
+        if known.factor.any():
+            self._append(known.factor, known.rows)
 
     def _append(self, factor: Array, rows: int) -> None:
         self.blocks = [*self.blocks, factor][-self.most :]

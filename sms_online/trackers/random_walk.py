@@ -36,14 +36,12 @@ class RandomWalk(Tracker):
 
     def __init__(self, n: int, process_std: Array, prior: Prior) -> None:
         self._n, self._process_std, self._prior = n, process_std, prior
-        self.enabled = True
         self._filter: KalmanTracker | None = None
-        self.reset()
+        self.state = WalkState()
+        self.begin(Information.none(n))
 
     def update(self, rows: Rows) -> None:
         """Take in rows; ValueError where their width is not n."""
-        if not self.enabled:
-            return
         # One by one, for the start must not depend on how rows come.
         for k in range(len(rows.t)):
             row = Rows(rows.Y[k : k + 1], rows.b[k : k + 1], rows.std[k : k + 1], rows.t[k : k + 1])
@@ -86,13 +84,8 @@ class RandomWalk(Tracker):
         """What is known of π now."""
         return self._squares.information if self._filter is None else self._filter.information
 
-    def reset(self) -> None:
-        """Forget all rows; the prior stays."""
-        self._squares = RecursiveLeastSquares(self._n, prior=self._prior)
-        self._filter = None
-        self.state = WalkState()
-
     def begin(self, known: Information) -> None:
         """Forget all rows, and go on from given information about π; the prior stays."""
-        self.reset()
+        self._squares = RecursiveLeastSquares(self._n, prior=self._prior)
         self._squares.begin(known)
+        self._filter, self.state = None, WalkState()

@@ -41,18 +41,14 @@ class RecursiveLeastSquares(Tracker):
         prior: Prior | None = None,
         scaled_by_residual: bool = False,
     ) -> None:
-        self.enabled = True
         self._scaled = scaled_by_residual
         self._n = n
         self._forgetting = forgetting if forgetting is not None else NoForgetting()
         self._prior = prior_factor(prior, n)
-        self._pending = PendingRows(np.empty((0, n + 1)))
-        self._memory = memory_for(self._forgetting, n)
+        self.begin(Information.none(n))
 
     def update(self, rows: Rows) -> None:
         """Take in rows; ValueError where their width is not n."""
-        if not self.enabled:
-            return
         pending = np.concatenate((self._pending.rows, rows.whitened(self._n)))
         while len(pending) >= BLOCK_ROWS:
             self._memory.absorb(pending[:BLOCK_ROWS])
@@ -85,16 +81,11 @@ class RecursiveLeastSquares(Tracker):
         content = self._memory.with_pending(self._pending.rows)
         return Information(triangular_factor(self._prior, content.factor), int(content.rows))
 
-    def reset(self) -> None:
-        """Forget all rows; the prior stays."""
-        self._pending = PendingRows(np.empty((0, self._n + 1)))
-        self._memory = memory_for(self._forgetting, self._n)
-
     def begin(self, known: Information) -> None:
         """Forget all rows, and go on from given information about π, which counts as older rows; the prior stays."""
-        checked(known, self._n)
-        self.reset()
-        self._memory.begin(known)
+        self._pending = PendingRows(np.empty((0, self._n + 1)))
+        self._memory = memory_for(self._forgetting, self._n)
+        self._memory.begin(checked(known, self._n))
 
 
 def session_tracker(n: int, prior: Prior | None, nuisances: int = 0) -> RecursiveLeastSquares:
