@@ -84,8 +84,7 @@ class CandidateRows:
         self._scale = Scale(rows.b, expected, is_inertial, known)
         self.trials = len(self.candidates)
         # Covariance of what the laws of the chosen effects do not determine.
-        self._own = np.zeros_like(rows.std)
-        self._free = np.zeros((len(rows.b), HOPS, self._n_v))
+        self._own, self._free = np.zeros_like(rows.std), np.zeros((len(rows.b), HOPS, self._n_v))
         # Speeds whose rows have no such covariance, with these effects chosen.
         self._loud: tuple[frozenset[int], NDArray[np.bool_]] = frozenset(), np.zeros(self._n_v, dtype=np.bool_)
         # Mean square that everything together left of the rows, and with which deviations.
@@ -366,10 +365,9 @@ class CandidateRows:
         return bounded(columns, b, positive) if np.any(solution[positive] < 0.0) else solution
 
     def bounds(self, chosen: Sequence[int]) -> NDArray[np.bool_]:
-        """Which unknowns (n + c + m,) a fit keeps from being negative: masses, springs, dampings, coefficients.
+        """Which unknowns (n + c + m,) a fit keeps from being negative, where rows leave more than noise.
 
-        Where rows leave more than noise, that draws them below zero. Where they do not, a value below it within its
-        deviation is noise, and nothing is bounded.
+        That draws them below zero. In other rows a value below zero within its deviation is noise.
         """
         positive = np.concatenate((self._not_negative(chosen), np.zeros(self.calibrated.count, dtype=bool)))
         return positive & bool(self.floor.any())

@@ -85,7 +85,7 @@ class GravitySpring(Force):
     entry = Entry(
         "gravity_spring", "force", "weighed joint", {"amplitude": "N m", "phase": "rad"},
         "the same angles of the axis with the axes after it stretched and folded",
-        traits=Traits(signed=True, course="smooth"),
+        traits=Traits(signed=True),
     )  # fmt: skip
 
     def __init__(self, site: Site, given: Mapping[str, float]) -> None:
