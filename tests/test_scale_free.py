@@ -27,7 +27,7 @@ def rows(lack: float) -> tuple[Array, Array]:
 
 def solved(Y: Array, b: Array, start: Array) -> Array:
     free = ScaleFree(Y, [1], np.zeros(2, dtype=bool))
-    return free.solved(NOTHING, b, start, start, 1e-4)
+    return free.solved(NOTHING, b, start, start, 1e-4, np.zeros(2, dtype=bool))
 
 
 @pytest.mark.parametrize("scale", [0.2, 1.0, 5.0])

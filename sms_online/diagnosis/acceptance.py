@@ -82,7 +82,7 @@ class Acceptance(HeldOutRows):
 
     def _negative(self, chosen: Sequence[int]) -> bool:
         """Whether the model has a negative mass, spring or damping in more than a few blocks."""
-        n = self._positive.size
+        n = self.n_model
         value = self.solution(chosen)[:n]
         if not np.any(self._positive & (value < 0.0)):
             return False

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from sms_online.diagnosis.calibrated import Calibrated
 from sms_online.diagnosis.candidate import Candidate, Laws
-from sms_online.diagnosis.evidence import Gain, basis, free_of, gains, least_squares, together
+from sms_online.diagnosis.evidence import Gain, basis, bounded, free_of, gains, least_squares, together
 from sms_online.diagnosis.folds import Folds
 from sms_online.diagnosis.scale_free import Scale
 from sms_online.diagnosis.weak_rows import WeakRows
@@ -70,8 +70,9 @@ class CandidateRows:
         self._declared = frozenset(declared)
         self._types = [[speed] for speed in range(self._n_v)] if types is None else [list(each) for each in types]
         self._of_effects = [*(of_effects or [False] * self._n), *(True for each in fixed for _ in each.parameters)]
-        self._positive = np.array([False] * self._n if positive is None else positive, dtype=bool)
         self._model = np.concatenate([rows.Y, *(candidate.columns for candidate in fixed)], axis=2)
+        self._positive = np.zeros(self._model.shape[2], dtype=bool)
+        self._positive[: self._n] = False if positive is None else positive
         # Those beside whose estimate rows without a torque count by their size.
         self._beside: tuple[int, ...] = ()
         expected = np.zeros(self._model.shape[2])
@@ -83,8 +84,7 @@ class CandidateRows:
         self._scale = Scale(rows.b, expected, is_inertial, known)
         self.trials = len(self.candidates)
         # Covariance of what the laws of the chosen effects do not determine.
-        self._own = np.zeros_like(rows.std)
-        self._free = np.zeros((len(rows.b), HOPS, self._n_v))
+        self._own, self._free = np.zeros_like(rows.std), np.zeros((len(rows.b), HOPS, self._n_v))
         # Speeds whose rows have no such covariance, with these effects chosen.
         self._loud: tuple[frozenset[int], NDArray[np.bool_]] = frozenset(), np.zeros(self._n_v, dtype=np.bool_)
         # Mean square that everything together left of the rows, and with which deviations.
@@ -222,7 +222,7 @@ class CandidateRows:
     def _beside_fit(self, chosen: Sequence[int], std: Array) -> tuple[Array, Array, Array]:
         """What the criterion free of scale makes of rows of deviations (W, n_v) with those chosen, see `Scale.fit`."""
         beside = self.columns(chosen)[..., self.n_model :] / std[..., None]
-        return self._scale.fit(self._model / std[..., None], beside, self.rows.b / std)
+        return self._scale.fit(self._model / std[..., None], beside, self.rows.b / std, self._not_negative(chosen))
 
     def _surely_more(self) -> bool:
         """Whether rows clearly leave more than noise whatever is added: with these deviations what they left with those
@@ -278,7 +278,7 @@ class CandidateRows:
             while m:
                 known[:, -m - 1 : -1] = self.calibrated.information(held)
                 both = np.concatenate((others, known))
-                solution = least_squares(both[:, :-1], both[:, -1])
+                solution = self._fitted_to(chosen, both[:, :-1], both[:, -1])
                 beyond = self.calibrated.beyond(solution[-m:]) & ~held
                 if not beyond.any():
                     break
@@ -300,7 +300,8 @@ class CandidateRows:
         """Basis of the white columns of the model with those chosen, and what it leaves of b. Kept as solutions are."""
         key = tuple(chosen)
         if key not in self._bases:
-            Q = basis(self._columns(chosen))
+            # What a bound keeps at zero gives way to nothing.
+            Q = basis(self._columns(chosen)[:, ~(self.bounds(chosen) & (self.solution(chosen) == 0.0))])
             self._bases[key] = Q, free_of(Q, self._b[:, None])[:, 0]
         return self._bases[key]
 
@@ -355,8 +356,26 @@ class CandidateRows:
         """
         key = self._key(chosen, beside)
         if key not in self._solved:
-            self._solved[key] = least_squares(self._columns(chosen, beside), self._b)
+            self._solved[key] = self._fitted_to(chosen, self._columns(chosen, beside), self._b)
         return self._solved[key]
+
+    def _fitted_to(self, chosen: Sequence[int], columns: Array, b: Array) -> Array:
+        """Solution (n + c + m,) of columns and b, see `bounds`."""
+        solution, positive = least_squares(columns, b), self.bounds(chosen)
+        return bounded(columns, b, positive) if np.any(solution[positive] < 0.0) else solution
+
+    def bounds(self, chosen: Sequence[int]) -> NDArray[np.bool_]:
+        """Which unknowns (n + c + m,) a fit keeps from being negative, where rows leave more than noise.
+
+        That draws them below zero. In other rows a value below zero within its deviation is noise.
+        """
+        positive = np.concatenate((self._not_negative(chosen), np.zeros(self.calibrated.count, dtype=bool)))
+        return positive & bool(self.floor.any())
+
+    def _not_negative(self, chosen: Sequence[int]) -> NDArray[np.bool_]:
+        """Which unknowns (n + c,) are masses, springs, dampings or coefficients that cannot be negative."""
+        own = [not self.candidates[k].traits.signed for k in chosen for _ in self.candidates[k].parameters]
+        return np.array([*self._positive.tolist(), *own], dtype=bool)
 
     def _terms(self, chosen: Sequence[int], solution: Array) -> Array:
         """Sums of squares (n_v,) of the terms of each speed's rows, over their deviations."""

@@ -19,7 +19,7 @@ from sms_online.diagnosis.reversals import Reversals
 from sms_online.diagnosis.rows import SessionRows
 from sms_online.diagnosis.standstill import LEAVING, SessionStandstill
 from sms_online.diagnosis.weak_windows import Motion, WeakWindows
-from sms_online.effects.base import Ranges, position
+from sms_online.effects.base import Ranges, joints_of, position
 from sms_online.effects.build import build_model
 from sms_online.effects.catalogue import ENTRIES, LINEAR, candidates, curve_variables, periods, traits_of
 from sms_online.model.effect import Inputs
@@ -152,7 +152,7 @@ class CandidateColumns:
     def ranges(self, where: str) -> Ranges:
         """How far the session goes at a place."""
         layout = self.rows.model.layout
-        joints = [int(where.removeprefix("joint_")) - 1] if where.startswith("joint_") else range(len(layout.q))
+        joints = joints_of(where) or range(len(layout.q))
         offset = layout.n_base_positions - layout.n_base_speeds
         theta_m, q = np.array(layout.theta_m)[list(joints)], np.array(layout.q)[list(joints)]
         motions = [motion for motion, _ in self.rows.weak.motions()]
@@ -225,7 +225,7 @@ class CandidateColumns:
         model = self._model(effect)
         force = model.effects[-1]
         law = _law(effect)
-        if effect.where.startswith("joint_") and not force.reversing and not force.n_states:
+        if joints_of(effect.where) and not force.reversing and not force.n_states:
             spread = partial(self._spread, model)
             return Unmodelled(self._forms.at(("spread", *law), spread, coefficients), nothing)
         squares = self._forms.at(("draws", *law), self._drawn(candidate), coefficients)

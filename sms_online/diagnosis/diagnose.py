@@ -28,6 +28,7 @@ from sms_online.diagnosis.captures import begins, in_seconds, one_after_another,
 from sms_online.diagnosis.constants import possible
 from sms_online.diagnosis.drifts import explained_by_drifts, following, leaves_more, may_explain
 from sms_online.diagnosis.exact_links import with_exact_links
+from sms_online.diagnosis.folds import LEAST_RISE
 from sms_online.diagnosis.hypothesis import corrections, share_left, verdict
 from sms_online.diagnosis.late_sensors import LateSensor, find_late
 from sms_online.diagnosis.mistakes import Mistake, find_mistakes, wrong_clock
@@ -201,7 +202,7 @@ def diagnose(
         expected = "a part without it: -ss or -to"
         raise InputError(source, f"{event.time:.2f} s", f"an event ({event.kind}) within the capture", expected)
     late: list[LateSensor] = []
-    while _explains_little(before) and (found := find_late(attempt.rows)):
+    while (_explains_little(before) or attempt.tracing.freed) and (found := find_late(attempt.rows)):
         progress("taking off a sensor's lag", TRACED)
         late.append(found)
         lagging = attempt.system.model_copy(update={"effects": (*attempt.system.effects, found.effect)})
@@ -226,6 +227,7 @@ def diagnose(
             # Links that are exact because of what another effect did would keep that one from being found.
             if beside[0].excess(beside[1]) < attempt.excess(chosen):
                 attempt, chosen, constants = beside
+    chosen = _no_joint_worse(attempt, chosen, bare)
     after = attempt.state(chosen)
     while predicts_worse(bare.holdout.relative, after.holdout.relative) and earlier:
         attempt, chosen = earlier.pop()
@@ -272,6 +274,18 @@ def diagnose(
         estimator_after=estimator_after,
         unexplained=unexplained,
     )
+
+
+def _no_joint_worse(attempt: Attempt, chosen: list[int], bare: State) -> list[int]:
+    """Those chosen, or the last of the search's steps to them after which no joint's held-out torque is predicted worse
+    than by the description alone, whose state is `bare`: what serves one axis by way of the masses may harm another.
+    """
+    before = bare.holdout.relative
+    for step in (chosen, *(step for _, step in reversed(attempt.tracing.path) if step != chosen)):
+        after = attempt.state(step).holdout.relative
+        if all(after[row] <= (1.0 + LEAST_RISE) * before[row] for row in before.keys() & after.keys()):
+            return step
+    return []
 
 
 def predicts_worse(before: Mapping[str, float], after: Mapping[str, float]) -> bool:

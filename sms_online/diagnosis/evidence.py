@@ -14,6 +14,7 @@ from functools import cache
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import solve_triangular
+from scipy.optimize import nnls
 from scipy.stats import chi2
 
 from sms_online.stream import Array
@@ -56,6 +57,24 @@ def least_squares(columns: Array, b: Array) -> Array:
     if len(R) >= n and _well_conditioned(R[:n, :n]):
         return np.asarray(solve_triangular(R[:n, :n], R[:n, n]) / size)
     return np.asarray(np.linalg.lstsq(R[:, :-1], R[:, -1], rcond=RANK_TOLERANCE)[0] / size)
+
+
+def bounded(columns: Array, b: Array, positive: NDArray[np.bool_]) -> Array:
+    """Least squares (n,) for columns (M, n) and b (M,) of which those positive (n,) are not negative.
+
+    Source: Lawson and Hanson, Solving Least Squares Problems, 1974, chapter 23.
+    """
+    order = np.concatenate((np.flatnonzero(~positive), np.flatnonzero(positive)))
+    size = np.linalg.norm(columns, axis=0)[order]
+    size[size == 0.0] = 1.0
+    R = np.asarray(np.linalg.qr(np.column_stack((columns[:, order] / size, b)), mode="r"))
+    n, free = order.size, int(np.count_nonzero(~positive))
+    # What the columns without a bound leave is a problem of the others alone.
+    rest = free_of(basis(R[:, :free]), R[:, free:])
+    own = nnls(rest[:, :-1], rest[:, -1])[0]
+    out = np.empty(n)
+    out[order] = np.concatenate((least_squares(R[:, :free], R[:, n] - R[:, free:n] @ own), own)) / size
+    return out
 
 
 def _well_conditioned(R: Array) -> bool:

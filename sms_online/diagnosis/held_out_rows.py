@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from sms_online.diagnosis.candidate_rows import CandidateRows, Key
-from sms_online.diagnosis.evidence import least_squares_without
+from sms_online.diagnosis.evidence import bounded, least_squares_without
 from sms_online.stream import Array
 
 
@@ -20,7 +20,14 @@ class HeldOutRows(CandidateRows):
         left_out = [
             np.concatenate((np.repeat(~self.folds.fitted(k), self._n_v), known)) for k in range(self.folds.parts)
         ]
-        return least_squares_without(self._columns(chosen, beside), self._b, left_out)
+        columns, positive = self._columns(chosen, beside), self.bounds(chosen)
+        # What is zero for all windows together is so for those without a part.
+        free = ~(positive & (self.solution(chosen, beside) == 0.0))
+        out = np.zeros((len(left_out), free.size))
+        out[:, free] = least_squares_without(columns[:, free], self._b, left_out)
+        for k in np.flatnonzero(np.any(out[:, positive] < 0.0, axis=1)):
+            out[k] = bounded(columns[~left_out[k]], self._b[~left_out[k]], positive)
+        return out
 
     def predicted(
         self, chosen: Sequence[int], solutions: Array | None = None, beside: Sequence[int] | None = None

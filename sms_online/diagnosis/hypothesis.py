@@ -12,11 +12,11 @@ from sms_online.diagnosis.candidate import Candidate
 from sms_online.diagnosis.candidates import CandidateColumns
 from sms_online.diagnosis.constants import improved
 from sms_online.diagnosis.folds import Folds
+from sms_online.diagnosis.possible import not_negative
 from sms_online.diagnosis.residuals import RowResidual
 from sms_online.diagnosis.shape import refine
 from sms_online.diagnosis.trace import Tracing
 from sms_online.effects.traits import INEXACT
-from sms_online.evaluation import POSITIVE
 from sms_online.row_types import row_types
 from sms_online.stream import Array
 from sms_online.trackers.interface import Prior
@@ -68,7 +68,7 @@ class Hypothesis:
             declared=(f"{effect.name}@{effect.where}" for effect in model.system.effects),
             types=row_types(model.layout).values(),
             of_effects=["@" in p.name for p in self.rows.base.parameters],
-            positive=[p.name.endswith(POSITIVE) for p in self.rows.base.parameters],
+            positive=[not_negative(p.name) for p in self.rows.base.parameters],
             calibrated=self.rows.calibrated,
             inertial=np.isin(self.rows.base.independent, model.inertial).tolist(),
         )

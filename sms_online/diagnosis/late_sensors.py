@@ -22,25 +22,27 @@ from sms_online.diagnosis.rough_fit import HOPS as ROUGH_HOPS
 from sms_online.diagnosis.rough_fit import RoughRows
 from sms_online.diagnosis.rows import SessionRows
 from sms_online.effects.catalogue import lag_places
-from sms_online.effects.delay import LONGEST_FOUND, delay_of, lag, late_keys
+from sms_online.effects.delay import HELD, LONGEST_FOUND, SensorLag, delay_of, lag, late_keys
 from sms_online.stream import Array
 
-# Corners that are tried first, Hz, from that of the longest delay on; quicker lags are found to first order in their
-# delay, beside the forces.
-CORNERS = (delay_of(LONGEST_FOUND), 2.0, 3.5, 6.0)
+# Corners that are tried first, Hz, from that of the longest delay to that of 3 ms; rows of a stiff spring show no more
+# than that it is late by a factor of three.
+CORNERS = (delay_of(LONGEST_FOUND), 2.0, 3.5, 6.0, delay_of(0.01), delay_of(0.003))
 # A lag takes this share of what is left at least, as any effect.
 LEAST_IMPROVEMENT = 0.1
 # Probability that any sensor seems late by accident.
 FALSE_ALARM = 0.01
 # Lags whose gain differs by less than this share are not distinguished.
 SAME_SHARE = 0.03
+# One sensor of a group is late alone where that gains more than its whole group does by this factor.
+ALONE = 1.25
 # Accuracy of the logarithm of a corner, and evaluations at most.
-TOLERANCE, EVALUATIONS = 3e-3, 15
+TOLERANCE, EVALUATIONS = 1e-2, 10
 # Step of the logarithm of a corner that shows how sharp its optimum is.
 SHARPNESS_STEP = 0.05
 # Blocks of windows, and parts that these make up, each predicted from the others.
 BLOCKS, PARTS = 9, 3
-# Of rows that leave less than this share nothing is left.
+# Of rows that leave less than this share nothing is left. Of those that leave more than all nothing is explained.
 TINY = 1e-3
 
 
@@ -79,11 +81,21 @@ class Lags:
         self._rows = rows
         self._independent = 0
 
-    def places(self) -> list[str]:
-        """Groups of sensors that may be late together."""
+    def places(self) -> dict[str, list[str]]:
+        """Groups of sensors that may be late together, and sensors of no group; to each the parts of a group."""
         readings = [self._rows.sensing.channels[k] for k in self._rows.sensing.position_columns]
-        lags = lag_places(self._rows.model.system)
-        return [where for where in lags if any(fnmatchcase(name, where) for name in readings)]
+        matching = {
+            where: {name for name in readings if fnmatchcase(name, where)}
+            for where in lag_places(self._rows.model.system)
+        }
+        lags = [effect.where for effect in self._rows.model.system.effects if effect.name == SensorLag.entry.name]
+        late = {name for name in readings if any(fnmatchcase(name, where) for where in lags)}
+        own = {where: names for where, names in matching.items() if names and not names & late}
+        return {
+            where: [other for other, part in own.items() if part < names]
+            for where, names in own.items()
+            if len(names) > 1 or not any(names < others for others in own.values())
+        }
 
     def left(self, where: str | None = None, corner: float = np.inf) -> Array:
         """Logarithms (types,) of what is left of each type of rows, windows predicted from the others.
@@ -102,11 +114,11 @@ class Lags:
         part = np.arange(rough.count) * BLOCKS // rough.count % PARTS
         shares = [rough.shares(part != k) for k in range(PARTS)]
         self._independent = rough.count // ROUGH_HOPS
-        return np.asarray(np.log(np.maximum(np.sqrt(np.mean(np.square(shares), axis=0)), TINY)))
+        return np.asarray(np.log(np.clip(np.sqrt(np.mean(np.square(shares), axis=0)), TINY, 1.0)))
 
-    def gain(self, before: Array, after: Array) -> float:
-        """Twice the logarithm of the likelihood ratio of what is left, windows that do not overlap counted."""
-        return float(2.0 * self._independent * np.sum(before - after))
+    def gains(self, before: Array, after: Array) -> Array:
+        """Twice the logarithms (types,) of likelihood ratios of what is left, windows that do not overlap counted."""
+        return np.asarray(2.0 * self._independent * (before - after))
 
 
 def find_late(rows: SessionRows) -> LateSensor | None:
@@ -118,22 +130,31 @@ def find_late(rows: SessionRows) -> LateSensor | None:
     before = lags.left()
     if not np.all(np.isfinite(before)):
         return None
-    tried = [(lags.left(where, corner), where, corner) for where in places for corner in CORNERS]
-    best, where, corner = min(tried, key=lambda each: each[0].sum())
+    # A drive that holds its command over a sample acts half a sample late.
+    least = HELD / rows.model.system.sample_rate
+    corners = [corner for corner in CORNERS if delay_of(corner) > least]
+    tried = [(lags.left(where, corner), where, corner) for where in places for corner in corners]
     limit = threshold(FALSE_ALARM, len(tried), 1)
-    if lags.gain(before, best) <= limit:
+    # A lag that is none leaves some types of rows with less and others with more.
+    tried = [each for each in tried if lags.gains(before, each[0]).min() > -limit]
+    best, where, corner = min(tried, key=lambda each: each[0].sum(), default=(before, "", np.inf))
+    if lags.gains(before, best).sum() <= limit:
         return None
     corner = _refined(lags, where, corner)
     after = lags.left(where, corner)
-    if after.mean() > before.mean() + np.log(1.0 - LEAST_IMPROVEMENT):
+    if delay_of(corner) <= least or after.mean() > before.mean() + np.log(1.0 - LEAST_IMPROVEMENT):
         return None
-    gain = lags.gain(before, after)
-    alike = dict.fromkeys(
-        other for left, other, _ in tried if other != where and lags.gain(before, left) > (1.0 - SAME_SHARE) * gain
-    )
+    gain = lags.gains(before, after).sum()
+    parts = [(lags.left(part, corner), part) for part in places[where]]
+    if parts and lags.gains(before, (alone := min(parts, key=lambda each: each[0].sum()))[0]).sum() > ALONE * gain:
+        after, where = alone
+        gain = lags.gains(before, after).sum()
+    others = [(left, other) for left, other, _ in tried] + parts
+    near = (1.0 - SAME_SHARE) * gain
+    alike = dict.fromkeys(o for left, o in others if o != where and lags.gains(before, left).sum() > near)
     std = _std(lags, where, corner, after)
     shares = float(np.exp(before.mean())), float(np.exp(after.mean()))
-    return LateSensor(lag(where, corner), std, gain, limit, *shares, tuple(late_keys((), alike)))
+    return LateSensor(lag(where, corner), std, float(gain), limit, *shares, tuple(late_keys((), alike)))
 
 
 def _refined(lags: Lags, where: str, corner: float) -> float:
@@ -153,7 +174,8 @@ def _refined(lags: Lags, where: str, corner: float) -> float:
 def _std(lags: Lags, where: str, corner: float, best: Array) -> float:
     """1σ of the corner, Hz, from the curvature of twice the log likelihood over the logarithm of the corner."""
     sides = [
-        lags.gain(lags.left(where, corner * float(np.exp(step))), best) for step in (SHARPNESS_STEP, -SHARPNESS_STEP)
+        lags.gains(lags.left(where, corner * float(np.exp(step))), best).sum()
+        for step in (SHARPNESS_STEP, -SHARPNESS_STEP)
     ]
     curvature = sum(sides) / SHARPNESS_STEP**2
     return corner * float(np.sqrt(2.0 / curvature)) if curvature > 0.0 else np.inf

@@ -126,6 +126,8 @@ class _Search:
             rows = RoughRows(self.session, self._segments)
         except np.linalg.LinAlgError:
             return False
+        if rows.count <= self.session.base.n:
+            return False  # as many parameters as windows explain any coordinate's rows
         given = rows.fit()
         found = [
             each

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sms_online.diagnosis.evidence import least_squares
+from sms_online.diagnosis.possible import not_negative
 from sms_online.diagnosis.record import Segment
 from sms_online.diagnosis.rows import SessionRows
 from sms_online.diagnosis.scale_free import ScaleFree
@@ -59,7 +60,7 @@ class RoughRows:
             np.arange(M, each.index.size - M - width - 1, max(1, width // HOPS), dtype=np.int64) for each in segments
         ]
         self.count = count = sum(each.size for each in starts)
-        if count <= base.n:
+        if 2 * base.n > count * layout.n_v:
             raise np.linalg.LinAlgError("too few windows without a gap")
         where = Windows(
             segment=np.repeat(np.arange(len(starts)), [each.size for each in starts]),
@@ -82,7 +83,7 @@ class RoughRows:
                 speed = motion.v[:, motor]
                 G[:, motor, 0] = -motion.torque[:, i]
                 own = slice(1 + LAWS * i, 1 + LAWS * (i + 1))
-                G[:, motor, own] = np.stack((sign(speed), speed, np.ones_like(speed)), axis=1)
+                G[:, motor, own] = np.stack((-sign(speed), -speed, np.ones_like(speed)), axis=1)
             return None, G
 
         physical, driven = weak.columns(inertia), weak.columns(drives)
@@ -92,6 +93,8 @@ class RoughRows:
         self._Y, self._known = base.columns(physical), base.known_part(physical)
         self._nominal = base.values(model.nominal)
         self._inertial = np.isin(base.independent, model.inertial)
+        laws = np.tile([True, True, False], len(self._motors))  # an offset has either sign
+        self._positive = np.concatenate(([not_negative(p.name) for p in base.parameters], laws))
         terms = np.sqrt(np.mean(np.sum((self._Y * self._nominal) ** 2, axis=2), axis=0))
         torque = np.sqrt(np.mean(self._torque**2, axis=0))
         self._homogeneous = torque == 0.0
@@ -134,7 +137,7 @@ class RoughRows:
         b = (self._torque - self._known) / self._size
         speeds, n = np.flatnonzero(self._homogeneous).tolist(), Y.shape[2]
         free = ScaleFree(Y[fitted], speeds, self._inertial)
-        solution = free.solved(friction[fitted], b[fitted], self._nominal, self._nominal, SMALLEST)
+        solution = free.solved(friction[fitted], b[fitted], self._nominal, self._nominal, SMALLEST, self._positive)
         left = b - np.concatenate((Y, friction), axis=2) @ solution
         squares = free.squares(solution[:n], left[~fitted], self._nominal)
         return np.asarray(np.sqrt(squares[self._used]))

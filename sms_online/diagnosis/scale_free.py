@@ -18,7 +18,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from sms_online.diagnosis.evidence import least_squares
+from sms_online.diagnosis.evidence import bounded, least_squares
 from sms_online.stream import Array
 
 # Fits about the solution before, at most, and halvings of a step that does not lower what is asked for.
@@ -55,11 +55,13 @@ class ScaleFree:
                 added[:, speed] = left[:, speed]
         return columns, added
 
-    def solved(self, beside: Array, b: Array, start: Array, near: Array, least: float) -> Array:
+    def solved(
+        self, beside: Array, b: Array, start: Array, near: Array, least: float, positive: NDArray[np.bool_]
+    ) -> Array:
         """Solution (n + c,) of rows b (W, n_v) with columns beside (W, n_v, c), weighted by what each speed leaves.
 
         start, near (n,): parameters to begin with, and those that rows which determine nothing else stay near. least:
-        mean square of what noise alone leaves.
+        mean square of what noise alone leaves. positive (n + c,): which unknowns are not negative.
         """
         columns, n = np.concatenate((self._Y, beside), axis=2), self._Y.shape[2]
         first, anchor = np.zeros((2, columns.shape[2]))
@@ -77,7 +79,9 @@ class ScaleFree:
             Y, added = self.about(solution[:n], left)
             weighted = (np.concatenate((Y, beside), axis=2) / std[:, None]).reshape(b.size, -1)
             rows = np.concatenate((weighted, np.diag(lengths)))
-            return least_squares(rows, np.concatenate((((b + added) / std).ravel(), lengths * anchor)))
+            aim = np.concatenate((((b + added) / std).ravel(), lengths * anchor))
+            found = least_squares(rows, aim)
+            return bounded(rows, aim, positive) if np.any(found[positive] < 0.0) else found
 
         return converged(fit, first, cost)
 
@@ -100,14 +104,14 @@ class Scale:
         """Free rows without a torque of speeds (n_v,) that leave more than noise."""
         self.freed = np.flatnonzero(beyond & self.homogeneous).tolist() if self.unknown else []
 
-    def fit(self, Y: Array, beside: Array, b: Array) -> tuple[Array, Array, Array]:
+    def fit(self, Y: Array, beside: Array, b: Array, positive: NDArray[np.bool_]) -> tuple[Array, Array, Array]:
         """Solution (n + c,) of rows b (W, n_v) with columns (W, n_v, n) and beside (W, n_v, c), and what it leaves.
 
         Each type of rows counts by what it leaves, those without a torque by their size. Mean squares (n_v,), then the
         same with these as large as the parameters behind the weights make them.
         """
         free, n = ScaleFree(Y, np.flatnonzero(self.homogeneous).tolist(), self._inertial), Y.shape[2]
-        solution = free.solved(beside, b, self.at, self._expected, 1.0)
+        solution = free.solved(beside, b, self.at, self._expected, 1.0, positive)
         left = b - np.concatenate((Y, beside), axis=2) @ solution
         return solution, np.mean(left**2, axis=0), free.squares(solution[:n], left, self._expected)
 

@@ -22,7 +22,8 @@ from sms_online.stream import Array
 
 Kind = Literal["force", "inertia", "channel", "kinematics"]
 Place = Literal[
-    "joint", "driven joint", "flexible joint", "later joint", "link", "linear link", "base", "tip", "angle", "position",
+    "joint", "driven joint", "flexible joint", "later joint", "joint pair", "weighed joint", "link", "linear link",
+    "base", "tip", "angle", "position",
 ]  # fmt: skip
 # Speed below which an axis is at rest, rad/s (m/s): an integrator cannot follow a jump, and encoders resolve no less.
 STANDSTILL = 1e-4
@@ -30,6 +31,11 @@ STANDSTILL = 1e-4
 CHANGES = ("stiffness", "friction", "offset", "damping")
 # Relative step of the differences that carry standard deviations over to reported coefficients.
 DIFFERENCE = 1e-6
+
+
+def joints_of(where: str) -> tuple[int, ...]:
+    """Indices, from 0, of the joint or the two joints of a place, `joint_i` or `joint_i+joint_j`; none of another."""
+    return tuple(int(each.removeprefix("joint_")) - 1 for each in where.split("+") if each.startswith("joint_"))
 
 
 @dataclass(frozen=True)

@@ -16,7 +16,8 @@ from sms_online.model.effect import ForceEffect, InertiaEffect
 from sms_online.model.model import Model
 from sms_online.stream import Array
 
-NUMBERED = re.compile(r"(?:joint|link)_(\d+)")
+# The last joint of a pair.
+NUMBERED = re.compile(r"(?:joint_\d+\+)?(?:joint|link)_(\d+)")
 
 
 def build_model(system: System, reference: Array | None = None) -> Model:

@@ -16,6 +16,7 @@ from sms_online.description.explain import hint, nearest
 from sms_online.description.schema import Effect, System
 from sms_online.effects.base import Constant, Entry, Place, Site
 from sms_online.effects.channel import ChannelEffect, EncoderEccentricity, EncoderOffset, Linear
+from sms_online.effects.coupled import CoupledFriction, CoupledInertia, GravitySpring
 from sms_online.effects.delay import LONGEST_DELAY, SensorLag, SensorLatency, TorqueDelay
 from sms_online.effects.drive import Cogging, TorqueGain, TorqueOffset, TorqueRipple
 from sms_online.effects.friction import (
@@ -39,10 +40,10 @@ FORCES = (
     CoulombFriction, ViscousFriction, StribeckFriction, PreslidingFriction, LoadFriction, DirectionFriction,
     TorsionalHysteresis, CubicStiffness, Backlash, KinematicError, Cogging, TorqueRipple, LinkDamping, LinkMassDamping,
     ReactionWheel, ThrusterLeak, TableTilt, AirDrag, CableSpring, Slosh, TorqueGain, TorqueOffset,
-    LearnedForce,
+    CoupledFriction, GravitySpring, LearnedForce,
 )  # fmt: skip
 CHANNELS = (EncoderOffset, EncoderEccentricity, SensorLag, TorqueDelay)
-INERTIAS = (TipPayload,)
+INERTIAS = (TipPayload, CoupledInertia)
 CLASSES = (*FORCES, *INERTIAS, *CHANNELS)
 _CLASSES: tuple[type[object], ...] = CLASSES  # of one type, of which some are constants
 # The step from `linear` to `exact` kinematics of a link; it has no coefficients and no class.
@@ -82,6 +83,13 @@ def places(system: System, at: Place) -> tuple[str, ...]:
             return driven
         case "later joint":
             return tuple(name for name in driven if name != joints[0])
+        case "joint pair":
+            # In a plane the sum of two rates is a link's own. No shaft runs through a link that bends.
+            stiff = [k for k, link in enumerate(system.links, start=1) if not isinstance(link, FlexibleLink)]
+            pairs = [(f"joint_{i}", f"joint_{i + 1}") for i in stiff] if system.motion == "spatial" else []
+            return tuple("+".join(pair) for pair in pairs if set(pair) <= set(driven))
+        case "weighed joint":
+            return tuple(joints) if any(system.gravity) else ()
         case "flexible joint":
             return tuple(n for n, j in zip(joints, system.joints, strict=True) if has_motor_side(j))
         case "link":

@@ -25,7 +25,7 @@ class TipPayload:
 
     def __init__(self, site: Site, given: Mapping[str, float]) -> None:
         self.name, self.where = self.entry.name, site.where
-        self.frame = site.chain.tip_frame
+        self.frame, self.speeds = site.chain.tip_frame, slice(0, 0)
         owner = f"{self.name}@{self.where}"
         self.parameters: tuple[Parameter, ...] = (Parameter(f"{owner}.mass", "m_p", "kg", given.get("mass", 0.0)),)
         self.matrices: Array = np.diag([1.0, 1.0, 1.0, 0.0, 0.0, 0.0])[None]

@@ -73,13 +73,14 @@ class ForceEffect(Protocol):
 
 
 class InertiaEffect(Protocol):
-    """An effect of kind `inertia`: a body in a frame of the chain.
+    """An effect of kind `inertia`: a body in a frame of the chain, or one that turns with d speeds of its own.
 
-    frame: number of the frame. parameters: its coefficients as they enter π. matrices (c, 6, 6): inertia of one unit of
-    each in the frame's axes, linear over angular.
+    frame: number of the frame. speeds: those of its own. parameters: its coefficients as they enter π. matrices
+    (c, 6 + d, 6 + d): inertia of one unit of each in the frame's axes, linear over angular, then by its own speeds.
     """
 
     frame: int
+    speeds: slice
     parameters: tuple[Parameter, ...]
     matrices: Array
 

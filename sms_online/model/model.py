@@ -121,11 +121,11 @@ class Model:
         indices = tuple(range(len(parameters), len(parameters) + len(effect.parameters)))
         parameters += effect.parameters
         for k, body in enumerate(self.bodies):
-            if body.frame == effect.frame:
+            if (body.frame, body.speeds) == (effect.frame, effect.speeds):
                 joined = np.concatenate((body.matrices, effect.matrices))
                 self.bodies[k] = BodyTerm(body.frame, body.speeds, body.parameters + indices, joined)
                 return
-        self.bodies.append(BodyTerm(effect.frame, slice(0, 0), indices, effect.matrices))
+        self.bodies.append(BodyTerm(effect.frame, effect.speeds, indices, effect.matrices))
 
     def _add_links(self, parameters: list[Parameter]) -> None:
         flexible = [(i, link) for i, link in enumerate(self.system.links, start=1) if isinstance(link, FlexibleLink)]
@@ -334,7 +334,7 @@ class Model:
 
     def _fall(self, configuration: Configuration, term: Term, g: Array) -> Array:
         """Local speeds (B, d) of free fall: gravity g (3,) or (B, 3), in inertial axes, in the frame's."""
-        fall = np.zeros((configuration.size, 6 + term.speeds.stop - term.speeds.start))
+        fall = np.zeros((configuration.size, 6 + len(range(self.layout.n_v)[term.speeds])))
         fall[:, :3] = (np.atleast_2d(g)[:, None] @ configuration.frames[term.frame].rotation)[:, 0]
         return fall
 

@@ -14,7 +14,7 @@ from itertools import product
 import numpy as np
 from numpy.typing import NDArray
 
-from sms_online.effects.base import STANDSTILL
+from sms_online.effects.base import STANDSTILL, joints_of
 from sms_online.model.model import Model
 from sms_online.pipeline.momentum_windows import INSTANTS
 from sms_online.pipeline.smoothing import kernel
@@ -45,10 +45,9 @@ class RoughForces:
         rough = [k for k, effect in enumerate(model.effects) if not effect.smooth]
         self.columns = np.concatenate([np.empty(0, dtype=np.int64), *(self._places(k) for k in rough)])
         self._joints = {
-            k: sorted({layout.theta_m[i], layout.q[i]})
+            k: sorted({speed for i in joints for speed in (layout.theta_m[i], layout.q[i])})
             for k in rough
-            if model.effects[k].where.startswith("joint_")
-            for i in [self._joint(k)]
+            if (joints := joints_of(model.effects[k].where))
         }
         entries = [
             entry for k, speeds in self._joints.items() for entry in product(speeds, speeds, self._places(k).tolist())
@@ -58,11 +57,9 @@ class RoughForces:
         dry = [(motor, place) for k, motor in self._dry for place in self._places(k).tolist()]
         self.motors, self.dry = np.array(dry, dtype=np.int64).reshape(-1, 2).T
 
-    def _joint(self, k: int) -> int:
-        return int(self._model.effects[k].where.removeprefix("joint_")) - 1
-
     def _motor(self, k: int) -> int:
-        return self._model.layout.theta_m[self._joint(k)]
+        (joint,) = joints_of(self._model.effects[k].where)
+        return self._model.layout.theta_m[joint]
 
     def _places(self, k: int) -> NDArray[np.int64]:
         columns = self._model.effect_slices[k]

@@ -1,0 +1,12 @@
+"""What can be: parameters and coefficients that no real body, spring or friction has negative."""
+
+from __future__ import annotations
+
+from sms_online.effects.catalogue import ENTRIES
+from sms_online.evaluation import POSITIVE
+
+
+def not_negative(name: str) -> bool:
+    """Whether a parameter cannot be negative: a mass, a spring, or a coefficient of an effect that is not signed."""
+    effect, at, _ = name.partition("@")
+    return not ENTRIES[effect].traits.signed if at else name.endswith(POSITIVE)
