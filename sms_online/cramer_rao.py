@@ -1,6 +1,6 @@
 """Cramér–Rao bound of π: the least standard deviation that an unbiased estimator can reach with given sensors.
 
-Sensors have white noise. The measured torque is the input of the equations of motion, so its noise drives the state;
+Sensors have white noise. Measured torques and wrenches are inputs of the equations of motion: their noise drives it;
 controller and initial state are unknown. Linearised about the true motion (`linearised`) the system is, in discrete
 time,
 
@@ -65,17 +65,17 @@ class MotionRecord(Observer):
         self._every = max(1, round(STEP * sample_rate))
         self._segments: dict[int, list[Motion]] = {}
 
-    def motion(self, index: NDArray[np.int64], segment: int, x: Array, v: Array) -> None:
+    def motion(self, index: NDArray[np.int64], segment: int, x: Array, v: Array, inputs: Array) -> None:
         """See `Observer`."""
         kept = index % self._every == 0
-        piece = Motion(index[kept] / self._sample_rate, x[kept], v[kept])
+        piece = Motion(index[kept] / self._sample_rate, x[kept], v[kept], inputs[kept])
         self._segments.setdefault(segment, []).append(piece)
 
     @property
     def motions(self) -> list[Motion]:
         """One motion a segment; those too short to hold a step are left out."""
         joined = [
-            Motion(*(np.concatenate([getattr(piece, name) for piece in pieces]) for name in ("t", "x", "v")))
+            Motion(*(np.concatenate([getattr(piece, name) for piece in pieces]) for name in ("t", "x", "v", "inputs")))
             for pieces in self._segments.values()
         ]
         return [motion for motion in joined if motion.t.size > 1]
@@ -120,7 +120,7 @@ def cramer_rao_bound(dynamics: Dynamics, base: BaseParameters, motions: Sequence
     if followed := _followed(dynamics.model):
         raise InputError(dynamics.model.system.name, "effect", followed[0], "effects of positions and speeds alone")
     readings = Readings(dynamics.model, sensors.channels)
-    n_v, joints = dynamics.model.layout.n_v, len(dynamics.model.layout.q)
+    n_v, inputs = dynamics.model.layout.n_v, dynamics.model.n_inputs
     information = Information(n_v, base.n)
     for motion in motions:
         step = motion.step
@@ -131,18 +131,20 @@ def cramer_rao_bound(dynamics: Dynamics, base: BaseParameters, motions: Sequence
         noise, drive = np.sqrt(sensors.density / step)[:, None], np.sqrt(sensors.torque / step)
         for start in range(0, motion.t.size - 1, instants):
             rows = slice(start, start + instants + 1)
-            linear = linearise(dynamics, base, readings, motion.x[rows], motion.v[rows], every)
+            measured = None if motion.inputs is None else motion.inputs[rows]
+            linear = linearise(dynamics, base, readings, motion.x[rows], motion.v[rows], every, measured)
             if start == 0:
                 information.begin(linear.H[0])
             Phi, driven = discretise(_middle(linear.A), _middle(linear.E), step)
-            Gamma, B = driven[..., :joints] * drive, driven[..., joints:]
+            Gamma, B = driven[..., :inputs] * drive, driven[..., inputs:]
             information.add(linear.C[:-1] / noise, linear.D[:-1] / noise, Phi, Gamma, B)
     return information.standard_deviations()
 
 
 def _followed(model: Model) -> list[str]:
-    """Effects that need torques or internal states."""
-    return [f"{effect.name}@{effect.where}" for effect in model.effects if effect.needs_torque or effect.n_states]
+    """Effects that need torques or internal states, but for measured wrenches, whose noise is an input's."""
+    declared = model.effects if model.wrenches is None else model.effects[1:]
+    return [f"{effect.name}@{effect.where}" for effect in declared if effect.needs_torque or effect.n_states]
 
 
 def _middle(samples: Array) -> Array:

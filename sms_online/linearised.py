@@ -24,11 +24,15 @@ from sms_online.stream import Array
 
 @dataclass(frozen=True)
 class Motion:
-    """A motion at a uniform step: t (B,) s, x (B, n_x), v (B, n_v) in the order of the model's layout."""
+    """A motion at a uniform step: t (B,) s, x (B, n_x), v (B, n_v) in the order of the model's layout.
+
+    inputs (B, inputs): what is measured beside, see `Inputs.torque`; a motion under wrenches needs it.
+    """
 
     t: Array
     x: Array
     v: Array
+    inputs: Array | None = None
 
     @property
     def step(self) -> float:
@@ -40,7 +44,7 @@ class Motion:
 class LinearSystem:
     """The linearised system at B instants, m = 2 n_v states.
 
-    A (B, m, m): of ṡ = A s. E (B, m, joints + n): columns by which joint torques n τ and parameters β drive ṡ.
+    A (B, m, m): of ṡ = A s. E (B, m, inputs + n): columns by which torques n τ, wrenches and parameters β drive ṡ.
     C (B, channels, m), D (B, channels, n): readings by s and by β. V (B, n_v, m): speeds by s; by β they are the first
     rows of E. H (B, n_v, n_v): mass matrix.
     """
@@ -54,14 +58,16 @@ class LinearSystem:
 
 
 def linearise(
-    dynamics: Dynamics, base: BaseParameters, readings: Readings, x: Array, v: Array, every: int = 1
-) -> LinearSystem:
+    dynamics: Dynamics, base: BaseParameters, readings: Readings, x: Array, v: Array, every: int = 1,
+    inputs: Array | None = None,
+) -> LinearSystem:  # fmt: skip
     """The balance and the readings, linearised at x (B, n_x), v (B, n_v).
 
     every: derivatives by displacements and of readings are evaluated at one instant in so many, and interpolated.
+    inputs (B, inputs): see `Motion`.
     """
     model, layout = dynamics.model, dynamics.model.layout
-    (B, n_v), joints = v.shape, len(layout.q)
+    (B, n_v), count = v.shape, model.n_inputs
     nodes = np.unique(np.append(np.arange(0, B, every), B - 1))
     weights = np.stack([np.interp(np.arange(B), nodes, unit) for unit in np.eye(nodes.size)], axis=1)
 
@@ -70,11 +76,19 @@ def linearise(
 
     H = dynamics.mass_matrix(x)
     derivatives, _ = Derivatives(model).at(
-        dynamics.pi, x[nodes], v[nodes], None, H[nodes], np.ones(nodes.size, dtype=np.bool_)
+        dynamics.pi,
+        x[nodes],
+        v[nodes],
+        None if inputs is None else inputs[nodes],
+        H[nodes],
+        np.ones(nodes.size, dtype=np.bool_),
     )
     P_x, G_v, G_x = np.split(interpolated(derivatives), 3, axis=2)
     C_x, C_v = (interpolated(part) for part in readings.derivatives(x[nodes], v[nodes]))
-    P, G = (base.columns(part) for part in model.momentum_columns(x, v))
+    P, G = (
+        base.columns(part)
+        for part in model.momentum_columns(x, v, inputs=None if inputs is None else model.inputs(inputs))
+    )
     # δv by δx, δp and δβ.
     v_p = np.linalg.inv(H)
     v_x, v_beta = -v_p @ P_x, -v_p @ P
@@ -83,7 +97,7 @@ def linearise(
     if layout.free and not layout.planar:
         # A small inertial rotation φ of the attitude obeys φ̇ = δω + ω × φ.
         A[:, 3:6, 3:6] += skew(v[:, 3:6])
-    E = np.zeros((B, 2 * n_v, joints + base.n))
-    E[:, n_v:, :joints] = model.generalized_force(np.eye(joints)).T
-    E[:, :n_v, joints:], E[:, n_v:, joints:] = v_beta, G + G_v @ v_beta
+    E = np.zeros((B, 2 * n_v, count + base.n))
+    E[:, n_v:, :count] = model.input_columns(x)
+    E[:, :n_v, count:], E[:, n_v:, count:] = v_beta, G + G_v @ v_beta
     return LinearSystem(A, E, np.concatenate((C_x + C_v @ v_x, C_v @ v_p), axis=2), C_v @ v_beta, V, H)

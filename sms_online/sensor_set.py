@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sms_online.description.channels import drive_channels
+from sms_online.description.channels import drive_channels, wrench_channels
 from sms_online.errors import InputError
 from sms_online.model.model import Model
 from sms_online.pipeline.sensing import Sensing
@@ -20,7 +20,7 @@ class SensorSet:
     """Sensors with white noise.
 
     channels: what is read, see `Readings`. density (channels,): σ² T_s of each, its unit squared times s. torque
-    (joints,): the same of n τ, (N m)² s ((N)² s).
+    (inputs,): the same of n τ and of measured wrenches, (N m)² s ((N)² s).
     """
 
     channels: tuple[str, ...]
@@ -39,7 +39,7 @@ def sensor_set(model: Model, channels: Sequence[str], sigma: Array, rate: Array)
         if not each > 0.0:
             place, expected = f"sensor of {name!r}", "noise or resolution above 0, or a grade"
             raise InputError(system.name, place, "no noise is stated", expected)
-    torque = np.zeros(len(system.joints))
+    torque = np.zeros(model.n_inputs)
     drives = []
     for drive, i in drive_channels(system).items():
         if drive not in channels:
@@ -48,6 +48,11 @@ def sensor_set(model: Model, channels: Sequence[str], sigma: Array, rate: Array)
         # tau_i is measured before the gear.
         ratio = system.joints[i - 1].gear_ratio if drive.startswith("tau_") else 1.0
         torque[i - 1] = density[drives[-1]] * ratio**2
+    for i, wrench in enumerate(wrench_channels(system), start=len(system.joints)):
+        if wrench not in channels:
+            raise InputError(system.name, "sensors", f"none of {wrench!r}", "every wrench measured")
+        drives.append(channels.index(wrench))
+        torque[i] = density[drives[-1]]
     others = [k for k in range(len(channels)) if k not in drives]
     return SensorSet(tuple(channels[k] for k in others), density[others], torque)
 

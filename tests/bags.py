@@ -29,6 +29,9 @@ PATHS = {
     "r_S_x": "/base.pose.position.x",
     "r_S_y": "/base.pose.position.y",
     "theta_0": "/markers.attitude",
+    "wrench_1.f_x": "/contact.wrench.force.x",
+    "wrench_1.f_y": "/contact.wrench.force.y",
+    "wrench_1.m_z": "/contact.wrench.torque.z",
 }
 
 
@@ -76,6 +79,12 @@ def messages(capture: sms.Capture, ros: int) -> Iterator[tuple[str, str, int, An
             torque = wrench(vector(0.0, 0.0, 0.0), vector(0.0, 0.0, value(f"tau_{k}")))
             stamped = types["geometry_msgs/msg/WrenchStamped"](header, torque)
             yield f"/torque_{k}", "geometry_msgs/msg/WrenchStamped", EPOCH + at, stamped
+        if "wrench_1.f_x" in column:
+            push = vector(value("wrench_1.f_x"), value("wrench_1.f_y"), 0.0)
+            pushed = types["geometry_msgs/msg/WrenchStamped"](
+                header, wrench(push, vector(0.0, 0.0, value("wrench_1.m_z")))
+            )
+            yield "/contact", "geometry_msgs/msg/WrenchStamped", EPOCH + at, pushed
         place = point(value("r_S_x"), value("r_S_y"), 0.0)
         base = pose(place, quaternion(0.0, 0.0, 0.0, 1.0))
         yield "/base", "geometry_msgs/msg/PoseStamped", EPOCH + at, types["geometry_msgs/msg/PoseStamped"](header, base)

@@ -50,7 +50,8 @@ def record_of(exact: ExactStates, segments: Array) -> MotionRecord:
     index = np.arange(exact.t.size)
     cuts = np.unique(np.concatenate((segments, [7, 260, 1111]))).astype(int)
     for piece in np.split(index, cuts):
-        record.motion(piece, int(np.searchsorted(segments, piece[0], side="right")), exact.x[piece], exact.v[piece])
+        segment = int(np.searchsorted(segments, piece[0], side="right"))
+        record.motion(piece, segment, exact.x[piece], exact.v[piece], exact.torque[piece])
     return record
 
 

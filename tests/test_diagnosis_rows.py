@@ -243,7 +243,7 @@ def test_rows_share_a_force_that_is_off_at_every_sample(half_hop: int) -> None:
     start = np.concatenate([np.arange(count) * 2 * half_hop + 10 for count in (14, 5)])
     half_width = np.array([4, 4, 7, 7, 7, 4, 4, 4, 7, 7, 4, 4, 4, 4, 4, 4, 7, 7, 4])
     windows = Windows(segment, start, half_width, width, EXPONENT, lambda M: 1)
-    sensing: Any = SimpleNamespace(coordinates=lambda values: values[:, :2], joint_torque=lambda values: values[:, 2:])
+    sensing: Any = SimpleNamespace(coordinates=lambda values: values[:, :2], inputs=lambda values: values[:, 2:])
     layout: Any = SimpleNamespace(n_v=2, n_x=2, speeds=lambda x, x_dot: x_dot)
     samples = [Segment(np.arange(200), np.zeros((200, 3))) for _ in range(2)]
     squares = np.random.default_rng(1).random((2, 200, 2))

@@ -29,8 +29,10 @@ def keys_of_page(page: str) -> set[str]:
 
 def test_channels_and_meanings_match_one_to_one() -> None:
     written = keys_of_page("channels.md") - {"t"} - set(shipped_systems())
-    patterns = {key: re.sub(r"_(i|j)(?=\\\.|$)", r"_\\d+", re.escape(key)) for key in written}
-    existing = {name for each in shipped_systems() for name in channels(parse_system(shipped_text(each), each))}
+    patterns = {key: re.sub(r"_(i|j|k)(?=\\\.|$)", r"_\\d+", re.escape(key)) for key in written}
+    wrench = '\n[[wrench]]\nwhere = "link_1"\n'
+    described = [parse_system(shipped_text(each) + wrench, each) for each in shipped_systems()]
+    existing = {name for system in described for name in channels(system)}
     unused = {key for key, pattern in patterns.items() if not any(re.fullmatch(pattern, name) for name in existing)}
     assert {name for name in existing if not any(re.fullmatch(p, name) for p in patterns.values())} == set()
     assert unused == set()

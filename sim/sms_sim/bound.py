@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from sms_online.cramer_rao import STEP, MotionRecord, cramer_rao_bound, session_bound
-from sms_online.description.channels import sensed_channels
+from sms_online.description.channels import drive_channels, sensed_channels, wrench_channels
 from sms_online.description.given import Given, given_system
 from sms_online.description.schema import System
 from sms_online.errors import InputError
@@ -28,8 +28,8 @@ from sms_sim.plant import Plant
 from sms_sim.sensors import Sensors
 from sms_sim.simulate import Simulation, exact_states
 
-# A bound needs every drive measured, so these are never left out.
-DRIVES = ("tau_", "force_")
+# A bound needs every drive and wrench measured, so these are never left out.
+DRIVES = ("tau_", "force_", "wrench_")
 # Noise of sensors whose system states none, as that of the demo.
 DEFAULT_GRADE = "B"
 
@@ -171,7 +171,7 @@ def motion_bounds(
     described, grade = noisy_sensors(plant, grade)
     instants = np.linspace(0.0, simulation.duration, max(1, round(simulation.duration / STEP)) + 1)
     exact = exact_states(simulation, instants)
-    base, motion = find_base_parameters(plant.model), Motion(exact.t, exact.x, exact.v)
+    base, motion = find_base_parameters(plant.model), Motion(exact.t, exact.x, exact.v, exact.torque)
 
     def least(sensors: SensorSet) -> Array:
         return cramer_rao_bound(plant.dynamics, base, [motion], sensors)
@@ -213,7 +213,8 @@ def _sensors(plant: Plant, system: System, grade: str | None) -> SensorSet:
 
 
 def _readable(plant: Plant) -> tuple[str, ...]:
-    return *plant.channels[: len(plant.system.joints)], *readable_channels(plant.model)
+    system = plant.system
+    return (*drive_channels(system), *wrench_channels(system), *readable_channels(plant.model))
 
 
 def _noise(sensors: Sensors) -> Array:

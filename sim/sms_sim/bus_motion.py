@@ -64,7 +64,7 @@ class MovingArm:
         # Before the start the arm rests; the first rows are what the most delayed sensor still shows then.
         delays = np.rint(sensors.latency * rate).astype(np.int64)
         longest = int(delays.max(initial=0))
-        rest = plant.channel_values(np.zeros((1, len(plant.system.joints))), x)[:, columns]
+        rest = plant.channel_values(np.zeros((1, plant.model.n_inputs)), x)[:, columns]
         history = np.repeat(rest, longest + 1, axis=0)
         history[-1] = plant.channel_values(plant.torque(np.zeros(1), plant.rest[None]), x)[:, columns]
         yield self._block(0, history, delays, 1)

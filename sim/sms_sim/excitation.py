@@ -1,11 +1,14 @@
 """Trajectories that a system's parameters are best estimated from, as Fourier series within limits.
 
-The criterion is the Cramér–Rao bound of the motion that the controller makes of the series: a smooth maximum of the
-relative bounds, so that the worst counts most. Series of several harmonics are drawn at random, some of them about the
-described one, and scaled into the limits; the best is improved by quasi-Newton steps (BFGS), all derivatives of a step
-from one batch of motions.
+The criterion is the Cramér–Rao bound of the motion that the controller makes of the series: the largest of the relative
+bounds, and their median. Series of several harmonics are drawn at random, some of them about the described one, and
+scaled into the limits; the best is improved by sequential linear programming: bounds and loads at all instants are
+linearised from one batch of motions, and the linear program that minimises the largest bound within the limits, in a
+box of amplitudes, gives the step. That is quick where many limits hold the motion at once, as a described motion's own
+extremes do.
 Source: Swevers, Ganseman, Tükel, De Schutter, Van Brussel, Optimal robot excitation and identification, IEEE Trans.
-Robotics and Automation 13 (1997) 730, for finite Fourier series and the optimisation by the bound.
+Robotics and Automation 13 (1997) 730, for finite Fourier series and the optimisation by the bound; Nocedal and
+Wright, Numerical Optimization (2006), ch. 18, for linear programs in a trust region.
 """
 
 from __future__ import annotations
@@ -16,51 +19,38 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from scipy.optimize import minimize
+from scipy.optimize import linprog
 
-from sms_online.cramer_rao import cramer_rao_bound
 from sms_online.description.given import Given, given_system
-from sms_online.description.schema import Effect, Harmonic, System, Trajectory
+from sms_online.description.schema import Effect, System, Trajectory
 from sms_online.effects.catalogue import parse_effect
 from sms_online.errors import InputError
-from sms_online.linearised import Motion
-from sms_online.model.base_parameters import find_base_parameters
 from sms_online.stream import Array
 from sms_online.tables import Tabled
-from sms_sim.bound import Bounds, motion_bounds, noisy_sensors
+from sms_sim.bound import Bounds, motion_bounds
 from sms_sim.capture import Simulated
-from sms_sim.ensemble import ensemble
-from sms_sim.motion_limits import Extremes, Limits
-from sms_sim.plant import Plant
-from sms_sim.simulate import Simulation, exact_states
+from sms_sim.excitation_problem import Problem, extreme_states
+from sms_sim.motion_limits import Limits
+from sms_sim.simulate import Simulation
 
-# Harmonics of each joint: five free frequencies determine ten parameters a joint, and are slow enough to be followed.
-HARMONICS = 5
-# Periods of the slowest in a motion without a described one: several, of which each repeats what the others show.
-PERIODS = 5
-# Step of the motions that are compared and of their bounds, s: twice that of `cramer_rao`. The planar example's worst
-# bound then comes out a tenth low, so that exact bounds decide in the end.
-STEP = 0.02
-# Random series that the best is chosen from, and how often they are scaled into the limits, which is not linear.
-DRAWN, SCALINGS = 24, 1
+# Random series that the best is chosen from.
+DRAWN = 24
 # Share of a random series that is added to the described one, at most.
 MIXED = 0.5
-# Order of the norm of relative bounds: near their maximum, and smooth. The median takes so much of the criterion, or
-# nothing would keep the others from being spent for the worst.
-ORDER, MEDIAN_SHARE = 8, 0.3
-# Order of the norm over signals and instants in place of the largest load.
-PEAK_ORDER = 40
-# Unit of the optimiser's amplitudes, rad (m): its first step is about as long as the criterion's slope in it, which
-# then keeps a motion one that can be followed.
-UNIT = 0.1
-# Increment of a series' amplitudes, rad (m), for derivatives: a thousand times what is left of the motions' equations.
-INCREMENT = 5e-3
-# In place of what cannot be followed: more than any motion costs.
-FAR = 1e3
+# Share of the median in the criterion, or nothing would keep the others from being spent for the worst.
+MEDIAN_SHARE = 0.3
+# Increment of amplitudes for derivatives, and the box of the first step, in their units.
+INCREMENT, RADIUS = 4e-3, 4e-2
+# Boxes that are tried in a step, over that of the last one; where none is better, the next are so much smaller.
+BOXES, SMALLER = (2.0, 1.0, 0.25), 0.1
+# Boxes below this end the search: what a step gains is then below what coarse motions leave of a bound.
+LEAST_RADIUS = 1e-4
+# Cost of a load beyond the limits, in logarithms of bounds: more than any bound gains by it.
+PENALTY = 3.0
 # The exact motion is scaled to this share of the limits until it is within them, so often.
 USED, CORRECTIONS = 0.999, 6
-# Steps of the optimiser by default: the criterion then changes by less than a hundredth in a step.
-ITERATIONS = 15
+# Steps of the optimiser by default: those that follow gain a tenth of what these do.
+ITERATIONS = 6
 
 
 @dataclass(frozen=True)
@@ -146,7 +136,7 @@ def excite(
     """
     described, _ = given_system(system)
     weighed = _with_pair(described, separate)
-    problem = _Problem.of(weighed, separate, limits or Limits(), duration, grade, progress)
+    problem = Problem.of(weighed, separate, limits or Limits(), duration, grade, progress)
     best = _optimised(problem, np.random.default_rng(seed), iterations, progress)
     trajectory, simulation, extremes = _exact(problem, best, progress)
     after = motion_bounds(simulation, problem.grade)
@@ -179,210 +169,84 @@ def _with_pair(system: System, separate: Sequence[str]) -> System:
     return system.model_copy(update={"effects": (*system.effects, *effects)})
 
 
-class _Series:
-    """Fourier series of every joint over common frequencies (K,), rad/s; a point is all sines and cosines, rad (m)."""
+def _criterion(bounds: Array, loads: Array) -> Array:
+    """What is minimised (P,): the largest and the median bound of the motion scaled to the limits.
 
-    def __init__(self, frequency: Array, joints: int) -> None:
-        self.frequency, self._joints = frequency, joints
-        self.size = 2 * frequency.size * joints
-
-    def __call__(self, points: Array) -> tuple[Array, Array]:
-        """Sines and cosines (P, K, joints) of points (P, size)."""
-        parts = points.reshape(-1, 2, self.frequency.size, self._joints)
-        return parts[:, 0], parts[:, 1]
-
-    def drawn(self, random: np.random.Generator, count: int, largest: float) -> Array:
-        """Random points (count, size), of alike rates at all frequencies, that reach `largest`, rad (m), at most."""
-        points = (random.normal(size=(count, 2, self.frequency.size, self._joints)) / self.frequency[:, None]).reshape(
-            count, self.size
-        )
-        most = sum(np.abs(part).sum(axis=1) for part in self(points))  # (count, joints)
-        return np.asarray(points * (largest / most.max(axis=1))[:, None])
-
-    def nearest(self, trajectory: Trajectory) -> Array:
-        """Point (size,) of a described series' terms at these frequencies; others are left out."""
-        parts = np.zeros((2, self.frequency.size, self._joints))
-        for j, terms in enumerate(trajectory.joints):
-            for term in terms:
-                at = np.isclose(self.frequency, term.frequency)
-                parts[:, at, j] += np.array([[term.sine], [term.cosine]])
-        return parts.ravel()
-
-    def trajectory(self, point: Array, duration: float) -> Trajectory:
-        """The series as it is described."""
-        sine, cosine = (part[0] for part in self(point[None]))
-        joints = tuple(
-            tuple(
-                Harmonic(frequency=float(w), sine=float(sine[k, j]), cosine=float(cosine[k, j]))
-                for k, w in enumerate(self.frequency)
-            )
-            for j in range(self._joints)
-        )
-        return Trajectory(duration=duration, joints=joints)
-
-
-class _Problem:
-    """Criterion and loads of series. bounds (signals,): largest magnitudes; counted (n,): parameters that matter."""
-
-    def __init__(
-        self,
-        system: System,
-        duration: float,
-        grade: str | None,
-        limits: Limits,
-        described: Simulation | None,
-        lowest: float,
-        counted: Callable[[str, float], bool],
-    ) -> None:
-        self.system, self.duration = system, duration
-        self.plant = Plant(system)
-        self.sensors, self.grade = noisy_sensors(self.plant, grade)
-        self.extremes, self.base = Extremes(self.plant), find_base_parameters(self.plant.model)
-        values = np.abs(self.base.values(self.plant.parameters))
-        names = [p.name for p in self.base.parameters]
-        self.counted = np.array([counted(name, value) for name, value in zip(names, values, strict=True)], dtype=bool)
-        if zero := [name for name, c, value in zip(names, self.counted, values, strict=True) if c and value == 0.0]:
-            raise InputError(system.name, zero[0], "nominally zero", "its size, as NAME@WHERE:coefficient=value")
-        self._values = values[self.counted]
-        self.described = None if described is None else self.extremes(*_states(described))
-        self.bounds = self.extremes.bounds(limits, self.described)
-        self.before = None if described is None else motion_bounds(described, self.grade)
-        self.series = _Series(lowest * np.arange(1.0, HARMONICS + 1.0), len(system.joints))
-
-    @staticmethod
-    def of(
-        system: System,
-        separate: Sequence[str],
-        limits: Limits,
-        duration: float | None,
-        grade: str | None,
-        progress: Callable[[str, float], None],
-    ) -> _Problem:
-        """InputError where nothing says how long and how large the motion may be."""
-        trajectory = system.trajectory
-        if trajectory is None and (duration is None or limits.angle is None):
-            expected = "a trajectory, or both a duration and the largest joint angle"
-            raise InputError(system.name, "trajectory", "no such table", expected)
-        described = None if trajectory is None else Simulated.of(system).solve(progress)
-        stated = [harmonic.frequency for joint in trajectory.joints for harmonic in joint] if trajectory else []
-        length = duration if duration is not None else trajectory.duration if trajectory else math.nan
-        lowest = min(stated, default=PERIODS * 2.0 * math.pi / length)
-        pair = [text.partition(":")[0] for text in separate]
-
-        def counted(name: str, value: float) -> bool:
-            return any(name.startswith(f"{effect}.") for effect in pair) if pair else value > 0.0
-
-        return _Problem(system, length, grade, limits, described, lowest, counted)
-
-    def keeps(self, duration: float | None) -> bool:
-        """Whether the described motion is itself within the limits, and as long as the one asked for."""
-        fits = self.described is not None and bool((self.described <= self.bounds).all())
-        return fits and (self.system.trajectory is None or duration in (None, self.system.trajectory.duration))
-
-    @property
-    def smallest_angle(self) -> float:
-        """Of the largest angles that joints may reach, rad (m): what a random series may ask for to begin with."""
-        angles = [signal.kind == "angle" and signal.stated for signal in self.extremes.signals]
-        return float(self.bounds[angles].min())
-
-    def __call__(self, points: Array) -> tuple[Array, Array, Array]:
-        """Of points (P, size): criterion, largest load (extreme over its bound), and a smooth maximum (P,)."""
-        motions = ensemble(self.system, self.series.frequency, *self.series(points), self.duration, STEP)
-        cost, load, smooth = np.full((3, len(points)), np.inf)
-        for p in range(len(points)):
-            x, v = motions.x[p], motions.v[p]
-            if np.isfinite(x).all() and np.isfinite(v).all():
-                loads = self.extremes.magnitudes(x, v, motions.torque[p]) / self.bounds
-                load[p], smooth[p] = loads.max(), np.linalg.norm(loads.ravel(), PEAK_ORDER)
-                cost[p] = self._criterion(Motion(motions.t, x, v))
-        return cost, load, smooth
-
-    def _criterion(self, motion: Motion) -> float:
-        std = cramer_rao_bound(self.plant.dynamics, self.base, [motion], self.sensors)[self.counted]
-        relative = std / self._values
-        if not np.isfinite(relative).all():
-            return math.inf
-        worst = math.log(float(np.linalg.norm(relative, ORDER)))
-        return (1.0 - MEDIAN_SHARE) * worst + MEDIAN_SHARE * math.log(float(np.median(relative)))
-
-
-def _states(simulation: Simulation) -> tuple[Array, Array, Array]:
-    """x, v and n τ of a motion, close enough together for their extremes."""
-    rate = simulation.plant.system.sample_rate
-    t = np.linspace(0.0, simulation.duration, round(simulation.duration * rate) + 1)
-    exact = exact_states(simulation, t)
-    return exact.x, exact.v, exact.torque
+    Bounds fall as amplitudes rise.
+    """
+    largest = loads.max(axis=(1, 2))
+    cost = (1.0 - MEDIAN_SHARE) * bounds.max(axis=1) + MEDIAN_SHARE * np.median(bounds, axis=1) + np.log(largest)
+    return np.where(np.isfinite(cost), cost, np.inf)
 
 
 def _optimised(
-    problem: _Problem, random: np.random.Generator, iterations: int, progress: Callable[[str, float], None]
+    problem: Problem, random: np.random.Generator, iterations: int, progress: Callable[[str, float], None]
 ) -> Array:
     """The best point that is found."""
-    what = "designing the motion"
-    total = SCALINGS + 1 + iterations
+    what, total = "designing the motion", 2 + iterations
     points = problem.series.drawn(random, DRAWN, problem.smallest_angle)
     if problem.system.trajectory is not None:
-        # Some are the described motion with more or less of something else; the first is itself.
-        share = np.linspace(0.0, MIXED, DRAWN // 2)[:, None]
+        # Some are the described motion with more or less of something else: from itself all seeds would lead to one.
+        share = np.linspace(0.0, MIXED, DRAWN // 2 + 1)[1:, None]
         points[: DRAWN // 2] = problem.series.nearest(problem.system.trajectory) + share * points[: DRAWN // 2]
-    for k in range(SCALINGS):
-        progress(what, k / total)
-        _, load, _ = problem(points)
-        points = points / np.where(np.isfinite(load), load, 2.0)[:, None]
-    progress(what, SCALINGS / total)
-    cost, load, _ = problem(points)
-    scaled = cost + np.log(load)
-    if not np.isfinite(scaled).any():
+    progress(what, 0.0)
+    load = problem(points)[1].max(axis=(1, 2))
+    points = points / np.where(np.isfinite(load), load, 2.0)[:, None]
+    progress(what, 1.0 / total)
+    costs = _criterion(*problem(points))
+    if not np.isfinite(costs).any():
         found = "no random motion within them determines the parameters"
         raise InputError(problem.system.name, "limits", found, "wider limits, or effects that such motions show")
-    steps = _Steps(problem, lambda n: progress(what, min(1.0, (SCALINGS + 1 + n) / total)))
-    begin = points[int(np.argmin(scaled))] / UNIT
-    minimize(steps.cost, begin, jac=steps.slope, method="BFGS", options={"maxiter": iterations})
-    return steps.best
+    best = points[int(np.argmin(costs))]
+    units, radius = problem.units, RADIUS
+    for k in range(iterations):
+        progress(what, (2.0 + k) / total)
+        bounds, loads = problem(np.concatenate((best[None], best + INCREMENT * np.diag(units))))
+        if not (np.isfinite(bounds).all() and np.isfinite(loads).all()):
+            break  # at the edge of what can be followed
+        boxes = radius * np.array(BOXES)
+        trials = np.array([best + units * _step(bounds, loads, box) for box in boxes])
+        costs = _criterion(*problem(trials))
+        chosen = int(np.argmin(costs))
+        if costs[chosen] < _criterion(bounds[:1], loads[:1])[0]:
+            best, radius = trials[chosen], float(boxes[chosen])
+        elif (radius := SMALLER * radius) < LEAST_RADIUS:
+            break
+    return np.asarray(best)
 
 
-class _Steps:
-    """What is minimised, and its derivatives, at a point in UNIT, all from one batch of motions.
+def _step(bounds: Array, loads: Array, box: float) -> Array:
+    """Change of a point (size,), in units and within a box, that is best as far as bounds and loads are linear.
 
-    It is the criterion of the motion scaled to the limits: bounds fall as amplitudes rise. So no limit is in the way of
-    a step, and amplitudes stay where motions are close to their limits for the second term's sake.
+    bounds (1 + size, counted), loads (1 + size, N, signals): at the point, then with INCREMENT more of each amplitude.
     """
-
-    def __init__(self, problem: _Problem, on_step: Callable[[int], None]) -> None:
-        self._problem, self._on_step = problem, on_step
-        self._known: dict[bytes, tuple[float, Array]] = {}
-        self.best, self._least = np.empty(0), math.inf
-
-    def cost(self, point: Array) -> float:
-        """What is minimised."""
-        return self._at(point)[0]
-
-    def slope(self, point: Array) -> Array:
-        """Its derivative (size,)."""
-        return self._at(point)[1]
-
-    def _at(self, scaled: Array) -> tuple[float, Array]:
-        key, point = scaled.tobytes(), UNIT * scaled
-        if key not in self._known:
-            near = np.concatenate((point[None], point + INCREMENT * np.eye(point.size)))
-            cost, load, smooth = self._problem(near)
-            value = np.nan_to_num(cost + np.log(smooth) + np.log(smooth) ** 2, nan=FAR, posinf=FAR)
-            self._known[key] = float(value[0]), (value[1:] - value[0]) * (UNIT / INCREMENT)
-            if cost[0] + math.log(load[0]) < self._least:
-                self.best, self._least = point, float(cost[0] + math.log(load[0]))
-            self._on_step(len(self._known))
-        return self._known[key]
+    slopes = (bounds[1:] - bounds[0]) / INCREMENT  # (size, counted)
+    n, middle = len(slopes), np.argsort(bounds[0])[(bounds.shape[1] - 1) // 2 : bounds.shape[1] // 2 + 1]
+    there, by_amplitude = loads[0].ravel(), ((loads[1:] - loads[0]) / INCREMENT).reshape(n, -1)
+    near = there + box * np.abs(by_amplitude).sum(axis=0) > 1.0
+    # Unknowns: the step, the logarithm of the largest bound, and the load beyond the limits.
+    rows = np.concatenate((slopes, by_amplitude[:, near]), axis=1).T
+    largest, beyond = np.zeros((2, len(rows), 1))
+    largest[: bounds.shape[1]], beyond[bounds.shape[1] :] = -1.0, -1.0
+    cost = np.concatenate((MEDIAN_SHARE * slopes[:, middle].mean(axis=1), [1.0 - MEDIAN_SHARE, PENALTY]))
+    found = linprog(
+        cost,
+        A_ub=np.concatenate((rows, largest, beyond), axis=1),
+        b_ub=np.concatenate((-bounds[0], 1.0 - there[near])),
+        bounds=[*[(-box, box)] * n, (None, None), (0.0, None)],
+    )
+    return np.asarray(found.x[:n]) if found.x is not None else np.zeros(n)
 
 
 def _exact(
-    problem: _Problem, point: Array, progress: Callable[[str, float], None]
+    problem: Problem, point: Array, progress: Callable[[str, float], None]
 ) -> tuple[Trajectory, Simulation, Array]:
     """The trajectory of a point, scaled until its exact motion is within the limits, that motion and its extremes."""
     for _ in range(CORRECTIONS):
         trajectory = problem.series.trajectory(point, problem.duration)
         moved = problem.system.model_copy(update={"trajectory": trajectory})
         simulation = Simulated.of(moved).solve(progress)
-        extremes = problem.extremes(*_states(simulation))
+        extremes = problem.extremes(*extreme_states(simulation))
         load = float((extremes / problem.bounds).max())
         if load <= 1.0:
             return trajectory, simulation, extremes

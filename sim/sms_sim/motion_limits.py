@@ -71,7 +71,7 @@ class Extremes:
         self.signals = tuple(signals)
 
     def __call__(self, x: Array, v: Array, torque: Array) -> Array:
-        """Extremes (signals,) of a motion x (N, n_x), v (N, n_v), n τ (N, joints)."""
+        """Extremes (signals,) of a motion x (N, n_x), v (N, n_v), torque (N, joints or more)."""
         return np.asarray(self.magnitudes(x, v, torque).max(axis=0))
 
     def magnitudes(self, x: Array, v: Array, torque: Array) -> Array:
@@ -83,7 +83,7 @@ class Extremes:
             cosine = 0.5 * (np.einsum("bij,ij->b", T, T[0]) - 1.0)
             turned = np.abs(x[:, 2] - x[0, 2]) if layout.planar else np.arccos(np.clip(cosine, -1.0, 1.0))
             parts.append(turned[:, None])
-        parts += [layout.joint_positions(x), v, self._markers(x, v), torque]
+        parts += [layout.joint_positions(x), v, self._markers(x, v), torque[:, : len(layout.q)]]
         return np.abs(np.concatenate(parts, axis=1))
 
     def bounds(self, limits: Limits, described: Array | None) -> Array:

@@ -7,7 +7,7 @@ from functools import cached_property
 
 import numpy as np
 
-from sms_online.description.channels import drive_channels, sensed_channels
+from sms_online.description.channels import drive_channels, sensed_channels, wrench_channels
 from sms_online.description.schema import System
 from sms_online.effects.build import build_model
 from sms_online.model.effect import Inputs
@@ -15,11 +15,11 @@ from sms_online.model.readings import Readings, position_channels, readable_chan
 from sms_online.stream import Array
 from sms_sim.controller import JointPD
 from sms_sim.drifting import ParameterDrift
-from sms_sim.references import fourier_reference
+from sms_sim.references import applied_wrenches, fourier_reference
 
 
 class Plant:
-    """A described system with parameter values π and a controller; without one no torque acts.
+    """A described system with parameter values π and a controller; without one no torque acts, but wrenches do.
 
     The state y is positions x, speeds v and the internal states z of declared effects in one array, (B, n_y). Euler
     parameters are integrated as plain states: their norm is an invariant of the equations, which the adaptive
@@ -38,6 +38,7 @@ class Plant:
         self.controller: JointPD | None = None
         if system.controller is not None and system.trajectory is not None:
             self.controller = JointPD(system.controller, fourier_reference(system.trajectory))
+        self._wrenches = applied_wrenches(system)
         layout = self.model.layout
         # Columns of a joint's link side and motor side, among the speeds and among the positions.
         self._q_speed, self._motor_speed = list(layout.q), list(layout.theta_m)
@@ -77,16 +78,20 @@ class Plant:
         return Inputs(self.torque(t, y), y[:, layout.n_x + layout.n_v :])
 
     def torque(self, t: Array, y: Array) -> Array:
-        """Torque after the gear n τ (B, joints), N m (N), at instants t (B,), s."""
-        if self.controller is None:
-            return np.zeros((t.size, len(self.system.joints)))
-        x, v = self.split(y)
-        return self.controller(t, x[:, self._q_position], v[:, self._q_speed])
+        """Torque after the gear n τ, N m (N), and components of wrenches (B, inputs), at instants t (B,), s."""
+        out = np.zeros((t.size, self.model.n_inputs))
+        joints = len(self.system.joints)
+        if self.controller is not None:
+            x, v = self.split(y)
+            out[:, :joints] = self.controller(t, x[:, self._q_position], v[:, self._q_speed])
+        if self._wrenches is not None:
+            out[:, joints:], _ = self._wrenches(t)
+        return out
 
     @cached_property
     def channels(self) -> tuple[str, ...]:
-        """Channels that the exact motion gives: drives, then positions of base, joints and markers."""
-        return (*drive_channels(self.system), *position_channels(self.model))
+        """Channels that the exact motion gives: drives, wrenches, then positions of base, joints and markers."""
+        return (*drive_channels(self.system), *wrench_channels(self.system), *position_channels(self.model))
 
     @cached_property
     def further_channels(self) -> tuple[str, ...]:
@@ -106,13 +111,14 @@ class Plant:
         return Readings(self.model, self.further_channels)(x, v)
 
     def channel_values(self, torque: Array, x: Array) -> Array:
-        """Exact values (B, channels) at torques after the gear n τ (B, joints) and positions x (B, n_x)."""
+        """Exact values (B, channels) at torques and wrenches (B, inputs), see `torque`, and positions x (B, n_x)."""
         drives = drive_channels(self.system)
         joints = [i - 1 for i in drives.values()]
         gears = np.array([self.system.joints[i].gear_ratio for i in joints])
         at_shaft = np.array([channel.startswith("tau_") for channel in drives])
         of_drives = torque[:, joints] / np.where(at_shaft, gears, 1.0)
-        return np.concatenate((of_drives, self._positions(x, np.zeros((len(x), self.model.layout.n_v)))), axis=1)
+        positions = self._positions(x, np.zeros((len(x), self.model.layout.n_v)))
+        return np.concatenate((of_drives, torque[:, len(self.system.joints) :], positions), axis=1)
 
     @cached_property
     def _positions(self) -> Readings:
@@ -140,4 +146,4 @@ class Plant:
     def motor_power(self, t: Array, y: Array) -> Array:
         """Power of each motor n τ θ̇_m (B, joints), W: its integral is the left side of (42)."""
         _, v = self.split(y)
-        return np.asarray(self.torque(t, y) * v[:, self._motor_speed])
+        return np.asarray(self.torque(t, y)[:, : len(self._motor_speed)] * v[:, self._motor_speed])

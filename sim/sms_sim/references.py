@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
-from sms_online.description.schema import Trajectory
+from sms_online.description.channels import wrench_components
+from sms_online.description.schema import Harmonic, System, Trajectory
 from sms_online.stream import Array
 
 
@@ -29,8 +32,18 @@ class References:
 
 def fourier_reference(trajectory: Trajectory) -> References:
     """The one reference that a system file describes."""
-    terms = [(joint, harmonic) for joint, series in enumerate(trajectory.joints) for harmonic in series]
-    sine, cosine = np.zeros((2, 1, len(terms), len(trajectory.joints)))
-    for k, (joint, harmonic) in enumerate(terms):
-        sine[0, k, joint], cosine[0, k, joint] = harmonic.sine, harmonic.cosine
+    return _fourier(trajectory.joints)
+
+
+def applied_wrenches(system: System) -> References | None:
+    """What the simulator applies of the measured wrenches, component by component; None where that is nothing."""
+    applied = [wrench.applied.get(name, ()) for wrench in system.wrenches for name in wrench_components(system, wrench)]
+    return _fourier(applied) if any(applied) else None
+
+
+def _fourier(series: Sequence[Sequence[Harmonic]]) -> References:
+    terms = [(column, harmonic) for column, own in enumerate(series) for harmonic in own]
+    sine, cosine = np.zeros((2, 1, len(terms), len(series)))
+    for k, (column, harmonic) in enumerate(terms):
+        sine[0, k, column], cosine[0, k, column] = harmonic.sine, harmonic.cosine
     return References(np.array([harmonic.frequency for _, harmonic in terms]), sine, cosine)

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sms_online.description.channels import drive_channels, sensed_channels
+from sms_online.description.channels import drive_channels, sensed_channels, wrench_channels
 from sms_online.description.schema import Sensor, System
 from sms_online.effects.catalogue import channel_effects
 from sms_online.errors import InputError
@@ -18,7 +18,7 @@ class Grade:
     """White noise of a sample, 1σ.
 
     encoder: of encoders and the base's angle, rad. marker: of markers and the base's position, m (slopes rad).
-    torque: of n τ, N m.
+    torque: of n τ and of measured wrenches, N and N m.
     """
 
     encoder: float
@@ -41,16 +41,17 @@ class Sensors:
     """The sensors on `channels` (C names), as described, or all of them at the system's rate with the noise of a grade.
 
     measurable: channels that exact values exist for, drives first. Those that no sensor fills are left out; drives are
-    always there, for the torque is commanded; a system without sensors has them all, exact. Raises InputError on an
-    unknown grade.
+    always there, for the torque is commanded, and so are measured wrenches; a system without sensors has them all,
+    exact. Raises InputError on an unknown grade.
     """
 
     def __init__(self, system: System, measurable: tuple[str, ...], grade: str | None, seed: int) -> None:
         if grade is not None and grade not in GRADES:
             raise InputError("simulation", "grade", repr(grade), f"one of {', '.join(GRADES)}")
         drives = drive_channels(system)
+        inputs = (*drives, *wrench_channels(system))
         filled = {channel: sensor for sensor in system.sensors for channel in sensed_channels(system, sensor)}
-        self.channels = tuple(c for c in measurable if c in drives or not system.sensors or c in filled)
+        self.channels = tuple(c for c in measurable if c in inputs or not system.sensors or c in filled)
         ideal = Sensor(channels=("*",))
         if grade is None:
             used = [filled.get(channel, ideal) for channel in self.channels]
@@ -93,6 +94,8 @@ def _grade_noise(system: System, channel: str, drives: dict[str, int], grade: Gr
     if channel in drives:
         gear = system.joints[drives[channel] - 1].gear_ratio
         return grade.torque / gear if channel.startswith("tau_") else grade.torque
+    if channel.startswith("wrench_"):
+        return grade.torque
     if channel in EULER_PARAMETERS:
         # Euler parameters turn by half the angle.
         return 0.5 * grade.encoder

@@ -48,7 +48,7 @@ class Drift:
 class ExactStates:
     """Exact values at B instants.
 
-    t (B,) s; x (B, n_x), v (B, n_v) in the order of the model's layout; torque (B, joints): n τ, N m (N); work
+    t (B,) s; x (B, n_x), v (B, n_v) in the order of the model's layout; torque (B, inputs): see `Plant.torque`; work
     (B, joints): of each motor since the start, (42), J; dissipated (B,): since the start, (24), with what declared
     effects took out, J.
     """

@@ -5,9 +5,10 @@ from __future__ import annotations
 from fnmatch import fnmatchcase
 
 from sms_online.description.bodies import Deformation, FlexibleLink, Joint
-from sms_online.description.schema import Sensor, System
+from sms_online.description.schema import Sensor, System, Wrench, WrenchComponent
 
 AXES = ("x", "y", "z")
+WRENCH_COMPONENTS: tuple[WrenchComponent, ...] = ("f_x", "f_y", "f_z", "m_x", "m_y", "m_z")
 # Nodal coordinates of a marker in the order of (32), with the deformation that moves each.
 NODAL: dict[str, Deformation] = {
     "u_x": "traction",
@@ -40,6 +41,19 @@ def drive_channel(system: System, i: int) -> str:
     return f"force_{i}" if is_directly_driven(system.joints[i - 1]) else f"tau_{i}"
 
 
+def wrench_components(system: System, wrench: Wrench) -> tuple[WrenchComponent, ...]:
+    """Components of a wrench that are measured."""
+    if wrench.components:
+        return wrench.components
+    return ("f_x", "f_y", "m_z") if system.motion == "planar" else WRENCH_COMPONENTS
+
+
+def wrench_channels(system: System) -> tuple[str, ...]:
+    """Channels of all measured wrenches, `wrench_1.f_x`, …."""
+    numbered = enumerate(system.wrenches, start=1)
+    return tuple(f"wrench_{k}.{name}" for k, wrench in numbered for name in wrench_components(system, wrench))
+
+
 def strain_channel(system: System, i: int) -> str | None:
     """Channel of the strain at the root of link i (from 1), as an angle, where it replaces the spring of joint i.
 
@@ -52,7 +66,7 @@ def strain_channel(system: System, i: int) -> str | None:
 
 
 def channels(system: System) -> tuple[str, ...]:
-    """Every channel that a capture of this system may hold: drives, joints, base, then the markers of each link."""
+    """Every channel that a capture of this system may hold: drives, joints, base, markers link by link, wrenches."""
     joints = range(1, len(system.joints) + 1)
     names = list(drive_channels(system))
     names += [f"theta_m_{i}" for i in joints if has_motor_side(system.joints[i - 1])]
@@ -66,7 +80,7 @@ def channels(system: System) -> tuple[str, ...]:
         names += point_channels(system, i)
         if i <= len(system.joints) and (strain := strain_channel(system, i)) is not None:
             names.append(strain)
-    return tuple(names)
+    return (*names, *wrench_channels(system))
 
 
 def point_channels(system: System, i: int) -> list[str]:
@@ -111,6 +125,8 @@ def channel_unit(system: System, channel: str) -> str:
         if stem in ("tau", "force"):
             return "N" if slides else "N m"
         return "m" if slides else "rad"
+    if channel.startswith("wrench_"):
+        return "N" if stem == "f" else "N m"
     if name.startswith(("v_S", "omega", "gyro")):
         return "m/s" if name.startswith("v_S") else "rad/s"
     if name.startswith("eps") or name == "eta":

@@ -10,7 +10,7 @@ from fnmatch import fnmatchcase
 import numpy as np
 
 from sms_online.description.bodies import Deformation, FlexibleLink, Inertia, Joint, Motor, RigidLink
-from sms_online.description.channels import channels, sensed_channels
+from sms_online.description.channels import channels, sensed_channels, wrench_components
 from sms_online.description.check_sources import check_sources
 from sms_online.description.check_tree import check_tips, check_tree
 from sms_online.description.explain import hint, nearest, quoted
@@ -61,6 +61,7 @@ def check_system(system: System, source: str) -> None:
         )
     _check_simulation(system, source)
     names = channels(system)
+    _check_wrenches(system, source)
     _check_sensors(system, names, source)
     check_sources(system, names, source)
     _check_effects(system, names, source)
@@ -195,6 +196,23 @@ def _check_simulation(system: System, source: str) -> None:
             for i, (joint, gain) in enumerate(zip(system.joints, gains, strict=True), start=1):
                 if joint.passive and gain > 0.0:
                     raise InputError(source, f"controller.{key}", f"{gain:g} of joint_{i}", "0, for it is passive")
+
+
+def _check_wrenches(system: System, source: str) -> None:
+    """Each acts on a body that there is, with components that the motion has."""
+    bodies = [f"link_{i}" for i in range(1, len(system.links) + 1)]
+    bodies += [] if system.spacecraft is None else ["base"]
+    for k, wrench in enumerate(system.wrenches, start=1):
+        if wrench.where not in bodies:
+            raise InputError(source, f"wrench {k}.where", repr(wrench.where), quoted(bodies))
+        components = wrench_components(system, wrench)
+        whole = wrench_components(system, wrench.model_copy(update={"components": ()}))
+        for place, names in (("components", components), ("applied", (*wrench.applied,))):
+            if other := [name for name in names if name not in (components if place == "applied" else whole)]:
+                expected = quoted(components if place == "applied" else whole)
+                raise InputError(source, f"wrench {k}.{place}", repr(other[0]), expected)
+        if len(set(components)) < len(components):
+            raise InputError(source, f"wrench {k}.components", "the same one twice", "each of them once")
 
 
 def _check_sensors(system: System, names: tuple[str, ...], source: str) -> None:

@@ -26,7 +26,10 @@ PLAIN = (
     "name", "title", "reference", "motion", "gravity", "sample_rate", "balance", "spacecraft", "payload", "known",
     "fitted",
 )  # fmt: skip
-RENAMED = {"sensor": "sensors", "source": "sources", "effect": "effects", "prior": "priors", "tracker": "trackers"}
+RENAMED = {
+    "wrench": "wrenches", "sensor": "sensors", "source": "sources", "effect": "effects", "prior": "priors",
+    "tracker": "trackers",
+}  # fmt: skip
 WITHOUT_NUMBERS = (*PLAIN, *RENAMED, "controller", "trajectory", "windows", "tolerances")
 NUMBERED = re.compile(r"(joint|motor|link)_([1-9]\d*)")
 # Levels of tables and lists in a file: one more than a signal of a source or a harmonic of a joint needs.

@@ -17,6 +17,7 @@ from sms_online.description.sources import Device, LogSource, Source
 
 Forgetting = Literal["none", "exponential", "window", "directional"]
 Over = Literal["rate", "angle", "deflection", "load"]
+WrenchComponent = Literal["f_x", "f_y", "f_z", "m_x", "m_y", "m_z"]
 Drift = Literal["none", "random_walk", "trend", "learned"]
 
 
@@ -115,6 +116,19 @@ class Trajectory(Record):
 
     duration: Positive
     joints: tuple[tuple[Harmonic, ...], ...]
+
+
+class Wrench(Record):
+    """A measured force and moment of the surroundings on a body, in that body's axes: the channels `wrench_k.f_x`, ….
+
+    where: `base`, at the tracked point S, or `link_i`, at its end.
+    components: those measured, of f_x, f_y, f_z, m_x, m_y, m_z; others are zero. Not stated: all that the motion has.
+    applied: what the simulator applies, a list of harmonics for each component, amplitudes in N and N m.
+    """
+
+    where: str
+    components: tuple[WrenchComponent, ...] = ()
+    applied: dict[WrenchComponent, tuple[Harmonic, ...]] = {}
 
 
 class Windows(Record):
@@ -234,6 +248,7 @@ class System(Record):
     fixed_joints: the last `[joint_i]` of a system file, of kind `fixed`.
     links: `[link_1]`, …, one for each joint, the fixed ones included.
     payload: a rigid body at the tip of the link of the last joint that moves, in that link's tip frame.
+    wrenches: `[[wrench]]` tables.
     sensors: `[[sensor]]` tables.
     sources: `[[source]]` tables, the devices of a live session and what the columns or topics of a log mean.
     effects: `[[effect]]` tables.
@@ -261,6 +276,7 @@ class System(Record):
     fixed_joints: tuple[FixedJoint, ...] = ()
     links: tuple[Link, ...]
     payload: RigidBody | None = None
+    wrenches: tuple[Wrench, ...] = ()
     sensors: tuple[Sensor, ...] = ()
     sources: tuple[Source, ...] = ()
     effects: tuple[Effect, ...] = ()

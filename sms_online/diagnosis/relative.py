@@ -39,7 +39,8 @@ class RelativeResiduals:
 
         physical = weak.columns(model)
         self._Y = rows.base.columns(physical)
-        torque = -weak.columns(lambda motion: (None, motion.torque[:, :, None]))[..., 0]
+        joints = len(layout.q)
+        torque = -weak.columns(lambda motion: (None, motion.torque[:, :joints, None]))[..., 0]
         self._measured = torque
         self._b = torque - rows.base.known_part(physical)
         self._effects: list[Array] = []

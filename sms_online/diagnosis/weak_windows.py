@@ -65,7 +65,7 @@ class WeakWindows:
         self.windows, self.segments = windows, segments
         self._layout, self._rate = layout, sample_rate
         self._signals = [
-            np.concatenate((sensing.coordinates(segment.values), sensing.joint_torque(segment.values)), axis=1)
+            np.concatenate((sensing.coordinates(segment.values), sensing.inputs(segment.values)), axis=1)
             for segment in segments
         ]
         self._motions: dict[bool, list[tuple[Motion, NDArray[np.int64]]]] = {}

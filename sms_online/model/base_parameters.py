@@ -43,7 +43,8 @@ class BaseParameters:
     """Identifiable combinations β = π_independent + mixture π_dependent.
 
     parameters: one a combination, with readable name, symbol and nominal value. independent, dependent, absent: indices
-    into the physical parameters; absent ones have no influence on the motion or are declared known.
+    into the physical parameters; absent ones have no influence on the motion, are declared known, or are the gain of
+    measured wrenches.
     """
 
     physical: tuple[Parameter, ...]
@@ -101,7 +102,7 @@ def random_states(model: Model, count: int, rng: np.random.Generator) -> tuple[A
 
 def random_inputs(model: Model, count: int, rng: np.random.Generator) -> Inputs:
     """Random torques and internal states for the effects of `count` random states."""
-    return Inputs(rng.normal(size=(count, len(model.layout.q))), rng.normal(size=(count, model.n_states)))
+    return Inputs(rng.normal(size=(count, model.n_inputs)), rng.normal(size=(count, model.n_states)))
 
 
 @one_blas_thread()
@@ -113,6 +114,8 @@ def find_base_parameters(model: Model) -> BaseParameters:
             expected = f"the name of a parameter of this system{hint(nearest(name, names))}"
             raise InputError(model.system.name, f'known."{name}"', "no such parameter", expected)
     known = tuple((names.index(name), value) for name, value in model.system.known.items())
+    if model.wrenches is not None:
+        known += tuple((names.index(p.name), p.nominal) for p in model.wrenches.parameters)
     rng = np.random.default_rng(RANDOM_SEED)
     x, v = random_states(model, STATES_PER_PARAMETER * model.n_pi, rng)
     inputs = random_inputs(model, len(x), rng)

@@ -263,6 +263,16 @@ class Configuration:
             out[chain.tip_frame] = self._end(last, out[2 * last + 2], rates)
         return out
 
+    def end_jacobians(self, places: Iterable[int]) -> list[Array]:
+        """Twist Jacobians (B, 6, n_v), in their axes, of the ends of some links (from 0), or of S where it is BASE."""
+        chain, unit = self.chain, np.eye(self.chain.layout.n_v)[None]
+        return [
+            _turn_back(self.T_0, chain.select_base @ unit)
+            if i == BASE
+            else self._end(i, self.jacobians[2 * i + 2], unit)
+            for i in places
+        ]
+
     def _joint(self, i: int, mount: Array, rates: Array) -> Array:
         """Twists beyond joint i (from 0) for those of its mount."""
         slide, q = self.slides[i], self.chain.layout.q[i]

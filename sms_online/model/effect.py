@@ -20,8 +20,8 @@ from sms_online.stream import Array
 class Inputs:
     """What an effect may need besides positions and speeds, at B instants.
 
-    torque (B, joints): n τ as measured, N m (N). states (B, n_z): internal states, to the model those of all effects in
-    their order, to an effect its own.
+    torque (B, inputs): n τ as measured, N m (N), then the components of measured wrenches, N and N m. states (B, n_z):
+    internal states, to the model those of all effects in their order, to an effect its own.
     """
 
     torque: Array

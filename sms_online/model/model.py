@@ -13,6 +13,7 @@ from dataclasses import replace
 import numpy as np
 
 from sms_online.description.bodies import FlexibleLink, RigidLink
+from sms_online.description.channels import wrench_channels
 from sms_online.description.schema import System
 from sms_online.model.chain import Chain, Configuration
 from sms_online.model.dynamics import Dynamics
@@ -30,6 +31,7 @@ from sms_online.model.parameters import (
 )
 from sms_online.model.projection import project
 from sms_online.model.springs import QuadraticForms, Spring
+from sms_online.model.wrench import MeasuredWrenches
 from sms_online.stream import Array
 
 
@@ -51,6 +53,12 @@ class Model:
         self.chain = Chain(system, self.layout)
         self.gravity = np.array(system.gravity)
         self.effects, inertias = effects_of(system, self.chain, self.weight)
+        # Measured inputs: n τ of the joints, then components of wrenches. These come before the effects that a system
+        # declares, the last of which a search looks at.
+        self.wrenches = MeasuredWrenches(system, self.chain) if system.wrenches else None
+        self.n_inputs = len(self.layout.q) + len(wrench_channels(system))
+        if self.wrenches is not None:
+            self.effects = (self.wrenches, *self.effects)
         parameters: list[Parameter] = []
         self.bodies: list[BodyTerm] = []
         self.links: list[LinkTerm] = []
@@ -207,15 +215,28 @@ class Model:
         return self.layout.position_rate(x, v)
 
     def inputs(self, signals: Array) -> Inputs:
-        """Inputs of the effects from signals (B, joints + n_states), n τ and then internal states."""
-        joints = len(self.layout.q)
-        return Inputs(signals[:, :joints], signals[:, joints:])
+        """Inputs of the effects from signals (B, n_signals): n τ, measured wrenches, then internal states."""
+        return Inputs(signals[:, : self.n_inputs], signals[:, self.n_inputs :])
+
+    @property
+    def n_signals(self) -> int:
+        """Number of measured inputs and of the effects' internal states."""
+        return self.n_inputs + self.n_states
 
     def generalized_force(self, joint_torque: Array) -> Array:
-        """Q of (41), (B, n_v), for torques after the gear n τ (B, joints), N m (N)."""
+        """Q of (41), (B, n_v), for torques after the gear n τ (B, joints or more), N m (N)."""
         Q = np.zeros((joint_torque.shape[0], self.layout.n_v))
-        Q[:, list(self.layout.theta_m)] = joint_torque  # of passive joints 0
+        Q[:, list(self.layout.theta_m)] = joint_torque[:, : len(self.layout.q)]  # of passive joints 0
         return Q
+
+    def input_columns(self, x: Array) -> Array:
+        """Generalized forces (B, n_v, n_inputs) of one unit of each measured input, at positions x (B, n_x)."""
+        joints = len(self.layout.q)
+        out = np.zeros((x.shape[0], self.layout.n_v, self.n_inputs))
+        out[:, list(self.layout.theta_m), range(joints)] = 1.0
+        if self.wrenches is not None:
+            out[:, :, joints:] = self.wrenches.by_component(x)
+        return out
 
     def energy_columns(self, x: Array, v: Array) -> Array:
         """Columns (B, n_pi) of K + U, (7), (14), (15), (17), (23), and of the potential of gravity, J per unit."""

@@ -48,7 +48,7 @@ class Derivatives:
         """∂Pπ/∂x, ∂Gπ/∂v and ∂Gπ/∂x side by side (·, n_v, 3 n_v) at the chosen ones of K states, K of them or fewer;
         and ∂Pπ and ∂Gπ (2, K, n_v, c) by geometries, readings staying as they are.
 
-        x (K, n_x), v (K, n_v). signals (K, joints + n_states): n τ, then internal states, for the effects that need
+        x (K, n_x), v (K, n_v). signals (K, n_signals): see `Model.inputs`, for the effects that need
         them. H (K, n_v, n_v): mass matrices.
         """
         n_v = v.shape[1]

@@ -146,17 +146,18 @@ class EnergyBalance(Stage):
         x: Array,
         v: Array,
         signals: Array,
-        torque_noise: Array,
+        input_noise: Array,
     ) -> BalanceRows:
         """Rows that B consecutive samples complete: grid index (B,), x (B, n_x), v (B, n_v).
 
-        signals (B, joints + n_states): n τ, then internal states of effects. torque_noise (joints,): white noise of
-        n τ, 1σ per sample.
+        signals (B, n_signals). input_noise (inputs,): white noise of n τ and of measured wrenches, 1σ per sample.
         """
         motor_rates = v[:, list(self.model.layout.theta_m)]
         work = np.einsum("bj,bj->b", signals[:, : motor_rates.shape[1]], motor_rates)
+        # Rates along which the inputs work. The work of wrenches is what they take out, with the effects'.
+        rates = motor_rates if self.model.wrenches is None else (v[:, None] @ self.model.input_columns(x))[:, 0]
         # The last column gathers the variance of the work's noise; its rate is per sample, not per second.
-        noise = (motor_rates**2 @ torque_noise**2) / self.sample_rate
+        noise = (rates**2 @ input_noise**2) / self.sample_rate
         taken = self.model.power_columns(x, v, self.model.inputs(signals))
         power = np.column_stack((taken[:, self._columns[:-1]], work, noise))
         x, v = np.concatenate((self.state.x, x)), np.concatenate((self.state.v, v))

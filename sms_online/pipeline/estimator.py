@@ -90,14 +90,17 @@ class Estimator(Stage):
         if distorted and self.sensing.missing and system.balance != "energy":
             found = f"{distorted[0].name}@{distorted[0].where}, and no {self.sensing.missing[0]}"
             raise InputError(source, "", found, 'balance = "energy", or all coordinates measured')
+        if system.wrenches and self._needs_smoother:
+            found = "a measured wrench, which the smoother does not use"
+            raise InputError(source, "", found, 'balance = "energy", or all coordinates measured fast enough')
         if not distorted and self._needs_smoother:
             self.smoother = Smoother(model, base, self.sensing, channels)
         self.channels = tuple(dict.fromkeys((*self.sensing.channels, *self._smoothed_channels)))
         self._columns = [channels.index(name) for name in self.channels]
         self._smoothed_columns = [self.channels.index(name) for name in self._smoothed_channels]
         self._identity = MarkerIdentity(model, self.sensing, self.channels)
-        # A torque may jump for one sample.
-        sensors = [k for k, name in enumerate(self.channels) if not name.startswith(("tau_", "force_"))]
+        # A torque may jump for one sample, and what pushes the arm.
+        sensors = [k for k, name in enumerate(self.channels) if not name.startswith(("tau_", "force_", "wrench_"))]
         self._outliers = Outliers(len(self.channels), sensors)
         self._attitude = AttitudeContinuity()
         self._synchroniser = Synchroniser(self.sensing.channels, system.sample_rate)
@@ -382,13 +385,13 @@ class Estimator(Stage):
             self._energy.begin_segment()
             self._joints.begin_segment()
         n_x = self.model.layout.n_x
-        x, torque = rates.values[:, :n_x], rates.values[:, n_x:]
+        x, inputs = rates.values[:, :n_x], rates.values[:, n_x:]
         v = self.model.layout.speeds(x, rates.rates[:, :n_x])
         if self.smoother is not None:
             self.smoother.move(rates.index, x, v)
         for observer in self.observers:
-            observer.motion(rates.index, rates.segment, x, v)
-        signals = np.concatenate((torque, self._followed.beside(rates)), axis=1)
+            observer.motion(rates.index, rates.segment, x, v, inputs)
+        signals = np.concatenate((inputs, self._followed.beside(rates)), axis=1)
         rows = self._energy.push(rates.index, x, v, signals, self._rates.sigma[n_x:])
         finite = np.isfinite(rows.Y).all(axis=1) & np.isfinite(rows.b)
         self.state.dropped_rows += int(np.sum(~finite))

@@ -38,7 +38,7 @@ def event_instant(
     """Grid index (with a fraction) at which parameters jumped; None where the samples do not reach far enough.
 
     jump (n_pi,): by how much. beta (n,): parameters before, of the windows' rows. windows: with those across the event.
-    index (B,), x (B, n_x), signals (B, joints + n_states): consecutive samples. between: grid indices that the event
+    index (B,), x (B, n_x), signals (B, n_signals): consecutive samples. between: grid indices that the event
     lies between.
 
     From the instant t_e on the equations of motion hold J = d/dt(P jump) - G jump more than before. Times φ and by

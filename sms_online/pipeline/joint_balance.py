@@ -72,7 +72,7 @@ class JointBalance(Stage):
         phi, phi_dot, _ = test_function(self.width, self.width / sample_rate, EXPONENT)
         self._phi, self._phi_dot = phi / sample_rate, phi_dot / sample_rate
         layout, n = model.layout, base.n
-        columns = layout.n_x + layout.n_v + len(layout.q) + model.n_states
+        columns = layout.n_x + layout.n_v + model.n_signals
         residuals = [SquaredResidual(np.zeros((n + 1, n + 1))) for _ in layout.q]
         self.state = JointState(np.empty((0, columns)), residuals)
 
@@ -83,7 +83,7 @@ class JointBalance(Stage):
     def push(self, index: NDArray[np.int64], x: Array, v: Array, signals: Array) -> list[tuple[BalanceRows, Array]]:
         """For each window that the samples complete, its rows, one a joint, and the torques (joints,) behind them.
 
-        signals (B, joints + n_states): n τ, then internal states of effects.
+        signals (B, n_signals): see `Model.inputs`.
         """
         samples = np.concatenate((self.state.samples, np.concatenate((x, v, signals), axis=1)))
         grid_end = int(index[-1])

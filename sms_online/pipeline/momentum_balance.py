@@ -146,15 +146,15 @@ class MomentumBalance(Stage):
     def begin_segment(self) -> None:
         """Forget the samples before a gap."""
         layout = self.model.layout
-        columns = COPIES * (layout.n_x + len(layout.q) + self.model.n_states)
+        columns = COPIES * (layout.n_x + self.model.n_signals)
         self.state = MomentumBalanceState(np.empty((0, columns)))
         self._standstill = Standstill(self._motors.size, self.sample_rate)
 
     def push(self, index: NDArray[np.int64], copies: list[Array], sigma: Array) -> tuple[list[Window], list[Instants]]:
         """Windows that B consecutive samples complete, and the states at their instants.
 
-        index (B,): grid index. copies: x, n τ and internal states of effects side by side (B, n_x + joints + n_states)
-        as measured, then with noise added and with the same subtracted. sigma (n_x,): noise of x, 1σ per sample.
+        index (B,): grid index. copies: x and signals side by side (B, n_x + n_signals) as measured, then with noise
+        added and with the same subtracted. sigma (n_x,): noise of x, 1σ per sample.
         """
         if self.state.skip is None:
             self.state.skip = -(int(index[0]) + self.lead) % self.hop if self._prompt else 0
@@ -229,7 +229,7 @@ class MomentumBalance(Stage):
         return out * self.sample_rate / (24.0 * self.half_hop)
 
     def _states(self, samples: Samples) -> tuple[Array, Array, Array]:
-        """x (copies, K, n_x), v (copies, K, n_v) and signals (copies, K, joints + n_states) at K samples.
+        """x (copies, K, n_x), v (copies, K, n_v) and signals (copies, K, n_signals) at K samples.
 
         samples: their numbers, K in all, and half width M of their filter.
         """

@@ -135,7 +135,7 @@ class MomentumFit(Stage):
         self.whitening = self._new_whitening()
         self._next: WindowWhitening | None = None  # with new weights; takes over when it has received enough windows
         layout = model.layout
-        widths = (layout.n_x, layout.n_v, len(layout.q) + model.n_states)
+        widths = (layout.n_x, layout.n_v, model.n_signals)
         x, v, signals = (np.empty((0, columns)) for columns in widths)
         self.state = MomentumFitState(x, v, signals)
         self._errors = RowErrors(layout.n_v)

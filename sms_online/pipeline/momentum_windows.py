@@ -33,7 +33,7 @@ COPIES = 3
 class Instants:
     """States at `number`, `number` + 1, …, in half hops since the segment began: x (K, n_x), v (K, n_v).
 
-    signals (K, joints + n_states): n τ, then internal states of effects.
+    signals (K, n_signals): n τ, measured wrenches, then internal states of effects.
     """
 
     number: int

@@ -15,8 +15,11 @@ class Observer:
     def samples(self, piece: GridSamples) -> None:
         """Grid samples of the channels that the model reads, as the synchroniser gives them."""
 
-    def motion(self, index: NDArray[np.int64], segment: int, x: Array, v: Array) -> None:
-        """Consecutive smoothed samples: grid index (B,), number of the segment, x (B, n_x), v (B, n_v)."""
+    def motion(self, index: NDArray[np.int64], segment: int, x: Array, v: Array, inputs: Array) -> None:
+        """Consecutive smoothed samples: grid index (B,), number of the segment, x (B, n_x), v (B, n_v).
+
+        inputs (B, inputs): n τ and measured wrenches.
+        """
 
     def block_through(self) -> None:
         """An internal block has passed all stages: the one moment at which effects may be adopted."""

@@ -2,7 +2,8 @@
 
 A row's error is linear in the noise n(t) of the positions: ∫ c(t) n(t) dt with
 c = φ̈ H + φ̇ (Ḣ + ∂Gπ/∂v - ∂Pπ/∂x) + φ (d/dt ∂Gπ/∂v - ∂Gπ/∂x), P π = H v the momentum and G π the force of the
-balance; and ∫ φ n_τ dt from the noise of the torque. White noise of 1σ per sample has the density σ² T_s. Rows of
+balance; ∫ φ n_τ dt from the noise of the torque; and ∫ φ Jᵀ n_w dt from that of a measured wrench, J in the middle
+of the window. White noise of 1σ per sample has the density σ² T_s. Rows of
 windows that overlap share noise, so their covariance is block-banded; see `whitening`.
 
 An unknown force, such as stiction at a standstill, is a common error of all windows that include it. It enters their
@@ -38,13 +39,14 @@ class RowNoiseState(State):
     """What is kept of the last windows.
 
     Of the last windows: kernel by time (·, n_v), density of torques (joints,), lateness by clock (n_v, clocks), and
-    deviation by unknown forces (INSTANTS, n_v).
+    deviation by unknown forces (INSTANTS, n_v). wrench (n_v, components): by white noise of measured wrenches.
     """
 
     before: list[Array] = msgspec.field(default_factory=list)
     torque: list[Array] = msgspec.field(default_factory=list)
     late: list[Array] = msgspec.field(default_factory=list)
     free: list[Array] = msgspec.field(default_factory=list)
+    wrench: list[Array] = msgspec.field(default_factory=list)
 
 
 class RowNoise(Stage):
@@ -100,14 +102,16 @@ class RowNoise(Stage):
         return np.asarray(self._step * np.einsum("wkvs,wks->wvs", weights, rates))
 
     def covariances(
-        self, kernels: Array, late: Array, sensor_density: Array, torque_density: Array, free: Array, ages: Array
-    ) -> list[list[Array]]:
+        self, kernels: Array, late: Array, sensor_density: Array, torque_density: Array, free: Array, ages: Array,
+        wrench: Array | None = None,
+    ) -> list[list[Array]]:  # fmt: skip
         """Covariances (n_v, n_v) of each of W windows in a row with those before, oldest first, then its own.
 
         In (N s)² and so on. kernels (W, STEPS + 1, n_v, sensors): c. late (W, n_v, sensors): `lateness`. sensor_density
         (sensors,): σ² T_s of each position sensor. torque_density (joints,): of n τ, (N m)² s. free (W, INSTANTS, n_v):
         deviation of what unknown forces add to each row in a half hop; no half hops where there are none in any window.
-        ages (W,): of the clocks at the windows' ends, s.
+        ages (W,): of the clocks at the windows' ends, s. wrench (W, n_v, components): generalized forces of unit
+        wrenches, times the root of their density.
         """
         W, _, n_v, sensors = kernels.shape
         now, past = self.state, len(self.state.before)
@@ -118,6 +122,8 @@ class RowNoise(Stage):
         error = np.where(ages >= CLOCK_KNOWN, CLOCK_ERROR, YOUNG_CLOCK_ERROR)
         by_clock = np.concatenate((*(each[None] for each in now.late), error[:, None, None] * self._by_clock(late)))
         unknown = np.concatenate((*(each[None] for each in now.free), free))
+        wrench = np.zeros((W, n_v, 0)) if wrench is None else wrench
+        pushed = np.concatenate((*(each[None] for each in now.wrench), wrench))
         out: list[list[Array]] = [[] for _ in range(W)]
         length = len(before[-1])
         for hops in range(min(HOPS, past + W) - 1, -1, -1):  # from each window to a later one
@@ -131,6 +137,8 @@ class RowNoise(Stage):
             if self._clocks:
                 # What windows share fades out where they no longer overlap, for the covariance to stay banded.
                 own += (1.0 - hops / HOPS) * (by_clock[later] @ by_clock[later - hops].swapaxes(1, 2))
+            if wrench.shape[2]:
+                own += self._overlap[hops] * (pushed[later] @ pushed[later - hops].swapaxes(1, 2))
             diagonal = np.einsum("wii->wi", own)
             if hops == 0:
                 diagonal += OWN_SHARE * diagonal
@@ -138,8 +146,8 @@ class RowNoise(Stage):
                 diagonal += common(unknown[later], unknown[later - hops], hops)
             for k, block in zip((later - past).tolist(), own, strict=True):
                 out[k].append(block)
-        now.before, now.torque, now.late, now.free = (
-            list(each[-(HOPS - 1) :]) for each in (before, torque, by_clock, unknown)
+        now.before, now.torque, now.late, now.free, now.wrench = (
+            list(each[-(HOPS - 1) :]) for each in (before, torque, by_clock, unknown, pushed)
         )
         return out
 

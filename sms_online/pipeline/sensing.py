@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from sms_online.description.bodies import FlexibleLink
-from sms_online.description.channels import point_channels, sensed_channels, strain_channel
+from sms_online.description.channels import point_channels, sensed_channels, strain_channel, wrench_channels
 from sms_online.description.explain import hint, nearest
 from sms_online.description.schema import System
 from sms_online.errors import InputError
@@ -116,6 +116,7 @@ class Sensing:
             ]
         )
         self._driven = [i - 1 for i in driven]
+        self._wrenches = [need(name) for name in wrench_channels(model.system)]
         self.channels = tuple(channels)
         self.unused = tuple(name for name in available if name not in channels)
 
@@ -126,7 +127,7 @@ class Sensing:
 
     @property
     def noise(self) -> Array:
-        """Stated white noise, 1σ per sample, of positions and joint torques (n_x + joints,); NaN where none is stated.
+        """Stated white noise, 1σ per sample, of positions and inputs (n_x + inputs,); NaN where none is stated.
 
         Strain coefficients of exact links mix several markers, and so do static shapes: nothing is stated of them.
         """
@@ -141,11 +142,11 @@ class Sensing:
             shape, columns = self._links[i]
             own = isinstance(kinematics, LinearLink) and shape.complete
             markers.append(stated[columns] if own else np.full(kinematics.n_f, np.nan))
-        joints = self._by_joint(stated[self.torque_columns])
+        inputs = self.inputs(stated[None])[0]
         q = stated[self._q]
         for joint, motor in self._beyond:
             q[joint] = np.hypot(q[joint], stated[self._theta_m[motor]])
-        return np.concatenate((stated[self._base], q, stated[self._theta_m], *markers, joints))
+        return np.concatenate((stated[self._base], q, stated[self._theta_m], *markers, inputs))
 
     @property
     def deciding(self) -> tuple[list[int], Array]:
@@ -259,12 +260,16 @@ class Sensing:
         return x
 
     def motion(self, values: Array) -> Array:
-        """x, n τ and internal states side by side (B, n_x + joints + n_states) of samples (B, channels + n_states)."""
+        """x and signals side by side (B, n_x + n_signals) of samples (B, channels + n_states)."""
         return np.concatenate((self.coordinates(values), self.signals(values)), axis=1)
 
     def joint_torque(self, values: Array) -> Array:
         """Torque after the gear n τ (B, joints), N m (N)."""
         return self._by_joint(values[:, self.torque_columns])
+
+    def inputs(self, values: Array) -> Array:
+        """n τ and measured wrenches (B, inputs)."""
+        return np.concatenate((self.joint_torque(values), values[:, self._wrenches]), axis=1)
 
     def _by_joint(self, drives: Array) -> Array:
         """n τ (..., joints) of the drives' readings (..., drives)."""
@@ -276,8 +281,8 @@ class Sensing:
         return out
 
     def signals(self, values: Array) -> Array:
-        """n τ (B, joints), and what samples (B, channels + n_states) hold beyond the channels."""
-        return np.concatenate((self.joint_torque(values), values[:, len(self.channels) :]), axis=1)
+        """Measured inputs (B, inputs), and what samples (B, channels + n_states) hold beyond the channels."""
+        return np.concatenate((self.inputs(values), values[:, len(self.channels) :]), axis=1)
 
 
 class AttitudeState(State):

@@ -99,7 +99,7 @@ class Sensitivities(Stage):
         return self.state.first + len(self.state.dense)
 
     def extend(self, pi: Array, x: Array, v: Array, signals: Array) -> Array:
-        """Take the next instants: x (K, n_x), v (K, n_v), signals (K, joints + n_states), with parameters π.
+        """Take the next instants: x (K, n_x), v (K, n_v), signals (K, n_signals), with parameters π.
 
         What geometries change momentum and force by there (2, K, n_v, c).
         """

@@ -26,13 +26,13 @@ ROUGHLY_EXACT = 100.0
 
 @dataclass(frozen=True)
 class SensorNoise:
-    """Noise of position sensors and joint torques.
+    """Noise of position sensors and measured inputs.
 
-    sensors (n_x,), torque (joints,): densities σ² T_s of each position sensor, in the order of the coordinates, and of
-    n τ. coordinates (n_x,): 1σ of the coordinates x a grid sample, had they white noise of those densities, and what
-    taking lags off adds. grid (n_x + drives,): the same of the readings of position sensors and of torques. exact:
-    positions have none, but for rounding. coloured: correlation time, s, of channels whose noise is not white; their
-    density is that in the pass band of the windows.
+    sensors (n_x,), torque (inputs,): densities σ² T_s of each position sensor, in the order of the coordinates, of n τ
+    and of measured wrenches. coordinates (n_x,): 1σ of the coordinates x a grid sample, had they white noise of those
+    densities, and what taking lags off adds. grid (n_x + drives,): the same of the readings of position sensors and of
+    torques. exact: positions have none, but for rounding. coloured: correlation time, s, of channels whose noise is not
+    white; their density is that in the pass band of the windows.
     """
 
     sensors: Array
@@ -123,9 +123,9 @@ class NoiseEstimate(Stage):
                 density[k] *= density_gain(a, self._pass_band * period[k])
                 coloured[self._sensing.channels[k]] = -float(period[k] / np.log(a))
         sensors = density[positions]
-        torque = self._sensing.joint_torque(np.sqrt(density)[None])[0] ** 2
+        inputs = self._sensing.inputs(np.sqrt(density)[None])[0] ** 2
         columns = [*positions, *self._sensing.torque_columns]
         gains = noise_gains(self._sensing.model.system, self._sensing.channels)
         grid = (gains * np.sqrt(density * self._sample_rate))[columns]
         coordinates = self._sensing.coordinate_noise(grid[: len(positions)])
-        return SensorNoise(sensors, torque, coordinates, grid, exact, coloured)
+        return SensorNoise(sensors, inputs, coordinates, grid, exact, coloured)

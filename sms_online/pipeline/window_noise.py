@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
+import msgspec
 import numpy as np
 
 from sms_online.calibration.columns import CalibrationColumns
@@ -42,11 +43,14 @@ class PropagatedNoise:
 class WindowNoiseState(State):
     """What the propagation of noise began with.
 
-    beta (n,): β, None before it has begun. sensor_noise: that of then.
+    beta (n,): β, None before it has begun. sensor_noise: that of then. pushes (K, n_v, components): generalized forces
+    of unit wrenches, where any are measured, at the instants from number `first` on.
     """
 
     beta: Array | None = None
     sensor_noise: SensorNoise | None = None
+    pushes: list[Array] = msgspec.field(default_factory=list)
+    first: int = 0
 
 
 class WindowNoise(Stage):
@@ -66,7 +70,8 @@ class WindowNoise(Stage):
         calibration: CalibrationColumns | None = None,
     ) -> None:
         self.n_v = model.layout.n_v
-        self._base, self._rough = base, balance.rough
+        self._base, self._rough, self._wrenches = base, balance.rough, model.wrenches
+        self._joints = len(model.layout.q)
         self._sample_rate = balance.sample_rate
         geometries = () if calibration is None else calibration.geometries
         self._sensitivities = Sensitivities(model, readings, balance.span / INSTANTS, geometries)
@@ -86,6 +91,7 @@ class WindowNoise(Stage):
         if self._calibration is not None:
             self._calibration.forget(instant)
         self._noise.begin_segment()
+        self.state.pushes, self.state.first = [], instant
 
     @property
     def beta(self) -> Array | None:
@@ -105,6 +111,8 @@ class WindowNoise(Stage):
         x, v, signals = x[fresh:], v[fresh:], signals[fresh:]
         if not len(x):
             return
+        if self._wrenches is not None:
+            self.state.pushes = [*self.state.pushes, *self._wrenches.by_component(x)]
         by_geometry = self._sensitivities.extend(pi, x, v, signals)
         if self._calibration is not None:
             self._calibration.extend(x, signals, self._sensitivities.rates(len(x)), by_geometry)
@@ -112,6 +120,8 @@ class WindowNoise(Stage):
     def drop(self, instant: int) -> None:
         """Forget what no window that starts at an instant or later needs."""
         self._sensitivities.drop(instant)
+        if self._wrenches is not None:
+            self.state.pushes, self.state.first = self.state.pushes[instant - self.state.first :], instant
         if self._calibration is not None:
             self._calibration.drop(instant)
 
@@ -136,7 +146,12 @@ class WindowNoise(Stage):
         kernels = self._noise.kernels(sensitivity) + rough
         free = self._rough.at_rest(np.array([window.rest for window in windows]), pi)
         late = self._noise.lateness(kernels, sensitivity.rates)
-        covariances = self._noise.covariances(kernels, late, noise.sensors, noise.torque, free, ages)
+        wrench = None
+        if self._wrenches is not None:
+            middles = starts + INSTANTS // 2 - self.state.first
+            wrench = np.array([self.state.pushes[k] for k in middles]) * np.sqrt(noise.torque[self._joints :])
+        torque = noise.torque[: self._joints]
+        covariances = self._noise.covariances(kernels, late, noise.sensors, torque, free, ages, wrench)
         for each, own in zip(covariances, errors, strict=True):
             diagonal = np.einsum("ii->i", each[-1])
             diagonal += own
