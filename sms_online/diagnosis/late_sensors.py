@@ -22,7 +22,7 @@ from sms_online.diagnosis.rough_fit import HOPS as ROUGH_HOPS
 from sms_online.diagnosis.rough_fit import RoughRows
 from sms_online.diagnosis.rows import SessionRows
 from sms_online.effects.catalogue import lag_places
-from sms_online.effects.delay import HELD, LONGEST_FOUND, SensorLag, delay_of, lag, late_keys
+from sms_online.effects.delay import HELD, LONGEST_FOUND, delay_of, lag, lagging, late_keys
 from sms_online.stream import Array
 
 # Corners that are tried first, Hz, from that of the longest delay to that of 3 ms; rows of a stiff spring show no more
@@ -88,7 +88,7 @@ class Lags:
             where: {name for name in readings if fnmatchcase(name, where)}
             for where in lag_places(self._rows.model.system)
         }
-        lags = [effect.where for effect in self._rows.model.system.effects if effect.name == SensorLag.entry.name]
+        lags = lagging(self._rows.model.system.effects)
         late = {name for name in readings if any(fnmatchcase(name, where) for where in lags)}
         own = {where: names for where, names in matching.items() if names and not names & late}
         return {

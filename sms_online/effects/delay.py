@@ -43,6 +43,11 @@ def lag(where: str, corner: float) -> Effect:
     return Effect(name=SensorLag.entry.name, where=where, coefficients={"corner": corner})
 
 
+def lagging(effects: Iterable[Effect]) -> list[str]:
+    """Channels, or patterns of channels, that are declared to lag."""
+    return [effect.where for effect in effects if effect.name == SensorLag.entry.name]
+
+
 def late_keys(joints: Iterable[int], channels: Iterable[str]) -> list[str]:
     """Effects, name@where, by which torques of joints (from 1) and then channels of positions come late."""
     keys = [f"{TorqueDelay.entry.name}@joint_{joint}" for joint in joints]
