@@ -143,6 +143,7 @@ def asked() -> Request:
     return requests[0]
 
 
+@pytest.mark.slow
 def test_a_search_in_another_process_says_what_it_says_here(tmp_path: Path) -> None:
     searches = SearchProcess(tmp_path, adopt=True)
     assert searches.submit(3, asked())
