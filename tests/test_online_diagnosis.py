@@ -10,7 +10,8 @@ import pytest
 
 from sms_adapters.system_file import load_system
 from sms_online.description.schema import Effect, System
-from sms_online.diagnosis.online import Immediate, OnlineDiagnosis, refusal
+from sms_online.diagnosis.online import OnlineDiagnosis, refusal
+from sms_online.diagnosis.online_search import Immediate
 from sms_online.effects.build import build_model
 from sms_online.model.base_parameters import find_base_parameters
 from sms_online.pipeline.estimator import Estimator
