@@ -122,6 +122,7 @@ def test_an_effect_from_the_start_is_named_and_leaves_no_bias() -> None:
         assert found[name][0] == pytest.approx(true, abs=4.0 * found[name][1])
 
 
+@pytest.mark.slow
 def test_the_evidence_grows_with_the_samples() -> None:
     _, online = cogged(True)
     episode = online.document()[0]
@@ -132,6 +133,7 @@ def test_the_evidence_grows_with_the_samples() -> None:
     assert episode["effects"][0]["evidence"]["gain"] > episode["effects"][0]["evidence"]["limit"]
 
 
+@pytest.mark.slow
 def test_a_session_without_anything_missing_says_nothing() -> None:
     estimator, online = watched(SYSTEM, axis_block(nothing))
     assert online.document() == []

@@ -109,6 +109,7 @@ def test_a_static_shape_is_found_from_points_to_a_hundredth() -> None:
     assert_allclose(found, x, atol=0.01 * np.abs(x[0, 7:]).max())
 
 
+@pytest.mark.slow
 def test_one_link_is_identified_from_points_alone() -> None:
     system = marked_bench()
     simulation = simulate(system)
