@@ -7,9 +7,8 @@ import pytest
 from numpy.testing import assert_allclose
 
 from sms_adapters.system_file import load_system
-from sms_online.description.bodies import FlexibleLink
+from sms_online.description.bodies import FlexibleLink, Marker
 from sms_online.description.channels import channels
-from sms_online.description.markers import Marker
 from sms_online.description.schema import System
 from sms_online.effects.build import build_model
 from sms_online.errors import InputError
