@@ -27,6 +27,7 @@ HEADINGS: dict[type[Record], str] = {
     bodies.RigidBody: "`[payload]`",
     bodies.Inertia: "Inertias",
     schema.Sensor: "`[[sensor]]`",
+    schema.Wrench: "`[[wrench]]`",
     schema.Effect: "`[[effect]]`",
     schema.Prior: "`[prior]`",
     schema.Fitted: "`[fitted]`",
