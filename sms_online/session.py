@@ -18,7 +18,8 @@ from sms_online.cramer_rao import MotionRecord, session_bound
 from sms_online.description.channels import channels as known_channels
 from sms_online.description.given import Given, given_system
 from sms_online.description.schema import System, TrackerChoice
-from sms_online.diagnosis.online import Immediate, OnlineDiagnosis, Searcher
+from sms_online.diagnosis.online import OnlineDiagnosis
+from sms_online.diagnosis.searcher import Searcher
 from sms_online.errors import InputError
 from sms_online.evaluation import Evaluation
 from sms_online.history import Recorder
@@ -81,7 +82,12 @@ class Session:
         if checkpoint is not None:
             checkpoint.put_into(self.estimator)
             checkpoint.put_into_history(self.recorder)
-        self.diagnosis = OnlineDiagnosis(self.estimator, Immediate() if searcher is None else searcher, adopt)
+        if searcher is None:
+            # A live session has its searches made by another process, and does not import them.
+            from sms_online.diagnosis.online_search import Immediate
+
+            searcher = Immediate()
+        self.diagnosis = OnlineDiagnosis(self.estimator, searcher, adopt)
         self.busy = 0.0  # s of computing
         self._begun = {"channels": self.channels, "prior": prior, "adopt": adopt, "source": source}
         self._source = source
@@ -208,14 +214,14 @@ class Recorded:
     """A recorded session: its samples, a name for messages, and what was recorded with them.
 
     truth: of a simulation. checkpoint: what the session resumed from. searcher: of its diagnosis, from whether effects
-    are adopted. trackers: those that were asked for in place of the system file's, none where nothing was.
+    are adopted; None for the session's own. trackers: those that were asked for in place of the system file's, if any.
     """
 
     source: Source
     name: str
     truth: Mapping[str, Any] | None = None
     checkpoint: Checkpoint | None = None
-    searcher: Callable[[bool], Searcher] = lambda adopt: Immediate()
+    searcher: Callable[[bool], Searcher | None] = lambda adopt: None
     trackers: tuple[TrackerChoice, ...] = ()
 
 

@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from sms_adapters.system_file import load_system
-from sms_online.description.bodies import FlexibleLink
-from sms_online.description.markers import Marker
+from sms_online.description.bodies import FlexibleLink, Marker
 from sms_online.description.parse import parse_system
 from sms_online.description.schema import Sensor, System, Tolerances
 from sms_online.stream import Array

@@ -138,6 +138,7 @@ def test_replay_in_step_with_the_clock_changes_no_bit(bench: Path) -> None:
     assert document(bench / "fast")["parameters"] == document(bench / "paced")["parameters"]
 
 
+@pytest.mark.slow
 def test_channels_that_the_model_does_not_use_are_named(bench: Path) -> None:
     (bench / "free.toml").write_text(AXIS + "[spacecraft]\nmass = 5.0\ninertia = { zz = 1.0 }\n")
     header, *lines = capture_lines(2.0)
@@ -242,6 +243,7 @@ def test_a_combination_has_a_prior_when_all_of_it_has() -> None:
     assert prior.value[k] == 403.0
 
 
+@pytest.mark.slow
 def test_a_prior_decides_what_the_motion_does_not(bench: Path) -> None:
     # At constant speed friction alone takes work; the kinetic energy never changes.
     rows = [f"{k / 200},{DAMPING * 0.5},{0.5 * k / 200}" for k in range(1200)]

@@ -18,7 +18,7 @@ from sms_sim.plant import Plant
 from sms_sim.references import fourier_reference
 from sms_sim.simulate import exact_states, simulate
 from sms_tools.cli import main
-from sms_tools.trajectory_file import reference_lines, with_trajectory
+from sms_tools.verbs.excite import reference_lines, with_trajectory
 from tests.axis import AXIS, MOTION
 
 MOVED = (AXIS + MOTION).replace("duration = 6.0", "duration = 3.0")

@@ -85,6 +85,7 @@ def test_cuts_and_checkpoints_leave_no_trace(
         np.testing.assert_array_equal(here.upper, there.upper)
 
 
+@pytest.mark.slow
 def test_a_long_session_keeps_a_bounded_number_of_instants(
     system: sms.System, block: Block, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -96,6 +97,7 @@ def test_a_long_session_keeps_a_bounded_number_of_instants(
     assert whole.t[-1] == block.t[-1]
 
 
+@pytest.mark.slow
 def test_more_parameters_keep_fewer_instants(system: sms.System, block: Block, monkeypatch: pytest.MonkeyPatch) -> None:
     """Two trackers of two parameters are ten numbers an instant."""
     monkeypatch.setattr(history_module, "MOST_NUMBERS", 100)

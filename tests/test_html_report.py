@@ -122,6 +122,7 @@ def test_the_same_session_gives_the_same_page(page: str, planar_block: Block, tm
     assert report_of(*watched(planar_block), tmp_path, throughput=2000.0) == page
 
 
+@pytest.mark.slow
 def test_matplotlib_waits_for_the_first_page() -> None:
     modules = "sms_tools.showing", "sms_tools.verbs.replay", "sms_tools.verbs.diagnose"
     code = f"import sys, {', '.join(modules)}; sys.exit(any(name in sys.modules for name in ('matplotlib', 'jinja2')))"
@@ -176,6 +177,7 @@ def test_every_estimate_is_within_the_window(page: str, tmp_path: Path, width: i
         assert box["x"] + box["width"] <= width
 
 
+@pytest.mark.slow
 def test_a_course_of_a_long_session_is_thinned_evenly(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(course_module, "MOST_INSTANTS", 20)
     block = axis_block(coulomb=0.0)

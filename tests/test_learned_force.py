@@ -157,6 +157,7 @@ def test_the_system_file_holds_the_curve(tmp_path: Path) -> None:
     assert_allclose(again.values[:, 0], true.values[:, 0], atol=0.02 * np.abs(true.values[:, 0]).max())
 
 
+@pytest.mark.slow
 def test_beyond_what_it_saw_the_curve_is_held_and_said(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
     found = learned(HARDENING).system
     model = build_model(found)

@@ -16,8 +16,9 @@ from sms_adapters.capture import CaptureWriter
 from sms_adapters.searches import NAME, Repeated, searcher_of
 from sms_adapters.sources import open_source
 from sms_adapters.system_file import load_system
-from sms_online.diagnosis.online import Immediate, OnlineDiagnosis, Searcher
-from sms_online.diagnosis.online_search import Outcome, Request, search
+from sms_online.diagnosis.online import OnlineDiagnosis
+from sms_online.diagnosis.online_search import Immediate, search
+from sms_online.diagnosis.searcher import Outcome, Request, Searcher
 from sms_online.errors import InputError
 from sms_online.pipeline.estimator import Estimator
 from sms_online.pipeline.momentum_windows import HOPS
@@ -143,6 +144,7 @@ def asked() -> Request:
     return requests[0]
 
 
+@pytest.mark.slow
 def test_a_search_in_another_process_says_what_it_says_here(tmp_path: Path) -> None:
     searches = SearchProcess(tmp_path, adopt=True)
     assert searches.submit(3, asked())
@@ -195,10 +197,10 @@ def test_a_search_overtaken_by_the_sessions_end_never_answers(tmp_path: Path) ->
 
 
 def test_searches_are_repeated_only_under_the_same_conditions(tmp_path: Path) -> None:
-    assert isinstance(searcher_of(tmp_path, adopt=True), Immediate)
+    assert searcher_of(tmp_path, adopt=True) is None
     (tmp_path / NAME).write_text('{"adopt": true}\n{"search": 1, "block": 9}\n{"search": 2, "bl')
     assert isinstance(searcher_of(tmp_path, adopt=True), Repeated)
-    assert isinstance(searcher_of(tmp_path, adopt=False), Immediate)
+    assert searcher_of(tmp_path, adopt=False) is None
     (tmp_path / NAME).write_text('{"adopt": true}\n{"search": "first"}\n')
     with pytest.raises(InputError, match=NAME):
         searcher_of(tmp_path, adopt=True)

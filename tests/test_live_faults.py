@@ -246,6 +246,7 @@ def test_each_fault_of_an_encoder_that_prints_lines(tmp_path: Path, fault: Calla
     check(s, tmp_path, LINE_FAULTS[fault])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("sources", "further"), [(SOURCES, (half_frames,)), (LINES, (not_text, half_frames))], ids=["frames", "lines"]
 )

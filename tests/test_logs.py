@@ -192,6 +192,7 @@ def test_messages_that_overtake_are_put_in_order(capture: sms.Capture, bagged: s
     np.testing.assert_array_equal(read.values[:, order], capture.values)
 
 
+@pytest.mark.slow
 def test_a_recorders_stamps_serve_where_asked(capture: sms.Capture, bagged: sms.System, tmp_path: Path) -> None:
     path = write_json_mcap(capture, tmp_path / "run.mcap", stamped=False)
     assert np.array_equal(sms.read_capture(path, bagged).t, capture.t)  # there are no others

@@ -96,6 +96,7 @@ def test_a_mistake_is_named_and_nothing_else(change: Change, key: str, words: st
     np.testing.assert_allclose(corrected.samples(block.channels, block.values), session().values, rtol=1e-9)
 
 
+@pytest.mark.slow
 def test_a_wrong_gear_is_corrected_in_the_system() -> None:
     corrected = found(times(1.6, "tau_2"))
     assert [mistake.key for mistake in corrected.mistakes] == ["gear_ratio@joint_2"]

@@ -10,7 +10,7 @@ from numpy.testing import assert_allclose
 
 from sms_adapters.motion_capture import import_points
 from sms_adapters.sources import open_source
-from sms_online.description.markers import Marker
+from sms_online.description.bodies import Marker
 from sms_online.description.schema import System
 from sms_online.errors import InputError
 from sms_online.stream import Array

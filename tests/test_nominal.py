@@ -81,6 +81,7 @@ def test_a_wrong_unit_of_everything_is_named(
     assert "unit" in trust.next_step
 
 
+@pytest.mark.slow
 def test_a_wrong_gear_is_never_green(capture: sms.Capture) -> None:
     """Ten for a hundred: a tenth of all torques, and of the rotor's inertia a hundredth of the gear's square."""
     system = sms.load_system({**RIG, "joint_1": {**RIG["joint_1"], "gear_ratio": 10.0}})

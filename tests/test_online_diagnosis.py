@@ -10,7 +10,8 @@ import pytest
 
 from sms_adapters.system_file import load_system
 from sms_online.description.schema import Effect, System
-from sms_online.diagnosis.online import Immediate, OnlineDiagnosis, refusal
+from sms_online.diagnosis.online import OnlineDiagnosis, refusal
+from sms_online.diagnosis.online_search import Immediate
 from sms_online.effects.build import build_model
 from sms_online.model.base_parameters import find_base_parameters
 from sms_online.pipeline.estimator import Estimator
@@ -121,6 +122,7 @@ def test_an_effect_from_the_start_is_named_and_leaves_no_bias() -> None:
         assert found[name][0] == pytest.approx(true, abs=4.0 * found[name][1])
 
 
+@pytest.mark.slow
 def test_the_evidence_grows_with_the_samples() -> None:
     _, online = cogged(True)
     episode = online.document()[0]
@@ -131,6 +133,7 @@ def test_the_evidence_grows_with_the_samples() -> None:
     assert episode["effects"][0]["evidence"]["gain"] > episode["effects"][0]["evidence"]["limit"]
 
 
+@pytest.mark.slow
 def test_a_session_without_anything_missing_says_nothing() -> None:
     estimator, online = watched(SYSTEM, axis_block(nothing))
     assert online.document() == []

@@ -12,6 +12,7 @@ from tests.axis import AXIS, axis_block
 FRICTION = 0.05
 
 
+@pytest.mark.slow
 def test_an_interrupted_search_reports_what_it_found() -> None:
     block = axis_block(coulomb=FRICTION)
     values = dict(zip(block.channels, block.values.T, strict=True))

@@ -7,9 +7,8 @@ import pytest
 from numpy.testing import assert_allclose
 
 from sms_adapters.system_file import load_system
-from sms_online.description.bodies import FlexibleLink
+from sms_online.description.bodies import FlexibleLink, Marker
 from sms_online.description.channels import channels
-from sms_online.description.markers import Marker
 from sms_online.description.schema import System
 from sms_online.effects.build import build_model
 from sms_online.errors import InputError
@@ -109,6 +108,7 @@ def test_a_static_shape_is_found_from_points_to_a_hundredth() -> None:
     assert_allclose(found, x, atol=0.01 * np.abs(x[0, 7:]).max())
 
 
+@pytest.mark.slow
 def test_one_link_is_identified_from_points_alone() -> None:
     system = marked_bench()
     simulation = simulate(system)

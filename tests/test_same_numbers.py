@@ -18,9 +18,9 @@ ELSEWHERE = 1e-3
 
 
 # Those that search for effects or add them take longer.
-MARKS = {"gap": pytest.mark.long, "axis-adopted": pytest.mark.long, "axis-event": pytest.mark.long} | {
-    "axis-undescribed": pytest.mark.slow
-}
+MARKS = {"gap": pytest.mark.long, "axis-adopted": pytest.mark.long, "axis-event": pytest.mark.long} | dict.fromkeys(
+    ("axis-undescribed", "smoother", "quanser-2dsfl"), pytest.mark.slow
+)
 
 
 @pytest.mark.parametrize("name", [pytest.param(name, marks=MARKS.get(name, ())) for name in QUICK])

@@ -76,6 +76,7 @@ def test_the_verb_takes_several_captures(rig: Path, tmp_path: Path) -> None:
     assert not any("gap" in warning for warning in document["warnings"])
 
 
+@pytest.mark.slow
 def test_captures_of_other_channels_are_refused(rig: Path) -> None:
     b = sms.read_capture(rig / "b.csv")
     fewer = sms.Capture(b.t, b.channels[:-1], b.values[:, :-1], "fewer")

@@ -76,6 +76,7 @@ def test_an_absent_viewer_is_one_line(capsys: pytest.CaptureFixture[str]) -> Non
     assert f"no viewer at rerun+http://127.0.0.1:{port}/proxy" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_a_served_view_stays_until_it_is_interrupted() -> None:
     command = [sys.executable, "-m", "sms_tools", "show", "--system", "emps", "--rerun", "serve"]
     with subprocess.Popen(command, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, text=True) as process:

@@ -61,6 +61,7 @@ def test_a_slow_sensor_has_lost_nothing_and_no_outliers() -> None:
     assert not any("lost" in ground.text for ground in evaluated(found).trust.grounds)
 
 
+@pytest.mark.slow
 def test_a_stated_slow_rate_is_left_to_the_smoother() -> None:
     found = estimator(10.0, 2.0)
     assert found.momentum is None

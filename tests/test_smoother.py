@@ -206,6 +206,7 @@ def test_exact_links_and_one_marker_alone_are_enough() -> None:
     assert np.all(np.abs(normalised(estimator)) < 4.0)
 
 
+@pytest.mark.slow
 def test_full_measurements_are_smoothed_only_on_request(simulation: Simulation) -> None:
     sensors = (*simulation.plant.system.sensors, Sensor(channels=("link_1.marker_*.theta_z",), noise=1e-4))
     system = simulation.plant.system.model_copy(update={"sensors": sensors})
@@ -231,6 +232,7 @@ def test_declared_effects_on_channels_exclude_the_smoother() -> None:
         Estimator(system, fewer, "test")
 
 
+@pytest.mark.slow
 def test_replay_of_a_capture_without_slopes(
     simulation: Simulation, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

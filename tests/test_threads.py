@@ -14,7 +14,8 @@ from threadpoolctl import threadpool_info, threadpool_limits
 
 from sms_adapters.system_file import load_system
 from sms_online.diagnosis import online_search
-from sms_online.diagnosis.online import Immediate, OnlineDiagnosis
+from sms_online.diagnosis.online import OnlineDiagnosis
+from sms_online.diagnosis.online_search import Immediate
 from sms_online.pipeline.estimator import Estimator
 from sms_online.pipeline.observer import Observer
 from sms_online.threads import one_blas_thread

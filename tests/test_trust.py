@@ -232,12 +232,14 @@ def test_a_session_goes_from_too_early_to_trust() -> None:
     assert levels == ["not yet", "not yet", "trust"]
 
 
+@pytest.mark.slow
 def test_a_model_without_friction_is_doubted_where_it_acts() -> None:
     judgement = judged(session(0.2, 12.0))
     assert judgement.grave
     assert [*judgement.marks] == ["joint_1"]
 
 
+@pytest.mark.slow
 def test_results_hold_the_judgement_and_warn_of_the_reasons() -> None:
     estimator = session(0.2, 12.0)
     estimator.finish()

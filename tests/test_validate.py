@@ -40,6 +40,7 @@ def test_a_stiffness_that_is_off_does_not_hold(rig: Path) -> None:
     assert "do not hold" in found.sentence
 
 
+@pytest.mark.slow
 def test_the_verb_takes_the_folder_of_a_run(rig: Path, capsys: pytest.CaptureFixture[str]) -> None:
     run, out = rig / "run", rig / "out"
     assert main(["replay", str(rig / "monday.csv"), "--system", str(rig / "rig.toml"), "--out", str(run)]) == 0

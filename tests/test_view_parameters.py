@@ -18,12 +18,11 @@ from sms_online.pipeline.events import Event
 from sms_online.pipeline.joint_balance import SquaredResidual
 from sms_tools.view.frames import Reference
 from sms_tools.view.known import Known
-from sms_tools.view.number_log import NumberLog
+from sms_tools.view.number_log import NumberLog, markdown_table
 from sms_tools.view.own_scale import LEAST_REST, OwnScale
 from sms_tools.view.parameter_groups import MOST_LINES, Basis, parameter_groups, shortened
 from sms_tools.view.residuals import RecentResidual
 from sms_tools.view.style import BAD, GOOD, residual_colors
-from sms_tools.view.table import markdown_table
 from tests.recordings import columns
 
 

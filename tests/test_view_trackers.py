@@ -38,6 +38,7 @@ def drawn(folder: Path, entity: str) -> np.ndarray:
     return scalars(folder / "session.rrd", entity)[1]
 
 
+@pytest.mark.slow
 def test_each_tracker_has_a_curve_with_its_band(folder: Path) -> None:
     document = json.loads((folder / "results.json").read_text(encoding="utf-8"))
     for label, tracker in zip(LABELS, document["trackers"], strict=True):
@@ -48,6 +49,7 @@ def test_each_tracker_has_a_curve_with_its_band(folder: Path) -> None:
         assert above - below == pytest.approx(2.0 * BOUNDS * inertia["std"])
 
 
+@pytest.mark.slow
 def test_curves_of_one_tracker_have_one_colour(folder: Path) -> None:
     colors: dict[str, set[int]] = {label: set() for label in LABELS}
     for label, name in product(LABELS, PARAMETERS):
@@ -57,6 +59,7 @@ def test_curves_of_one_tracker_have_one_colour(folder: Path) -> None:
     assert colors[LABELS[0]] != colors[LABELS[1]]
 
 
+@pytest.mark.slow
 def test_health_has_innovations_with_their_band_and_memory(folder: Path) -> None:
     document = json.loads((folder / "results.json").read_text(encoding="utf-8"))
     for label, tracker in zip(LABELS, document["trackers"], strict=True):

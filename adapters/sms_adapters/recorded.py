@@ -17,7 +17,6 @@ from sms_adapters.sources import open_source
 from sms_adapters.truth import read_truth, write_truth
 from sms_online.capture import Capture
 from sms_online.description.given import Given, given_system
-from sms_online.diagnosis.online import Immediate
 from sms_online.errors import InputError
 from sms_online.session import Recorded
 from sms_online.stream import Source
@@ -30,7 +29,7 @@ def recorded_at(path: Path, source: Source, whole: bool = True) -> Recorded:
         str(path),
         truth_beside(path),
         resumed_from(path),
-        partial(searcher_of, path) if whole else lambda adopt: Immediate(),
+        partial(searcher_of, path) if whole else lambda adopt: None,
         read_header(path)[0].trackers if path.is_dir() and (path / SESSION).is_file() else (),
     )
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
-from sms_online.diagnosis.online import Immediate, Searcher
-from sms_online.diagnosis.online_search import Outcome, Request, search
+from sms_online.diagnosis.online_search import search
+from sms_online.diagnosis.searcher import Outcome, Request, Searcher
 from sms_online.errors import InputError
 
 NAME = "searches.jsonl"
@@ -42,15 +42,15 @@ class Repeated:
         return done
 
 
-def searcher_of(capture: Path, adopt: bool) -> Searcher:
-    """Who searches while a capture is replayed.
+def searcher_of(capture: Path, adopt: bool) -> Searcher | None:
+    """Who searches while a capture is replayed; None for a session's own searches, whose answers are used at once.
 
-    Of a recording that was made with the same `adopt`, searches are used when they were then; else at once. Raises
-    InputError where the recording's searches are no such document.
+    Of a recording that was made with the same `adopt`, answers are used when they were then. Raises InputError where
+    the recording's searches are no such document.
     """
     path = capture / NAME
     if not path.is_file():
-        return Immediate()
+        return None
     try:
         # A session that was killed may have left half a line.
         whole = [line for line in path.read_text(encoding="utf-8").splitlines(keepends=True) if line.endswith("\n")]
@@ -60,4 +60,4 @@ def searcher_of(capture: Path, adopt: bool) -> Searcher:
         same = bool(first["adopt"]) == adopt
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise InputError(str(path), "", f"{type(error).__name__}: {error}", "searches as `live` writes them") from None
-    return Repeated(used, lost, begun) if same else Immediate()
+    return Repeated(used, lost, begun) if same else None

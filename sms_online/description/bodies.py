@@ -6,7 +6,6 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
-from sms_online.description.markers import Marker
 from sms_online.description.record import NonNegative, Positive, Record
 
 Vector3 = tuple[float, float, float]
@@ -26,6 +25,18 @@ class Inertia(Record):
     xy: float = 0.0
     xz: float = 0.0
     yz: float = 0.0
+
+
+class Marker(Record):
+    """A marker that cameras see as a point.
+
+    name: what it is called elsewhere, in a file of a motion capture for instance.
+    position: in the frame {i} of the undeformed link, m. On a flexible link x is its station along the link, y and z
+    are its offset from the neutral axis, which turns with the section there.
+    """
+
+    name: str = ""
+    position: Vector3
 
 
 class RigidBody(Record):

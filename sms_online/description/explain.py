@@ -10,7 +10,7 @@ from pydantic import BaseModel, ValidationError
 from pydantic_core import ErrorDetails
 
 from sms_online.description import bodies, schema, sources
-from sms_online.description.markers import Marker
+from sms_online.description.bodies import Marker
 from sms_online.errors import InputError
 
 # Fields of `System` that are numbered tables, or lists of tables, in the file.

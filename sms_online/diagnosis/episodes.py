@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Any
 
-from sms_online.diagnosis.online_search import Named, Outcome
+from sms_online.diagnosis.searcher import Named, Outcome
 from sms_online.pipeline.events import Event
 from sms_online.verdict.evidence import Discrepancy
 

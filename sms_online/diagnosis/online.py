@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,8 +19,8 @@ from sms_online.description.schema import Effect, System
 from sms_online.diagnosis.constants import applied, corrected, is_constant
 from sms_online.diagnosis.episodes import Episode, Evidence, discrepancy, episode_document, line
 from sms_online.diagnosis.followed import least_samples
-from sms_online.diagnosis.online_search import Named, Outcome, Request, search
 from sms_online.diagnosis.record import Segment, joined
+from sms_online.diagnosis.searcher import Named, Outcome, Request, Searcher
 from sms_online.effects.build import changed_model
 from sms_online.effects.catalogue import ENTRIES
 from sms_online.model.model import Model
@@ -46,33 +46,6 @@ DUE_FROM_THE_START = (10.0, 15.0, 20.0, 30.0, 40.0)
 
 # Episodes whose effects are added to the model at most: what is left of a real rig then is for a person.
 MOST_ADOPTED = 8
-
-
-class Searcher(Protocol):
-    """Makes searches, one at a time."""
-
-    def submit(self, number: int, request: Request) -> bool:
-        """Begin a search; False where this one is left out."""
-
-    def outcome(self, block: int) -> tuple[int, Outcome | None] | None:
-        """Number of the search that was begun, and its answer, once, from the internal block on that may use it."""
-
-
-class Immediate:
-    """Every search, at once."""
-
-    def __init__(self) -> None:
-        self._done: tuple[int, Outcome | None] | None = None
-
-    def submit(self, number: int, request: Request) -> bool:
-        """See `Searcher`."""
-        self._done = number, search(request)
-        return True
-
-    def outcome(self, block: int) -> tuple[int, Outcome | None] | None:
-        """See `Searcher`."""
-        done, self._done = self._done, None
-        return done
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,7 @@ more, in all windows. A search is a function of its request alone, so that it ma
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
@@ -18,21 +18,17 @@ from sms_online.diagnosis.candidates import CandidateColumns
 from sms_online.diagnosis.constants import applied, corrected, improved, is_constant, possible
 from sms_online.diagnosis.folds import Folds
 from sms_online.diagnosis.hypothesis import REWEIGHED, Hypothesis, corrections, share_left, verdict
-from sms_online.diagnosis.record import Segment, bounded, excerpts
+from sms_online.diagnosis.record import bounded, excerpts
 from sms_online.diagnosis.reported import of_constant, of_unknowns
 from sms_online.diagnosis.residuals import ResidualTest
 from sms_online.diagnosis.rows import SessionRows
+from sms_online.diagnosis.searcher import Named, Outcome, Request
 from sms_online.diagnosis.weak_windows import WeakWindows
 from sms_online.effects.build import build_model
 from sms_online.effects.catalogue import ENTRIES, declarable
-from sms_online.model.base_parameters import BaseParameters
-from sms_online.model.model import Model
 from sms_online.model.parameters import Parameter
-from sms_online.pipeline.sensing import Sensing
-from sms_online.pipeline.sensor_noise import SensorNoise
 from sms_online.stream import Array
 from sms_online.threads import one_blas_thread
-from sms_online.trackers.interface import Prior
 
 # Windows that the effect acts in, in blocks of which each checks what the others say.
 LEAST_WINDOWS = 12
@@ -43,72 +39,21 @@ LEAST_SHARE = 0.01
 REPORTED = 8
 
 
-@dataclass(frozen=True)
-class Request:
-    """Samples of a session that show more than noise.
+class Immediate:
+    """Every search, at once."""
 
-    model, base: those of the session, of `model.system`. segments: gap-free samples of the session's channels as they
-    came. late: number of the first segment that holds the effect, if it began at all. beta (n,): parameters behind the
-    rows' noise; whitened: they come from rows that were whitened by it. prior: what is known of them beforehand.
-    """
+    def __init__(self) -> None:
+        self._done: tuple[int, Outcome | None] | None = None
 
-    model: Model
-    base: BaseParameters
-    sensing: Sensing
-    noise: SensorNoise
-    segments: tuple[Segment, ...]
-    late: int
-    beta: Array
-    whitened: bool
-    prior: Prior | None
+    def submit(self, number: int, request: Request) -> bool:
+        """See `Searcher`."""
+        self._done = number, search(request)
+        return True
 
-
-@dataclass(frozen=True)
-class Named:
-    """An effect that the record shows.
-
-    effect: as a system file declares it. parameters, values (c,): its unknowns of π, none where it is a constant.
-    coefficients: as people read them, name to value, 1σ (None where there is none) and unit. gain: evidence, twice the
-    log likelihood ratio; limit: what the best of all absent candidates reaches by chance. ambiguous: keys of others
-    that explain as much.
-    """
-
-    effect: Effect
-    parameters: tuple[str, ...]
-    units: tuple[str, ...]
-    values: Array
-    stds: Array
-    coefficients: dict[str, tuple[float, float | None, str]]
-    gain: float
-    limit: float
-    ambiguous: tuple[str, ...]
-
-    @property
-    def key(self) -> str:
-        """name@where."""
-        return f"{self.effect.name}@{self.effect.where}"
-
-
-@dataclass(frozen=True)
-class Outcome:
-    """The answer of a search: verdict "clean", "named" or "unexplained".
-
-    named: the effects found, also where they leave more than noise. scores: gain of the best candidates alone, by key.
-    left: share of what was beyond noise that is left. began: whether the effects are absent from the segments before
-    the late ones. beta (n,): parameters with the effects.
-    """
-
-    verdict: str
-    named: tuple[Named, ...]
-    scores: dict[str, float]
-    left: float
-    began: bool
-    beta: Array
-
-    @property
-    def keys(self) -> tuple[str, ...]:
-        """What was found, in an order that does not depend on that of the search."""
-        return tuple(sorted(named.key for named in self.named))
+    def outcome(self, block: int) -> tuple[int, Outcome | None] | None:
+        """See `Searcher`."""
+        done, self._done = self._done, None
+        return done
 
 
 class LateColumns(CandidateColumns):

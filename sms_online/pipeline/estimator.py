@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from itertools import groupby, pairwise
 from operator import attrgetter
+from typing import TYPE_CHECKING
 
 import msgspec
 import numpy as np
@@ -37,12 +38,14 @@ from sms_online.pipeline.relinearisation import Relinearisation
 from sms_online.pipeline.sensing import AttitudeContinuity, Sensing, is_slow, stated_period
 from sms_online.pipeline.statistics import Method, Setup
 from sms_online.pipeline.synchronise import GridSamples, SyncCounters, Synchroniser
-from sms_online.smoother.session import Smoother
 from sms_online.state import Stage, State
 from sms_online.stream import Array, Block
 from sms_online.threads import one_blas_thread
 from sms_online.trackers.interface import Estimate, Prior, Rows, Tracker
 from sms_online.trackers.square_root import session_tracker
+
+if TYPE_CHECKING:
+    from sms_online.smoother.session import Smoother
 
 
 class EstimatorState(State):
@@ -94,6 +97,8 @@ class Estimator(Stage):
             found = "a measured wrench, which the smoother does not use"
             raise InputError(source, "", found, 'balance = "energy", or all coordinates measured fast enough')
         if not distorted and self._needs_smoother:
+            from sms_online.smoother.session import Smoother  # which few sessions need
+
             self.smoother = Smoother(model, base, self.sensing, channels)
         self.channels = tuple(dict.fromkeys((*self.sensing.channels, *self._smoothed_channels)))
         self._columns = [channels.index(name) for name in self.channels]

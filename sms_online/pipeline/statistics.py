@@ -30,7 +30,6 @@ from sms_online.pipeline.plain_rows import PlainRows
 from sms_online.pipeline.sensing import Sensing
 from sms_online.pipeline.synchronise import SyncCounters
 from sms_online.pipeline.tracker_bank import Reading, Suspected
-from sms_online.smoother.session import SmootherStatistics
 from sms_online.state import snapshot, state_copy
 from sms_online.stream import Array
 from sms_online.threads import one_blas_thread
@@ -38,6 +37,7 @@ from sms_online.trackers.interface import Estimate, Prior, Tracker
 
 if TYPE_CHECKING:
     from sms_online.pipeline.estimator import Estimator
+    from sms_online.smoother.session import SmootherStatistics
 
 # What the estimate comes from.
 Method = Literal["smoother", "momentum", "energy"]

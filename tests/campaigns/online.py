@@ -20,7 +20,8 @@ import numpy as np
 
 from sms_adapters.system_file import load_system
 from sms_online.description.schema import System
-from sms_online.diagnosis.online import Immediate, OnlineDiagnosis
+from sms_online.diagnosis.online import OnlineDiagnosis
+from sms_online.diagnosis.online_search import Immediate
 from sms_online.effects.catalogue import ENTRIES, channel_effects, parse_effect
 from sms_online.pipeline.estimator import Estimator
 from sms_online.stream import Block

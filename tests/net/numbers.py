@@ -21,7 +21,8 @@ from sms_online.checkpoint import Checkpoint
 from sms_online.description.schema import Tolerances
 from sms_online.diagnosis.diagnose import diagnose
 from sms_online.diagnosis.document import diagnosis_document
-from sms_online.diagnosis.online import Immediate, OnlineDiagnosis
+from sms_online.diagnosis.online import OnlineDiagnosis
+from sms_online.diagnosis.online_search import Immediate
 from sms_online.evaluation import Evaluation
 from sms_online.pipeline.estimator import Estimator
 from sms_online.pipeline.statistics import Statistics

@@ -9,7 +9,7 @@ from typing import Any, get_args
 
 from markdown.extensions.toc import slugify
 
-from sms_online.description import bodies, markers, schema, sources
+from sms_online.description import bodies, schema, sources
 from sms_online.description.parse import RENAMED
 from sms_online.description.record import Record
 from sms_online.description.schema import System
@@ -23,10 +23,11 @@ HEADINGS: dict[type[Record], str] = {
     bodies.Motor: "`[motor_i]`",
     bodies.RigidLink: '`[link_i]` of `kind = "rigid"`',
     bodies.FlexibleLink: '`[link_i]` of `kind = "flexible"`',
-    markers.Marker: "`[[link_i.markers]]`",
+    bodies.Marker: "`[[link_i.markers]]`",
     bodies.RigidBody: "`[payload]`",
     bodies.Inertia: "Inertias",
     schema.Sensor: "`[[sensor]]`",
+    schema.Wrench: "`[[wrench]]`",
     schema.Effect: "`[[effect]]`",
     schema.Prior: "`[prior]`",
     schema.Fitted: "`[fitted]`",

@@ -19,6 +19,7 @@ from sms_tools.exit_codes import BAD_INPUT, INTERRUPTED, OK
 from sms_tools.option_values import magnification, positive, rerun, seconds, whole
 
 PROGRAM = "sms-online"
+UNDESCRIBED = "A is the least, C the most; B where no noise is described"
 
 
 class Parser(argparse.ArgumentParser):
@@ -91,8 +92,8 @@ def _parser() -> Parser:
     parser = Parser(
         prog=PROGRAM,
         description="Online parameter estimation for flexible space manipulators.",
-        epilog="Exit codes: 0 done; 1 record received nothing, or check found a capture unfit; 2 bad input; 3 no "
-        "parameter is determined (results are written); 130 interrupted.",
+        epilog="Exit codes: 0 done; 1 nothing was received, or a capture is unfit; 2 bad input; 3 no parameter is "
+        "determined (results are written); 130 interrupted.",
     )
     parser.add_argument("--version", action=Version, nargs=0, help="print the version")
     text = "print a completion script for the shell"
@@ -207,9 +208,7 @@ def _add_duration(parser: Parser, text: str = "end the session after this time; 
 
 
 def _add_simulate(verbs: Verbs) -> None:
-    parser = _add_verb(
-        verbs, "simulate", "simulate", "Simulate a system, and write a capture with its true parameters beside it."
-    )
+    parser = _add_verb(verbs, "simulate", "simulate", "Simulate a system; write a capture with its true parameters.")
     _add_system(parser)
     _add_capture(parser)
     _add_duration(parser, "length of the session; that of the described trajectory by default")
@@ -327,9 +326,7 @@ def _add_export(verbs: Verbs) -> None:
 
 
 def _add_markers(verbs: Verbs) -> None:
-    parser = _add_verb(
-        verbs, "markers", "markers", "List the eigenmodes of each flexible link and the number of markers they need."
-    )
+    parser = _add_verb(verbs, "markers", "markers", "List the modes of each flexible link and the markers it needs.")
     _add_system(parser)
     text = "number of modes that the markers have to resolve; 2 by default"
     parser.add_argument("--modes", metavar="N", type=whole(1), default=2, help=text)
@@ -349,7 +346,7 @@ def _add_bound(verbs: Verbs) -> None:
     text = "a capture; without one the described trajectory is simulated"
     parser.add_argument("capture", metavar="CAPTURE", type=Path, nargs="?", help=text)
     _add_system(parser)
-    _add_grade(parser, "A is the least, C the most; B where no noise is described", "A", "B", "C")
+    _add_grade(parser, UNDESCRIBED, "A", "B", "C")
     text = "also compute the bounds without each of the described sensors"
     parser.add_argument("--each-sensor", action="store_true", help=text)
 
@@ -370,12 +367,9 @@ def _add_excite(verbs: Verbs) -> None:
     for name, (unit, text) in units.items():
         read = seconds(positive=True) if name == "--duration" else positive
         parser.add_argument(name, metavar=unit, type=read, help=text)
-    text = (
-        "two effects, NAME@WHERE:coefficient=value, that a diagnosis could not separate: design the motion for "
-        "their coefficients alone"
-    )
+    text = "two effects, NAME@WHERE:coefficient=value, that a diagnosis could not separate: design for them alone"
     parser.add_argument("--separate", metavar="EFFECT", nargs=2, help=text)
-    _add_grade(parser, "A is the least, C the most; B where no noise is described", "A", "B", "C")
+    _add_grade(parser, UNDESCRIBED, "A", "B", "C")
     parser.add_argument("--seed", metavar="N", type=whole(0), default=0, help="seed of the random start; 0 by default")
     text = "largest number of optimiser steps; 15 by default"
     parser.add_argument("--iterations", metavar="N", type=whole(1), default=15, help=text)

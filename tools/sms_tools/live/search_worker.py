@@ -9,7 +9,8 @@ import os
 import pickle
 import sys
 
-from sms_online.diagnosis.online_search import Request, search
+from sms_online.diagnosis.online_search import search
+from sms_online.diagnosis.searcher import Request
 
 # The estimator and whoever else works on the machine come first.
 NICENESS = 10

@@ -12,7 +12,7 @@ from threading import Thread
 from typing import IO
 
 from sms_adapters.searches import BEGUN, LOST, NAME, USED
-from sms_online.diagnosis.online_search import Outcome, Request
+from sms_online.diagnosis.searcher import Outcome, Request
 
 
 class SearchProcess:

@@ -1,4 +1,4 @@
-"""import: a published measurement, or any log that a system file describes, as a capture."""
+"""import: a published measurement, or any log that a system file describes, as a capture; a URDF as a system file."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ from sms_adapters.importers import import_emps, import_quanser
 from sms_adapters.mcap_capture import capture_writer
 from sms_adapters.motion_capture import import_points
 from sms_adapters.truth import truth_path
+from sms_adapters.urdf import import_urdf
 from sms_online.errors import InputError
 from sms_tools.exit_codes import OK
 from sms_tools.report import say
 from sms_tools.session import described_system
-from sms_tools.verbs import import_urdf
 from sms_tools.waiting import watched
 
 # Writes the capture of a source; number of its samples, and what was skipped.
@@ -25,7 +25,7 @@ Importer = Callable[[argparse.Namespace], tuple[int, list[str]]]
 def run(args: argparse.Namespace) -> int:
     """Write the capture and say how long it is, or the system file of a URDF."""
     if args.kind == "urdf":
-        return import_urdf.run(args)
+        return _urdf(args)
     if args.capture is None:
         raise InputError(f"import {args.kind}", "", "no --capture", "--capture FILE, the capture to write")
     if args.capture.resolve() == args.source.resolve():
@@ -36,6 +36,17 @@ def run(args: argparse.Namespace) -> int:
     lines = [f"warning: {warning}" for warning in warnings]
     document = {"schema": "sms-online/import/1", "capture": str(args.capture), "samples": samples, "warnings": warnings}
     say(args, f"capture: {args.capture}, {samples} samples", *lines, document=document)
+    return OK
+
+
+def _urdf(args: argparse.Namespace) -> int:
+    """Write the system file of a URDF; InputError where there is one already, which somebody may have completed."""
+    path = args.source.with_suffix(".toml") if args.out is None else args.out
+    if path.exists():
+        raise InputError(str(path), "", "a file of this name", "--out with the name of a file that is not there yet")
+    path.write_text(import_urdf(args.source), encoding="utf-8")
+    document = {"schema": "sms-online/import-urdf/1", "system": str(path)}
+    say(args, f"system file: {path}; its first lines say what is to be completed", document=document)
     return OK
 
 

@@ -8,11 +8,13 @@ from dataclasses import dataclass, field
 import numpy as np
 import rerun as rr
 
+from sms_online.model.parameters import Parameter
 from sms_online.stream import Array
 from sms_tools.view import style
 from sms_tools.view.arm_log import times
+from sms_tools.view.frames import Reference
 from sms_tools.view.known import BOUNDS, Known
-from sms_tools.view.parameter_groups import Group
+from sms_tools.view.parameter_groups import Group, shortened
 
 PARAMETERS, RESIDUAL, HEALTH, EVIDENCE = "parameters", "residual", "health", "evidence"
 TABLE, LOG = "table", "log"
@@ -171,3 +173,19 @@ class ParameterLog:
         for group in self.groups:
             half = UNKNOWN_RANGE if group.half_range is None else group.half_range
             self._numbers.mark(f"{self.drawn(group)}/events", t, -half, half)
+
+
+def markdown_table(parameters: Sequence[Parameter], references: Sequence[Reference | None], now: Known) -> str:
+    """Symbol, unit, estimate ± std and the reference; a dash where the data determine nothing."""
+    estimate, std, determined = now.estimate, now.std, now.determined
+    compared = "true" if any(reference is not None and reference.is_true for reference in references) else "nominal"
+    lines = [f"| parameter | unit | estimate | ± std | {compared} | deviation |", "|:--|:--|--:|--:|--:|--:|"]
+    for k, (p, reference) in enumerate(zip(parameters, references, strict=True)):
+        value = spread = deviation = "–"
+        if determined[k]:
+            value, spread = f"{estimate[k]:.6g}", f"{std[k]:.2g}"
+            if reference is not None and reference.value:
+                deviation = f"{100.0 * (estimate[k] / reference.value - 1.0):+.3g} %"
+        known = "–" if reference is None else f"{reference.value:.6g}"
+        lines.append(f"| {shortened(p.symbol)} | {p.unit} | {value} | {spread} | {known} | {deviation} |")
+    return "\n".join(lines)

@@ -32,6 +32,7 @@ from sms_tools.view.number_log import (
     WHITENED_RANGE,
     NumberLog,
     ParameterLog,
+    markdown_table,
 )
 from sms_tools.view.own_scale import OwnScale
 from sms_tools.view.parameter_groups import Group, parameter_groups
@@ -40,7 +41,6 @@ from sms_tools.view.readings import Readings
 from sms_tools.view.residuals import RecentResidual
 from sms_tools.view.scene import Scene
 from sms_tools.view.sink import Sink
-from sms_tools.view.table import markdown_table
 from sms_tools.view.tracker_log import TrackerLog
 
 # The table, and residuals of all rows so far, which move slowly: s of the session.

@@ -1,0 +1,93 @@
+"""What a running session asks of a search, what it is answered, and whom it asks: no search is imported for that."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol
+
+from sms_online.description.schema import Effect
+from sms_online.diagnosis.record import Segment
+from sms_online.model.base_parameters import BaseParameters
+from sms_online.model.model import Model
+from sms_online.pipeline.sensing import Sensing
+from sms_online.pipeline.sensor_noise import SensorNoise
+from sms_online.stream import Array
+from sms_online.trackers.interface import Prior
+
+
+@dataclass(frozen=True)
+class Request:
+    """Samples of a session that show more than noise.
+
+    model, base: those of the session, of `model.system`. segments: gap-free samples of the session's channels as they
+    came. late: number of the first segment that holds the effect, if it began at all. beta (n,): parameters behind the
+    rows' noise; whitened: they come from rows that were whitened by it. prior: what is known of them beforehand.
+    """
+
+    model: Model
+    base: BaseParameters
+    sensing: Sensing
+    noise: SensorNoise
+    segments: tuple[Segment, ...]
+    late: int
+    beta: Array
+    whitened: bool
+    prior: Prior | None
+
+
+@dataclass(frozen=True)
+class Named:
+    """An effect that the record shows.
+
+    effect: as a system file declares it. parameters, values (c,): its unknowns of π, none where it is a constant.
+    coefficients: as people read them, name to value, 1σ (None where there is none) and unit. gain: evidence, twice the
+    log likelihood ratio; limit: what the best of all absent candidates reaches by chance. ambiguous: keys of others
+    that explain as much.
+    """
+
+    effect: Effect
+    parameters: tuple[str, ...]
+    units: tuple[str, ...]
+    values: Array
+    stds: Array
+    coefficients: dict[str, tuple[float, float | None, str]]
+    gain: float
+    limit: float
+    ambiguous: tuple[str, ...]
+
+    @property
+    def key(self) -> str:
+        """name@where."""
+        return f"{self.effect.name}@{self.effect.where}"
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """The answer of a search: verdict "clean", "named" or "unexplained".
+
+    named: the effects found, also where they leave more than noise. scores: gain of the best candidates alone, by key.
+    left: share of what was beyond noise that is left. began: whether the effects are absent from the segments before
+    the late ones. beta (n,): parameters with the effects.
+    """
+
+    verdict: str
+    named: tuple[Named, ...]
+    scores: dict[str, float]
+    left: float
+    began: bool
+    beta: Array
+
+    @property
+    def keys(self) -> tuple[str, ...]:
+        """What was found, in an order that does not depend on that of the search."""
+        return tuple(sorted(named.key for named in self.named))
+
+
+class Searcher(Protocol):
+    """Makes searches, one at a time."""
+
+    def submit(self, number: int, request: Request) -> bool:
+        """Begin a search; False where this one is left out."""
+
+    def outcome(self, block: int) -> tuple[int, Outcome | None] | None:
+        """Number of the search that was begun, and its answer, once, from the internal block on that may use it."""
