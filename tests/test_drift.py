@@ -140,6 +140,7 @@ def test_the_end_of_a_drift_is_seen_within_three_seconds(seed: int) -> None:
         assert estimate.std[2] < 0.03
         assert estimate.pi[2] == pytest.approx(TRUE[2] + 0.1 * end, abs=4.0 * estimate.std[2])
     (drift,) = tracker.found
+    assert drift.changed == pytest.approx(end, abs=1.0)
     assert drift.rate == pytest.approx(0.0, abs=4.0 * drift.std)
     assert drift.std < 0.01
 

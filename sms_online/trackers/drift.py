@@ -64,12 +64,16 @@ SHOWN = 0.1
 
 @dataclass(frozen=True)
 class Found:
-    """A drift that was learned, of the parameter in `column`, since when, s; its rate now and its deviation, per s."""
+    """A drift that was learned, of the parameter in `column`, since when, s; its rate now and its deviation, per s.
+
+    changed: instant, s, before which the rate became another one; None where it never did.
+    """
 
     column: int
     since: float
     rate: float
     std: float
+    changed: float | None = None
 
 
 class DriftState(State):
@@ -330,7 +334,7 @@ class LearnedTrend(Tracker):
         """The drifts that were learned so far."""
         rate, std = self.rates()
         return tuple(
-            Found(column, each.begun, float(rate[column]), float(std[column]))
+            Found(column, each.begun, float(rate[column]), float(std[column]), each.changed)
             for each in self.state.moving
             if each.learned
             for column in each.columns
