@@ -179,7 +179,14 @@ class Evaluation:
             moving = [(self.parameters[drift.column], drift, drift.column) for drift in reading.drifts]
             drifts = tuple(
                 Drift(
-                    p.name, p.unit, drift.since, drift.rate, drift.std, float(estimate.pi[column]), float(std[column])
+                    p.name,
+                    p.unit,
+                    drift.since,
+                    drift.changed,
+                    drift.rate,
+                    drift.std,
+                    float(estimate.pi[column]),
+                    float(std[column]),
                 )
                 for p, drift, column in moving
             )

@@ -55,12 +55,14 @@ class Tracked:
 class Drift:
     """A parameter that a tracker has found to drift: since when, s, and its value and rate now.
 
-    unit: of the parameter and its value ± value_std; the rate ± std is in it per s.
+    changed: since when at this rate, s, where it was another one before. unit: of the parameter and its value ±
+    value_std; the rate ± std is in it per s.
     """
 
     parameter: str
     unit: str
     since: float
+    changed: float | None
     rate: float
     std: float
     value: float
@@ -71,6 +73,7 @@ class Drift:
         return {
             "parameter": self.parameter,
             "since": self.since,
+            "changed": self.changed,
             "rate": self.rate,
             "rate_std": self.std,
             "value": self.value,

@@ -7,6 +7,7 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
+from sms_online.pipeline.drift_line import DriftLine
 from sms_online.stream import Array
 from sms_online.trackers import Prior, RecursiveLeastSquares, Rows
 from sms_online.trackers.drift import LearnedTrend
@@ -140,6 +141,7 @@ def test_the_end_of_a_drift_is_seen_within_three_seconds(seed: int) -> None:
         assert estimate.std[2] < 0.03
         assert estimate.pi[2] == pytest.approx(TRUE[2] + 0.1 * end, abs=4.0 * estimate.std[2])
     (drift,) = tracker.found
+    assert drift.changed == pytest.approx(end, abs=1.0)
     assert drift.rate == pytest.approx(0.0, abs=4.0 * drift.std)
     assert drift.std < 0.01
 
@@ -197,3 +199,11 @@ def test_drifts_do_not_depend_on_how_rows_come() -> None:
     assert whole.found == cut.found != ()
     assert np.array_equal(whole.estimate().pi, cut.estimate().pi)
     assert np.array_equal(whole.estimate().covariance, cut.estimate().covariance)
+
+
+def test_a_known_drift_goes_on_as_it_decays() -> None:
+    line = DriftLine(np.array([1.0, 1.0]), np.array([2.0, 2.0]), np.array([0.1, 0.0]), 3.0)
+    later = line.at(8.0)
+    np.testing.assert_allclose(later.moved, [1.0 + 20.0 * (1.0 - np.exp(-0.5)), 11.0])
+    np.testing.assert_allclose(later.rate, [2.0 * np.exp(-0.5), 2.0])
+    np.testing.assert_allclose(line.at(5.0).at(8.0).moved, later.moved)

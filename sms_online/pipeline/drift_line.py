@@ -1,4 +1,4 @@
-"""What is known of a drift while rows are made: a straight line for each parameter that moves.
+"""What is known of a drift while rows are made: a line for each parameter that moves, straight or decaying.
 
 What takes parameters for constant (the session's least squares, sums behind residuals, the detector of changes) gets
 rows without the known part of the drift, that of the judged tracker's last estimate. Whitened rows are combinations of
@@ -10,20 +10,29 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import numpy as np
+
 from sms_online.stream import Array
 
 
 @dataclass(frozen=True)
 class DriftLine:
-    """moved (n,): by how much parameters have moved at t, s, from a reference; rate (n,): per s, from there on."""
+    """moved (n,): by how much parameters have moved at t, s, from a reference; rate (n,): per s, from there on.
+
+    decay (n,): of the rates, 1/s.
+    """
 
     moved: Array
     rate: Array
+    decay: Array
     t: float
 
     def at(self, t: float) -> DriftLine:
         """The same at another instant."""
-        return DriftLine(self.moved + (t - self.t) * self.rate, self.rate, t)
+        time, decaying = t - self.t, self.decay > 0.0
+        slowed = -np.expm1(-self.decay * time) / np.where(decaying, self.decay, 1.0)
+        moved = self.moved + np.where(decaying, slowed, time) * self.rate
+        return DriftLine(moved, self.rate * np.exp(-self.decay * time), self.decay, t)
 
     def removed(self, rows: Array, ramp: Array) -> Array:
         """Rows [Y b] (…, n_v, n + 1) of a window centred at t as if nothing had moved.

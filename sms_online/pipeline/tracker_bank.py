@@ -17,9 +17,10 @@ from sms_online.pipeline.momentum_windows import HOPS
 from sms_online.state import Stage, State
 from sms_online.stream import Array
 from sms_online.trackers.build import Tracked, build_tracker, build_watch
-from sms_online.trackers.drift import Found, LearnedTrend
+from sms_online.trackers.drift import LearnedTrend
 from sms_online.trackers.drift_filter import STEP
 from sms_online.trackers.drift_search import Ramp
+from sms_online.trackers.drift_state import Found
 from sms_online.trackers.information import Information
 from sms_online.trackers.interface import Estimate, Prior, Rows, Tracker
 
@@ -233,12 +234,13 @@ class TrackerBank(Stage):
         if not estimate.determined[m:].all():
             return None
         moves, rate = np.ones(estimate.pi.size, dtype=np.bool_), np.zeros(estimate.pi.size)
+        decay = rate
         if isinstance(judged, LearnedTrend):
-            moves, rate = judged.moves, judged.rates()[0]
+            moves, (rate, _, decay) = judged.moves, judged.rates()
         if self.state.reference is None:
             self.state.reference = own().pi[m:]
         moved = np.where(moves[m:], estimate.pi[m:] - self.state.reference, 0.0)
-        return DriftLine(moved, rate[m:], judged.instant if isinstance(judged, LearnedTrend) else t)
+        return DriftLine(moved, rate[m:], decay[m:], judged.instant if isinstance(judged, LearnedTrend) else t)
 
     @property
     def information(self) -> Information:

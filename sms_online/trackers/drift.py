@@ -17,13 +17,10 @@ linear trend) and 3.4 (likelihood of its innovations).
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
-import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from sms_online.state import State
 from sms_online.stream import Array
 from sms_online.trackers.drift_filter import KNOT, STEP, Block, DriftFilter, Moving, innovation_loss, reach
 from sms_online.trackers.drift_noise import likeliest
@@ -31,17 +28,17 @@ from sms_online.trackers.drift_search import (
     LARGEST_LEFT,
     Break,
     Ramp,
-    Suspicion,
     Tried,
     best_break,
     best_ramp,
     changes_within,
     likeliest_change,
 )
+from sms_online.trackers.drift_state import DriftState, Found
 from sms_online.trackers.factor import masked_covariance, solve, triangular_factor
 from sms_online.trackers.information import Information
 from sms_online.trackers.interface import Estimate, Prior, Rows, Tracker, checked, prior_factor
-from sms_online.trackers.rate_change import TRIED, RateChange, branches
+from sms_online.trackers.rate_change import TRIED, branches
 
 # Knots that are looked back at, for ramps and for process noise.
 REMEMBERED = 32
@@ -60,46 +57,6 @@ PATIENCE = 12
 SUSPECTED = 0.07
 # Chance that the earlier of the two has at most.
 SHOWN = 0.1
-
-
-@dataclass(frozen=True)
-class Found:
-    """A drift that was learned, of the parameter in `column`, since when, s; its rate now and its deviation, per s."""
-
-    column: int
-    since: float
-    rate: float
-    std: float
-
-
-class DriftState(State):
-    """What a learned trend keeps of its rows.
-
-    anchor: the filter at the oldest remembered knot; now: at the newest step. blocks: from knot to knot. pending: rows
-    [Y, (t - knot) Y, b] since the last knot; fresh: how many of them are not in `now` yet. step: number of the open
-    one, from t = 0 on; knots: since the beginning. rows: so far; newest: time of the last, s. accepted: how often
-    drifts were. quiet: whether rows leave no more than noise, without which no drift is accepted. until: instant that
-    estimates hold for, s; no earlier than that of the newest row. searches: so far. likeliest: change that the last one
-    found, of what does not move; suspected: where it is hardly chance. changes: of rates, that may have been.
-    """
-
-    anchor: DriftFilter
-    now: DriftFilter
-    moving: list[Moving]
-    blocks: list[Block] = msgspec.field(default_factory=list)
-    pending: list[Array] = msgspec.field(default_factory=list)
-    fresh: int = 0
-    step: int = -1
-    knots: int = 0
-    rows: float = 0.0
-    newest: float = 0.0
-    accepted: int = 0
-    quiet: bool = True
-    until: float = -np.inf
-    searches: int = 0
-    likeliest: Suspicion | None = None
-    suspected: Suspicion | None = None
-    changes: list[RateChange] = msgspec.field(default_factory=list)
 
 
 class LearnedTrend(Tracker):
@@ -328,9 +285,9 @@ class LearnedTrend(Tracker):
     @property
     def found(self) -> tuple[Found, ...]:
         """The drifts that were learned so far."""
-        rate, std = self.rates()
+        rate, std, _ = self.rates()
         return tuple(
-            Found(column, each.begun, float(rate[column]), float(std[column]))
+            Found(column, each.begun, float(rate[column]), float(std[column]), each.changed)
             for each in self.state.moving
             if each.learned
             for column in each.columns
@@ -349,15 +306,17 @@ class LearnedTrend(Tracker):
             out[list(each.columns)] = True
         return out
 
-    def rates(self) -> tuple[Array, Array]:
-        """Rate of each parameter (n,) now, zero where it does not move, and standard deviation (n,)."""
+    def rates(self) -> tuple[Array, Array, Array]:
+        """Rate of each parameter (n,) now, zero where it does not move, standard deviation, and decay (n,), 1/s."""
         state = self.state.now.absorbed(self._open())
-        solution = solve(state.factor)
-        rate, std = np.zeros(self._n), np.zeros(self._n)
+        solution, ahead = solve(state.factor), self.instant - self.state.step * STEP
+        rate, std, decays = np.zeros((3, self._n))
         covariance = solution.covariance()
-        for column, place, _ in state.places():
-            rate[column], std[column] = solution.pi[place], np.sqrt(covariance[place, place])
-        return rate, std
+        for column, place, decay in state.places():
+            left = np.exp(-decay * ahead)
+            rate[column], std[column] = left * solution.pi[place], left * np.sqrt(covariance[place, place])
+            decays[column] = decay
+        return rate, std, decays
 
     def estimate(self) -> Estimate:
         """π at the instant that estimates hold for; leaves the state as it is."""

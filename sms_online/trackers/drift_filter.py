@@ -72,6 +72,12 @@ class Moving:
         """Whether it was found in the rows."""
         return bool(self.rates)
 
+    @property
+    def changed(self) -> float | None:
+        """Instant, s, of the last knot before which its rates became others; None where they never did."""
+        later = [at * STEP for at in (*self.breaks, *self.bends) if at > self.since]
+        return max(later, default=None)
+
     def noise(self) -> list[float]:
         """Process noise of each column's rate, per √s."""
         return [self.std * abs(rate) for rate in self.rates] if self.learned else [self.std] * len(self.columns)

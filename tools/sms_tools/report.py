@@ -132,7 +132,10 @@ def value_cell(parameter: Document) -> str:
 def tracker_facts(trackers: list[Document]) -> dict[str, list[str]]:
     """Normalised innovations squared with their band, and the memory in effect, of each tracker."""
     nis = [
-        "–" if t["nis"] is None else f"{t['nis']:.3f} ({t['nis_lower']:.2f} … {t['nis_upper']:.2f})" for t in trackers
+        "–"
+        if t["nis"] is None
+        else f"{t['nis']:.3f} ({t['nis_lower']:.2f} … {t['nis_upper']:.2f}{'' if t['consistent'] else ', outside'})"
+        for t in trackers
     ]
     return {"innovations squared": nis, "memory": [f"{t['memory_s']:.3g} s" for t in trackers]}
 
@@ -161,11 +164,13 @@ def drift_lines(document: Document) -> list[str]:
 
 
 def _drift_line(d: Document) -> str:
+    changed = "" if d.get("changed") is None else f", at another rate since {d['changed']:.1f} s"
     rate = f"{d['rate']:+.4g} ± {d['rate_std']:.2g} {d['unit']} per s"
+    line = f"drift since {d['since']:.1f} s{changed}: {d['parameter']} {rate}"
     if d["value_std"] is None:
-        return f"drift since {d['since']:.1f} s: {d['parameter']} {rate}"
+        return line
     value = formatter(d["value"], d["value_std"])(d["value"])
-    return f"drift since {d['since']:.1f} s: {d['parameter']} {rate}, {value} ± {d['value_std']:.2g} {d['unit']} now"
+    return f"{line}, {value} ± {d['value_std']:.2g} {d['unit']} now"
 
 
 def _calibration(document: Document) -> list[Calibration]:
