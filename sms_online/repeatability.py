@@ -32,6 +32,8 @@ BAR_SESSIONS = 4
 LEAST_SESSIONS = 3
 # Lengths of halves that differ by less than this factor differ by chance.
 ABOUT_AS_CLOSE = 2.0
+# A reference is zero for all that sessions show where it is below this multiple of what they scatter by.
+KNOWN = 3.0
 # Standard deviation of the middle half of a Gaussian, of the whole one's.
 MIDDLE_HALF = math.sqrt(1.0 - 4.0 * norm.ppf(0.75) * norm.pdf(norm.ppf(0.75)))
 
@@ -68,6 +70,16 @@ class Compared:
     spread: float | None
     changes: tuple[Change, ...]
 
+    @property
+    def size(self) -> float:
+        """What sessions scatter by: the spread, or with two of them the error bars."""
+        return self.spread or float(np.nanmedian(self.stds))
+
+    @property
+    def relative(self) -> bool:
+        """Whether deviations are read in per cent of the reference: where it is known not to be zero."""
+        return abs(self.reference) > KNOWN * self.size
+
 
 @dataclass(frozen=True, repr=False)
 class Comparison(Tabled):
@@ -99,10 +111,9 @@ class Comparison(Tabled):
         for each in self.parameters.values():
             if not math.isfinite(each.reference):
                 continue
-            size = each.spread or float(np.nanmedian(each.stds))
-            spread = f"{100.0 * each.spread / abs(each.reference):.2g}" if each.spread and each.reference else ""
+            spread = f"{100.0 * each.spread / abs(each.reference):.2g}" if each.spread and each.relative else ""
             changes = ", ".join(f"{c.session} {change_text(c, each)}" for c in each.changes)
-            rows.append([each.name, each.unit, formatter(each.reference, size)(each.reference), spread, changes])
+            rows.append([each.name, each.unit, formatter(each.reference, each.size)(each.reference), spread, changes])
         return headings, rows
 
     def document(self) -> dict[str, Any]:
@@ -119,8 +130,8 @@ class Comparison(Tabled):
 
 
 def change_text(change: Change, compared: Compared) -> str:
-    """Size of a change in per cent of the reference, in its unit where that is zero."""
-    if not compared.reference:
+    """Size of a change in per cent of the reference, in its unit where that may be zero."""
+    if not compared.relative:
         return f"{change.size:+.2g} {compared.unit}".rstrip()
     return f"{100.0 * change.size / abs(compared.reference):+.2g} %"
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import sms_online as sms
-from sms_online.repeatability import FALSE_ALARM, compare_documents, judge_changes
+from sms_online.repeatability import FALSE_ALARM, change_text, compare_documents, judge_changes
 from sms_online.stream import Array
 
 PARAMETERS, BAR = 16, 1e-5
@@ -90,3 +90,11 @@ def test_sessions_of_two_systems_are_refused() -> None:
         compare_documents({"a": document("a", 1.0), "b": document("b", 1.0, "other")})
     with pytest.raises(sms.InputError, match="two at least"):
         compare_documents({"a": document("a", 1.0)})
+
+
+def test_a_number_that_may_be_zero_is_read_in_its_unit() -> None:
+    documents = {f"run-{k}": document("", BAR * (-1.0) ** k) for k in range(4)}
+    documents["run-4"] = document("", 0.5)
+    compared = compare_documents(documents).parameters["joint_1.stiffness"]
+    assert not compared.relative
+    assert change_text(compared.changes[0], compared) == "+0.5"

@@ -27,8 +27,6 @@ PERIODS = 5
 # Step of the motions that are compared and of their bounds, s: twice that of `cramer_rao`. The planar example's worst
 # bound then comes out a tenth low, so that exact bounds decide in the end.
 STEP = 0.02
-# A series is searched for over so many periods of its slowest; the exact motion is then brought into the limits.
-SEARCHED = 1.5
 
 
 class Series:
@@ -100,7 +98,6 @@ class Problem:
         self.bounds = self.extremes.bounds(limits, self.described)
         self.before = None if described is None else motion_bounds(described, self.grade)
         self.series = Series(lowest * np.array(HARMONICS), len(system.joints))
-        self.searched = min(duration, SEARCHED * 2.0 * math.pi / lowest)
 
     @staticmethod
     def of(
@@ -152,7 +149,7 @@ class Problem:
 
         A load is a magnitude over its limit; inf where a motion cannot be followed.
         """
-        motions = ensemble(self.system, self.series.frequency, *self.series(points), self.searched, STEP)
+        motions = ensemble(self.system, self.series.frequency, *self.series(points), self.duration, STEP)
         bounds = np.full((len(points), self._values.size), np.inf)
         loads = np.full((len(points), motions.t.size, self.bounds.size), np.inf)
         for p in range(len(points)):

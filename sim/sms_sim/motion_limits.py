@@ -16,7 +16,7 @@ Kind = Literal["angle", "rate", "torque", "base_rotation", "deflection"]
 
 @dataclass(frozen=True)
 class Limits:
-    """Largest magnitudes that a motion may reach; None means the extremes of the described motion.
+    """Largest magnitudes that a motion may reach; None means those of the described motion.
 
     angle, rate: of each joint, rad and rad/s (m and m/s). torque: of each joint after its gear, N m (N). base_rotation:
     from its attitude at the start, rad. deflection: of each marker from where it is on the undeformed link, m.

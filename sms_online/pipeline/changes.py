@@ -47,8 +47,9 @@ LONGEST_DECISION = 40
 LEAST_DECISION = 5
 # An instant is certain to so many half hops; samples closer to it are left out on both sides.
 GUARD = 1
-# Clocks are estimated anew where one has shifted by less than this, s: what is more they notice themselves.
-LARGEST_SHIFT = 1e-3
+# What was known goes on behind shifts of clocks by less than LARGEST_SHIFT, s. A clock that begins anew on a late host
+# may be off by more, up to LARGEST_STEP: then nothing is known afterwards, for rows are linear in less.
+LARGEST_SHIFT, LARGEST_STEP = 1e-3, 5e-3
 # Kind of that hypothesis.
 CLOCK = "clock"
 # Times that the rows after an event are whitened, each with the jumps found before.
@@ -258,11 +259,14 @@ class Changes(Stage):
         """What shifts of clocks alone leave of the rows, where that is little but noise; see `explain`."""
         each = [Jump(CLOCK, (k,)) for k in self._clocks]
         found = explain(factor, rows, [*each, Jump(CLOCK, self._clocks)] if each[1:] else each)
-        small = bool((np.abs(found.sizes) < LARGEST_SHIFT).all())
+        small = bool((np.abs(found.sizes) < LARGEST_STEP).all())
         return replace(found, decisive=True) if found.explained and small else None
 
     def _follow_clocks(self, explanation: Explanation, onset: int, alarm: int, start_time: float) -> Adoption:
-        """Go on with the same model behind shifts of clocks, of which as much is known as they have shifted by."""
+        """Go on with the same model behind shifts of clocks, of which as much is known as they have shifted by.
+
+        Behind a step of one nothing is known.
+        """
         assert explanation.jump is not None
         shifted, m, n = list(explanation.jump.columns), len(self._nuisances), self.base.n
         time = start_time + 0.5 * (onset + alarm) / self._system.sample_rate
@@ -273,6 +277,8 @@ class Changes(Stage):
         again = np.zeros((len(shifted), m + n + 1))
         again[np.arange(len(shifted)), shifted] = [1.0 / each.tolerance for each in wide]
         known = self.detector.before(onset - MARGIN).known.without(shifted).with_rows(again)
+        if (np.abs(explanation.sizes) >= LARGEST_SHIFT).any():
+            known = self.beforehand
         self.detector = self._new_detector()
         self.detector.begin(known)
         return Adoption(self.model, self.base, known, explanation.beta[m : m + n], self.behind(alarm))

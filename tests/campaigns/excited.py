@@ -5,8 +5,8 @@
     python -m tests.campaigns.excited summary RESULTS.jsonl
 
 By how much the median and the largest of the relative Cramér–Rao bounds are lower than with the described motion; and,
-with the best of them, the errors of sessions at grade B. A start takes some six minutes of a quiet core, a session of
-either motion ten seconds.
+with the best of them, the errors of sessions at grade B. A start takes some fifteen minutes of a quiet core, a session
+of either motion ten seconds.
 """
 
 from __future__ import annotations

@@ -40,24 +40,23 @@ def write_comparison(directory: Path, comparison: Comparison) -> Path:
 
 
 def _row(each: Compared) -> dict[str, object]:
-    shown = formatter(each.reference, each.spread or float(np.nanmedian(each.stds)))
-    relative = each.spread and each.reference
+    shown = formatter(each.reference, each.size)
     return {
         "name": each.name,
         "symbol": each.symbol,
         "unit": each.unit,
         "reference": shown(each.reference),
         "spread": f"{each.spread:.2g}" if each.spread else "",
-        "percent": f"{100.0 * each.spread / abs(each.reference):.2g}" if relative and each.spread else "",
+        "percent": f"{100.0 * each.spread / abs(each.reference):.2g}" if each.spread and each.relative else "",
         "sessions": int(np.isfinite(each.values).sum()),
         "changes": [(c.session, change_text(c, each), f"{abs(c.deviations):.3g}") for c in each.changes],
     }
 
 
 def _chart(each: Compared, sessions: Sequence[str]) -> Chart:
-    """Deviation from the reference over the sessions, % of it; in the parameter's unit where that is zero."""
-    scale = abs(each.reference) / 100.0 if each.reference else 1.0
-    unit = "%" if each.reference else each.unit
+    """Deviation from the reference over the sessions, % of it; in the parameter's unit where that may be zero."""
+    scale = abs(each.reference) / 100.0 if each.relative else 1.0
+    unit = "%" if each.relative else each.unit
     number = np.arange(1, each.values.size + 1)
     off, bars = (each.values - each.reference) / scale, BOUNDS * each.stds / scale
     changed = np.isin(sessions, [change.session for change in each.changes])
@@ -73,5 +72,6 @@ def _chart(each: Compared, sessions: Sequence[str]) -> Chart:
         axes.set_xticks(number if number.size <= MOST_NAMES else np.linspace(1, number.size, MOST_NAMES).round())
         axes.set_xlabel("session")
 
-    caption = f"{each.name}, {unit} off {each.reference:.6g} {each.unit}".rstrip()
+    shown = formatter(each.reference, each.size)(each.reference)
+    caption = f"{each.name}, {unit} off {shown} {each.unit}".rstrip()
     return Chart(caption, (), drawn(each.name, WIDTH, HEIGHT, draw))
