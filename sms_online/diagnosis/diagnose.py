@@ -279,7 +279,11 @@ def diagnose(
 def _no_joint_worse(attempt: Attempt, chosen: list[int], bare: State) -> list[int]:
     """Those chosen, or the last of the search's steps to them after which no joint's held-out torque is predicted worse
     than by the description alone, whose state is `bare`: what serves one axis by way of the masses may harm another.
+
+    All of those chosen where rows leave no more than noise: by that torques differ.
     """
+    if not attempt.tracing.freed:
+        return chosen
     before = bare.holdout.relative
     for step in (chosen, *(step for _, step in reversed(attempt.tracing.path) if step != chosen)):
         after = attempt.state(step).holdout.relative
