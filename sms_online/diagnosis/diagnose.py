@@ -227,7 +227,7 @@ def diagnose(
             # Links that are exact because of what another effect did would keep that one from being found.
             if beside[0].excess(beside[1]) < attempt.excess(chosen):
                 attempt, chosen, constants = beside
-    chosen = _no_joint_worse(attempt, chosen, bare)
+    chosen = _no_joint_worse(attempt, chosen)
     after = attempt.state(chosen)
     while predicts_worse(bare.holdout.relative, after.holdout.relative) and earlier:
         attempt, chosen = earlier.pop()
@@ -276,11 +276,15 @@ def diagnose(
     )
 
 
-def _no_joint_worse(attempt: Attempt, chosen: list[int], bare: State) -> list[int]:
+def _no_joint_worse(attempt: Attempt, chosen: list[int]) -> list[int]:
     """Those chosen, or the last of the search's steps to them after which no joint's held-out torque is predicted worse
-    than by the description alone, whose state is `bare`: what serves one axis by way of the masses may harm another.
+    than without any: what serves one axis by way of the masses may harm another.
+
+    All of those chosen where rows leave no more than noise: by that torques differ.
     """
-    before = bare.holdout.relative
+    if not attempt.tracing.freed:
+        return chosen
+    before = attempt.state([]).holdout.relative
     for step in (chosen, *(step for _, step in reversed(attempt.tracing.path) if step != chosen)):
         after = attempt.state(step).holdout.relative
         if all(after[row] <= (1.0 + LEAST_RISE) * before[row] for row in before.keys() & after.keys()):

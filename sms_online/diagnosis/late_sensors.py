@@ -90,11 +90,11 @@ class Lags:
         }
         lags = lagging(self._rows.model.system.effects)
         late = {name for name in readings if any(fnmatchcase(name, where) for where in lags)}
-        own = {where: names for where, names in matching.items() if names and not names & late}
+        own = {where: names for where, names in matching.items() if names}
         return {
             where: [other for other, part in own.items() if part < names]
             for where, names in own.items()
-            if len(names) > 1 or not any(names < others for others in own.values())
+            if not names & late and (len(names) > 1 or not any(names < others for others in own.values()))
         }
 
     def left(self, where: str | None = None, corner: float = np.inf) -> Array:

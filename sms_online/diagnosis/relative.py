@@ -7,10 +7,12 @@ from collections.abc import Iterable, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from sms_online.calibration.channels import Family, TorqueFamily, position_families, torque_families
+from sms_online.calibration.channels import Motion as Readings
 from sms_online.description.schema import Effect
 from sms_online.diagnosis.candidates import CandidateColumns
 from sms_online.diagnosis.rows import SessionRows, joint_windows
-from sms_online.diagnosis.weak_windows import Motion
+from sms_online.diagnosis.weak_windows import Motion, WeakWindows
 from sms_online.row_types import joint_rows
 from sms_online.stream import Array
 
@@ -44,6 +46,42 @@ class RelativeResiduals:
         self._measured = torque
         self._b = torque - rows.base.known_part(physical)
         self._effects: list[Array] = []
+        names = [p.name for p in rows.base.parameters]
+        springs = [f"joint_{i}.stiffness" for i in range(1, len(self._joints) + 1)]
+        self._springs = [names.index(spring) if spring in names else None for spring in springs]
+        self._deflections, self._torques = self._calibration(rows, weak)
+
+    def _calibration(self, rows: SessionRows, weak: WeakWindows) -> tuple[Array, Array]:
+        """What joints' deflections and torques are read too much for one unit of each nuisance, (W, joints, m) both.
+
+        A stiff spring makes of an encoder's zero within its tolerance as much as the torque. What else calibration does
+        to the rows of joints is little beside it.
+        """
+        sensing, layout, m = rows.sensing, rows.model.layout, rows.calibrated.count
+        number = {nuisance: k for k, nuisance in enumerate(rows.calibrated.nuisances)}
+        along = sensing.displacements(np.zeros((1, layout.n_x)))[0]
+        deflection = along[list(layout.theta_m)] - along[list(layout.q)]
+        tolerances = rows.model.system.tolerances
+
+        def read(families: Iterable[Family | TorqueFamily], motion: Motion) -> Array:
+            values = rows.segments[motion.segment].values[:, sensing.position_columns]
+            rates = np.gradient(values, axis=0) * rows.model.system.sample_rate
+            turned = np.broadcast_to(np.eye(3), (len(motion.x), 3, 3))
+            given = Readings(values[motion.samples], rates[motion.samples], motion.torque, turned)
+            out = [(family.adds(given), family.nuisances) for family in families]
+            added = np.zeros((*out[0][0].shape[:2], m)) if out else np.zeros((len(motion.x), 0, m))
+            for columns, nuisances in out:
+                for column, nuisance in zip(np.moveaxis(columns, 2, 0), nuisances, strict=True):
+                    if nuisance in number:
+                        added[..., number[nuisance]] = column
+            return added
+
+        positions, torques = position_families(sensing, tolerances), torque_families(sensing, tolerances)
+        none = np.zeros((weak.count, len(self._joints), m))
+        return (
+            -weak.columns(lambda motion: (None, deflection @ read(positions, motion))) if positions else none,
+            -weak.columns(lambda motion: (None, read(torques, motion))) if torques else none,
+        )
 
     def declare(self, effects: Sequence[Effect]) -> None:
         """Effects whose coefficients a solution holds after the model's parameters, in this order."""
@@ -52,13 +90,19 @@ class RelativeResiduals:
     def of(self, solution: Array, held: Iterable[tuple[NDArray[np.bool_], Array]] = ()) -> dict[str, float]:
         """By joint, for a solution (n + c + m,); held: windows (W,) that another solution predicts.
 
-        Calibration is left out: within its tolerances it is little beside a torque.
+        Calibration is that of deflections and torques.
         """
         columns = np.concatenate([self._Y, *self._effects], axis=2)
         c = columns.shape[2]
-        left = self._b - columns @ solution[:c]
+
+        def left(each: Array) -> Array:
+            stiffness = [0.0 if k is None else each[k] for k in self._springs]
+            calibrated = stiffness * (self._deflections @ each[c:]) - self._torques @ each[c:]
+            return np.asarray(self._b - columns @ each[:c] + calibrated)
+
+        rest = left(solution)
         for windows, other in held:
-            left[windows] = self._b[windows] - columns[windows] @ other[:c]
+            rest[windows] = left(other)[windows]
         size = np.linalg.norm(self._measured, axis=0)
-        ratio = np.divide(np.linalg.norm(left, axis=0), size, out=np.zeros_like(size), where=size > 0.0)
+        ratio = np.divide(np.linalg.norm(rest, axis=0), size, out=np.zeros_like(size), where=size > 0.0)
         return {joint_rows(i): float(r) for i, r in enumerate(ratio)}

@@ -41,7 +41,12 @@ MOST_EFFECTS = 8
 
 
 class Tracing(Acceptance):
-    """Searches the candidates for what the rows of a session leave."""
+    """Searches the candidates for what the rows of a session leave.
+
+    path: which candidate each step of the last search took, and all that were chosen then.
+    """
+
+    path: Sequence[tuple[int, list[int]]] = ()
 
     def _excess(self, k: int, g: Gain) -> float:
         """Gain beyond what an absent candidate reaches, and beyond what the laws of those found are uncertain by."""
@@ -97,8 +102,7 @@ class Tracing(Acceptance):
         is called with those chosen before each further one; true ends the search with these. start: those that a
         search of nearly the same rows has found, to go on from.
         """
-        # Which candidate each step of the search took, and all that were chosen then.
-        self.path: list[tuple[int, list[int]]] = []
+        self.path = []
         self._taken: dict[int, float] = {}  # gains of the effects chosen
         self._leaves: dict[int, float] = {}
         self._refused: set[str] = set()
@@ -170,7 +174,7 @@ class Tracing(Acceptance):
             if frozenset(chosen) in seen:
                 break  # effects that replace each other in turn
             seen.add(frozenset(chosen))
-            self.path.append((best, list(chosen)))
+            self.path = [*self.path, (best, list(chosen))]
             # Beside it others may be of use that were none before.
             useless = set()
             found, deviances = self.gains(chosen), {}
