@@ -10,6 +10,7 @@ and 12.
 from __future__ import annotations
 
 import numpy as np
+from scipy.linalg.lapack import dtrtrs
 
 from sms_online.smoother.collocation import Transitions
 from sms_online.stream import Array
@@ -47,11 +48,11 @@ class FixedIntervalSmoother:
             before[n_y : n_y + m, n_y:] = 0.0 if Phi is None else self._L @ Phi.T
             before[n_y + m :, n_y:] = 0.0 if Phi is None else steps.Gamma[k].T
             after = raw_triangle(before)  # [[R_e^½, gainᵀ], [·, root of the next covariance]]
-            root, gain = np.triu(after[:n_y, :n_y]), after[:n_y, n_y:]
+            root, gain = after[:n_y, :n_y], after[:n_y, n_y:]
             innovation = -C[k] @ self._M
             innovation[:, 0] += e[k]
             innovation[:, 1:] -= D[k]
-            white = np.linalg.solve(root.T, innovation)
+            white = dtrtrs(root, innovation, trans=1)[0]
             rows.append(white[sampled[k]])
             self._past.append((self._L, self._M, C[k], root, white) if Phi is None else
                               (self._L, self._M, C[k], root, white, Phi, gain))  # fmt: skip
@@ -74,6 +75,6 @@ class FixedIntervalSmoother:
                 Phi, gain = step
                 innovation = innovation - gain @ adjoint
                 adjoint = Phi.T @ adjoint
-            adjoint = adjoint + C.T @ np.linalg.solve(root, innovation)
+            adjoint = adjoint + C.T @ dtrtrs(root, innovation)[0]
             out[k] = M @ full + L.T @ (L @ adjoint)
         return out
