@@ -132,7 +132,7 @@ def test_filter_and_smoother_equal_dense_least_squares() -> None:
     missing = rng.random((K + 1, n_y)) < 0.3
     C[missing], D[missing], e[missing] = 0.0, 0.0, 0.0
     root = np.triu(rng.standard_normal((m, m))) + 3.0 * np.eye(m)
-    kalman = FixedIntervalSmoother(root.copy(), n)
+    kalman = FixedIntervalSmoother(root.copy(), np.zeros((m, 1 + n)))
     half = Transitions(*(part[:6] for part in (steps.Phi, steps.Gamma, steps.B, steps.d)))
     rest = Transitions(*(part[6:] for part in (steps.Phi, steps.Gamma, steps.B, steps.d)))
     innovations = np.concatenate((kalman.push(e[:6], C[:6], D[:6], half), kalman.push(e[6:], C[6:], D[6:], rest)))
@@ -141,3 +141,14 @@ def test_filter_and_smoother_equal_dense_least_squares() -> None:
     expected_delta, expected_states = dense_problem(steps, root, C, D, e)
     assert_allclose(delta, expected_delta, rtol=1e-9)
     assert_allclose(kalman.smooth(delta), expected_states, rtol=1e-8, atol=1e-8)
+    # Another filter that goes on from the end of a first one loses nothing; samples where they meet are the first's.
+    first = FixedIntervalSmoother(root.copy(), np.zeros((m, 1 + n)))
+    rows = [first.push(e[:7], C[:7], D[:7], half)]
+    second = FixedIntervalSmoother(first.root, first.mean)
+    nothing = np.zeros_like(C[:1])
+    rows.append(second.push(e[6:], np.concatenate((nothing, C[7:])), D[6:], rest))
+    innovations = np.concatenate(rows)
+    assert len(innovations) == np.count_nonzero(~missing)
+    delta = np.linalg.lstsq(-innovations[:, 1:], innovations[:, 0], rcond=None)[0]
+    assert_allclose(delta, expected_delta, rtol=1e-9)
+    assert_allclose(second.smooth(expected_delta)[-1], expected_states[-1], rtol=1e-8, atol=1e-8)

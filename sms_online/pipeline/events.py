@@ -21,7 +21,7 @@ from sms_online.pipeline.latency import WANDER
 from sms_online.pipeline.white_rows import WhiteRows
 from sms_online.state import Stage, State
 from sms_online.stream import Array
-from sms_online.trackers.factor import triangular_factor
+from sms_online.trackers.factor import extended
 from sms_online.trackers.information import Information
 
 # Time before the first test, s, and after an event before the next: a motion must have shown what the model lacks.
@@ -183,7 +183,7 @@ class ChangeDetector(Stage):
         # uncertainty counted; directions that nothing is known of add nothing.
         known = self.state.known.factor.copy()
         known[-1, -1] = 0.0
-        chi2 = float(triangular_factor(known, own)[-1, -1] ** 2)
+        chi2 = float(extended(known, own)[-1, -1] ** 2)
         if self.state.sum == 0.0:
             # What may be an event is measured by what was before it.
             self.state.level = max(1.0, self.state.levels / max(1, self.state.tested))

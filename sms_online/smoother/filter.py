@@ -10,6 +10,7 @@ and 12.
 from __future__ import annotations
 
 import numpy as np
+from scipy.linalg.lapack import dtrtrs
 
 from sms_online.smoother.collocation import Transitions
 from sms_online.stream import Array
@@ -19,18 +20,17 @@ from sms_online.trackers.factor import raw_triangle
 class FixedIntervalSmoother:
     """Filter forwards through `push`, piece by piece, then `smooth` back.
 
-    root (m, m): the first state has the covariance rootᵀ root. n: number of parameters.
+    root (m, m), mean (m, 1 + n): of the first state, which has the mean `mean` [1, δβ] and the covariance rootᵀ root;
+    behind the last step, of the last state with all samples so far.
     """
 
-    def __init__(self, root: Array, n: int) -> None:
-        self._L = root
-        n_v = len(root) // 2
-        self._M = np.zeros((2 * n_v, 1 + n))
-        self._upper = np.triu(np.ones((2 * n_v, 2 * n_v)))
+    def __init__(self, root: Array, mean: Array) -> None:
+        self.root, self.mean = root, mean
+        self._upper, self._eye = np.triu(np.ones_like(root)), np.eye(len(root))
         self._past: list[tuple[Array, ...]] = []
 
     def push(self, e: Array, C: Array, D: Array, steps: Transitions) -> Array:
-        """Samples at B nodes, each with the step behind it where there is one; whitened innovations (rows, 1 + n).
+        """Samples at B nodes, each with the step behind it, the last one without; whitened innovations (rows, 1 + n).
 
         e (B, n_y), C (B, n_y, m), D (B, n_y, n): differences, and readings by state and parameters, in units of the
         noise; a row of zeros in C is no sample. The innovation of [1, δβ] is row @ [1, δβ].
@@ -42,38 +42,34 @@ class FixedIntervalSmoother:
         sampled = np.asarray(C.any(axis=2))
         rows = []
         for k in range(len(e)):
-            Phi = steps.Phi[k] if k < len(steps.Phi) else None
-            before[n_y : n_y + m, :n_y] = self._L @ C[k].T
-            before[n_y : n_y + m, n_y:] = 0.0 if Phi is None else self._L @ Phi.T
-            before[n_y + m :, n_y:] = 0.0 if Phi is None else steps.Gamma[k].T
+            goes_on = k < len(steps.Phi)
+            Phi = steps.Phi[k] if goes_on else self._eye
+            before[n_y : n_y + m, :n_y] = self.root @ C[k].T
+            before[n_y : n_y + m, n_y:] = self.root @ Phi.T
+            before[n_y + m :, n_y:] = steps.Gamma[k].T if goes_on else 0.0
             after = raw_triangle(before)  # [[R_e^½, gainᵀ], [·, root of the next covariance]]
-            root, gain = np.triu(after[:n_y, :n_y]), after[:n_y, n_y:]
-            innovation = -C[k] @ self._M
+            root, gain = after[:n_y, :n_y], after[:n_y, n_y:]
+            innovation = -C[k] @ self.mean
             innovation[:, 0] += e[k]
             innovation[:, 1:] -= D[k]
-            white = np.linalg.solve(root.T, innovation)
+            white = dtrtrs(root, innovation, trans=1)[0]
             rows.append(white[sampled[k]])
-            self._past.append((self._L, self._M, C[k], root, white) if Phi is None else
-                              (self._L, self._M, C[k], root, white, Phi, gain))  # fmt: skip
-            if Phi is not None:
-                self._M = Phi @ self._M + gain.T @ white
-                self._M[:, 0] += steps.d[k]
-                self._M[:, 1:] += steps.B[k]
-                self._L = after[n_y : n_y + m, n_y:] * self._upper
+            self._past.append((self.root, self.mean, C[k], root, white, Phi, gain))
+            self.mean = Phi @ self.mean + gain.T @ white
+            if goes_on:
+                self.mean[:, 0] += steps.d[k]
+                self.mean[:, 1:] += steps.B[k]
+            self.root = after[n_y : n_y + m, n_y:] * self._upper
         return np.concatenate(rows)
 
     def smooth(self, delta: Array) -> Array:
         """Smoothed deviations (K + 1, m) of all nodes for δβ (n,)."""
         full = np.concatenate(([1.0], delta))
-        out = np.empty((len(self._past), len(self._L)))
-        adjoint = np.zeros(len(self._L))
+        out = np.empty((len(self._past), len(self.root)))
+        adjoint = np.zeros(len(self.root))
         for k in range(len(self._past) - 1, -1, -1):
-            L, M, C, root, white, *step = self._past[k]
-            innovation = white @ full
-            if step:
-                Phi, gain = step
-                innovation = innovation - gain @ adjoint
-                adjoint = Phi.T @ adjoint
-            adjoint = adjoint + C.T @ np.linalg.solve(root, innovation)
+            L, M, C, root, white, Phi, gain = self._past[k]
+            innovation = white @ full - gain @ adjoint
+            adjoint = Phi.T @ adjoint + C.T @ dtrtrs(root, innovation)[0]
             out[k] = M @ full + L.T @ (L @ adjoint)
         return out

@@ -25,7 +25,7 @@ from sms_online.physical import PhysicalSet
 from sms_online.pipeline.description import described
 from sms_online.smoother.collocation import defects, momenta_and_forces, transitions
 from sms_online.smoother.filter import FixedIntervalSmoother
-from sms_online.smoother.span import Innovations, Span, interpolated
+from sms_online.smoother.span import Ending, Innovations, Span, interpolated
 from sms_online.stream import Array
 from sms_online.trackers.factor import Solution, solve, triangular_factor
 
@@ -34,6 +34,8 @@ from sms_online.trackers.factor import Solution, solve, triangular_factor
 LEVELS = (0.3, 0.1, 0.03, 0.01, 0.003, 0.001)
 # Those that a span begins with whose parameters are known from the spans before it.
 LATER_LEVELS = (0.01, 0.001, 0.0)
+# And that of a span whose first state is known, too.
+NEXT_LEVELS = (0.0,)
 # Those that are allowed for where the samples refute exact equations; more than that is another system.
 ALLOWED = (0.001, 0.003, 0.01, 0.03)
 # A level is tried again while the innovations are larger than noise makes them, so often at most.
@@ -96,7 +98,7 @@ class SpanFit:
 
     beta (n,): estimate from this span and what was known before it. rows: how many innovations. mean_square: of the
     whitened innovations. level: of the white forces that are left, 0 where the equations hold. step: of the
-    collocation, s.
+    collocation, s. ending: last state.
     """
 
     factor: Array
@@ -105,6 +107,7 @@ class SpanFit:
     mean_square: float
     level: float
     step: float
+    ending: Ending
 
 
 class SpanSmoother:
@@ -122,14 +125,20 @@ class SpanSmoother:
         self._motors = model.generalized_force(np.eye(torque.size)).T * np.sqrt(torque)
         self._physical = PhysicalSet(model, base)
 
-    def fit(self, span: Span, beta: Array, known: Array, last_step: float | None) -> SpanFit:
+    def fit(
+        self, span: Span, beta: Array, known: Array, last_step: float | None, before: Ending | None = None
+    ) -> SpanFit:
         """Fit a span from β (n,), with what is known before it as a factor or rows (·, n + 1).
 
-        last_step: of the collocation of an earlier span, s; None in the first one. Raises DivergedError.
+        last_step: of the collocation of an earlier span, s; None in the first one. before: of the span that this one
+        goes on from. Raises DivergedError.
         """
         with _diverging():
             if last_step is None:
                 return self._first(span, beta, known)
+            if before is not None:
+                with suppress(*NO_NUMBERS):
+                    return _Search(self, span, beta, known, before=before).through(NEXT_LEVELS, (last_step,))
             try:
                 return _Search(self, span, beta, known).through(LATER_LEVELS, (last_step,))
             except NO_NUMBERS:
@@ -173,12 +182,14 @@ class _Search:
     """The state of a search: β and the motion, and what the last step was made of.
 
     reach (n,): how far a step takes parameters that loose equations do not determine, as a standard deviation; 0 where
-    that is not known.
+    that is not known. before: see `SpanSmoother.fit`.
     """
 
     def __init__(
-        self, smoother: SpanSmoother, span: Span, beta: Array, known: Array, reach: Array | None = None
-    ) -> None:
+        self, smoother: SpanSmoother, span: Span, beta: Array, known: Array, reach: Array | None = None,
+        before: Ending | None = None,
+    ) -> None:  # fmt: skip
+        self._before = before
         self.reach = np.zeros(beta.size) if reach is None else reach
         self._smoother, self._span, self._known = smoother, span, known
         self._model, self._base = smoother._model, smoother._base
@@ -233,7 +244,7 @@ class _Search:
                 if not self.converge(level):
                     continue
             if self.mean_square <= LARGEST_MEAN_SQUARE:
-                return SpanFit(self.factor, self.beta, self.rows, self.mean_square, level, step)
+                return SpanFit(self.factor, self.beta, self.rows, self.mean_square, level, step, self.ending)
         raise DivergedError(f"no motion and no parameters explain the samples, after {self.iterations} steps")
 
     def loosen(self, level: float) -> None:
@@ -261,7 +272,7 @@ class _Search:
         dynamics = self._smoother.dynamics(self.beta)
         differences = self._innovations(motion.x, motion.v)
         lacking = defects(dynamics, motion, self._impulse, self._impulse_m)
-        kalman = FixedIntervalSmoother(self._first_state(dynamics), base.n)
+        kalman = FixedIntervalSmoother(*self._first_state(dynamics))
         every = max(1, round(DERIVATIVES_INTERVAL / motion.step))
         nodes = every * max(1, 512 // every)
         drive, joints = self._drive(dynamics, level, tame), self._smoother._motors.shape[1]
@@ -295,6 +306,7 @@ class _Search:
         v = motion.v + np.concatenate(moved)[..., 0]
         self.motion = Motion(motion.t, self._model.layout.displaced(motion.x, s[:, :n_v]), v)
         self.beta = beta
+        self.ending = Ending(self.motion.x[-1], v[-1], beta, kalman.root, kalman.mean[:, 1:])
         self.iterations += 1
 
     def _relax(self, delta: Array) -> None:
@@ -304,12 +316,23 @@ class _Search:
             max(LEAST_RELAXATION, 0.5 * self._relaxation) if along < 0.0 else min(1.0, 2.0 * self._relaxation)
         )
 
-    def _first_state(self, dynamics: Dynamics) -> Array:
-        """Root of the covariance that leaves the first state free to move, (2 n_v, 2 n_v)."""
-        n_v = self._model.layout.n_v
-        root = np.diag(np.concatenate((np.full(n_v, FREE_POSITION), self._usual_speed)))
-        root[n_v:, n_v:] @= dynamics.mass_matrix(self.motion.x[:1])[0]
-        return root
+    def _first_state(self, dynamics: Dynamics) -> tuple[Array, Array]:
+        """Root (2 n_v, 2 n_v) and mean (2 n_v, 1 + n) of how far the first state is from the motion's.
+
+        As the span before leaves it, or free to move.
+        """
+        n_v, x, mass = self._model.layout.n_v, self.motion.x[:1], dynamics.mass_matrix(self.motion.x[:1])[0]
+        mean, before = np.zeros((2 * n_v, 1 + self._base.n)), self._before
+        if before is None:
+            root = np.diag(np.concatenate((np.full(n_v, FREE_POSITION), self._usual_speed)))
+            root[n_v:, n_v:] @= mass
+            return root, mean
+        momentum = self._smoother.dynamics(before.beta).mass_matrix(before.x[None])[0] @ before.v
+        mean[:n_v, 0] = self._model.layout.speeds(x, before.x - x)[0]
+        mean[n_v:, 0] = momentum - mass @ self.motion.v[0]
+        mean[:, 0] += before.by_beta @ (self.beta - before.beta)
+        mean[:, 1:] = before.by_beta
+        return before.root, mean
 
     def _drive(self, dynamics: Dynamics, level: float, tame: bool) -> Array:
         """What unit noise adds to the state in a step, (2 n_v, noises)."""

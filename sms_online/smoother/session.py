@@ -17,16 +17,18 @@ from sms_online.pipeline.sensing import Sensing, stated_noise
 from sms_online.pipeline.sensor_noise import FEWEST_SAMPLES, SAMPLES
 from sms_online.pipeline.synchronise import GridSamples, Synchroniser
 from sms_online.smoother.fit import DivergedError, SpanFit, SpanSmoother
-from sms_online.smoother.span import Span
+from sms_online.smoother.span import Ending, Span
 from sms_online.state import Stage, State
 from sms_online.stream import Array, Block
 from sms_online.trackers.factor import solve, triangular_factor
 from sms_online.trackers.interface import Estimate, Prior, prior_factor
 
-# Length of a span, s. Its first state is unknown, which costs some information; its arrays take some 10 MB a second.
-SPAN = 10.0
-# Where a gap of the motion is at its end, it goes on to the end of the gap, at most to this multiple of its length.
-LATER_END = 1.5
+# Length of the first span, and of one behind a gap, s: long enough to determine the parameters from a poor first fit.
+SPAN = 4.0
+# Of one that goes on from the last, whose state it knows: nothing is lost where spans meet, and nobody waits longer.
+NEXT_SPAN = 1.0
+# Where a gap of the motion is at its end, it goes on to the end of the gap, at most for this time, s.
+LATER_END = 5.0
 # A shorter one may not hold a motion.
 LEAST_SPAN = 0.5
 # A gap of the motion longer than this is filled, at this interval, s: 1 m/s moves the arm by a centimetre in it.
@@ -79,7 +81,9 @@ class SmootherState(State):
     """What a smoother keeps of the spans so far and to come.
 
     known: from the spans so far. values (B, channels): readings at t (B,), s. torque (K, joints): at index (K, 2), grid
-    index and segment. motion (M, n_x + n_v): as the pipeline took it from the sensors, at grid indices `moved`.
+    index and segment. motion (M, n_x + n_v): as the pipeline took it from the sensors, at grid indices `moved`. ending:
+    of the span that the next one goes on from, None where there is none. sigma (channels,): noise of the last span's
+    readings, NaN where it is not known.
     """
 
     known: SmootherStatistics
@@ -89,6 +93,8 @@ class SmootherState(State):
     torque: Array
     moved: NDArray[np.int64]
     motion: Array
+    sigma: Array
+    ending: Ending | None = None
 
 
 class Smoother(Stage):
@@ -113,6 +119,7 @@ class Smoother(Stage):
             torque=np.empty((0, joints)),
             moved=np.empty(0, dtype=np.int64),
             motion=np.empty((0, model.layout.n_x + model.layout.n_v)),
+            sigma=np.full(len(self.channels), np.nan),
         )
 
     def set_prior(self, prior: Prior) -> None:
@@ -167,7 +174,8 @@ class Smoother(Stage):
         """Torque samples of the first span, 0 where more of them may come."""
         segment = self.state.index[:, 1]
         run = int(np.searchsorted(segment, segment[0], side="right")) if segment.size else 0
-        longest, most = (round(factor * SPAN * self._rate) + 1 for factor in (1.0, LATER_END))
+        length = SPAN if self.state.ending is None else NEXT_SPAN
+        longest, most = (round(seconds * self._rate) + 1 for seconds in (length, length + LATER_END))
         if run < longest:
             return run if last or run < segment.size else 0
         # A span ends, and the next one begins, where the motion is known: a first state that is guessed rings.
@@ -186,6 +194,8 @@ class Smoother(Stage):
         now = self.state
         goes_on = count < len(now.index) and now.index[count, 1] == now.index[count - 1, 1]
         dropped = count - 1 if goes_on else count
+        if not goes_on:
+            now.ending = None
         end = now.index[count - 1, 0]
         now.index, now.torque = now.index[dropped:], now.torque[dropped:]
         kept = now.t > self._time(end)
@@ -202,20 +212,21 @@ class Smoother(Stage):
         values, sigma, torque_density = self._with_noise(now.t[inside], now.values[inside], now.torque[:count])
         sensed = np.flatnonzero(np.isfinite(sigma))
         readings = Readings(self._model, [self.channels[k] for k in sensed])
-        guess = self._guess(self._time(now.moved[moved]), now.motion[moved], now.t[inside], values)
-        span = Span(torque_t, now.torque[:count], now.t[inside], values[:, sensed], *guess)
         smoother = SpanSmoother(self._model, self._base, readings, sigma[sensed], torque_density)
         try:
             if not moved.any():
                 raise DivergedError("the sensors give no motion to begin with")
+            guess = self._guess(self._time(now.moved[moved]), now.motion[moved], now.t[inside], values)
+            span = Span(torque_t, now.torque[:count], now.t[inside], values[:, sensed], *guess)
             past = now.known
             beta = past.beta if past.spans else self._realisable(first_fit())
             known = triangular_factor(prior_factor(self.prior, self._base.n), past.factor)
-            fit = smoother.fit(span, beta, known, past.last_step if past.spans else None)
+            fit = smoother.fit(span, beta, known, past.last_step if past.spans else None, now.ending)
         except DivergedError as error:
             failures = (*now.known.failures, f"{begin:.6g} … {end:.6g} s: {error}")
-            now.known = now.known._replace(failures=failures)
+            now.known, now.ending = now.known._replace(failures=failures), None
             return
+        now.ending = fit.ending
         self._take(fit, end)
 
     def _guess(self, t: Array, motion: Array, sampled: Array, values: Array) -> tuple[Array, Array, Array]:
@@ -282,10 +293,14 @@ class Smoother(Stage):
     def _with_noise(self, t: Array, values: Array, torque: Array) -> tuple[Array, Array, Array]:
         """Samples at t, their noise (C,), NaN where nothing is known of it, and the torques' density (joints,)."""
         sigma = stated_noise(self._model.system, self.channels)
+        if self.state.ending is not None:
+            # A short span has too few samples of a slow channel.
+            sigma = np.where(np.isnan(sigma), self.state.sigma, sigma)
         for k in np.flatnonzero(np.isnan(sigma)):
             own = np.flatnonzero(np.isfinite(values[:, k]))[-SAMPLES:]
             if own.size >= FEWEST_SAMPLES:
                 sigma[k] = noise_std(values[own, k][:, None], t[own])[0]
+        self.state.sigma = sigma
         largest = np.max(np.abs(values), axis=0, initial=0.0, where=np.isfinite(values))
         sigma = np.maximum(sigma, FINEST * largest + np.finfo(np.float64).tiny)
         drives = self._sensing.noise[self._model.layout.n_x :]

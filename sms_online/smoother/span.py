@@ -1,9 +1,10 @@
-"""What a smoother fits at once: a span of samples, and the instants of its states."""
+"""What a smoother fits at once: a span of samples, the instants of its states, and what the next span goes on from."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 from scipy.interpolate import BSpline, make_interp_spline
@@ -54,6 +55,20 @@ class Span:
 def interpolated(nodes: Array, values: Array, t: Array) -> Array:
     """Values (M, ·) at instants t (M,) of what is known at the nodes, (K + 1, ·)."""
     return np.asarray(make_interp_spline(nodes, values, k=STATE_DEGREE)(t))
+
+
+class Ending(NamedTuple):
+    """What a span knows of its last state, for the next one, which goes on from there.
+
+    x (n_x,), v (n_v,): the state, with β (n,). Given β it has the covariance rootᵀ root (2 n_v, 2 n_v) in positions and
+    momenta, and by another β it is another by by_beta (2 n_v, n).
+    """
+
+    x: Array
+    v: Array
+    beta: Array
+    root: Array
+    by_beta: Array
 
 
 class Innovations:

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from sms_online.stream import Array
-from sms_online.trackers.factor import triangular_factor
+from sms_online.trackers.factor import extended, reduced, triangular_factor
 
 # Time from one step of the filter to the next, s, and steps from one knot that is looked back at to the next.
 STEP, KNOT = 0.2, 5
@@ -20,9 +20,9 @@ BEND = KNOT * STEP / np.sqrt(12.0)
 
 @dataclass(frozen=True)
 class Block:
-    """Rows between two knots as one factor: columns [Y, (t - knot) Y, b], (2 n + 1, 2 n + 1). knot: its number.
+    """Rows between two knots, or their factor: columns [Y, (t - knot) Y, b], (k, 2 n + 1).
 
-    rows: how many. span: s.
+    knot: its number. rows: how many. span: s.
     """
 
     factor: Array
@@ -33,7 +33,7 @@ class Block:
     @staticmethod
     def of(rows: Array, knot: int, span: float) -> Block:
         """The block of whitened rows [Y, (t - knot) Y, b] (M, 2 n + 1) of `span` s."""
-        return Block(triangular_factor(rows), knot, len(rows), span)
+        return Block(reduced(rows), knot, len(rows), span)
 
 
 def decaying(value: Array, ramp: Array, decay: float, span: float) -> Array:
@@ -170,7 +170,7 @@ class DriftFilter:
         rows[:, :n], rows[:, -1] = block.factor[:, :n], block.factor[:, -1]
         for column, place, decay in state.places():
             rows[:, place] = decaying(block.factor[:, column], block.factor[:, n + column], decay, block.span)
-        return replace(state, factor=triangular_factor(self.factor, rows))
+        return replace(state, factor=extended(self.factor, rows))
 
     def advanced(self, knot: int) -> DriftFilter:
         """At a later knot."""

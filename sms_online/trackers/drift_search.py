@@ -10,7 +10,7 @@ from scipy.special import chdtrc
 
 from sms_online.stream import Array
 from sms_online.trackers.drift_filter import STEP, Block, DriftFilter, decaying
-from sms_online.trackers.factor import triangular_factor
+from sms_online.trackers.factor import extended
 
 # Starts of a ramp that are tried, knots before now.
 STARTS = (4, 8, 16, 32)
@@ -159,18 +159,17 @@ def _left(state: DriftFilter, blocks: Sequence[Block], n: int) -> tuple[Array, A
     state, squares = replace(state, factor=wide), np.zeros(2 * n)
     runs = [[block] for block in blocks] if state.uneven else [list(blocks)]
     for k, run in enumerate(runs):
-        own, begun = np.concatenate([_relative(block, run[0].knot, state) for block in run]), len(state.factor)
-        stacked = np.zeros((begun + len(own), wide.shape[1]))
-        stacked[:begun] = state.factor
-        stacked[begun:, :n] = own[:, :n]
+        own = np.concatenate([_relative(block, run[0].knot, state) for block in run])
+        rows = np.zeros((len(own), wide.shape[1]))
+        rows[:, :n] = own[:, :n]
         for column, place, decay in state.places():
             span = sum(block.span for block in run)
-            stacked[begun:, place] = decaying(own[:, column], own[:, n + column], decay, span)
-        stacked[begun:, size:] = own
+            rows[:, place] = decaying(own[:, column], own[:, n + column], decay, span)
+        rows[:, size:] = own
         # Ramps begin where all begins.
-        stacked[begun:, size + n : -1] += (run[0].knot - since) * STEP * own[:, :n]
-        squares += np.sum(stacked[begun:, size:-1] ** 2, axis=0)
-        state = replace(state, factor=triangular_factor(stacked))
+        rows[:, size + n : -1] += (run[0].knot - since) * STEP * own[:, :n]
+        squares += np.sum(rows[:, size:-1] ** 2, axis=0)
+        state = replace(state, factor=extended(state.factor, rows))
         if k + 1 < len(runs):
             state = state.advanced(runs[k + 1][0].knot)
     return state.factor[size:, size:], np.sqrt(squares)

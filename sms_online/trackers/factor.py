@@ -15,6 +15,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.linalg.lapack import dgeqrf, dtpqrt
 
 from sms_online.stream import Array
 
@@ -24,6 +25,8 @@ RANK_TOLERANCE = 1e-12
 # A parameter is undetermined when its unit vector has more than this in the null space. Rounding rotates the null space
 # by about 1e-15 times the scaled condition number, 1e-10 at 1e5; true combinations have fractions of order one.
 PARTICIPATION_TOLERANCE = 1e-6
+# Columns that LAPACK works off together; of 50 as of 180 columns this is the quickest.
+PANEL = 8
 
 
 def triangular_factor(*stacked: Array) -> Array:
@@ -35,9 +38,27 @@ def triangular_factor(*stacked: Array) -> Array:
     return np.asarray(np.linalg.qr(rows, mode="r"))
 
 
+def reduced(rows: Array) -> Array:
+    """The same information (k, n + 1) in no more rows than columns: rows (M, n + 1) as they are, or their triangle."""
+    return rows if len(rows) <= rows.shape[1] else np.asarray(np.linalg.qr(rows, mode="r"))
+
+
+def extended(factor: Array, rows: Array) -> Array:
+    """Factor (n + 1, n + 1) of another one, upper triangular, and rows (M, n + 1).
+
+    LAPACK leaves the zeros of the triangle out: with fewer rows than columns that is several times as fast.
+    """
+    if not len(rows):
+        return factor
+    return np.ascontiguousarray(dtpqrt(0, min(PANEL, len(factor)), factor, rows)[0])
+
+
 def raw_triangle(rows: Array) -> Array:
-    """R with Rᵀ R = rowsᵀ rows in its upper triangle; below it there is what LAPACK leaves there."""
-    return np.asarray(np.linalg.qr(rows, mode="raw")[0].T, dtype=np.float64)
+    """R with Rᵀ R = rowsᵀ rows in its upper triangle; below it there is what LAPACK leaves there.
+
+    Of small matrices NumPy's checks would cost more than the decomposition.
+    """
+    return np.asarray(dgeqrf(rows, lwork=PANEL * rows.shape[1])[0])
 
 
 @dataclass(frozen=True)

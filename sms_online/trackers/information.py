@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from sms_online.stream import Array
-from sms_online.trackers.factor import RANK_TOLERANCE, Solution, solve, triangular_factor
+from sms_online.trackers.factor import RANK_TOLERANCE, Solution, extended, solve, triangular_factor
 
 
 @dataclass(frozen=True)
@@ -33,7 +33,7 @@ class Information:
 
     def with_rows(self, rows: Array) -> Information:
         """The same with further whitened rows [Y b] (M, n + 1)."""
-        return Information(triangular_factor(self.factor, rows), self.rows + len(rows))
+        return Information(extended(self.factor, rows), self.rows + len(rows))
 
     def solution(self) -> Solution:
         """The least-squares solution."""

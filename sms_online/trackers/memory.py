@@ -10,7 +10,7 @@ import numpy as np
 
 from sms_online.state import Stage, State
 from sms_online.stream import Array
-from sms_online.trackers.factor import triangular_factor
+from sms_online.trackers.factor import extended, triangular_factor
 from sms_online.trackers.forgetting import FadingForgetting, Forgetting, NoForgetting, SlidingWindow
 from sms_online.trackers.information import Information
 from sms_online.trackers.robust import MAX_CLUSTERS, ClusterFactors, merge_neighbours
@@ -22,7 +22,7 @@ BLOCK_ROWS = 32
 
 @dataclass(frozen=True)
 class Content:
-    """What a memory holds: factor (n + 1, n + 1), rows it counts for, clusters (C, n + 1, n + 1) where they exist."""
+    """What a memory holds: factor (n + 1, n + 1), rows it counts for, clusters (C, k, n + 1) where they exist."""
 
     factor: Array
     rows: float
@@ -60,15 +60,13 @@ class FullMemory(State):
 
     def absorb(self, block: Array) -> None:
         """See Memory."""
-        factor = triangular_factor(block)
-        self.factor = triangular_factor(self.factor, factor)
+        self.factor = extended(self.factor, block)
         self.rows += len(block)
-        self.clusters.add(factor)
+        self.clusters.add(block)
 
     def with_pending(self, block: Array) -> Content:
         """See Memory."""
-        pending = triangular_factor(block)
-        return Content(triangular_factor(self.factor, pending), self.rows + len(block), self.clusters.stack(pending))
+        return Content(extended(self.factor, block), self.rows + len(block), self.clusters.stack(block))
 
 
 class FadingState(State):
