@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from sms_adapters.system_file import load_system
-from sms_online.calibration.channels import Motion, position_families, torque_families
+from sms_online.calibration.channels import Motion, low_pass_families, position_families, torque_families
 from sms_online.calibration.columns import CalibrationColumns, nuisances
 from sms_online.calibration.geometry import Geometry, geometries
 from sms_online.description.schema import System, Tolerances
@@ -34,6 +34,7 @@ SYSTEMS: dict[str, Callable[[], System]] = {
     "planar": paper,
     "planar, exact links": lambda: paper("exact"),
     "spatial": lambda: load_system("spatial-two-link"),
+    "flexible joints with gauges": lambda: load_system("quanser-2dsfl"),
     "spatial, prismatic joint, gravity, effects": lambda: spatial(free=False),
 }
 
@@ -103,6 +104,11 @@ class Rows:
         out = []
         for family in position_families(sensing, model.system.tolerances):
             for column in np.moveaxis(family.adds(motion), 2, 0):
+                out.append(np.zeros_like(self.exact))
+                out[-1][:, sensing.position_columns] = column
+        for low_pass in low_pass_families(sensing, model.system.tolerances):
+            slopes = np.gradient(low_pass.adds(motion), 1.0 / model.system.sample_rate, axis=0)
+            for column in np.moveaxis(slopes, 2, 0):
                 out.append(np.zeros_like(self.exact))
                 out[-1][:, sensing.position_columns] = column
         for torques in torque_families(sensing, model.system.tolerances):

@@ -20,6 +20,8 @@ from sms_online.pipeline.sensing import Sensing
 from sms_online.stream import Array
 
 MARKER = re.compile(r"(?P<marker>link_(?P<link>\d+)\.marker_\d+)\.(?P<kind>u|theta)_(?P<axis>[xyz])")
+# Clocks of what measures links behind flexible joints.
+GAUGES, LINK_ENCODERS = "gauges", "link encoders"
 # Along the link a displacement changes by this rotation, with this sign.
 SLOPES = {"y": ("z", 1.0), "z": ("y", -1.0)}
 
@@ -63,6 +65,20 @@ def position_families(sensing: Sensing, tolerances: Tolerances) -> list[Family]:
         *_camera(sensing, names, tolerances),
     ]
     return [family for family in every if family.nuisances and all(each.tolerance > 0.0 for each in family.nuisances)]
+
+
+def low_pass_families(sensing: Sensing, tolerances: Tolerances) -> list[Family]:
+    """Families whose rate is what one unit of each adds to the position sensors' readings.
+
+    A low-pass of second order reads y of x = y + c ẏ + ÿ / ω²: beside the clock, which is late by c, it has ω.
+    """
+    names = [sensing.channels[column] for column in sensing.position_columns]
+    gauges = [k for k, name in enumerate(names) if name.endswith("strain_angle")]
+    if not gauges or not tolerances.gauge_low_pass:
+        return []
+    read = np.isin(np.arange(len(names)), gauges)
+    low_pass = Nuisance("gauge_low_pass", GAUGES, "s²", tolerances.gauge_low_pass)
+    return [Family((low_pass,), lambda motion: -(motion.rates * read)[:, :, None])]
 
 
 def torque_families(sensing: Sensing, tolerances: Tolerances) -> list[TorqueFamily]:
@@ -115,8 +131,8 @@ def _clocks(sensing: Sensing, names: Sequence[str], tolerance: float) -> Iterato
         base = sensing.model.layout.n_base_positions
         for k, name in enumerate(names):
             second = name.startswith("q_") and f"theta_m_{name[2:]}" in names
-            encoders = "link encoders" if second else "encoders"
-            rest = "gauges" if name.endswith("strain_angle") else encoders
+            encoders = LINK_ENCODERS if second else "encoders"
+            rest = GAUGES if name.endswith("strain_angle") else encoders
             kind = "base" if k < base else "markers" if MARKER.fullmatch(name) else rest
             groups.setdefault((kind, ""), []).append(k)
     chosen = {name: sensors for name, sensors in groups.items() if sensors}

@@ -7,13 +7,21 @@ is read too large by n(t) adds ∫ φ n dt to b, so N. With the right geometry m
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from itertools import chain
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import make_interp_spline
 
-from sms_online.calibration.channels import Motion, position_families, torque_families
+from sms_online.calibration.channels import (
+    Family,
+    Motion,
+    TorqueFamily,
+    low_pass_families,
+    position_families,
+    torque_families,
+)
 from sms_online.calibration.geometry import geometries
 from sms_online.calibration.nuisance import Nuisance
 from sms_online.model.model import Model
@@ -33,8 +41,10 @@ def nuisances(sensing: Sensing) -> tuple[Nuisance, ...]:
     """What a session's description may be wrong in, in the order of its columns."""
     system = sensing.model.system
     positions = [each.nuisances for each in position_families(sensing, system.tolerances)]
+    low_passes = [each.nuisances for each in low_pass_families(sensing, system.tolerances)]
     torques = [each.nuisances for each in torque_families(sensing, system.tolerances)]
-    return (*chain.from_iterable((*positions, *torques)), *(each.nuisance for each in geometries(system)))
+    channels = chain.from_iterable((*positions, *low_passes, *torques))
+    return (*channels, *(each.nuisance for each in geometries(system)))
 
 
 def _interpolation(at: NDArray[np.int64], derivative: int = 0) -> Array:
@@ -46,12 +56,14 @@ def _interpolation(at: NDArray[np.int64], derivative: int = 0) -> Array:
 class CalibrationState(State):
     """What nuisances change at a segment's instants.
 
-    From instant number `first` on: what a position sensor reads too much, added (K, sensors, ·), a torque, torque
-    (K, joints, ·), and by what another geometry changes momentum and force (K, n_v, ·), each by nuisance.
+    From instant number `first` on: what a position sensor reads too much, added (K, sensors, ·), and what has that for
+    its rate, before (K, sensors, ·); what a torque reads too much, torque (K, joints, ·); and by what another geometry
+    changes momentum and force (K, n_v, ·), each by nuisance.
     """
 
     first: int
     added: Array
+    before: Array
     torque: Array
     momentum: Array
     force: Array
@@ -67,13 +79,17 @@ class CalibrationColumns(Stage):
         self.count = len(nuisances(sensing))
         self._model, self._sensing = model, sensing
         self._positions = position_families(sensing, sensing.model.system.tolerances)
+        self._low_passes = low_pass_families(sensing, sensing.model.system.tolerances)
         self._torques = torque_families(sensing, sensing.model.system.tolerances)
         # Of the session's system: an event's may hold more that has a geometry.
         self.geometries = tuple(geometries(sensing.model.system))
         self._joint_rows = list(model.layout.theta_m)
         # What is added at the instants, in the sum over steps; and that sum of c, by parts of a `Sensitivity`.
         self._to_steps = _interpolation(np.arange(INSTANTS + 1)) * span / STEPS
-        self._kernels = [self._kernel(offset, span) for offset in range(SPARSE)]
+        self._rate_to_steps = _interpolation(np.arange(INSTANTS + 1), 1) * INSTANTS / STEPS
+        steps = [self._kernel(offset, span) for offset in range(SPARSE)]
+        self._kernels = [self._to_steps.T @ kernel for kernel in steps]
+        self._rate_kernels = [self._rate_to_steps.T @ kernel for kernel in steps]
         phi, phi_dot, _ = test_function(INSTANTS, span, EXPONENT)
         self._phi, self._phi_dot = phi * span / INSTANTS, phi_dot * span / INSTANTS
         self.forget(0)
@@ -82,12 +98,14 @@ class CalibrationColumns(Stage):
         """Begin anew: `next_instant` is the number of the first one to come."""
         layout = self._model.layout
         sensors = len(self._sensing.position_columns)
-        widths = [sum(len(each.nuisances) for each in family) for family in (self._positions, self._torques)]
+        families = (self._positions, self._low_passes, self._torques)
+        widths = [sum(len(each.nuisances) for each in family) for family in families]
         moved = self.count - sum(widths)
         self.state = CalibrationState(
             next_instant,
             np.empty((0, sensors, widths[0])),
-            np.empty((0, len(layout.q), widths[1])),
+            np.empty((0, sensors, widths[1])),
+            np.empty((0, len(layout.q), widths[2])),
             *np.empty((2, 0, layout.n_v, moved)),
         )
 
@@ -101,17 +119,22 @@ class CalibrationColumns(Stage):
         torque = signals[:, : len(self._model.layout.q)]
         _, T_0 = self._model.layout.base_pose(x)
         motion = Motion(self._sensing.readings(x), rates, torque, T_0)
-        K = len(x)
-        added = [np.empty((K, *self.state.added.shape[1:2], 0)), *(family.adds(motion) for family in self._positions)]
-        torques = [np.empty((K, *self.state.torque.shape[1:2], 0)), *(family.adds(motion) for family in self._torques)]
         momentum, force = by_geometry
-        self.state.added = np.concatenate((self.state.added, np.concatenate(added, axis=2)))
-        self.state.torque = np.concatenate((self.state.torque, np.concatenate(torques, axis=2)))
-        self.state.momentum = np.concatenate((self.state.momentum, momentum))
-        self.state.force = np.concatenate((self.state.force, force))
+        now = self.state
+        now.added = np.concatenate((now.added, self._sum_of(self._positions, motion, now.added)))
+        now.before = np.concatenate((now.before, self._sum_of(self._low_passes, motion, now.before)))
+        now.torque = np.concatenate((now.torque, self._sum_of(self._torques, motion, now.torque)))
+        now.momentum = np.concatenate((now.momentum, momentum))
+        now.force = np.concatenate((now.force, force))
+
+    @staticmethod
+    def _sum_of(families: Sequence[Family] | Sequence[TorqueFamily], motion: Motion, like: Array) -> Array:
+        """What families add, side by side (K, sensors or joints, ·), as in an array of before."""
+        none = np.empty((len(motion.readings), like.shape[1], 0))
+        return np.concatenate((none, *(family.adds(motion) for family in families)), axis=2)
 
     def _kernel(self, offset: int, span: float) -> Array:
-        """Weights (INSTANTS + 1, ·) of H, ∂Pπ/∂x, ∂Gπ/∂v and ∂Gπ/∂x in the integral of c times what is added.
+        """Weights (STEPS + 1, ·) of H, ∂Pπ/∂x, ∂Gπ/∂v and ∂Gπ/∂x in the integral of c times what is added.
 
         As `RowNoise.kernel`, but by splines: noise is known to a tenth, these are to be known to a thousandth.
         """
@@ -120,7 +143,7 @@ class CalibrationColumns(Stage):
         of_mass = phi_ddot * _interpolation(every) + phi_dot * _interpolation(every, 1) * per_second
         sparse, slope = _interpolation(some), _interpolation(some, 1) * per_second
         of_force = (-phi_dot * sparse, phi_dot * sparse + phi * slope, -phi * sparse)
-        return np.asarray(self._to_steps.T @ np.concatenate((of_mass, *of_force), axis=1))
+        return np.concatenate((of_mass, *of_force), axis=1)
 
     def windows(self, starts: NDArray[np.int64], sensitivity: Sensitivity, rough: Array) -> Array:
         """N (W, n_v, count) of the windows that start at some instants.
@@ -132,15 +155,23 @@ class CalibrationColumns(Stage):
             return np.empty((W, n_v, 0))
         now, inside = self.state, (starts - self.state.first)[:, None] + np.arange(INSTANTS + 1)
         parts = np.concatenate((sensitivity.H, sensitivity.P_x, sensitivity.G_v, sensitivity.G_x), axis=1)
-        weights = self._kernels[sensitivity.offset] @ parts.reshape(W, -1, n_v * sensors)
-        if rough.any():
-            weights += self._to_steps.T @ rough.reshape(W, STEPS + 1, -1)
-        flat = weights.reshape(W, -1, n_v, sensors).swapaxes(1, 2).reshape(W, n_v, -1)
-        positions = -flat @ now.added[inside].reshape(W, flat.shape[2], -1)
+        parts, rough = parts.reshape(W, -1, n_v * sensors), rough.reshape(W, STEPS + 1, -1)
+        positions = []
+        for kernels, to_steps, read in (
+            (self._kernels, self._to_steps, now.added),
+            (self._rate_kernels, self._rate_to_steps, now.before),
+        ):
+            if not read.shape[2]:
+                continue
+            weights = kernels[sensitivity.offset] @ parts
+            if rough.any():
+                weights += to_steps.T @ rough
+            flat = weights.reshape(W, -1, n_v, sensors).swapaxes(1, 2).reshape(W, n_v, -1)
+            positions.append(-flat @ read[inside].reshape(W, flat.shape[2], -1))
         torques = np.zeros((W, n_v, now.torque.shape[2]))
         torques[:, self._joint_rows] = self._over(self._phi, now.torque[inside])
         moved = -self._over(self._phi_dot, now.momentum[inside]) - self._over(self._phi, now.force[inside])
-        return np.concatenate((positions, torques, moved), axis=2)
+        return np.concatenate((*positions, torques, moved), axis=2)
 
     @staticmethod
     def _over(weights: Array, values: Array) -> Array:
@@ -151,6 +182,7 @@ class CalibrationColumns(Stage):
         """Forget instants with smaller numbers."""
         if self.count:
             kept = slice(before - self.state.first, None)
-            self.state.added, self.state.torque = self.state.added[kept], self.state.torque[kept]
+            self.state.added, self.state.before = self.state.added[kept], self.state.before[kept]
+            self.state.torque = self.state.torque[kept]
             self.state.momentum, self.state.force = self.state.momentum[kept], self.state.force[kept]
         self.state.first = before

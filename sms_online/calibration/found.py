@@ -27,6 +27,7 @@ NAMES = {
     "axis": "axis",
     "gravity": "direction of gravity",
     "marker_station": "place along the link",
+    "gauge_low_pass": "low-pass",
     "encoder_zero": "zero",
     "once_per_turn": "once per turn",
     "marker_zero": "zero",
@@ -72,6 +73,9 @@ class Calibration:
         return abs(self.estimate) > CERTAIN * self.std
 
     def __str__(self) -> str:
+        if self.name == "gauge_low_pass" and self.estimate > 0.0:
+            corner = 1.0 / (2.0 * np.pi * np.sqrt(self.estimate))
+            return f"{self.where} behind a low-pass of {_rounded(corner, 0.5 * corner * self.std / self.estimate)} Hz"
         positive, negative = WORDS.get(self.name, ("off", "off"))
         words = positive if self.estimate >= 0.0 else negative
         value = abs(self.estimate) if positive != negative else self.estimate
@@ -84,6 +88,8 @@ class Calibration:
     @property
     def advice(self) -> str:
         """What to do where it is beyond its tolerance."""
+        if self.name == "gauge_low_pass":
+            return "record them unfiltered, or declare the effect sensor_lag with this corner"
         if self.name == "clock" and self.estimate > 0.0:
             return f"state latency = {self.estimate:.2g} of it, or a larger tolerances.clock"
         return f"correct the system file or the sensor, or state a larger tolerances.{self.name}"

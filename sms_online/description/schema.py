@@ -156,6 +156,8 @@ class Tolerances(Record):
     marker_station: place of a marker along its link, m.
     clock: a device's clock against that of the torques, s; where all channels come from one, of encoders, base,
     gauges and markers.
+    gauge_low_pass: inverse square of the corner of the low-pass that strain gauges are read through, s²; by default it
+    is at 100 Hz.
     encoder_zero: zero of an encoder, rad (m).
     once_per_turn: sine and cosine of an encoder's error once a turn, rad.
     base_angle: zero of the base's measured attitude, rad. The base's frame is the one that is measured: what this zero
@@ -173,6 +175,7 @@ class Tolerances(Record):
     gravity: NonNegative = 1e-3
     marker_station: NonNegative = 5e-4
     clock: NonNegative = 5e-5
+    gauge_low_pass: NonNegative = 2.5e-6
     encoder_zero: NonNegative = 1e-4
     once_per_turn: NonNegative = 5e-5
     base_angle: NonNegative = 1e-3
