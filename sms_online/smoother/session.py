@@ -24,7 +24,7 @@ from sms_online.trackers.factor import solve, triangular_factor
 from sms_online.trackers.interface import Estimate, Prior, prior_factor
 
 # Length of the first span, and of one behind a gap, s: long enough to determine the parameters from a poor first fit.
-SPAN = 4.0
+SPAN = 10.0
 # Of one that goes on from the last, whose state it knows: nothing is lost where spans meet, and nobody waits longer.
 NEXT_SPAN = 1.0
 # Where a gap of the motion is at its end, it goes on to the end of the gap, at most for this time, s.
