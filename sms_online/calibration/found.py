@@ -89,7 +89,7 @@ class Calibration:
     def advice(self) -> str:
         """What to do where it is beyond its tolerance."""
         if self.name == "gauge_low_pass":
-            return "record them unfiltered, or declare the effect sensor_lag with this corner"
+            return "record them unfiltered, or declare their low-pass as an effect with this corner"
         if self.name == "clock" and self.estimate > 0.0:
             return f"state latency = {self.estimate:.2g} of it, or a larger tolerances.clock"
         return f"correct the system file or the sensor, or state a larger tolerances.{self.name}"

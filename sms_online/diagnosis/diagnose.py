@@ -209,6 +209,9 @@ def diagnose(
         attempt = Attempt(case, lagging)
     progress("searching for effects", TRACED)
     chosen = attempt.search()
+    if late and (forces := _explaining_alone(case, system, attempt, chosen)):
+        late, attempt = [], Attempt(case, system)
+        chosen = attempt.search(forces)
     if late:
         # With the same weights, so that before and after are in the same measure.
         described = Attempt(case, system, (), attempt.rows.beta, ())
@@ -274,6 +277,20 @@ def diagnose(
         estimator_after=estimator_after,
         unexplained=unexplained,
     )
+
+
+def _explaining_alone(case: Case, system: System, attempt: Attempt, chosen: Sequence[int]) -> list[Effect]:
+    """Effects found beside a sensor's lag that need none: they leave noise, or predict held-out torques as well.
+
+    Few windows do not distinguish a lag from what was not yet in the model when it was looked for.
+    """
+    forces = [attempt.tracing.candidates[k].effect for k in chosen]
+    if not forces:
+        return []
+    alone = Attempt(case, system, candidates=forces)
+    left, both = alone.state(range(len(alone.tracing.candidates))), attempt.state(chosen)
+    beyond = any(row.beyond for row in left.test.values())
+    return [] if beyond and predicts_worse(both.holdout.relative, left.holdout.relative) else forces
 
 
 def _no_joint_worse(attempt: Attempt, chosen: list[int]) -> list[int]:

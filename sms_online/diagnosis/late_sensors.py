@@ -42,6 +42,8 @@ TOLERANCE, EVALUATIONS = 1e-2, 10
 SHARPNESS_STEP = 0.05
 # Blocks of windows, and parts that these make up, each predicted from the others.
 BLOCKS, PARTS = 9, 3
+# Standard deviations that a corner is from zero at least: what windows leave depends on it.
+DETERMINED = 3.0
 # Of rows that leave less than this share nothing is left. Of those that leave more than all nothing is explained.
 TINY = 1e-3
 
@@ -153,6 +155,8 @@ def find_late(rows: SessionRows) -> LateSensor | None:
     near = (1.0 - SAME_SHARE) * gain
     alike = dict.fromkeys(o for left, o in others if o != where and lags.gains(before, left).sum() > near)
     std = _std(lags, where, corner, after)
+    if std > corner / DETERMINED:
+        return None
     shares = float(np.exp(before.mean())), float(np.exp(after.mean()))
     return LateSensor(lag(where, corner), std, float(gain), limit, *shares, tuple(late_keys((), alike)))
 
