@@ -280,17 +280,16 @@ def diagnose(
 
 
 def _explaining_alone(case: Case, system: System, attempt: Attempt, chosen: Sequence[int]) -> list[Effect]:
-    """Effects found beside a sensor's lag that need none: they leave noise, or predict held-out torques as well.
+    """Effects found beside a sensor's lag that leave no more than noise without it; none where they leave more.
 
     Few windows do not distinguish a lag from what was not yet in the model when it was looked for.
     """
     forces = [attempt.tracing.candidates[k].effect for k in chosen]
-    if not forces:
+    if not forces or attempt.tracing.freed:
         return []
     alone = Attempt(case, system, candidates=forces)
-    left, both = alone.state(range(len(alone.tracing.candidates))), attempt.state(chosen)
-    beyond = any(row.beyond for row in left.test.values())
-    return [] if beyond and predicts_worse(both.holdout.relative, left.holdout.relative) else forces
+    beyond = any(row.beyond for row in alone.test(range(len(alone.tracing.candidates))).values())
+    return [] if beyond else forces
 
 
 def _no_joint_worse(attempt: Attempt, chosen: list[int]) -> list[int]:
