@@ -32,3 +32,12 @@ def test_what_cannot_be_negative() -> None:
     # Of either sign: a cubic spring that softens, an offset, a first moment.
     for name in ("cubic_stiffness@joint_1.stiffness", "torque_offset@joint_1.torque", "link_1.first_moment_x"):
         assert not not_negative(name)
+
+
+def test_a_column_that_others_make_stays_bounded() -> None:
+    """Rounding leaves of it what no fit may divide by."""
+    rng = np.random.default_rng(0)
+    columns = rng.normal(size=(20, 4))
+    columns[:, 3] = columns[:, 0]
+    found = bounded(columns, rng.normal(size=20), np.array([False, True, True, True]))
+    assert np.abs(found).max() < 10.0

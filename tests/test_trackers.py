@@ -162,6 +162,14 @@ def test_a_snapshot_stays_while_its_tracker_goes_on(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", TRACKERS)
+def test_what_a_tracker_knows_takes_further_rows(name: str) -> None:
+    """Its factor is upper triangular, as further rows need it."""
+    tracker = TRACKERS[name]()
+    tracker.update(exciting_rows(seed=31, count=640))
+    assert not np.tril(tracker.information.factor, -1).any()
+
+
+@pytest.mark.parametrize("name", TRACKERS)
 def test_a_tracker_goes_on_from_what_others_know(name: str) -> None:
     """As when a session goes on with further parameters: what was known of the old ones is known to a new tracker."""
     rows = exciting_rows(seed=18, count=640)

@@ -60,7 +60,7 @@ def percent(std: float, value: float) -> float | None:
     return 100.0 * std / abs(value) if value and math.isfinite(std) else None
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Bounds(Tabled):
     """Cramér–Rao bounds of a system's parameters, for a motion and a set of sensors; parameters: by name.
 

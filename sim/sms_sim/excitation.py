@@ -66,7 +66,7 @@ class Reached:
     largest: float
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Excitation(Tabled):
     """A designed motion, or the described one if none was found with a lower bound of the worst parameter.
 

@@ -141,7 +141,9 @@ class Problem:
         controller = self.system.controller
         assert controller is not None  # of a system that has been simulated
         gains = np.array(controller.stiffness) + 1j * self.series.frequency[:, None] * np.array(controller.damping)
-        size = self.smallest_angle * np.abs(gains[0] / gains)
+        # A passive joint has no gain, and its series is not changed.
+        ratio = np.divide(gains[0], gains, out=np.zeros_like(gains), where=gains != 0.0)
+        size = self.smallest_angle * np.abs(ratio)
         return np.asarray(np.broadcast_to(size, (2, *size.shape)).ravel())
 
     def __call__(self, points: Array) -> tuple[Array, Array]:

@@ -88,7 +88,7 @@ class Calibration:
     @property
     def advice(self) -> str:
         """What to do where it is beyond its tolerance."""
-        if self.name == "gauge_low_pass":
+        if self.name == "gauge_low_pass" and self.estimate > 0.0:
             return "record them unfiltered, or declare their low-pass as an effect with this corner"
         if self.name == "clock" and self.estimate > 0.0:
             return f"state latency = {self.estimate:.2g} of it, or a larger tolerances.clock"

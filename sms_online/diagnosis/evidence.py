@@ -71,6 +71,8 @@ def bounded(columns: Array, b: Array, positive: NDArray[np.bool_]) -> Array:
     n, free = order.size, int(np.count_nonzero(~positive))
     # What the columns without a bound leave is a problem of the others alone.
     rest = free_of(basis(R[:, :free]), R[:, free:])
+    # A column that they make too is rounding now.
+    rest[:, :-1][:, np.linalg.norm(rest[:, :-1], axis=0) <= RANK_TOLERANCE * np.linalg.norm(R[:, free:n], axis=0)] = 0.0
     own = nnls(rest[:, :-1], rest[:, -1])[0]
     out = np.empty(n)
     out[order] = np.concatenate((least_squares(R[:, :free], R[:, n] - R[:, free:n] @ own), own)) / size

@@ -67,7 +67,8 @@ class RelativeResiduals:
             values = rows.segments[motion.segment].values[:, sensing.position_columns]
             rates = np.gradient(values, axis=0) * rows.model.system.sample_rate
             turned = np.broadcast_to(np.eye(3), (len(motion.x), 3, 3))
-            given = Readings(values[motion.samples], rates[motion.samples], motion.torque, turned)
+            torque = motion.torque[:, : len(layout.q)]  # without the wrenches behind them
+            given = Readings(values[motion.samples], rates[motion.samples], torque, turned)
             out = [(family.adds(given), family.nuisances) for family in families]
             added = np.zeros((*out[0][0].shape[:2], m)) if out else np.zeros((len(motion.x), 0, m))
             for columns, nuisances in out:

@@ -75,6 +75,7 @@ def places(system: System, at: Place) -> tuple[str, ...]:
     """Where effects of a kind of place may sit in a system; for channels, the channels."""
     joints = [f"joint_{i}" for i in range(1, len(system.joints) + 1)]
     driven = tuple(f"joint_{i}" for i in drive_channels(system).values())
+    turning = [name for name, joint in zip(joints, system.joints, strict=True) if joint.kind == "revolute"]
     flexible = [(f"link_{i}", k) for i, k in enumerate(system.links, start=1) if isinstance(k, FlexibleLink)]
     match at:
         case "joint":
@@ -87,9 +88,9 @@ def places(system: System, at: Place) -> tuple[str, ...]:
             # In a plane the sum of two rates is a link's own. No shaft runs through a link that bends.
             stiff = [k for k, link in enumerate(system.links, start=1) if not isinstance(link, FlexibleLink)]
             pairs = [(f"joint_{i}", f"joint_{i + 1}") for i in stiff] if system.motion == "spatial" else []
-            return tuple("+".join(pair) for pair in pairs if set(pair) <= set(driven))
+            return tuple("+".join(pair) for pair in pairs if set(pair) <= set(driven) & set(turning))
         case "weighed joint":
-            return tuple(joints) if any(system.gravity) else ()
+            return tuple(turning) if any(system.gravity) else ()
         case "flexible joint":
             return tuple(n for n, j in zip(joints, system.joints, strict=True) if has_motor_side(j))
         case "link":

@@ -278,7 +278,7 @@ class Changes(Stage):
         again[np.arange(len(shifted)), shifted] = [1.0 / each.tolerance for each in wide]
         known = self.detector.before(onset - MARGIN).known.without(shifted).with_rows(again)
         if (np.abs(explanation.sizes) >= LARGEST_SHIFT).any():
-            known = self.beforehand
+            known = self.beforehand.without(shifted).with_rows(again)
         self.detector = self._new_detector()
         self.detector.begin(known)
         return Adoption(self.model, self.base, known, explanation.beta[m : m + n], self.behind(alarm))

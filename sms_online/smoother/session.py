@@ -168,6 +168,8 @@ class Smoother(Stage):
                 return
             if count > max(LEAST_SPAN * self._rate, FEWEST_SAMPLES):
                 self._fit(count, first_fit)
+            else:
+                self.state.ending = None
             self._forget(count)
 
     def _complete(self, last: bool) -> int:
@@ -175,7 +177,8 @@ class Smoother(Stage):
         segment = self.state.index[:, 1]
         run = int(np.searchsorted(segment, segment[0], side="right")) if segment.size else 0
         length = SPAN if self.state.ending is None else NEXT_SPAN
-        longest, most = (round(seconds * self._rate) + 1 for seconds in (length, length + LATER_END))
+        longest = max(round(length * self._rate), FEWEST_SAMPLES) + 1
+        most = longest + round(LATER_END * self._rate)
         if run < longest:
             return run if last or run < segment.size else 0
         # A span ends, and the next one begins, where the motion is known: a first state that is guessed rings.

@@ -200,10 +200,12 @@ class DriftFilter:
             broken, bent = (sum(self.knot < at <= knot for at in knots) for knots in (each.breaks, each.bends))
             sizes = np.sqrt(bent) * np.abs(each.rates) if each.learned else np.zeros(len(each.columns))
             for column, walk, size in zip(each.columns, each.noise(), sizes.tolist(), strict=True):
-                if column not in places:
-                    continue
                 if broken:
-                    out[column] = out[places[column]] = np.inf
+                    out[column] = np.inf
+                if column not in places:
+                    continue  # its rate begins at this knot
+                if broken:
+                    out[places[column]] = np.inf
                 elif walk > 0.0 or size > 0.0:
                     out[places[column]] = float(np.hypot(walk * np.sqrt(time), size))
                 if size > 0.0 and not broken:

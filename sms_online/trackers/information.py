@@ -15,7 +15,7 @@ from sms_online.trackers.factor import RANK_TOLERANCE, Solution, extended, solve
 class Information:
     """The information of so many whitened rows.
 
-    factor (n + 1, n + 1): see `factor`. It is never written, so that whoever keeps one has it as it was.
+    factor (n + 1, n + 1): upper triangular, see `factor`. It is never written, so whoever keeps one has it as it was.
     """
 
     factor: Array

@@ -8,7 +8,7 @@ import numpy as np
 
 from sms_online.state import State
 from sms_online.stream import Array
-from sms_online.trackers.factor import RANK_TOLERANCE, masked_covariance, solve
+from sms_online.trackers.factor import RANK_TOLERANCE, masked_covariance, solve, triangular_factor
 from sms_online.trackers.information import Information
 from sms_online.trackers.interface import Estimate, Prior, Rows, Tracker, checked
 
@@ -102,7 +102,7 @@ class KalmanTracker(Tracker):
         factor[:-1, :-1] = root
         factor[:-1, -1] = root @ (self._initial.value + self._initial.std * self.state.x[:, 0])
         factor[-1, -1] = np.sqrt(self.state.nis)
-        return Information(factor, self.state.rows)
+        return Information(triangular_factor(factor), self.state.rows)
 
     def begin(self, known: Information) -> None:
         """Forget all rows; start from the initial value and std together with given information about π."""

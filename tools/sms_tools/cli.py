@@ -372,7 +372,7 @@ def _add_excite(verbs: Verbs) -> None:
     _add_grade(parser, UNDESCRIBED, "A", "B", "C")
     parser.add_argument("--seed", metavar="N", type=whole(0), default=0, help="seed of the random start; 0 by default")
     text = "largest number of optimiser steps; 6 by default"
-    parser.add_argument("--iterations", metavar="N", type=whole(1), default=15, help=text)
+    parser.add_argument("--iterations", metavar="N", type=whole(1), default=6, help=text)
     _add_out(parser, "for system.toml, reference.csv and excitation.json; runs/<time> by default")
 
 

@@ -164,7 +164,7 @@ def drift_lines(document: Document) -> list[str]:
 
 
 def _drift_line(d: Document) -> str:
-    changed = "" if d.get("changed") is None else f", at another rate since {d['changed']:.1f} s"
+    changed = "" if d.get("changed") is None else f", at this rate since {d['changed']:.1f} s"
     rate = f"{d['rate']:+.4g} ± {d['rate_std']:.2g} {d['unit']} per s"
     line = f"drift since {d['since']:.1f} s{changed}: {d['parameter']} {rate}"
     if d["value_std"] is None:
