@@ -97,7 +97,9 @@ class Problem:
         self.described = None if described is None else self.extremes(*extreme_states(described))
         self.bounds = self.extremes.bounds(limits, self.described)
         self.before = None if described is None else motion_bounds(described, self.grade)
-        self.series = Series(lowest * np.array(HARMONICS), len(system.joints))
+        frequency = lowest * np.array(HARMONICS)
+        # A step of more than a radian of a harmonic shows neither its bounds nor its loads.
+        self.series = Series(frequency[(frequency * STEP < 1.0) | (frequency == lowest)], len(system.joints))
 
     @staticmethod
     def of(
