@@ -15,7 +15,7 @@ import numpy as np
 from sms_online.description.schema import Effect, Over, System
 from sms_online.effects.traits import Traits
 from sms_online.model.chain import Chain
-from sms_online.model.effect import ForceEffect, Inputs
+from sms_online.model.effect import ForceEffect
 from sms_online.model.layout import Layout
 from sms_online.model.parameters import Parameter
 from sms_online.stream import Array
@@ -174,7 +174,7 @@ def dahl_rate(rate: Array, z: Array, width: float) -> Array:
     return np.asarray(r - np.abs(r) * z / width)
 
 
-class Force:
+class Force(ForceEffect):
     """What most force effects share: no torque, no internal state, coefficients reported as they are."""
 
     entry: ClassVar[Entry]
@@ -195,31 +195,6 @@ class Force:
             Parameter(f"{self.name}@{self.where}.{quantity}", symbol, site.unit(unit), nominal)
             for quantity, (symbol, unit, nominal) in linear.items()
         )
-
-    def force(self, layout: Layout, x: Array, v: Array, inputs: Inputs | None) -> Array:
-        """See `ForceEffect`."""
-        raise NotImplementedError
-
-    def power(self, layout: Layout, x: Array, v: Array, inputs: Inputs | None) -> Array:
-        """-f · v."""
-        return np.asarray(-np.einsum("bvn,bv->bn", self.force(layout, x, v, inputs), v))
-
-    def beyond(self, layout: Layout, x: Array, v: Array) -> str:
-        """Where a motion goes beyond what the force is known for, in a sentence: nowhere, for a law."""
-        return ""
-
-    def state_rate(self, layout: Layout, x: Array, v: Array, z: Array) -> Array:
-        """No states, no rates."""
-        return np.zeros_like(z)
-
-    def initial_state(self, layout: Layout, x_0: Array) -> Array:
-        """No states."""
-        return np.zeros(self.n_states)
-
-    def reported(self, values: Array) -> dict[str, float]:
-        """The linear coefficients and the shape constants."""
-        linear = {p.quantity: float(value) for p, value in zip(self.parameters, values, strict=True)}
-        return linear | dict(self.shapes)
 
 
 def position(layout: Layout, x: Array, speed: int) -> Array:

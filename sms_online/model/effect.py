@@ -9,6 +9,8 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Protocol
 
+import numpy as np
+
 from sms_online.description.schema import System
 from sms_online.model.chain import Chain
 from sms_online.model.layout import Layout
@@ -29,7 +31,7 @@ class Inputs:
 
 
 class ForceEffect(Protocol):
-    """An effect of kind `force`.
+    """An effect of kind `force`, with what a law without torques, internal states and shape constants has in common.
 
     parameters: the linear coefficients as they enter π. shapes: shape constants. relative_to: names of the model's
     parameters that reported coefficients are divided by. n_states: number of internal states. smooth: whether it is as
@@ -54,22 +56,28 @@ class ForceEffect(Protocol):
         """Columns f_j (B, n_v, coefficients): generalized force of one unit of each coefficient."""
 
     def power(self, layout: Layout, x: Array, v: Array, inputs: Inputs | None) -> Array:
-        """Power (B, coefficients) that one unit of each coefficient takes out, W."""
+        """Power (B, coefficients) that one unit of each coefficient takes out, W: -f · v."""
+        return np.asarray(-np.einsum("bvn,bv->bn", self.force(layout, x, v, inputs), v))
 
     def beyond(self, layout: Layout, x: Array, v: Array) -> str:
         """Where a motion x (B, n_x), v (B, n_v) goes beyond what the force is known for; empty where it does not."""
+        return ""
 
     def state_rate(self, layout: Layout, x: Array, v: Array, z: Array) -> Array:
-        """ż (B, n_states) of the internal states z (B, n_states)."""
+        """ż (B, n_states) of the internal states z (B, n_states); zero without a law of its own."""
+        return np.zeros_like(z)
 
     def initial_state(self, layout: Layout, x_0: Array) -> Array:
-        """z (n_states,) at the start, at positions x_0 (n_x,) and rest."""
+        """z (n_states,) at the start, at positions x_0 (n_x,) and rest; zero without a law of its own."""
+        return np.zeros(self.n_states)
 
     def reported(self, values: Array) -> dict[str, float]:
         """The coefficients that a person reads, shape constants included, by name.
 
         values: of `parameters`, then of the parameters that `relative_to` names.
         """
+        linear = {p.quantity: float(value) for p, value in zip(self.parameters, values, strict=True)}
+        return linear | dict(self.shapes)
 
 
 class InertiaEffect(Protocol):

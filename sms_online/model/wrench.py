@@ -10,7 +10,7 @@ from sms_online.description.channels import WRENCH_COMPONENTS, wrench_components
 from sms_online.description.schema import System
 from sms_online.description.tree import BASE
 from sms_online.model.chain import Chain
-from sms_online.model.effect import Inputs
+from sms_online.model.effect import ForceEffect, Inputs
 from sms_online.model.layout import Layout
 from sms_online.model.parameters import Parameter
 from sms_online.stream import Array
@@ -19,7 +19,7 @@ from sms_online.stream import Array
 GAIN = Parameter("wrench.gain", "w", "", 1.0)
 
 
-class MeasuredWrenches:
+class MeasuredWrenches(ForceEffect):
     """Σ Jᵀ w over the described wrenches, J the twist Jacobian of where each acts, in that body's axes there."""
 
     name, where = "wrench", "base"  # of a free base they change the momentum
@@ -49,22 +49,6 @@ class MeasuredWrenches:
         """See `ForceEffect`."""
         assert inputs is not None  # of an effect that needs them
         return self.by_component(x) @ inputs.torque[:, len(layout.q) :, None]
-
-    def power(self, layout: Layout, x: Array, v: Array, inputs: Inputs | None) -> Array:
-        """-f · v."""
-        return np.asarray(-np.einsum("bvn,bv->bn", self.force(layout, x, v, inputs), v))
-
-    def beyond(self, layout: Layout, x: Array, v: Array) -> str:
-        """Nowhere."""
-        return ""
-
-    def state_rate(self, layout: Layout, x: Array, v: Array, z: Array) -> Array:
-        """No states, no rates."""
-        return np.zeros_like(z)
-
-    def initial_state(self, layout: Layout, x_0: Array) -> Array:
-        """No states."""
-        return np.zeros(0)
 
     def reported(self, values: Array) -> dict[str, float]:
         """Nothing: it is measured."""
