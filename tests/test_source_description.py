@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import pytest
 
+from sms_adapters.devices import DECODERS, READERS
+from sms_online.description import explain
 from sms_online.description.parse import parse_system
-from sms_online.description.sources import CanSource, SerialFrames
+from sms_online.description.record import records_in
+from sms_online.description.sources import CanSource, Device, SerialFrames, Source
 from tests.refused import RIG, assert_refused, refusal
 
 CAN = """
@@ -110,3 +113,11 @@ def test_lines_need_a_separator_that_no_number_holds() -> None:
         assert parse_system(f'{RIG}{LINES}separator = "{separator}"\n', "rig.toml").sources
     for separator in ("e", ".", "ab", " ", "*"):
         assert "source 1.separator" in refusal(f'{RIG}{LINES}separator = "{separator}"\n', "rig.toml")
+
+
+def test_every_described_device_is_read_decoded_and_headed() -> None:
+    records = records_in(Device)
+    assert set(DECODERS) == set(records)
+    for record in records:
+        assert [base for base in record.__mro__ if base in READERS], record.__name__
+    assert {*explain.SOURCES.values(), *explain.SERIAL.values()} == set(records_in(Source))

@@ -6,7 +6,7 @@ import select
 import socket
 
 from sms_adapters.raw import Clock, LostDevice, Raw, SerialChunk, Turn, at_once, one_line
-from sms_online.description.sources import NatnetSource
+from sms_online.description.sources import DatagramPort
 
 # A datagram is no longer.
 LONGEST = 65536
@@ -17,7 +17,7 @@ HELD_BACK = 1 << 21
 class DatagramReader:
     """Datagrams as they come, a chunk each: a `Reader`."""
 
-    def __init__(self, source: NatnetSource, clock: Clock, turn: Turn = at_once) -> None:
+    def __init__(self, source: DatagramPort, clock: Clock, turn: Turn = at_once) -> None:
         self.name = source.name
         self._source = source
         self._clock = clock

@@ -20,7 +20,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 from itertools import islice, repeat
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,6 +30,7 @@ from sms_adapters.files import reading
 from sms_adapters.lines import LineReader
 from sms_adapters.raw import ERROR_FRAME, EXTENDED, FD_FRAME, REMOTE_FRAME, CanFrames, Raw, SerialChunk
 from sms_online.description.schema import TrackerChoice
+from sms_online.description.sources import Recorded
 from sms_online.errors import InputError
 from sms_online.stream import Array
 
@@ -40,14 +41,12 @@ RULES = 4
 SESSION = "session.toml"
 SYSTEM = "system.toml"
 CHECKPOINT = "resumed-from.msgpack"
-SUFFIXES: dict[str, str] = {"can": ".log", "serial": ".serial", "udp": ".udp"}
+SUFFIXES: dict[Recorded, str] = {"can": ".log", "serial": ".serial", "udp": ".udp"}
 STAMPS, DROPPED = ".stamps", ".dropped"
 MICROSECOND = 1e-6
 # Bit of a candump identifier that marks an error frame (CAN_ERR_FLAG of linux/can.h), written with eight digits.
 _ERROR_ID = 0x2000_0000
 _NO_STAMP = b"-"
-
-Kind = Literal["can", "serial", "udp"]
 
 
 def to_microseconds(t: float) -> int:
@@ -70,7 +69,7 @@ class SessionHeader:
     """
 
     epoch: int
-    sources: dict[str, Kind]
+    sources: dict[str, Recorded]
     start: float
     versions: dict[str, str]
     rules: int = RULES
@@ -163,7 +162,7 @@ class RecordedItems:
         self,
         directory: Path,
         name: str,
-        kind: Kind,
+        kind: Recorded,
         epoch: int,
         on_bytes: Callable[[Path, int], None] = lambda path, count: None,
     ) -> None:

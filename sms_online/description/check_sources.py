@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from ipaddress import AddressValueError, IPv4Address
 
 from sms_online.description.explain import hint, nearest
@@ -12,14 +12,16 @@ from sms_online.description.sources import (
     BagSource,
     CanopenSource,
     CanSource,
+    DatagramPort,
     FrameField,
     LogSource,
     NatnetSource,
     SerialField,
     SerialFrames,
     SerialLines,
+    SerialPort,
     Signal,
-    Source,
+    numbers_of,
 )
 from sms_online.errors import InputError
 
@@ -29,6 +31,7 @@ CAN_SIGNAL = re.compile(r"\w+\.\w+")
 CANOPEN_SIGNAL = re.compile(r"(?P<node>\d+)\.[0-9A-Fa-f]{4}(:[0-9A-Fa-f]{1,2})?")
 # A topic, and the path of a number in its messages: names and, in brackets, a number or a name.
 BAG_SIGNAL = re.compile(r"[^.\[\]]+(\.\w+(\[[^\[\].]+\])*)+")
+NATNET_SHOWN = '"ASSET.PART" or "ASSET.MARKER.AXIS", such as "3.2.x",'
 NATNET_SIGNAL = re.compile(r"\d+\.([xyz]|q[xyzw]|yaw)|\d+\.[1-9]\d*\.[xyz]")
 STAMP = re.compile(r"\w+(\.\w+)*")
 MOST_NODES = 127  # CiA 301
@@ -56,26 +59,21 @@ def check_sources(system: System, names: Sequence[str], source: str) -> None:
             _check_can(device, place, source)
         elif isinstance(device, CanopenSource):
             _check_canopen(device, place, source)
-        elif isinstance(device, NatnetSource):
-            _check_natnet(device, place, source)
         elif isinstance(device, LogSource):
             _check_log(device, place, source)
-        else:
+        elif isinstance(device, SerialPort):
             _check_serial(device, place, source)
-        for where, signal in _signals(device, place):
-            _check_signal(signal, where, names, fed, source)
+        elif isinstance(device, NatnetSource):
+            _check_keys(device, f"{place}.signals", NATNET_SIGNAL, NATNET_SHOWN, source)
+        if isinstance(device, DatagramPort):
+            _check_addresses(device, place, source)
+        if not numbers_of(device):
+            raise InputError(source, f"{place}.signals", "an empty table", '"NAME" = "channel", at least once')
+        for where, number in numbers_of(device).items():
+            _check_number(number, f"{place}.{where}", names, fed, source)
 
 
-def _signals(device: Source, place: str) -> Iterator[tuple[str, Signal | SerialField]]:
-    if isinstance(device, CanSource | CanopenSource | NatnetSource | LogSource):
-        for name, signal in device.signals.items():
-            yield f"{place}.signals.{name}", signal
-    else:
-        for k, field in enumerate(device.fields, start=1):
-            yield f"{place}.fields[{k}]", field
-
-
-def _check_signal(
+def _check_number(
     signal: Signal | SerialField, where: str, names: Sequence[str], fed: dict[str, str], source: str
 ) -> None:
     if signal.channel is None:
@@ -140,10 +138,7 @@ def _check_log(device: LogSource, place: str, source: str) -> None:
                 raise InputError(source, f"{place}.signals", repr(name), expected)
 
 
-def _check_natnet(device: NatnetSource, place: str, source: str) -> None:
-    _check_keys(
-        device, f"{place}.signals", NATNET_SIGNAL, '"ASSET.PART" or "ASSET.MARKER.AXIS", such as "3.2.x",', source
-    )
+def _check_addresses(device: DatagramPort, place: str, source: str) -> None:
     for key, value, several in (("group", device.group, True), ("interface", device.interface, False)):
         if not value and several:
             continue

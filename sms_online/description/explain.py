@@ -11,6 +11,7 @@ from pydantic_core import ErrorDetails
 
 from sms_online.description import bodies, schema, sources
 from sms_online.description.bodies import Marker
+from sms_online.description.record import Record, tagged
 from sms_online.errors import InputError
 
 # Fields of `System` that are numbered tables, or lists of tables, in the file.
@@ -47,14 +48,10 @@ LINKS: dict[str, type[BaseModel]] = {
     "cross": bodies.RigidLink,
     "flexible": bodies.FlexibleLink,
 }
-SOURCES: dict[str, type[BaseModel]] = {
-    "can": sources.CanSource,
-    "canopen": sources.CanopenSource,
-    "udp": sources.NatnetSource,
-    "table": sources.TableSource,
-    "bag": sources.BagSource,
+SERIAL: dict[str, type[Record]] = tagged("format", sources.SerialSource)
+SOURCES: dict[str, type[Record]] = {
+    kind: record for kind, record in tagged("kind", sources.Source).items() if record not in SERIAL.values()
 }
-SERIAL: dict[str, type[BaseModel]] = {"frames": sources.SerialFrames, "lines": sources.SerialLines}
 TAGS = {"links": {"kind": tuple(LINKS)}, "sources": {"kind": (*SOURCES, "serial"), "format": tuple(SERIAL)}}
 INERTIAS = ("inertia", "stator_inertia")
 # Longest value that a message repeats; more would not fit a line.

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated
+from typing import Annotated, Any, get_args
 
 from pydantic import BaseModel, ConfigDict, Field
 
@@ -18,3 +18,15 @@ class Record(BaseModel):
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+
+def records_in(annotation: Any) -> list[type[Record]]:
+    """The records that a type is made of, in its order: those of a union, of a list, of a table."""
+    if isinstance(annotation, type) and issubclass(annotation, Record):
+        return [annotation]
+    return [record for part in get_args(annotation) for record in records_in(part)]
+
+
+def tagged(key: str, union: Any) -> dict[str, type[Record]]:
+    """Records of a union by the value of the key that distinguishes them."""
+    return {get_args(record.model_fields[key].annotation)[0]: record for record in records_in(union)}

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Any, Literal
+from collections.abc import Mapping
+from typing import Annotated, Any, ClassVar, Literal
 
 from pydantic import Field, model_validator
 
 from sms_online.description.record import NonNegative, Positive, Record
+
+# What a recording holds of a device: CAN frames, the bytes of a serial port, or datagrams.
+Recorded = Literal["can", "serial", "udp"]
 
 
 class Signal(Record):
@@ -54,10 +58,18 @@ class CanBus(SourceRecord):
     options: further options, passed to python-can as they are.
     """
 
+    recorded: ClassVar[Recorded] = "can"
     interface: str = "socketcan"
     channel: str = "can0"
     bitrate: Annotated[int, Field(gt=0)] | None = None
     options: dict[str, bool | int | float | str] = {}
+
+    @property
+    def address(self) -> str:
+        """Where it is, for messages."""
+        bitrate = [] if self.bitrate is None else [f"{self.bitrate} bit/s"]
+        options = [f"{name} {value}" for name, value in self.options.items()]
+        return ", ".join([f"{self.interface} {self.channel}", *bitrate, *options])
 
 
 class CanSource(CanBus):
@@ -129,9 +141,15 @@ class SerialPort(SourceRecord):
     baudrate: bit/s.
     """
 
+    recorded: ClassVar[Recorded] = "serial"
     kind: Literal["serial"]
     port: str
     baudrate: Annotated[int, Field(gt=0)] = 115200
+
+    @property
+    def address(self) -> str:
+        """Where it is, for messages."""
+        return f"{self.port} at {self.baudrate} bit/s"
 
 
 class SerialFrames(SerialPort):
@@ -164,7 +182,26 @@ class SerialLines(SerialPort):
     checksum: Literal["none", "xor"] = "none"
 
 
-class NatnetSource(SourceRecord):
+class DatagramPort(SourceRecord):
+    """A port that UDP datagrams come to.
+
+    group: the multicast group that is sent to; "" where datagrams come to this machine's own address.
+    port: the data port.
+    interface: address of this machine's network card; "0.0.0.0" leaves the choice to the operating system.
+    """
+
+    recorded: ClassVar[Recorded] = "udp"
+    group: str = ""
+    port: Annotated[int, Field(gt=0, lt=65536)]
+    interface: str = "0.0.0.0"
+
+    @property
+    def address(self) -> str:
+        """Where it is, for messages."""
+        return f"UDP {self.group or self.interface}:{self.port}"
+
+
+class NatnetSource(DatagramPort):
     """Frames that a motion capture sends as UDP datagrams, in OptiTrack's protocol NatNet, with its z axis up.
 
     The keys of signals are "ASSET.PART", of the pose of a rigid body: x, y, z in m, its Euler parameters qx, qy, qz, qw
@@ -174,9 +211,6 @@ class NatnetSource(SourceRecord):
     kind: `udp`.
     format: `natnet`.
     version: of the protocol, as the streaming settings state it; Motive 2 sends "3.1", Motive 3 "4.0" and later.
-    group: the multicast group that is sent to; "" where datagrams come to this machine's own address.
-    port: the data port.
-    interface: address of this machine's network card; "0.0.0.0" leaves the choice to the operating system.
     signals: where each number of a frame goes.
     """
 
@@ -185,7 +219,6 @@ class NatnetSource(SourceRecord):
     version: Annotated[str, Field(pattern=r"^\d+\.\d+$")]
     group: str = "239.255.42.99"
     port: Annotated[int, Field(gt=0, lt=65536)] = 1511
-    interface: str = "0.0.0.0"
     signals: dict[str, Signal]
 
 
@@ -243,8 +276,20 @@ class BagSource(LogSource):
     stamp: str = "header.stamp"
 
 
-Device = CanSource | CanopenSource | SerialFrames | SerialLines | NatnetSource
+# Devices that their `kind` alone distinguishes: a further one is listed here.
+OfOneKind = CanSource | CanopenSource | NatnetSource
+Device = OfOneKind | SerialFrames | SerialLines
 SerialSource = Annotated[SerialFrames | SerialLines, Field(discriminator="format")]
-Source = Annotated[
-    CanSource | CanopenSource | SerialSource | NatnetSource | TableSource | BagSource, Field(discriminator="kind")
-]
+Source = Annotated[OfOneKind | SerialSource | TableSource | BagSource, Field(discriminator="kind")]
+
+
+def numbers_of(source: Source) -> Mapping[str, Signal | SerialField]:
+    """What is said of each number of a source, by its place in the table."""
+    if isinstance(source, SerialPort):
+        return {f"fields[{k}]": field for k, field in enumerate(source.fields, start=1)}
+    return {f"signals.{key}": signal for key, signal in source.signals.items()}
+
+
+def source_channels(source: Source) -> list[str]:
+    """Channels that a source delivers."""
+    return [number.channel for number in numbers_of(source).values() if number.channel is not None]

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from sms_online.calibration.nuisance import Nuisance
-from sms_online.description.sources import CanopenSource, CanSource, SerialFrames, SerialLines, Source
+from sms_online.description.sources import CanopenSource, CanSource, source_channels
 from sms_online.effects.delay import late_keys
 from sms_online.pipeline.sensing import Sensing
 from sms_online.state import Stage, State
@@ -54,13 +54,6 @@ class Latency:
     size: float
     std: float
     effects: tuple[str, ...]
-
-
-def source_channels(source: Source) -> list[str]:
-    """Channels that a source delivers."""
-    if isinstance(source, SerialFrames | SerialLines):
-        return [field.channel for field in source.fields if field.channel is not None]
-    return [signal.channel for signal in source.signals.values()]
 
 
 def _group(sensing: Sensing, name: str, channels: Sequence[str]) -> SourceGroup:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from sms_online.pipeline.latency import source_channels
+from sms_online.description.sources import source_channels
 from sms_online.pipeline.periods import LONGEST_HOLE
 from sms_online.pipeline.sensing import is_slow
 from sms_online.pipeline.statistics import Statistics

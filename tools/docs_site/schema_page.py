@@ -5,13 +5,14 @@ from __future__ import annotations
 import inspect
 import json
 import re
-from typing import Any, get_args
+from typing import Any
 
 from markdown.extensions.toc import slugify
 
 from sms_online.description import bodies, schema, sources
+from sms_online.description.explain import SERIAL, SOURCES
 from sms_online.description.parse import RENAMED
-from sms_online.description.record import Record
+from sms_online.description.record import Record, records_in
 from sms_online.description.schema import System
 
 # Heading of each record's section; `System` comes first, the others in this order.
@@ -37,13 +38,8 @@ HEADINGS: dict[type[Record], str] = {
     schema.Windows: "`[windows]`",
     schema.Tolerances: "`[tolerances]`",
     schema.TrackerChoice: "`[tracker]`",
-    sources.CanSource: '`[[source]]` of `kind = "can"`',
-    sources.CanopenSource: '`[[source]]` of `kind = "canopen"`',
-    sources.SerialFrames: '`[[source]]` of `kind = "serial"` and `format = "frames"`',
-    sources.SerialLines: '`[[source]]` of `kind = "serial"` and `format = "lines"`',
-    sources.NatnetSource: '`[[source]]` of `kind = "udp"`',
-    sources.TableSource: '`[[source]]` of `kind = "table"`',
-    sources.BagSource: '`[[source]]` of `kind = "bag"`',
+    **{record: f'`[[source]]` of `kind = "{kind}"`' for kind, record in SOURCES.items()},
+    **{record: f'`[[source]]` of `kind = "serial"` and `format = "{name}"`' for name, record in SERIAL.items()},
     sources.Signal: "Signals of a CAN or UDP source",
     sources.FrameField: "Fields of binary frames",
     sources.SerialField: "Fields of lines",
@@ -99,15 +95,9 @@ def _reachable(record: type[Record]) -> set[type[Record]]:
     """The record and all that its fields hold."""
     found = {record}
     for field in record.model_fields.values():
-        for inner in _records(field.annotation):
+        for inner in records_in(field.annotation):
             found |= _reachable(inner)
     return found
-
-
-def _records(annotation: Any) -> list[type[Record]]:
-    if isinstance(annotation, type) and issubclass(annotation, Record):
-        return [annotation]
-    return [record for part in get_args(annotation) for record in _records(part)]
 
 
 def _section(record: type[Record], heading: str) -> str:

@@ -11,8 +11,7 @@ from math import inf
 from sms_adapters.raw import CanFrames, LostDevice, Raw, Reader
 from sms_adapters.recorder import Recorder
 from sms_adapters.recording import split
-from sms_adapters.session_log import Kind, from_microseconds, number_of_items, quantised
-from sms_online.description.sources import CanBus, Device
+from sms_adapters.session_log import from_microseconds, number_of_items, quantised
 from sms_online.errors import InputError
 
 # Longest wait in a read, s: how late a reader notices that the session ends.
@@ -66,11 +65,6 @@ class SessionClock:
     def __call__(self) -> float:
         """Now, s."""
         return from_microseconds((time.monotonic_ns() - self._zero) // 1000)
-
-
-def kind_of(source: Device) -> Kind:
-    """What its recording holds: CAN frames, the bytes of a serial port, or datagrams."""
-    return "can" if isinstance(source, CanBus) else source.kind
 
 
 class Feed:

@@ -20,7 +20,7 @@ from sms_online.description.parse import shipped_systems
 from sms_online.description.schema import System
 from sms_online.errors import InputError
 from sms_online.session import Session
-from sms_tools.live.feed import Feed, Interpreter, SessionClock, kind_of
+from sms_tools.live.feed import Feed, Interpreter, SessionClock
 from sms_tools.live.loop import CHECKPOINT, LiveSession
 from sms_tools.live.status import StatusWriter
 
@@ -77,7 +77,7 @@ def open_testbed(
     start = 0.0 if resume is None else resumed_start(resume, session, clock.epoch)
     header = SessionHeader(
         clock.epoch,
-        {source.name: kind_of(source) for source in system.devices},
+        {source.name: source.recorded for source in system.devices},
         start,
         versions(),
         trackers=() if system.trackers == given_system(name)[0].trackers else system.trackers,

@@ -13,11 +13,11 @@ from can.util import cast_from_string
 from sms_adapters.devices import make_reader
 from sms_adapters.recorder import Recorder
 from sms_adapters.session_log import SessionHeader
-from sms_online.description.sources import CanSource, Device, NatnetSource, SerialField, SerialLines, SerialPort
+from sms_online.description.sources import CanSource, Device, SerialField, SerialLines
 from sms_online.errors import InputError
 from sms_tools.exit_codes import INTERRUPTED, NOTHING_RECEIVED, OK
 from sms_tools.interruption import Interruption
-from sms_tools.live.feed import Feed, SessionClock, check_feeds, kind_of
+from sms_tools.live.feed import Feed, SessionClock, check_feeds
 from sms_tools.live.testbed import versions
 from sms_tools.report import Document, report_console, say, show
 from sms_tools.results_file import results_directory
@@ -38,7 +38,7 @@ def run(args: argparse.Namespace) -> int:
     sources = _named_apart(sources)
     directory = results_directory(args.out)
     clock = SessionClock()
-    header = SessionHeader(clock.epoch, {source.name: kind_of(source) for source in sources}, 0.0, versions())
+    header = SessionHeader(clock.epoch, {source.name: source.recorded for source in sources}, 0.0, versions())
     recorder = Recorder(directory, header)
     feeds = [Feed(make_reader(source, clock), recorder, queued=False) for source in sources]
     console = report_console(args.json)
@@ -70,22 +70,12 @@ def run(args: argparse.Namespace) -> int:
     lines = [*parts, *(f"warning: {warning}" for warning in warnings), f"recording: {directory}"]
     received = any(document["sources"].values())
     if not received:
-        listened = ", ".join(f"{source.name} ({_device(source)})" for source in sources)
+        listened = ", ".join(f"{source.name} ({source.address})" for source in sources)
         lines.append(f"nothing was received from {listened}")
     say(args, *lines, document=document)
     if not received:
         return NOTHING_RECEIVED
     return INTERRUPTED if interruption.requested else OK
-
-
-def _device(source: Device) -> str:
-    if isinstance(source, SerialPort):
-        return f"{source.port} at {source.baudrate} bit/s"
-    if isinstance(source, NatnetSource):
-        return f"UDP {source.group or source.interface}:{source.port}"
-    options = [f"{name} {value}" for name, value in source.options.items()]
-    bitrate = [] if source.bitrate is None else [f"{source.bitrate} bit/s"]
-    return ", ".join([f"{source.interface} {source.channel}", *bitrate, *options])
 
 
 def _line(feed: Feed) -> str:
