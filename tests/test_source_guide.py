@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 import socket
 import time
+import tomllib
 from pathlib import Path
 from typing import Any
 
@@ -12,9 +13,11 @@ import numpy as np
 import pytest
 
 import sms_online as sms
-from sms_adapters.raw import LostDevice, SerialChunk
+from sms_adapters.devices import DECODERS, make_decoder, make_reader
+from sms_adapters.raw import LostDevice, Raw
 from sms_adapters.sources import READERS
 from sms_adapters.system_file import system_text
+from sms_online.description import sources as described
 from sms_online.description.parse import parse_system
 from tests.axis import AXIS, axis_block
 
@@ -74,29 +77,40 @@ def test_the_guides_format_is_read_and_cut_by_every_verb(tmp_path: Path, monkeyp
         sms.read_capture(tmp_path / "run.npz", system, start=20.0)
 
 
-def test_the_guides_own_source_reads_and_decodes() -> None:
-    code = shown("add-a-source.md", "python")[-1]
-    assert len(code.splitlines()) < 50
-    scope: dict[str, Any] = {"__name__": "guide"}
-    exec(compile(code, "add-a-source.md", "exec"), scope)
+def test_the_guides_own_device_is_read_and_decoded(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Datagrams of one and of two lines, and of what is no line; a port that is taken is a lost device."""
+    record, code, entry = shown("add-a-source.md", "python")[2:]
+    assert len(record.splitlines()) + len(code.splitlines()) < 60
+    scope = dict(vars(described))
+    exec(compile(record, "add-a-source.md", "exec", dont_inherit=True), scope)
+    monkeypatch.setattr(described, "JsonSource", scope["JsonSource"], raising=False)
+    own: dict[str, Any] = {"__name__": "guide", "JsonSource": scope["JsonSource"]}
+    exec(compile(code, "add-a-source.md", "exec", dont_inherit=True), own)
+    for kind, decoder_of in eval(f"{{{entry}}}", own).items():
+        monkeypatch.setitem(DECODERS, kind, decoder_of)
+    (table,) = tomllib.loads(shown("add-a-source.md", "toml")[0])["source"]
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as free:
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
-    reader, decoder = scope["DatagramReader"]("mocap", port, time.monotonic), scope["LineDecoder"](scope["POSE"])
+    source = scope["JsonSource"](**table | {"port": port})
+    assert (source.recorded, source.address) == ("udp", f"UDP 0.0.0.0:{port}")
+    reader, decoder = make_reader(source, time.monotonic), make_decoder(source, None)
     reader.open()
-    assert reader.read(0.01) == []
-    with pytest.raises(LostDevice, match="mocap: "):
-        scope["DatagramReader"]("mocap", port, time.monotonic).open()
+    with pytest.raises(LostDevice, match="axis: "):
+        make_reader(source, time.monotonic).open()
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
-        for k in (0, 1, 3):
-            sender.sendto(f"{k},{1000 + k},-500,0.25".encode(), ("127.0.0.1", port))
-    chunks = [raw for _ in range(3) for raw in reader.read(1.0)]
+        for sent in (
+            b'{"t": 0.5, "angle": 2, "torque": -1}',
+            b'{"t": 0.6, "angle": 3, "torque": 0}\n{"t": 0.7, "angle": 4, "torque": NaN}\n',
+            b'{"t": 0.8, "angle": 3}\n[1]\n\xff',
+        ):
+            sender.sendto(sent, ("127.0.0.1", port))
+        items: list[Raw] = []
+        while len(items) < 3 and (came := reader.read(5.0)):
+            items += came
     reader.close()
-    assert all(isinstance(chunk, SerialChunk) for chunk in chunks)
-    samples = [decoder.push(chunk) for chunk in chunks]
-    assert decoder.channels == ("r_S_x", "r_S_y", "theta_0")
-    assert [sample.values.tolist() for sample in samples] == [
-        [[x * 1e-3, -500 * 1e-3, 0.25]] for x in (1000, 1001, 1003)
-    ]
-    assert [float(sample.t_device[0]) for sample in samples] == [0.0, 1 / 240, 3 / 240]
-    assert decoder.counters["lost_counter"] == 1
+    samples = decoder.push(*items)
+    assert decoder.channels == ("q_1", "tau_1")
+    np.testing.assert_array_equal(samples.values, [[2, -1], [3, 0], [4, np.nan]])
+    assert samples.t_device.tolist() == [0.5, 0.6, 0.7]
+    assert decoder.counters == {"bad_number": 3, "non_finite": 1, "out_of_range": 0}
