@@ -34,35 +34,11 @@ from sms_sim.plant import Plant
 from sms_sim.realtime import RealTimeStepper
 from sms_sim.simulate import Simulation, exact_states, sampled_blocks, simulate
 from sms_tools.cli import main
+from tests.effect_laws import FORCES
 from tests.saved import resumed
 from tests.sessions_of import session_of
 from tests.simulations import planar
 
-FORCES = (
-    "viscous_friction@joint_1:damping=2",
-    "coulomb_friction@joint_2:torque=1",
-    "stribeck_friction@joint_1:torque=1,velocity=0.05",
-    "presliding_friction@joint_1:torque=1,width=0.005",
-    "load_friction@joint_1:ratio=0.02",
-    "direction_friction@joint_1:plus=1,minus=0.5",
-    "torsional_hysteresis@joint_1:torque=5,width=0.01",
-    "cubic_stiffness@joint_2:stiffness=2000",
-    "backlash@joint_1:gap=0.002",
-    "kinematic_error@joint_2:amplitude=0.0001,phase=0.5",
-    "cogging@joint_1:amplitude=1,phase=0.3,order=2",
-    "torque_ripple@joint_1:amplitude=0.02,phase=0.3,order=2",
-    "link_damping@link_2:time=0.001",
-    "link_mass_damping@link_1:rate=0.5",
-    "tip_payload@tip:mass=1,inertia=0.1",
-    "reaction_wheel@base:torque=0.5",
-    "thruster_leak@base:force_x=0.5,force_y=0.2",
-    "table_tilt@base:gravity_x=0.001,gravity_y=0.002",
-    "air_drag@base:damping=5",
-    "cable_spring@base:stiffness=20",
-    "slosh@base:mass=20,stiffness=500",
-    "torque_gain@joint_2:ratio=0.03",
-    "torque_offset@joint_1:torque=0.02",
-)
 # Of those that act on the example's second joint and base, with what is declared of each to the estimator.
 FOUND = {
     "cogging@joint_2:amplitude=2,phase=0.3,order=1": "cogging@joint_2:order=1",
