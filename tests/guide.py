@@ -3,15 +3,11 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Mapping
 from pathlib import Path
 from types import ModuleType
 from typing import cast
 
-import numpy as np
-
-from sms_online.effects.base import Entry, Force
-from sms_online.effects.friction import MotorSide
+from sms_online.effects.base import Force
 from sms_online.trackers import Prior, Tracker
 
 HOW_TO = Path(__file__).parents[1] / "docs" / "how-to"
@@ -29,9 +25,9 @@ def code_of(page: str, beginning: str) -> str:
 
 def windage() -> type[Force]:
     """The class of the effect."""
-    code = code_of("add-an-effect.md", "class WindageFriction")
-    names = {"np": np, "MotorSide": MotorSide, "Entry": Entry, "Mapping": Mapping}
-    exec(f"from __future__ import annotations\n\n{code}", names)
+    code = code_of("add-an-effect.md", '"""Drag')
+    names: dict[str, object] = {"__name__": "windage"}
+    exec(compile(code, "add-an-effect.md", "exec"), names)
     return cast(type[Force], names["WindageFriction"])
 
 
