@@ -61,3 +61,9 @@ def test_what_rows_leave_is_compared_at_one_size() -> None:
     small = 0.1 * TRUE
     one, other = (free.squares(pi, b - Y @ pi, TRUE)[1] for pi in (TRUE, small))
     assert other == pytest.approx(one)
+
+
+def test_parameters_of_nothing_are_no_fit_and_no_warning() -> None:
+    Y, b = rows(lack=0.5)
+    free = ScaleFree(Y, [1], np.zeros(2, dtype=bool))
+    assert not np.isfinite(free.squares(np.zeros(2), b, TRUE)[1])

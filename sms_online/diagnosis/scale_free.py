@@ -42,7 +42,9 @@ class ScaleFree:
         """Mean squares (n_v,) of what parameters (n,) leave (W, n_v), freed rows as large as expected (n,) has them."""
         out = np.mean(left**2, axis=0)
         for speed, M in self._metric.items():
-            out[speed] *= float(expected @ M @ expected) / max(float(pi @ M @ pi), np.finfo(np.float64).tiny)
+            size = np.maximum(pi @ M @ pi, np.finfo(np.float64).tiny)
+            with np.errstate(over="ignore", invalid="ignore"):  # of a step to parameters without rows
+                out[speed] *= (expected @ M @ expected) / size
         return np.asarray(out)
 
     def about(self, pi: Array, left: Array) -> tuple[Array, Array]:
