@@ -11,10 +11,12 @@ import sms_online as sms
 from sms_online.description.parse import parse_system, shipped_text
 from sms_online.description.schema import TrackerChoice
 from sms_online.tracker_results import TrackerResult
+from sms_online.trackers.build import KINDS
 from sms_online.trackers.parse import parse_tracker
 from sms_tools.cli import main
 from tests.axis import AXIS, capture_lines
 from tests.exactly_known import exactly_known
+from tests.guide import fading
 from tests.simulations import planar_capture
 
 SYSTEM = exactly_known(sms.load_system("paper-planar"))
@@ -137,6 +139,12 @@ def test_a_text_that_is_no_tracker_is_refused(text: str, place: str) -> None:
     with pytest.raises(sms.InputError) as refused:
         parse_tracker(text)
     assert place in str(refused.value)
+
+
+def test_an_unknown_kind_is_refused_with_all_that_are_known(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(KINDS, "fading", lambda choice, tracked: fading(tracked.n, 10.0, tracked.prior))
+    with pytest.raises(sms.InputError, match=r"one of rls, kalman, fading \(did you mean 'fading'\?\)"):
+        parse_tracker("fadin:memory=5")
 
 
 @pytest.mark.parametrize(

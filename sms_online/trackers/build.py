@@ -52,9 +52,13 @@ class Tracked:
 def build_tracker(choice: TrackerChoice, tracked: Tracked) -> Tracker:
     """The empty tracker of a choice; InputError where it does not fit the system's parameters."""
     if choice.kind not in KINDS:
-        near = hint(nearest(choice.kind, list(KINDS)))
-        raise InputError(tracked.source, "tracker.kind", repr(choice.kind), f"one of {', '.join(KINDS)}{near}")
+        raise InputError(tracked.source, "tracker.kind", repr(choice.kind), kinds(choice.kind))
     return KINDS[choice.kind](choice, tracked)
+
+
+def kinds(given: str) -> str:
+    """What is expected in place of a kind that is none."""
+    return f"one of {', '.join(KINDS)}{hint(nearest(given, list(KINDS)))}"
 
 
 def build_watch(tracked: Tracked) -> LearnedTrend:

@@ -6,7 +6,7 @@ from typing import get_args
 
 from sms_online.description.schema import Drift, Forgetting, TrackerChoice
 from sms_online.errors import InputError
-from sms_online.trackers.build import KINDS
+from sms_online.trackers.build import KINDS, kinds
 
 # As the site, the command line and messages say it.
 GRAMMAR = "rls, rls:forgetting=KIND,memory=SECONDS or kalman:drift=KIND,PARAMETER=KIND/STD,share=NUMBER"
@@ -19,7 +19,7 @@ def parse_tracker(text: str) -> TrackerChoice:
     """
     kind, _, options = text.partition(":")
     if kind not in KINDS:
-        raise InputError("--tracker", text, repr(kind), GRAMMAR)
+        raise InputError("--tracker", text, repr(kind), kinds(kind))
     chosen: dict[str, object] = {"kind": kind}
     drifts: dict[str, str] = {}
     std: dict[str, float] = {}
