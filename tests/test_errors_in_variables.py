@@ -142,6 +142,18 @@ def test_a_shift_that_one_window_makes_is_taken_for_chance() -> None:
     assert gathered(rows, noisy).correction(np.array([True]))[0][0] == 0.0
 
 
+def test_a_bias_that_is_not_corrected_is_within_the_bar() -> None:
+    """Two clusters of 400 rows make all of it: too few to call it a bias, and it may be one."""
+    rows, _ = scalar_problem(0.0, seed=6)
+    noisy = np.stack((rows, rows))
+    noisy[:, :800, 0] *= 2.0
+    shift, covariance = gathered(rows, noisy).correction(np.array([True]))
+    gram = rows.T @ rows
+    free = 2.0 * gram - noisy[0].T @ noisy[0]
+    assert shift[0] == 0.0
+    assert np.sqrt(covariance[0, 0]) > abs(free[0, 1] / free[0, 0] - gram[0, 1] / gram[0, 0])
+
+
 def test_few_parameters_more_leave_the_shift_of_the_others() -> None:
     rows, noisy = scalar_problem(0.3, seed=7)
     bias = gathered(rows, noisy)

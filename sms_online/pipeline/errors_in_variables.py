@@ -15,6 +15,7 @@ from dataclasses import replace
 import msgspec
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import stdtrit
 
 from sms_online.state import State
 from sms_online.stream import Array
@@ -22,8 +23,8 @@ from sms_online.trackers.interface import Estimate
 
 # Windows that share samples answer for noise together; a cluster is of windows side by side.
 CLUSTER = 20
-# A shift counts from so many of its standard deviations on.
-EVIDENCE = 2.0
+# Probability by Student's distribution from which on a shift counts: two standard deviations of many clusters.
+EVIDENCE = 0.97725
 # Along a direction of whose information noise makes this share or more nothing is corrected, for small errors of the
 # share would be large ones of the correction. What it would be counts as a deviation, so many times the estimate at
 # most.
@@ -79,6 +80,7 @@ class NoiseBias(State):
 
         The synthetic noise is one sample, so the shift scatters. As much of it is given as is no scatter: a bias that
         many clusters agree on counts, one that few of them make shrinks to zero as James and Stein's estimate does.
+        What it shrinks by may be bias all the same, and counts as a deviation.
 
         The scatter is also what the session's own noise does to the estimate in second order. With Y = Y₀ + L and
         errors e = l + q of first and of second order, Yᵀ e holds Y₀ᵀ q + Lᵀ l besides Y₀ᵀ l, and the pair changes the
@@ -118,15 +120,15 @@ class NoiseBias(State):
         attenuated = along[lost] * np.clip(share[lost] / np.maximum(apart, 1.0 / LARGEST_FACTOR), 1.0, LARGEST_FACTOR)
         # Each cluster's part of it, to first order.
         parts = kept @ (kept.T @ (clusters[:, :-1] @ np.append(directions @ along, -1.0)).T)
-        scatter = np.sum(parts**2, axis=1)
-        doubt = EVIDENCE**2 * scatter
-        certain = 1.0 - np.divide(doubt, whole**2, out=np.ones_like(doubt), where=whole**2 > doubt)
-        unit = size[-1] / size[:-1]
-        shift[known] = certain * whole * unit
         count = parts.shape[1]
         if count > 1:
             parts = (parts - parts.mean(axis=1, keepdims=True)) * np.sqrt(count / (count - 1.0))
-        parts = np.concatenate((parts, certain[:, None] * parts, directions[:, lost] * attenuated), axis=1)
+        doubt = stdtrit(max(1, count - 1), EVIDENCE) ** 2 * np.sum(parts**2, axis=1)
+        certain = 1.0 - np.divide(doubt, whole**2, out=np.ones_like(doubt), where=whole**2 > doubt)
+        unit = size[-1] / size[:-1]
+        shift[known] = certain * whole * unit
+        left = np.diag((1.0 - certain) * whole)
+        parts = np.concatenate((parts, certain[:, None] * parts, left, directions[:, lost] * attenuated), axis=1)
         parts *= unit[:, None]
         covariance[np.ix_(known, known)] = parts @ parts.T
         return shift, covariance
