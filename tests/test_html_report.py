@@ -34,6 +34,7 @@ from sms_tools.html_report.parameter_rows import error_bar
 from sms_tools.view.scene import Scene
 from tests.axis import AXIS, axis_block
 from tests.evaluated import results_document
+from tests.test_view_scene import rigid_axis
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
 WARNING = "a warning with <angle brackets>"
@@ -248,6 +249,15 @@ def test_any_arm_can_be_drawn(name: str) -> None:
         x[:, 6] = 1.0
     for figure in arm_drawings(scene, x, [0, 2], ["a", "b"]):
         ElementTree.fromstring(figure.svg)
+
+
+@pytest.mark.parametrize("link", ["center_of_mass = [0.2, 0.1, 0.0]", ""])
+def test_a_rigid_link_without_a_tip_is_no_dot(link: str) -> None:
+    (picture,) = arm_drawings(rigid_axis("revolute", link), np.zeros((1, 1)), [0], ["a"])
+    (line,) = curves(picture.svg, "ink")
+    ends = np.array(re.findall(r"[\d.]+", line), dtype=float).reshape(-1, 2)
+    # A picture is 150 pt high, a joint's dot 7 pt wide.
+    assert np.ptp(ends, axis=0).max() > 30.0
 
 
 def test_figure_6_shows_angles_rates_and_torques(planar_session: Simulation) -> None:
