@@ -236,7 +236,7 @@ def _line(kind: str, tolerances: str, own: list[dict[str, Any]], truth: Array, c
 def _calibration(own: list[dict[str, Any]]) -> tuple[str, str]:
     """Shares of what is wrong in some sessions that are said, and within three deviations of the estimate."""
     said, within = [], []
-    for record in own:
+    for record in own if own[0]["nuisances"] else ():  # without tolerances there is nothing to say
         found = {tuple(key): (value, std) for *key, value, std in record["nuisances"]}
         for *key, true, certain in record["true"]:
             value, std = found[tuple(key)]
