@@ -57,8 +57,8 @@ def one_session(cache: Path, seed: int) -> Record:
         "estimate": estimator.estimate().pi.tolist(),
         "std": standard_deviation(estimator).tolist(),
         "by_smoother": estimator.by_smoother,
-        "mean_square": smoother.mean_square,
-        "failures": smoother.failures,
+        "mean_square": smoother.known.mean_square,
+        "failures": smoother.known.failures,
         "seconds": process_time() - start,
     }
 
