@@ -28,7 +28,7 @@ from sms_tools.html_report import course as course_module
 from sms_tools.html_report.arm_drawing import arm_drawings
 from sms_tools.html_report.course import MOST_INSTANTS, Course, CourseRecorder
 from sms_tools.html_report.figures import PALETTE, Series, chart
-from sms_tools.html_report.page import _residual, write_report
+from sms_tools.html_report.page import _convergence, _residual, write_report
 from sms_tools.html_report.paper_example import figure_6
 from sms_tools.html_report.parameter_rows import error_bar
 from sms_tools.view.scene import Scene
@@ -275,6 +275,18 @@ def test_a_bar_that_goes_on_beyond_its_scale_says_so() -> None:
     assert outside is not None
     assert (outside.start, outside.end, outside.middle) == (0.0, 0.0, None)
     assert error_bar(0.0, np.nan, 1.0, "blue") is None
+
+
+def test_what_is_determined_late_fills_its_axis() -> None:
+    count, unknown = 21, 12
+    courses = {"estimate": 1.001, "std": 5e-4}
+    late = {name: [None] * unknown + [value] * (count - unknown) for name, value in courses.items()}
+    history = {"judged": True, "t": np.linspace(0.0, 4.0, count).tolist(), "parameters": [{"name": "mass", **late}]}
+    parameters = [{"name": "mass", "symbol": "m", "unit": "kg", "true": 1.0}]
+    (drawing,) = _convergence({"parameters": parameters, "history": [history], "events": []}, {"mass": 1.0})
+    # It deviates by 0.1 %, ± 0.1 %; numbers of time are not negative.
+    lowest = max(map(float, re.findall(r">−([\d.]+)</text>", drawing.svg)))
+    assert 0.2 <= lowest < 1.0
 
 
 def test_the_judgement_is_the_first_thing_on_the_page(page: str) -> None:
