@@ -275,7 +275,7 @@ def test_nothing_else_goes_into_a_running_sessions_folder(tmp_path: Path) -> Non
     assert results_directory(tmp_path / "run") == tmp_path / "run"
 
 
-@pytest.mark.parametrize("verb", ["replay", "diagnose", "validate", "check"])
+@pytest.mark.parametrize("verb", ["replay", "diagnose", "validate", "check", "show"])
 def test_no_verb_writes_into_a_running_sessions_folder(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], verb: str
 ) -> None:
@@ -283,8 +283,8 @@ def test_no_verb_writes_into_a_running_sessions_folder(
     (tmp_path / "run.csv").write_text("\n".join(capture_lines()) + "\n")
     recorder = Recorder(tmp_path / "run", HEADER)
     before = sorted((tmp_path / "run").iterdir())
-    capture, system = str(tmp_path / "run.csv"), str(tmp_path / "axis.toml")
-    assert main([verb, capture, "--system", system, "--out", str(tmp_path / "run")]) == 2
+    read = ["--rerun", "save"] if verb == "show" else [str(tmp_path / "run.csv")]
+    assert main([verb, *read, "--system", str(tmp_path / "axis.toml"), "--out", str(tmp_path / "run")]) == 2
     assert "the folder of a session that runs" in capsys.readouterr().err
     assert sorted((tmp_path / "run").iterdir()) == before
     recorder.close(1.0)
