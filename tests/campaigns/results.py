@@ -61,7 +61,7 @@ def complete(args: argparse.Namespace, work: Work, tasks: Iterable[Task]) -> Non
 def _importable(work: Work) -> Work:
     """The same function of the module as others import it: what was started here is not what a cluster starts."""
     spec = sys.modules[work.__module__].__spec__
-    return work if spec is None else getattr(import_module(spec.name), work.__name__)  # type: ignore[no-any-return]
+    return work if spec is None else getattr(import_module(spec.name), work.__name__)
 
 
 def _key(names: Mapping[str, Any], keys: list[str]) -> str:
