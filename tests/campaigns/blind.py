@@ -47,7 +47,7 @@ from sms_online.stream import Array, Block
 from sms_tools.archive.runner import Work
 from tests.campaigns.accuracy import flagged
 from tests.campaigns.results import Record, absolute, campaign, complete, summed
-from tests.campaigns.sessions import disguised, exact_session, noisy_session, true_parameters
+from tests.campaigns.sessions import SLIGHT, disguised, exact_session, noisy_session, true_parameters
 from tests.sessions_of import session_of
 
 SYSTEM = "paper-planar"
@@ -204,7 +204,7 @@ def one_clean(folder: Path, grade: str, seed: int) -> Record:
     """The diagnosis of a session that nothing is missing in."""
     system = load_system(SYSTEM)
     block = noisy_session(system, exact_session(system, folder / CLEAN), grade, seed)
-    return _told(diagnose(disguised(system), [block], "case", lambda _: None))
+    return _told(diagnose(disguised(system, factor=SLIGHT), [block], "case", lambda _: None))
 
 
 def _told(found: Diagnosis) -> Record:

@@ -23,7 +23,7 @@ from sms_online.diagnosis.document import coefficients
 from sms_online.pipeline.estimator import Estimator
 from sms_online.stream import Block
 from tests.campaigns.results import Record, absolute, campaign, complete, summed
-from tests.campaigns.sessions import cached, disguised, noisy_session, true_parameters
+from tests.campaigns.sessions import SLIGHT, cached, disguised, noisy_session, true_parameters
 from tests.engine_mujoco import EngineEffects, mujoco_capture
 
 GRADE, SEED = "B", 3
@@ -79,7 +79,7 @@ def diagnosed(cache: Path, name: str) -> Record:
     block = captured(case.effects, cache / f"{engine}.mujoco.npz")
     block = noisy_session(load_system("paper-planar-exact"), block, GRADE, SEED)
     begin = process_time()
-    found = diagnose(disguised(load_system(case.system)), [block], "mujoco", lambda _: None)
+    found = diagnose(disguised(load_system(case.system), factor=SLIGHT), [block], "mujoco", lambda _: None)
     return {**_record(case, found), "seconds": process_time() - begin}
 
 

@@ -25,6 +25,8 @@ DISGUISED = (
     *("stiffness", "damping", "axial_rigidity", "torsional_rigidity", "flexural_rigidity_y", "flexural_rigidity_z"),
 )
 DISGUISE = 2.0
+# So far a rig may be from its description and be called clean: beyond 1.5 the diagnosis names the common factor.
+SLIGHT = 1.2
 ROUGH = (1 / 1.4, 1.4)
 
 
