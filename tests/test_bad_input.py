@@ -39,6 +39,7 @@ def elements(n: int) -> str:
 def bench(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A working directory with a good system and a good capture."""
     monkeypatch.chdir(tmp_path)
+    (tmp_path / "empty").mkdir()
     (tmp_path / "axis.toml").write_text(AXIS)
     (tmp_path / "run.csv").write_text("\n".join(capture_lines()) + "\n")
     return tmp_path
@@ -186,6 +187,8 @@ def test_a_can_log_needs_its_dbc(bench: Path, capsys: pytest.CaptureFixture[str]
         (("simulate", "--system", "paper-planar", "--capture", "absent/new.csv"), "No such file"),
         (("simulate", "--system", "axis.toml", "--capture", "new.csv"), "trajectory"),
         (("demo", "--system", "axis.toml"), "expected a controller and a trajectory"),
+        (("bound", "--system", "axis.toml"), "expected a trajectory, or a capture"),
+        (("replay", "empty", "--system", "axis.toml"), "a folder that holds neither bag nor recording"),
         (("import", "pumps", "x.mat", "--capture", "new.csv"), "'pumps'"),
         (("import", "emps", "x.mat", "--capture", "new.csv"), "No such file"),
         (("markers", "--system", "paper-planar", "--modes", "0"), "a whole number, 1 or more"),

@@ -6,9 +6,13 @@ import json
 import re
 from pathlib import Path
 
+import numpy as np
 import pytest
 
-from sms_online.description.parse import shipped_text
+from sms_adapters.system_file import load_system
+from sms_online.description.parse import shipped_systems, shipped_text
+from sms_sim.bound import noisy_sensors
+from sms_sim.plant import Plant
 from sms_tools.cli import main
 
 SENSORS = """
@@ -58,6 +62,15 @@ def test_bounds_rise_with_the_noise_and_without_a_sensor(rig: Path, capsys: pyte
 WITHOUT_NOISE = (
     "emps", "paper-planar", "paper-planar-exact", "paper-planar-table-v", "seven-joint", "spatial-two-link",
 )  # fmt: skip
+
+
+@pytest.mark.parametrize("name", shipped_systems())
+def test_sensors_of_every_shipped_system_have_noise(name: str) -> None:
+    system = load_system(name)
+    sensors, grade = noisy_sensors(Plant(system), None)
+    assert grade == (None if name == "ak80-pendulum" else "B")
+    assert np.all(np.concatenate((sensors.density, sensors.torque)) > 0.0)
+    assert (system.trajectory is None) == (name not in (*WITHOUT_NOISE, "ak80-pendulum"))
 
 
 @pytest.mark.long

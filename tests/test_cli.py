@@ -179,9 +179,11 @@ def test_every_verb_that_takes_long_has_a_bar(
     verbs: list[tuple[list[str], list[str]]] = [
         (["replay", *capture, "-to", "2", "--out", "done"], ["run.csv"]),
         (["bound", *capture], ["run.csv"]),
+        (["validate", *capture, "--out", "done"], ["run.csv"]),
         (["diagnose", *capture, "--out", "done"], ["run.csv", "fitting the model"]),
         (["simulate", "--system", "moved.toml", "--capture", "new.csv", "--duration", "1"], ["solving the motion"]),
         (["bound", "--system", "moved.toml"], ["solving the motion"]),
+        (["excite", "--system", "moved.toml", "--iterations", "1", "--out", "done"], ["designing the motion"]),
     ]
     for verb, said in verbs:
         assert main(verb) in (0, 3)  # without noise there is no bound

@@ -15,6 +15,7 @@ from tests.simulations import planar_capture
 
 SECONDS, SHIFTED = 16.0, 9.0  # s
 LATE = 9e-4  # s, twice as much as in demos beside busy processes
+STEP = 2e-3  # s, of a clock that begins anew on a late host
 
 
 @pytest.fixture(scope="module")
@@ -24,16 +25,20 @@ def rig(tmp_path_factory: pytest.TempPathFactory) -> System:
     return load_system(str(write_testbed("paper-planar", load_system("paper-planar"), "B", folder)))
 
 
-@pytest.fixture(scope="module")
-def shifted() -> sms.Capture:
-    """A session in which the markers' samples are LATE from SHIFTED on."""
+def with_late_markers(late: float) -> sms.Capture:
+    """A session in which the markers' samples are late by so much, s, from SHIFTED on."""
     capture = planar_capture(SECONDS)
     values = capture.values.copy()
     for k, channel in enumerate(capture.channels):
         if ".marker_" in channel:
-            late = np.interp(capture.t - LATE, capture.t, values[:, k])
-            values[:, k] = np.where(capture.t < SHIFTED, values[:, k], late)
+            behind = np.interp(capture.t - late, capture.t, values[:, k])
+            values[:, k] = np.where(capture.t < SHIFTED, values[:, k], behind)
     return sms.Capture(capture.t, capture.channels, values)
+
+
+@pytest.fixture(scope="module")
+def shifted() -> sms.Capture:
+    return with_late_markers(LATE)
 
 
 @pytest.mark.long
@@ -58,9 +63,26 @@ def test_a_shift_that_is_noticed_is_sized(rig: System, shifted: sms.Capture, mon
     monkeypatch.setattr("sms_online.pipeline.events.WANDER", 0.0)
     result = sms.estimate(rig, shifted)
     assert result.events == ()
+    size, std, time = said_of_markers(result)
+    assert abs(size - 1e6 * LATE) < 4.0 * std < 200.0
+    assert time == pytest.approx(SHIFTED, abs=0.5)
+
+
+@pytest.mark.long
+def test_a_step_of_one_clock_is_no_event(rig: System) -> None:
+    result = sms.estimate(rig, with_late_markers(STEP))
+    assert result.events == ()
+    size, std, time = said_of_markers(result)
+    assert abs(size - 1e6 * STEP) < 4.0 * std < 200.0
+    assert time == pytest.approx(SHIFTED, abs=0.5)
+    known = [p for p in result.parameters.values() if p.determined and p.nominal]
+    assert max(abs(p.value - p.nominal) / p.std for p in known if p.nominal) < 5.0
+
+
+def said_of_markers(result: sms.Result) -> tuple[float, float, float]:
+    """Size and deviation (µs) of the one shift that is said, and its instant (s)."""
     (said,) = (warning for warning in result.warnings if "its clock shifted" in warning)
     found = re.fullmatch(r"markers: its clock shifted by \+(\d+) ± (\d+) µs against the others' at ([\d.]+) s", said)
     assert found is not None, said
     size, std, time = map(float, found.groups())
-    assert abs(size - 1e6 * LATE) < 4.0 * std < 200.0
-    assert time == pytest.approx(SHIFTED, abs=0.5)
+    return size, std, time

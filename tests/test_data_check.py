@@ -109,6 +109,13 @@ def test_times_in_milliseconds_are_recognised() -> None:
     assert "q_1: time in ms, not in s: a sample every 5" in found
 
 
+def test_times_are_recognised_without_described_sensors() -> None:
+    found = grave(capture(t=lambda t: 1000.0 * t), parse_system(AXIS, "axis.toml"))
+    assert ": time in ms, not in s: a sample every 5" in found
+    # Slower than the system, as a camera is, and no other unit.
+    assert not grave(capture(t=lambda t: 4.0 * t), parse_system(AXIS, "axis.toml"))
+
+
 def test_holes_are_counted_and_placed() -> None:
     found = sms.check(SYSTEM, capture(t=lambda t: t + 0.5 * (t > 3.0) + 0.2 * (t > 7.0)))
     assert "2 holes of more than 5 samples, the first at 3.000 s, the longest of 0.505 s" in found.lines[0]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 
 import numpy as np
@@ -140,6 +141,30 @@ def test_what_a_diagnosis_names_together_it_then_names_alone(one_way: Excitation
 def test_an_effect_to_separate_needs_its_size() -> None:
     with pytest.raises(sms.InputError, match="nominally zero; expected its size"):
         excite(parse_system(MOVED, "axis.toml"), separate=(FRICTION[0], "stribeck_friction@joint_1"))
+
+
+@pytest.mark.parametrize(
+    ("second", "said"),
+    [
+        ("nonsense@joint_1:x=1", "--separate, nonsense@joint_1:x=1: unknown effect"),
+        (FRICTION[0], "again; expected each effect once"),
+        ("viscous_friction@joint_1:damping=1", "the system file declares; expected viscous_friction@joint_1 alone"),
+    ],
+)
+def test_what_cannot_be_separated_is_refused(second: str, said: str) -> None:
+    with pytest.raises(sms.InputError, match=re.escape(said)):
+        excite(parse_system(MOVED, "axis.toml"), separate=(FRICTION[0], second))
+
+
+def test_a_motion_too_long_to_be_designed_is_refused() -> None:
+    with pytest.raises(sms.InputError, match=r"duration: 1e\+09 s; expected a motion of 600 s at most"):
+        excite(parse_system(MOVED, "axis.toml"), duration=1e9)
+
+
+@pytest.mark.parametrize("kind", ["deflection", "base_rotation"])
+def test_a_limit_of_what_is_not_there_is_refused(kind: str) -> None:
+    with pytest.raises(sms.InputError, match=f"nothing that a limit of the {kind.replace('_', ' ')} holds for"):
+        excite(parse_system(MOVED, "axis.toml"), limits=Limits(**{kind: 1.0}))
 
 
 @pytest.mark.slow

@@ -28,12 +28,13 @@ from sms_tools.html_report import course as course_module
 from sms_tools.html_report.arm_drawing import arm_drawings
 from sms_tools.html_report.course import MOST_INSTANTS, Course, CourseRecorder
 from sms_tools.html_report.figures import PALETTE, Series, chart
-from sms_tools.html_report.page import _residual, write_report
+from sms_tools.html_report.page import _convergence, _residual, write_report
 from sms_tools.html_report.paper_example import figure_6
 from sms_tools.html_report.parameter_rows import error_bar
 from sms_tools.view.scene import Scene
 from tests.axis import AXIS, axis_block
 from tests.evaluated import results_document
+from tests.test_view_scene import rigid_axis
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
 WARNING = "a warning with <angle brackets>"
@@ -250,6 +251,15 @@ def test_any_arm_can_be_drawn(name: str) -> None:
         ElementTree.fromstring(figure.svg)
 
 
+@pytest.mark.parametrize("link", ["center_of_mass = [0.2, 0.1, 0.0]", ""])
+def test_a_rigid_link_without_a_tip_is_no_dot(link: str) -> None:
+    (picture,) = arm_drawings(rigid_axis("revolute", link), np.zeros((1, 1)), [0], ["a"])
+    (line,) = curves(picture.svg, "ink")
+    ends = np.array(re.findall(r"[\d.]+", line), dtype=float).reshape(-1, 2)
+    # A picture is 150 pt high, a joint's dot 7 pt wide.
+    assert np.ptp(ends, axis=0).max() > 30.0
+
+
 def test_figure_6_shows_angles_rates_and_torques(planar_session: Simulation) -> None:
     figures = figure_6(planar_session)
     assert [len(figure.key) for figure in figures] == [4, 4, 2]
@@ -265,6 +275,18 @@ def test_a_bar_that_goes_on_beyond_its_scale_says_so() -> None:
     assert outside is not None
     assert (outside.start, outside.end, outside.middle) == (0.0, 0.0, None)
     assert error_bar(0.0, np.nan, 1.0, "blue") is None
+
+
+def test_what_is_determined_late_fills_its_axis() -> None:
+    count, unknown = 21, 12
+    courses = {"estimate": 1.001, "std": 5e-4}
+    late = {name: [None] * unknown + [value] * (count - unknown) for name, value in courses.items()}
+    history = {"judged": True, "t": np.linspace(0.0, 4.0, count).tolist(), "parameters": [{"name": "mass", **late}]}
+    parameters = [{"name": "mass", "symbol": "m", "unit": "kg", "true": 1.0}]
+    (drawing,) = _convergence({"parameters": parameters, "history": [history], "events": []}, {"mass": 1.0})
+    # It deviates by 0.1 %, ± 0.1 %; numbers of time are not negative.
+    lowest = max(map(float, re.findall(r">−([\d.]+)</text>", drawing.svg)))
+    assert 0.2 <= lowest < 1.0
 
 
 def test_the_judgement_is_the_first_thing_on_the_page(page: str) -> None:

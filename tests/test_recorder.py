@@ -26,7 +26,9 @@ from sms_online.capture import Capture
 from sms_online.errors import InputError
 from sms_online.stream import Array
 from sms_online.trackers.parse import parse_tracker
+from sms_tools.cli import main
 from sms_tools.results_file import results_directory
+from tests.axis import AXIS, capture_lines
 from tests.bus_streams import AxisBus, axis_testbed, merged
 
 EPOCH = 1_700_000_000_123_456
@@ -271,6 +273,21 @@ def test_nothing_else_goes_into_a_running_sessions_folder(tmp_path: Path) -> Non
         results_directory(tmp_path / "run")
     recorder.close(1.0)
     assert results_directory(tmp_path / "run") == tmp_path / "run"
+
+
+@pytest.mark.parametrize("verb", ["replay", "diagnose", "validate", "check", "show"])
+def test_no_verb_writes_into_a_running_sessions_folder(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], verb: str
+) -> None:
+    (tmp_path / "axis.toml").write_text(AXIS)
+    (tmp_path / "run.csv").write_text("\n".join(capture_lines()) + "\n")
+    recorder = Recorder(tmp_path / "run", HEADER)
+    before = sorted((tmp_path / "run").iterdir())
+    read = ["--rerun", "save"] if verb == "show" else [str(tmp_path / "run.csv")]
+    assert main([verb, *read, "--system", str(tmp_path / "axis.toml"), "--out", str(tmp_path / "run")]) == 2
+    assert "the folder of a session that runs" in capsys.readouterr().err
+    assert sorted((tmp_path / "run").iterdir()) == before
+    recorder.close(1.0)
 
 
 @pytest.mark.realtime

@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 from rich.console import Console
 
-from sms_tools.report import parameter_table, verdict_text
+from sms_tools.report import parameter_table, report_console, show, table, verdict_text
 
 LONGEST_NAME = "spacecraft.inertia_about_joint_1"
 
@@ -35,6 +35,12 @@ def test_the_interval_stays_in_a_narrow_terminal(true: float | None) -> None:
     assert "95 % interval" in lines[0]
     assert any("864.998 … 865.045" in line for line in lines)
     assert ("error %" in lines[0]) == (true is not None)
+
+
+@pytest.mark.parametrize("text", ["/dev/null:abc: gone", "run[1].csv: [bold] is no style", "[red]x[/red]"])
+def test_messages_are_shown_as_they_are(text: str, capsys: pytest.CaptureFixture[str]) -> None:
+    show(report_console(json=False), text, table(("what",), [(text,)]))
+    assert capsys.readouterr().out.count(text) == 2
 
 
 def test_a_wide_terminal_shows_the_deviation_and_the_truth_too() -> None:

@@ -139,6 +139,12 @@ def test_the_command_line_imports_and_exports(tmp_path: Path, capsys: pytest.Cap
     again = build_model(parse_system(import_urdf(out), "new.urdf"))
     assert find_base_parameters(again).values(again.nominal)[0] == pytest.approx(estimate, rel=1e-9)
     assert main(["export", "urdf", str(FOLDER / "panda.urdf"), "--results", str(results), "--out", str(out)]) == 2
+    capsys.readouterr()
+    for verb in (["import", "urdf", str(source)], ["export", "urdf", str(source), "--results", str(results)]):
+        assert main([*verb, "--out", "/proc/new.toml"]) == 2
+        assert (
+            "/proc/new.toml: No such file or directory; expected a file that can be written" in capsys.readouterr().err
+        )
 
 
 def test_an_inertial_that_no_body_has_is_named() -> None:

@@ -10,14 +10,14 @@ from typing import Any
 
 import numpy as np
 
-from sms_adapters.channel_check import ChannelCheck, Remark
+from sms_adapters.channel_check import UNIT_TOLERANCE, ChannelCheck, Remark
 from sms_online.description.channels import channel_unit, drive_channels, sensed_channels
 from sms_online.description.given import Given, given_system
 from sms_online.description.schema import System
 from sms_online.errors import InputError
 from sms_online.pipeline.estimator import Estimator
 from sms_online.pipeline.outliers import LeftOut, Outliers
-from sms_online.sample_faults import PIECE, StuckGuard
+from sms_online.sample_faults import PIECE, StuckGuard, unit_of_stamps
 from sms_online.session import Data, recorded_session
 from sms_online.stream import Array, Block
 from sms_online.tables import Tabled, html_table, text_table
@@ -138,6 +138,7 @@ class ChannelChecks:
             for name in sensed_channels(system, sensor)
         }
         self.absent = tuple(name for name in described if name not in self.channels)
+        self._described, self._tick = bool(described), 1.0 / system.sample_rate
         self.checks = []
         for name in self.channels:
             rate, resolution = described.get(name, (None, 0.0))
@@ -177,6 +178,12 @@ class ChannelChecks:
         """What is the matter so far."""
         for check in self.checks:
             yield from check.remarks()
+        periods = [period for check in self.checks if (period := check.measured_period)]
+        if periods and not self._described:
+            # No sensor says how often it samples, but one at least as often as the system does.
+            stamps = unit_of_stamps(min(periods) / self._tick, UNIT_TOLERANCE)
+            if stamps is not None:
+                yield Remark("", f"time in {stamps[0]}, not in s: a sample every {min(periods):g}", True)
 
 
 class Checked:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import io
 import re
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
@@ -69,10 +68,10 @@ class CsvTable:
     def _layout(self, text: bytes, wanted: Sequence[str]) -> tuple[int, _Layout]:
         """Lines up to the header, it included, and how the file is written."""
         lines = text.decode("utf-8-sig", "replace").split("\n")
-        best: list[str] = []
+        best: list[str] = []  # the names of the line that has most of the wanted columns
         for number, line in enumerate(lines[:HEADER_LINES], start=1):
             for separator in SEPARATORS:
-                names = [name.strip() for name in next(csv.reader([line], delimiter=separator), [])]
+                names = [name.strip() for name in _cells(line, separator)]
                 best = max(best, names, key=lambda each: len(set(each) & set(wanted)))
                 if not set(wanted) <= set(names):
                     continue
@@ -81,10 +80,14 @@ class CsvTable:
                     raise InputError(str(self._path), f"line {number}", f"column {twice!r} twice", "it once")
                 places = [names.index(name) for name in wanted]
                 below = next((row for row in lines[number:] if row.strip()), "")
-                cells = next(csv.reader([below], delimiter=separator), [])
+                cells = _cells(below, separator)
                 whole = len(cells) > places[0] and bool(_WHOLE.fullmatch(cells[places[0]].strip()))
                 return number, _Layout(separator, names, places, whole, "," in below)
-        raise missing(self._path, next(name for name in wanted if name not in best), best)
+        absent = next(name for name in wanted if name not in best)
+        if set(best) & set(wanted):
+            raise missing(self._path, absent, best)
+        found = f"no header with a column {absent!r}, line 1 is {lines[0].strip()[:60]!r}"
+        raise InputError(str(self._path), "", found, "names with commas, semicolons or tabs between them, in UTF-8")
 
     def _parse(self, text: bytes, line: int, layout: _Layout) -> pa.Table:
         """The wanted columns of whole lines; InputError names the first line that does not fit."""
@@ -117,8 +120,8 @@ class CsvTable:
 
     def _explained(self, text: bytes, line: int, layout: _Layout, error: Exception) -> InputError:
         """InputError for the first line that is to blame."""
-        rows = csv.reader(io.StringIO(text.decode("utf-8", "replace")), delimiter=layout.separator)
-        for number, row in enumerate(rows, start=line):
+        lines = text.decode("utf-8", "replace").split("\n")
+        for number, row in enumerate((_cells(each, layout.separator) for each in lines), start=line):
             if row and len(row) != len(layout.names):
                 expected = f"{len(layout.names)}, as in the header"
                 return InputError(str(self._path), f"line {number}", f"{len(row)} cells", expected)
@@ -127,3 +130,11 @@ class CsvTable:
                     where = f"line {number}, column {layout.names[k]}"
                     return InputError(str(self._path), where, repr(row[k][:40]), "a number or nothing")
         return InputError(str(self._path), "", one_line(error), "a table of numbers")
+
+
+def _cells(line: str, separator: str) -> list[str]:
+    """Cells of a line; one that holds all of it where it is no line of a table."""
+    try:
+        return next(csv.reader([line], delimiter=separator), [])
+    except csv.Error:
+        return [line]

@@ -93,5 +93,8 @@ def _whole(path: Path, system: System, on_bytes: Callable[[int], None] | None, d
         return LogReader(path, system, on_bytes)
     reader = _reader(path)
     if reader is None:
+        if path.is_dir():
+            expected = "that of a ROS 2 bag, with its metadata.yaml, or of a recording, or a file"
+            raise InputError(str(path), "", "a folder that holds neither bag nor recording", expected)
         raise InputError(str(path), "", f"a file named {path.name}", NAMES)
     return reader(path, system, on_bytes, directory)

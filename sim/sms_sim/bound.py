@@ -140,6 +140,8 @@ def bound(
 def _of_simulation(
     system: System, grade: str | None, each_sensor: bool, progress: Callable[[str, float], None]
 ) -> Bounds:
+    if system.trajectory is None:
+        raise InputError(system.name, "trajectory", "no such table", "a trajectory, or a capture")
     plant = Plant(system)
     # Sensors come first: what is missing of them is known before a long simulation.
     _, grade = noisy_sensors(plant, grade)

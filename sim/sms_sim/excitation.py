@@ -163,9 +163,12 @@ def _with_pair(system: System, separate: Sequence[str]) -> System:
         whole = system.model_copy(update={"effects": (*system.effects, *effects)})
         known = {(e.name, e.where): e for e in system.effects}
         head = text.partition(":")[0]
-        if ":" not in text and tuple(head.split("@")) in known:
+        if tuple(head.split("@")) in known:
+            if ":" in text:
+                expected = f"{head} alone, of the declared size"
+                raise InputError("--separate", text, "an effect that the system file declares", expected)
             continue
-        effects.append(parse_effect(text, whole))
+        effects.append(parse_effect(text, whole, "--separate"))
     return system.model_copy(update={"effects": (*system.effects, *effects)})
 
 

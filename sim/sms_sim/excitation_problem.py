@@ -27,6 +27,8 @@ PERIODS = 5
 # Step of the motions that are compared and of their bounds, s: twice that of `cramer_rao`. The planar example's worst
 # bound then comes out a tenth low, so that exact bounds decide in the end.
 STEP = 0.02
+# Longest motion, s: all that are compared are in memory at once.
+LONGEST = 600.0
 
 
 class Series:
@@ -115,10 +117,12 @@ class Problem:
         if trajectory is None and (duration is None or limits.angle is None):
             expected = "a trajectory, or both a duration and the largest joint angle"
             raise InputError(system.name, "trajectory", "no such table", expected)
-        described = None if trajectory is None else Simulated.of(system).solve(progress)
         stated = [harmonic.frequency for joint in trajectory.joints for harmonic in joint] if trajectory else []
         length = duration if duration is not None else trajectory.duration if trajectory else math.nan
+        if length > LONGEST:
+            raise InputError(system.name, "duration", f"{length:g} s", f"a motion of {LONGEST:g} s at most")
         lowest = min(stated, default=PERIODS * 2.0 * math.pi / length)
+        described = None if trajectory is None else Simulated.of(system).solve(progress)
         pair = [text.partition(":")[0] for text in separate]
 
         def counted(name: str, value: float) -> bool:

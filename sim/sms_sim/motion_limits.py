@@ -7,6 +7,7 @@ from typing import Literal
 
 import numpy as np
 
+from sms_online.errors import InputError
 from sms_online.model.readings import Readings, readable_channels
 from sms_online.stream import Array
 from sms_sim.plant import Plant
@@ -89,8 +90,14 @@ class Extremes:
     def bounds(self, limits: Limits, described: Array | None) -> Array:
         """Largest magnitude allowed of each signal (signals,); inf where there is none.
 
-        described: extremes of the described motion, where there is one.
+        described: extremes of the described motion, where there is one. InputError where a stated limit has nothing to
+        limit.
         """
+        stated = {signal.kind for signal in self.signals if signal.stated}
+        for kind, limit in vars(limits).items():
+            if limit is not None and kind not in stated:
+                found = f"nothing that a limit of the {kind.replace('_', ' ')} holds for"
+                raise InputError(self._plant.system.name, "limits", found, "a limit of what this arm has")
         out = np.full(len(self.signals), np.inf) if described is None else described.copy()
         for k, signal in enumerate(self.signals):
             limit = limits.of(signal.kind)

@@ -184,12 +184,15 @@ def with_shapes(effect: Effect, system: System) -> Effect:
     return effect.model_copy(update={"coefficients": shapes | effect.coefficients})
 
 
-def parse_effect(text: str, system: System) -> Effect:
-    """Effect of `NAME@WHERE:coefficient=value,…`, coefficients optional; InputError on whatever is wrong with it."""
+def parse_effect(text: str, system: System, source: str = "--effect") -> Effect:
+    """Effect of `NAME@WHERE:coefficient=value,…`, coefficients optional; InputError on whatever is wrong with it.
+
+    source: what takes the text, for messages.
+    """
     head, _, tail = text.partition(":")
     name, at, where = head.partition("@")
     if not at:
-        raise InputError("--effect", text, "no @", "NAME@WHERE:coefficient=value,…, such as coulomb_friction@joint_1")
+        raise InputError(source, text, "no @", "NAME@WHERE:coefficient=value,…, such as coulomb_friction@joint_1")
     coefficients: dict[str, float] = {}
     for part in filter(None, tail.split(",")):
         key, _, number = (piece.strip() for piece in part.partition("="))
@@ -199,12 +202,12 @@ def parse_effect(text: str, system: System) -> Effect:
             value = float("nan")
         if not math.isfinite(value) or key in coefficients:
             found = f"{key!r} twice" if key in coefficients else repr(part)
-            raise InputError("--effect", text, found, "coefficient=value with a finite number, each once")
+            raise InputError(source, text, found, "coefficient=value with a finite number, each once")
         coefficients[key] = value
     effect = Effect(name=name, where=where, coefficients=coefficients)
-    check_effect(system, effect, text, "--effect")
+    check_effect(system, effect, text, source)
     if any((other.name, other.where) == (name, where) for other in system.effects):
-        raise InputError("--effect", text, f"{head} again", "each effect once at a place")
+        raise InputError(source, text, f"{head} again", "each effect once at a place")
     return effect
 
 

@@ -9,6 +9,7 @@ is estimated from the data, and the nominal values that the estimator sees are n
 
 from __future__ import annotations
 
+import argparse
 from pathlib import Path
 from time import process_time
 
@@ -20,7 +21,7 @@ from sms_online.evaluation import NORMAL_95
 from sms_online.model.base_parameters import find_base_parameters
 from sms_online.pipeline.estimator import Estimator
 from sms_online.stream import Array, Block
-from tests.campaigns.results import Record, append, campaign, read, summed
+from tests.campaigns.results import Record, absolute, campaign, complete, summed
 from tests.campaigns.sessions import disguised, exact_session, noisy_session, true_parameters
 from tests.evaluated import standard_deviation
 from tests.exactly_known import exactly_known
@@ -43,24 +44,21 @@ POOLED, EACH = (93.5, 96.5), (88.5, 99.5)
 LARGEST_BIAS = 1.0 / 3.0
 
 
-def run(results: Path, cache: Path, runs: int, grades: list[str]) -> None:
-    """Append the sessions that `results` lacks, seed by seed."""
-    system = load_system(SYSTEM)
-    exact = exact_session(system, cache)
-    done = {(record["grade"], record["seed"]) for record in read(results)}
-    for seed in range(runs):
-        for grade in grades:
-            if (grade, seed) in done:
-                continue
-            record = one_session(noisy_session(system, exact, grade, seed))
-            append(results, {"grade": grade, "seed": seed, **record})
+def run(args: argparse.Namespace) -> None:
+    """Append the sessions that the results lack, seed by seed."""
+    cache = args.exact or args.results.with_suffix(".exact.npz")
+    exact_session(load_system(SYSTEM), cache)
+    wanted = [(grade, seed) for seed in range(args.runs) for grade in args.grades]
+    tasks = [({"grade": grade, "seed": seed}, (cache, grade, seed)) for grade, seed in wanted]
+    complete(args, one_session, tasks)
 
 
-def one_session(block: Block) -> Record:
+def one_session(cache: Path, grade: str, seed: int) -> Record:
     """Estimate of one session, as of 4 s and at its end."""
+    system = load_system(SYSTEM)
+    block = noisy_session(system, exact_session(system, cache), grade, seed)
     start = process_time()
-    exact = exactly_known(disguised(load_system(SYSTEM)))
-    estimator = Estimator(exact, block.channels, "campaign")
+    estimator = Estimator(exactly_known(disguised(system)), block.channels, "campaign")
     split = int(np.searchsorted(block.t, EARLY, side="right"))
     estimator.push(Block(block.t[:split], block.channels, block.values[:split]))
     early = estimator.estimate().pi.tolist()
@@ -134,13 +132,8 @@ def flagged(value: float, missed: bool, form: str) -> str:
 if __name__ == "__main__":
     campaign(
         __doc__,
-        {
-            "run": lambda args: run(
-                args.results, args.exact or args.results.with_suffix(".exact.npz"), args.runs, args.grades
-            ),
-            "summary": summed(summary),
-        },
+        {"run": run, "summary": summed(summary)},
         runs={"type": int, "default": 200, "help": "seeds 0, 1, … of each grade, 200 by default"},
         grades={"nargs": "+", "choices": GRADES, "default": list(GRADES)},
-        exact={"metavar": "FILE.npz", "type": Path, "help": "exact samples, beside RESULTS by default"},
+        exact={"metavar": "FILE.npz", "type": absolute, "help": "exact samples, beside RESULTS by default"},
     )

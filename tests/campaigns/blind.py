@@ -16,11 +16,13 @@ goes on where it was.
 
 from __future__ import annotations
 
+import argparse
 import zlib
 from collections.abc import Iterator
+from functools import cache
+from itertools import product
 from pathlib import Path
 from time import process_time
-from typing import Any
 from unittest.mock import patch
 
 import numpy as np
@@ -42,9 +44,10 @@ from sms_online.model.base_parameters import find_base_parameters
 from sms_online.pipeline.estimator import Estimator
 from sms_online.pipeline.statistics import Statistics
 from sms_online.stream import Array, Block
+from sms_tools.archive.runner import Work
 from tests.campaigns.accuracy import flagged
-from tests.campaigns.results import append, campaign, read, summed
-from tests.campaigns.sessions import disguised, exact_session, noisy_session, true_parameters
+from tests.campaigns.results import Record, absolute, campaign, complete, summed
+from tests.campaigns.sessions import SLIGHT, disguised, exact_session, noisy_session, true_parameters
 from tests.sessions_of import session_of
 
 SYSTEM = "paper-planar"
@@ -55,6 +58,8 @@ WORTH = (0.02, 0.2)
 SAME_ANGLE = np.deg2rad(10.0)
 # Noise of grade B is 1e-4 m and rad: motions are simulated to a ten-thousandth of it.
 TOLERANCE = 1e-8
+# Exact samples of the arm without an effect.
+CLEAN = "clean.npz"
 
 # Asked of the residual on data not fitted, over what noise alone leaves.
 MOST_OVER_FLOOR = 1.2
@@ -63,8 +68,6 @@ MOST_IN_A_SESSION = 1.25
 # Asked of the median error of every parameter, over that of sessions whose description declares the effect.
 MOST_OVER_DECLARED = 1.5
 
-Record = dict[str, Any]
-
 
 class Draw:
     """Draws effects for the planar example from its own clean motion."""
@@ -72,7 +75,7 @@ class Draw:
     def __init__(self, system: System, cache: Path) -> None:
         self.system = system
         self.cache = cache
-        block = noisy_session(system, exact_session(system, cache / "clean.npz"), GRADE, 0)
+        block = noisy_session(system, exact_session(system, cache / CLEAN), GRADE, 0)
         estimator = Estimator(system, block.channels, "clean")
         record = SampleRecord(system.sample_rate)
         estimator.observers.append(record)
@@ -158,57 +161,54 @@ class Draw:
         return dict(zip(names, linear.tolist(), strict=False)) | shapes
 
 
-def run(results: Path, cache: Path, seeds: int, names: list[str], struck: bool) -> None:
-    """Append the cases that `results` lacks, seed by seed."""
-    system = load_system(SYSTEM)
-    kind = "struck" if struck else "single"
-    draw = Draw(system, cache)
-    done = {(r["kind"], r["name"], r["seed"]) for r in read(results)}
-    for seed in range(seeds):
-        for name in names:
-            if (kind, name, seed) in done or (struck and ENTRIES[name].kind == "kinematics"):
-                continue
-            effect = draw.effect(name, seed)
-            block = draw.session((effect,), seed)
-            case = _struck(system, block, effect, draw) if struck else _case(system, block, effect)
-            append(results, {"kind": kind, "seed": seed, **case})
+@cache
+def drawn(folder: Path) -> Draw:
+    """What draws effects, once a process."""
+    return Draw(load_system(SYSTEM), folder)
 
 
-def pairs(results: Path, cache: Path, seeds: int, names: list[str]) -> None:
+def singles(args: argparse.Namespace, kind: str, work: Work) -> None:
+    """Append the cases of one effect that the results lack, seed by seed."""
+    drawn(args.cache)
+    names = [name for name in args.names if kind == "single" or ENTRIES[name].kind != "kinematics"]
+    wanted = product(range(args.seeds), names)
+    complete(args, work, [({"kind": kind, "seed": k, "name": name}, (args.cache, name, k)) for k, name in wanted])
+
+
+def pairs(args: argparse.Namespace) -> None:
     """Append sessions with two effects of different names, one pair for each seed."""
-    system = load_system(SYSTEM)
-    draw = Draw(system, cache)
-    done = {r["seed"] for r in read(results) if r["kind"] == "pair"}
-    drawn = [name for name in names if ENTRIES[name].kind != "kinematics"]
-    for seed in range(seeds):
-        if seed in done:
-            continue
-        rng = np.random.default_rng([seed, 2])
-        effects = tuple(draw.effect(str(name), seed) for name in rng.choice(drawn, 2, replace=False))
-        found = diagnose(disguised(system), [draw.session(effects, seed)], "case", lambda _: None)
-        record = {
-            "kind": "pair",
-            "seed": seed,
-            "name": "+".join(effect.name for effect in effects),
-            "true": {f"{effect.name}@{effect.where}": effect.coefficients for effect in effects},
-            "verdict": found.verdict,
-            "found": _keys(found),
-            "holdout": found.after.holdout.whitened,
-        }
-        append(results, record)
+    drawn(args.cache)
+    names = [name for name in args.names if ENTRIES[name].kind != "kinematics"]
+    complete(args, one_pair, [({"kind": "pair", "seed": k}, (args.cache, names, k)) for k in range(args.seeds)])
 
 
-def clean(results: Path, cache: Path, seeds: int) -> None:
+def one_pair(folder: Path, names: list[str], seed: int) -> Record:
+    """The diagnosis of a session with two effects."""
+    draw, rng = drawn(folder), np.random.default_rng([seed, 2])
+    effects = tuple(draw.effect(str(name), seed) for name in rng.choice(names, 2, replace=False))
+    return {
+        "name": "+".join(effect.name for effect in effects),
+        "true": {f"{effect.name}@{effect.where}": effect.coefficients for effect in effects},
+        **_told(diagnose(disguised(draw.system), [draw.session(effects, seed)], "case", lambda _: None)),
+    }
+
+
+def clean(args: argparse.Namespace) -> None:
     """Append clean sessions of all grades."""
+    exact_session(load_system(SYSTEM), args.cache / CLEAN)
+    wanted = product(range(args.seeds), ("A", "B", "C"))
+    complete(args, one_clean, [({"kind": "clean", "name": g, "seed": k}, (args.cache, g, k)) for k, g in wanted])
+
+
+def one_clean(folder: Path, grade: str, seed: int) -> Record:
+    """The diagnosis of a session that nothing is missing in."""
     system = load_system(SYSTEM)
-    exact = exact_session(system, cache / "clean.npz")
-    done = {(r["name"], r["seed"]) for r in read(results) if r["kind"] == "clean"}
-    for seed in range(seeds):
-        for grade in ("A", "B", "C"):
-            if (grade, seed) not in done:
-                found = diagnose(disguised(system), [noisy_session(system, exact, grade, seed)], "case", lambda _: None)
-                record = {"kind": "clean", "name": grade, "seed": seed, "verdict": found.verdict, "found": _keys(found)}
-                append(results, record | {"holdout": found.after.holdout.whitened})
+    block = noisy_session(system, exact_session(system, folder / CLEAN), grade, seed)
+    return _told(diagnose(disguised(system, factor=SLIGHT), [block], "case", lambda _: None))
+
+
+def _told(found: Diagnosis) -> Record:
+    return {"verdict": found.verdict, "found": _keys(found), "holdout": found.after.holdout.whitened}
 
 
 def _keys(found: Diagnosis) -> list[str]:
@@ -216,7 +216,11 @@ def _keys(found: Diagnosis) -> list[str]:
     return [f"{e.name}@{e.where}" for e in exact] + [finding.candidate.key for finding in found.findings]
 
 
-def _case(system: System, block: Block, effect: Effect) -> Record:
+def one_single(folder: Path, name: str, seed: int) -> Record:
+    """The diagnosis of a session with one effect, and sessions without and with what was found."""
+    draw = drawn(folder)
+    system, effect = draw.system, draw.effect(name, seed)
+    block = draw.session((effect,), seed)
     start = process_time()
     found = diagnose(disguised(system), [block], "case", lambda _: None)
     seconds = process_time() - start
@@ -225,16 +229,13 @@ def _case(system: System, block: Block, effect: Effect) -> Record:
         for finding in found.findings
     }
     return {
-        "name": effect.name,
         "where": effect.where,
         "true": effect.coefficients,
-        "verdict": found.verdict,
-        "found": _keys(found),
+        **_told(found),
         "told": reported,
         "ambiguous": {finding.candidate.key: list(finding.ambiguous) for finding in found.findings},
         "before": {row: test.whitened for row, test in found.before.test.items()},
         "after": {row: test.whitened for row, test in found.after.test.items()},
-        "holdout": found.after.holdout.whitened,
         "session": _left(found.estimator_after),
         "errors": _errors(system, found.estimator_after),
         "declared": _declared(system, block, effect),
@@ -264,9 +265,11 @@ def _errors(system: System, session: Estimator) -> dict[str, float]:
     return {p.name: float(value / truth[p.name] - 1.0) for p, value in estimated if p.name in truth}
 
 
-def _struck(system: System, block: Block, effect: Effect, draw: Draw) -> Record:
+def one_struck(folder: Path, name: str, seed: int) -> Record:
     """The same without the true effect, and without those that say the same."""
-    rows = draw.rows
+    draw = drawn(folder)
+    rows, effect = draw.rows, draw.effect(name, seed)
+    block = draw.session((effect,), seed)
     Q = basis(rows.white(rows.Y))
     columns = {}
     for each in draw.make.effects():
@@ -285,20 +288,17 @@ def _struck(system: System, block: Block, effect: Effect, draw: Draw) -> Record:
         return (e for e in inner(self, learned) if f"{e.name}@{e.where}" not in near)
 
     with patch.object(CandidateColumns, "effects", allowed):
-        found = diagnose(disguised(system), [block], "case", lambda _: None)
+        found = diagnose(disguised(draw.system), [block], "case", lambda _: None)
     worst = max(found.before.test, key=lambda row: found.before.test[row].whitened)
     return {
-        "name": effect.name,
         "where": effect.where,
         "struck": sorted(near),
-        "verdict": found.verdict,
-        "found": _keys(found),
+        **_told(found),
         "row": None if found.unexplained is None else found.unexplained.row,
         "worst": worst,
         "left": found.left,
         "before": {row: test.whitened for row, test in found.before.test.items()},
         "after": {row: test.whitened for row, test in found.after.test.items()},
-        "holdout": found.after.holdout.whitened,
     }
 
 
@@ -390,13 +390,13 @@ if __name__ == "__main__":
     campaign(
         __doc__,
         {
-            "run": lambda args: run(args.results, args.cache, args.seeds, args.names, False),
-            "struck": lambda args: run(args.results, args.cache, args.seeds, args.names, True),
-            "pairs": lambda args: pairs(args.results, args.cache, args.seeds, args.names),
-            "clean": lambda args: clean(args.results, args.cache, args.seeds),
+            "run": lambda args: singles(args, "single", one_single),
+            "struck": lambda args: singles(args, "struck", one_struck),
+            "pairs": pairs,
+            "clean": clean,
             "summary": summed(summary),
         },
         seeds={"type": int, "default": 4},
-        cache={"type": Path, "default": Path("runs/blind")},
+        cache={"type": absolute, "default": absolute("runs/blind")},
         names={"nargs": "*", "default": [name for name, entry in ENTRIES.items() if entry.forms is None]},
     )

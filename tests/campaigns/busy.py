@@ -3,17 +3,16 @@
     python -m tests.campaigns.busy run RESULTS.jsonl --demos 20
     python -m tests.campaigns.busy summary RESULTS.jsonl
 
-Each demo is a process of its own, and beside it as many processes as there are cores compute all the time, at the same
-priority. Nothing changes in the demo's arm, so every event is false. True values are read from results.json, where the
-verb has put them after the estimate. Recordings lie beside RESULTS, in a folder for each demo whose result is bad;
-`sms-online replay FOLDER --system FOLDER/system.toml` repeats it.
+Each demo is a process of its own, and beside it `--beside` processes, one for each core by default, compute all the
+time at the same priority. Nothing changes in the demo's arm, so every event is false. True values are read from
+results.json, where the verb has put them after the estimate. Recordings lie beside RESULTS, in a folder for each demo
+whose result is bad; `sms-online replay FOLDER --system FOLDER/system.toml` repeats it.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
-import os
 import shutil
 import subprocess
 import sys
@@ -25,11 +24,13 @@ from time import monotonic
 from typing import Any
 
 from sms_tools.archive.runner import cores
-from tests.campaigns.results import Record, append, campaign, read, summed
+from sms_tools.option_values import whole
+from tests.campaigns.results import Record, campaign, complete, summed
 
 # An interval that misses the true value by more bars than this is wrong, not unlucky.
 FAR = 5.0
-BUSY = "while True: pass"
+# Computes until its parent ends, however that ends.
+BUSY = "import os; parent = os.getppid()\nwhile os.getppid() == parent: pass"
 
 
 @contextmanager
@@ -45,16 +46,16 @@ def busy(processes: int) -> Iterator[None]:
 
 
 def demo(out: Path, seed: int) -> Record:
-    """One demo: what it says of itself, and by how many bars it errs."""
+    """One demo: what it says of itself, and by how many bars it errs; a good one leaves no files."""
     shutil.rmtree(out, ignore_errors=True)  # what a stopped campaign left
     command = [sys.executable, "-m", "sms_tools", "demo", "--rerun", "off", "--seed", str(seed), "--out", str(out)]
     began = monotonic()
-    done = subprocess.run(command, check=False, capture_output=True, text=True, env=dict(os.environ))
+    done = subprocess.run(command, check=False, capture_output=True, text=True)
     if not (out / "results.json").is_file():
         return {"code": done.returncode, "failed": done.stderr.strip().splitlines()[-1:]}
     results = json.loads((out / "results.json").read_text(encoding="utf-8"))
     verdict = results["verdict"]
-    return {
+    record = {
         "code": done.returncode,
         "level": verdict["level"],
         "sentence": verdict["sentence"],
@@ -65,6 +66,9 @@ def demo(out: Path, seed: int) -> Record:
         "warnings": results["warnings"],
         "seconds": monotonic() - began,
     }
+    if not bad(record):
+        shutil.rmtree(out)
+    return record
 
 
 def worst(results: Mapping[str, Any]) -> float | None:
@@ -79,22 +83,16 @@ def bad(record: Mapping[str, Any]) -> list[str]:
         return ["failed"]
     found = [f"event: {kind}" for kind in record["events"]]
     if record["level"] == "trust" and (record["worst"] is None or record["worst"] > FAR):
-        found.append(f"trusted, {record['worst']:.1f} bars off")
+        found.append(f"trusted, {record['worst']} bars off")
     return found
 
 
 def run(args: argparse.Namespace) -> None:
     """Append the demos that the results lack."""
-    done = {record["seed"] for record in read(args.results)}
-    for seed in range(args.demos):
-        if seed in done:
-            continue
-        out = args.results.with_suffix("") / str(seed)
-        with busy(cores()):
-            record = demo(out, seed)
-        append(args.results, {"seed": seed, "cores": cores(), **record})
-        if not bad(record) and not os.environ.get("KEEPALL"):
-            shutil.rmtree(out, ignore_errors=True)
+    names = {"cores": cores(), "beside": args.beside}
+    outs = {seed: args.results.with_suffix("") / str(seed) for seed in range(args.demos)}
+    with busy(args.beside):
+        complete(args, demo, [({"seed": seed, **names}, (out, seed)) for seed, out in outs.items()])
 
 
 def summary(records: list[Record]) -> str:
@@ -124,4 +122,10 @@ def summary(records: list[Record]) -> str:
 
 
 if __name__ == "__main__":
-    campaign(__doc__, {"run": run, "summary": summed(summary)}, demos={"type": int, "default": 20})
+    campaign(
+        __doc__,
+        {"run": run, "summary": summed(summary)},
+        alone=True,
+        demos={"type": int, "default": 20},
+        beside={"type": whole(0), "default": cores(), "help": "busy processes; 0 on a host that is busy already"},
+    )

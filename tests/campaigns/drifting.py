@@ -10,6 +10,7 @@ not the true ones. The judged tracker is `kalman` with `drift = learned`, least 
 
 from __future__ import annotations
 
+import argparse
 from collections import Counter
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -30,7 +31,7 @@ from sms_online.session import Session
 from sms_online.stream import Array, Block
 from sms_sim.drifting import drifted, parsed
 from tests.campaigns.accuracy import flagged
-from tests.campaigns.results import Record, append, campaign, read, summed
+from tests.campaigns.results import Record, campaign, complete, summed
 from tests.campaigns.sessions import disguised, exact_session, noisy_session
 from tests.exactly_known import exactly_known
 
@@ -107,24 +108,29 @@ def true_course(case: Case, t: Array) -> Array:
     return np.array([base.values(pi) for pi in drifted(model, model.nominal, parsed(case.drifts), t)])
 
 
-def run(results: Path, runs: int, names: list[str]) -> None:
-    """Append the sessions that `results` lacks, seed by seed."""
-    done = {(record["case"], record["seed"]) for record in read(results)}
-    for seed, name in product(range(runs), names):
-        if (name, seed) in done:
-            continue
-        case = CASES[name]
-        system = described(case)
-        whole = system.model_copy(
-            update={"effects": (*system.effects, *(parse_effect(text, system) for text in case.undeclared))}
-        )
-        exact = exact_session(whole, results.with_suffix(f".{name}.npz"), duration=DURATION, drifts=parsed(case.drifts))
-        record = one_session(case, noisy_session(whole, exact, GRADE, seed), alone=seed == 0)
-        append(results, {"case": name, "seed": seed, **record})
+def run(args: argparse.Namespace) -> None:
+    """Append the sessions that the results lack, seed by seed."""
+    caches = {name: args.results.with_suffix(f".{name}.npz") for name in args.cases}
+    for name, cache in caches.items():
+        sampled(name, cache, 0)
+    wanted = product(range(args.runs), caches.items())
+    tasks = [({"case": name, "seed": seed}, (name, cache, seed)) for seed, (name, cache) in wanted]
+    complete(args, one_session, tasks)
 
 
-def one_session(case: Case, block: Block, alone: bool) -> Record:
-    """What the judged tracker said on the way, and what was found; alone: and what least squares alone would say."""
+def sampled(name: str, cache: Path, seed: int) -> Block:
+    """The samples of a case with noise of the seed."""
+    case = CASES[name]
+    system = described(case)
+    undeclared = (parse_effect(text, system) for text in case.undeclared)
+    whole = system.model_copy(update={"effects": (*system.effects, *undeclared)})
+    exact = exact_session(whole, cache, duration=DURATION, drifts=parsed(case.drifts))
+    return noisy_session(whole, exact, GRADE, seed)
+
+
+def one_session(name: str, cache: Path, seed: int) -> Record:
+    """What the judged tracker said on the way, and what was found; of seed 0 also what least squares alone says."""
+    case, block, alone = CASES[name], sampled(name, cache, seed), seed == 0
     start = process_time()
     system = exactly_known(disguised(described(case), factor=DISGUISE))
     session = Session(system, block.channels, tracker=TRACKERS)
@@ -235,7 +241,7 @@ def _counts(names: Iterable[str]) -> str:
 if __name__ == "__main__":
     campaign(
         __doc__,
-        {"run": lambda args: run(args.results, args.runs, args.cases), "summary": summed(summary)},
+        {"run": run, "summary": summed(summary)},
         runs={"type": int, "default": 10, "help": "seeds 0, 1, … of each case, 10 by default"},
         cases={"nargs": "+", "choices": list(CASES), "default": list(CASES)},
     )

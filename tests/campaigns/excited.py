@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import argparse
 import math
+from pathlib import Path
 from time import process_time
 
 import numpy as np
@@ -20,10 +21,13 @@ import numpy as np
 import sms_online as sms
 from sms_adapters.system_file import load_system
 from sms_online.description.schema import System, Trajectory
+from sms_online.effects.build import build_model
+from sms_online.errors import InputError
+from sms_online.model.base_parameters import find_base_parameters
 from sms_sim.bound import Bounds
-from sms_sim.capture import Simulated
 from sms_sim.excitation import ITERATIONS, excite
-from tests.campaigns.results import Record, append, campaign, read, summed
+from tests.campaigns.results import Record, campaign, complete, read, summed
+from tests.campaigns.sessions import exact_session, noisy_session, true_parameters
 
 SYSTEM, GRADE = "paper-planar", "B"
 DESCRIBED, DESIGNED = MOTIONS = ("described", "designed")
@@ -47,36 +51,50 @@ def starts(records: list[Record]) -> list[Record]:
 
 def run(args: argparse.Namespace) -> None:
     """Append the starts that the results lack."""
-    done = {record["seed"] for record in starts(read(args.results))}
+    steps = args.iterations
+    complete(args, start, [({"seed": seed, "iterations": steps}, (seed, steps)) for seed in range(args.seeds)])
+
+
+def start(seed: int, iterations: int) -> Record:
+    """The design of one seeded start."""
     system = load_system(SYSTEM)
-    for seed in range(args.seeds):
-        if seed in done:
-            continue
-        began = process_time()
-        found = excite(system, seed=seed, grade=GRADE, iterations=args.iterations)
-        assert found.before is not None
-        assert found.system.trajectory is not None
-        shares = [relative(bounds) for bounds in (found.before, found.after)]
-        record = {"seed": seed, "iterations": args.iterations, "kept": found.system == system}
-        record |= {"median": [float(np.median(s)) for s in shares], "worst": [max(s) for s in shares]}
-        record |= {"trajectory": found.system.trajectory.model_dump(mode="json"), "seconds": process_time() - began}
-        append(args.results, record)
+    began = process_time()
+    found = excite(system, seed=seed, grade=GRADE, iterations=iterations)
+    assert found.before is not None
+    assert found.system.trajectory is not None
+    shares = [relative(bounds) for bounds in (found.before, found.after)]
+    return {
+        "kept": found.system == system,
+        "median": [float(np.median(s)) for s in shares],
+        "worst": [max(s) for s in shares],
+        "trajectory": found.system.trajectory.model_dump(mode="json"),
+        "seconds": process_time() - began,
+    }
 
 
 def fact(args: argparse.Namespace) -> None:
     """Append errors of sessions with the described motion and with the best designed one."""
-    records = read(args.results)
-    best = starts(records)[0]
-    system = load_system(SYSTEM)
-    moved = {DESCRIBED: system, DESIGNED: designed(system, best)}
-    for motion, each in moved.items():
-        simulation = Simulated.of(each, grade=GRADE).solve()
-        done = {r["noise"] for r in records if r.get("motion") == motion and r["design"] == best["seed"]}
-        for noise in sorted({*range(args.noises)} - done):
-            result = sms.estimate(each, Simulated.of(each, grade=GRADE, seed=noise).capture(simulation))
-            errors = {p.name: 100.0 * abs(p.value - p.true) / p.true for p in result.parameters.values() if p.true}
-            found = {"motion": motion, "design": best["seed"], "noise": noise, "errors": errors}
-            append(args.results, found | {"trust": result.trust.level})
+    ordered = starts(read(args.results))
+    if not ordered:
+        raise InputError(str(args.results), "", "no start", "the results of run")
+    best = ordered[0]
+    tasks = []
+    for motion, system in ((DESCRIBED, load_system(SYSTEM)), (DESIGNED, designed(load_system(SYSTEM), best))):
+        cache = args.results.with_suffix(f".{motion}.npz")
+        exact_session(system, cache)
+        names = {"motion": motion, "design": best["seed"]}
+        tasks += [({**names, "noise": noise}, (cache, system, noise)) for noise in range(args.noises)]
+    complete(args, session, tasks)
+
+
+def session(cache: Path, system: System, noise: int) -> Record:
+    """Errors of one session, % of each parameter's value."""
+    block = noisy_session(system, exact_session(system, cache), GRADE, noise)
+    result = sms.estimate(system, sms.Capture(block.t, block.channels, block.values))
+    names = [p.name for p in find_base_parameters(build_model(system)).parameters]
+    truth = dict(zip(names, true_parameters(system).tolist(), strict=True))
+    errors = {p.name: 100.0 * abs(p.value - truth[p.name]) / truth[p.name] for p in result.parameters.values()}
+    return {"errors": errors, "trust": result.trust.level}
 
 
 def designed(system: System, record: Record) -> System:

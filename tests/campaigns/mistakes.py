@@ -11,8 +11,10 @@ same ones without a mistake. Every case is a line of RESULTS.jsonl; a stopped ca
 
 from __future__ import annotations
 
+import argparse
 import zlib
 from collections.abc import Callable
+from itertools import product
 from pathlib import Path
 from time import process_time
 from typing import Any
@@ -24,7 +26,7 @@ from sms_online.description.parse import describe
 from sms_online.description.schema import System
 from sms_online.diagnosis.diagnose import diagnose
 from sms_online.stream import Array, Block
-from tests.campaigns.results import append, campaign, read, summed
+from tests.campaigns.results import Record, absolute, campaign, complete, summed
 from tests.campaigns.sessions import DISGUISED, exact_session, noisy_session
 
 SYSTEMS = ("paper-planar", "paper-planar-table-v", "spatial-two-link")
@@ -161,10 +163,13 @@ def clean(values: Values, system: System, rng: np.random.Generator) -> str:
     return ""
 
 
-MISTAKES: tuple[Callable[[Values, System, np.random.Generator], str], ...] = (
-    torque_sign, angle_sign, swapped, degrees, millimetres, torque_unit, clock_unit, joint_torque, gear_ratio,
-    motor_angle, encoder, held_command, zero_offset, markers, clean,
-)  # fmt: skip
+MISTAKES: dict[str, Callable[[Values, System, np.random.Generator], str]] = {
+    make.__name__: make
+    for make in (
+        torque_sign, angle_sign, swapped, degrees, millimetres, torque_unit, clock_unit, joint_torque, gear_ratio,
+        motor_angle, encoder, held_command, zero_offset, markers, clean,
+    )
+}  # fmt: skip
 
 
 def session(name: str, cache: Path, seed: int) -> tuple[System, Block]:
@@ -175,37 +180,34 @@ def session(name: str, cache: Path, seed: int) -> tuple[System, Block]:
     return system, Block(block.t[:count], block.channels, block.values[:count])
 
 
-def case(
-    name: str, cache: Path, seed: int, make: Callable[[Values, System, np.random.Generator], str]
-) -> dict[str, Any]:
+def case(name: str, cache: Path, seed: int, mistake: str) -> Record:
     """One diagnosis."""
-    rng = np.random.default_rng([seed, zlib.crc32(make.__name__.encode()), zlib.crc32(name.encode())])
+    rng = np.random.default_rng([seed, zlib.crc32(mistake.encode()), zlib.crc32(name.encode())])
     system, block = session(name, cache, seed)
     values = {"t": block.t.copy()} | {
         c: column.copy() for c, column in zip(block.channels, block.values.T, strict=True)
     }
-    key = make(values, system, rng)
+    key = MISTAKES[mistake](values, system, rng)
     wrong = Block(values["t"], block.channels, np.stack([values[c] for c in block.channels], axis=1))
     start = process_time()
     found = diagnose(described(system, rng), [wrong], "case", lambda _: None)
-    keys = [mistake.key for mistake in found.mistakes] + [finding.candidate.key for finding in found.findings]
+    keys = [each.key for each in found.mistakes] + [finding.candidate.key for finding in found.findings]
     return {
-        "system": name, "seed": seed, "name": make.__name__, "true": key, "found": keys, "verdict": found.verdict,
-        "or_else": [mistake.or_else for mistake in found.mistakes], "seconds": process_time() - start,
+        "true": key, "found": keys, "verdict": found.verdict,
+        "or_else": [each.or_else for each in found.mistakes], "seconds": process_time() - start,
     }  # fmt: skip
 
 
-def run(results: Path, cache: Path, seeds: int, systems: list[str], names: list[str]) -> None:
-    """Append the cases that `results` lacks."""
-    done = {(r["system"], r["name"], r["seed"]) for r in read(results)}
-    for seed in range(seeds):
-        for system in systems:
-            for make in MISTAKES:
-                if make.__name__ in names and (system, make.__name__, seed) not in done:
-                    append(results, case(system, cache, seed, make))
+def run(args: argparse.Namespace) -> None:
+    """Append the cases that the results lack."""
+    for system in args.systems:
+        session(system, args.cache, 0)
+    wanted = product(range(args.seeds), args.systems, args.names)
+    tasks = [({"system": s, "seed": k, "name": name}, (s, args.cache, k, name)) for k, s, name in wanted]
+    complete(args, case, tasks)
 
 
-def summary(records: list[dict[str, Any]]) -> str:
+def summary(records: list[Record]) -> str:
     """Cases whose mistake is named first, and clean ones."""
     wrong = [r for r in records if r["found"][:1] != ([r["true"]] if r["true"] else [])]
     lines = [f"{r['system']} {r['seed']}: {r['true'] or 'clean'} → {r['found']}, {r['verdict']}" for r in wrong]
@@ -221,12 +223,9 @@ def summary(records: list[dict[str, Any]]) -> str:
 if __name__ == "__main__":
     campaign(
         __doc__,
-        {
-            "run": lambda args: run(args.results, args.cache, args.seeds, args.systems, args.names),
-            "summary": summed(summary),
-        },
+        {"run": run, "summary": summed(summary)},
         seeds={"type": int, "default": 5},
-        cache={"type": Path, "default": Path("runs/mistakes")},
+        cache={"type": absolute, "default": absolute("runs/mistakes")},
         systems={"nargs": "*", "default": list(SYSTEMS)},
-        names={"nargs": "*", "default": [make.__name__ for make in MISTAKES]},
+        names={"nargs": "*", "choices": list(MISTAKES), "default": list(MISTAKES)},
     )

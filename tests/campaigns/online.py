@@ -12,13 +12,17 @@ goes on where it was.
 
 from __future__ import annotations
 
+import argparse
+import json
+from functools import cache
+from itertools import product
 from pathlib import Path
 from time import process_time
-from typing import Any
 
 import numpy as np
 
 from sms_adapters.system_file import load_system
+from sms_online.description.parse import describe
 from sms_online.description.schema import System
 from sms_online.diagnosis.online import OnlineDiagnosis
 from sms_online.diagnosis.online_search import Immediate
@@ -26,8 +30,8 @@ from sms_online.effects.catalogue import ENTRIES, channel_effects, parse_effect
 from sms_online.pipeline.estimator import Estimator
 from sms_online.stream import Block
 from sms_sim.simulate import Simulation, exact_states, simulate
-from tests.campaigns.results import append, campaign, read, summed
-from tests.campaigns.sessions import disguised, noisy_session
+from tests.campaigns.results import Record, campaign, complete, summed
+from tests.campaigns.sessions import cached, disguised, exact_session, noisy_session
 from tests.changed_session import changed_session
 
 SYSTEM = "paper-planar"
@@ -49,11 +53,10 @@ CASES = (
 # What events call an effect.
 ALIKE = {"tip_payload@tip": "payload."}
 
-Record = dict[str, Any]
 
-
-def session(before: Simulation, system: System, text: str) -> Block:
+def begun(system: System, text: str) -> Block:
     """Exact samples of a session in which an effect begins."""
+    before = unchanged()
     effect = parse_effect(text, system)
     changed = system.model_copy(update={"effects": (*system.effects, effect)})
     if ENTRIES[effect.name].kind != "channel":
@@ -80,42 +83,52 @@ def watched(system: System, block: Block, adopt: bool) -> tuple[Estimator, Onlin
     return estimator, online
 
 
-def run(results: Path, seeds: int) -> None:
-    """Append the cases that `results` lacks."""
+@cache
+def unchanged() -> Simulation:
+    """The motion without an effect."""
+    return simulate(load_system(SYSTEM), END)
+
+
+def exact_begun(text: str, folder: Path) -> Block:
+    """The same, kept in a folder."""
     system = load_system(SYSTEM)
-    before = simulate(system, END)
-    done = {(r["kind"], r["case"], r["seed"]) for r in read(results)}
+    description = json.dumps([describe(system), text, BEGIN, END])
+    return cached(folder / f"{text.partition(':')[0]}.npz", description, lambda: begun(system, text))
+
+
+def run(args: argparse.Namespace) -> None:
+    """Append the cases that the results lack."""
+    folder = args.results.with_suffix("")
     for text in CASES:
-        missing = [seed for seed in range(seeds) if ("begun", text, seed) not in done]
-        exact = session(before, system, text) if missing else None
-        for seed in missing:
-            assert exact is not None
-            start = process_time()
-            estimator, online = watched(system, noisy_session(system, exact, "B", seed), adopt=True)
-            record = {
-                "kind": "begun", "case": text, "seed": seed, "episodes": online.document(),
-                "events": [event.kind for event in estimator.events], "seconds": process_time() - start,
-            }  # fmt: skip
-            append(results, record)
+        exact_begun(text, folder)
+    wanted = product(CASES, range(args.seeds))
+    complete(args, one_begun, [({"kind": "begun", "case": t, "seed": seed}, (folder, t, seed)) for t, seed in wanted])
 
 
-def steady(results: Path, seeds: int) -> None:
+def one_begun(folder: Path, text: str, seed: int) -> Record:
+    """What was noticed and named of an effect."""
+    system, exact = load_system(SYSTEM), exact_begun(text, folder)
+    start = process_time()
+    estimator, online = watched(system, noisy_session(system, exact, "B", seed), adopt=True)
+    events = [event.kind for event in estimator.events]
+    return {"episodes": online.document(), "events": events, "seconds": process_time() - start}
+
+
+def steady(args: argparse.Namespace) -> None:
     """Append sessions in which nothing is missing."""
+    file = args.results.with_suffix("") / "steady.npz"
+    exact_session(load_system(SYSTEM), file)
+    wanted = product(range(args.seeds), ("A", "B", "C"))
+    complete(args, one_steady, [({"kind": "steady", "case": g, "seed": seed}, (file, g, seed)) for seed, g in wanted])
+
+
+def one_steady(file: Path, grade: str, seed: int) -> Record:
+    """Alarms of a session in which nothing is missing."""
     system = load_system(SYSTEM)
-    simulation = simulate(system)
-    samples = round(simulation.duration * system.sample_rate)
-    states = exact_states(simulation, np.arange(samples + 1) / system.sample_rate)
-    plant = simulation.plant
-    exact = Block(states.t, plant.channels, plant.channel_values(states.torque, states.x))
-    done = {(r["case"], r["seed"]) for r in read(results) if r["kind"] == "steady"}
-    for seed in range(seeds):
-        for grade in ("A", "B", "C"):
-            if (grade, seed) not in done:
-                estimator, online = watched(system, noisy_session(system, exact, grade, seed), adopt=False)
-                assert estimator.momentum is not None
-                largest = max(estimator.momentum.test.evidence.values())
-                record = {"kind": "steady", "case": grade, "seed": seed, "episodes": online.document(), "sum": largest}
-                append(results, record)
+    block = noisy_session(system, exact_session(system, file), grade, seed)
+    estimator, online = watched(system, block, adopt=False)
+    assert estimator.momentum is not None
+    return {"episodes": online.document(), "sum": max(estimator.momentum.test.evidence.values())}
 
 
 def summary(records: list[Record]) -> str:
@@ -150,10 +163,6 @@ def summary(records: list[Record]) -> str:
 if __name__ == "__main__":
     campaign(
         __doc__,
-        {
-            "run": lambda args: run(args.results, args.seeds),
-            "steady": lambda args: steady(args.results, args.seeds),
-            "summary": summed(summary),
-        },
+        {"run": run, "steady": steady, "summary": summed(summary)},
         seeds={"type": int, "default": 2},
     )

@@ -10,21 +10,20 @@ Captures are kept in --cache: the engine needs half a minute of a core for each.
 
 from __future__ import annotations
 
+import argparse
 import json
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from time import process_time
-from typing import Any
-
-import numpy as np
 
 from sms_adapters.system_file import load_system
+from sms_online.description.parse import describe
 from sms_online.diagnosis.diagnose import Diagnosis, diagnose
 from sms_online.diagnosis.document import coefficients
 from sms_online.pipeline.estimator import Estimator
 from sms_online.stream import Block
-from tests.campaigns.results import append, campaign, read, summed
-from tests.campaigns.sessions import disguised, noisy_session, true_parameters
+from tests.campaigns.results import Record, absolute, campaign, complete, summed
+from tests.campaigns.sessions import SLIGHT, cached, disguised, noisy_session, true_parameters
 from tests.engine_mujoco import EngineEffects, mujoco_capture
 
 GRADE, SEED = "B", 3
@@ -40,8 +39,9 @@ class Case:
     found: dict[str, float | None]
 
 
+CLEAN = "clean"
 CASES = {
-    "clean": Case(EngineEffects(), "paper-planar-exact", {}),
+    CLEAN: Case(EngineEffects(), "paper-planar-exact", {}),
     "coulomb": Case(EngineEffects(coulomb=(0.0, 1.0)), "paper-planar-exact", {"coulomb_friction@joint_2": 1.0}),
     "cubic": Case(EngineEffects(cubic=(300.0, 0.0)), "paper-planar-exact", {"cubic_stiffness@joint_1": 300.0}),
     "tip": Case(EngineEffects(tip_mass=0.5), "paper-planar-exact", {"tip_payload@tip": 0.5}),
@@ -61,36 +61,29 @@ CASES = {
 
 def captured(effects: EngineEffects, cache: Path) -> Block:
     """What exact sensors read of the engine, from `cache` or else simulated and written there."""
-    if cache.exists():
-        with np.load(cache) as saved:
-            return Block(saved["t"], tuple(saved["channels"].tolist()), saved["values"])
-    block = mujoco_capture(load_system("paper-planar-exact"), DURATION, effects=effects)
-    cache.parent.mkdir(parents=True, exist_ok=True)
-    np.savez(cache, t=block.t, channels=np.array(block.channels), values=block.values)
-    return block
+    system = load_system("paper-planar-exact")
+    description = json.dumps([describe(system), DURATION, asdict(effects)])
+    return cached(cache, description, lambda: mujoco_capture(system, DURATION, effects=effects))
 
 
-def run(results: Path, cache: Path, names: list[str]) -> None:
-    """Diagnose the cases that are not in the results yet."""
-    done = {record["case"] for record in read(results)}
-    for name in names:
-        if name in done:
-            continue
-        case = CASES[name]
-        engine = "clean" if name == "linear" else name
-        described = load_system("paper-planar-exact")
-        block = noisy_session(described, captured(case.effects, cache / f"mujoco-{engine}.npz"), GRADE, SEED)
-        begin = process_time()
-        record = {"case": name, **_record(case, _diagnosed(case, block)), "seconds": process_time() - begin}
-        append(results, record)
-        print(json.dumps(record), flush=True)
+def run(args: argparse.Namespace) -> None:
+    """Append the cases that the results lack."""
+    captured(EngineEffects(), args.cache / f"{CLEAN}.mujoco.npz")
+    complete(args, diagnosed, [({"case": name}, (args.cache, name)) for name in args.cases])
 
 
-def _diagnosed(case: Case, block: Block) -> Diagnosis:
-    return diagnose(disguised(load_system(case.system)), [block], "mujoco", lambda _: None)
+def diagnosed(cache: Path, name: str) -> Record:
+    """The diagnosis of a case."""
+    case = CASES[name]
+    engine = name if case.effects != EngineEffects() else CLEAN
+    block = captured(case.effects, cache / f"{engine}.mujoco.npz")
+    block = noisy_session(load_system("paper-planar-exact"), block, GRADE, SEED)
+    begin = process_time()
+    found = diagnose(disguised(load_system(case.system), factor=SLIGHT), [block], "mujoco", lambda _: None)
+    return {**_record(case, found), "seconds": process_time() - begin}
 
 
-def _record(case: Case, found: Diagnosis) -> dict[str, Any]:
+def _record(case: Case, found: Diagnosis) -> Record:
     """What was found, and how far base parameters are off before and after, %."""
     keys = [finding.candidate.key for finding in found.findings]
     declared = [f"{effect.name}@{effect.where}" for effect in found.after.system.effects]
@@ -119,7 +112,7 @@ def _off(case: Case, session: Estimator) -> dict[str, float]:
     return {name: 100.0 * (estimate[name] / value - 1.0) for name, value in zip(names, truth, strict=False)}
 
 
-def summary(records: list[dict[str, Any]]) -> str:
+def summary(records: list[Record]) -> str:
     """A line for each case: whether all that was added, and nothing else, was found; rows and parameters."""
     lines = []
     for r in records:
@@ -140,7 +133,7 @@ def summary(records: list[dict[str, Any]]) -> str:
 if __name__ == "__main__":
     campaign(
         __doc__,
-        {"run": lambda args: run(args.results, args.cache, args.cases), "summary": summed(summary)},
-        cache={"type": Path, "default": Path("runs")},
+        {"run": run, "summary": summed(summary)},
+        cache={"type": absolute, "default": absolute("runs")},
         cases={"nargs": "*", "choices": tuple(CASES), "default": list(CASES)},
     )

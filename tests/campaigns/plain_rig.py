@@ -10,22 +10,20 @@ values that the estimator sees are not the true ones, and nothing is a prior.
 
 from __future__ import annotations
 
-import json
+import argparse
+from functools import partial
 from pathlib import Path
 from time import process_time
-from typing import Any
 
 import numpy as np
 
-from sms_online.description.schema import System
 from sms_online.effects.build import build_model
 from sms_online.evaluation import NORMAL_95
 from sms_online.model.base_parameters import find_base_parameters
-from sms_online.stream import Block
-from sms_sim.sensors import Sensors
+from sms_online.stream import Array
 from sms_sim.simulate import simulate
-from tests.campaigns.results import Record, append, campaign, read
-from tests.campaigns.sessions import disguised, exact_session, true_parameters
+from tests.campaigns.results import Record, campaign, complete, summed
+from tests.campaigns.sessions import cached_bound, disguised, exact_session, noisy_session, true_parameters
 from tests.evaluated import standard_deviation
 from tests.plain_rig import bound_of, plain_rig
 from tests.sessions_of import session_of
@@ -34,13 +32,23 @@ from tests.sessions_of import session_of
 ASKED = 10.0
 
 
-def noisy(system: System, exact: Block, seed: int) -> Block:
-    """What the described sensors make of exact samples."""
-    return Block(exact.t, exact.channels, Sensors(system, exact.channels, None, seed).read(0, exact.values))
+def run(args: argparse.Namespace) -> None:
+    """Append the sessions that the results lack, seed by seed."""
+    cache = args.results.with_suffix(".exact.npz")
+    exact_session(plain_rig(), cache)
+    limit(args.results)
+    complete(args, one_session, [({"seed": seed}, (cache, seed)) for seed in range(args.runs)])
 
 
-def one_session(system: System, block: Block) -> Record:
+def limit(results: Path) -> Array:
+    """The bound (n,), kept beside the results."""
+    return cached_bound(results.with_suffix(".bound.json"), lambda: bound_of(simulate(plain_rig())))
+
+
+def one_session(cache: Path, seed: int) -> Record:
     """Estimate of one session."""
+    system = plain_rig()
+    block = noisy_session(system, exact_session(system, cache), None, seed)
     start = process_time()
     estimator = session_of(disguised(system), [block])
     smoother = estimator.smoother
@@ -49,30 +57,14 @@ def one_session(system: System, block: Block) -> Record:
         "estimate": estimator.estimate().pi.tolist(),
         "std": standard_deviation(estimator).tolist(),
         "by_smoother": estimator.by_smoother,
-        "mean_square": smoother.mean_square,
-        "failures": smoother.failures,
+        "mean_square": smoother.known.mean_square,
+        "failures": smoother.known.failures,
         "seconds": process_time() - start,
     }
 
 
-def run(results: Path, runs: int) -> None:
-    """Append the sessions that `results` lacks, seed by seed."""
-    system = plain_rig()
-    exact = exact_session(system, results.with_suffix(".exact.npz"))
-    limit = results.with_suffix(".bound.json")
-    if not limit.exists():
-        limit.write_text(json.dumps(bound_of(simulate(system)).tolist()), encoding="utf-8")
-    done = {record["seed"] for record in read(results)}
-    for seed in range(runs):
-        if seed not in done:
-            record = one_session(system, noisy(system, exact, seed))
-            append(results, {"seed": seed, **record})
-
-
-def summary(results: Path) -> str:
+def summary(records: list[Record], limit: Array) -> str:
     """Errors beside the bound; an exclamation mark where an error is beyond what is asked."""
-    records: list[dict[str, Any]] = read(results)
-    limit = np.array(json.loads(results.with_suffix(".bound.json").read_text(encoding="utf-8")))
     system = plain_rig()
     truth, names = true_parameters(system), [p.name for p in find_base_parameters(build_model(system)).parameters]
     estimate, std = (np.array([record[key] for record in records]) for key in ("estimate", "std"))
@@ -99,6 +91,6 @@ def summary(results: Path) -> str:
 if __name__ == "__main__":
     campaign(
         __doc__,
-        {"run": lambda args: run(args.results, args.runs), "summary": lambda args: summary(args.results)},
+        {"run": run, "summary": lambda args: summed(partial(summary, limit=limit(args.results)))(args)},
         runs={"type": int, "default": 20, "help": "seeds 0, 1, …, 20 by default"},
     )

@@ -1,71 +1,75 @@
 """Sessions of an arm that cameras see as points: coverage, errors and error bars against the bound.
 
-python -m tests.campaigns.points RESULTS.jsonl --seeds 50 [--system NAME] [--faults]
+    python -m tests.campaigns.points run RESULTS.jsonl --seeds 50 [--system NAME] [--faults]
+    python -m tests.campaigns.points summary RESULTS.jsonl
+
+Every session is a line of RESULTS.jsonl: `run` may be stopped at any time and goes on where it was.
 """
 
 from __future__ import annotations
 
 import argparse
-import json
 from pathlib import Path
 
 import numpy as np
 
-from sms_adapters.system_file import load_system
 from sms_online.evaluation import NORMAL_95
+from sms_online.stream import Array
 from sms_sim.camera_faults import CameraFaults, parsed_faults
-from sms_sim.plant import Plant
-from sms_sim.simulate import Simulation, sampled_blocks
+from sms_sim.simulate import simulate
 from tests.camera_rig import FAULTS, bound_of, seen_by_cameras
+from tests.campaigns.results import Record, campaign, complete, summed
+from tests.campaigns.sessions import cached_bound, exact_session, noisy_session
 from tests.sessions_of import normalised, session_of
-from tests.simulations import simulated
 
 
-def run(results: Path, name: str, seeds: range, faulty: bool) -> None:
-    """One line a session: z of each parameter, and its standard deviation as a multiple of the bound."""
+def run(args: argparse.Namespace) -> None:
+    """Append the sessions that the results lack, seed by seed."""
+    system = seen_by_cameras(args.system)
+    cache = args.results.with_suffix(f".{args.system}.npz")
+    exact_session(system, cache)
+    bound = cached_bound(cache.with_suffix(".bound.json"), lambda: bound_of(simulate(system)))
+    names = {"system": args.system, "faults": args.faults}
+    tasks = [({**names, "seed": seed}, (cache, bound, args.system, args.faults, seed)) for seed in range(args.seeds)]
+    complete(args, one_session, tasks)
+
+
+def one_session(cache: Path, bound: Array, name: str, faulty: bool, seed: int) -> Record:
+    """z of each parameter, and its standard deviation as a multiple of the bound."""
     system = seen_by_cameras(name)
-    # Cameras play no part in the motion.
-    simulation = Simulation(Plant(system), simulated(load_system(name)).solution)
-    bound = bound_of(simulation)
-    for seed in seeds:
-        blocks = list(sampled_blocks(simulation, None, seed))
-        faults = CameraFaults(parsed_faults(FAULTS if faulty else ()), blocks[0].channels, seed)
-        estimator = session_of(system, [faults(block) for block in blocks])
-        record = {
-            "seed": seed,
-            "method": estimator.method,
-            "z": normalised(estimator).tolist(),
-            "std": (estimator.estimate().std / bound).tolist(),
-            "swaps": len(estimator.swaps),
-        }
-        with results.open("a", encoding="utf-8") as file:
-            file.write(json.dumps(record) + "\n")
+    block = noisy_session(system, exact_session(system, cache), None, seed)
+    faults = CameraFaults(parsed_faults(FAULTS if faulty else ()), block.channels, seed)
+    estimator = session_of(system, [faults(block)])
+    return {
+        "method": estimator.method,
+        "z": normalised(estimator).tolist(),
+        "std": (estimator.estimate().std / bound).tolist(),
+        "swaps": len(estimator.swaps),
+    }
 
 
-def show(results: Path) -> None:
+def summary(records: list[Record]) -> str:
     """Coverage of 95 % intervals, rms of z, and of errors over the bound, the worst parameter's too."""
-    records = [json.loads(line) for line in results.read_text(encoding="utf-8").splitlines()]
-    z, std = (np.array([record[name] for record in records]) for name in ("z", "std"))
-    rms = np.sqrt(np.mean((z * std) ** 2, axis=0))
-    print(f"{len(records)} sessions, {sum(record['method'] == 'smoother' for record in records)} by the smoother")
-    print(f"coverage {np.mean(np.abs(z) < NORMAL_95):.3f}, rms z {np.sqrt(np.mean(z**2)):.2f}")
-    print(f"errors over the bound: rms {np.sqrt(np.mean(rms**2)):.2f}, of the worst parameter {rms.max():.2f}")
-    print(f"error bars over the bound: {std.min():.2f} to {std.max():.2f}")
-
-
-def main() -> None:
-    """Run what is asked for, and show what there is."""
-    assert __doc__ is not None
-    parser = argparse.ArgumentParser(prog="python -m tests.campaigns.points", description=__doc__.splitlines()[0])
-    parser.add_argument("results", type=Path)
-    parser.add_argument("--seeds", type=int, default=50)
-    parser.add_argument("--first", type=int, default=0, help="number of the first seed")
-    parser.add_argument("--system", default="paper-planar", help="a shipped system")
-    parser.add_argument("--faults", action="store_true", help="markers missing, hidden and swapped")
-    args = parser.parse_args()
-    run(args.results, args.system, range(args.first, args.first + args.seeds), args.faults)
-    show(args.results)
+    lines = []
+    for system, faults in dict.fromkeys((record["system"], record["faults"]) for record in records):
+        own = [record for record in records if (record["system"], record["faults"]) == (system, faults)]
+        z, std = (np.array([record[name] for record in own]) for name in ("z", "std"))
+        rms = np.sqrt(np.mean((z * std) ** 2, axis=0))
+        by_smoother = sum(record["method"] == "smoother" for record in own)
+        lines += [
+            f"{len(own)} sessions of {system}{' with faults' if faults else ''}, {by_smoother} by the smoother",
+            f"coverage {np.mean(np.abs(z) < NORMAL_95):.3f}, rms z {np.sqrt(np.mean(z**2)):.2f}",
+            f"errors over the bound: rms {np.sqrt(np.mean(rms**2)):.2f}, of the worst parameter {rms.max():.2f}",
+            f"error bars over the bound: {std.min():.2f} to {std.max():.2f}",
+        ]
+    return "\n".join(lines)
 
 
 if __name__ == "__main__":
-    main()
+    campaign(
+        __doc__,
+        {"run": run, "summary": summed(summary)},
+        seeds={"type": int, "default": 50},
+        system={"default": "paper-planar", "help": "a shipped system"},
+        faults={"action": "store_true", "help": "markers missing, hidden and swapped"},
+    )

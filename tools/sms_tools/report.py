@@ -35,14 +35,19 @@ Document = dict[str, Any]
 def report_console(json: bool) -> Console:
     """Where people read: stdout, or stderr where stdout belongs to a JSON document."""
     stream = sys.stderr if json else sys.stdout
-    return Console(file=stream, width=None if stream.isatty() else FILE_WIDTH, highlight=False)
+    return plain_console(file=stream, width=None if stream.isatty() else FILE_WIDTH)
+
+
+def plain_console(**settings: Any) -> Console:
+    """A console that shows paths and messages as they are: `[x]` is no style in them, `:abc:` no picture."""
+    return Console(highlight=False, markup=False, emoji=False, **settings)
 
 
 def show(console: Console, *parts: Table | str | Text) -> None:
     """Print; raises BrokenPipeError, which rich itself would turn into an exit code of its own."""
     with console.capture() as capture:
         for part in parts:
-            console.print(part, markup=False, soft_wrap=not isinstance(part, Table))
+            console.print(part, soft_wrap=not isinstance(part, Table))
     console.file.write(capture.get())
 
 

@@ -16,6 +16,7 @@ from sms_adapters.sources import open_source
 from sms_online.capture import PIECE
 from sms_online.description.schema import System
 from sms_online.stream import Block, Relayed, Source
+from sms_tools.report import plain_console
 
 # What is over before this many seconds needs no bar.
 MOMENT = 2.0
@@ -49,7 +50,7 @@ def watched(
 
     The arguments are those of `open_source`.
     """
-    console = Console(stderr=True, highlight=False)
+    console = plain_console(stderr=True)
     if not console.is_terminal:
         source = open_source(path, system, start, stop, None, folder)
         yield Watched(source, source, console)
@@ -76,7 +77,7 @@ def waiting() -> Iterator[Callable[[str, float], None]]:
 
     Yields whom to call with what is being done, a few words, and the share of all that is done.
     """
-    console = Console(stderr=True, highlight=False)
+    console = plain_console(stderr=True)
     if not console.is_terminal:
         yield lambda what, share: None
         return
@@ -89,7 +90,7 @@ def waiting() -> Iterator[Callable[[str, float], None]]:
 
 
 def _bar(console: Console) -> Progress:
-    columns = (TextColumn("{task.description}"), BarColumn(), TextColumn("{task.percentage:.0f} %"))
+    columns = (TextColumn("{task.description}", markup=False), BarColumn(), TextColumn("{task.percentage:.0f} %"))
     return Progress(*columns, TimeRemainingColumn(), console=console, transient=True)
 
 

@@ -92,9 +92,11 @@ def _convergence(document: Document, nominal: Mapping[str, float]) -> list[Chart
     for group in parameter_groups(parameters, references, basis):
         drawn = (estimate[:, group.indices] - group.zero) / group.scale
         curves.append((group, drawn, BOUNDS * std[:, group.indices] / group.scale))
-    # One axis for all deviations, which holds what was known at half time and at the end: between them they converge.
-    half = t.size // 2
+    # One axis for all deviations, which holds what was known at half time, since something was, and at the end: between
+    # them they converge.
     reach = [np.abs(drawn) + width for group, drawn, width in curves if group.half_range is not None]
+    known = np.flatnonzero(np.any([np.isfinite(r).any(axis=1) for r in reach], axis=0)) if reach else np.empty(0, int)
+    half = known[known.size // 2] if known.size else -1
     limit = max(half_range(np.concatenate([r[k] for r in reach])) for k in (half, -1)) if reach else np.nan
     marks = [event["time"] for event in document["events"]]
     charts = []

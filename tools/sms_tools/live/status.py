@@ -7,11 +7,10 @@ import threading
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from rich.console import Console
 from rich.table import Table
 
 from sms_online.verdict.trust import Trust
-from sms_tools.report import verdict_text
+from sms_tools.report import plain_console, verdict_text
 
 # News a second: more than anybody reads; where there is no terminal, a line every so many seconds.
 INTERVAL, LINE_INTERVAL = 0.5, 5.0
@@ -70,13 +69,13 @@ def screen(news: News, width: int) -> str:
     table = Table(box=None, pad_edge=False, show_header=False)
     for p in news.leading:
         table.add_row(p.name, f"{p.estimate:.6g}", f"± {2.0 * p.std:.2g}", p.unit)
-    console = Console(width=width, highlight=False, force_terminal=True)
+    console = plain_console(width=width, force_terminal=True)
     with console.capture() as capture:
-        console.print(summary(news), style="bold", markup=False)
+        console.print(summary(news), style="bold")
         if news.leading:
             console.print(table)
         for trouble in news.troubles:
-            console.print(trouble, style="yellow", markup=False)
+            console.print(trouble, style="yellow")
         console.print(verdict_text(news.trust.document()))
     return capture.get()
 

@@ -29,7 +29,7 @@ def run(args: argparse.Namespace) -> int:
         def note(row: Row, done: int, of: int) -> None:
             progress.update(task, completed=done, total=of)
             text = f"{row['capture']}: {row['error'] or row['summary']}"
-            progress.console.print(text, markup=False, highlight=False, soft_wrap=True)
+            progress.console.print(text, soft_wrap=True)
 
         rows = archive(args.folder, system, folder, out, workers=args.workers, scheduler=args.scheduler, progress=note)
     counts = Counter(row.get("verdict") or "failed" for row in rows)

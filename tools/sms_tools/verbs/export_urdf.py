@@ -9,7 +9,7 @@ from typing import Any
 
 from pydantic import ValidationError
 
-from sms_adapters.files import read_json
+from sms_adapters.files import read_json, write_text
 from sms_adapters.urdf_export import export_urdf
 from sms_online.description.explain import explain
 from sms_online.description.schema import System
@@ -25,7 +25,7 @@ def run(args: argparse.Namespace) -> int:
         show(report_console(args.json), f"{args.results}: no parameter is determined, so there is nothing to export")
         return NOTHING_DETERMINED
     exported = export_urdf(args.source, system, estimates)
-    args.out.write_text(exported.text, encoding="utf-8")
+    write_text(args.out, exported.text)
     lines = [f"URDF: {args.out}, {len(estimates)} estimates, {len(exported.links)} links"]
     if exported.impossible:
         names = ", ".join(exported.impossible)

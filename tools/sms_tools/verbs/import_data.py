@@ -7,6 +7,7 @@ from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 
+from sms_adapters.files import write_text
 from sms_adapters.importers import import_emps, import_quanser
 from sms_adapters.mcap_capture import capture_writer
 from sms_adapters.motion_capture import import_points
@@ -44,7 +45,7 @@ def _urdf(args: argparse.Namespace) -> int:
     path = args.source.with_suffix(".toml") if args.out is None else args.out
     if path.exists():
         raise InputError(str(path), "", "a file of this name", "--out with the name of a file that is not there yet")
-    path.write_text(import_urdf(args.source), encoding="utf-8")
+    write_text(path, import_urdf(args.source))
     document = {"schema": "sms-online/import-urdf/1", "system": str(path)}
     say(args, f"system file: {path}; its first lines say what is to be completed", document=document)
     return OK

@@ -52,7 +52,7 @@ def run(args: argparse.Namespace) -> int:
             rows = PIECE if patient else max(1, round(PACE * system.sample_rate))
             pieces = (piece for block in reading for piece in block.pieces(rows))
             blocks = pieces if patient else _paced(pieces, interruption)
-            say = partial(reading.console.print, markup=False, soft_wrap=True)
+            say = partial(reading.console.print, soft_wrap=True)
             checked = Checked(ChannelChecks(system, source.channels), lambda line: say(f"check: {line}"))
             with showing(args, session, directory, recorded.truth, patient) as shown:
                 shown.follow(say)

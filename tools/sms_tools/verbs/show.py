@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import argparse
-from pathlib import Path
 
 from sms_online.tables import json_text
 from sms_tools.exit_codes import OK
 from sms_tools.report import report_console
 from sms_tools.report import show as print_to
+from sms_tools.results_file import RUNS, results_directory
 from sms_tools.session import described_system
 from sms_tools.view.described import channel_table, show
 
@@ -18,7 +18,9 @@ def run(args: argparse.Namespace) -> int:
     system, _ = described_system(args)
     table = channel_table(system)
     print_to(report_console(args.json), *(f"{row.place}: {', '.join(row.channels)}" for row in table))
-    directory = Path("runs") / "show" if args.out is None else args.out
+    directory = args.out or RUNS / "show"
+    if args.rerun == "save":
+        results_directory(directory)
     place = show(system, rerun=args.rerun, directory=directory, exaggeration=args.exaggerate)
     if args.json:
         places = [{"place": row.place, "channels": row.channels} for row in table]

@@ -5,15 +5,15 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from sms_adapters.recorded import captured, recorded_at
 from sms_adapters.runs import read_results
-from sms_adapters.sources import open_source
 from sms_online.description.schema import System
+from sms_online.session import Recorded
 from sms_online.validation import validate
 from sms_tools.exit_codes import OK
 from sms_tools.report import say, table
 from sms_tools.results_file import results_directory, write_document
 from sms_tools.session import check_part, described_system
+from sms_tools.waiting import watched
 
 NAME = "validation.json"
 
@@ -23,10 +23,8 @@ def run(args: argparse.Namespace) -> int:
     check_part(args)
     system, parameters, folder = _described(args)
     directory = results_directory(args.out)
-    capture = captured(
-        recorded_at(args.capture, open_source(args.capture, system, args.start, args.stop, None, folder))
-    )
-    found = validate(system, capture, parameters)
+    with watched(args.capture, system, folder, args.start, args.stop) as reading:
+        found = validate(system, Recorded(reading, str(args.capture)), parameters)
     path = write_document(directory / NAME, found.to_json())
     lines = [*(f"warning: {warning}" for warning in found.warnings), f"validation: {path}", "", found.sentence]
     say(args, table(*found.rows(), left=("joint",)), "", *lines, document=found.to_json())
