@@ -27,25 +27,10 @@ from sms_online.pipeline.estimator import Estimator
 from sms_online.priors import base_prior
 from sms_online.stream import Block
 from sms_tools.cli import main
-from tests.axis import AXIS, DAMPING, INERTIA, MOTION, capture_lines
+from tests.axis import AXIS, DAMPING, INERTIA, capture_lines
+from tests.axis_bench import TRUTH, bench, document
 
-MOVED = AXIS + MOTION
-TRUTH = {"link_1.inertia": INERTIA, "viscous_friction@joint_1.damping": DAMPING}
-
-
-@pytest.fixture
-def bench(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A working directory with an axis, one that a controller moves, and a capture of it."""
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "axis.toml").write_text(AXIS)
-    (tmp_path / "moved.toml").write_text(MOVED)
-    (tmp_path / "run.csv").write_text("\n".join(capture_lines()) + "\n")
-    return tmp_path
-
-
-def document(directory: Path) -> dict[str, Any]:
-    found: dict[str, Any] = json.loads((directory / "results.json").read_text())
-    return found
+__all__ = ["bench"]
 
 
 def estimates(found: dict[str, Any]) -> dict[str, float]:
@@ -259,75 +244,6 @@ def test_a_prior_decides_what_the_motion_does_not(bench: Path) -> None:
     flags = {p["name"]: p["identifiable"] for p in document(bench / "without")["parameters"]}
     assert flags == {"link_1.inertia": False, "viscous_friction@joint_1.damping": True}
     assert estimates(document(bench / "with"))["link_1.inertia"] == pytest.approx(0.31, abs=1e-3)
-
-
-# simulate, demo
-
-
-def test_a_simulation_is_replayed_to_its_truth(bench: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    simulated = ["simulate", "--system", "moved.toml", "--capture", "sim.csv", "--duration", "4", "--grade", "A"]
-    assert main([*simulated, "--seed", "3", "--json"]) == 0
-    out, err = capsys.readouterr()
-    said = json.loads(out)
-    assert said["samples"] == 801
-    assert said["drift"]["energy"] < 1e-8
-    assert said["drift"]["linear_momentum"] is None
-    assert "energy drift" in err
-    truth = json.loads(truth_path(bench / "sim.csv").read_text())
-    assert (truth["system"], truth["grade"], truth["seed"], truth["duration_s"]) == ("axis", "A", 3, 4.0)
-    assert truth["parameters"].items() >= TRUTH.items()
-    assert main(["replay", "sim.csv", "--system", "moved.toml", "--out", "done"]) == 0
-    for p in document(bench / "done")["parameters"]:
-        assert abs(p["estimate"] - p["true"]) < 4.0 * p["std"]
-
-
-def test_the_seed_decides_the_capture(bench: Path) -> None:
-    def capture(seed: str) -> bytes:
-        arguments = ["simulate", "--system", "moved.toml", "--capture", "sim.csv", "--duration", "1", "--grade", "B"]
-        assert main([*arguments, "--seed", seed]) == 0
-        return (bench / "sim.csv").read_bytes()
-
-    assert capture("1") == capture("1")
-    assert capture("1") != capture("2")
-
-
-@pytest.mark.slow
-def test_the_demo_shows_the_papers_parameters_converge(bench: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    (bench / "paper.toml").write_text(shipped_text("paper-planar").replace("duration = 20.0", "duration = 3.0"))
-    assert main(["demo", "--system", "paper.toml", "--out", "done"]) == 0
-    out, err = capsys.readouterr()
-    assert err == ""
-    assert out.splitlines()[0] == "solving the arm's motion ahead …"
-    assert " of 16 parameters determined" in out.splitlines()[1]
-    parameters = document(bench / "done")["parameters"]
-    assert [p["name"] for p in parameters] == [
-        "spacecraft.inertia_about_joint_1", "spacecraft.first_moment_x", "spacecraft.first_moment_y",
-        "spacecraft.mass_with_motor_1", "motor_1.rotor_inertia", "motor_2.rotor_inertia", "motor_2.stator_inertia",
-        "motor_2.mass", "link_1.mass_per_length", "link_2.mass_per_length", "link_1.flexural_rigidity",
-        "link_2.flexural_rigidity", "joint_1.stiffness", "joint_2.stiffness", "joint_1.damping", "joint_2.damping",
-    ]  # fmt: skip
-    # Samples come through a real bus and their times through estimated clocks; three seconds of them, on any machine.
-    assert np.median([abs(p["estimate"] / p["true"] - 1.0) for p in parameters]) < 0.1
-
-
-@pytest.mark.long
-def test_at_a_terminal_the_demo_draws_its_table_again_and_again(
-    bench: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    (bench / "moved.toml").write_text(MOVED.replace("duration = 6.0", "duration = 2.0"))
-    monkeypatch.setenv("FORCE_COLOR", "1")
-    monkeypatch.setattr("sms_tools.verbs.demo.TABLE_INTERVAL", 0.0)
-    assert main(["demo", "--system", "moved.toml", "--out", "done"]) == 0
-    out = capsys.readouterr().out
-    # The first second waits for the clocks.
-    assert "1.0 of 2 s" in out
-    assert "2.0 of 2 s" in out
-    assert out.count("link_1.inertia") >= 10
-    assert str(Path("done") / "results.json") in out
-    assert str(Path("done") / "report.html") in out
-    verdict, then = out.rstrip().splitlines()[-2:]
-    assert verdict.removeprefix("\x1b[1;90m").startswith("Not yet: ")
-    assert then.startswith("  next: ")
 
 
 # import, markers
