@@ -78,7 +78,7 @@ def test_the_verb_writes_a_table_and_a_page(
     document = json.loads((tmp_path / "comparison.json").read_text())
     assert document["changed"] == ["run-2", "run-5", "run-6"]
     page = (tmp_path / "comparison.html").read_text()
-    assert page.count("<svg") == len(document["parameters"])
+    assert page.count("<svg") == len(document["parameters"]) + len(document["calibration"])
     assert re.search(r"run-5</b>: -(1|0\.9\d*) %", page)
 
 
