@@ -1,8 +1,8 @@
 """Trajectories that a system's parameters are best estimated from, as Fourier series within limits.
 
 The criterion is the Cramér–Rao bound of the motion that the controller makes of the series: the largest of the relative
-bounds, and their median. Series of several harmonics are drawn at random, some of them about the described one, and
-scaled into the limits; the best is improved by sequential linear programming: bounds and loads at all instants are
+bounds, and their median. The described motion and series drawn at random, some of them about it, are scaled into the
+limits; the best is improved by sequential linear programming: bounds and loads at all instants are
 linearised from one batch of motions, and the linear program that minimises the largest bound within the limits, in a
 box of amplitudes, gives the step. That is quick where many limits hold the motion at once, as a described motion's own
 extremes do.
@@ -33,9 +33,9 @@ from sms_sim.excitation_problem import Problem, extreme_states
 from sms_sim.motion_limits import Limits
 from sms_sim.simulate import Simulation
 
-# Random series that the best is chosen from.
-DRAWN = 24
-# Share of a random series that is added to the described one, at most.
+# Series that the best is chosen from.
+DRAWN = 8
+# Share of a random series in those about the described one, at most.
 MIXED = 0.5
 # Share of the median in the criterion, or nothing would keep the others from being spent for the worst.
 MEDIAN_SHARE = 0.3
@@ -50,7 +50,7 @@ PENALTY = 3.0
 # The exact motion is scaled to this share of the limits until it is within them, so often.
 USED, CORRECTIONS = 0.999, 6
 # Steps of the optimiser by default: those that follow gain a tenth of what these do.
-ITERATIONS = 6
+ITERATIONS = 4
 
 
 @dataclass(frozen=True)
@@ -130,14 +130,15 @@ def excite(
     system: described, or its name or file, with a controller. limits: see `Limits`; duration: s; by default the
     described motion's own. separate: two effects, "name@where:coefficient=value", whose coefficients are to be
     estimated beside each other; without them all parameters count that are not nominally zero. grade: of the noise, as
-    for `bound`. seed: of the draw. iterations: steps of the optimiser at most. progress: what is being done, and the
-    share of it that is done.
+    for `bound`. seed: of the draw of frequencies and series. iterations: steps of the optimiser at most. progress: what
+    is being done, and the share of it that is done.
     Raises InputError where nothing limits the motion, an effect's size is not stated, or as `bound` does.
     """
     described, _ = given_system(system)
     weighed = _with_pair(described, separate)
-    problem = Problem.of(weighed, separate, limits or Limits(), duration, grade, progress)
-    best = _optimised(problem, np.random.default_rng(seed), iterations, progress)
+    random = np.random.default_rng(seed)
+    problem = Problem.of(weighed, separate, limits or Limits(), duration, grade, random, progress)
+    best = _optimised(problem, random, iterations, progress)
     trajectory, simulation, extremes = _exact(problem, best, progress)
     after = motion_bounds(simulation, problem.grade)
     names = tuple(p.name for k, p in enumerate(problem.base.parameters) if problem.counted[k])
@@ -189,8 +190,8 @@ def _optimised(
     what, total = "designing the motion", 2 + iterations
     points = problem.series.drawn(random, DRAWN, problem.smallest_angle)
     if problem.system.trajectory is not None:
-        # Some are the described motion with more or less of something else: from itself all seeds would lead to one.
-        share = np.linspace(0.0, MIXED, DRAWN // 2 + 1)[1:, None]
+        # The described motion, and some with more or less of something else.
+        share = np.linspace(0.0, MIXED, DRAWN // 2)[:, None]
         points[: DRAWN // 2] = problem.series.nearest(problem.system.trajectory) + share * points[: DRAWN // 2]
     progress(what, 0.0)
     load = problem(points)[1].max(axis=(1, 2))

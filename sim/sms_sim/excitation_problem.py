@@ -20,8 +20,9 @@ from sms_sim.motion_limits import Extremes, Limits
 from sms_sim.plant import Plant
 from sms_sim.simulate import Simulation, exact_states
 
-# Frequencies over the slowest: four octaves, for a link's modes lie far above what joints follow.
-HARMONICS = (1.0, 2.0, 4.0, 9.0, 19.0)
+# Frequencies of a series at least, and of those drawn beside described ones: four octaves above the slowest, for a
+# link's modes lie far above what joints follow.
+FREQUENCIES, LEAST_DRAWN, OCTAVES = 5, 2, 4.0
 # Periods of the slowest in a motion without a described one: several, of which each repeats what the others show.
 PERIODS = 5
 # Step of the motions that are compared and of their bounds, s: twice that of `cramer_rao`. The planar example's worst
@@ -52,7 +53,7 @@ class Series:
         return np.asarray(points * (largest / most.max(axis=1))[:, None])
 
     def nearest(self, trajectory: Trajectory) -> Array:
-        """Point (size,) of a described series' terms at these frequencies; others are left out."""
+        """Point (size,) of a described series, whose frequencies are among these."""
         parts = np.zeros((2, self.frequency.size, self._joints))
         for j, terms in enumerate(trajectory.joints):
             for term in terms:
@@ -73,6 +74,15 @@ class Series:
         return Trajectory(duration=duration, joints=joints)
 
 
+def _frequencies(stated: Sequence[float], random: np.random.Generator) -> Array:
+    """The stated frequencies and others, each drawn from its own part of the octaves above the slowest, rad/s."""
+    own = np.unique(stated)
+    count = max(FREQUENCIES - own.size, LEAST_DRAWN)
+    # A step of more than a radian of a harmonic shows neither its bounds nor its loads.
+    ratio = max(1.0, min(2.0**OCTAVES, 1.0 / (STEP * own[0])))
+    return np.union1d(own, own[0] * ratio ** ((np.arange(count) + random.uniform(size=count)) / count))
+
+
 class Problem:
     """Criterion and loads of series. bounds (signals,): largest magnitudes; counted (n,): parameters that matter."""
 
@@ -83,7 +93,7 @@ class Problem:
         grade: str | None,
         limits: Limits,
         described: Simulation | None,
-        lowest: float,
+        frequency: Array,
         counted: Callable[[str, float], bool],
     ) -> None:
         self.system, self.duration = system, duration
@@ -99,9 +109,7 @@ class Problem:
         self.described = None if described is None else self.extremes(*extreme_states(described))
         self.bounds = self.extremes.bounds(limits, self.described)
         self.before = None if described is None else motion_bounds(described, self.grade)
-        frequency = lowest * np.array(HARMONICS)
-        # A step of more than a radian of a harmonic shows neither its bounds nor its loads.
-        self.series = Series(frequency[(frequency * STEP < 1.0) | (frequency == lowest)], len(system.joints))
+        self.series = Series(frequency, len(system.joints))
 
     @staticmethod
     def of(
@@ -110,9 +118,13 @@ class Problem:
         limits: Limits,
         duration: float | None,
         grade: str | None,
+        random: np.random.Generator,
         progress: Callable[[str, float], None],
     ) -> Problem:
-        """InputError where nothing says how long and how large the motion may be."""
+        """Frequencies beside described ones are drawn.
+
+        InputError where nothing says how long and how large the motion may be.
+        """
         trajectory = system.trajectory
         if trajectory is None and (duration is None or limits.angle is None):
             expected = "a trajectory, or both a duration and the largest joint angle"
@@ -121,14 +133,14 @@ class Problem:
         length = duration if duration is not None else trajectory.duration if trajectory else math.nan
         if length > LONGEST:
             raise InputError(system.name, "duration", f"{length:g} s", f"a motion of {LONGEST:g} s at most")
-        lowest = min(stated, default=PERIODS * 2.0 * math.pi / length)
+        frequency = _frequencies(stated or [PERIODS * 2.0 * math.pi / length], random)
         described = None if trajectory is None else Simulated.of(system).solve(progress)
         pair = [text.partition(":")[0] for text in separate]
 
         def counted(name: str, value: float) -> bool:
             return any(name.startswith(f"{effect}.") for effect in pair) if pair else value > 0.0
 
-        return Problem(system, length, grade, limits, described, lowest, counted)
+        return Problem(system, length, grade, limits, described, frequency, counted)
 
     def keeps(self, duration: float | None) -> bool:
         """Whether the described motion is itself within the limits, and as long as the one asked for."""
