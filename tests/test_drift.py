@@ -149,7 +149,7 @@ def test_the_end_of_a_drift_is_seen_within_three_seconds(seed: int) -> None:
 def test_changes_of_a_rate_are_kept_for_half_a_minute() -> None:
     """The rate turns every 12 s; what is no more looked back at is forgotten, but for the last turn."""
     tracker = learned()
-    tracker.update(rows(180.0, lambda t: only(2, 0.3 * np.abs((t % 24.0) - 12.0)), noise=0.05))
+    tracker.update(rows(180.0, lambda t: only(2, np.interp(t % 24.0, [0.0, 12.0, 24.0], [3.6, 0.0, 3.6])), noise=0.05))
     (moving,) = tracker.state.moving
     assert 1 <= len(moving.bends) <= 4
     assert min(moving.bends) > tracker.state.anchor.knot

@@ -187,7 +187,7 @@ def _errors(case: Case, records: list[Record]) -> tuple[Array, Array, Array, lis
     names, scale = records[0]["names"], np.abs(truth)
     if case.scale:
         scale[:, [names.index(each) for each in case.moving]] = case.scale
-    held = np.abs(estimate - truth) < NORMAL_95 * std
+    held = (np.abs(estimate - truth) < NORMAL_95 * std).astype(np.float64)
     return 100.0 * (estimate - truth) / scale, 100.0 * (beside - truth) / scale, held, names
 
 
