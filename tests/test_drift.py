@@ -149,7 +149,11 @@ def test_the_end_of_a_drift_is_seen_within_three_seconds(seed: int) -> None:
 def test_changes_of_a_rate_are_kept_for_half_a_minute() -> None:
     """The rate turns every 12 s; what is no more looked back at is forgotten, but for the last turn."""
     tracker = learned()
-    tracker.update(rows(180.0, lambda t: only(2, np.interp(t % 24.0, [0.0, 12.0, 24.0], [3.6, 0.0, 3.6])), noise=0.05))
+
+    def turning(t: Array) -> Array:
+        return only(2, np.asarray(np.interp(t % 24.0, [0.0, 12.0, 24.0], [3.6, 0.0, 3.6]), dtype=np.float64))
+
+    tracker.update(rows(180.0, turning, noise=0.05))
     (moving,) = tracker.state.moving
     assert 1 <= len(moving.bends) <= 4
     assert min(moving.bends) > tracker.state.anchor.knot
@@ -170,7 +174,7 @@ def test_an_alarm_behind_the_end_of_a_drift_is_of_that_end() -> None:
 
 def test_a_step_is_no_drift() -> None:
     tracker = learned()
-    tracker.update(rows(40.0, lambda t: only(1, 0.3 * (t > 20.0)), noise=0.02))
+    tracker.update(rows(40.0, lambda t: only(1, 0.3 * (t > 20.0).astype(np.float64)), noise=0.02))
     assert tracker.found == ()
 
 
