@@ -146,6 +146,21 @@ def test_the_end_of_a_drift_is_seen_within_three_seconds(seed: int) -> None:
     assert drift.std < 0.01
 
 
+def test_changes_of_a_rate_are_kept_for_half_a_minute() -> None:
+    """The rate turns every 12 s; what is no more looked back at is forgotten, but for the last turn."""
+    tracker = learned()
+
+    def turning(t: Array) -> Array:
+        return only(2, np.asarray(np.interp(t % 24.0, [0.0, 12.0, 24.0], [3.6, 0.0, 3.6]), dtype=np.float64))
+
+    tracker.update(rows(180.0, turning, noise=0.05))
+    (moving,) = tracker.state.moving
+    assert 1 <= len(moving.bends) <= 4
+    assert min(moving.bends) > tracker.state.anchor.knot
+    assert moving.changed == pytest.approx(168.0, abs=2.0)
+    assert moving.remembered(10**6).changed == moving.changed
+
+
 def test_an_alarm_behind_the_end_of_a_drift_is_of_that_end() -> None:
     """It was taken for a change of the rate before the alarm came, and is broken off there."""
     tracker, given = learned(), rows(40.0, lambda t: only(2, 0.5 * np.minimum(t, 20.5)), noise=0.05)
@@ -159,7 +174,7 @@ def test_an_alarm_behind_the_end_of_a_drift_is_of_that_end() -> None:
 
 def test_a_step_is_no_drift() -> None:
     tracker = learned()
-    tracker.update(rows(40.0, lambda t: only(1, 0.3 * (t > 20.0)), noise=0.02))
+    tracker.update(rows(40.0, lambda t: only(1, 0.3 * (t > 20.0).astype(np.float64)), noise=0.02))
     assert tracker.found == ()
 
 
@@ -207,3 +222,16 @@ def test_a_known_drift_goes_on_as_it_decays() -> None:
     np.testing.assert_allclose(later.moved, [1.0 + 20.0 * (1.0 - np.exp(-0.5)), 11.0])
     np.testing.assert_allclose(later.rate, [2.0 * np.exp(-0.5), 2.0])
     np.testing.assert_allclose(line.at(5.0).at(8.0).moved, later.moved)
+
+
+def test_whitened_rows_are_free_of_a_drift_that_decays() -> None:
+    """A row looks back for 2 s, a fifteenth of the time in which the rate decays: what is left is of third order."""
+    line, rng = DriftLine(np.array([1.0]), np.array([-2.0]), np.array([1.0 / 30.0]), 50.0), np.random.default_rng(0)
+    back, weights = -np.arange(0.0, 2.0, 0.1), rng.normal(size=20)
+    Y, path = rng.normal(size=20), np.array([line.at(50.0 + t).moved[0] for t in back])
+    rows = np.array([[weights @ Y, weights @ (Y * path)]])
+    ramp, bend = (np.array([[weights @ (Y * part)]]) for part in (back, 0.5 * back**2))
+    straight, bent = (abs(float(line.removed(rows, ramp, each)[0, 1])) for each in (None, bend))
+    third = 2.0 * (1.0 / 30.0) ** 2 * float(np.abs(weights * Y) @ np.abs(back) ** 3) / 6.0
+    assert bent < third
+    assert straight > 20.0 * bent

@@ -30,7 +30,7 @@ GOOD = Evidence(determined=(2, 2), residual={"joint_1": Residual(0.01, 1.0)})
 def axis_capture(seed: int, *drift: str) -> tuple[sms.System, sms.Capture]:
     """The axis as simulated at grade B."""
     system = sms.load_system(tomllib.loads(AXIS + MOTION))
-    return system, sms.simulate(system, 18.0, "B", seed, drift=drift)
+    return system, sms.simulate(system, 19.0, "B", seed, drift=drift)
 
 
 def judged(tracker: str, seed: int, drift: Sequence[str] = ()) -> sms.Trust:

@@ -22,12 +22,15 @@ from sms_adapters.recording import split
 from sms_adapters.session_log import SessionHeader, from_microseconds
 from sms_adapters.sources import open_source
 from sms_online.description.schema import System
+from sms_online.description.sources import Device
 from sms_online.pipeline.estimator import Estimator
 from sms_online.session import Session
 from sms_online.verdict.evidence import Evidence
 from sms_online.verdict.judge import judge
+from sms_tools.cli import main
 from sms_tools.interruption import Interruption
 from sms_tools.live import feed as feed_module
+from sms_tools.live import testbed
 from sms_tools.live.feed import Feed, Interpreter, SessionClock
 from sms_tools.live.latency import Latencies
 from sms_tools.live.loop import LiveSession
@@ -258,6 +261,39 @@ def test_a_checkpoint_of_a_running_session_gives_the_same_bits(
     resumed.finish()
     assert resumed.estimate().pi.tobytes() == bench.estimator.estimate().pi.tobytes()
     assert standard_deviation(resumed).tobytes() == standard_deviation(bench.estimator).tobytes()
+
+
+@pytest.mark.realtime
+def test_two_trackers_resumed_live_replay_to_the_same_bits(
+    tmp_path: Path, system: System, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The second session goes on from the first one's checkpoint, and its recording is replayed from there."""
+
+    def played(source: Device, clock: FastClock, *_: object) -> Played:
+        bus = AxisBus(seconds=10.0)
+        clock.start()
+        return Played(source.name, [bus.drive()] if source.name == "drive" else bus.encoder(system), clock)
+
+    monkeypatch.setattr(testbed, "SessionClock", FastClock)
+    monkeypatch.setattr(testbed, "make_reader", played)
+    choices = ["--tracker", "kalman:drift=learned", "--tracker", "rls:forgetting=exponential,memory=3"]
+    first, second, again = (tmp_path / name for name in ("first", "second", "again"))
+    for verb in (
+        ["live", "--duration", "11", *choices, "--out", str(first)],
+        ["live", "--duration", "11", *choices, "--resume", str(first), "--out", str(second)],
+        ["replay", str(second), "--out", str(again)],
+    ):
+        assert main([*verb, "--system", str(tmp_path / "axis.toml")]) == 0
+    earlier, live, replayed = (
+        json.loads((folder / "results.json").read_text(encoding="utf-8")) for folder in (first, second, again)
+    )
+    assert [tracker["name"] for tracker in live["trackers"]] == ["kalman learned", "rls exponential 3 s"]
+    assert live["samples"] > earlier["samples"] + 1500
+    for tracker, before in zip(live["trackers"], earlier["trackers"], strict=True):
+        assert tracker["parameters"] != before["parameters"]
+    assert live["trackers"][0]["memory_s"] > 1.5 * earlier["trackers"][0]["memory_s"]
+    assert json.dumps(replayed["trackers"]) == json.dumps(live["trackers"])
+    assert json.dumps(replayed["parameters"]) == json.dumps(live["parameters"])
 
 
 def test_no_arrival_precedes_a_processed_tick() -> None:

@@ -3,7 +3,8 @@
 What takes parameters for constant (the session's least squares, sums behind residuals, the detector of changes) gets
 rows without the known part of the drift, that of the judged tracker's last estimate. Whitened rows are combinations of
 windows at several times, in which a parameter that drifts was another: a ramp's own column, t Y and the first moment of
-the test function, goes through the whitening with them, so that a ramp is removed exactly.
+the test function, goes through the whitening with them, so that a ramp is removed exactly. So does that of a parabola,
+for rates that decay: the whitening of a spacecraft's rows looks back for seconds.
 """
 
 from __future__ import annotations
@@ -34,11 +35,13 @@ class DriftLine:
         moved = self.moved + np.where(decaying, slowed, time) * self.rate
         return DriftLine(moved, self.rate * np.exp(-self.decay * time), self.decay, t)
 
-    def removed(self, rows: Array, ramp: Array) -> Array:
+    def removed(self, rows: Array, ramp: Array, bend: Array | None = None) -> Array:
         """Rows [Y b] (…, n_v, n + 1) of a window centred at t as if nothing had moved.
 
-        ramp (n_v, n): what rates add to b about t.
+        ramp, bend (n_v, n): what rates, and what their changes per s, add to b about t.
         """
         out = rows.copy()
         out[..., -1] -= rows[..., :-1] @ self.moved + ramp @ self.rate
+        if bend is not None:
+            out[..., -1] += bend @ (self.decay * self.rate)
         return out

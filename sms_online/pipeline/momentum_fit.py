@@ -146,7 +146,7 @@ class MomentumFit(Stage):
         self._next = None if self.state.warm is None else self._new_whitening()
 
     def _new_whitening(self) -> WindowWhitening:
-        return WindowWhitening(self._new_noise(), COPIES * (self.base.n + 1) + self._ramps, self._sources)
+        return WindowWhitening(self._new_noise(), COPIES * (self.base.n + 1) + 2 * self._ramps, self._sources)
 
     @property
     def _ramps(self) -> int:
@@ -302,25 +302,28 @@ class MomentumFit(Stage):
     def _white_together(self, windows: Sequence[Window]) -> list[WhiteRows]:
         W, n_v, n = len(windows), self.model.layout.n_v, self.base.n
         rows = self._balance.dense(windows)
-        # Columns of parameters that change evenly, from the grid's beginning on.
+        # Columns of parameters that change evenly, and whose rates do, from the grid's beginning on. How a rate changes
+        # within a window is nothing to what it does over the windows that whitening looks back at.
         moments, centres = self._balance.moments(windows), self._centres(windows)
         ramp = (centres * rows[:, 0, :, :-1] + moments)[..., : self._ramps]
+        bend = (0.5 * centres**2 * rows[:, 0, :, :-1] + centres * moments)[..., : self._ramps]
         weights, misfit = self._known_weights, self.whitening.misfit
         samples = beyond_first_order(rows, weights)
         widths = [window.half_width for window in windows]
         errors = self._errors.push(widths, samples, size(rows[:, 0], weights))
-        columns = np.concatenate((rows.swapaxes(1, 2).reshape(W, n_v, -1), ramp), axis=2)
+        columns = np.concatenate((rows.swapaxes(1, 2).reshape(W, n_v, -1), ramp, bend), axis=2)
         whitened = self._whiten(windows, columns, errors)
         raw, noisy = rows[:, 0], 0.5 * (rows[:, 1] - rows[:, 2])
         white = np.array([each.rows for each in whitened])
-        ramp = white[..., COPIES * (n + 1) :]
+        ramp, bend = np.split(white[..., COPIES * (n + 1) :], 2, axis=2)
         white = white[..., : COPIES * (n + 1)].reshape(W, n_v, COPIES, -1).swapaxes(1, 2)
+        bend = bend - centres * ramp + 0.5 * centres**2 * white[:, 0, :, : self._ramps]
         ramp = ramp - centres * white[:, 0, :, : self._ramps]
         drifts = [self._drift(window.end) for window in windows]
         for k, drift in enumerate(drifts):
             if drift is not None:
                 # Behind the whitening, for what it subtracts of earlier windows must have the same reference.
-                white[k], raw[k] = drift.removed(white[k], ramp[k]), drift.removed(raw[k], moments[k])
+                white[k], raw[k] = drift.removed(white[k], ramp[k], bend[k]), drift.removed(raw[k], moments[k])
         if self._nuisances:
             before = np.array([each.calibration[0] for each in whitened])
             behind = np.array([each.calibration[1] for each in whitened])[:, None]

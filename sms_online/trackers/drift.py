@@ -44,6 +44,8 @@ from sms_online.trackers.rate_change import TRIED, branches
 REMEMBERED = 32
 # From one search for ramps to the next, and from one choice of process noise to the next, knots.
 SEARCHED, CHOSEN = 2, 4
+# Knots since the last drift began within which process noise is chosen at each: few rows show little of how it goes on.
+YOUNG = 16
 # Knots before the first search: the first rows have weights that change.
 UNSEARCHED = 3
 # Knots before an alarm within which a change of rates may be what it is of.
@@ -52,9 +54,10 @@ RECENT = 2
 MOST_AT_ONCE = 4
 # Knots from the beginning within which more than noise may be a drift yet to be found.
 PATIENCE = 12
-# A change that may be chance is suspected where two searches in a row show one of the same parameters, and its chance
-# is below this share over the number of searches so far; half a minute of searches gives a false word in some hundred.
-SUSPECTED = 0.07
+# A change is suspected where two searches in a row show one of the same parameters, the later with a chance of at most
+# this to be none. In steady sessions one search in some 500 finds one, ten times as many as normal rows would: their
+# noise is known to a tenth alone, and is not quite white.
+SUSPECTED = 5e-4
 # Chance that the earlier of the two has at most.
 SHOWN = 0.1
 
@@ -188,7 +191,8 @@ class LearnedTrend(Tracker):
             self.state.likeliest = self.state.suspected = None
         elif self.state.knots > UNSEARCHED and self.state.knots % SEARCHED == 0:
             self._search()
-        if any(each.learned for each in self.state.moving) and self.state.knots % CHOSEN == 0:
+        found = [each.since for each in self.state.moving if each.learned]
+        if found and (self.state.knots % CHOSEN == 0 or self._knot - max(found) < YOUNG * KNOT):
             self._choose()
 
     def _open(self) -> Block:
@@ -242,11 +246,10 @@ class LearnedTrend(Tracker):
 
     def _suspect(self, tried: Tried) -> None:
         """Whether a change is hardly chance, for the second time."""
-        self.state.searches += 1
         level = max(1.0, self.state.now.factor[-1, -1] ** 2 / max(1.0, self.state.rows - self._n))
         before, now = self.state.likeliest, likeliest_change(tried, level)
         again = before is not None and now is not None and before.columns == now.columns and before.chance < SHOWN
-        hardly = now is not None and now.chance < SUSPECTED / self.state.searches
+        hardly = now is not None and now.chance < SUSPECTED
         self.state.likeliest, self.state.suspected = now, now if again and hardly else None
 
     def _choose(self) -> None:
@@ -258,7 +261,8 @@ class LearnedTrend(Tracker):
 
     def _move(self, moving: list[Moving], now: DriftFilter) -> None:
         """Go on with these moving, and their filter at the newest step."""
-        self.state.moving, self.state.now = moving, now
+        moving = [each.remembered(self.state.anchor.knot) for each in moving]
+        self.state.moving, self.state.now = moving, now.with_moving(moving)
         self.state.anchor = self.state.anchor.with_moving(moving)
 
     @property

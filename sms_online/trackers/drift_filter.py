@@ -97,6 +97,12 @@ class Moving:
         """Without the bends behind a knot."""
         return replace(self, bends=tuple(at for at in self.bends if at <= knot))
 
+    def remembered(self, knot: int) -> Moving:
+        """Without the breaks and bends up to a knot, before which nothing is looked back at; the last of all stays."""
+        last = max((*self.breaks, *self.bends), default=-1)
+        breaks, bends = (tuple(at for at in knots if at > knot or at == last) for knots in (self.breaks, self.bends))
+        return replace(self, breaks=breaks, bends=bends)
+
     def at(self, level: int, time: float, fading: int, decay_time: float) -> Moving:
         """With a rate that changes by its own size in `time` s, and decays in `decay_time` s."""
         return replace(self, level=level, std=1.0 / np.sqrt(time), fading=fading, decay=1.0 / decay_time)

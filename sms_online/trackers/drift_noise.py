@@ -25,20 +25,35 @@ def likeliest(
     """
     best, (chosen, least) = list(moving), filtered(moving)
     least += _cost(moving)
-    for k, each in enumerate(moving):
-        # What decays steadily looks like process noise, so one is tried without the other first.
-        tried = [(0, fading) for fading in range(len(DECAYS))] + [(each.level + step, each.fading) for step in (-1, 1)]
-        for level, fading in tried if each.learned else ():
-            if not 0 <= level < len(TIMES):
-                continue
-            other = [*best[:k], each.at(level, TIMES[level], fading, DECAYS[fading]), *best[k + 1 :]]
-            found, loss = filtered(other)
-            loss += _cost(other)
-            if loss < least:
-                chosen, least, best = found, loss, other
+    for k in range(len(best)):
+        # What decays steadily looks like process noise, so every decay is tried with the least of that first.
+        tried = [(_least_level(fading), fading) for fading in range(len(DECAYS))]
+        while best[k].learned:
+            before = best[k]
+            for level, fading in [*tried, *_around(before)]:
+                other = [*best[:k], before.at(level, TIMES[level], fading, DECAYS[fading]), *best[k + 1 :]]
+                found, loss = filtered(other)
+                loss += _cost(other)
+                if loss < least:
+                    chosen, least, best = found, loss, other
+            if best[k] == before:
+                break
+            tried = []
     return best, chosen
+
+
+def _least_level(fading: int) -> int:
+    """Process noise of a decay at least: that of the drift lies between two of them."""
+    return min(fading, 1)
+
+
+def _around(each: Moving) -> list[tuple[int, int]]:
+    """Process noise and decays beside those of a drift."""
+    level, fading = each.level, each.fading
+    beside = [(level - 1, fading), (level + 1, fading), (level, fading - 1), (level, fading + 1)]
+    return [(q, d) for q, d in beside if 0 <= d < len(DECAYS) and _least_level(d) <= q < len(TIMES)]
 
 
 def _cost(moving: Sequence[Moving]) -> float:
     """What process noise and decay must gain over none."""
-    return COST * sum((each.level > 0) + (each.fading > 0) for each in moving)
+    return COST * sum((each.level > _least_level(each.fading)) + (each.fading > 0) for each in moving)

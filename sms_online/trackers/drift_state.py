@@ -35,8 +35,8 @@ class DriftState(State):
     [Y, (t - knot) Y, b] since the last knot; fresh: how many of them are not in `now` yet. step: number of the open
     one, from t = 0 on; knots: since the beginning. rows: so far; newest: time of the last, s. accepted: how often
     drifts were. quiet: whether rows leave no more than noise, without which no drift is accepted. until: instant that
-    estimates hold for, s; no earlier than that of the newest row. searches: so far. likeliest: change that the last one
-    found, of what does not move; suspected: where it is hardly chance. changes: of rates, that may have been.
+    estimates hold for, s; no earlier than that of the newest row. likeliest: change that the last search found, of what
+    does not move; suspected: where it is hardly chance. changes: of rates, that may have been.
     """
 
     anchor: DriftFilter
@@ -52,7 +52,6 @@ class DriftState(State):
     accepted: int = 0
     quiet: bool = True
     until: float = -np.inf
-    searches: int = 0
     likeliest: Suspicion | None = None
     suspected: Suspicion | None = None
     changes: list[RateChange] = msgspec.field(default_factory=list)
