@@ -6,6 +6,7 @@ only positions and speeds appear: -∫ (φ̇ P + φ G) dt π = ∫ φ n τ dt.
 
 from __future__ import annotations
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
@@ -35,10 +36,15 @@ class SquaredResidual(State):
     """
 
     gram: Array
-    deflections: list[int]
-    torques: list[int]
+    deflections: list[int] = msgspec.field(default_factory=list)
+    torques: list[int] = msgspec.field(default_factory=list)
     spring: int = -1
     signal: float = 0.0
+
+    def since(self, then: SquaredResidual | None) -> SquaredResidual:
+        """The sums of what came after another moment of the session, of all where there is none."""
+        gram, signal = (0.0, 0.0) if then is None else (then.gram, then.signal)
+        return SquaredResidual(self.gram - gram, self.deflections, self.torques, self.spring, self.signal - signal)
 
     def add(self, row: Array, signal: float) -> None:
         """Add a row [Y D T b], and the measured torque or force behind b, before what is known was subtracted."""
@@ -53,11 +59,11 @@ class SquaredResidual(State):
         if self.signal == 0.0:
             return None
         turned, gained = np.zeros(len(self.deflections)), np.zeros(len(self.torques))
-        if nuisances is not None:
+        if nuisances is not None and nuisances.size:
             stiffness = beta[self.spring] if self.spring >= 0 else 0.0
             turned, gained = -stiffness * nuisances[self.deflections], nuisances[self.torques]
-        w = np.concatenate((beta, turned, gained, [-1.0]))
-        return float(np.sqrt(max(0.0, w @ self.gram @ w) / self.signal))
+        w: Array = np.concatenate((beta, turned, gained, [-1.0]))
+        return float(np.sqrt(max(0.0, float(w @ self.gram @ w)) / self.signal))
 
 
 class JointState(State):
