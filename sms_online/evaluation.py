@@ -126,8 +126,8 @@ class Evaluation:
     def residuals(self) -> dict[str, Residual]:
         """By type of the rows."""
         now, joint = self.statistics, self._joint
-        beta = joint[len(now.setup.nuisances) :]
-        relative = {joint_rows(i): joint.relative(beta) for i, joint in enumerate(now.joints)}
+        own, beta = np.split(joint, [len(now.setup.nuisances)])
+        relative = {joint_rows(i): each.relative(beta, own) for i, each in enumerate(now.joints)}
         out = {ENERGY: Residual(None, None)}
         # Where the smoother knows better, rows of the balance see shapes that are not the links'.
         momentum = None if now.method == "smoother" else now.momentum

@@ -159,4 +159,4 @@ def _fitted(sums: list[SquaredResidual], n: int) -> Array:
     size = np.sqrt(np.diag(gram))[:n]
     size[size == 0.0] = 1.0
     scaled = gram[:n, :n] / np.outer(size, size)
-    return np.asarray(np.linalg.lstsq(scaled, gram[:n, n] / size, rcond=RANK_TOLERANCE)[0] / size)
+    return np.asarray(np.linalg.lstsq(scaled, gram[:n, -1] / size, rcond=RANK_TOLERANCE)[0] / size)

@@ -130,11 +130,12 @@ def test_the_lag_of_a_robots_link_encoders_is_found(robot: dict[str, Any]) -> No
 
 
 @pytest.mark.long
-@pytest.mark.xfail(strict=True, reason="with the lag alone the torques of axes 1 and 4 are predicted worse")
-def test_what_is_found_of_a_robot_predicts_its_torques_no_worse(robot: dict[str, Any]) -> None:
+def test_what_is_found_of_a_robot_predicts_its_torques_better(robot: dict[str, Any]) -> None:
+    """All but those of axis 4, whose 27 parameters ten seconds hardly determine."""
     left = [[row["relative"] or 0.0 for row in robot[when]["holdout"].values()] for when in ("before", "after")]
     before, after = np.linalg.norm(left, axis=1)
-    assert after < before
+    assert after < 0.9 * before
+    assert robot["after"]["holdout"]["joint_3"]["relative"] < 0.09
 
 
 def test_a_holdout_that_is_the_capture_itself_needs_an_end(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -163,12 +163,11 @@ class Watched:
 def test_the_recent_residual_forgets_what_is_over() -> None:
     estimator, recent = Watched(), RecentResidual()
     beta = np.array([2.0])
-    rows = np.ones((1, 1))
     for t in np.arange(0.0, 3.0, 0.25):
         # Nothing of the torque of 4 is explained by β Y = 2 at first, all of 2 later.
         measured = 4.0 if t < 1.0 else 2.0
         estimator.joints = [copy(estimator.joints[0])]
-        estimator.joints[0].add(rows, np.array([measured]), measured)
+        estimator.joints[0].add(np.array([1.0, measured]), measured)
         share = recent.push(float(t), estimator, beta)  # type: ignore[arg-type]
         if t < 1.0:
             assert share[0] == pytest.approx(0.5)

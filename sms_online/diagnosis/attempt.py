@@ -286,13 +286,13 @@ class Attempt(Hypothesis):
 
     def test(self, chosen: Sequence[int]) -> dict[str, RowResidual]:
         """Residuals of the model with the effects chosen, by row type, against noise."""
-        self.tracing.reweight(chosen)
+        self.tracing.weigh(chosen)
         return ResidualTest(self.rows).of(self.residual(chosen))
 
     def state(self, chosen: Sequence[int]) -> State:
         """Residuals of the model with the effects chosen."""
         rows, tracing = self.rows, self.tracing
-        tracing.reweight(chosen)
+        tracing.weigh(chosen)
         solution, without = self.solution(chosen), tracing.solutions(chosen)
         residual = tracing.residual(chosen, solution)
         effects = [tracing.candidates[k].effect for k in chosen]
@@ -338,12 +338,13 @@ class Attempt(Hypothesis):
         joints.declare([*self.constants, *effects])
         return Part(whitened(rows, held.residual(everything, solution)), joints.of(solution))
 
-    def steps(self) -> list[Step]:
-        """The way of the last search."""
+    def steps(self, chosen: Sequence[int]) -> list[Step]:
+        """The way of the last search, with the weights of those chosen in the end."""
+        self.tracing.weigh(chosen)
         out = []
-        for taken, chosen in self.tracing.path:
-            effects = [self.tracing.candidates[k] for k in chosen]
+        for taken, those in self.tracing.path:
+            effects = [self.tracing.candidates[k] for k in those]
             self._joints.declare([*self.constants, *(candidate.effect for candidate in effects)])
-            relative = self._joints.of(self.solution(chosen), self._blocks(self.tracing.solutions(chosen)))
+            relative = self._joints.of(self.solution(those), self._blocks(self.tracing.solutions(those)))
             out.append(Step(self.tracing.candidates[taken].key, tuple(c.key for c in effects), relative))
         return out

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from sms_online.diagnosis.calibrated import Calibrated
 from sms_online.diagnosis.candidate import Candidate, Laws
-from sms_online.diagnosis.evidence import Gain, basis, bounded, free_of, gains, least_squares, together
+from sms_online.diagnosis.evidence import Gain, basis, fitted, free_of, gains, together
 from sms_online.diagnosis.folds import Folds
 from sms_online.diagnosis.scale_free import Scale
 from sms_online.diagnosis.weak_rows import WeakRows
@@ -28,6 +28,8 @@ LARGEST_RATIO = 1.5
 CLEARLY = 4.0
 # Rows for a column at least, for curves to be fitted together.
 LEAST_ROWS = 4
+# Times at most that rows are whitened anew for a set of effects: weights follow coefficients, and these the weights.
+ROUNDS = 3
 # Share of a row's variance by which that of the effects chosen has to change for rows to be whitened anew.
 SMALL_CHANGE = 0.1
 
@@ -73,8 +75,6 @@ class CandidateRows:
         self._model = np.concatenate([rows.Y, *(candidate.columns for candidate in fixed)], axis=2)
         self._positive = np.zeros(self._model.shape[2], dtype=bool)
         self._positive[: self._n] = False if positive is None else positive
-        # Those beside whose estimate rows without a torque count by their size.
-        self._beside: tuple[int, ...] = ()
         expected = np.zeros(self._model.shape[2])
         if rows.weights is not None:
             expected[: self._n] = rows.weights
@@ -83,13 +83,33 @@ class CandidateRows:
         known = prior is not None and bool(prior.known.any())
         self._scale = Scale(rows.b, expected, is_inertial, known)
         self.trials = len(self.candidates)
+        self._begin()
+
+    def _begin(self) -> None:
+        """Whiten the rows for none of the candidates, whatever they were whitened for before."""
+        rows = self.rows
+        # Those beside whose estimate rows without a torque count by their size.
+        self._beside: tuple[int, ...] = ()
         # Covariance of what the laws of the chosen effects do not determine.
         self._own, self._free = np.zeros_like(rows.std), np.zeros((len(rows.b), HOPS, self._n_v))
         # Speeds whose rows have no such covariance, with these effects chosen.
         self._loud: tuple[frozenset[int], NDArray[np.bool_]] = frozenset(), np.zeros(self._n_v, dtype=np.bool_)
         # Mean square that everything together left of the rows, and with which deviations.
         self._explained = 0.0, rows.std
+        self._scale.begin()
         self._whiten()
+        self._begun = True
+
+    def weigh(self, chosen: Sequence[int]) -> None:
+        """Whiten the rows for those chosen from the beginning, until the weights are those of their coefficients.
+
+        So they follow from the rows and those chosen alone, and not from what was asked before.
+        """
+        if not self._begun:
+            self._begin()
+        for _ in range(ROUNDS):
+            if not self.reweight(chosen):
+                break
 
     def reweight(self, chosen: Sequence[int], solution: Array | None = None) -> bool:
         """Whiten the rows with what the laws of the chosen effects do not determine too; whether the weights change.
@@ -106,8 +126,10 @@ class CandidateRows:
         self._beside = tuple(chosen)
         if not np.any(np.abs(wanted - used) > SMALL_CHANGE * (self.rows.std**2 + used)):
             if moved and self.freed:
+                self._begun = False
                 self._whiten()
             return False
+        self._begun = False
         self._own, self._free = own, free
         self._whiten()
         # Rows that leave more than noise even so are uncertain by that: what the laws do not determine there would grow
@@ -184,15 +206,21 @@ class CandidateRows:
         shape, end = (len(self.rows.b), self._n_v, -1), size + self._known - self.calibrated.count
         self._white[end - n : end], self._white_b[end - n : end] = self._scale.near(self._white[:size])
 
+        rest = np.concatenate([*(self._Z[k] for k in self._beside), self._N], axis=1)
+        white, b, beside = (part[:size].reshape(shape) for part in (self._white, self._white_b, rest))
+        # From one point to the next only rows that are freed change: all others are reduced once.
+        freed = np.isin(np.arange(self._n_v), self._scale.freed)
+        others = np.concatenate([part[:, ~freed] for part in (white, beside, b)], axis=2)
+        known = np.column_stack((self._white, rest, self._white_b))[size : self._b.size - self.calibrated.count]
+        reduced = np.linalg.qr(np.concatenate((others.reshape(-1, known.shape[1]), known)), mode="r")
+
         def solve(Y: Array, b: Array) -> Array:
-            self._forget()
             self._Y = np.concatenate((Y.reshape(size, n), self._white[size:]))
             self._b = np.concatenate((b.ravel(), self._white_b[size:]))
-            return self.solution(self._beside)
+            moved = np.concatenate((Y[:, freed], beside[:, freed], b[:, freed, None]), axis=2)
+            return self._released(self._beside, np.concatenate((reduced, moved.reshape(-1, known.shape[1]))))[1]
 
-        rest = np.concatenate([*(self._Z[k] for k in self._beside), self._N], axis=1)
-        white, b, rest = (part[:size].reshape(shape) for part in (self._white, self._white_b, rest))
-        self._scale.linearise(white, b[..., 0], rest, solve)
+        self._scale.linearise(white, b[..., 0], beside, solve)
         self._forget()
 
     def _floor(self) -> tuple[Array, Array]:
@@ -268,25 +296,30 @@ class CandidateRows:
         """Which numbers of calibration (m,) are held at zero beside those chosen: effects replace them, or have to."""
         m, key = self.calibrated.count, frozenset(chosen)
         if key not in self._zeroed:
-            solution = None
-            effects = (candidate.effect for candidate in (*self._fixed, *(self.candidates[k] for k in chosen)))
-            held = self.calibrated.said_by(effects)
+            rows = np.column_stack((self._Y, *(self._Z[k] for k in chosen), self._N, self._b))
+            self._zeroed[key], solution = self._released(chosen, rows[: len(rows) - m])
             if m:
-                rows = np.column_stack((self._with_calibration(chosen, held), self._b))
-                # Only what is known of calibration changes: all other rows are reduced once.
-                others, known = np.linalg.qr(rows[:-m], mode="r"), np.zeros((m, rows.shape[1]))
-            while m:
-                known[:, -m - 1 : -1] = self.calibrated.information(held)
-                both = np.concatenate((others, known))
-                solution = self._fitted_to(chosen, both[:, :-1], both[:, -1])
-                beyond = self.calibrated.beyond(solution[-m:]) & ~held
-                if not beyond.any():
-                    break
-                held = held | beyond
-            self._zeroed[key] = held
-            if solution is not None:
                 self._solved[tuple(chosen), None] = solution
         return self._zeroed[key]
+
+    def _released(self, chosen: Sequence[int], rows: Array) -> tuple[NDArray[np.bool_], Array]:
+        """Which numbers of calibration (m,) are held at zero beside those chosen, and the solution (n + c + m,).
+
+        rows (M, n + c + m + 1): all columns and the right-hand side, without what is known of calibration.
+        """
+        m = self.calibrated.count
+        effects = (candidate.effect for candidate in (*self._fixed, *(self.candidates[k] for k in chosen)))
+        held = self.calibrated.said_by(effects)
+        # Only what is known of calibration changes: all other rows are reduced once.
+        others, known = np.linalg.qr(rows, mode="r"), np.zeros((m, rows.shape[1]))
+        while True:
+            known[:, known.shape[1] - m - 1 : -1] = self.calibrated.information(held)
+            both = np.concatenate((others, known))
+            solution = self._fitted_to(chosen, both[:, :-1], both[:, -1])
+            beyond = self.calibrated.beyond(solution[solution.size - m :]) & ~held
+            if not beyond.any():
+                return held, solution
+            held = held | beyond
 
     def gains(self, chosen: Sequence[int]) -> list[Gain]:
         """What each candidate would take beside those chosen."""
@@ -317,6 +350,7 @@ class CandidateRows:
     def put(self, k: int, candidate: Candidate) -> None:
         """Put another form of an effect in the place of a candidate."""
         self.candidates[k] = candidate
+        self._begun = False
         self._plain[k] = candidate.columns / self.std[..., None]
         self._Z[k] = self._whitened(candidate.columns)
         self._forget()
@@ -361,8 +395,7 @@ class CandidateRows:
 
     def _fitted_to(self, chosen: Sequence[int], columns: Array, b: Array) -> Array:
         """Solution (n + c + m,) of columns and b, see `bounds`."""
-        solution, positive = least_squares(columns, b), self.bounds(chosen)
-        return bounded(columns, b, positive) if np.any(solution[positive] < 0.0) else solution
+        return fitted(columns, b, self.bounds(chosen))
 
     def bounds(self, chosen: Sequence[int]) -> NDArray[np.bool_]:
         """Which unknowns (n + c + m,) a fit keeps from being negative, where rows leave more than noise.

@@ -217,9 +217,9 @@ def diagnose(
         described = Attempt(case, system, (), attempt.rows.beta, ())
     earlier: list[tuple[Attempt, list[int]]] = [(described, []), (attempt, [])]
     bare = described.state([])
-    attempt.tracing.reweight([])
+    attempt.tracing.weigh([])
     ranking = attempt.tracing.ranking()
-    attempt.tracing.reweight(chosen)
+    attempt.tracing.weigh(chosen)
     attempt, chosen, constants = _with_constants(case, attempt, chosen, bare, progress)
     beyond = not stop() and any(row.beyond for row in attempt.test(chosen).values())
     if beyond and kinematic_candidates(attempt.system):
@@ -236,6 +236,7 @@ def diagnose(
         attempt, chosen = earlier.pop()
         constants, after = [], attempt.state(chosen)
     late = late if attempt.system != system else []
+    attempt.tracing.weigh(chosen)
     findings = [*constants, *(attempt.tracing.finding(chosen, k) for k in chosen)]
     named, partial = after.system != system, stop()
     estimator_after = before
@@ -269,7 +270,7 @@ def diagnose(
         ranking=ranking,
         described=described,
         attempt=attempt,
-        steps=attempt.steps(),
+        steps=attempt.steps(chosen),
         chosen=chosen,
         before=bare,
         after=after,

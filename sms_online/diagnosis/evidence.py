@@ -59,6 +59,14 @@ def least_squares(columns: Array, b: Array) -> Array:
     return np.asarray(np.linalg.lstsq(R[:, :-1], R[:, -1], rcond=RANK_TOLERANCE)[0] / size)
 
 
+def fitted(columns: Array, b: Array, positive: NDArray[np.bool_]) -> Array:
+    """Least squares (n,) for columns (M, n) and b (M,), those positive (n,) kept from being negative."""
+    R = np.asarray(np.linalg.qr(np.column_stack((columns, b)), mode="r"))
+    columns, b = R[:, :-1], R[:, -1]
+    solution = least_squares(columns, b)
+    return bounded(columns, b, positive) if np.any(solution[positive] < 0.0) else solution
+
+
 def bounded(columns: Array, b: Array, positive: NDArray[np.bool_]) -> Array:
     """Least squares (n,) for columns (M, n) and b (M,) of which those positive (n,) are not negative.
 
@@ -70,7 +78,10 @@ def bounded(columns: Array, b: Array, positive: NDArray[np.bool_]) -> Array:
     R = np.asarray(np.linalg.qr(np.column_stack((columns[:, order] / size, b)), mode="r"))
     n, free = order.size, int(np.count_nonzero(~positive))
     # What the columns without a bound leave is a problem of the others alone.
-    rest = free_of(basis(R[:, :free]), R[:, free:])
+    if len(R) >= free and _well_conditioned(R[:free, :free]):
+        rest = R[free:, free:].copy()
+    else:
+        rest = free_of(basis(R[:, :free]), R[:, free:])
     # A column that they make too is rounding now.
     rest[:, :-1][:, np.linalg.norm(rest[:, :-1], axis=0) <= RANK_TOLERANCE * np.linalg.norm(R[:, free:n], axis=0)] = 0.0
     own = nnls(rest[:, :-1], rest[:, -1])[0]
@@ -101,28 +112,35 @@ def together(columns: Array, b: Array, prior: Prior | None) -> Array:
     return solution
 
 
-def least_squares_without(columns: Array, b: Array, left_out: Sequence[NDArray[np.bool_]]) -> Array:
+def least_squares_without(
+    columns: Array, b: Array, left_out: Sequence[NDArray[np.bool_]], positive: NDArray[np.bool_] | None = None
+) -> Array:
     """Solutions (B, n) for columns (M, n) and b (M,) without each of some sets of rows (M,), from one factorisation.
 
-    Where columns are nearly dependent, or are so without a set, each is solved for itself. Source: the block form of
-    leaving one out, Cook and Weisberg, Residuals and Influence in Regression, 1982, section 3.6.
+    positive (n,): which are not negative, none by default. Where columns are nearly dependent, or are so without a set,
+    each is solved for itself. Source: the block form of leaving one out, Cook and Weisberg, Residuals and Influence in
+    Regression, 1982, section 3.6.
     """
     size = np.linalg.norm(columns, axis=0)
     size[size == 0.0] = 1.0
     Q, R = np.linalg.qr(columns / size)
     n = columns.shape[1]
+    positive = np.zeros(n, dtype=bool) if positive is None else positive
     if len(columns) < n or not _well_conditioned(R):
-        return np.array([least_squares(columns[~each], b[~each]) for each in left_out])
+        return np.array([fitted(columns[~each], b[~each], positive) for each in left_out])
     along = Q.T @ b
     residual, out = b - Q @ along, np.empty((len(left_out), n))
     for k, each in enumerate(left_out):
         own = Q[each]
         kept = np.eye(n) - own.T @ own
         if np.linalg.eigvalsh(kept)[0] <= WELL_CONDITIONED:
-            out[k] = least_squares(columns[~each], b[~each])
+            out[k] = fitted(columns[~each], b[~each], positive)
             continue
         moved = along - np.linalg.solve(kept, own.T @ residual[each])
         out[k] = solve_triangular(R, moved) / size
+        if np.any(out[k, positive] < 0.0):
+            root = np.linalg.cholesky(kept).T
+            out[k] = bounded(root @ R * size, root @ moved, positive)
     return out
 
 

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from sms_online.diagnosis.candidate_rows import CandidateRows, Key
-from sms_online.diagnosis.evidence import bounded, least_squares_without
+from sms_online.diagnosis.evidence import least_squares_without
 from sms_online.stream import Array
 
 
@@ -24,9 +24,7 @@ class HeldOutRows(CandidateRows):
         # What is zero for all windows together is so for those without a part.
         free = ~(positive & (self.solution(chosen, beside) == 0.0))
         out = np.zeros((len(left_out), free.size))
-        out[:, free] = least_squares_without(columns[:, free], self._b, left_out)
-        for k in np.flatnonzero(np.any(out[:, positive] < 0.0, axis=1)):
-            out[k] = bounded(columns[~left_out[k]], self._b[~left_out[k]], positive)
+        out[:, free] = least_squares_without(columns[:, free], self._b, left_out, positive[free])
         return out
 
     def predicted(

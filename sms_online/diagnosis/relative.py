@@ -7,8 +7,9 @@ from collections.abc import Iterable, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from sms_online.calibration.channels import Family, TorqueFamily, position_families, torque_families
 from sms_online.calibration.channels import Motion as Readings
+from sms_online.calibration.joints import JointCalibration
+from sms_online.calibration.nuisance import Nuisance
 from sms_online.description.schema import Effect
 from sms_online.diagnosis.candidates import CandidateColumns
 from sms_online.diagnosis.rows import SessionRows, joint_windows
@@ -52,37 +53,27 @@ class RelativeResiduals:
         self._deflections, self._torques = self._calibration(rows, weak)
 
     def _calibration(self, rows: SessionRows, weak: WeakWindows) -> tuple[Array, Array]:
-        """What joints' deflections and torques are read too much for one unit of each nuisance, (W, joints, m) both.
-
-        A stiff spring makes of an encoder's zero within its tolerance as much as the torque. What else calibration does
-        to the rows of joints is little beside it.
-        """
-        sensing, layout, m = rows.sensing, rows.model.layout, rows.calibrated.count
+        """What joints' deflections and torques are read too much for one unit of each nuisance, (W, joints, m) both."""
+        sensing, layout, calibration = rows.sensing, rows.model.layout, JointCalibration(rows.sensing)
         number = {nuisance: k for k, nuisance in enumerate(rows.calibrated.nuisances)}
-        along = sensing.displacements(np.zeros((1, layout.n_x)))[0]
-        deflection = along[list(layout.theta_m)] - along[list(layout.q)]
-        tolerances = rows.model.system.tolerances
 
-        def read(families: Iterable[Family | TorqueFamily], motion: Motion) -> Array:
+        def read(motion: Motion) -> Readings:
             values = rows.segments[motion.segment].values[:, sensing.position_columns]
             rates = np.gradient(values, axis=0) * rows.model.system.sample_rate
             turned = np.broadcast_to(np.eye(3), (len(motion.x), 3, 3))
             torque = motion.torque[:, : len(layout.q)]  # without the wrenches behind them
-            given = Readings(values[motion.samples], rates[motion.samples], torque, turned)
-            out = [(family.adds(given), family.nuisances) for family in families]
-            added = np.zeros((*out[0][0].shape[:2], m)) if out else np.zeros((len(motion.x), 0, m))
-            for columns, nuisances in out:
-                for column, nuisance in zip(np.moveaxis(columns, 2, 0), nuisances, strict=True):
-                    if nuisance in number:
-                        added[..., number[nuisance]] = column
-            return added
+            return Readings(values[motion.samples], rates[motion.samples], torque, turned)
 
-        positions, torques = position_families(sensing, tolerances), torque_families(sensing, tolerances)
-        none = np.zeros((weak.count, len(self._joints), m))
-        return (
-            -weak.columns(lambda motion: (None, deflection @ read(positions, motion))) if positions else none,
-            -weak.columns(lambda motion: (None, read(torques, motion))) if torques else none,
-        )
+        def spread(each: Array, nuisances: Sequence[Nuisance]) -> Array:
+            out = np.zeros((*each.shape[:2], rows.calibrated.count))
+            for column, nuisance in zip(np.moveaxis(each, 2, 0), nuisances, strict=True):
+                if nuisance in number:
+                    out[..., number[nuisance]] = column
+            return out
+
+        deflections = weak.columns(lambda motion: (None, calibration.deflections(read(motion))))
+        torques = weak.columns(lambda motion: (None, calibration.torque(read(motion))))
+        return -spread(deflections, calibration.of_positions), -spread(torques, calibration.of_torques)
 
     def declare(self, effects: Sequence[Effect]) -> None:
         """Effects whose coefficients a solution holds after the model's parameters, in this order."""

@@ -13,12 +13,13 @@ they lead to where the criterion is least (Gauss and Newton).
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import solve_triangular
 
-from sms_online.diagnosis.evidence import bounded, least_squares
+from sms_online.diagnosis.evidence import bounded
 from sms_online.stream import Array
 
 # Fits about the solution before, at most, and halvings of a step that does not lower what is asked for.
@@ -50,11 +51,9 @@ class ScaleFree:
     def about(self, pi: Array, left: Array) -> tuple[Array, Array]:
         """Columns (W, n_v, n) about parameters (n,) that leave (W, n_v), and what is added to the right-hand side."""
         columns, added = self._Y.copy(), np.zeros_like(left)
-        for speed, M in self._metric.items():
-            squares = float(pi @ M @ pi)
-            if squares > 0.0:
-                columns[:, speed] += left[:, speed, None] * (M @ pi / squares)
-                added[:, speed] = left[:, speed]
+        for speed, g in self._directions(pi):
+            columns[:, speed] += left[:, speed, None] * g
+            added[:, speed] = left[:, speed]
         return columns, added
 
     def solved(
@@ -70,6 +69,11 @@ class ScaleFree:
         first[:n], anchor[:n] = start, near
         std = np.sqrt(np.maximum(least, np.mean((b - columns @ first) ** 2, axis=0)))
         lengths = NEAR * np.linalg.norm(columns / std[:, None], axis=(0, 1))
+        unseen = lengths == 0.0
+        first[unseen] = anchor[unseen] = 0.0
+        by_speed = np.ascontiguousarray(columns.swapaxes(0, 1))
+        grams = by_speed.swapaxes(1, 2) @ by_speed
+        known = np.diag(np.where(unseen, 1.0, lengths**2))
 
         def cost(solution: Array) -> float:
             squares = self.squares(solution[:n], b - columns @ solution, start) / least
@@ -77,15 +81,31 @@ class ScaleFree:
 
         def fit(solution: Array) -> Array:
             left = b - columns @ solution
-            std = np.sqrt(np.maximum(least, np.mean(left**2, axis=0)))
-            Y, added = self.about(solution[:n], left)
-            weighted = (np.concatenate((Y, beside), axis=2) / std[:, None]).reshape(b.size, -1)
-            rows = np.concatenate((weighted, np.diag(lengths)))
-            aim = np.concatenate((((b + added) / std).ravel(), lengths * anchor))
-            found = least_squares(rows, aim)
-            return bounded(rows, aim, positive) if np.any(found[positive] < 0.0) else found
+            squares = np.sum(left**2, axis=0)
+            weight = 1.0 / np.maximum(least, squares / len(b))
+            downhill = np.einsum("vwc,wv->vc", by_speed, left)
+            information = known + np.tensordot(weight, grams, 1)
+            slope = weight @ downhill - lengths**2 * (solution - anchor)
+            for speed, g in self._directions(solution[:n]):
+                along = np.zeros(solution.size)
+                along[:n] = g
+                cross = np.outer(downhill[speed], along)
+                information += weight[speed] * (cross + cross.T + squares[speed] * np.outer(along, along))
+                slope += weight[speed] * squares[speed] * along
+            size = np.sqrt(np.diag(information))
+            root = np.linalg.cholesky(information / np.outer(size, size)).T * size
+            aim = root @ solution + solve_triangular(root, slope, trans="T")
+            found = solve_triangular(root, aim)
+            return bounded(root, aim, positive) if np.any(found[positive] < 0.0) else found
 
         return converged(fit, first, cost)
+
+    def _directions(self, pi: Array) -> Iterator[tuple[int, Array]]:
+        """Freed speeds and their g (n,) at parameters (n,), where these make such rows at all."""
+        for speed, M in self._metric.items():
+            squares = float(pi @ M @ pi)
+            if squares > 0.0:
+                yield speed, M @ pi / squares
 
 
 class Scale:
@@ -99,8 +119,13 @@ class Scale:
         """b (W, n_v): torques of the rows. expected (n,): parameters behind their weights. known: a prior gives it."""
         self.homogeneous = ~np.any(b, axis=0)
         self.unknown = not known and bool(expected.any()) and bool(self.homogeneous.any())
+        self._expected, self._inertial = expected, inertial
+        self.begin()
+
+    def begin(self) -> None:
+        """Nothing is fitted yet."""
         self.freed: list[int] = []
-        self.at, self._expected, self._inertial = expected, expected, inertial
+        self.at = self._expected
 
     def free(self, beyond: NDArray[np.bool_]) -> None:
         """Free rows without a torque of speeds (n_v,) that leave more than noise."""

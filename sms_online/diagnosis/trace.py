@@ -17,6 +17,7 @@ import numpy as np
 
 from sms_online.diagnosis.acceptance import Acceptance
 from sms_online.diagnosis.candidate import Finding, Ranked, Rival
+from sms_online.diagnosis.candidate_rows import ROUNDS
 from sms_online.diagnosis.evidence import Gain, basis, free_of, gain, gains, threshold
 from sms_online.diagnosis.folds import fall
 
@@ -34,8 +35,6 @@ HARDLY_MORE = 1.02
 MUCH_REST = 0.05
 # Laws of it that are compared, with their shape constants, those that explain most.
 RIVALS = 3
-# Times at most that rows are whitened anew for a set of effects: weights follow coefficients, and these the weights.
-ROUNDS = 3
 # At most so many effects are looked for in turn.
 MOST_EFFECTS = 8
 
@@ -108,7 +107,8 @@ class Tracing(Acceptance):
         self._refused: set[str] = set()
         self._held: set[int] = set()
         seen: set[frozenset[int]] = {frozenset()}
-        chosen = self._begun(start)
+        self.weigh(start)
+        chosen = self._begun_with(start)
         while True:
             chosen = self._grown(chosen, seen, refine, watch)
             if watch(chosen) or any(self.candidates[k].constant for k in chosen):
@@ -121,11 +121,10 @@ class Tracing(Acceptance):
             self.reweight(chosen)
             self._take(chosen)
 
-    def _begun(self, start: Sequence[int]) -> list[int]:
+    def _begun_with(self, start: Sequence[int]) -> list[int]:
         """Those of a search before that are of use in these rows too, each in its best form beside the others."""
         if not start:
             return []
-        self._iterated(start)
         self._take(start)
         chosen = self._weeded(self._revised(list(start)))
         self._refused = set()  # beside others they may be of use again

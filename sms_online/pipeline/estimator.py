@@ -195,7 +195,8 @@ class Estimator(Stage):
 
     def _begin_joints(self) -> None:
         """Residuals of the joints count since the last event, in the parameters that hold since then."""
-        self._joints = JointBalance(self.model, self.base, self.system.sample_rate)
+        sensing = None if self._relinearisation is None else self.sensing
+        self._joints = JointBalance(self.model, self.base, self.system.sample_rate, sensing)
 
     @property
     def samples(self) -> int:
@@ -404,10 +405,7 @@ class Estimator(Stage):
             fresh = self._stamped(BalanceRows(rows.Y[finite], rows.b[finite], rows.index[finite]))
             self.energy_tracker.update(fresh)
             self.state.newest_energy_row = float(fresh.t[-1])
-        for window, measured in self._joints.push(rates.index, x, v, signals):
-            for residual, Y, b, signal in zip(self.joint_residuals, window.Y, window.b, measured, strict=True):
-                if np.isfinite(Y).all() and np.isfinite(b):
-                    residual.add(Y[None], b[None], signal)
+        self._joints.push(rates.index, x, v, signals)
 
     def _stamped(self, rows: BalanceRows) -> Rows:
         t = self._synchroniser.start_time + rows.index / self.system.sample_rate

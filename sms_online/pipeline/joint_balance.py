@@ -6,12 +6,15 @@ only positions and speeds appear: -∫ (φ̇ P + φ G) dt π = ∫ φ n τ dt.
 
 from __future__ import annotations
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+from sms_online.calibration.channels import Motion
+from sms_online.calibration.joints import JointCalibration
 from sms_online.model.base_parameters import BaseParameters
 from sms_online.model.model import Model
-from sms_online.pipeline.energy_balance import BalanceRows
+from sms_online.pipeline.sensing import Sensing
 from sms_online.pipeline.weak_form import test_function
 from sms_online.state import Stage, State
 from sms_online.stream import Array
@@ -24,27 +27,43 @@ LARGEST_HOP = 0.4
 
 
 class SquaredResidual(State):
-    """Sums that give the rms of Y β - b for any β: the Gram matrix of [Y b], (n + 1, n + 1), and the measured signal's.
+    """Sums that give the rms of a joint's residual for any β and nuisances, and that of the measured signal.
 
-    A Gram matrix gives a residual down to 1e-8 of b, which is enough for a share of the signal. It is replaced, never
-    written, so whoever keeps one has the sum of then.
+    gram: of [Y D T b]; D, T: what deflections and torques are read too much for nuisances with numbers `deflections`
+    and `torques`. spring: number of the joint's stiffness, -1 where it has none. A Gram matrix gives a residual down to
+    1e-8 of b, which is enough for a share of the signal. It is replaced, never written, so whoever keeps one has the
+    sum of then.
     """
 
     gram: Array
+    deflections: list[int] = msgspec.field(default_factory=list)
+    torques: list[int] = msgspec.field(default_factory=list)
+    spring: int = -1
     signal: float = 0.0
 
-    def add(self, Y: Array, b: Array, signal: float) -> None:
-        """Add rows Y (M, n), b (M,), and the measured torque or force behind b, before what is known was subtracted."""
-        stacked = np.concatenate((Y, b[:, None]), axis=1)
-        self.gram = self.gram + stacked.T @ stacked
+    def since(self, then: SquaredResidual | None) -> SquaredResidual:
+        """The sums of what came after another moment of the session, of all where there is none."""
+        gram, signal = (0.0, 0.0) if then is None else (then.gram, then.signal)
+        return SquaredResidual(self.gram - gram, self.deflections, self.torques, self.spring, self.signal - signal)
+
+    def add(self, row: Array, signal: float) -> None:
+        """Add a row [Y D T b], and the measured torque or force behind b, before what is known was subtracted."""
+        self.gram = self.gram + np.outer(row, row)
         self.signal += float(signal) ** 2
 
-    def relative(self, beta: Array) -> float | None:
-        """rms of the residual over rms of the measured signal; None where there is none."""
+    def relative(self, beta: Array, nuisances: Array | None = None) -> float | None:
+        """rms of the residual over rms of the measured signal; None where there is none.
+
+        nuisances (m,): all of the session's, zeros unless given.
+        """
         if self.signal == 0.0:
             return None
-        w = np.append(beta, -1.0)
-        return float(np.sqrt(max(0.0, w @ self.gram @ w) / self.signal))
+        turned, gained = np.zeros(len(self.deflections)), np.zeros(len(self.torques))
+        if nuisances is not None and nuisances.size:
+            stiffness = beta[self.spring] if self.spring >= 0 else 0.0
+            turned, gained = -stiffness * nuisances[self.deflections], nuisances[self.torques]
+        w: Array = np.concatenate((beta, turned, gained, [-1.0]))
+        return float(np.sqrt(max(0.0, float(w @ self.gram @ w)) / self.signal))
 
 
 class JointState(State):
@@ -61,11 +80,16 @@ class JointState(State):
 
 
 class JointBalance(Stage):
-    """Turns consecutive samples into weak-form rows of every joint, in N m s (N s)."""
+    """Turns consecutive samples into weak-form rows of every joint, in N m s (N s).
 
-    def __init__(self, model: Model, base: BaseParameters, sample_rate: float) -> None:
+    sensing: what has nuisances, where they are estimated.
+    """
+
+    def __init__(self, model: Model, base: BaseParameters, sample_rate: float, sensing: Sensing | None = None) -> None:
         self.model = model
         self.base = base
+        self._sensing, self._sample_rate = sensing, sample_rate
+        self._calibration = None if sensing is None else JointCalibration(sensing)
         seconds = model.system.windows.relative
         self.width = 2 * max(1, round(0.5 * seconds * sample_rate))
         self.hop = max(self.width // 2, min(4 * self.width, round(LARGEST_HOP * sample_rate)))
@@ -73,35 +97,54 @@ class JointBalance(Stage):
         self._phi, self._phi_dot = phi / sample_rate, phi_dot / sample_rate
         layout, n = model.layout, base.n
         columns = layout.n_x + layout.n_v + model.n_signals
-        residuals = [SquaredResidual(np.zeros((n + 1, n + 1))) for _ in layout.q]
+        numbers: tuple[list[int], list[int]] = ([], [])
+        if self._calibration is not None:
+            numbers = self._calibration.positions, self._calibration.torques
+        width = n + sum(map(len, numbers)) + 1
+        names = [p.name for p in base.parameters]
+        springs = [f"joint_{i}.stiffness" for i in range(1, len(layout.q) + 1)]
+        residuals = [
+            SquaredResidual(np.zeros((width, width)), *numbers, names.index(each) if each in names else -1)
+            for each in springs
+        ]
         self.state = JointState(np.empty((0, columns)), residuals)
 
     def begin_segment(self) -> None:
         """Forget the samples before a gap."""
         self.state.samples, self.state.skip = self.state.samples[:0], 0
 
-    def push(self, index: NDArray[np.int64], x: Array, v: Array, signals: Array) -> list[tuple[BalanceRows, Array]]:
-        """For each window that the samples complete, its rows, one a joint, and the torques (joints,) behind them.
+    def push(self, index: NDArray[np.int64], x: Array, v: Array, signals: Array) -> None:
+        """Add the rows of each window that the samples complete to the joints' residuals.
 
         signals (B, n_signals): see `Model.inputs`.
         """
         samples = np.concatenate((self.state.samples, np.concatenate((x, v, signals), axis=1)))
-        grid_end = int(index[-1])
-        rows = []
         start = self.state.skip
         while start + self.width + 1 <= samples.shape[0]:
-            end = grid_end - (samples.shape[0] - 1) + start + self.width
-            rows.append(self._window(samples[start : start + self.width + 1], end))
+            self._add(samples[start : start + self.width + 1])
             start += self.hop
         dropped = min(start, samples.shape[0])
         self.state.samples, self.state.skip = samples[dropped:], start - dropped
-        return rows
 
-    def _window(self, samples: Array, end: int) -> tuple[BalanceRows, Array]:
+    def _add(self, samples: Array) -> None:
         layout = self.model.layout
         x, v, signals = np.split(samples, [layout.n_x, layout.n_x + layout.n_v], axis=1)
         P, G = self.model.momentum_columns(x, v, layout.theta_m, self.model.inputs(signals))
         columns = -(np.tensordot(self._phi_dot, P, 1) + np.tensordot(self._phi, G, 1))
         measured = self._phi @ signals[:, : len(layout.q)]
         b = measured - self.base.known_part(columns)
-        return BalanceRows(self.base.columns(columns), b, np.full(len(layout.q), end)), measured
+        rows = np.concatenate((self.base.columns(columns), *self._calibrated(x, signals), b[:, None]), axis=1)
+        for residual, row, signal in zip(self.state.residuals, rows, measured, strict=True):
+            if np.isfinite(row).all():
+                residual.add(row, signal)
+
+    def _calibrated(self, x: Array, signals: Array) -> tuple[Array, ...]:
+        """D and T (joints, ·) of a window's samples, none where no nuisances are estimated."""
+        if self._sensing is None or self._calibration is None:
+            return ()
+        readings = self._sensing.readings(x)
+        rates = np.gradient(readings, axis=0) * self._sample_rate
+        _, T_0 = self.model.layout.base_pose(x)
+        motion = Motion(readings, rates, signals[:, : len(self.model.layout.q)], T_0)
+        each = self._calibration.deflections(motion), self._calibration.torque(motion)
+        return tuple(np.tensordot(self._phi, part, 1) for part in each)

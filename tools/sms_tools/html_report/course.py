@@ -88,4 +88,4 @@ class CourseRecorder:
         latest = self._session.recorder.latest
         if latest is not None and (always or self._residual.is_due(latest[0])):
             t, now = latest
-            self._residual.add(t, self._recent.push(t, now.statistics, now.estimate.pi))
+            self._residual.add(t, self._recent.push(t, now.statistics, now.estimate.pi, now.estimate.nuisances))

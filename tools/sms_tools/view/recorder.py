@@ -187,7 +187,7 @@ class Recorder:
         self._arrange(t, more, self._scale.follow(known, converged, last))
         self._parameters.add(known)
         self._trackers.add(t, now)
-        self._residual = self._recent.push(t, state, known.estimate)
+        self._residual = self._recent.push(t, state, known.estimate, now.estimate.nuisances)
         self._numbers.add(f"{RESIDUAL}/relative", t, self._residual)
         self._name_changes(known)
         if slow:

@@ -21,8 +21,11 @@ class RecentResidual:
         self._past: deque[tuple[float, tuple[SquaredResidual, ...]]] = deque()
         self._events = 0
 
-    def push(self, t: float, known: Statistics, beta: Array) -> Array:
-        """Shares (joints,) of the measured torque or force that are not explained; NaN where nothing was measured."""
+    def push(self, t: float, known: Statistics, beta: Array, nuisances: Array | None = None) -> Array:
+        """Shares (joints,) of the measured torque or force that are not explained; NaN where nothing was measured.
+
+        nuisances (m,): found beside β, zeros unless given.
+        """
         now = known.joints
         if len(known.events) > self._events:
             # The sums begin anew, with what the event has added.
@@ -31,7 +34,6 @@ class RecentResidual:
         self._past.append((t, now))
         while len(self._past) > 1 and self._past[1][0] <= t - SPAN:
             self._past.popleft()
-        then = self._past[0][1] if len(self._past) > 1 else tuple(SquaredResidual(0.0 * r.gram, 0.0) for r in now)
-        recent = [SquaredResidual(a.gram - b.gram, a.signal - b.signal) for a, b in zip(now, then, strict=True)]
-        shares = [residual.relative(beta) for residual in recent]
+        then = self._past[0][1] if len(self._past) > 1 else (None,) * len(now)
+        shares = [each.since(before).relative(beta, nuisances) for each, before in zip(now, then, strict=True)]
         return np.array([np.nan if share is None else share for share in shares])
