@@ -25,9 +25,9 @@ from sms_sim.simulate import Simulation, exact_states
 FREQUENCIES, LEAST_DRAWN, OCTAVES = 5, 2, 4.0
 # Periods of the slowest in a motion without a described one: several, of which each repeats what the others show.
 PERIODS = 5
-# Step of the motions that are compared and of their bounds, s: twice that of `cramer_rao`. The planar example's worst
-# bound then comes out a tenth low, so that exact bounds decide in the end.
-STEP = 0.02
+# Step of the motions that are compared and of their bounds, s. The planar example's worst bound then comes out to 1e-4;
+# with twice the step it is a tenth low, and a search finds motions for which it is a third low.
+STEP = 0.01
 # Longest motion, s: all that are compared are in memory at once.
 LONGEST = 600.0
 

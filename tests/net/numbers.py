@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import math
 import platform
+import re
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -134,7 +135,12 @@ def _is_number(value: Value) -> bool:
 
 
 def environment() -> dict[str, str]:
-    """What the last bits depend on beside the code: libraries, and the kernels that they choose on this processor."""
+    """What the last bits depend on beside the code: libraries, the processor, and the kernels chosen for it.
+
+    Sizes of caches, which follow from the model, decide how products of matrices are split.
+    """
+    described = Path("/proc/cpuinfo")
+    model = re.search(r"model name\s*: (.*)", described.read_text()) if described.is_file() else None
     blas = sorted(
         f"{each['internal_api']} {each['version']} {each.get('architecture', '')}"
         for each in threadpool_info()
@@ -145,5 +151,7 @@ def environment() -> dict[str, str]:
         "scipy": scipy.__version__,
         "blas": ", ".join(blas),
         "machine": platform.machine(),
+        "processor": model[1] if model else platform.processor(),
+        "simd": " ".join(np.show_config(mode="dicts")["SIMD Extensions"]["found"]),
         "libc": " ".join(platform.libc_ver()),
     }
