@@ -38,7 +38,9 @@ class JointCalibration:
         first = len(self.of_positions) + len(_nuisances(low_pass_families(sensing, tolerances)))
         self.positions = list(range(len(self.of_positions)))
         self.torques = list(range(first, first + len(self.of_torques)))
-        along = sensing.displacements(np.zeros((1, layout.n_x)))[0]
+        # Any positions serve: rows of joints do not depend on them. Euler parameters of no rotation end with η = 1.
+        positions = np.array([[name == "eta" for name in layout.position_names]], dtype=np.float64)
+        along = sensing.displacements(positions)[0]
         self._deflection = along[list(layout.theta_m)] - along[list(layout.q)]
 
     def deflections(self, motion: Motion) -> Array:

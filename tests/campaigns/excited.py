@@ -5,7 +5,7 @@
     python -m tests.campaigns.excited summary RESULTS.jsonl
 
 By how much the median and the largest of the relative Cramér–Rao bounds are lower than with the described motion; and,
-with the best of them, the errors of sessions at grade B. A start takes some fifteen minutes of a quiet core, a session
+with the best of them, the errors of sessions at grade B. A start takes some five minutes of a core, a session
 of either motion ten seconds.
 """
 
