@@ -11,14 +11,8 @@ from itertools import chain
 
 import numpy as np
 
-from sms_online.calibration.channels import (
-    Family,
-    Motion,
-    TorqueFamily,
-    low_pass_families,
-    position_families,
-    torque_families,
-)
+from sms_online.calibration.channels import Family, Motion, TorqueFamily, position_families, torque_families
+from sms_online.calibration.columns import nuisances
 from sms_online.calibration.nuisance import Nuisance
 from sms_online.pipeline.sensing import Sensing
 from sms_online.stream import Array
@@ -35,9 +29,8 @@ class JointCalibration:
         layout, tolerances = sensing.model.layout, sensing.model.system.tolerances
         self._positions, self._torques = position_families(sensing, tolerances), torque_families(sensing, tolerances)
         self.of_positions, self.of_torques = _nuisances(self._positions), _nuisances(self._torques)
-        first = len(self.of_positions) + len(_nuisances(low_pass_families(sensing, tolerances)))
-        self.positions = list(range(len(self.of_positions)))
-        self.torques = list(range(first, first + len(self.of_torques)))
+        number = {nuisance: k for k, nuisance in enumerate(nuisances(sensing))}
+        self.positions, self.torques = ([number[each] for each in own] for own in (self.of_positions, self.of_torques))
         # Any positions serve: rows of joints do not depend on them. Euler parameters of no rotation end with η = 1.
         positions = np.array([[name == "eta" for name in layout.position_names]], dtype=np.float64)
         along = sensing.displacements(positions)[0]

@@ -8,7 +8,7 @@ and camera, are penalised by their tolerances throughout.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
 
@@ -72,6 +72,26 @@ class Calibrated:
         """Which of them (m,) an effect of the catalogue has to replace, for estimates (m,)."""
         said = np.array([each.name in self.sayable for each in self.nuisances], dtype=np.bool_)
         return np.asarray(said & (np.abs(values) > LIMIT * self.tolerance))
+
+    def released(
+        self, effects: Iterable[Effect], rows: Array, fitted: Callable[[Array, Array], Array]
+    ) -> tuple[NDArray[np.bool_], Array]:
+        """Which of them (m,) are held at zero beside effects, and the solution (n + m,) with these held.
+
+        rows (M, n + m + 1): all columns, theirs last, and the right-hand side, without what is known of them. fitted:
+        solves columns and a right-hand side.
+        """
+        m, held = self.count, self.said_by(effects)
+        # Only what is known of them changes: all other rows are reduced once.
+        others, known = np.linalg.qr(rows, mode="r"), np.zeros((m, rows.shape[1]))
+        while True:
+            known[:, known.shape[1] - m - 1 : -1] = self.information(held)
+            both = np.concatenate((others, known))
+            solution = fitted(both[:, :-1], both[:, -1])
+            beyond = self.beyond(solution[solution.size - m :]) & ~held
+            if not beyond.any():
+                return held, solution
+            held = held | beyond
 
 
 def _replaces(effect: Effect, nuisance: Nuisance) -> bool:

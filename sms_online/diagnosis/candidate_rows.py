@@ -307,19 +307,8 @@ class CandidateRows:
 
         rows (M, n + c + m + 1): all columns and the right-hand side, without what is known of calibration.
         """
-        m = self.calibrated.count
-        effects = (candidate.effect for candidate in (*self._fixed, *(self.candidates[k] for k in chosen)))
-        held = self.calibrated.said_by(effects)
-        # Only what is known of calibration changes: all other rows are reduced once.
-        others, known = np.linalg.qr(rows, mode="r"), np.zeros((m, rows.shape[1]))
-        while True:
-            known[:, known.shape[1] - m - 1 : -1] = self.calibrated.information(held)
-            both = np.concatenate((others, known))
-            solution = self._fitted_to(chosen, both[:, :-1], both[:, -1])
-            beyond = self.calibrated.beyond(solution[solution.size - m :]) & ~held
-            if not beyond.any():
-                return held, solution
-            held = held | beyond
+        effects = [candidate.effect for candidate in (*self._fixed, *(self.candidates[k] for k in chosen))]
+        return self.calibrated.released(effects, rows, lambda columns, b: self._fitted_to(chosen, columns, b))
 
     def gains(self, chosen: Sequence[int]) -> list[Gain]:
         """What each candidate would take beside those chosen."""

@@ -57,12 +57,13 @@ class RelativeResiduals:
         sensing, layout, calibration = rows.sensing, rows.model.layout, JointCalibration(rows.sensing)
         number = {nuisance: k for k, nuisance in enumerate(rows.calibrated.nuisances)}
 
-        def read(motion: Motion) -> Readings:
+        def read(motion: Motion) -> Array:
             values = rows.segments[motion.segment].values[:, sensing.position_columns]
             rates = np.gradient(values, axis=0) * rows.model.system.sample_rate
             turned = np.broadcast_to(np.eye(3), (len(motion.x), 3, 3))
             torque = motion.torque[:, : len(layout.q)]  # without the wrenches behind them
-            return Readings(values[motion.samples], rates[motion.samples], torque, turned)
+            given = Readings(values[motion.samples], rates[motion.samples], torque, turned)
+            return np.concatenate((calibration.deflections(given), calibration.torque(given)), axis=2)
 
         def spread(each: Array, nuisances: Sequence[Nuisance]) -> Array:
             out = np.zeros((*each.shape[:2], rows.calibrated.count))
@@ -71,8 +72,8 @@ class RelativeResiduals:
                     out[..., number[nuisance]] = column
             return out
 
-        deflections = weak.columns(lambda motion: (None, calibration.deflections(read(motion))))
-        torques = weak.columns(lambda motion: (None, calibration.torque(read(motion))))
+        added = weak.columns(lambda motion: (None, read(motion)))
+        deflections, torques = np.split(added, [len(calibration.of_positions)], axis=2)
         return -spread(deflections, calibration.of_positions), -spread(torques, calibration.of_torques)
 
     def declare(self, effects: Sequence[Effect]) -> None:
