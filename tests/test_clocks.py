@@ -136,6 +136,17 @@ def test_a_backlog_that_is_worked_off_moves_no_time() -> None:
     np.testing.assert_allclose(corrected(clock, device, np.maximum.accumulate(backlog)), t, rtol=0, atol=1e-4)
 
 
+@pytest.mark.parametrize("longest", [2.0, 0.02])
+def test_half_a_minute_of_load_moves_no_time(longest: float) -> None:
+    # Nothing comes undelayed, and every quarter of a second has another delay.
+    t, device, arrival = pairs(1000.0, 60.0, 20e-6, 0.3, seed=12)
+    delay = longest * (0.1 + 0.9 * np.interp(t, t[::250], np.random.default_rng(12).uniform(size=t.size // 250)))
+    loaded = np.maximum.accumulate(arrival + np.where((t > 21.0) & (t < 51.0), delay, 0.0))
+    clock = DeviceClock(LATENCY)
+    np.testing.assert_allclose(corrected(clock, device, loaded), t, rtol=0, atol=1e-4)
+    assert (clock.counters.jumps, clock.counters.steps) == (0, 0)
+
+
 def test_a_lasting_change_of_latency_is_followed_and_counted() -> None:
     t, device, arrival = pairs(240.0, 60.0, 0.0, 0.0, seed=5)
     later = np.maximum.accumulate(arrival + np.where(t > 21.0, 0.01, 0.0))

@@ -16,6 +16,7 @@ from __future__ import annotations
 
 from collections import deque
 from dataclasses import dataclass
+from statistics import median
 
 import numpy as np
 
@@ -48,11 +49,12 @@ CONFIRMED = 8
 # latency. A millisecond is beyond any drift between two lines.
 STEP = 1e-3
 # So many intervals in a row make a step. Samples cannot be early, so two are enough where the line has to go down. Late
-# is what a loaded machine makes them for seconds; until it is a step times follow the old line.
-EARLY_INTERVALS, LATE_INTERVALS = 2, 40
+# is what a loaded machine makes them for as long as it is loaded, but then by ever other delays. Behind a step half of
+# the intervals are late by the same, within SAME, s, and a tenth of the step; until then times follow the old line.
+EARLY_INTERVALS, LATE_INTERVALS, SAME = 2, 40, 5e-3
 # But a sender that paused, and whose clock or count did not go on meanwhile, is late by the same time ever after: by
-# more than PAUSE, s, and within SAME, s, over so many intervals. A backlog that is read grows less.
-PAUSE, SAME, PAUSED_INTERVALS = 0.2, 5e-3, 4
+# more than PAUSE, s, over so many intervals. A backlog that is read grows less.
+PAUSE, PAUSED_INTERVALS = 0.2, 4
 
 
 @dataclass
@@ -262,7 +264,7 @@ class DeviceClock:
                 return
             self.counters.steps += 1
             # The first of them may lie between the old line and the new.
-            self._points = deque(self._off[-max(len(self._off) // 2, 1) :])
+            self._points = deque(self._off[-max(min(len(self._off), LATE_INTERVALS) // 2, 1) :])
         else:
             self._points.append(point)
         self._off = []
@@ -274,9 +276,11 @@ class DeviceClock:
         """Whether the points off the line, the last of them by `off`, are enough for a step."""
         if off < 0.0:
             return len(self._off) >= EARLY_INTERVALS
-        last = [a - self._line(d) for d, a in self._off[-PAUSED_INTERVALS:]]
+        late = [a - self._line(d) for d, a in self._off[-LATE_INTERVALS:]]
+        last = late[-PAUSED_INTERVALS:]
         paused = len(last) == PAUSED_INTERVALS and min(last) > PAUSE and max(last) - min(last) < SAME
-        return paused or len(self._off) >= LATE_INTERVALS
+        least = min(late)
+        return paused or (len(late) == LATE_INTERVALS and median(late) - least < min(SAME, 0.1 * least))
 
     def _ahead(self) -> float:
         return self._offset + (self._slope - 1.0) * self._newest
