@@ -7,12 +7,14 @@ import pty
 import socket
 import time
 import tty
+from pathlib import Path
 
 import pytest
 
 from sms_adapters.devices import make_decoder, make_reader
 from sms_adapters.raw import LostDevice, Reader, SerialChunk
 from sms_online.description.sources import SerialField, SerialLines
+from sms_online.errors import InputError
 
 
 def reader(port: str) -> Reader:
@@ -116,6 +118,15 @@ def test_a_port_of_two_readers_is_refused() -> None:
     os.close(far)
 
 
+def test_what_is_no_port_is_refused(tmp_path: Path) -> None:
+    file = tmp_path / "ttyUSB0"
+    file.touch()
+    for port, found in ((file, "no device"), (tmp_path, "no device"), ("nonesuch://", "nonesuch")):
+        with pytest.raises(InputError, match=found) as refused:
+            reader(str(port)).open()
+        assert "\n" not in str(refused.value)
+
+
 def test_a_socket_is_a_port_too() -> None:
     server = socket.create_server(("127.0.0.1", 0))
     device = reader(f"socket://127.0.0.1:{server.getsockname()[1]}")
@@ -130,7 +141,7 @@ def test_a_socket_is_a_port_too() -> None:
     server.close()
 
 
-@pytest.mark.parametrize("port", ["/dev/absent", "nonesuch://", "socket://nowhere"])
+@pytest.mark.parametrize("port", ["/dev/absent", "socket://nowhere"])
 def test_a_port_that_cannot_be_opened_is_lost(port: str) -> None:
     with pytest.raises(LostDevice, match=r"^strain: ") as lost:
         reader(port).open()

@@ -4,14 +4,17 @@ from __future__ import annotations
 
 import os
 import select
+from pathlib import Path
 
 import serial
 
 from sms_adapters.raw import Clock, LostDevice, Raw, SerialChunk, Turn, at_once, one_line
 from sms_online.description.sources import SerialPort
+from sms_online.errors import InputError
 
 # Most bytes of one read, which bounds what a flooded port can keep in memory: a second at 10 Mbit/s.
 MOST_BYTES_READ = 1 << 20
+EXPECTED = "a serial port, or a URL of one, that pyserial can open here"
 
 
 class SerialReader:
@@ -26,14 +29,19 @@ class SerialReader:
         self._opened = False  # and nothing read yet
 
     def open(self) -> None:
-        """Open the port; raises LostDevice where that fails."""
+        """Open the port; raises LostDevice where that fails, InputError where it always will."""
         self.close()
+        path = Path(self._source.port)
+        if path.exists() and not path.is_char_device():
+            raise InputError(self.name, self._source.port, "no device", EXPECTED)
         try:
             # Exclusive, for two readers of one port would each get half of the bytes.
             self._port = serial.serial_for_url(self._source.port, self._source.baudrate, exclusive=True)
             self._opened = True
-        # ValueError: a URL or a rate that pyserial does not know.
-        except (OSError, ValueError) as error:
+        # A URL or a rate that pyserial does not know.
+        except ValueError as error:
+            raise InputError(self.name, self._source.port, one_line(error), EXPECTED) from error
+        except OSError as error:
             raise LostDevice(self.name, one_line(error)) from error
 
     def read(self, timeout: float) -> list[Raw]:
