@@ -246,7 +246,7 @@ def _exact(
     problem: Problem, point: Array, progress: Callable[[str, float], None]
 ) -> tuple[Trajectory, Simulation, Array]:
     """The trajectory of a point, scaled until its exact motion is within the limits, that motion and its extremes."""
-    for _ in range(CORRECTIONS):
+    for k in range(CORRECTIONS):
         trajectory = problem.series.trajectory(point, problem.duration)
         moved = problem.system.model_copy(update={"trajectory": trajectory})
         simulation = Simulated.of(moved).solve(progress)
@@ -254,5 +254,6 @@ def _exact(
         load = float((extremes / problem.bounds).max())
         if load <= 1.0:
             return trajectory, simulation, extremes
-        point = point * (USED / load)
+        # A load may fall by less than amplitudes do: every correction takes more.
+        point = point * (USED / load) ** (k + 1)
     raise InputError(problem.system.name, "limits", "no motion within them", "wider limits")
