@@ -61,11 +61,12 @@ def test_a_tracker_alone_estimates_as_beside_others(choice: str, data: sms.Captu
         assert here.std == pytest.approx(there.std, rel=0.02)
 
 
-def test_no_choice_is_least_squares_of_all_rows(data: sms.Capture, several: sms.Result) -> None:
-    plain = sms.estimate(SYSTEM, data)
-    assert list(plain.parameters.values()) == list(several.parameters.values())
+def test_no_choice_is_least_squares_until_something_moves(data: sms.Capture) -> None:
+    plain, rls = (sms.estimate(SYSTEM, data, tracker=tracker) for tracker in (None, "rls"))
+    assert list(plain.parameters.values()) == list(rls.parameters.values())
     (tracker,) = plain.trackers
-    assert tracker.name == "rls"
+    assert tracker.name == "kalman learned"
+    assert not tracker.drifts
     assert tracker.consistency.consistent
 
 

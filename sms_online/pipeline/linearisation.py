@@ -64,7 +64,9 @@ class Linearisation(Stage):
         self._largest = np.where(clocks, LATEST, np.inf)
         self._movable = np.arange(len(nuisances)) < sum(len(each.nuisances) for each in families)
         self._linear = np.array([getattr(LINEAR, each.name) or 0.0 for each in nuisances], dtype=np.float64)
-        self.state = LinearisationState(np.zeros(len(nuisances)), first, remembers=bool(self._movable.any()))
+        # Drifts that are yet to be learned may turn out to be none.
+        remembers = bool(self._movable.any()) or sensing.model.system.trackers[0].learns
+        self.state = LinearisationState(np.zeros(len(nuisances)), first, remembers=remembers)
         self._correction = self._new_correction()
 
     def _new_correction(self) -> Correction:

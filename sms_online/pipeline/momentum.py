@@ -44,10 +44,12 @@ class MomentumState(State):
     """What a momentum balance keeps beside its stages.
 
     sensor_noise: that of the samples so far. newest_row: time of the last window's end, s. start_time: of grid index 0,
-    s. random: gives the synthetic noise. drift: known to windows to come.
+    s. random: gives the synthetic noise. patient: whether more than noise in the beginning may be a drift yet to be
+    learned. drift: known to windows to come.
     """
 
     random: np.random.Generator
+    patient: bool
     sensor_noise: SensorNoise | None = None
     segment: int = -1
     start_time: float = np.nan
@@ -64,7 +66,7 @@ class Momentum(Stage):
     whether rows leave more than noise, likewise. changes: events, and the model and parameters that the session goes on
     with after them. nuisances: what the description may be wrong in. prior: what is known of the described ones
     beforehand. point: gives the nuisances (m,) that samples are corrected by. changed: called where others come to be
-    estimated.
+    estimated. patient: see `MomentumState`.
     """
 
     def __init__(
@@ -76,6 +78,7 @@ class Momentum(Stage):
         prior: Prior | None,
         point: Callable[[], Array],
         changed: Callable[[], None],
+        patient: bool,
     ) -> None:
         system = model.system
         self.sensing, self.nuisances, self.prior = sensing, tuple(nuisances), prior
@@ -84,9 +87,9 @@ class Momentum(Stage):
         self._span = system.windows.momentum
         self.changes = Changes(model, base, sensing, self.nuisances, self._rebuild, point)
         self._sources, self._clocks = source_groups(sensing), clock_groups(sensing)
+        self.state = MomentumState(np.random.default_rng(SEED), patient)
         self.bank = self._new_bank()
         self._build()
-        self.state = MomentumState(np.random.default_rng(SEED))
 
     @property
     def newest_row(self) -> float:
@@ -109,7 +112,7 @@ class Momentum(Stage):
             prior_rows(self.nuisances, base.n), self.joint.beforehand,
             [k for k, each in enumerate(self.nuisances) if each.name == "drive_gain"], self._drift_at, self._point,
         )  # fmt: skip
-        self.fit.plain.patient = self.bank.learned is not None
+        self.fit.plain.patient = self.state.patient and self.bank.learned is not None
         self.test = self._new_test()
 
     def _rebuild(self) -> None:
@@ -161,6 +164,11 @@ class Momentum(Stage):
     def testable(self) -> bool:
         """Whether there are rows enough since the last event for a test of what they leave."""
         return self.started and self.fit.plain.windows * self._balance.span / HOPS >= TESTED
+
+    @property
+    def lacking(self) -> bool:
+        """Whether rows leave more than noise while that was taken for a drift, and none of ramps explains it."""
+        return self.state.patient and self.bank.learned is not None and self.bank.learned.state.lacking
 
     @property
     def misfit(self) -> bool:
@@ -287,9 +295,12 @@ class Momentum(Stage):
         """Hand rows to the chosen trackers, and to what watches for drifts."""
         learned = self.bank.learned
         before = 0 if learned is None else learned.state.accepted
-        self.bank.update(self._for_trackers(rows), not self.misfit)
+        noise = self.state.sensor_noise
+        # Rounding moves as it likes where samples are exact.
+        quiet = not self.misfit and noise is not None and not noise.exact
+        self.bank.update(self._for_trackers(rows), quiet)
         if learned is not None:
-            self.fit.plain.patient = learned.patient
+            self.fit.plain.patient = self.state.patient and learned.patient
             if learned.state.accepted > before:
                 self._begin_drift(learned.information)
 
@@ -384,8 +395,7 @@ class Momentum(Stage):
             scale_free=self.joint.scale_free(self.fit),
             latency=self.latencies.found,
             coloured={} if noise is None else noise.coloured,
-            # Rounding moves as it likes where samples are exact.
-            suspected=None if noise is None or noise.exact else self.bank.suspected,
+            suspected=self.bank.suspected,
             shifts=tuple(self.changes.shifts),
             unwatched=self.bank.unwatched,
             point=self._point(),

@@ -1,7 +1,8 @@
 """The momentum balance about a point of the nuisances that follows what samples show, see `linearisation`.
 
 Samples wait until the noise of the sensors is known, are corrected by the point, and go to the balance. Where its
-estimate of the nuisances is far from the point, that moves, and a new balance gets all samples so far once more.
+estimate of the nuisances is far from the point, that moves, and a new balance gets all samples so far once more. So it
+does where rows turn out to lack more than a drift that was yet to be learned: their weights took it for one.
 """
 
 from __future__ import annotations
@@ -38,13 +39,14 @@ class RelinearisationState(State):
     """What comes before the balance.
 
     noise: of the sensors, as estimated at grid index `noise_at`. waiting: samples, until it is known. start_time: of
-    grid index 0, s.
+    grid index 0, s. patient: see `MomentumState`.
     """
 
     noise: SensorNoise | None = None
     noise_at: int = 0
     waiting: list[GridSamples] = msgspec.field(default_factory=list)
     start_time: float = float("nan")
+    patient: bool = True
 
 
 class Relinearisation(Stage):
@@ -63,11 +65,14 @@ class Relinearisation(Stage):
         self._renewed = round(NOISE_RENEWED * system.sample_rate)
         first = round(FIRST_MOTION * HOPS / span)
         self.linearisation = Linearisation(sensing, self._nuisances, system.sample_rate, first)
-        self.momentum = self._new_momentum()
         self.state = RelinearisationState()
+        self.momentum = self._new_momentum()
 
     def _new_momentum(self) -> Momentum:
-        return Momentum(*self._described, self._sensing, self._nuisances, self._prior, self._point, self._changed)
+        return Momentum(
+            *self._described, self._sensing, self._nuisances, self._prior, self._point, self._changed,
+            self.state.patient,
+        )  # fmt: skip
 
     def _point(self) -> Array:
         """Nuisances (m,) that samples are corrected by."""
@@ -125,6 +130,12 @@ class Relinearisation(Stage):
         if self.momentum.changes.events or self.momentum.changes.shifts:
             # No one point is that of the samples before and after.
             self.linearisation.forget()
+        if self.momentum.lacking and self.linearisation.state.samples:
+            self.state.patient = False
+            self.momentum = self._new_momentum()
+            self._advance(self.linearisation.again(), noise)
+            if last:
+                self.momentum.end_segment(noise)
         if not self.momentum.started or not self.linearisation.looks(self.momentum.fit.plain.windows, last):
             return
         # Where rows hold more than noise and errors of calibration, these look like what the model lacks.

@@ -264,9 +264,13 @@ class TrackerBank(Stage):
         """
         return tuple(self._reading(chosen, own, bias, t) for chosen in self._chosen)
 
+    def _as_least_squares(self, tracker: Tracker) -> bool:
+        """Whether a tracker has learned of no drift: what is known is then the session's own least squares."""
+        return tracker is self.learned and not self.learned.moves.any() and not self.state.held
+
     def _reading(self, chosen: _Chosen, own: Estimate, bias: NoiseBias, t: float) -> Reading:
         tracker = chosen.tracker
-        if tracker is None:
+        if tracker is None or self._as_least_squares(tracker):
             return Reading(chosen.choice.label, own, own.rows / self._rows_per_second)
         if isinstance(tracker, LearnedTrend):
             # Rows since an alarm wait until they show what it was; a drift may have ended with it, or grown.

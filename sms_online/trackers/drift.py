@@ -52,8 +52,9 @@ UNSEARCHED = 3
 RECENT = 2
 # Drifts that begin together, at most.
 MOST_AT_ONCE = 4
-# Knots from the beginning within which more than noise may be a drift yet to be found.
-PATIENCE = 12
+# Knots from the beginning within which more than noise may be a drift yet to be found; but not where ramps leave this
+# share of it or more.
+PATIENCE, RAMPS_LEAVE = 12, 0.5
 # A change is suspected where two searches in a row show one of the same parameters, the later with a chance of at most
 # this to be none. In steady sessions one search in some 500 finds one, ten times as many as normal rows would: their
 # noise is known to a tenth alone, and is not quite white.
@@ -227,16 +228,20 @@ class LearnedTrend(Tracker):
             begun = ramp.since * STEP
             found.append(Moving(ramp.columns, ramp.since, 0.0, tuple(ramp.rates.tolist()), begun=begun))
             tried = self._tried(found)
-        if len(found) == len(self.state.moving):
-            return
         # A lack of the model leaves more than noise, whatever ramps it is taken for.
-        state, _ = self._filtered(found)
-        before = self.state.anchor.factor[-1, -1] ** 2
-        if state.factor[-1, -1] ** 2 - before < LARGEST_LEFT * sum(block.rows for block in self.state.blocks):
+        if len(found) > len(self.state.moving) and self._excess(found) < LARGEST_LEFT - 1.0:
             self.state.moving, self.state.changes = found, []
             self._choose()
             self.state.accepted += 1
             self.state.likeliest = self.state.suspected = None
+        elif self.patient:
+            least = max(LARGEST_LEFT - 1.0, RAMPS_LEAVE * self._excess(self.state.moving))
+            self.state.lacking = self._excess(found) >= least
+
+    def _excess(self, moving: Sequence[Moving]) -> float:
+        """Mean square of what the remembered rows leave with these moving, less that of noise."""
+        left = self._filtered(moving)[0].factor[-1, -1] ** 2 - self.state.anchor.factor[-1, -1] ** 2
+        return float(left / sum(block.rows for block in self.state.blocks) - 1.0)
 
     def _tried(self, moving: Sequence[Moving]) -> Tried:
         """Changes of what does not move, within the remembered blocks."""
@@ -268,7 +273,7 @@ class LearnedTrend(Tracker):
     @property
     def patient(self) -> bool:
         """Whether more than noise may be a drift that is yet to be found."""
-        return self.state.knots < PATIENCE
+        return self.state.knots < PATIENCE and not self.state.lacking
 
     @property
     def instant(self) -> float:

@@ -34,8 +34,9 @@ class DriftState(State):
     anchor: the filter at the oldest remembered knot; now: at the newest step. blocks: from knot to knot. pending: rows
     [Y, (t - knot) Y, b] since the last knot; fresh: how many of them are not in `now` yet. step: number of the open
     one, from t = 0 on; knots: since the beginning. rows: so far; newest: time of the last, s. accepted: how often
-    drifts were. quiet: whether rows leave no more than noise, without which no drift is accepted. until: instant that
-    estimates hold for, s; no earlier than that of the newest row. likeliest: change that the last search found, of what
+    drifts were. quiet: whether rows leave no more than noise, without which no drift is accepted. lacking: whether they
+    leave more in the beginning, which no ramps explain. until: instant that estimates hold for, s; no earlier than that
+    of the newest row. likeliest: change that the last search found, of what
     does not move; suspected: where it is hardly chance. changes: of rates, that may have been.
     """
 
@@ -51,6 +52,7 @@ class DriftState(State):
     newest: float = 0.0
     accepted: int = 0
     quiet: bool = True
+    lacking: bool = False
     until: float = -np.inf
     likeliest: Suspicion | None = None
     suspected: Suspicion | None = None

@@ -1,12 +1,12 @@
-"""The demo on a host whose cores are busy with other work: false events, verdicts, errors over their bars, losses.
+"""The demo on a host whose cores are busy with other work: false events and drifts, verdicts, errors, losses.
 
     python -m tests.campaigns.busy run RESULTS.jsonl --demos 20
     python -m tests.campaigns.busy summary RESULTS.jsonl
 
 Each demo is a process of its own, and beside it `--beside` processes, one for each core by default, compute all the
-time at the same priority. Nothing changes in the demo's arm, so every event is false. True values are read from
-results.json, where the verb has put them after the estimate. Recordings lie beside RESULTS, in a folder for each demo
-whose result is bad; `sms-online replay FOLDER --system FOLDER/system.toml` repeats it.
+time at the same priority. Nothing changes in the demo's arm, so every event or drift is false. True values are read
+from results.json, where the verb has put them after the estimate. Recordings lie beside RESULTS, in a folder for each
+demo whose result is bad; `sms-online replay FOLDER --system FOLDER/system.toml` repeats it.
 """
 
 from __future__ import annotations
@@ -60,6 +60,7 @@ def demo(out: Path, seed: int) -> Record:
         "level": verdict["level"],
         "sentence": verdict["sentence"],
         "events": [event["kind"] for event in results["events"]],
+        "drifts": [drift["parameter"] for tracker in results["trackers"] for drift in tracker["drifts"]],
         "worst": worst(results),
         "lost": results["lost_samples"],
         "samples": results["samples"],
@@ -81,7 +82,7 @@ def bad(record: Mapping[str, Any]) -> list[str]:
     """What a demo must never do, a word for each."""
     if "failed" in record:
         return ["failed"]
-    found = [f"event: {kind}" for kind in record["events"]]
+    found = [f"event: {kind}" for kind in record["events"]] + [f"drift: {name}" for name in record["drifts"]]
     if record["level"] == "trust" and (record["worst"] is None or record["worst"] > FAR):
         found.append(f"trusted, {record['worst']} bars off")
     return found
@@ -111,7 +112,8 @@ def summary(records: list[Record]) -> str:
     ended = [record for record in records if "failed" not in record]
     levels = Counter(record["level"] for record in ended)
     lines.append(
-        f"{len(records)} demos: {sum(len(record['events']) for record in ended)} false events; "
+        f"{len(records)} demos: {sum(len(record['events']) for record in ended)} false events, "
+        f"{sum(len(record['drifts']) for record in ended)} false drifts; "
         f"{', '.join(f'{count} {level}' for level, count in sorted(levels.items()))}; "
         f"worst {max((record['worst'] or 0.0 for record in ended), default=0.0):.1f} bars, "
         f"{sum(any('trusted' in what for what in bad(record)) for record in records)} of them trusted beyond {FAR:g}; "

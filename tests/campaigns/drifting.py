@@ -228,7 +228,8 @@ def _summary(name: str, records: list[Record], steady: tuple[Array, Array, Array
     if steady is None:
         return "\n".join(lines)
     least = np.sqrt(np.mean(steady[1] ** 2, axis=(0, 1)))[[_index(names[k]) for k in others]]
-    ratio, limit = float(np.mean(rms[others] / least)), STEADY_ERROR if name == STEADY else OTHERS_ERROR
+    ratio = float(np.mean(rms[others] / least))
+    limit = {STEADY: STEADY_ERROR, TOLERANT: np.inf}.get(name, OTHERS_ERROR)
     low, high = {STEADY: STEADY_HELD, TOLERANT: TOLERANT_HELD}.get(name, (OTHERS_HELD, 100.0))
     lines.append(
         f"  all others: error {flagged(ratio, ratio > limit, '.2f')} of steady least squares' ({limit:g} asked), "
