@@ -79,7 +79,7 @@ def test_drifts_are_not_watched_for_beside_wandering_clocks(tmp_path: Path) -> N
     devices, one = axis_testbed(tmp_path), sms.load_system(tomllib.loads(AXIS))
     unwatched = [
         momentum.bank.unwatched
-        for system in (with_trackers(devices, "rls"), devices, with_trackers(one, "rls"))
+        for system in (devices, with_trackers(devices, "kalman:drift=learned"), one)
         if (momentum := Estimator(system, ("force_1", "q_1"), "test").momentum) is not None
     ]
     assert unwatched == [True, False, False]

@@ -61,13 +61,19 @@ def test_a_tracker_alone_estimates_as_beside_others(choice: str, data: sms.Captu
         assert here.std == pytest.approx(there.std, rel=0.02)
 
 
-def test_no_choice_is_least_squares_until_something_moves(data: sms.Capture) -> None:
-    plain, rls = (sms.estimate(SYSTEM, data, tracker=tracker) for tracker in (None, "rls"))
-    assert list(plain.parameters.values()) == list(rls.parameters.values())
+def test_no_choice_is_least_squares_of_all_rows(data: sms.Capture, several: sms.Result) -> None:
+    plain = sms.estimate(SYSTEM, data)
+    assert list(plain.parameters.values()) == list(several.parameters.values())
     (tracker,) = plain.trackers
-    assert tracker.name == "kalman learned"
-    assert not tracker.drifts
+    assert tracker.name == "rls"
     assert tracker.consistency.consistent
+
+
+def test_drifts_are_least_squares_until_something_moves(data: sms.Capture) -> None:
+    learned, rls = (sms.estimate(SYSTEM, data, tracker=tracker) for tracker in ("kalman:drift=learned", "rls"))
+    for here, there in zip(learned.parameters.values(), rls.parameters.values(), strict=True):
+        assert (here.value, here.std) == pytest.approx((there.value, there.std), rel=1e-9)
+    assert not learned.trackers[0].drifts
 
 
 def test_estimates_agree_with_the_truth_within_bars(several: sms.Result) -> None:

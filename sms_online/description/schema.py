@@ -236,10 +236,6 @@ class TrackerChoice(Record):
         return self == TrackerChoice()
 
 
-# Least squares of all rows until a parameter shows a drift.
-LEARNED = TrackerChoice(kind="kalman", drift="learned")
-
-
 class System(Record):
     """A whole testbed; joints, motors and links are in the order of their numbers.
 
@@ -266,8 +262,7 @@ class System(Record):
     trajectory: of the simulator.
     windows: widths of the test functions.
     tolerances: of geometry, clocks and calibration.
-    trackers: `[tracker]`, or several `[[tracker]]` tables, of which the first gives the judged estimate. By default one
-    of kind `kalman` with `drift = learned`, and where there is no momentum balance, `rls`.
+    trackers: `[tracker]`, or several `[[tracker]]` tables, of which the first gives the judged estimate.
     balance: which rows are fitted. `both`: the momentum balance, and the energy balance until its weights are known.
     `smoother`: state and parameters together, which links with too few sensors get unless it says `energy`.
     """
@@ -295,7 +290,7 @@ class System(Record):
     trajectory: Trajectory | None = None
     windows: Windows = Windows()
     tolerances: Tolerances = Tolerances()
-    trackers: Annotated[tuple[TrackerChoice, ...], Field(min_length=1)] = (LEARNED,)
+    trackers: Annotated[tuple[TrackerChoice, ...], Field(min_length=1)] = (TrackerChoice(),)
     balance: Literal["both", "energy", "momentum", "smoother"] = "both"
 
     @property

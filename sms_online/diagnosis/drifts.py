@@ -13,7 +13,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from sms_online.description.schema import LEARNED, System
+from sms_online.description.schema import System, TrackerChoice
 from sms_online.diagnosis.evidence import least_squares
 from sms_online.diagnosis.weak_rows import WeakRows
 from sms_online.evaluation import Evaluation
@@ -28,6 +28,7 @@ from sms_online.verdict.trust import Reason, Trust
 KNOTS, LEAST_ROWS = 4, 2
 # Mean square, over the noise's, and share of what parameters that stay leave, beyond which it is not.
 MUCH_MORE, LEFT = 10.0, 0.1
+LEARNED = TrackerChoice(kind="kalman", drift="learned")
 
 
 def following(system: System) -> System:

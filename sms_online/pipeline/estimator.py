@@ -118,7 +118,7 @@ class Estimator(Stage):
         # A balance of forces does not hold in a shape that is not the link's; energies tolerate it best.
         by_energy = system.balance == "energy" or self.sensing.missing or (self.smoother is not None and self._slow)
         self._relinearisation = None if by_energy else Relinearisation(model, base, self.sensing, self._begin_joints)
-        if by_energy and "trackers" in system.model_fields_set and not all(each.static for each in system.trackers):
+        if by_energy and not all(choice.static for choice in system.trackers):
             found = "a tracker of its own, and no momentum balance"
             raise InputError(system.name, "tracker", found, "rls without forgetting, or all coordinates measured")
         self.energy_tracker: Tracker = session_tracker(base.n, None)
