@@ -92,6 +92,28 @@ def test_a_badly_explained_torque_enlarges_no_parameter() -> None:
     assert found.covariance[0, 0] == pytest.approx(36.0 * OVERLAP / 4000.0, rel=0.1)
 
 
+def test_rows_of_other_weights_count_as_those_to_come() -> None:
+    """Rows that were whitened with parameters twice as large, and with a misfit 100 times as large."""
+    grams, alike = RowGrams.none(2, 2), RowGrams.none(2, 2)
+    random = np.random.default_rng(3)
+    before, now = (2.0 * TRUE, np.array([99.0, 9.0])), (TRUE, np.array([0.0, 0.09]))
+    scale = np.sqrt(1.0 + before[1]) * np.array([1.0, 2.0])  # a torque's noise does not grow with the parameters
+    scale /= np.sqrt(1.0 + now[1])
+    for window in range(200):
+        rows = random.standard_normal((2, 3))
+        added = np.array([[0.0, 0.0, 1.0], [1.0, 1.0, 0.0]]) * random.standard_normal((2, 3))
+        both = np.stack((rows + added, rows - added))
+        by = scale[:, None] if window < 100 else 1.0
+        if window == 100:
+            grams.whiten_anew(before, now)
+        grams.add(rows / by, both / by)
+        alike.add(rows, both)
+    # Rows without an excess of now are whitened against each other: those of before, which were not, gain nothing.
+    for found, expected in ((grams.signal, alike.signal), (grams.noise, alike.noise)):
+        np.testing.assert_allclose(found.matrices[1], expected.matrices[1], rtol=1e-9)
+        assert found.matrices[0, -1, -1] < 0.6 * expected.matrices[0, -1, -1]
+
+
 def test_a_nuisance_beyond_its_tolerance_shrinks_no_parameter() -> None:
     """Rows u (π_2 + ν π_2) = 0 of a nuisance ν of 100 tolerances, whose column was evaluated with the true π."""
     random = np.random.default_rng(0)

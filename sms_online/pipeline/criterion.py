@@ -74,10 +74,26 @@ class RowGrams(State):
         self.noise.add(np.stack((first, second), axis=1))
         self.windows += 1
 
-    def weaken(self, share: Array) -> None:
-        """Have the rows so far count less, (n_v,) of their squares: they were whitened with too small a variance."""
-        self.signal.weaken(share)
-        self.noise.weaken(share)
+    def whiten_anew(self, before: tuple[Array, Array], now: tuple[Array, Array]) -> None:
+        """Have the rows so far count as those to come, whose variance others predict: their weights and misfit.
+
+        Either (n,), of the parameters behind the variance, and (n_v,). Rows that leave more than noise are weighted by
+        what they were thought to leave then: it may differ a hundredfold from one time to the next. Rows to come that
+        leave no more are whitened against each other, as those before were not: these count no more than they did.
+        """
+        noise = self.noise.matrices
+        then, later = ((1.0 + misfit) * self._of_noise(noise, weights) for weights, misfit in (before, now))
+        share = np.divide(then, later, out=np.ones_like(then), where=(then > 0.0) & (later > 0.0))
+        lacking = now[1] > 0.0
+        share = np.where(lacking, share, np.minimum(1.0, (1.0 + before[1]) / (1.0 + now[1])))
+        self.signal.scale(share)
+        self.noise.scale(share)
+
+    @staticmethod
+    def _of_noise(noise: Array, weights: Array) -> Array:
+        """Sum of squares (n_v,) of the rows' noise with parameters β (n,); nuisances before them make none."""
+        w = np.append(weights, -1.0)
+        return np.asarray(noise[:, -w.size :, -w.size :] @ w @ w)
 
 
 @dataclass(frozen=True)

@@ -41,6 +41,6 @@ class GramSum(State):
         if len(self.waiting) == GATHERED:
             self.total, self.waiting = self.matrices, []
 
-    def weaken(self, share: Array) -> None:
-        """Have the rows so far count less, (n_v,) of their squares."""
+    def scale(self, share: Array) -> None:
+        """Have the rows so far count so much, (n_v,) of their squares."""
         self.total, self.waiting = share[:, None, None] * self.matrices, []

@@ -30,11 +30,12 @@ class JointEstimateState(State):
     """What a joint estimate keeps beside its sums.
 
     known (k, m + n + 1): what is known from before an event, as rows [N Y b] of unit variance. misfit (n_v,): behind
-    the rows that came last.
+    the rows that came last; weights (n,): likewise, None before the first.
     """
 
     known: Array
     misfit: Array
+    weights: Array | None = None
 
 
 class JointEstimate(Stage):
@@ -75,10 +76,11 @@ class JointEstimate(Stage):
         M = rows.Y.shape[0]
         self.tracker.update(Rows(rows.Y[:, :-1], rows.Y[:, -1], np.ones(M), np.full(M, t)))
         self.bias.add(rows.Y, rows.noisy)
-        if np.any(rows.misfit != self.state.misfit):
-            # Rows that were whitened as if the model lacked less must not outweigh those to come.
-            self.grams.weaken(np.minimum(1.0, (1.0 + self.state.misfit) / (1.0 + rows.misfit)))
-            self.state.misfit = rows.misfit
+        now, before = self.state, self.state.weights
+        if before is None or np.any(rows.misfit != now.misfit) or np.any(rows.weights != before):
+            if before is not None:
+                self.grams.whiten_anew((before, now.misfit), (rows.weights, rows.misfit))
+            now.weights, now.misfit = rows.weights, rows.misfit
         self.grams.add(rows.Y, rows.noisy)
 
     def estimate(self, fit: MomentumFit) -> Estimate:

@@ -342,8 +342,8 @@ class MomentumFit(Stage):
             covariance, noise = each.covariance + unsteady, each.noise + unsteady
             out.append(
                 WhiteRows(
-                    white[k, 0], white[k, 1:], raw[k], covariance, noise, window.end, each.late, misfit, ramp[k],
-                    drifts[k],
+                    white[k, 0], white[k, 1:], raw[k], covariance, noise, window.end, each.late, misfit,
+                    self._known_weights, ramp[k], drifts[k],
                 )
             )  # fmt: skip
         return out
