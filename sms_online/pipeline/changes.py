@@ -61,13 +61,14 @@ class Adoption:
     """What the session goes on with after an event.
 
     base: its parameters, of `model`. known: what is known of them. weights (n,): values behind the weights of the rows
-    to come. samples: those after the event.
+    to come. misfit (n_v,): what the model lacked in the rows before, see `WhiteRows`. samples: those after the event.
     """
 
     model: Model
     base: BaseParameters
     known: Information
     weights: Array
+    misfit: Array
     samples: GridSamples
 
 
@@ -188,7 +189,8 @@ class Changes(Stage):
     def decide(self, noise: SensorNoise, start_time: float, last: bool) -> Adoption | None:
         """The event, once the windows after it suffice to decide; last: in this segment no more of them come.
 
-        start_time: s of grid index 0.
+        Where the model lacked something before, only a jump that explains the rows is one, and the alarm is dismissed
+        otherwise. start_time: s of grid index 0.
         """
         alarm = self.detector.alarm
         if alarm is None or self.windows_after < (LEAST_DECISION if last else self.state.wanted):
@@ -203,6 +205,9 @@ class Changes(Stage):
             self.state.wanted = self.windows_after + DECISION
             return None
         self.state.wanted = DECISION
+        if self.detector.uncertain and not (explanation.jump is not None and explanation.explained):
+            self.detector.dismiss()
+            return None
         if explanation.jump is not None and explanation.jump.kind == CLOCK:
             return self._follow_clocks(explanation, onset, alarm, start_time)
         return self._adopt(whole, base, explanation, onset, alarm, start_time)
@@ -211,6 +216,9 @@ class Changes(Stage):
         """The session ends while rows are held back: what was known before the event is all there is."""
         if self.detector.alarm is None:
             return None
+        if self.detector.uncertain:
+            self.detector.dismiss()
+            return None
         onset = self.detector.onset - MARGIN
         before = self.detector.before(onset)
         time = start_time + 0.5 * (onset + self.detector.alarm) / self._system.sample_rate
@@ -218,7 +226,7 @@ class Changes(Stage):
         self.state.events.append(Event(time, "undecided", (), (), (), (), dropped))
         weights = self.parameters(before.known)
         nothing = GridSamples(self.state.index[:0], self.state.values[:0], self.state.segment)
-        return Adoption(self.model, self.base, before.known, weights, nothing)
+        return Adoption(self.model, self.base, before.known, weights, before.misfit, nothing)
 
     def _explain(self, model: Model, base: BaseParameters, before: Seen, start: int, noise: SensorNoise) -> Explanation:
         n, m = self.base.n, len(self._nuisances)
@@ -243,7 +251,7 @@ class Changes(Stage):
             prior = prior_rows(self._nuisances, base.n)
             known = partial(np.append, np.zeros(m), weights)
             fit = MomentumFit(model, base, balance, new_noise, known, calibration=prior, point=self._point)
-            fit.go_on(weights, noise)
+            fit.go_on(weights, noise, before.misfit)
             rows = np.concatenate([white.Y for white in fit.push(windows, instants, noise)])
             explanation = explain(factor / left, rows / left, jumps)
             clocks = self._of_clocks(factor / left, rows / left)
@@ -276,12 +284,15 @@ class Changes(Stage):
                 for k, size in zip(shifted, explanation.sizes, strict=True)]  # fmt: skip
         again = np.zeros((len(shifted), m + n + 1))
         again[np.arange(len(shifted)), shifted] = [1.0 / each.tolerance for each in wide]
-        known = self.detector.before(onset - MARGIN).known.without(shifted).with_rows(again)
+        before = self.detector.before(onset - MARGIN)
+        known = before.known.without(shifted).with_rows(again)
         if (np.abs(explanation.sizes) >= LARGEST_SHIFT).any():
             known = self.beforehand.without(shifted).with_rows(again)
         self.detector = self._new_detector()
         self.detector.begin(known)
-        return Adoption(self.model, self.base, known, explanation.beta[m : m + n], self.behind(alarm))
+        return Adoption(
+            self.model, self.base, known, explanation.beta[m : m + n], before.misfit, self.behind(alarm)
+        )  # fmt: skip
 
     def _adopt(
         self, whole: Model, base: BaseParameters, explanation: Explanation, onset: int, alarm: int, start_time: float
@@ -328,7 +339,7 @@ class Changes(Stage):
         self.state.events.append(event)
         self.detector = self._new_detector()
         self.detector.begin(known)
-        return Adoption(self.model, self.base, known, weights, self.behind(last))
+        return Adoption(self.model, self.base, known, weights, before.misfit, self.behind(last))
 
     def behind(self, index: int) -> GridSamples:
         """Samples from a grid index on, as far as they are remembered."""
@@ -351,7 +362,7 @@ class Changes(Stage):
         self.state.clear, self.state.wanted = int(samples.index[0]), DECISION
         self.detector = self._new_detector()
         self.detector.begin(known)
-        return Adoption(self.model, self.base, known, weights, samples)
+        return Adoption(self.model, self.base, known, weights, np.zeros(self.model.layout.n_v), samples)
 
     def _follow_adopted(self, adopted: tuple[Effect, ...]) -> None:
         fresh = adopted[len(self.state.adopted) :]
