@@ -155,10 +155,11 @@ def kind_of(names: list[str]) -> str:
     return next((kind for kind, ends in KINDS.items() if name.endswith(ends)), "inertia")
 
 
-def explain(factor: Array, rows: Array, jumps: list[Jump]) -> Explanation:
+def explain(factor: Array, rows: Array, jumps: list[Jump], alike: float = 1.0) -> Explanation:
     """The best of the hypotheses `jumps`.
 
     factor (n + 1, n + 1): information of the rows before the event. rows (M, n + m + 1): [Y Z b] after it, whitened.
+    alike: so many rows have one error in common, and count as one.
     """
     n, M = len(factor) - 1, len(rows)
     before = np.concatenate((factor[:n, :n], rows[:, :n]))
@@ -179,16 +180,16 @@ def explain(factor: Array, rows: Array, jumps: list[Jump]) -> Explanation:
             delta = np.linalg.lstsq(scaled[:, columns], residual, rcond=None)[0]
             rest = residual - scaled[:, columns] @ delta
             ranked.append((float(rest @ rest), jump))
-    cost = COST_OF_A_JUMP + LEAST_SHARE * float(residual @ residual)
+    cost = alike * COST_OF_A_JUMP + LEAST_SHARE * float(residual @ residual)
     ranked.sort(key=lambda entry: round((entry[0] + cost * len(entry[1].columns)) / SAME))
     if not ranked:
         return Explanation(None, np.empty(0), np.empty(0), solve(factor).pi, False, True)
     rss, best = ranked[0]
     others = [other - rss for other, jump in ranked[1:] if len(jump.columns) == len(best.columns)]
-    decisive = all(more > DECISIVE or more < SAME for more in others)
+    decisive = all(more > alike * DECISIVE or more < SAME for more in others)
     columns = list(best.columns)
     fitted = solve(np.column_stack((before, jumped[:, columns], b)))
-    std = np.linalg.norm(fitted.root, axis=1)
+    std = np.sqrt(alike) * np.linalg.norm(fitted.root, axis=1)
     freedom = M - len(columns)
     beyond_noise = max(rss - freedom, 0.0) / max(float(residual @ residual) - M, 1.0)
     noise = EXPLAINED * (freedom + SCATTER * np.sqrt(2.0 * freedom))

@@ -87,7 +87,7 @@ class Momentum(Stage):
         self._point, self._changed = point, changed
         self._sample_rate = system.sample_rate
         self._span = system.windows.momentum
-        self.changes = Changes(model, base, sensing, self.nuisances, self._rebuild, point)
+        self.changes = Changes(model, base, sensing, self.nuisances, self._rebuild, point, self._beside_squares)
         self._sources, self._clocks = source_groups(sensing), clock_groups(sensing)
         self.state = MomentumState(np.random.default_rng(SEED), patient)
         self.bank = self._new_bank()
@@ -193,6 +193,9 @@ class Momentum(Stage):
     def joint_estimate(self) -> Estimate:
         """The nuisances, then the base parameters, by the session's own least squares."""
         return self.joint.estimate(self.fit)
+
+    def _beside_squares(self) -> Array:
+        return self.joint_estimate.pi - self.joint.tracker.estimate().pi
 
     @property
     def row_variance(self) -> float:
