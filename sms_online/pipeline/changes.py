@@ -207,7 +207,7 @@ class Changes(Stage):
             self.state.wanted = self.windows_after + DECISION
             return None
         self.state.wanted = DECISION
-        if self.detector.uncertain and not (explanation.jump is not None and explanation.explained):
+        if self.detector.uncertain and not (explanation.jump and explanation.explained and explanation.needed):
             self.detector.dismiss()
             return None
         if explanation.jump is not None and explanation.jump.kind == CLOCK:

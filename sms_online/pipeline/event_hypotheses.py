@@ -62,7 +62,7 @@ class Explanation:
 
     jump: None where the rows determine no hypothesis. sizes, stds: of each jump (p,). beta (n,): the parameters
     as they were before, from all rows. explained: whether it leaves little but noise. decisive: whether the next best
-    leaves clearly more.
+    leaves clearly more. needed: whether more than noise is left without it.
     """
 
     jump: Jump | None
@@ -71,6 +71,7 @@ class Explanation:
     beta: Array
     explained: bool
     decisive: bool
+    needed: bool
 
 
 def everything(system: System) -> System:
@@ -183,7 +184,7 @@ def explain(factor: Array, rows: Array, jumps: list[Jump], alike: float = 1.0) -
     cost = alike * COST_OF_A_JUMP + LEAST_SHARE * float(residual @ residual)
     ranked.sort(key=lambda entry: round((entry[0] + cost * len(entry[1].columns)) / SAME))
     if not ranked:
-        return Explanation(None, np.empty(0), np.empty(0), solve(factor).pi, False, True)
+        return Explanation(None, np.empty(0), np.empty(0), solve(factor).pi, False, True, True)
     rss, best = ranked[0]
     others = [other - rss for other, jump in ranked[1:] if len(jump.columns) == len(best.columns)]
     decisive = all(more > alike * DECISIVE or more < SAME for more in others)
@@ -192,6 +193,10 @@ def explain(factor: Array, rows: Array, jumps: list[Jump], alike: float = 1.0) -
     std = np.sqrt(alike) * np.linalg.norm(fitted.root, axis=1)
     freedom = M - len(columns)
     beyond_noise = max(rss - freedom, 0.0) / max(float(residual @ residual) - M, 1.0)
-    noise = EXPLAINED * (freedom + SCATTER * np.sqrt(2.0 * freedom))
-    explained = bool(rss <= noise) or beyond_noise <= UNEXPLAINED
-    return Explanation(best, fitted.pi[n:], std[n:], fitted.pi[:n], explained, decisive)
+    explained = rss <= _most_of_noise(freedom) or beyond_noise <= UNEXPLAINED
+    needed = float(residual @ residual) > _most_of_noise(M)
+    return Explanation(best, fitted.pi[n:], std[n:], fitted.pi[:n], explained, decisive, needed)
+
+
+def _most_of_noise(freedom: int) -> float:
+    return float(EXPLAINED * (freedom + SCATTER * np.sqrt(2.0 * freedom)))
