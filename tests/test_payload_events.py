@@ -9,7 +9,6 @@ import pytest
 
 from sms_online.pipeline.estimator import Estimator
 from sms_online.pipeline.events import Event
-from sms_online.session import Session
 from sms_online.stream import Block
 from tests.carrying_arm import carrying, described
 from tests.saved import resumed
@@ -72,16 +71,14 @@ def test_a_payload_is_an_event_beside_friction(seed: int) -> None:
 def test_two_runs_tell_the_payload_of_the_second() -> None:
     """As docs/how-to/payloads.md has it: the loaded run goes on behind a pause. Seeds 4 and 5."""
     empty, loaded = carrying(14.0, 4, 0.0, np.inf), carrying(10.0, 5, MASS, 0.0)
-    session = Session(described(), empty.channels)
-    for block in empty:
-        session.update(block)
+    estimator = Estimator(described(), empty.channels, "two runs")
+    assert events_of(estimator, list(empty)) == []
     later = empty.t[-1] + PAUSE - loaded.t[0]
-    for block in loaded:
-        session.update(Block(block.t + later, block.channels, block.values))
-    session.finish()
-    (event,) = session.result.events
+    behind = [Block(block.t + later, block.channels, block.values) for block in loaded]
+    ((_, event),) = events_of(estimator, behind)
+    estimator.finish()
     assert event.kind == "payload"
-    assert session.result.parameters["payload.mass"].value == pytest.approx(MASS, rel=WITHIN)
+    assert estimated_mass(estimator) == pytest.approx(MASS, rel=WITHIN)
 
 
 @pytest.mark.slow
