@@ -337,7 +337,8 @@ class Momentum(Stage):
     def _drift_decided(self, noise: SensorNoise) -> bool:
         """Whether rows held back need no event decided on: not yet, or they were those of a drift."""
         detector, learned = self.changes.detector, self.bank.learned
-        if detector.alarm is None or learned is None:
+        # Where rows leave more than noise no drifts are learned.
+        if detector.alarm is None or learned is None or detector.uncertain:
             return False
         onset, alarm, newest = (
             self.state.start_time + end / self._sample_rate
