@@ -31,7 +31,7 @@ from sms_online.pipeline.events import REMEMBERED, ChangeDetector, ClockShift, E
 from sms_online.pipeline.latency import wandering_clocks
 from sms_online.pipeline.momentum_balance import MARGIN, MomentumBalance
 from sms_online.pipeline.momentum_fit import MomentumFit
-from sms_online.pipeline.momentum_windows import COPIES, INSTANTS
+from sms_online.pipeline.momentum_windows import COPIES, INSTANTS, OVERLAP
 from sms_online.pipeline.sensing import Sensing
 from sms_online.pipeline.sensor_noise import SensorNoise
 from sms_online.pipeline.synchronise import GridSamples
@@ -61,13 +61,14 @@ class Adoption:
     """What the session goes on with after an event.
 
     base: its parameters, of `model`. known: what is known of them. weights (n,): values behind the weights of the rows
-    to come. samples: those after the event.
+    to come. misfit (n_v,): what the model lacked in the rows before, see `WhiteRows`. samples: those after the event.
     """
 
     model: Model
     base: BaseParameters
     known: Information
     weights: Array
+    misfit: Array
     samples: GridSamples
 
 
@@ -95,7 +96,8 @@ class Changes(Stage):
 
     model, base: current ones, with what events have added to the system's own. Information is on the session's
     nuisances and then on the parameters. renewed: called when a saved state has put other events here. point: gives the
-    nuisances (m,) that samples are corrected by.
+    nuisances (m,) that samples are corrected by. off: gives by how much the session's estimate (m + n,) differs from
+    least squares, which shrink with noise in the columns of gains where rows leave more than noise.
     """
 
     def __init__(
@@ -106,9 +108,10 @@ class Changes(Stage):
         nuisances: Sequence[Nuisance],
         renewed: Callable[[], None],
         point: Callable[[], Array],
+        off: Callable[[], Array],
     ) -> None:
         self.model, self.base = model, base
-        self._point = point
+        self._point, self._off = point, off
         self._nuisances = tuple(nuisances)
         self._system, self._described = model.system, base
         self._sensing = sensing
@@ -188,7 +191,8 @@ class Changes(Stage):
     def decide(self, noise: SensorNoise, start_time: float, last: bool) -> Adoption | None:
         """The event, once the windows after it suffice to decide; last: in this segment no more of them come.
 
-        start_time: s of grid index 0.
+        Where the model lacked something before, only a jump that explains the rows is one, and the alarm is dismissed
+        otherwise. start_time: s of grid index 0.
         """
         alarm = self.detector.alarm
         if alarm is None or self.windows_after < (LEAST_DECISION if last else self.state.wanted):
@@ -197,12 +201,15 @@ class Changes(Stage):
         names = additional(self._system, whole, self.base)
         base = extended(self._described, whole, [*self.state.added, *names])
         onset = self.detector.onset - MARGIN
-        before = self.detector.before(onset)
+        before = self._before(onset)
         explanation = self._explain(whole, base, before, max(alarm, self.state.clear), noise)
         if not (explanation.explained and explanation.decisive) and self.windows_after < LONGEST_DECISION and not last:
             self.state.wanted = self.windows_after + DECISION
             return None
         self.state.wanted = DECISION
+        if self.detector.uncertain and not (explanation.jump and explanation.explained and explanation.needed):
+            self.detector.dismiss()
+            return None
         if explanation.jump is not None and explanation.jump.kind == CLOCK:
             return self._follow_clocks(explanation, onset, alarm, start_time)
         return self._adopt(whole, base, explanation, onset, alarm, start_time)
@@ -211,6 +218,9 @@ class Changes(Stage):
         """The session ends while rows are held back: what was known before the event is all there is."""
         if self.detector.alarm is None:
             return None
+        if self.detector.uncertain:
+            self.detector.dismiss()
+            return None
         onset = self.detector.onset - MARGIN
         before = self.detector.before(onset)
         time = start_time + 0.5 * (onset + self.detector.alarm) / self._system.sample_rate
@@ -218,7 +228,12 @@ class Changes(Stage):
         self.state.events.append(Event(time, "undecided", (), (), (), (), dropped))
         weights = self.parameters(before.known)
         nothing = GridSamples(self.state.index[:0], self.state.values[:0], self.state.segment)
-        return Adoption(self.model, self.base, before.known, weights, nothing)
+        return Adoption(self.model, self.base, before.known, weights, before.misfit, nothing)
+
+    def _before(self, end: int) -> Seen:
+        """The last window that ends at or before a grid index, with what was known by then, free of its bias."""
+        seen = self.detector.before(end)
+        return replace(seen, known=seen.known.shifted(self._off())) if self.detector.uncertain else seen
 
     def _explain(self, model: Model, base: BaseParameters, before: Seen, start: int, noise: SensorNoise) -> Explanation:
         n, m = self.base.n, len(self._nuisances)
@@ -234,6 +249,8 @@ class Changes(Stage):
         # What the rows before left decides, where it is more than noise.
         factor = before.known.factor
         left = max(1.0, abs(factor[-1, -1]) / np.sqrt(max(1, before.known.rows - m - n)))
+        # Rows are not whitened of what the model lacks, which those of windows that overlap have in common.
+        alike = OVERLAP if before.misfit.any() else 1.0
 
         def new_noise() -> WindowNoise:
             calibration = CalibrationColumns(model, self._sensing, balance.span) if m else None
@@ -243,10 +260,10 @@ class Changes(Stage):
             prior = prior_rows(self._nuisances, base.n)
             known = partial(np.append, np.zeros(m), weights)
             fit = MomentumFit(model, base, balance, new_noise, known, calibration=prior, point=self._point)
-            fit.go_on(weights, noise)
+            fit.go_on(weights, noise, before.misfit)
             rows = np.concatenate([white.Y for white in fit.push(windows, instants, noise)])
-            explanation = explain(factor / left, rows / left, jumps)
-            clocks = self._of_clocks(factor / left, rows / left)
+            explanation = explain(factor / left, rows / left, jumps, alike)
+            clocks = self._of_clocks(factor / left, rows / left, alike)
             if clocks is not None:
                 return clocks
             weights = np.zeros(base.n)
@@ -255,10 +272,10 @@ class Changes(Stage):
                 weights[[k - m for k in explanation.jump.columns]] += explanation.sizes
         return explanation
 
-    def _of_clocks(self, factor: Array, rows: Array) -> Explanation | None:
+    def _of_clocks(self, factor: Array, rows: Array, alike: float) -> Explanation | None:
         """What shifts of clocks alone leave of the rows, where that is little but noise; see `explain`."""
         each = [Jump(CLOCK, (k,)) for k in self._clocks]
-        found = explain(factor, rows, [*each, Jump(CLOCK, self._clocks)] if each[1:] else each)
+        found = explain(factor, rows, [*each, Jump(CLOCK, self._clocks)] if each[1:] else each, alike)
         small = bool((np.abs(found.sizes) < LARGEST_STEP).all())
         return replace(found, decisive=True) if found.explained and small else None
 
@@ -276,12 +293,15 @@ class Changes(Stage):
                 for k, size in zip(shifted, explanation.sizes, strict=True)]  # fmt: skip
         again = np.zeros((len(shifted), m + n + 1))
         again[np.arange(len(shifted)), shifted] = [1.0 / each.tolerance for each in wide]
-        known = self.detector.before(onset - MARGIN).known.without(shifted).with_rows(again)
+        before = self._before(onset - MARGIN)
+        known = before.known.without(shifted).with_rows(again)
         if (np.abs(explanation.sizes) >= LARGEST_SHIFT).any():
             known = self.beforehand.without(shifted).with_rows(again)
         self.detector = self._new_detector()
         self.detector.begin(known)
-        return Adoption(self.model, self.base, known, explanation.beta[m : m + n], self.behind(alarm))
+        return Adoption(
+            self.model, self.base, known, explanation.beta[m : m + n], before.misfit, self.behind(alarm)
+        )  # fmt: skip
 
     def _adopt(
         self, whole: Model, base: BaseParameters, explanation: Explanation, onset: int, alarm: int, start_time: float
@@ -301,7 +321,7 @@ class Changes(Stage):
         guard = GUARD * self._half_hop
         first, last = (onset, alarm) if instant is None else (int(instant) - guard, int(np.ceil(instant)) + guard)
         at = 0.5 * (first + last) if instant is None else instant
-        before = self.detector.before(first - MARGIN)
+        before = self._before(first - MARGIN)
         fresh = [base.parameters[k].name for k in columns if k >= n]
         if fresh:
             self.state.added += fresh
@@ -328,7 +348,7 @@ class Changes(Stage):
         self.state.events.append(event)
         self.detector = self._new_detector()
         self.detector.begin(known)
-        return Adoption(self.model, self.base, known, weights, self.behind(last))
+        return Adoption(self.model, self.base, known, weights, before.misfit, self.behind(last))
 
     def behind(self, index: int) -> GridSamples:
         """Samples from a grid index on, as far as they are remembered."""
@@ -351,7 +371,7 @@ class Changes(Stage):
         self.state.clear, self.state.wanted = int(samples.index[0]), DECISION
         self.detector = self._new_detector()
         self.detector.begin(known)
-        return Adoption(self.model, self.base, known, weights, samples)
+        return Adoption(self.model, self.base, known, weights, np.zeros(self.model.layout.n_v), samples)
 
     def _follow_adopted(self, adopted: tuple[Effect, ...]) -> None:
         fresh = adopted[len(self.state.adopted) :]

@@ -62,7 +62,7 @@ class Explanation:
 
     jump: None where the rows determine no hypothesis. sizes, stds: of each jump (p,). beta (n,): the parameters
     as they were before, from all rows. explained: whether it leaves little but noise. decisive: whether the next best
-    leaves clearly more.
+    leaves clearly more. needed: whether more than noise is left without it.
     """
 
     jump: Jump | None
@@ -71,6 +71,7 @@ class Explanation:
     beta: Array
     explained: bool
     decisive: bool
+    needed: bool
 
 
 def everything(system: System) -> System:
@@ -155,10 +156,11 @@ def kind_of(names: list[str]) -> str:
     return next((kind for kind, ends in KINDS.items() if name.endswith(ends)), "inertia")
 
 
-def explain(factor: Array, rows: Array, jumps: list[Jump]) -> Explanation:
+def explain(factor: Array, rows: Array, jumps: list[Jump], alike: float = 1.0) -> Explanation:
     """The best of the hypotheses `jumps`.
 
     factor (n + 1, n + 1): information of the rows before the event. rows (M, n + m + 1): [Y Z b] after it, whitened.
+    alike: so many rows have one error in common, and count as one.
     """
     n, M = len(factor) - 1, len(rows)
     before = np.concatenate((factor[:n, :n], rows[:, :n]))
@@ -179,18 +181,22 @@ def explain(factor: Array, rows: Array, jumps: list[Jump]) -> Explanation:
             delta = np.linalg.lstsq(scaled[:, columns], residual, rcond=None)[0]
             rest = residual - scaled[:, columns] @ delta
             ranked.append((float(rest @ rest), jump))
-    cost = COST_OF_A_JUMP + LEAST_SHARE * float(residual @ residual)
+    cost = alike * COST_OF_A_JUMP + LEAST_SHARE * float(residual @ residual)
     ranked.sort(key=lambda entry: round((entry[0] + cost * len(entry[1].columns)) / SAME))
     if not ranked:
-        return Explanation(None, np.empty(0), np.empty(0), solve(factor).pi, False, True)
+        return Explanation(None, np.empty(0), np.empty(0), solve(factor).pi, False, True, True)
     rss, best = ranked[0]
     others = [other - rss for other, jump in ranked[1:] if len(jump.columns) == len(best.columns)]
-    decisive = all(more > DECISIVE or more < SAME for more in others)
+    decisive = all(more > alike * DECISIVE or more < SAME for more in others)
     columns = list(best.columns)
     fitted = solve(np.column_stack((before, jumped[:, columns], b)))
-    std = np.linalg.norm(fitted.root, axis=1)
+    std = np.sqrt(alike) * np.linalg.norm(fitted.root, axis=1)
     freedom = M - len(columns)
     beyond_noise = max(rss - freedom, 0.0) / max(float(residual @ residual) - M, 1.0)
-    noise = EXPLAINED * (freedom + SCATTER * np.sqrt(2.0 * freedom))
-    explained = bool(rss <= noise) or beyond_noise <= UNEXPLAINED
-    return Explanation(best, fitted.pi[n:], std[n:], fitted.pi[:n], explained, decisive)
+    explained = rss <= _most_of_noise(freedom) or beyond_noise <= UNEXPLAINED
+    needed = float(residual @ residual) > _most_of_noise(M)
+    return Explanation(best, fitted.pi[n:], std[n:], fitted.pi[:n], explained, decisive, needed)
+
+
+def _most_of_noise(freedom: int) -> float:
+    return float(EXPLAINED * (freedom + SCATTER * np.sqrt(2.0 * freedom)))

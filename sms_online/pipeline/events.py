@@ -11,7 +11,7 @@ window to the next, since what the two widths pass of the same noise differs in 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import msgspec
 import numpy as np
@@ -40,7 +40,8 @@ CUMULATIVE_ALARM = 100.0
 CAPPED = 10.0
 SLACK = 1.0
 # The test sleeps where past rows leave more than this times their predicted variance: then the model lacks something,
-# and what it lacks varies with the motion.
+# and what it lacks varies with the motion. Once the rows' covariance counts what it lacks, and for WARM_UP has, what is
+# large alarms again.
 LARGEST_LEVEL = 1.3
 
 
@@ -81,13 +82,14 @@ class ClockShift:
 class Seen:
     """A window that the test has seen: its rows before whitening across windows, and the information after it.
 
-    end: grid index of its last sample. raw (n_v, n + 1), covariance (n_v, n_v): as in WhiteRows. known: information of
-    all rows taken in up to and with this window.
+    end: grid index of its last sample. raw (n_v, n + 1), covariance (n_v, n_v), misfit (n_v,): as in WhiteRows. known:
+    information of all rows taken in up to and with this window.
     """
 
     end: int
     raw: Array
     covariance: Array
+    misfit: Array
     known: Information
 
 
@@ -96,7 +98,8 @@ class DetectorState(State):
 
     known, history, alarm, onset: see `ChangeDetector`. tested: windows; levels: sum of their χ² / n_v, none for more
     than the cumulative sum counts it; level: what the next ones are measured by. sum: the cumulative sum. loud: windows
-    in a row beyond ALARM. moved (n,): drift that rows of now are free of, None where there is none.
+    in a row beyond ALARM. lacking: windows in a row since the model is known to lack something. moved (n,): drift that
+    rows of now are free of, None where there is none.
     """
 
     known: Information
@@ -108,6 +111,7 @@ class DetectorState(State):
     levels: float = 0.0
     sum: float = 0.0
     loud: int = 0
+    lacking: int = 0
     moved: Array | None = None
 
 
@@ -142,6 +146,15 @@ class ChangeDetector(Stage):
         return self.state.alarm
 
     @property
+    def uncertain(self) -> bool:
+        """Whether what the model lacked before may be behind an alarm too."""
+        return self.state.lacking > 0
+
+    def dismiss(self) -> None:
+        """Nothing has changed: go on with what was known before the alarm, as at the beginning."""
+        self.begin(self.known)
+
+    @property
     def onset(self) -> int:
         """Grid index of the last window that is surely undisturbed."""
         return self.state.onset
@@ -149,24 +162,27 @@ class ChangeDetector(Stage):
     def push(self, rows: WhiteRows, misfit: bool) -> bool:
         """Test a window; whether to take its rows in: not from an alarm on.
 
-        misfit: the model lacks something already, and what it lacks varies with the motion: the test sleeps.
+        misfit: the model lacks something already, and what it lacks varies with the motion: only what is large alarms.
         """
         if self.state.alarm is None:
             self._test(rows, misfit)
         if self.state.alarm is None:
             self.state.known = self.state.known.with_rows(rows.Y)
-        seen = Seen(rows.end, rows.raw, rows.covariance, self.state.known)
+        seen = Seen(rows.end, rows.raw, rows.covariance, rows.misfit, self.state.known)
         self.state.history = [*self.state.history, seen][-self._remembered :]
         return self.state.alarm is None
 
     def _test(self, rows: WhiteRows, misfit: bool) -> None:
+        self.state.lacking = self.state.lacking + 1 if misfit else 0
         excess = self._excess(rows)
-        if misfit or self.state.tested <= self._warm_up or excess is None:
+        young = self.state.tested <= self._warm_up or 0 < self.state.lacking <= self._warm_up
+        if young or (self.state.level > LARGEST_LEVEL and not misfit):
             self.state.sum, self.state.loud = 0.0, 0
             return
         if self.state.sum == 0.0:
             self.state.onset = self.state.history[-1].end
-        self.state.sum = max(0.0, self.state.sum + min(excess, CAPPED) - SLACK)
+        # What the model lacks lasts as well.
+        self.state.sum = 0.0 if misfit else max(0.0, self.state.sum + min(excess, CAPPED) - SLACK)
         self.state.loud = self.state.loud + 1 if excess > ALARM else 0
         loud = self.state.loud == IN_A_ROW or excess > LOUDEST
         if loud:
@@ -174,8 +190,8 @@ class ChangeDetector(Stage):
         if loud or self.state.sum > CUMULATIVE_ALARM:
             self.state.alarm = rows.end
 
-    def _excess(self, rows: WhiteRows) -> float | None:
-        """χ² of the window less its expectation, in standard deviations √(2 n_v); None where the test sleeps."""
+    def _excess(self, rows: WhiteRows) -> float:
+        """χ² of the window less its expectation, in standard deviations √(2 n_v)."""
         late = WANDER * rows.raw[:, self._clocks]
         L = np.linalg.cholesky(rows.covariance + late @ late.T)
         own = scipy.linalg.solve_triangular(L, rows.raw, lower=True, check_finite=False)
@@ -190,9 +206,7 @@ class ChangeDetector(Stage):
         deviation = np.sqrt(2.0 / self._n_v)
         self.state.tested += 1
         self.state.levels += min(chi2 / self._n_v, 1.0 + CAPPED * deviation)
-        return (
-            None if self.state.level > LARGEST_LEVEL else float((chi2 / self._n_v / self.state.level - 1.0) / deviation)
-        )
+        return float((chi2 / self._n_v / self.state.level - 1.0) / deviation)
 
     def seen(self) -> list[Seen]:
         """The last windows, oldest first, with the drift that was subtracted from their rows."""
@@ -203,7 +217,7 @@ class ChangeDetector(Stage):
         for seen in self.state.history:
             raw = seen.raw.copy()
             raw[:, -1] += raw[:, :-1] @ moved
-            out.append(Seen(seen.end, raw, seen.covariance, seen.known.shifted(moved)))
+            out.append(replace(seen, raw=raw, known=seen.known.shifted(moved)))
         return out
 
     def before(self, end: int) -> Seen:

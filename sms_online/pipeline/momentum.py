@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 
+import msgspec
 import numpy as np
 
 from sms_online.calibration.columns import CalibrationColumns
@@ -45,7 +46,7 @@ class MomentumState(State):
 
     sensor_noise: that of the samples so far. newest_row: time of the last window's end, s. start_time: of grid index 0,
     s. random: gives the synthetic noise. patient: whether more than noise in the beginning may be a drift yet to be
-    learned. drift: known to windows to come.
+    learned. drift: known to windows to come. held: rows since an alarm that may be false.
     """
 
     random: np.random.Generator
@@ -56,6 +57,7 @@ class MomentumState(State):
     newest_row: float = -np.inf
     dropped_windows: int = 0
     drift: DriftLine | None = None
+    held: list[WhiteRows] = msgspec.field(default_factory=list)
 
 
 class Momentum(Stage):
@@ -85,7 +87,7 @@ class Momentum(Stage):
         self._point, self._changed = point, changed
         self._sample_rate = system.sample_rate
         self._span = system.windows.momentum
-        self.changes = Changes(model, base, sensing, self.nuisances, self._rebuild, point)
+        self.changes = Changes(model, base, sensing, self.nuisances, self._rebuild, point, self._beside_squares)
         self._sources, self._clocks = source_groups(sensing), clock_groups(sensing)
         self.state = MomentumState(np.random.default_rng(SEED), patient)
         self.bank = self._new_bank()
@@ -192,6 +194,9 @@ class Momentum(Stage):
         """The nuisances, then the base parameters, by the session's own least squares."""
         return self.joint.estimate(self.fit)
 
+    def _beside_squares(self) -> Array:
+        return self.joint_estimate.pi - self.joint.tracker.estimate().pi
+
     @property
     def row_variance(self) -> float:
         """Mean square of what the rows leave, in units of their predicted variance."""
@@ -243,14 +248,24 @@ class Momentum(Stage):
         adoption = self.changes.decide(noise, self.state.start_time, last)
         if adoption is not None:
             self.adopt(adoption, noise)
+        self._take_back()
+
+    def _take_back(self) -> None:
+        """Take in rows that were held back for no event."""
+        if self.changes.detector.alarm is None and self.state.held:
+            held, self.state.held = self.state.held, []
+            self.bank.release()
+            for rows in held:
+                self.changes.detector.push(rows, self.misfit)
+                self._take_in(rows)
 
     def adopt(self, adoption: Adoption, noise: SensorNoise) -> None:
         """Go on after an event with what is known from before it."""
-        bias, self.state.drift = self.joint.bias, None
+        bias, self.state.drift, self.state.held = self.joint.bias, None, []
         self._rebuild()
         self.joint.begin_behind_event(adoption.known, bias)
         self.bank.begin(adoption.known)
-        self.fit.go_on(adoption.weights, noise)
+        self.fit.go_on(adoption.weights, noise, adoption.misfit)
         if adoption.samples.index.size:
             self._process(adoption.samples, noise)
 
@@ -269,6 +284,7 @@ class Momentum(Stage):
         adoption = self.changes.abandon(self.state.start_time)
         if adoption is not None:
             self.adopt(adoption, noise)
+        self._take_back()
 
     def _absorb(self, fresh: list[WhiteRows]) -> None:
         for rows in fresh:
@@ -282,14 +298,19 @@ class Momentum(Stage):
             if not detector.push(rows, self.misfit):
                 onset = self.state.start_time + detector.onset / self._sample_rate - self._window
                 self.bank.hold(self._for_trackers(rows), onset)
+                if detector.uncertain:
+                    self.state.held = [*self.state.held, rows]
                 continue
-            t = self.state.start_time + rows.end / self._sample_rate
-            self._follow(rows)
-            self.joint.add(rows, t)
-            self.state.newest_row = t
-            self.latencies.add(rows.Y[:, len(self.nuisances) :], rows.late)
+            self._take_in(rows)
         if self.bank.follows and fresh:
             self._renew_drift()
+
+    def _take_in(self, rows: WhiteRows) -> None:
+        t = self.state.start_time + rows.end / self._sample_rate
+        self._follow(rows)
+        self.joint.add(rows, t)
+        self.state.newest_row = t
+        self.latencies.add(rows.Y[:, len(self.nuisances) :], rows.late)
 
     def _follow(self, rows: WhiteRows) -> None:
         """Hand rows to the chosen trackers, and to what watches for drifts."""
@@ -316,7 +337,8 @@ class Momentum(Stage):
     def _drift_decided(self, noise: SensorNoise) -> bool:
         """Whether rows held back need no event decided on: not yet, or they were those of a drift."""
         detector, learned = self.changes.detector, self.bank.learned
-        if detector.alarm is None or learned is None:
+        # Where rows leave more than noise no drifts are learned.
+        if detector.alarm is None or learned is None or detector.uncertain:
             return False
         onset, alarm, newest = (
             self.state.start_time + end / self._sample_rate
@@ -336,7 +358,7 @@ class Momentum(Stage):
         learned.state = before
         self.bank.go_on_behind(change, drift, held=False)
         self.bank.release()
-        self.fit.go_on(known.solution().pi[len(self.nuisances) :], noise)
+        self.fit.go_on(known.solution().pi[len(self.nuisances) :], noise, self.fit.plain.misfit)
         self._process(samples, noise)
         return True
 

@@ -190,8 +190,9 @@ class MomentumFit(Stage):
         self._forget_instants()
         return out
 
-    def go_on(self, weights: Array, noise: SensorNoise) -> None:
-        """Begin with weights β (n,) that are known."""
+    def go_on(self, weights: Array, noise: SensorNoise, misfit: Array) -> None:
+        """Begin with weights β (n,) and a misfit (n_v,) that are known."""
+        self.plain.misfit = misfit
         self.whitening.begin(weights, noise, self.plain.misfit, self.state.first)
         self.state.renewal = self._count(FIRST_RENEWAL)
 

@@ -154,7 +154,7 @@ class Relinearisation(Stage):
     def _make_rows_again(self, weights: Array, noise: SensorNoise, last: bool) -> None:
         """All rows of the session so far, about the point of now, with weights β (n,) that are known."""
         self.momentum = self._new_momentum()
-        self.momentum.fit.go_on(weights, noise)
+        self.momentum.fit.go_on(weights, noise, self.momentum.fit.plain.misfit)
         self._advance(self.linearisation.again(), noise)
         if last:
             self.momentum.end_segment(noise)
