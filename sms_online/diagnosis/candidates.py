@@ -304,11 +304,11 @@ class CandidateColumns:
     def reported(self, effect: Effect, beta: Array, coefficients: Array) -> dict[str, float]:
         """A force's coefficients as a person reads them, for parameters β (n,) and its own coefficients (c,).
 
-        Empty where β does not hold what they are relative to.
+        Empty where β does not hold what they are relative to, or none of it is determined.
         """
         force = self._model(effect).effects[-1]
         known = dict(zip((p.name for p in self.rows.base.parameters), beta.tolist(), strict=True))
-        if not known.keys() >= set(force.relative_to):
+        if not all(known.get(name) for name in force.relative_to):
             return {}
         return force.reported(np.append(coefficients, [known[name] for name in force.relative_to]))
 
