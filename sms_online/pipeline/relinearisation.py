@@ -132,10 +132,7 @@ class Relinearisation(Stage):
             self.linearisation.forget()
         if self.momentum.lacking and self.linearisation.state.samples:
             self.state.patient = False
-            self.momentum = self._new_momentum()
-            self._advance(self.linearisation.again(), noise)
-            if last:
-                self.momentum.end_segment(noise)
+            self._make_rows_again(None, noise, last)
         if not self.momentum.started or not self.linearisation.looks(self.momentum.fit.plain.windows, last):
             return
         # Where rows hold more than noise and errors of calibration, these look like what the model lacks.
@@ -151,10 +148,11 @@ class Relinearisation(Stage):
                 return
             before, weights = self.linearisation.point, self.momentum.weights
 
-    def _make_rows_again(self, weights: Array, noise: SensorNoise, last: bool) -> None:
-        """All rows of the session so far, about the point of now, with weights β (n,) that are known."""
+    def _make_rows_again(self, weights: Array | None, noise: SensorNoise, last: bool) -> None:
+        """All rows of the session so far, about the point of now, with weights β (n,); None to find them anew."""
         self.momentum = self._new_momentum()
-        self.momentum.fit.go_on(weights, noise, self.momentum.fit.plain.misfit)
+        if weights is not None:
+            self.momentum.fit.go_on(weights, noise, self.momentum.fit.plain.misfit)
         self._advance(self.linearisation.again(), noise)
         if last:
             self.momentum.end_segment(noise)

@@ -228,15 +228,19 @@ class LearnedTrend(Tracker):
             begun = ramp.since * STEP
             found.append(Moving(ramp.columns, ramp.since, 0.0, tuple(ramp.rates.tolist()), begun=begun))
             tried = self._tried(found)
+        new = len(found) > len(self.state.moving)
+        if not new and not self.patient:
+            return
         # A lack of the model leaves more than noise, whatever ramps it is taken for.
-        if len(found) > len(self.state.moving) and self._excess(found) < LARGEST_LEFT - 1.0:
+        left = self._excess(found)
+        if new and left < LARGEST_LEFT - 1.0:
             self.state.moving, self.state.changes = found, []
             self._choose()
             self.state.accepted += 1
             self.state.likeliest = self.state.suspected = None
         elif self.patient:
-            least = max(LARGEST_LEFT - 1.0, RAMPS_LEAVE * self._excess(self.state.moving))
-            self.state.lacking = self._excess(found) >= least
+            without = self._excess(self.state.moving) if new else left
+            self.state.lacking = left >= max(LARGEST_LEFT - 1.0, RAMPS_LEAVE * without)
 
     def _excess(self, moving: Sequence[Moving]) -> float:
         """Mean square of what the remembered rows leave with these moving, less that of noise."""

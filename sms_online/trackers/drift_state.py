@@ -36,8 +36,8 @@ class DriftState(State):
     one, from t = 0 on; knots: since the beginning. rows: so far; newest: time of the last, s. accepted: how often
     drifts were. quiet: whether rows leave no more than noise, without which no drift is accepted. lacking: whether they
     leave more in the beginning, which no ramps explain. until: instant that estimates hold for, s; no earlier than that
-    of the newest row. likeliest: change that the last search found, of what
-    does not move; suspected: where it is hardly chance. changes: of rates, that may have been.
+    of the newest row. likeliest: change that the last search found, of what does not move; suspected: where it is
+    hardly chance. changes: of rates, that may have been.
     """
 
     anchor: DriftFilter
