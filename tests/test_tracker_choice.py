@@ -76,6 +76,25 @@ def test_drifts_are_least_squares_until_something_moves(data: sms.Capture) -> No
     assert not learned.trackers[0].drifts
 
 
+@pytest.mark.slow
+def test_what_no_ramps_explain_is_a_lack_from_the_first_row() -> None:
+    """Patience with a drift yet to be learned ends, and rows are made again with weights that allow for friction."""
+    data = sms.simulate(SYSTEM, duration=8.0, grade="B", effects=["coulomb_friction@joint_2:torque=8"])
+    sessions = [sms.Session(SYSTEM, data.channels, tracker=tracker) for tracker in ("kalman:drift=learned", "rls")]
+    for session in sessions:
+        for block in data:
+            session.update(block)
+        session.finish()
+    learned, rls = (session.result.parameters for session in sessions)
+    momentum = sessions[0].estimator.momentum
+    assert momentum is not None
+    assert not momentum.state.patient
+    assert momentum.misfit
+    for name, here in learned.items():
+        assert here.value == pytest.approx(rls[name].value, abs=rls[name].std), name
+        assert here.std == pytest.approx(rls[name].std, rel=0.2), name
+
+
 def test_estimates_agree_with_the_truth_within_bars(several: sms.Result) -> None:
     for tracker in several.trackers:
         truth = {p.name: p.true for p in several.parameters.values()}
