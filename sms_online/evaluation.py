@@ -170,7 +170,7 @@ class Evaluation:
         readings = now.momentum.trackers
         if not readings:
             rate = rows_per_second(self.model.layout.n_v, self.model.system.windows.momentum)
-            readings = (Reading(now.setup.system.trackers[0].label, self.estimate, self.estimate.rows / rate),)
+            readings = (Reading(now.setup.trackers[0].label, self.estimate, self.estimate.rows / rate),)
         out = []
         for k, (reading, (estimate, std)) in enumerate(zip(readings, self.estimates, strict=True)):
             numbers = (estimate.pi.tolist(), std.tolist(), identifiable(estimate.pi, std).tolist())

@@ -140,7 +140,7 @@ class Recorder(Stage, Observer):
     @property
     def _most(self) -> int:
         """Instants that are kept."""
-        numbers = self._estimator.base.n * (self._estimator.base.n + 3) // 2 * len(self._estimator.system.trackers)
+        numbers = self._estimator.base.n * (self._estimator.base.n + 3) // 2 * len(self._estimator.trackers)
         return int(np.clip(MOST_NUMBERS // numbers, 2, MOST_INSTANTS))
 
     def _look(self, t: float) -> None:
@@ -162,7 +162,7 @@ class Recorder(Stage, Observer):
         instants, parameters = self.state.instants, self._estimator.base.parameters
         if not instants:
             return ()
-        n, labels = len(parameters), [choice.label for choice in self._estimator.system.trackers]
+        n, labels = len(parameters), [choice.label for choice in self._estimator.trackers]
         i, j = np.triu_indices(n)
         found = np.full((len(labels), len(instants), n + i.size), np.nan)
         first = 0

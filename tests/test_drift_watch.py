@@ -74,15 +74,17 @@ def test_a_long_session_that_nobody_watches_is_doubted(seconds: float, level: st
         assert trust.grounds[0].then == FOLLOW
 
 
-def test_drifts_are_not_watched_for_beside_wandering_clocks(tmp_path: Path) -> None:
-    """Unless a tracker follows them; from one clock they are."""
+def test_drifts_are_not_looked_for_beside_wandering_clocks(tmp_path: Path) -> None:
+    """Unless a tracker is chosen that follows them; from one clock they are, as far as there are rows for it."""
     devices, one = axis_testbed(tmp_path), sms.load_system(tomllib.loads(AXIS))
-    unwatched = [
-        momentum.bank.unwatched
-        for system in (devices, with_trackers(devices, "kalman:drift=learned"), one)
-        if (momentum := Estimator(system, ("force_1", "q_1"), "test").momentum) is not None
+    energies = one.model_copy(update={"balance": "energy"})
+    sessions = [
+        Estimator(system, ("force_1", "q_1"), "test")
+        for system in (devices, with_trackers(devices, "kalman:drift=learned"), one, with_trackers(one, "rls"))
     ]
-    assert unwatched == [True, False, False]
+    assert [each.momentum.bank.unwatched for each in sessions if each.momentum] == [True, False, False, False]
+    labels = [each.trackers[0].label for each in (*sessions, Estimator(energies, ("force_1", "q_1"), "test"))]
+    assert labels == ["rls", "kalman learned", "kalman learned", "rls", "rls"]
 
 
 def test_what_is_missing_comes_before_a_suspected_drift() -> None:

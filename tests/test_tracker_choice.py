@@ -61,19 +61,15 @@ def test_a_tracker_alone_estimates_as_beside_others(choice: str, data: sms.Captu
         assert here.std == pytest.approx(there.std, rel=0.02)
 
 
-def test_no_choice_is_least_squares_of_all_rows(data: sms.Capture, several: sms.Result) -> None:
-    plain = sms.estimate(SYSTEM, data)
-    assert list(plain.parameters.values()) == list(several.parameters.values())
-    (tracker,) = plain.trackers
-    assert tracker.name == "rls"
-    assert tracker.consistency.consistent
-
-
-def test_drifts_are_least_squares_until_something_moves(data: sms.Capture) -> None:
-    learned, rls = (sms.estimate(SYSTEM, data, tracker=tracker) for tracker in ("kalman:drift=learned", "rls"))
-    for here, there in zip(learned.parameters.values(), rls.parameters.values(), strict=True):
+def test_no_choice_learns_drifts_and_begins_as_rls(data: sms.Capture, several: sms.Result) -> None:
+    plain, learned = sms.estimate(SYSTEM, data), sms.estimate(SYSTEM, data, tracker="kalman:drift=learned")
+    assert list(plain.parameters.values()) == list(learned.parameters.values())
+    for here, there in zip(plain.parameters.values(), several.parameters.values(), strict=True):
         assert (here.value, here.std) == pytest.approx((there.value, there.std), rel=1e-9)
-    assert not learned.trackers[0].drifts
+    (tracker,) = plain.trackers
+    assert tracker.name == "kalman learned"
+    assert tracker.consistency.consistent
+    assert not tracker.drifts
 
 
 @pytest.mark.slow

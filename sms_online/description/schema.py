@@ -233,7 +233,11 @@ class TrackerChoice(Record):
     @property
     def static(self) -> bool:
         """Whether it is the session's own least squares, in which every row counts alike."""
-        return self == TrackerChoice()
+        return self == LEAST_SQUARES
+
+
+# Least squares of all rows, and the same until a parameter shows a drift.
+LEAST_SQUARES, LEARNED = TrackerChoice(), TrackerChoice(kind="kalman", drift="learned")
 
 
 class System(Record):
@@ -262,7 +266,9 @@ class System(Record):
     trajectory: of the simulator.
     windows: widths of the test functions.
     tolerances: of geometry, clocks and calibration.
-    trackers: `[tracker]`, or several `[[tracker]]` tables, of which the first gives the judged estimate.
+    trackers: `[tracker]`, or several `[[tracker]]` tables, of which the first gives the judged estimate. Without any it
+    is `kalman` with `drift = learned` where all channels that are used have one clock and there is a momentum balance,
+    `rls` otherwise.
     balance: which rows are fitted. `both`: the momentum balance, and the energy balance until its weights are known.
     `smoother`: state and parameters together, which links with too few sensors get unless it says `energy`.
     """
@@ -290,7 +296,7 @@ class System(Record):
     trajectory: Trajectory | None = None
     windows: Windows = Windows()
     tolerances: Tolerances = Tolerances()
-    trackers: Annotated[tuple[TrackerChoice, ...], Field(min_length=1)] = (TrackerChoice(),)
+    trackers: tuple[TrackerChoice, ...] = ()
     balance: Literal["both", "energy", "momentum", "smoother"] = "both"
 
     @property

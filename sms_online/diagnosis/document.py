@@ -138,7 +138,7 @@ def trust_of(diagnosis: Diagnosis, after: Evaluation | None = None) -> Trust:
     row = None if diagnosis.unexplained is None else diagnosis.unexplained.row
     rest = _after(diagnosis, after)
     if diagnosis.drifts:
-        rest = trust_with(diagnosis.drifts, diagnosis.described.system, rest)
+        rest = trust_with(diagnosis.drifts, diagnosis.estimator_before, rest)
         if not diagnosis.mistakes:
             return rest
     if not diagnosis.mistakes and not effects and diagnosis.verdict == "named":

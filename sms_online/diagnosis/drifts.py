@@ -13,7 +13,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from sms_online.description.schema import System, TrackerChoice
+from sms_online.description.schema import LEARNED, System
 from sms_online.diagnosis.evidence import least_squares
 from sms_online.diagnosis.weak_rows import WeakRows
 from sms_online.evaluation import Evaluation
@@ -28,12 +28,11 @@ from sms_online.verdict.trust import Reason, Trust
 KNOTS, LEAST_ROWS = 4, 2
 # Mean square, over the noise's, and share of what parameters that stay leave, beyond which it is not.
 MUCH_MORE, LEFT = 10.0, 0.1
-LEARNED = TrackerChoice(kind="kalman", drift="learned")
 
 
 def following(system: System) -> System:
-    """The system with a judged tracker that learns drifts; the same where it has one."""
-    return system if system.trackers[0].learns else system.model_copy(update={"trackers": (LEARNED,)})
+    """The system with a judged tracker that learns drifts."""
+    return system.model_copy(update={"trackers": (LEARNED,)})
 
 
 def leaves_more(session: Estimator) -> bool:
@@ -88,10 +87,10 @@ def summary_of(drifts: Sequence[Drift]) -> str:
     return f"{each[:1].upper()}{each[1:]}. With that followed nothing but noise is left."
 
 
-def trust_with(drifts: Sequence[Drift], before: System, after: Trust) -> Trust:
-    """The judgement of a capture with drifts: of a system whose tracker follows them, as of the session.
+def trust_with(drifts: Sequence[Drift], before: Estimator, after: Trust) -> Trust:
+    """The judgement of a capture with drifts: of a session whose tracker follows them, that one's own.
 
-    before: as described. after: of the session that follows them.
+    before: of the system as described. after: of the session that follows them.
     """
     if before.trackers[0].learns:
         return after

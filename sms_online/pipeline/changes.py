@@ -4,38 +4,32 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 
 import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from sms_online.calibration.columns import CalibrationColumns
-from sms_online.calibration.nuisance import Nuisance, known_beforehand, prior_rows
+from sms_online.calibration.nuisance import Nuisance, known_beforehand
 from sms_online.description.schema import Effect
 from sms_online.effects.build import changed_model
 from sms_online.model.base_parameters import BaseParameters
 from sms_online.model.model import Model
 from sms_online.pipeline.event_hypotheses import (
     Explanation,
-    Jump,
     additional,
     everything,
-    explain,
     extended,
-    hypotheses,
     restricted,
 )
 from sms_online.pipeline.event_instant import event_instant
+from sms_online.pipeline.event_rows import CLOCK, LARGEST_SHIFT, EventRows
 from sms_online.pipeline.events import REMEMBERED, ChangeDetector, ClockShift, Event, Seen
 from sms_online.pipeline.latency import wandering_clocks
-from sms_online.pipeline.momentum_balance import MARGIN, MomentumBalance
-from sms_online.pipeline.momentum_fit import MomentumFit
-from sms_online.pipeline.momentum_windows import COPIES, INSTANTS, OVERLAP
+from sms_online.pipeline.momentum_balance import MARGIN
+from sms_online.pipeline.momentum_windows import INSTANTS
 from sms_online.pipeline.sensing import Sensing
 from sms_online.pipeline.sensor_noise import SensorNoise
 from sms_online.pipeline.synchronise import GridSamples
-from sms_online.pipeline.window_noise import WindowNoise
 from sms_online.state import Stage, State
 from sms_online.stream import Array
 from sms_online.trackers.information import Information
@@ -47,13 +41,6 @@ LONGEST_DECISION = 40
 LEAST_DECISION = 5
 # An instant is certain to so many half hops; samples closer to it are left out on both sides.
 GUARD = 1
-# What was known goes on behind shifts of clocks by less than LARGEST_SHIFT, s. A clock that begins anew on a late host
-# may be off by more, up to LARGEST_STEP: then nothing is known afterwards, for rows are linear in less.
-LARGEST_SHIFT, LARGEST_STEP = 1e-3, 5e-3
-# Kind of that hypothesis.
-CLOCK = "clock"
-# Times that the rows after an event are whitened, each with the jumps found before.
-PASSES = 2
 
 
 @dataclass(frozen=True)
@@ -97,7 +84,8 @@ class Changes(Stage):
     model, base: current ones, with what events have added to the system's own. Information is on the session's
     nuisances and then on the parameters. renewed: called when a saved state has put other events here. point: gives the
     nuisances (m,) that samples are corrected by. off: gives by how much the session's estimate (m + n,) differs from
-    least squares, which shrink with noise in the columns of gains where rows leave more than noise.
+    least squares, which shrink with noise in the columns of gains where rows leave more than noise. drifts: whether
+    they are learned.
     """
 
     def __init__(
@@ -109,6 +97,7 @@ class Changes(Stage):
         renewed: Callable[[], None],
         point: Callable[[], Array],
         off: Callable[[], Array],
+        drifts: bool,
     ) -> None:
         self.model, self.base = model, base
         self._point, self._off = point, off
@@ -117,10 +106,11 @@ class Changes(Stage):
         self._sensing = sensing
         self._renewed = renewed
         self._clocks = wandering_clocks(sensing, self._nuisances)
+        self._drifts = drifts
         rate, span = self._system.sample_rate, self._system.windows.momentum
         self._half_hop = max(1, round(span * rate / INSTANTS))
         # Where it may have been a drift, an event is decided on later.
-        self._remembered = 2 * REMEMBERED if model.system.trackers[0].learns else REMEMBERED
+        self._remembered = 2 * REMEMBERED if self._drifts else REMEMBERED
         self.detector = self._new_detector()
         columns = len(sensing.channels) + model.n_states
         self.state = ChangesState(np.empty(0, dtype=np.int64), np.empty((0, columns)))
@@ -188,22 +178,25 @@ class Changes(Stage):
         )
         return max(0, samples // (2 * self._half_hop))
 
-    def decide(self, noise: SensorNoise, start_time: float, last: bool) -> Adoption | None:
+    def decide(self, noise: SensorNoise, start_time: float, last: bool, steps: bool = False) -> Adoption | None:
         """The event, once the windows after it suffice to decide; last: in this segment no more of them come.
 
         Where the model lacked something before, only a jump that explains the rows is one, and the alarm is dismissed
-        otherwise. start_time: s of grid index 0.
+        otherwise. start_time: s of grid index 0. steps: it may be a drift yet, and is none only where a jump explains
+        the rows and does not go on.
         """
-        alarm = self.detector.alarm
-        if alarm is None or self.windows_after < (LEAST_DECISION if last else self.state.wanted):
+        alarm, wanted = self.detector.alarm, min(self.state.wanted, LONGEST_DECISION)
+        if alarm is None or self.windows_after < (LEAST_DECISION if last else self.state.wanted if steps else wanted):
             return None
         whole = changed_model(self.model, everything(self._system))
         names = additional(self._system, whole, self.base)
         base = extended(self._described, whole, [*self.state.added, *names])
         onset = self.detector.onset - MARGIN
         before = self._before(onset)
-        explanation = self._explain(whole, base, before, max(alarm, self.state.clear), noise)
-        if not (explanation.explained and explanation.decisive) and self.windows_after < LONGEST_DECISION and not last:
+        samples = self.behind(alarm)
+        explanation, goes_on = self._rows.explain(whole, base, before, samples, (onset, alarm), noise)
+        clear = explanation.explained and explanation.decisive and not (steps and goes_on)
+        if not clear and not last and (steps or self.windows_after < LONGEST_DECISION):
             self.state.wanted = self.windows_after + DECISION
             return None
         self.state.wanted = DECISION
@@ -230,54 +223,14 @@ class Changes(Stage):
         nothing = GridSamples(self.state.index[:0], self.state.values[:0], self.state.segment)
         return Adoption(self.model, self.base, before.known, weights, before.misfit, nothing)
 
+    @property
+    def _rows(self) -> EventRows:
+        return EventRows(self._system, self._sensing, self._nuisances, self._clocks, self._point, self._drifts)
+
     def _before(self, end: int) -> Seen:
         """The last window that ends at or before a grid index, with what was known by then, free of its bias."""
         seen = self.detector.before(end)
         return replace(seen, known=seen.known.shifted(self._off())) if self.detector.uncertain else seen
-
-    def _explain(self, model: Model, base: BaseParameters, before: Seen, start: int, noise: SensorNoise) -> Explanation:
-        n, m = self.base.n, len(self._nuisances)
-        jumps = [replace(jump, columns=tuple(m + k for k in jump.columns)) for jump in hypotheses(base.parameters)]
-        after = self.state.index >= start
-        values = self.state.values[after]
-        balance = MomentumBalance(model, base, self._system.sample_rate, self._system.windows.momentum)
-        windows, instants = balance.push(
-            self.state.index[after], [self._sensing.motion(values)] * COPIES, noise.coordinates
-        )
-        weights = np.zeros(base.n)
-        weights[:n] = self.parameters(before.known)
-        # What the rows before left decides, where it is more than noise.
-        factor = before.known.factor
-        left = max(1.0, abs(factor[-1, -1]) / np.sqrt(max(1, before.known.rows - m - n)))
-        # Rows are not whitened of what the model lacks, which those of windows that overlap have in common.
-        alike = OVERLAP if before.misfit.any() else 1.0
-
-        def new_noise() -> WindowNoise:
-            calibration = CalibrationColumns(model, self._sensing, balance.span) if m else None
-            return WindowNoise(model, base, balance, self._sensing.displacements, calibration=calibration)
-
-        for _ in range(PASSES):
-            prior = prior_rows(self._nuisances, base.n)
-            known = partial(np.append, np.zeros(m), weights)
-            fit = MomentumFit(model, base, balance, new_noise, known, calibration=prior, point=self._point)
-            fit.go_on(weights, noise, before.misfit)
-            rows = np.concatenate([white.Y for white in fit.push(windows, instants, noise)])
-            explanation = explain(factor / left, rows / left, jumps, alike)
-            clocks = self._of_clocks(factor / left, rows / left, alike)
-            if clocks is not None:
-                return clocks
-            weights = np.zeros(base.n)
-            weights[:n] = explanation.beta[m:]
-            if explanation.jump is not None:
-                weights[[k - m for k in explanation.jump.columns]] += explanation.sizes
-        return explanation
-
-    def _of_clocks(self, factor: Array, rows: Array, alike: float) -> Explanation | None:
-        """What shifts of clocks alone leave of the rows, where that is little but noise; see `explain`."""
-        each = [Jump(CLOCK, (k,)) for k in self._clocks]
-        found = explain(factor, rows, [*each, Jump(CLOCK, self._clocks)] if each[1:] else each, alike)
-        small = bool((np.abs(found.sizes) < LARGEST_STEP).all())
-        return replace(found, decisive=True) if found.explained and small else None
 
     def _follow_clocks(self, explanation: Explanation, onset: int, alarm: int, start_time: float) -> Adoption:
         """Go on with the same model behind shifts of clocks, of which as much is known as they have shifted by.

@@ -38,6 +38,7 @@ from sms_online.pipeline.relinearisation import Relinearisation
 from sms_online.pipeline.sensing import AttitudeContinuity, Sensing, is_slow, stated_period
 from sms_online.pipeline.statistics import Method, Setup
 from sms_online.pipeline.synchronise import GridSamples, SyncCounters, Synchroniser
+from sms_online.pipeline.tracker_bank import session_trackers
 from sms_online.state import Stage, State
 from sms_online.stream import Array, Block
 from sms_online.threads import one_blas_thread
@@ -117,10 +118,13 @@ class Estimator(Stage):
         self._energy = EnergyBalance(model, base, system.sample_rate)
         # A balance of forces does not hold in a shape that is not the link's; energies tolerate it best.
         by_energy = system.balance == "energy" or self.sensing.missing or (self.smoother is not None and self._slow)
-        self._relinearisation = None if by_energy else Relinearisation(model, base, self.sensing, self._begin_joints)
-        if by_energy and not all(choice.static for choice in system.trackers):
+        self.trackers = session_trackers(self.sensing, not by_energy)
+        if by_energy and not all(choice.static for choice in self.trackers):
             found = "a tracker of its own, and no momentum balance"
             raise InputError(system.name, "tracker", found, "rls without forgetting, or all coordinates measured")
+        self._relinearisation = (
+            None if by_energy else Relinearisation(model, base, self.sensing, self.trackers, self._begin_joints)
+        )
         self.energy_tracker: Tracker = session_tracker(base.n, None)
         self._begin_joints()
         self._first_block, self._block = self._blocks()
@@ -253,7 +257,7 @@ class Estimator(Stage):
             current = None if self.momentum is None else self.momentum.current_prior
             now = self.model, self.base, self._base
             nuisances = () if self.momentum is None else self.momentum.nuisances
-            setup = Setup(self.system, *now, self.sensing, self.unused, self.prior, current, nuisances)
+            setup = Setup(self.system, *now, self.sensing, self.unused, self.prior, current, nuisances, self.trackers)
             self._setup = len(self.events), setup
         return self._setup[1]
 

@@ -38,6 +38,8 @@ UNEXPLAINED = 0.02
 DECISIVE = 10.0
 SAME = 1e-3
 
+# Standard deviations from which on a jump is certain, and its rate behind it certainly less.
+CERTAIN = 5.0
 # A column of which the others leave less than this share cannot jump alone.
 FREE = 1e-6
 
@@ -196,6 +198,25 @@ def explain(factor: Array, rows: Array, jumps: list[Jump], alike: float = 1.0) -
     explained = rss <= _most_of_noise(freedom) or beyond_noise <= UNEXPLAINED
     needed = float(residual @ residual) > _most_of_noise(M)
     return Explanation(best, fitted.pi[n:], std[n:], fitted.pi[:n], explained, decisive, needed)
+
+
+def goes_on(factor: Array, rows: Array, ramps: Array, explanation: Explanation, alike: float = 1.0) -> float:
+    """Share of its size by which what jumped may go on in 1 s, that of the parameter which may do so most.
+
+    Infinite where no jump is certain. factor, rows, alike: see `explain`. ramps (M, p): what each parameter that jumped
+    adds to the rows if it goes on by 1 in 1 s.
+    """
+    assert explanation.jump is not None
+    n, columns = len(factor) - 1, list(explanation.jump.columns)
+    before = np.concatenate((factor[:n, :n], np.zeros((n, len(columns) + 1)), factor[:n, -1:]), axis=1)
+    shares = []
+    for ramp, size, std in zip(ramps.T, explanation.sizes.tolist(), explanation.stds.tolist(), strict=True):
+        if abs(size) > CERTAIN * std:
+            after = np.column_stack((rows[:, :n], rows[:, columns], ramp, rows[:, -1]))
+            fitted = solve(np.concatenate((before, after)))
+            deviation = np.sqrt(alike) * float(np.linalg.norm(fitted.root[-1]))
+            shares.append((abs(float(fitted.pi[-1])) + CERTAIN * deviation) / abs(size))
+    return max(shares, default=np.inf)
 
 
 def _most_of_noise(freedom: int) -> float:

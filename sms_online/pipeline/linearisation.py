@@ -54,18 +54,20 @@ class LinearisationState(State):
 class Linearisation(Stage):
     """Corrects samples by the point ν₀ (m,), and moves it.
 
-    first: windows at the first look. Those of torques are linear, and geometry stays as described.
+    first: windows at the first look. learns: whether drifts are yet to be learned, and may turn out to be none, so that
+    samples are remembered in any case. Those of torques are linear, and geometry stays as described.
     """
 
-    def __init__(self, sensing: Sensing, nuisances: Sequence[Nuisance], sample_rate: float, first: int) -> None:
+    def __init__(
+        self, sensing: Sensing, nuisances: Sequence[Nuisance], sample_rate: float, first: int, learns: bool
+    ) -> None:
         self._sensing, self._sample_rate = sensing, sample_rate
         families = position_families(sensing, sensing.model.system.tolerances)
         clocks = np.array([each.name == "clock" for each in nuisances], dtype=np.bool_)
         self._largest = np.where(clocks, LATEST, np.inf)
         self._movable = np.arange(len(nuisances)) < sum(len(each.nuisances) for each in families)
         self._linear = np.array([getattr(LINEAR, each.name) or 0.0 for each in nuisances], dtype=np.float64)
-        # Drifts that are yet to be learned may turn out to be none.
-        remembers = bool(self._movable.any()) or sensing.model.system.trackers[0].learns
+        remembers = bool(self._movable.any()) or learns
         self.state = LinearisationState(np.zeros(len(nuisances)), first, remembers=remembers)
         self._correction = self._new_correction()
 

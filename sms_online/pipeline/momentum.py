@@ -9,6 +9,7 @@ import numpy as np
 
 from sms_online.calibration.columns import CalibrationColumns
 from sms_online.calibration.nuisance import Nuisance, prior_rows
+from sms_online.description.schema import TrackerChoice
 from sms_online.model.base_parameters import BaseParameters
 from sms_online.model.model import Model
 from sms_online.pipeline.changes import Adoption, Changes
@@ -67,8 +68,8 @@ class Momentum(Stage):
     the same. fit: what makes rows independent, and its sums. latencies: of the sources, since the last event. test:
     whether rows leave more than noise, likewise. changes: events, and the model and parameters that the session goes on
     with after them. nuisances: what the description may be wrong in. prior: what is known of the described ones
-    beforehand. point: gives the nuisances (m,) that samples are corrected by. changed: called where others come to be
-    estimated. patient: see `MomentumState`.
+    beforehand. trackers: of the session. point: gives the nuisances (m,) that samples are corrected by. changed: called
+    where others come to be estimated. patient: see `MomentumState`.
     """
 
     def __init__(
@@ -78,6 +79,7 @@ class Momentum(Stage):
         sensing: Sensing,
         nuisances: Sequence[Nuisance],
         prior: Prior | None,
+        trackers: Sequence[TrackerChoice],
         point: Callable[[], Array],
         changed: Callable[[], None],
         patient: bool,
@@ -87,7 +89,9 @@ class Momentum(Stage):
         self._point, self._changed = point, changed
         self._sample_rate = system.sample_rate
         self._span = system.windows.momentum
-        self.changes = Changes(model, base, sensing, self.nuisances, self._rebuild, point, self._beside_squares)
+        self._trackers = tuple(trackers)
+        learns = self._trackers[0].learns
+        self.changes = Changes(model, base, sensing, self.nuisances, self._rebuild, point, self._beside_squares, learns)
         self._sources, self._clocks = source_groups(sensing), clock_groups(sensing)
         self.state = MomentumState(np.random.default_rng(SEED), patient)
         self.bank = self._new_bank()
@@ -141,7 +145,9 @@ class Momentum(Stage):
         model, base, nuisances = self.changes.model, self.changes.base, self.nuisances
         prior, n_v = self.current_prior, model.layout.n_v
         steady = not self._clocks
-        return TrackerBank(model.system, base.parameters, nuisances, prior, n_v, self._window, steady)
+        return TrackerBank(
+            self._trackers, model.system.name, base.parameters, nuisances, prior, n_v, self._window, steady
+        )
 
     @property
     def _window(self) -> float:
@@ -243,9 +249,12 @@ class Momentum(Stage):
 
     def _decide(self, noise: SensorNoise, last: bool) -> None:
         """Where rows are held back for an event: decide on it, once there are enough of them, and go on."""
-        if not last and self._drift_decided(noise):
-            return
-        adoption = self.changes.decide(noise, self.state.start_time, last)
+        may_drift = not last and self._may_drift
+        adoption = self.changes.decide(noise, self.state.start_time, last, steps=may_drift)
+        if adoption is None and may_drift:
+            if self._drift_decided(noise):
+                return
+            adoption = self.changes.decide(noise, self.state.start_time, last)
         if adoption is not None:
             self.adopt(adoption, noise)
         self._take_back()
@@ -334,12 +343,17 @@ class Momentum(Stage):
             b = b + rows.Y[:, m:-1] @ rows.drift.moved + rows.ramp @ rows.drift.rate
         return Rows(rows.Y[:, :-1], b, np.ones(b.size), np.full(b.size, centre), ramp)
 
+    @property
+    def _may_drift(self) -> bool:
+        """Whether rows are held back that may be those of a drift; where rows leave more than noise none is learned."""
+        detector = self.changes.detector
+        return detector.alarm is not None and self.bank.learned is not None and not detector.uncertain
+
     def _drift_decided(self, noise: SensorNoise) -> bool:
         """Whether rows held back need no event decided on: not yet, or they were those of a drift."""
         detector, learned = self.changes.detector, self.bank.learned
-        # Where rows leave more than noise no drifts are learned.
-        if detector.alarm is None or learned is None or detector.uncertain:
-            return False
+        assert detector.alarm is not None
+        assert learned is not None
         onset, alarm, newest = (
             self.state.start_time + end / self._sample_rate
             for end in (detector.onset, detector.alarm, detector.history[-1].end)

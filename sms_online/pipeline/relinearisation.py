@@ -7,12 +7,13 @@ does where rows turn out to lack more than a drift that was yet to be learned: t
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 
 import msgspec
 
 from sms_online.calibration.columns import nuisances
+from sms_online.description.schema import TrackerChoice
 from sms_online.model.base_parameters import BaseParameters
 from sms_online.model.model import Model
 from sms_online.pipeline.changes import Adoption
@@ -52,11 +53,20 @@ class RelinearisationState(State):
 class Relinearisation(Stage):
     """Hands corrected samples to a momentum balance, and begins another one where the correction changes.
 
-    momentum: the balance of now. changed: called where other parameters come to be estimated.
+    momentum: the balance of now. trackers: of the session, see `session_trackers`. changed: called where other
+    parameters come to be estimated.
     """
 
-    def __init__(self, model: Model, base: BaseParameters, sensing: Sensing, changed: Callable[[], None]) -> None:
+    def __init__(
+        self,
+        model: Model,
+        base: BaseParameters,
+        sensing: Sensing,
+        trackers: Sequence[TrackerChoice],
+        changed: Callable[[], None],
+    ) -> None:
         system = model.system
+        self._trackers = tuple(trackers)
         self._described, self._sensing, self._changed = (model, base), sensing, changed
         self._nuisances = nuisances(sensing)
         self._prior: Prior | None = None
@@ -64,13 +74,13 @@ class Relinearisation(Stage):
         self._estimate = NoiseEstimate(sensing, system.sample_rate, PASS_BAND / span)
         self._renewed = round(NOISE_RENEWED * system.sample_rate)
         first = round(FIRST_MOTION * HOPS / span)
-        self.linearisation = Linearisation(sensing, self._nuisances, system.sample_rate, first)
+        self.linearisation = Linearisation(sensing, self._nuisances, system.sample_rate, first, trackers[0].learns)
         self.state = RelinearisationState()
         self.momentum = self._new_momentum()
 
     def _new_momentum(self) -> Momentum:
         return Momentum(
-            *self._described, self._sensing, self._nuisances, self._prior, self._point, self._changed,
+            *self._described, self._sensing, self._nuisances, self._prior, self._trackers, self._point, self._changed,
             self.state.patient,
         )  # fmt: skip
 

@@ -15,7 +15,7 @@ import numpy as np
 
 from sms_online.calibration.nuisance import Nuisance
 from sms_online.calibration.release import released
-from sms_online.description.schema import System
+from sms_online.description.schema import System, TrackerChoice
 from sms_online.model.base_parameters import BaseParameters
 from sms_online.model.model import Model
 from sms_online.pipeline.criterion import ScaleFree
@@ -49,8 +49,8 @@ class Setup:
 
     system: as described. model, base: with what events have added; described: base parameters of the system itself.
     unused: channels of the source that play no part. prior: on `described`; current_prior: on `base`, of which nothing
-    is known beforehand where something has changed. nuisances: what the description may be wrong in. Pickled
-    once, and one object wherever the same is read again.
+    is known beforehand where something has changed. nuisances: what the description may be wrong in. trackers: of the
+    session, the judged one first. Pickled once, and one object wherever the same is read again.
     """
 
     system: System
@@ -62,6 +62,7 @@ class Setup:
     prior: Prior | None
     current_prior: Prior | None
     nuisances: tuple[Nuisance, ...]
+    trackers: tuple[TrackerChoice, ...]
 
     def __reduce__(self) -> tuple[Any, ...]:
         packed = vars(self).get("_packed")
@@ -174,7 +175,7 @@ class Statistics:
         if self.method == "energy":
             return self.energy_estimate()
         assert self.momentum is not None
-        if not setup.system.trackers[0].static:
+        if not setup.trackers[0].static:
             return self.momentum.trackers[0].estimate
         rows, scale_free = self.momentum.tracker.estimate(), self.momentum.scale_free
         if scale_free is None:

@@ -9,11 +9,13 @@ import msgspec
 import numpy as np
 
 from sms_online.calibration.nuisance import Nuisance
-from sms_online.description.schema import System, TrackerChoice
+from sms_online.description.schema import LEARNED, LEAST_SQUARES, TrackerChoice
 from sms_online.model.parameters import Parameter
 from sms_online.pipeline.drift_line import DriftLine
 from sms_online.pipeline.errors_in_variables import NoiseBias
+from sms_online.pipeline.latency import clock_groups
 from sms_online.pipeline.momentum_windows import HOPS
+from sms_online.pipeline.sensing import Sensing
 from sms_online.state import Stage, State
 from sms_online.stream import Array
 from sms_online.trackers.build import Tracked, build_tracker, build_watch
@@ -29,6 +31,15 @@ LOOKED = 1.0
 # Times behind an alarm when it is asked whether it was a drift, s, where the judged tracker is a learned trend: the
 # first shows nothing but a fast drift, the second a step too, and the last is for what is unclear till then.
 WAITED = (3.0, 4.4, 6.5)
+
+
+def session_trackers(sensing: Sensing, momentum: bool) -> tuple[TrackerChoice, ...]:
+    """The trackers of a session: those that are stated, or one that learns drifts where these can be known.
+
+    Without a momentum balance it has no rows, and clocks of several devices wander as if parameters moved.
+    """
+    learned = momentum and not clock_groups(sensing)
+    return sensing.model.system.trackers or ((LEARNED,) if learned else (LEAST_SQUARES,))
 
 
 @dataclass(frozen=True)
@@ -91,14 +102,16 @@ class BankState(State):
 class TrackerBank(Stage):
     """The chosen trackers of one session, from one event to the next.
 
-    system: with its choice. parameters (n,): columns of the rows behind those of the nuisances. prior: of the
-    parameters. span: of a window, s. steady: all channels have one clock; clocks of several devices wander, as if
-    parameters moved, and no drift is suspected. InputError where a choice does not fit the parameters.
+    trackers: those of the session. name: of the system. parameters (n,): columns of the rows behind those of the
+    nuisances. prior: of the parameters. span: of a window, s. steady: all channels have one clock; clocks of several
+    devices wander, as if parameters moved, and no drift is suspected. InputError where a choice does not fit the
+    parameters.
     """
 
     def __init__(
         self,
-        system: System,
+        trackers: Sequence[TrackerChoice],
+        name: str,
         parameters: Sequence[Parameter],
         nuisances: Sequence[Nuisance],
         prior: Prior | None,
@@ -118,14 +131,14 @@ class TrackerBank(Stage):
         )
         self._rows_per_second = rows_per_second(rows_a_window, span)
         rate = self._rows_per_second
-        tracked = Tracked(parameters, tolerance.size, known, prior is not None, rate, system.name)
+        tracked = Tracked(parameters, tolerance.size, known, prior is not None, rate, name)
         self._chosen = [
-            _Chosen(choice, None if choice.static and system.trackers[0].static else build_tracker(choice, tracked))
-            for choice in system.trackers
+            _Chosen(choice, None if choice.static and trackers[0].static else build_tracker(choice, tracked))
+            for choice in trackers
         ]
         self._names = [p.name for p in parameters]
         # A judged tracker that lets nothing move is watched: rows that show a drift speak against it.
-        judged = system.trackers[0]
+        judged = trackers[0]
         self._still = judged.kind != "kalman" or judged.drift == "none"
         self._watch = build_watch(tracked) if steady and self._still else None
         # By name, for each is saved as a stage within.

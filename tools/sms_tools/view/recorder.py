@@ -93,7 +93,7 @@ class Recorder:
         stream = self._sink.stream
         self._numbers = NumberLog(stream)
         self._parameters = ParameterLog(self._numbers, self._groups())
-        chosen = self._now.statistics.setup.system.trackers
+        chosen = self._now.statistics.setup.trackers
         self._trackers = TrackerLog(self._numbers, [choice.label for choice in chosen])
         self._trackers.describe(self._now.parameters)
         self._opened(self._sink.open(self._layout()))
