@@ -36,8 +36,8 @@ CLOCK = "clock"
 # Times that the rows after an event are whitened, each with the jumps found before.
 PASSES = 2
 # A jump is a step where its parameters then go on by less than this share of the rate that would have brought them
-# there since it began.
-LARGEST_PROGRESS = 0.2
+# there since it began. A drift may have begun so long before the alarm, s: its first part hides in the noise.
+LARGEST_PROGRESS, HIDDEN = 0.2, 2.0
 
 
 @dataclass(frozen=True)
@@ -106,7 +106,7 @@ class EventRows:
         ramp = np.concatenate([t * each.Y[:, m:-1] + each.ramp for t, each in zip(after, white, strict=True)])
         ramps = ramp[:, [k - m for k in explanation.jump.columns]]
         share = goes_on(factor / left, rows / left, ramps / left, explanation, alike)
-        return explanation, share * (alarm - onset) / system.sample_rate > LARGEST_PROGRESS
+        return explanation, share * max((alarm - onset) / system.sample_rate, HIDDEN) > LARGEST_PROGRESS
 
     def _of_clocks(self, factor: Array, rows: Array, alike: float) -> Explanation | None:
         """What shifts of clocks alone leave of the rows, where that is little but noise; see `explain`."""
