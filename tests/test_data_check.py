@@ -13,6 +13,7 @@ import sms_online as sms
 from sms_online.description.parse import parse_system
 from sms_online.stream import Array
 from sms_tools.cli import main
+from sms_tools.exit_codes import NOTHING_DETERMINED
 from tests.axis import AXIS, axis_block
 from tests.simulations import planar_capture
 
@@ -164,7 +165,7 @@ def test_a_replay_begins_with_what_is_the_matter(tmp_path: Path, capsys: pytest.
     (tmp_path / "axis.toml").write_text(AXIS + SENSORS)
     sms.write_capture(capture(stuck), tmp_path / "run.csv")
     arguments = ["replay", str(tmp_path / "run.csv"), "--system", str(tmp_path / "axis.toml"), "--out", str(tmp_path)]
-    assert main(arguments) == 0
+    assert main(arguments) == NOTHING_DETERMINED
     assert "check: q_1: stuck at" in capsys.readouterr().err
     warnings = json.loads((tmp_path / "results.json").read_text())["warnings"]
     assert any(warning.startswith("q_1: stuck at") for warning in warnings)

@@ -19,7 +19,7 @@ from tests.test_tracing import SPEEDS, WINDOWS, made_up_rows
 
 BEGIN, SHARE, SECONDS = 6.0, 0.001, 24.0  # s, of the inertia that is lost in a second, s
 RATE = -SHARE * INERTIA
-LEARNED = "kalman:drift=learned"
+RLS = '[tracker]\nkind = "rls"\n'
 
 
 def system(more: str = "") -> sms.System:
@@ -44,7 +44,7 @@ def drifting() -> sms.Capture:
 
 @pytest.fixture(scope="module")
 def found(drifting: sms.Capture) -> sms.Diagnosis:
-    return sms.diagnose(system(), drifting)
+    return sms.diagnose(system(RLS), drifting)
 
 
 @pytest.mark.slow
@@ -71,8 +71,8 @@ def test_the_system_that_was_found_follows_the_drift(found: sms.Diagnosis, drift
 
 
 @pytest.mark.slow
-def test_a_tracker_that_follows_it_already_is_trusted(drifting: sms.Capture) -> None:
-    again = sms.diagnose(system('[tracker]\nkind = "kalman"\ndrift = "learned"\n'), drifting)
+def test_a_drift_that_is_followed_already_is_trusted(drifting: sms.Capture) -> None:
+    again = sms.diagnose(system(), drifting)
     assert [drift.parameter for drift in again.drifts] == ["link_1.inertia"]
     assert again.trust.level == "trust"
 
@@ -111,7 +111,7 @@ def test_a_step_stays_an_event() -> None:
 
 @pytest.mark.slow
 def test_the_command_writes_a_system_file_that_follows(tmp_path: Path, drifting: sms.Capture) -> None:
-    (tmp_path / "axis.toml").write_text(AXIS, encoding="utf-8")
+    (tmp_path / "axis.toml").write_text(AXIS + RLS, encoding="utf-8")
     sms.write_capture(drifting, tmp_path / "run.csv")
     options = ["--system", str(tmp_path / "axis.toml"), "--out", str(tmp_path / "found"), "--rerun", "off"]
     assert main(["diagnose", str(tmp_path / "run.csv"), *options]) == 0

@@ -15,7 +15,7 @@ from sms_online.effects.build import build_model
 from sms_online.model.base_parameters import find_base_parameters
 from sms_online.pipeline.estimator import Estimator
 from sms_online.pipeline.events import Event
-from sms_online.pipeline.momentum_balance import MARGIN
+from sms_online.pipeline.momentum_balance import half_widths
 from sms_online.pipeline.momentum_windows import HOPS
 from sms_online.stream import Array, Block
 from sms_online.trackers.factor import solve, triangular_factor
@@ -264,4 +264,4 @@ def test_windows_are_smoothed_with_samples_of_their_side_only() -> None:
     assert estimator.momentum is not None
     first = estimator.momentum.changes.detector.history[0]
     width = round(SYSTEM.windows.momentum * RATE)
-    assert first.end - width - MARGIN >= CHANGE * RATE
+    assert first.end - width - half_widths(width)[-1] >= CHANGE * RATE

@@ -74,5 +74,5 @@ def test_health_has_innovations_with_their_band_and_memory(folder: Path) -> None
 def test_one_tracker_has_no_curves_of_its_own(folder: Path, tmp_path: Path) -> None:
     options = ["--system", str(folder / "axis.toml"), "--out", str(tmp_path), "--rerun", "save", "-to", "5"]
     assert main(["replay", str(folder / "run.csv"), *options]) == 0
-    assert columns(tmp_path / "session.rrd", f"/trackers/{PARAMETERS[0]}/1_rls/value") == []
-    assert drawn(tmp_path, "/health/innovations/1_rls").shape[1] == 3
+    assert columns(tmp_path / "session.rrd", f"/trackers/{PARAMETERS[0]}/1_kalman_learned/value") == []
+    assert drawn(tmp_path, "/health/innovations/1_kalman_learned").shape[1] == 3
