@@ -52,7 +52,7 @@ def test_least_squares_beside_it_says_that_it_fails(followed: sms.Result) -> Non
 
 @pytest.mark.long
 def test_without_a_tracker_that_follows_nothing_is_green(data: sms.Capture) -> None:
-    result = sms.estimate(sms.load_system("paper-planar"), data)
+    result = sms.estimate(sms.load_system("paper-planar"), data, tracker="rls")
     stiffness = result.parameters[STIFFNESS]
     assert stiffness.true is not None
     assert abs(stiffness.value - stiffness.true) > 10.0 * stiffness.std
