@@ -88,7 +88,7 @@ class Evaluation:
         From the residual: the larger of two answers. One takes the rows' errors as independent with the residual's
         variance, the other allows errors that last within clusters of rows. To it comes what errors add that rows of an
         energy window share, which least squares absorbs and no residual shows; it is known while no row is forgotten.
-        Where rows have been weighted against a prior, the posterior's own covariance holds.
+        Where rows have been weighted against a prior and leave no more than noise, the posterior's own covariance holds.
         """
         return self._reported(self.estimate)
 
@@ -99,11 +99,11 @@ class Evaluation:
         if estimate.dof <= 0.0:
             return std
         known = estimate.determined
-        if estimate.scale is not None or now.method == "smoother":
+        misfit = self._misfit
+        if now.method == "smoother" or (estimate.scale is not None and not misfit):
             std[known] = estimate.std[known]
             return std
         row_variance = estimate.rss / estimate.dof
-        misfit = now.momentum is not None and now.momentum.rows.misfit.any()
         if now.method == "momentum" and row_variance <= LARGEST_ROW_VARIANCE and not misfit:
             std[known] = estimate.std[known]
             return std
@@ -115,6 +115,12 @@ class Evaluation:
             variance = variance + now.shared.variance(inverse, row_variance)[known]
         std[known] = np.sqrt(variance)
         return std
+
+    @property
+    def _misfit(self) -> bool:
+        """Whether rows of the balance that gives the estimate leave more than noise."""
+        now = self.statistics
+        return now.method == "momentum" and now.momentum is not None and bool(now.momentum.rows.misfit.any())
 
     @cached_property
     def determined(self) -> NDArray[np.bool_]:
@@ -200,7 +206,10 @@ class Evaluation:
         estimate, nuisances = self.estimate, self.statistics.setup.nuisances
         if estimate.nuisances.size != len(nuisances) or estimate.dof <= 0.0:
             return []
-        return found(nuisances, estimate, max(1.0, float(np.sqrt(estimate.rss / estimate.dof))))
+        std = max(1.0, float(np.sqrt(estimate.rss / estimate.dof))) * estimate.nuisances_std
+        if self._misfit and estimate.nuisances_robust is not None:
+            std = np.maximum(std, estimate.nuisances_robust)
+        return found(nuisances, estimate.nuisances, std)
 
     @cached_property
     @one_blas_thread()

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from sms_online.calibration.nuisance import Nuisance
-from sms_online.trackers.interface import Estimate
+from sms_online.stream import Array
 
 # A nuisance is a result where its deviation is below this share of its tolerance, or, without one and beyond it, below
 # this share of its size.
@@ -108,12 +108,10 @@ def _rounded(value: float, std: float) -> str:
     return f"{value:.{decimals}f} ± {std:.{decimals}f}"
 
 
-def found(nuisances: Sequence[Nuisance], estimate: Estimate, scale: float = 1.0) -> list[Calibration]:
-    """What is estimated better than its tolerance; scale: of the deviations, where rows leave more than noise."""
+def found(nuisances: Sequence[Nuisance], values: Array, deviations: Array) -> list[Calibration]:
+    """What is estimated better than its tolerance; values, deviations (m,): of all."""
     out = []
-    for nuisance, value, std in zip(
-        nuisances, estimate.nuisances.tolist(), (scale * estimate.nuisances_std).tolist(), strict=True
-    ):
+    for nuisance, value, std in zip(nuisances, values.tolist(), deviations.tolist(), strict=True):
         known = np.isfinite(nuisance.tolerance)
         better = known and std < IMPROVED * nuisance.tolerance
         if better or ((not known or abs(value) > BEYOND * nuisance.tolerance) and std < OF_ITS_SIZE * abs(value)):

@@ -24,18 +24,17 @@ Reading: the concentrated likelihood of the functional errors-in-variables model
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
 from sms_online.pipeline.beforehand import WIDENED, Beforehand, Penalty
 from sms_online.pipeline.gram_sum import GramSum
-from sms_online.pipeline.momentum_windows import OVERLAP
+from sms_online.pipeline.momentum_windows import HOPS, OVERLAP
 from sms_online.state import State
 from sms_online.stream import Array
-from sms_online.trackers.factor import masked_covariance
-from sms_online.trackers.interface import Estimate
 
 # Directions of scaled columns with less information than this share of the largest are not moved along.
 RANK_TOLERANCE = 1e-10
@@ -49,18 +48,24 @@ LEAST_NOISE = 0.1
 ROUNDED = 16.0
 # A step is halved until it gains this share of what the slope promises, so many times at most.
 SUFFICIENT, HALVINGS = 1e-4, 30
+# A block of time is two windows long at least, for neighbours to share little. When there are so many, they merge: with
+# eight to sixteen, their scatter is known to a fifth, and they are as long as a session allows. Even.
+SHORTEST_BLOCK, MOST_BLOCKS = 2 * HOPS, 16
 
 
 class RowGrams(State):
     """Sums over windows of whitened rows, by generalized speed.
 
     signal (n_v, n + 1, n + 1): Gram matrices of [Y b]. noise: the same of what the sensors' noise adds to the rows, of
-    first and of second order, from synthetic noise. windows: how many.
+    first and of second order, from synthetic noise. windows: how many. marks: signal as it was after each block of
+    time, of `length` windows each.
     """
 
     signal: GramSum
     noise: GramSum
     windows: int = 0
+    marks: list[Array] = msgspec.field(default_factory=list)
+    length: int = SHORTEST_BLOCK
 
     @staticmethod
     def none(n_v: int, n: int) -> RowGrams:
@@ -73,6 +78,27 @@ class RowGrams(State):
         self.signal.add(rows[:, None])
         self.noise.add(np.stack((first, second), axis=1))
         self.windows += 1
+        if self.windows % self.length == 0:
+            self.marks.append(self.signal.matrices)
+            if len(self.marks) == MOST_BLOCKS:
+                self.marks, self.length = self.marks[1::2], 2 * self.length
+
+    def without_blocks(self) -> list[RowGrams]:
+        """The sums without each block of time in turn; windows behind the last whole block are part of it.
+
+        What noise adds is alike in all windows.
+        """
+        count = len(self.marks)
+        if not count:
+            return []
+        signal, noise = self.signal.matrices, self.noise.matrices
+        ends = [np.zeros_like(signal), *self.marks[:-1], signal]
+        windows = np.diff([*(self.length * k for k in range(count)), self.windows]).tolist()
+        out = []
+        for begin, end, left in zip(ends[:-1], ends[1:], (self.windows - each for each in windows), strict=True):
+            share = left / self.windows
+            out.append(RowGrams(GramSum(signal - (end - begin)), GramSum(share * noise), left))
+        return out
 
     def whiten_anew(self, before: tuple[Array, Array], now: tuple[Array, Array]) -> None:
         """Have the rows so far count as those to come, whose variance others predict: their weights and misfit.
@@ -88,6 +114,7 @@ class RowGrams(State):
         share = np.where(lacking, share, np.minimum(1.0, (1.0 + before[1]) / (1.0 + now[1])))
         self.signal.scale(share)
         self.noise.scale(share)
+        self.marks = [share[:, None, None] * mark for mark in self.marks]
 
     @staticmethod
     def _of_noise(noise: Array, weights: Array) -> Array:
@@ -139,40 +166,6 @@ class Minimum:
 
 
 @dataclass(frozen=True)
-class ScaleFree:
-    """What the criterion needs of a session's rows; see `minimum`. weights (n,): values behind the rows' whitening.
-
-    alone: nothing is known of π beside the rows.
-    """
-
-    grams: RowGrams
-    lacking: NDArray[np.bool_]
-    torque: NDArray[np.bool_]
-    weights: Array
-    columns: Columns
-    known: Beforehand
-    alone: bool
-
-    def minimum(self) -> Minimum:
-        """The minimum next to the weights."""
-        return minimum(self.grams, self.lacking, self.torque, [self.weights], self.columns, self.known)
-
-    def estimate(self, squares: Estimate) -> Estimate:
-        """That minimum; squares: the estimate by least squares, whose robust covariance stays.
-
-        Its covariance is that of rows as independent as they count, their variance taken from what they leave.
-        """
-        found, known = self.minimum(), squares.determined
-        return replace(
-            squares,
-            pi=np.where(known, found.beta, squares.pi),
-            covariance=masked_covariance(found.covariance, known),
-            rss=squares.dof,
-            scale=None if self.alone else 1.0,
-        )
-
-
-@dataclass(frozen=True)
 class _Point:
     """w (n + 1,) and its products (·, n + 1) with the matrices of a criterion: linear in w."""
 
@@ -188,8 +181,8 @@ class _Point:
         return _Point(*(one + length * other for one, other in zip(own, along, strict=True)))
 
 
-class _Criterion:
-    """The criterion of some rows; lacking, torque (n_v,): which leave more than noise, and which hold a torque.
+class Criterion:
+    """The criterion of some rows. lacking, torque (n_v,): which leave more than noise, and which hold a torque.
 
     Of the matrices only those are kept that some row needs: they are read once for a step, which is what it costs.
     """
@@ -295,7 +288,7 @@ def minimum(
     weights behind the rows. known: what is known of β beside the rows.
     """
     w = np.append(starts[0], -1.0)
-    criterion = _Criterion(grams, lacking, torque, columns, w)
+    criterion = Criterion(grams, lacking, torque, columns, w)
     squares = np.einsum("vii->vi", grams.signal.matrices)
     penalties = [Penalty(known, columns.nuisances, squares, w, widened) for widened in WIDENED]
     penalty = penalties[-1]
@@ -309,11 +302,11 @@ def minimum(
     there = criterion.at(w)
     errors = criterion.errors(there)
     slopes, curvature, _ = criterion.slopes(there, errors)
-    basis = _basis(curvature[:-1, :-1] + penalty.derivatives(w)[1])
-    return Minimum(w[:-1], basis @ basis.T, slopes[:, :-1], np.sqrt(errors))
+    directions = basis(curvature[:-1, :-1] + penalty.derivatives(w)[1])
+    return Minimum(w[:-1], directions @ directions.T, slopes[:, :-1], np.sqrt(errors))
 
 
-def _basis(information: Array) -> Array:
+def basis(information: Array) -> Array:
     """Directions (n, rank) of unit information."""
     size = np.sqrt(np.diag(information))
     scale = np.divide(1.0, size, out=np.zeros_like(size), where=size > 0.0)
@@ -322,22 +315,22 @@ def _basis(information: Array) -> Array:
     return np.asarray(scale[:, None] * vectors[:, kept] / np.sqrt(values[kept]))
 
 
-def _descended(criterion: _Criterion, w: Array, penalty: Penalty) -> Array:
+def _descended(criterion: Criterion, w: Array, penalty: Penalty) -> Array:
     """Newton steps from w; e follows from step to step."""
     for _ in range(MOST_STEPS):
         at = criterion.at(w)
         errors = criterion.errors(at)
         slopes, squares, whole = criterion.slopes(at, errors)
         pull, known = penalty.derivatives(w)
-        basis = _basis(squares[:-1, :-1] + known)
-        slope = basis.T @ (slopes.sum(axis=0)[:-1] + pull)
-        values, vectors = np.linalg.eigh(basis.T @ (whole[:-1, :-1] + known) @ basis)
+        directions = basis(squares[:-1, :-1] + known)
+        slope = directions.T @ (slopes.sum(axis=0)[:-1] + pull)
+        values, vectors = np.linalg.eigh(directions.T @ (whole[:-1, :-1] + known) @ directions)
         step = -vectors @ ((vectors.T @ slope) / np.maximum(np.abs(values), LEAST_CURVATURE))
         gain = -float(slope @ step)
         if gain < CONVERGED:
             break
         before, length = criterion.value(at, errors) + penalty.value(w), 1.0
-        along = criterion.at(np.append(basis @ step, 0.0))
+        along = criterion.at(np.append(directions @ step, 0.0))
         for _ in range(HALVINGS):
             moved = at.moved(along, length)
             if criterion.value(moved, errors) + penalty.value(moved.w) <= before - SUFFICIENT * length * gain:

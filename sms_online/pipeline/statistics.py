@@ -18,7 +18,6 @@ from sms_online.calibration.release import released
 from sms_online.description.schema import System, TrackerChoice
 from sms_online.model.base_parameters import BaseParameters
 from sms_online.model.model import Model
-from sms_online.pipeline.criterion import ScaleFree
 from sms_online.pipeline.energy_balance import SharedErrors
 from sms_online.pipeline.errors_in_variables import NoiseBias, unbiased
 from sms_online.pipeline.events import ClockShift, Event
@@ -27,6 +26,7 @@ from sms_online.pipeline.latency import Latency
 from sms_online.pipeline.marker_identity import Swap
 from sms_online.pipeline.outliers import LeftOut
 from sms_online.pipeline.plain_rows import PlainRows
+from sms_online.pipeline.scale_free import ScaleFree
 from sms_online.pipeline.sensing import Sensing
 from sms_online.pipeline.synchronise import SyncCounters
 from sms_online.pipeline.tracker_bank import Reading, Suspected

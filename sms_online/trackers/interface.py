@@ -102,8 +102,8 @@ class Estimate:
     factor, inf where its rank is not full. rows: number of rows, less where old ones count less.
     rss: residual sum of squares of the whitened rows, priors included. dof: its degrees of freedom. scale: what the
     rows' stated std were multiplied with to weight them against a prior; None where they were taken as stated.
-    nuisances, nuisances_std (m,): what was estimated beside π, see `without_nuisances`; crossed (m, n): its covariance
-    with π.
+    nuisances, nuisances_std (m,): what was estimated beside π, see `without_nuisances`; nuisances_robust (m,): likewise
+    from the residuals, None where it is not defined; crossed (m, n): its covariance with π.
     """
 
     pi: Array
@@ -117,6 +117,7 @@ class Estimate:
     scale: float | None = None
     nuisances: Array = field(default_factory=lambda: np.empty(0))
     nuisances_std: Array = field(default_factory=lambda: np.empty(0))
+    nuisances_robust: Array | None = None
     crossed: Array | None = None
 
     def without_nuisances(self, m: int) -> Estimate:
@@ -132,6 +133,7 @@ class Estimate:
             determined=self.determined[m:],
             nuisances=self.pi[:m],
             nuisances_std=self.std[:m],
+            nuisances_robust=None if robust is None else np.sqrt(np.diag(robust)[:m]),
             crossed=self.covariance[:m, m:],
         )
 

@@ -1,0 +1,94 @@
+"""A session's estimate by the criterion that no scale of the rows changes, with error bars from blocks of time.
+
+What the model lacks is alike from window to window for as long as it likes. The criterion's curvature H takes rows for
+as independent as windows overlap, and its inverse is too small then. So each block of time is left out in turn: with
+its minimum δ_c from that of all, the covariance is (C - 1)/C Σ (δ_c - δ̄) (δ_c - δ̄)ᵀ + H⁻¹ P H⁻¹, P the curvature of
+what is known beside the rows. It is the sandwich H⁻¹ J H⁻¹ with J from blocks, in which each score counts by what the
+others say where it was: a parameter that one block determines nearly alone gets the bar that the others leave it. δ_c
+is one Newton step. Blocks are as long as a session allows, so they are few, and the deviations of Student's t.
+
+Sources: Künsch, Annals of Statistics 17 (1989) 1217 (jackknife of blocks of time); MacKinnon, Nielsen and Webb, J.
+Applied Econometrics 38 (2023) 671 (it against other sandwiches); Bester, Conley and Hansen, J. Econometrics 165 (2011)
+137 (few long blocks and Student's t).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import stdtrit
+
+from sms_online.pipeline.beforehand import Beforehand, Penalty
+from sms_online.pipeline.criterion import Columns, Criterion, Minimum, RowGrams, basis, minimum
+from sms_online.stream import Array
+from sms_online.trackers.factor import masked_covariance
+from sms_online.trackers.interface import Estimate
+
+# Probability by Student's distribution at which deviations are compared: two of a normal one.
+TWO_DEVIATIONS = 0.97725
+# Where the others leave less than this share of what all determine, a block determines it alone.
+LEAST_LEFT = 1e-2
+
+
+@dataclass(frozen=True)
+class ScaleFree:
+    """What the criterion needs of a session's rows; see `minimum`. weights (n,): values behind the rows' whitening.
+
+    alone: nothing is known of π beside the rows.
+    """
+
+    grams: RowGrams
+    lacking: NDArray[np.bool_]
+    torque: NDArray[np.bool_]
+    weights: Array
+    columns: Columns
+    known: Beforehand
+    alone: bool
+
+    def minimum(self) -> Minimum:
+        """The minimum next to the weights."""
+        return minimum(self.grams, self.lacking, self.torque, [self.weights], self.columns, self.known)
+
+    def estimate(self, squares: Estimate) -> Estimate:
+        """That minimum; squares: the estimate by least squares, which says what the rows determine.
+
+        Its covariance is that of rows as independent as they count, their variance taken from what they leave; the
+        robust one is from blocks of time.
+        """
+        found, known = self.minimum(), squares.determined
+        return replace(
+            squares,
+            pi=np.where(known, found.beta, squares.pi),
+            covariance=masked_covariance(found.covariance, known),
+            covariance_robust=self._of_blocks(found, known),
+            rss=squares.dof,
+            scale=None if self.alone else 1.0,
+        )
+
+    def _of_blocks(self, found: Minimum, known: NDArray[np.bool_]) -> Array:
+        """Covariance (n, n) of a minimum from what it is without each block of time; known (n,): what has one.
+
+        Infinite where blocks are fewer than two, and where one alone determines a parameter.
+        """
+        without = self.grams.without_blocks()
+        count = len(without)
+        if count < 2:
+            return masked_covariance(found.covariance, np.zeros_like(known))
+        start, w = np.append(self.weights, -1.0), np.append(found.beta, -1.0)
+        squares = np.einsum("vii->vi", self.grams.signal.matrices)
+        pull, beforehand = Penalty(self.known, self.columns.nuisances, squares, start).derivatives(w)
+        moved = []
+        for grams in without:
+            criterion = Criterion(grams, self.lacking, self.torque, self.columns, start)
+            at = criterion.at(w)
+            slopes, curvature, _ = criterion.slopes(at, criterion.errors(at))
+            directions = basis(curvature[:-1, :-1] + beforehand)
+            moved.append(directions @ (directions.T @ (slopes.sum(axis=0)[:-1] + pull)))
+            left = np.einsum("ij,ij->i", directions, directions)
+            known = known & (LEAST_LEFT * left <= np.diag(found.covariance))
+        apart = np.array(moved) - np.mean(moved, axis=0)
+        wider = (0.5 * float(stdtrit(count - 1, TWO_DEVIATIONS))) ** 2 * (count - 1) / count
+        of_known = found.covariance @ beforehand @ found.covariance
+        return masked_covariance(wider * (apart.T @ apart) + of_known, known)
