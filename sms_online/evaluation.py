@@ -88,7 +88,7 @@ class Evaluation:
         From the residual: the larger of two answers. One takes the rows' errors as independent with the residual's
         variance, the other allows errors that last within clusters of rows. To it comes what errors add that rows of an
         energy window share, which least squares absorbs and no residual shows; it is known while no row is forgotten.
-        Where rows have been weighted against a prior and leave no more than noise, the posterior's own covariance holds.
+        Where rows beside a prior leave no more than noise, the posterior's own covariance holds.
         """
         return self._reported(self.estimate)
 

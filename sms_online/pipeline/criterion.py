@@ -154,15 +154,20 @@ class Columns:
 
 @dataclass(frozen=True)
 class Minimum:
-    """beta (n,): where the criterion is least. covariance (n, n): inverse of its curvature, rows as independent as they
-    count; of directions without information zero. slopes (n_v, n): of each speed's part of it, which add up to what
-    priors pull with. errors (n_v,): the share e that each column is off by beyond noise.
+    """beta (n,): where the criterion is least. directions (n, rank): of unit curvature, those with information. slopes
+    (n_v, n): of each speed's part of it, which add up to what priors pull with. errors (n_v,): the share e that each
+    column is off by beyond noise.
     """
 
     beta: Array
-    covariance: Array
+    directions: Array
     slopes: Array
     errors: Array
+
+    @property
+    def covariance(self) -> Array:
+        """Inverse (n, n) of the curvature, rows as independent as they count; of other directions zero."""
+        return self.directions @ self.directions.T
 
 
 @dataclass(frozen=True)
@@ -302,11 +307,11 @@ def minimum(
     there = criterion.at(w)
     errors = criterion.errors(there)
     slopes, curvature, _ = criterion.slopes(there, errors)
-    directions = basis(curvature[:-1, :-1] + penalty.derivatives(w)[1])
-    return Minimum(w[:-1], directions @ directions.T, slopes[:, :-1], np.sqrt(errors))
+    directions = _basis(curvature[:-1, :-1] + penalty.derivatives(w)[1])
+    return Minimum(w[:-1], directions, slopes[:, :-1], np.sqrt(errors))
 
 
-def basis(information: Array) -> Array:
+def _basis(information: Array) -> Array:
     """Directions (n, rank) of unit information."""
     size = np.sqrt(np.diag(information))
     scale = np.divide(1.0, size, out=np.zeros_like(size), where=size > 0.0)
@@ -322,7 +327,7 @@ def _descended(criterion: Criterion, w: Array, penalty: Penalty) -> Array:
         errors = criterion.errors(at)
         slopes, squares, whole = criterion.slopes(at, errors)
         pull, known = penalty.derivatives(w)
-        directions = basis(squares[:-1, :-1] + known)
+        directions = _basis(squares[:-1, :-1] + known)
         slope = directions.T @ (slopes.sum(axis=0)[:-1] + pull)
         values, vectors = np.linalg.eigh(directions.T @ (whole[:-1, :-1] + known) @ directions)
         step = -vectors @ ((vectors.T @ slope) / np.maximum(np.abs(values), LEAST_CURVATURE))

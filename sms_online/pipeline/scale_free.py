@@ -21,15 +21,15 @@ from numpy.typing import NDArray
 from scipy.special import stdtrit
 
 from sms_online.pipeline.beforehand import Beforehand, Penalty
-from sms_online.pipeline.criterion import Columns, Criterion, Minimum, RowGrams, basis, minimum
+from sms_online.pipeline.criterion import Columns, Criterion, Minimum, RowGrams, minimum
 from sms_online.stream import Array
 from sms_online.trackers.factor import masked_covariance
 from sms_online.trackers.interface import Estimate
 
 # Probability by Student's distribution at which deviations are compared: two of a normal one.
 TWO_DEVIATIONS = 0.97725
-# Where the others leave less than this share of what all determine, a block determines it alone.
-LEAST_LEFT = 1e-2
+# What the others determine by less than this share, a block determines alone. A share below the second is rounding.
+LEAST_LEFT, LOST = 1e-2, 1e-10
 
 
 @dataclass(frozen=True)
@@ -72,10 +72,10 @@ class ScaleFree:
 
         Infinite where blocks are fewer than two, and where one alone determines a parameter.
         """
-        without = self.grams.without_blocks()
+        without, covariance = self.grams.without_blocks(), found.covariance
         count = len(without)
         if count < 2:
-            return masked_covariance(found.covariance, np.zeros_like(known))
+            return masked_covariance(covariance, np.zeros_like(known))
         start, w = np.append(self.weights, -1.0), np.append(found.beta, -1.0)
         squares = np.einsum("vii->vi", self.grams.signal.matrices)
         pull, beforehand = Penalty(self.known, self.columns.nuisances, squares, start).derivatives(w)
@@ -84,11 +84,11 @@ class ScaleFree:
             criterion = Criterion(grams, self.lacking, self.torque, self.columns, start)
             at = criterion.at(w)
             slopes, curvature, _ = criterion.slopes(at, criterion.errors(at))
-            directions = basis(curvature[:-1, :-1] + beforehand)
-            moved.append(directions @ (directions.T @ (slopes.sum(axis=0)[:-1] + pull)))
-            left = np.einsum("ij,ij->i", directions, directions)
-            known = known & (LEAST_LEFT * left <= np.diag(found.covariance))
+            information = found.directions.T @ (curvature[:-1, :-1] + beforehand) @ found.directions
+            share, axes = np.linalg.eigh(information)
+            axes = found.directions @ axes / np.sqrt(np.maximum(share, LOST))
+            moved.append(axes @ (axes.T @ (slopes.sum(axis=0)[:-1] + pull)))
+            known = known & (LEAST_LEFT * np.einsum("ij,ij->i", axes, axes) <= np.diag(covariance))
         apart = np.array(moved) - np.mean(moved, axis=0)
         wider = (0.5 * float(stdtrit(count - 1, TWO_DEVIATIONS))) ** 2 * (count - 1) / count
-        of_known = found.covariance @ beforehand @ found.covariance
-        return masked_covariance(wider * (apart.T @ apart) + of_known, known)
+        return masked_covariance(wider * (apart.T @ apart) + covariance @ beforehand @ covariance, known)
