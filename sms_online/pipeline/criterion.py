@@ -49,7 +49,7 @@ ROUNDED = 16.0
 # A step is halved until it gains this share of what the slope promises, so many times at most.
 SUFFICIENT, HALVINGS = 1e-4, 30
 # A block of time is two windows long at least, for neighbours to share little. When there are so many, they merge: with
-# eight to sixteen, their scatter is known to a fifth, and they are as long as a session allows. Even.
+# eight to sixteen, their scatter is known to a quarter, and they are as long as a session allows. Even.
 SHORTEST_BLOCK, MOST_BLOCKS = 2 * HOPS, 16
 
 
