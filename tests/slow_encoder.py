@@ -1,4 +1,4 @@
-"""A bench of one flexible joint and a rigid link; nobody declares a slow link encoder, friction or a push."""
+"""A bench of one flexible joint and a rigid link. Undeclared are a slow link encoder, friction, a gain that wanders."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from functools import cache
 
 import numpy as np
 from scipy.integrate import solve_ivp
-from scipy.signal import butter, cont2discrete, lfilter
+from scipy.signal import butter, lfilter
 
 from sms_online.description.parse import parse_system
 from sms_online.description.schema import System
@@ -47,18 +47,14 @@ def bench(factor: float = 1.0) -> System:
     return parse_system(TEXT.format(**{name: factor * value for name, value in values.items()}), "slow-encoder")
 
 
-def reference(t: float | Array) -> Array:
-    """Angle that the motor is to follow, rad."""
-    return np.asarray(0.6 * np.sin(0.8 * np.pi * t) + 0.25 * np.sin(3.4 * np.pi * t + 1.0))
-
-
-def torque(t: float | Array, theta: Array, rate: Array) -> Array:
-    """Of the motor at the output side, N m."""
-    return np.asarray(8.0 * (reference(t) - theta) - 0.3 * rate)
-
-
 @cache
 def _motion(coulomb: float) -> tuple[Array, Array]:
+    def reference(t: float | Array) -> Array:
+        return np.asarray(0.6 * np.sin(0.8 * np.pi * t) + 0.25 * np.sin(3.4 * np.pi * t + 1.0))
+
+    def torque(t: float | Array, theta: Array, rate: Array) -> Array:
+        return np.asarray(8.0 * (reference(t) - theta) - 0.3 * rate)
+
     def change(t: float, y: Array) -> list[float]:
         theta, q, rate, link_rate = y
         spring = K * (theta - q) + B * (rate - link_rate)
@@ -70,36 +66,19 @@ def _motion(coulomb: float) -> tuple[Array, Array]:
     return t, np.stack((torque(t, y[0], y[2]) / GEAR, y[0], y[1]), axis=1)
 
 
-def session(corner: float | None, coulomb: float = 0.0, once: float = 0.0, seed: int = 0) -> Block:
+def session(corner: float | None, coulomb: float = 0.0, once: float = 0.0, seed: int = 0, wander: float = 0.0) -> Block:
     """Samples; corner: Hz, of the low-pass behind which the link encoder is read; once: its error once per turn, rad.
 
-    coulomb: friction, N m.
+    coulomb: friction, N m. wander: 1σ of the torque's gain, at random and correlated over a second.
     """
     t, exact = _motion(coulomb)
     values = exact.copy()
+    if wander:
+        fade, before = np.exp(-1.0 / RATE), round(10.0 * RATE)
+        white = np.random.default_rng(1000 + seed).standard_normal(before + t.size)
+        values[:, 0] *= 1.0 + wander * lfilter([np.sqrt(1.0 - fade**2)], [1.0, -fade], white)[before:]
     values[:, 2] += once * np.sin(values[:, 2] + 0.4)
     if corner is not None:
         values[:, 2] = lfilter(*butter(2, corner / (RATE / 2.0)), values[:, 2])
     values += NOISE * np.random.default_rng(seed).standard_normal(values.shape)
     return Block(t, ("tau_1", "theta_m_1", "q_1"), values)
-
-
-def pushed_session(std: float, lasts: float, seed: int) -> Block:
-    """Samples beside a random torque on the motor, N m, that is correlated over so many seconds (first order)."""
-    random, steps = np.random.default_rng(seed), 4
-    t = np.arange(round(DURATION * RATE)) / RATE
-    fade = np.exp(-1.0 / (lasts * RATE))
-    before = round(10.0 * lasts * RATE)
-    push = lfilter([std * np.sqrt(1.0 - fade**2)], [1.0, -fade], random.standard_normal(before + t.size))[before:]
-    motor = [[-8.0 - K, K, -0.3 - B - F, B], [8.0, 1.0]]
-    A = np.array([[0, 0, 1, 0], [0, 0, 0, 1], np.array(motor[0]) / I_M, np.array([K, -K, B, -B]) / I_L])
-    U = np.array([[0, 0], [0, 0], np.array(motor[1]) / I_M, [0, 0]])
-    # Inputs are held over a quarter of a sample at their middle; every mode is a filter of first order.
-    A, U = cont2discrete((A, U, np.eye(4), np.zeros((4, 2))), 1.0 / (steps * RATE), "zoh")[:2]
-    middle = (np.arange(steps * t.size) + 0.5) / (steps * RATE)
-    decay, modes = np.linalg.eig(A)
-    driven = np.linalg.solve(modes, U @ np.stack((reference(middle), np.interp(middle, t, push))))
-    each = np.stack([lfilter([0.0, 1.0], [1.0, -one], own) for one, own in zip(decay, driven, strict=True)])
-    theta, q, rate, _ = (modes @ each).real[:, ::steps]
-    values = np.stack((torque(t, theta, rate) / GEAR, theta, q), axis=1)
-    return Block(t, ("tau_1", "theta_m_1", "q_1"), values + NOISE * random.standard_normal(values.shape))

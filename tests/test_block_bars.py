@@ -15,7 +15,7 @@ from sms_online.pipeline.scale_free import ScaleFree
 from sms_online.stream import Array
 from sms_online.trackers.interface import Estimate
 from tests.evaluated import standard_deviation
-from tests.slow_encoder import GEAR, I_L, I_M, B, F, K, bench, pushed_session
+from tests.slow_encoder import GEAR, I_L, I_M, B, F, K, bench, session
 
 TRUE = np.array([2.0, -1.0])
 
@@ -145,22 +145,21 @@ def test_a_prior_keeps_its_own_bar_where_rows_say_nothing() -> None:
 
 
 @pytest.mark.long
-def test_bars_hold_beside_a_slow_torque_that_nobody_describes() -> None:
-    """A torque of 0.02 N m, correlated over a second, pushes the motor: 40 seeds of 20 s.
+def test_bars_hold_beside_a_gain_that_wanders() -> None:
+    """The measured torque is off by 5 %, correlated over a second: 60 seeds of 20 s.
 
-    Of five parameters each. They share the same torque, so intervals are fewer than 200, and what blocks give is known
-    to some 5 %.
+    It scales all parameters but friction alike: 60 intervals, of which chance has 52 to 60 hold.
     """
     true = np.array([I_M / GEAR**2, I_L, K, B, F])
     held = []
-    for seed in range(40):
-        block = pushed_session(0.02, 1.0, seed)
+    for seed in range(60):
+        block = session(None, seed=seed, wander=0.05)
         estimator = Estimator(bench(), block.channels, "bench")
         estimator.push(block)
         estimator.finish()
         estimate = estimator.estimate()
-        reported = standard_deviation(estimator)
-        held.append(np.abs(estimate.pi - true) < 1.96 * np.stack((estimate.std, reported)))
+        bars = np.stack((estimate.std, standard_deviation(estimator)))
+        held.append((np.abs(estimate.pi - true) < 1.96 * bars)[:, :3])
     alone, reported = np.mean(held, axis=(0, 2))
-    assert 0.9 < reported < 0.99, (alone, reported)
-    assert alone < 0.88, (alone, reported)
+    assert 52 / 60 <= reported, (alone, reported)
+    assert alone < 0.8, (alone, reported)

@@ -57,8 +57,8 @@ class RowGrams(State):
     """Sums over windows of whitened rows, by generalized speed.
 
     signal (n_v, n + 1, n + 1): Gram matrices of [Y b]. noise: the same of what the sensors' noise adds to the rows, of
-    first and of second order, from synthetic noise. windows: how many. marks: signal as it was after each block of
-    time, of `length` windows each.
+    first and of second order, from synthetic noise. windows: how many. marks (2, n_v, n + 1, n + 1): both as they were
+    after each block of time, of `length` windows each.
     """
 
     signal: GramSum
@@ -79,25 +79,25 @@ class RowGrams(State):
         self.noise.add(np.stack((first, second), axis=1))
         self.windows += 1
         if self.windows % self.length == 0:
-            self.marks.append(self.signal.matrices)
+            self.marks.append(self._both)
             if len(self.marks) == MOST_BLOCKS:
                 self.marks, self.length = self.marks[1::2], 2 * self.length
 
-    def without_blocks(self) -> list[RowGrams]:
-        """The sums without each block of time in turn; windows behind the last whole block are part of it.
+    @property
+    def _both(self) -> Array:
+        return np.stack((self.signal.matrices, self.noise.matrices))
 
-        What noise adds is alike in all windows.
-        """
-        count = len(self.marks)
-        if not count:
+    def without_blocks(self) -> list[RowGrams]:
+        """The sums without each block of time in turn; windows behind the last whole block are part of it."""
+        if not self.marks:
             return []
-        signal, noise = self.signal.matrices, self.noise.matrices
-        ends = [np.zeros_like(signal), *self.marks[:-1], signal]
-        windows = np.diff([*(self.length * k for k in range(count)), self.windows]).tolist()
+        whole = self._both
+        ends = [np.zeros_like(whole), *self.marks[:-1], whole]
+        windows = np.diff([*(self.length * k for k in range(len(self.marks))), self.windows]).tolist()
         out = []
-        for begin, end, left in zip(ends[:-1], ends[1:], (self.windows - each for each in windows), strict=True):
-            share = left / self.windows
-            out.append(RowGrams(GramSum(signal - (end - begin)), GramSum(share * noise), left))
+        for begin, end, count in zip(ends[:-1], ends[1:], windows, strict=True):
+            signal, noise = whole - (end - begin)
+            out.append(RowGrams(GramSum(signal), GramSum(noise), self.windows - count))
         return out
 
     def whiten_anew(self, before: tuple[Array, Array], now: tuple[Array, Array]) -> None:

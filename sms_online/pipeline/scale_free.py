@@ -72,23 +72,28 @@ class ScaleFree:
 
         Infinite where blocks are fewer than two, and where one alone determines a parameter.
         """
-        without, covariance = self.grams.without_blocks(), found.covariance
-        count = len(without)
+        without = self.grams.without_blocks()
+        count, start, w = len(without), np.append(self.weights, -1.0), np.append(found.beta, -1.0)
         if count < 2:
-            return masked_covariance(covariance, np.zeros_like(known))
-        start, w = np.append(self.weights, -1.0), np.append(found.beta, -1.0)
+            return masked_covariance(found.covariance, np.zeros_like(known))
         squares = np.einsum("vii->vi", self.grams.signal.matrices)
         pull, beforehand = Penalty(self.known, self.columns.nuisances, squares, start).derivatives(w)
-        moved = []
-        for grams in without:
+
+        def about(grams: RowGrams) -> tuple[Array, Array]:
+            """Slope (n,) there of some rows, and axes (n, rank) of their inverse curvature."""
             criterion = Criterion(grams, self.lacking, self.torque, self.columns, start)
             at = criterion.at(w)
-            slopes, curvature, _ = criterion.slopes(at, criterion.errors(at))
-            information = found.directions.T @ (curvature[:-1, :-1] + beforehand) @ found.directions
-            share, axes = np.linalg.eigh(information)
-            axes = found.directions @ axes / np.sqrt(np.maximum(share, LOST))
-            moved.append(axes @ (axes.T @ (slopes.sum(axis=0)[:-1] + pull)))
-            known = known & (LEAST_LEFT * np.einsum("ij,ij->i", axes, axes) <= np.diag(covariance))
+            slopes, _, curvature = criterion.slopes(at, criterion.errors(at))
+            share, axes = np.linalg.eigh(found.directions.T @ (curvature[:-1, :-1] + beforehand) @ found.directions)
+            return slopes.sum(axis=0)[:-1] + pull, found.directions @ axes / np.sqrt(np.maximum(share, LOST))
+
+        every = about(self.grams)[1]
+        moved = []
+        for grams in without:
+            slope, axes = about(grams)
+            moved.append(axes @ (axes.T @ slope))
+            known = known & (LEAST_LEFT * np.sum(axes**2, axis=1) <= np.sum(every**2, axis=1))
         apart = np.array(moved) - np.mean(moved, axis=0)
         wider = (0.5 * float(stdtrit(count - 1, TWO_DEVIATIONS))) ** 2 * (count - 1) / count
-        return masked_covariance(wider * (apart.T @ apart) + covariance @ beforehand @ covariance, known)
+        of_known = every @ (every.T @ beforehand @ every) @ every.T
+        return masked_covariance(wider * (apart.T @ apart) + of_known, known)
