@@ -148,7 +148,7 @@ def test_a_prior_keeps_its_own_bar_where_rows_say_nothing() -> None:
 def test_bars_hold_beside_a_gain_that_wanders() -> None:
     """The measured torque is off by 5 %, correlated over a second: 60 seeds of 20 s.
 
-    It scales all parameters but friction alike: 60 intervals, of which chance has 52 to 60 hold.
+    Rotor inertia, and link inertia with spring, have an error each; chance has 52 to 60 of 60 intervals hold.
     """
     true = np.array([I_M / GEAR**2, I_L, K, B, F])
     held = []
@@ -161,5 +161,5 @@ def test_bars_hold_beside_a_gain_that_wanders() -> None:
         bars = np.stack((estimate.std, standard_deviation(estimator)))
         held.append((np.abs(estimate.pi - true) < 1.96 * bars)[:, :3])
     alone, reported = np.mean(held, axis=(0, 2))
-    assert 52 / 60 <= reported, (alone, reported)
+    assert reported >= 52 / 60, (alone, reported)
     assert alone < 0.8, (alone, reported)

@@ -32,7 +32,8 @@ def replayed(
     system: System, capture: Path, prior: bool, start: float | None = None, stop: float | None = None
 ) -> Evaluation:
     source = open_source(capture, system, start, stop)
-    session = Session(system, source.channels, prior=prior)
+    # Constant parameters: what friction with memory leaves may look like a drift.
+    session = Session(system, source.channels, prior=prior, tracker="rls")
     for block in source:
         session.update(block)
     session.finish()

@@ -1,11 +1,12 @@
 """A session's estimate by the criterion that no scale of the rows changes, with error bars from blocks of time.
 
-What the model lacks is alike from window to window for as long as it likes. The criterion's curvature H takes rows for
-as independent as windows overlap, and its inverse is too small then. So each block of time is left out in turn: with
-its minimum δ_c from that of all, the covariance is (C - 1)/C Σ (δ_c - δ̄) (δ_c - δ̄)ᵀ + H⁻¹ P H⁻¹, P the curvature of
-what is known beside the rows. It is the sandwich H⁻¹ J H⁻¹ with J from blocks, in which each score counts by what the
-others say where it was: a parameter that one block determines nearly alone gets the bar that the others leave it. δ_c
-is one Newton step. Blocks are as long as a session allows, so they are few, and the deviations of Student's t.
+What the model lacks is alike from window to window for as long as it likes. The rows' squares as curvature take rows for
+as independent as windows overlap, and what noise there is in columns for information: their inverse is too small then.
+So each block of time is left out in turn: with δ_c from the minimum of all to that of the others, the covariance is
+(C - 1)/C Σ (δ_c - δ̄) (δ_c - δ̄)ᵀ + H⁻¹ P H⁻¹, H the criterion's own curvature and P that of what is known beside the
+rows. It is the sandwich H⁻¹ J H⁻¹ with J from blocks, in which each score counts by what the others say where it was: a
+parameter that one block determines nearly alone gets the bar that the others leave it. δ_c is one Newton step. Blocks
+are as long as a session allows, so they are few, and the deviations are those of Student's t.
 
 Sources: Künsch, Annals of Statistics 17 (1989) 1217 (jackknife of blocks of time); MacKinnon, Nielsen and Webb, J.
 Applied Econometrics 38 (2023) 671 (it against other sandwiches); Bester, Conley and Hansen, J. Econometrics 165 (2011)
