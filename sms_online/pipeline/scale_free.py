@@ -1,8 +1,8 @@
 """A session's estimate by the criterion that no scale of the rows changes, with error bars from blocks of time.
 
-What the model lacks is alike from window to window for as long as it likes. The rows' squares as curvature take rows for
-as independent as windows overlap, and what noise there is in columns for information: their inverse is too small then.
-So each block of time is left out in turn: with δ_c from the minimum of all to that of the others, the covariance is
+What the model lacks is alike from window to window for as long as it likes. The rows' squares as curvature take rows
+for as independent as windows overlap, and noise in columns for information: their inverse is too small then. So each
+block of time is left out in turn: with δ_c from the minimum of all to that of the others, the covariance is
 (C - 1)/C Σ (δ_c - δ̄) (δ_c - δ̄)ᵀ + H⁻¹ P H⁻¹, H the criterion's own curvature and P that of what is known beside the
 rows. It is the sandwich H⁻¹ J H⁻¹ with J from blocks, in which each score counts by what the others say where it was: a
 parameter that one block determines nearly alone gets the bar that the others leave it. δ_c is one Newton step. Blocks
@@ -29,8 +29,10 @@ from sms_online.trackers.interface import Estimate
 
 # Probability by Student's distribution at which deviations are compared: two of a normal one.
 TWO_DEVIATIONS = 0.97725
-# What the others determine by less than this share, a block determines alone. A share below the second is rounding.
-LEAST_LEFT, LOST = 1e-2, 1e-10
+# What the others determine by less than this share, a block determines alone.
+LEAST_LEFT = 1e-2
+# Curvature is no less than this share of that of the squares: where noise makes all of it, it may be of either sign.
+LEAST_CURVATURE = 1e-4
 
 
 @dataclass(frozen=True)
@@ -86,7 +88,9 @@ class ScaleFree:
             at = criterion.at(w)
             slopes, _, curvature = criterion.slopes(at, criterion.errors(at))
             share, axes = np.linalg.eigh(found.directions.T @ (curvature[:-1, :-1] + beforehand) @ found.directions)
-            return slopes.sum(axis=0)[:-1] + pull, found.directions @ axes / np.sqrt(np.maximum(share, LOST))
+            return slopes.sum(axis=0)[:-1] + pull, found.directions @ axes / np.sqrt(
+                np.maximum(np.abs(share), LEAST_CURVATURE)
+            )
 
         every = about(self.grams)[1]
         moved = []
