@@ -84,7 +84,7 @@ def test_blocks_count_as_the_sums_when_weights_change() -> None:
     np.testing.assert_allclose(without, (len(grams.marks) - 1) * grams.signal.matrices, rtol=1e-9)
 
 
-def test_a_step_without_a_block_is_a_fit_without_it() -> None:
+def test_bars_are_the_spread_of_fits_without_a_block() -> None:
     rows = torque_rows(1, 300)
     free = scale_free(rows)
     fits = np.array([replace(free, grams=without).minimum().beta for without in free.grams.without_blocks()])

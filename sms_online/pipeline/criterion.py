@@ -297,11 +297,11 @@ def minimum(
     squares = np.einsum("vii->vi", grams.signal.matrices)
     penalties = [Penalty(known, columns.nuisances, squares, w, widened) for widened in WIDENED]
     penalty = penalties[-1]
-    found = [_descended(criterion, np.append(start, -1.0), penalty) for start in starts]
+    found = [descended(criterion, np.append(start, -1.0), penalty) for start in starts]
     if len(known.doubtful):
         freed = found[0]
         for wider in penalties:
-            freed = _descended(criterion, freed, wider)
+            freed = descended(criterion, freed, wider)
         found.append(freed)
     w = min(found, key=lambda each: criterion.relative(each, columns.nuisances) + penalty.value(each))
     there = criterion.at(w)
@@ -320,7 +320,7 @@ def _basis(information: Array) -> Array:
     return np.asarray(scale[:, None] * vectors[:, kept] / np.sqrt(values[kept]))
 
 
-def _descended(criterion: Criterion, w: Array, penalty: Penalty) -> Array:
+def descended(criterion: Criterion, w: Array, penalty: Penalty) -> Array:
     """Newton steps from w; e follows from step to step."""
     for _ in range(MOST_STEPS):
         at = criterion.at(w)

@@ -86,14 +86,20 @@ class JointEstimate(Stage):
 
     def estimate(self, fit: MomentumFit) -> Estimate:
         """The nuisances, then the base parameters; fit: that the rows come from."""
-        estimate, scale_free = self.tracker.estimate(), self.scale_free(fit)
-        if scale_free is not None:
-            return scale_free.estimate(estimate)
-        return released(unbiased(estimate, self.bias), self._nuisances, estimate.covariance)
+        squares, scale_free = self.tracker.estimate(), self.scale_free(fit)
+        return self._unbiased(squares) if scale_free is None else scale_free.estimate(squares)
+
+    def solved(self, fit: MomentumFit) -> Estimate:
+        """The same without what only error bars take, for weights that follow the estimate."""
+        squares, scale_free = self.tracker.estimate(), self.scale_free(fit)
+        return self._unbiased(squares) if scale_free is None else scale_free.solved(squares)
+
+    def _unbiased(self, squares: Estimate) -> Estimate:
+        return released(unbiased(squares, self.bias), self._nuisances, squares.covariance)
 
     def row_variance(self, fit: MomentumFit) -> float:
         """Mean square of what the rows leave, in units of their predicted variance."""
-        estimate = self.estimate(fit)
+        estimate = self.solved(fit)
         return estimate.rss / max(estimate.dof, 1.0) * (1.0 + float(fit.plain.misfit.mean()))
 
     def scale_free(self, fit: MomentumFit) -> ScaleFree | None:

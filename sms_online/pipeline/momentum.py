@@ -201,7 +201,7 @@ class Momentum(Stage):
         return self.joint.estimate(self.fit)
 
     def _beside_squares(self) -> Array:
-        return self.joint_estimate.pi - self.joint.tracker.estimate().pi
+        return self.joint.solved(self.fit).pi - self.joint.tracker.estimate().pi
 
     @property
     def row_variance(self) -> float:
@@ -218,7 +218,8 @@ class Momentum(Stage):
 
     def _solved(self) -> Array:
         """Nuisances and β, of the rows and, where these determine little, of the description."""
-        return nearer(self._own(), *self.fit.described)
+        solved = self.joint.solved(self.fit).without_nuisances(len(self.nuisances))
+        return nearer(solved, *self.fit.described)
 
     def push(self, piece: GridSamples, noise: SensorNoise, start_time: float) -> None:
         """Take corrected grid samples of the channels, followed by internal states of effects.
@@ -414,7 +415,7 @@ class Momentum(Stage):
     @property
     def _reference(self) -> Array | None:
         """Nuisances and parameters that the rows without the known drift have; None where nothing has moved."""
-        return None if self.state.drift is None else self.joint_estimate.pi
+        return None if self.state.drift is None else self.joint.solved(self.fit).pi
 
     def statistics(self, t: float) -> MomentumStatistics:
         """What is known now; nothing in it changes as the session goes on. t: of the newest sample, s."""

@@ -1,12 +1,12 @@
 """A session's estimate by the criterion that no scale of the rows changes, with error bars from blocks of time.
 
-What the model lacks is alike from window to window for as long as it likes. The rows' squares as curvature take rows
+What the model lacks is alike from window to window for as long as it likes. The rows' squares as curvature H take rows
 for as independent as windows overlap, and noise in columns for information: their inverse is too small then. So each
 block of time is left out in turn: with δ_c from the minimum of all to that of the others, the covariance is
-(C - 1)/C Σ (δ_c - δ̄) (δ_c - δ̄)ᵀ + H⁻¹ P H⁻¹, H the criterion's own curvature and P that of what is known beside the
-rows. It is the sandwich H⁻¹ J H⁻¹ with J from blocks, in which each score counts by what the others say where it was: a
-parameter that one block determines nearly alone gets the bar that the others leave it. δ_c is one Newton step. Blocks
-are as long as a session allows, so they are few, and the deviations are those of Student's t.
+(C - 1)/C Σ (δ_c - δ̄) (δ_c - δ̄)ᵀ + H⁻¹ P H⁻¹, P the curvature of what is known beside the rows. To first order that is
+the sandwich H⁻¹ J H⁻¹ with J from blocks, in which each score counts by what the others say where it was: a parameter
+that one block determines nearly alone gets the bar that the others leave it. Blocks are as long as a session allows, so
+they are few, and the deviations are those of Student's t.
 
 Sources: Künsch, Annals of Statistics 17 (1989) 1217 (jackknife of blocks of time); MacKinnon, Nielsen and Webb, J.
 Applied Econometrics 38 (2023) 671 (it against other sandwiches); Bester, Conley and Hansen, J. Econometrics 165 (2011)
@@ -22,17 +22,15 @@ from numpy.typing import NDArray
 from scipy.special import stdtrit
 
 from sms_online.pipeline.beforehand import Beforehand, Penalty
-from sms_online.pipeline.criterion import Columns, Criterion, Minimum, RowGrams, minimum
+from sms_online.pipeline.criterion import Columns, Criterion, Minimum, RowGrams, descended, minimum
 from sms_online.stream import Array
 from sms_online.trackers.factor import masked_covariance
 from sms_online.trackers.interface import Estimate
 
 # Probability by Student's distribution at which deviations are compared: two of a normal one.
 TWO_DEVIATIONS = 0.97725
-# What the others determine by less than this share, a block determines alone.
-LEAST_LEFT = 1e-2
-# Curvature is no less than this share of that of the squares: where noise makes all of it, it may be of either sign.
-LEAST_CURVATURE = 1e-4
+# What the others determine by less than this share, a block determines alone. A share below the second is rounding.
+LEAST_LEFT, LOST = 1e-2, 1e-10
 
 
 @dataclass(frozen=True)
@@ -54,18 +52,26 @@ class ScaleFree:
         """The minimum next to the weights."""
         return minimum(self.grams, self.lacking, self.torque, [self.weights], self.columns, self.known)
 
-    def estimate(self, squares: Estimate) -> Estimate:
+    def solved(self, squares: Estimate) -> Estimate:
         """That minimum; squares: the estimate by least squares, which says what the rows determine.
 
-        Its covariance is that of rows as independent as they count, their variance taken from what they leave; the
-        robust one is from blocks of time.
+        Its covariance is that of rows as independent as they count, their variance taken from what they leave.
         """
-        found, known = self.minimum(), squares.determined
+        return self._solved(self.minimum(), squares)
+
+    def estimate(self, squares: Estimate) -> Estimate:
+        """The same with a robust covariance from blocks of time, which takes three times as long."""
+        found = self.minimum()
+        robust = self._of_blocks(found, squares.determined)
+        return replace(self._solved(found, squares), covariance_robust=robust)
+
+    def _solved(self, found: Minimum, squares: Estimate) -> Estimate:
+        known = squares.determined
         return replace(
             squares,
             pi=np.where(known, found.beta, squares.pi),
             covariance=masked_covariance(found.covariance, known),
-            covariance_robust=self._of_blocks(found, known),
+            covariance_robust=None,
             rss=squares.dof,
             scale=None if self.alone else 1.0,
         )
@@ -75,30 +81,22 @@ class ScaleFree:
 
         Infinite where blocks are fewer than two, and where one alone determines a parameter.
         """
-        without = self.grams.without_blocks()
+        without, covariance = self.grams.without_blocks(), found.covariance
         count, start, w = len(without), np.append(self.weights, -1.0), np.append(found.beta, -1.0)
         if count < 2:
-            return masked_covariance(found.covariance, np.zeros_like(known))
+            return masked_covariance(covariance, np.zeros_like(known))
         squares = np.einsum("vii->vi", self.grams.signal.matrices)
-        pull, beforehand = Penalty(self.known, self.columns.nuisances, squares, start).derivatives(w)
-
-        def about(grams: RowGrams) -> tuple[Array, Array]:
-            """Slope (n,) there of some rows, and axes (n, rank) of their inverse curvature."""
+        penalty = Penalty(self.known, self.columns.nuisances, squares, start)
+        beforehand = penalty.derivatives(w)[1]
+        fits = []
+        for grams in without:
             criterion = Criterion(grams, self.lacking, self.torque, self.columns, start)
             at = criterion.at(w)
-            slopes, _, curvature = criterion.slopes(at, criterion.errors(at))
-            share, axes = np.linalg.eigh(found.directions.T @ (curvature[:-1, :-1] + beforehand) @ found.directions)
-            return slopes.sum(axis=0)[:-1] + pull, found.directions @ axes / np.sqrt(
-                np.maximum(np.abs(share), LEAST_CURVATURE)
-            )
-
-        every = about(self.grams)[1]
-        moved = []
-        for grams in without:
-            slope, axes = about(grams)
-            moved.append(axes @ (axes.T @ slope))
-            known = known & (LEAST_LEFT * np.sum(axes**2, axis=1) <= np.sum(every**2, axis=1))
-        apart = np.array(moved) - np.mean(moved, axis=0)
+            curvature = criterion.slopes(at, criterion.errors(at))[1][:-1, :-1] + beforehand
+            share, axes = np.linalg.eigh(found.directions.T @ curvature @ found.directions)
+            left = np.sum((found.directions @ axes) ** 2 / np.maximum(share, LOST), axis=1)
+            known = known & (LEAST_LEFT * left <= np.diag(covariance))
+            fits.append(descended(criterion, w, penalty)[:-1])
+        apart = np.array(fits) - np.mean(fits, axis=0)
         wider = (0.5 * float(stdtrit(count - 1, TWO_DEVIATIONS))) ** 2 * (count - 1) / count
-        of_known = every @ (every.T @ beforehand @ every) @ every.T
-        return masked_covariance(wider * (apart.T @ apart) + of_known, known)
+        return masked_covariance(wider * (apart.T @ apart) + covariance @ beforehand @ covariance, known)
