@@ -133,7 +133,8 @@ class Estimate:
             determined=self.determined[m:],
             nuisances=self.pi[:m],
             nuisances_std=self.std[:m],
-            nuisances_robust=None if robust is None else np.sqrt(np.diag(robust)[:m]),
+            # Clusters that leave nothing of a nuisance round to either side of zero.
+            nuisances_robust=None if robust is None else np.sqrt(np.maximum(np.diag(robust)[:m], 0.0)),
             crossed=self.covariance[:m, m:],
         )
 
