@@ -74,8 +74,10 @@ class Relinearisation(Stage):
         self._estimate = NoiseEstimate(sensing, system.sample_rate, PASS_BAND / span)
         self._renewed = round(NOISE_RENEWED * system.sample_rate)
         first = round(FIRST_MOTION * HOPS / span)
-        self.linearisation = Linearisation(sensing, self._nuisances, system.sample_rate, first, trackers[0].learns)
-        self.state = RelinearisationState()
+        # Only where a tracker is asked for that learns drifts: a lack of the model is by far the commoner.
+        patient = bool(system.trackers) and trackers[0].learns
+        self.linearisation = Linearisation(sensing, self._nuisances, system.sample_rate, first, patient)
+        self.state = RelinearisationState(patient=patient)
         self.momentum = self._new_momentum()
 
     def _new_momentum(self) -> Momentum:
