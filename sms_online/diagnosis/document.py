@@ -138,7 +138,8 @@ def trust_of(diagnosis: Diagnosis, after: Evaluation | None = None) -> Trust:
     row = None if diagnosis.unexplained is None else diagnosis.unexplained.row
     rest = _after(diagnosis, after)
     if diagnosis.drifts:
-        rest = trust_with(diagnosis.drifts, diagnosis.estimator_before, rest)
+        if diagnosis.estimator_after is not diagnosis.estimator_before:
+            rest = trust_with(diagnosis.drifts, rest)
         if not diagnosis.mistakes:
             return rest
     if not diagnosis.mistakes and not effects and diagnosis.verdict == "named":

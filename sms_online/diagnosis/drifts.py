@@ -31,8 +31,9 @@ MUCH_MORE, LEFT = 10.0, 0.1
 
 
 def following(system: System) -> System:
-    """The system with a judged tracker that learns drifts."""
-    return system.model_copy(update={"trackers": (LEARNED,)})
+    """The system with a judged tracker that is asked to learn drifts; the same where it has one."""
+    stated = system.trackers
+    return system if stated and stated[0].learns else system.model_copy(update={"trackers": (LEARNED,)})
 
 
 def leaves_more(session: Estimator) -> bool:
@@ -87,13 +88,11 @@ def summary_of(drifts: Sequence[Drift]) -> str:
     return f"{each[:1].upper()}{each[1:]}. With that followed nothing but noise is left."
 
 
-def trust_with(drifts: Sequence[Drift], before: Estimator, after: Trust) -> Trust:
-    """The judgement of a capture with drifts: of a session whose tracker follows them, that one's own.
+def trust_with(drifts: Sequence[Drift], after: Trust) -> Trust:
+    """The judgement of a capture whose drifts the tracker of the description does not follow.
 
-    before: of the system as described. after: of the session that follows them.
+    after: of the session that follows them.
     """
-    if before.trackers[0].learns:
-        return after
     names = ", ".join(drift.parameter for drift in drifts)
     more = " but for what follows" if after.level == "doubt" else ""
     trusted = "" if after.grave or after.level == "not yet" else f"; trust the parameters of one that does{more}"

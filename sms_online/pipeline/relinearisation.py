@@ -75,9 +75,10 @@ class Relinearisation(Stage):
         self._renewed = round(NOISE_RENEWED * system.sample_rate)
         first = round(FIRST_MOTION * HOPS / span)
         # Only where a tracker is asked for that learns drifts: a lack of the model is by far the commoner.
-        patient = bool(system.trackers) and trackers[0].learns
-        self.linearisation = Linearisation(sensing, self._nuisances, system.sample_rate, first, patient)
-        self.state = RelinearisationState(patient=patient)
+        asked = bool(system.trackers)
+        learns = asked and trackers[0].learns
+        self.linearisation = Linearisation(sensing, self._nuisances, system.sample_rate, first, learns)
+        self.state = RelinearisationState(patient=asked)
         self.momentum = self._new_momentum()
 
     def _new_momentum(self) -> Momentum:
