@@ -119,7 +119,7 @@ def validate(system: System, data: Data, parameters: Parameters | Mapping[str, f
         session.push(block)
     session.finish()
     beta = _values(session.base, system, parameters)
-    sums = {joint_rows(i): each for i, each in enumerate(session.joint_residuals) if each.signal > 0.0}
+    sums = {joint_rows(i): each for i, each in enumerate(session.energy.joint_residuals) if each.signal > 0.0}
     if not sums:
         raise InputError(recorded.name, "", "no torque, or too few samples", "a run with measured torques")
     fitted = _fitted(list(sums.values()), beta.size)

@@ -26,6 +26,6 @@ def test_a_zero_that_a_session_finds_leaves_no_torque() -> None:
     left = found.residuals["joint_1"].relative
     assert left is not None
     assert left < 0.02
-    described = estimator.joint_residuals[0].relative(found.estimate.pi)
+    described = estimator.energy.joint_residuals[0].relative(found.estimate.pi)
     assert described is not None
     assert described > 0.3

@@ -369,7 +369,7 @@ def _check_measured(session: Estimator, source: str) -> None:
 def _explains_little(estimator: Estimator) -> bool:
     """Whether a session's own fit leaves more than half of a joint's torque."""
     beta = estimator.estimate().pi
-    shares = [joint.relative(beta) for joint in estimator.joint_residuals]
+    shares = [joint.relative(beta) for joint in estimator.energy.joint_residuals]
     return not estimator.by_smoother and any(share is not None and share > LARGEST_RESIDUAL for share in shares)
 
 

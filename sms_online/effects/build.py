@@ -11,6 +11,7 @@ from sms_online.description.bodies import FlexibleLink
 from sms_online.description.schema import System
 from sms_online.effects.base import Site
 from sms_online.effects.catalogue import FORCE_CLASSES, GEOMETRIC_STIFFENING, INERTIA_CLASSES, check_effect, with_shapes
+from sms_online.errors import InputError
 from sms_online.model.chain import Chain
 from sms_online.model.effect import ForceEffect, InertiaEffect
 from sms_online.model.model import Model
@@ -27,6 +28,15 @@ def build_model(system: System, reference: Array | None = None) -> Model:
     name, place or coefficient of an effect.
     """
     return Model(with_kinematics(system), build_effects, reference)
+
+
+def refuse_unknown_masses(model: Model) -> None:
+    """InputError on a declared effect whose columns hold masses that are yet to be found."""
+    for effect in model.effects:
+        if effect.needs_masses:
+            place, found = f"effect {effect.name}@{effect.where}", "a product with masses, which are unknown"
+            expected = "the system's gravity, or a tilt that is found from a whole capture"
+            raise InputError(model.system.name, place, found, expected)
 
 
 def changed_model(model: Model, system: System) -> Model:

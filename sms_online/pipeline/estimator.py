@@ -17,7 +17,7 @@ import msgspec
 import numpy as np
 
 from sms_online.description.schema import System
-from sms_online.effects.build import build_model
+from sms_online.effects.build import build_model, refuse_unknown_masses
 from sms_online.effects.catalogue import channel_effects
 from sms_online.errors import InputError
 from sms_online.model.base_parameters import BaseParameters, find_base_parameters
@@ -25,10 +25,9 @@ from sms_online.model.model import Model
 from sms_online.pipeline.blocks import ENERGY_BLOCK, energy_blocks, momentum_blocks
 from sms_online.pipeline.changes import Adoption
 from sms_online.pipeline.conditioning import Conditioning
-from sms_online.pipeline.energy_balance import BalanceRows, EnergyBalance, SharedErrors
+from sms_online.pipeline.energy_estimate import EnergyEstimate
 from sms_online.pipeline.events import Event
 from sms_online.pipeline.internal_states import FollowedStates
-from sms_online.pipeline.joint_balance import JointBalance, SquaredResidual
 from sms_online.pipeline.marker_identity import MarkerIdentity, Swap
 from sms_online.pipeline.momentum import Momentum
 from sms_online.pipeline.observer import Observer
@@ -42,8 +41,7 @@ from sms_online.pipeline.tracker_bank import session_trackers
 from sms_online.state import Stage, State
 from sms_online.stream import Array, Block
 from sms_online.threads import one_blas_thread
-from sms_online.trackers.interface import Estimate, Prior, Rows, Tracker
-from sms_online.trackers.square_root import session_tracker
+from sms_online.trackers.interface import Estimate, Prior
 
 if TYPE_CHECKING:
     from sms_online.smoother.session import Smoother
@@ -53,9 +51,8 @@ class EstimatorState(State):
     """What an estimator keeps beside its stages.
 
     samples: received, over `duration` s from `first_time` on. pending_t (B,), pending (B, channels): samples that
-    wait for their block to be whole. unbalanced: coordinates and torques that wait for the energy balance; segment: of
-    the last that it took. newest_energy_row: time, s. dropped_rows: of the energy balance, not finite. through: time of
-    the newest sample that has passed the stages, s.
+    wait for their block to be whole. unbalanced: coordinates and torques that wait for the energy balance. through:
+    time of the newest sample that has passed the stages, s.
     """
 
     pending_t: Array
@@ -64,9 +61,6 @@ class EstimatorState(State):
     first_time: float = np.nan
     duration: float = 0.0
     unbalanced: list[GridSamples] = msgspec.field(default_factory=list)
-    segment: int = -1
-    newest_energy_row: float = -np.inf
-    dropped_rows: int = 0
     through: float = -np.inf
 
 
@@ -84,7 +78,7 @@ class Estimator(Stage):
         self.system = system
         self._model = model = build_model(system, reference)
         if reference is None:
-            _refuse_unknown_masses(model)
+            refuse_unknown_masses(model)
         self._base = base = find_base_parameters(model)
         self.sensing = Sensing(model, channels, source)
         self.observers: list[Observer] = []
@@ -115,7 +109,7 @@ class Estimator(Stage):
         # sake of the lag.
         self._rates = RatesStage(system.sample_rate, *self.sensing.deciding)
         self._followed = FollowedStates(model, self.sensing, system.sample_rate)
-        self._energy = EnergyBalance(model, base, system.sample_rate)
+        self.energy = EnergyEstimate(model, base, system.sample_rate)
         # A balance of forces does not hold in a shape that is not the link's; energies tolerate it best.
         by_energy = system.balance == "energy" or self.sensing.missing or (self.smoother is not None and self._slow)
         self.trackers = session_trackers(self.sensing, not by_energy)
@@ -125,7 +119,6 @@ class Estimator(Stage):
         self._relinearisation = (
             None if by_energy else Relinearisation(model, base, self.sensing, self.trackers, self._begin_joints)
         )
-        self.energy_tracker: Tracker = session_tracker(base.n, None)
         self._begin_joints()
         self._first_block, self._block = self._blocks()
         self.finished = False  # no more samples come
@@ -167,7 +160,7 @@ class Estimator(Stage):
     def set_prior(self, prior: Prior) -> None:
         """Add what is known of the base parameters beforehand as a prior; before the first sample."""
         self.prior, self._setup = prior, None
-        self.energy_tracker = session_tracker(self.base.n, prior)
+        self.energy.set_prior(prior)
         if self._relinearisation is not None:
             self._relinearisation.set_prior(prior)
         if self.smoother is not None:
@@ -200,7 +193,7 @@ class Estimator(Stage):
     def _begin_joints(self) -> None:
         """Residuals of the joints count since the last event, in the parameters that hold since then."""
         sensing = None if self._relinearisation is None else self.sensing
-        self._joints = JointBalance(self.model, self.base, self.system.sample_rate, sensing)
+        self.energy.begin_joints(self.model, self.base, sensing)
 
     @property
     def samples(self) -> int:
@@ -211,11 +204,6 @@ class Estimator(Stage):
     def duration(self) -> float:
         """Time from the first sample to the last, s."""
         return self.state.duration
-
-    @property
-    def joint_residuals(self) -> list[SquaredResidual]:
-        """Sums behind the relative residual of each joint, since the last event."""
-        return self._joints.state.residuals
 
     @property
     def end(self) -> float:
@@ -229,7 +217,7 @@ class Estimator(Stage):
             return self.smoother.end
         if self.momentum is not None and self.by_momentum:
             return self.momentum.newest_row
-        return self.state.newest_energy_row
+        return self.energy.state.newest_row
 
     @property
     def by_smoother(self) -> bool:
@@ -265,11 +253,6 @@ class Estimator(Stage):
     def half_width(self) -> int:
         """Half width M of the rates' filter, samples."""
         return self._rates.half_width
-
-    @property
-    def shared_errors(self) -> SharedErrors:
-        """What errors that rows share do to the estimate."""
-        return self._energy.shared
 
     @property
     def periods(self) -> Array:
@@ -390,10 +373,6 @@ class Estimator(Stage):
             self._relinearisation.push(piece, self._synchroniser.start_time, self.periods)
 
     def _balance(self, rates: RateSamples) -> None:
-        if rates.segment != self.state.segment:
-            self.state.segment = rates.segment
-            self._energy.begin_segment()
-            self._joints.begin_segment()
         n_x = self.model.layout.n_x
         x, inputs = rates.values[:, :n_x], rates.values[:, n_x:]
         v = self.model.layout.speeds(x, rates.rates[:, :n_x])
@@ -402,18 +381,9 @@ class Estimator(Stage):
         for observer in self.observers:
             observer.motion(rates.index, rates.segment, x, v, inputs)
         signals = np.concatenate((inputs, self._followed.beside(rates)), axis=1)
-        rows = self._energy.push(rates.index, x, v, signals, self._rates.sigma[n_x:])
-        finite = np.isfinite(rows.Y).all(axis=1) & np.isfinite(rows.b)
-        self.state.dropped_rows += int(np.sum(~finite))
-        if finite.any():
-            fresh = self._stamped(BalanceRows(rows.Y[finite], rows.b[finite], rows.index[finite]))
-            self.energy_tracker.update(fresh)
-            self.state.newest_energy_row = float(fresh.t[-1])
-        self._joints.push(rates.index, x, v, signals)
-
-    def _stamped(self, rows: BalanceRows) -> Rows:
-        t = self._synchroniser.start_time + rows.index / self.system.sample_rate
-        return Rows(rows.Y, rows.b, np.ones_like(rows.b), t)
+        self.energy.push(
+            rates.index, rates.segment, x, v, signals, self._rates.sigma[n_x:], self._synchroniser.start_time
+        )
 
     @one_blas_thread()
     def estimate(self) -> Estimate:
@@ -426,13 +396,4 @@ class Estimator(Stage):
         """The base parameters as the balances determine them."""
         if self.momentum is not None and self.by_momentum:
             return self.momentum.estimate(self.end)
-        return self.energy_tracker.estimate()
-
-
-def _refuse_unknown_masses(model: Model) -> None:
-    """InputError on a declared effect whose columns hold masses that are yet to be found."""
-    for effect in model.effects:
-        if effect.needs_masses:
-            place, found = f"effect {effect.name}@{effect.where}", "a product with masses, which are unknown"
-            expected = "the system's gravity, or a tilt that is found from a whole capture"
-            raise InputError(model.system.name, place, found, expected)
+        return self.energy.tracker.estimate()

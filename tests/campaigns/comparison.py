@@ -77,7 +77,7 @@ def paper(system: System, block: Block) -> Array:
 
 def _energy_rows(system: System, block: Block) -> tuple[Array, Array]:
     estimator = Estimator(system.model_copy(update={"balance": "energy"}), block.channels, "comparison")
-    recorder = estimator.energy_tracker = KeepingTracker(estimator.base.n)
+    recorder = estimator.energy.tracker = KeepingTracker(estimator.base.n)
     estimator.push(block)
     estimator.finish()
     return np.concatenate([rows.Y for rows in recorder.kept]), np.concatenate([rows.b for rows in recorder.kept])
