@@ -189,7 +189,7 @@ def diagnose(
         raise InputError(source, "", str(error), "the links' own markers, in their frames") from error
     followed = before
     # From one capture to the next parameters may change at once.
-    if len(runs) == 1 and following(system) != system and leaves_more(before) and may_explain(attempt.rows):
+    if len(runs) == 1 and not before.trackers[0].learns and leaves_more(before) and may_explain(attempt.rows):
         progress("looking for parameters that drift", FITTED_ONCE)
         followed, _ = _session(following(system), runs, source, prior)
     drifts = explained_by_drifts(followed)

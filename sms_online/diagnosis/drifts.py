@@ -31,9 +31,8 @@ MUCH_MORE, LEFT = 10.0, 0.1
 
 
 def following(system: System) -> System:
-    """The system with a judged tracker that is asked to learn drifts; the same where it has one."""
-    stated = system.trackers
-    return system if stated and stated[0].learns else system.model_copy(update={"trackers": (LEARNED,)})
+    """The system with a judged tracker that learns drifts."""
+    return system.model_copy(update={"trackers": (LEARNED,)})
 
 
 def leaves_more(session: Estimator) -> bool:

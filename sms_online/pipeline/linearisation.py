@@ -19,6 +19,7 @@ from sms_online.calibration.correction import Correction
 from sms_online.calibration.nuisance import Nuisance
 from sms_online.description.schema import Tolerances
 from sms_online.pipeline.sensing import Sensing
+from sms_online.pipeline.sensor_noise import SensorNoise
 from sms_online.pipeline.synchronise import GridSamples
 from sms_online.state import Stage, State
 from sms_online.stream import Array
@@ -46,7 +47,7 @@ class LinearisationState(State):
 
     point: Array
     due: int
-    samples: list[GridSamples] = msgspec.field(default_factory=list)
+    samples: list[tuple[GridSamples, SensorNoise]] = msgspec.field(default_factory=list)
     remembers: bool = True
     steps: int = STEPS
 
@@ -83,11 +84,11 @@ class Linearisation(Stage):
         """ν₀ (m,)."""
         return self.state.point
 
-    def push(self, piece: GridSamples) -> list[GridSamples]:
-        """The samples that can be corrected by now."""
+    def push(self, piece: GridSamples, noise: SensorNoise) -> list[GridSamples]:
+        """The samples that can be corrected by now. noise: of the sensors, as known now."""
         if self.state.remembers:
-            self.state.samples.append(piece)
-            if piece.index[-1] - self.state.samples[0].index[0] > REMEMBERED * self._sample_rate:
+            self.state.samples.append((piece, noise))
+            if piece.index[-1] - self.state.samples[0][0].index[0] > REMEMBERED * self._sample_rate:
                 self.forget()
         return self._correction.push(piece)
 
@@ -103,11 +104,12 @@ class Linearisation(Stage):
         """Samples of one segment, by themselves."""
         return self._new_correction().push(samples)
 
-    def again(self) -> Iterator[GridSamples]:
-        """All samples so far, corrected anew."""
+    def again(self) -> Iterator[tuple[GridSamples, SensorNoise]]:
+        """All samples so far, corrected anew, with the noise that was known then."""
         self._correction = self._new_correction()
-        for piece in self.state.samples:
-            yield from self._correction.push(piece)
+        for piece, noise in self.state.samples:
+            for corrected in self._correction.push(piece):
+                yield corrected, noise
 
     def looks(self, windows: int, last: bool) -> bool:
         """Whether to look at the estimate of so many windows; last: no more samples come."""

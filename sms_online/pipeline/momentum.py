@@ -173,10 +173,16 @@ class Momentum(Stage):
         """Whether there are rows enough since the last event for a test of what they leave."""
         return self.started and self.fit.plain.windows * self._balance.span / HOPS >= TESTED
 
-    @property
-    def lacking(self) -> bool:
-        """Whether rows leave more than noise while that was taken for a drift, and none of ramps explains it."""
-        return self.state.patient and self.bank.learned is not None and self.bank.learned.state.lacking
+    def lacking(self, last: bool) -> bool:
+        """Whether rows leave more than noise while that was taken for a drift, and none of ramps explains it.
+
+        last: the session ends, and a drift that was not learned so far is none.
+        """
+        learned = self.bank.learned
+        if not self.state.patient or learned is None or not self.started:
+            return False
+        unlearned = last and self.fit.plain.patient and not learned.state.accepted
+        return learned.state.lacking or (unlearned and bool(self.fit.plain.excess(self._solved()).any()))
 
     @property
     def misfit(self) -> bool:

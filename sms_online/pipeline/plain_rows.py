@@ -86,8 +86,8 @@ class PlainRows(State):
         ratio = self._squares(beta) / self.windows
         independent = max(1.0, self.windows / OVERLAP)
         largest = max(LARGEST_RATIO, float(chdtri(independent, CHANCE / ratio.size)) / independent)
-        return np.where((ratio > largest) & (not self.patient), ratio - 1.0, 0.0)
+        return np.where(ratio > largest, ratio - 1.0, 0.0)
 
     def judge(self, beta: Array) -> None:
-        """Take the misfit of β (n,) from the windows so far."""
-        self.misfit = self.excess(beta)
+        """Take the misfit of β (n,) from the windows so far: none while that may be a drift."""
+        self.misfit = np.zeros_like(self.misfit) if self.patient else self.excess(beta)

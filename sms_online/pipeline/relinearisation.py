@@ -74,11 +74,9 @@ class Relinearisation(Stage):
         self._estimate = NoiseEstimate(sensing, system.sample_rate, PASS_BAND / span)
         self._renewed = round(NOISE_RENEWED * system.sample_rate)
         first = round(FIRST_MOTION * HOPS / span)
-        # Only where a tracker is asked for that learns drifts: a lack of the model is by far the commoner.
-        asked = bool(system.trackers)
-        learns = asked and trackers[0].learns
+        learns = trackers[0].learns
         self.linearisation = Linearisation(sensing, self._nuisances, system.sample_rate, first, learns)
-        self.state = RelinearisationState(patient=asked)
+        self.state = RelinearisationState()
         self.momentum = self._new_momentum()
 
     def _new_momentum(self) -> Momentum:
@@ -114,7 +112,7 @@ class Relinearisation(Stage):
             return
         waiting, now.waiting = now.waiting, []
         for each in waiting:
-            self._advance(self.linearisation.push(each), now.noise)
+            self._advance((corrected, now.noise) for corrected in self.linearisation.push(each, now.noise))
             self._look(now.noise, last=False)
 
     def finish(self, periods: Array) -> None:
@@ -134,8 +132,8 @@ class Relinearisation(Stage):
             adoption = replace(adoption, samples=samples)
         self.momentum.adopt(adoption, self.state.noise)
 
-    def _advance(self, corrected: Iterable[GridSamples], noise: SensorNoise) -> None:
-        for piece in corrected:
+    def _advance(self, corrected: Iterable[tuple[GridSamples, SensorNoise]]) -> None:
+        for piece, noise in corrected:
             self.momentum.push(piece, noise, self.state.start_time)
 
     def _look(self, noise: SensorNoise, last: bool) -> None:
@@ -143,7 +141,7 @@ class Relinearisation(Stage):
         if self.momentum.changes.events or self.momentum.changes.shifts:
             # No one point is that of the samples before and after.
             self.linearisation.forget()
-        if self.momentum.lacking and self.linearisation.state.samples:
+        if self.momentum.lacking(last) and self.linearisation.state.samples:
             self.state.patient = False
             self._make_rows_again(None, noise, last)
         if not self.momentum.started or not self.linearisation.looks(self.momentum.fit.plain.windows, last):
@@ -162,10 +160,15 @@ class Relinearisation(Stage):
             before, weights = self.linearisation.point, self.momentum.weights
 
     def _make_rows_again(self, weights: Array | None, noise: SensorNoise, last: bool) -> None:
-        """All rows of the session so far, about the point of now, with weights β (n,); None to find them anew."""
+        """All rows of the session so far, about the point of now, with weights β (n,) and the noise of now.
+
+        None to find weights and noise as they were found without patience.
+        """
         self.momentum = self._new_momentum()
+        again = self.linearisation.again()
         if weights is not None:
             self.momentum.fit.go_on(weights, noise, self.momentum.fit.plain.misfit)
-        self._advance(self.linearisation.again(), noise)
+            again = ((piece, noise) for piece, _ in again)
+        self._advance(again)
         if last:
             self.momentum.end_segment(noise)

@@ -229,7 +229,8 @@ class LearnedTrend(Tracker):
             found.append(Moving(ramp.columns, ramp.since, 0.0, tuple(ramp.rates.tolist()), begun=begun))
             tried = self._tried(found)
         new = len(found) > len(self.state.moving)
-        if not new and not self.patient:
+        ends = self.state.knots == PATIENCE and not self.state.accepted
+        if not new and not self.patient and not ends:
             return
         # A lack of the model leaves more than noise, whatever ramps it is taken for.
         left = self._excess(found)
@@ -238,9 +239,10 @@ class LearnedTrend(Tracker):
             self._choose()
             self.state.accepted += 1
             self.state.likeliest = self.state.suspected = None
-        elif self.patient:
+        elif self.patient or ends:
             without = self._excess(self.state.moving) if new else left
-            self.state.lacking = left >= max(LARGEST_LEFT - 1.0, RAMPS_LEAVE * without)
+            least = 0.0 if ends else RAMPS_LEAVE * without
+            self.state.lacking = left >= max(LARGEST_LEFT - 1.0, least)
 
     def _excess(self, moving: Sequence[Moving]) -> float:
         """Mean square of what the remembered rows leave with these moving, less that of noise."""
