@@ -98,6 +98,8 @@ CASES = {
     ),
     "late": Case(("joint_1.stiffness:share=-0.1,over=30,begin=15.3",), ("joint_1.stiffness",), 0.003),
     "step": Case(("joint_2.stiffness:share=-0.05,over=0.001,begin=30",)),
+    "small-step": Case(("joint_2.stiffness:share=-0.005,over=0.001,begin=15.3",), duration=30.0),
+    "damping-step": Case(("joint_1.damping:share=-0.5,over=0.001,begin=15.3",), duration=30.0),
     "missing": Case(undeclared=("coulomb_friction@joint_2:torque=1",)),
 }
 # What drifts, once more with the tolerances of a description.
@@ -147,8 +149,11 @@ def one_session(name: str, cache: Path, seed: int) -> Record:
     samples = round(LOOKED * session.estimator.system.sample_rate)
     looks: dict[str, list[Any]] = {key: [] for key in ("t", "estimate", "std", "beside")}
     named: dict[str, float] = {}
+    known: dict[float, float] = {}
     for piece in block.pieces(samples):
         session.update(piece)
+        for event in session.estimator.events:
+            known.setdefault(event.time, float(piece.t[-1]))
         found = session.evaluation()
         if not found.trackers:
             continue
@@ -170,6 +175,7 @@ def one_session(name: str, cache: Path, seed: int) -> Record:
         "names": list(result.parameters),
         "named": named,
         "events": [event.kind for event in result.events],
+        "known_after": [known[event.time] - event.time for event in result.events if event.time in known],
         "verdict": result.trust.sentence,
         "static_verdict": static.result.trust.sentence if alone else None,
         "episodes": [episode["effects"] for episode in result.diagnosis],
@@ -201,10 +207,12 @@ def _errors(case: Case, records: list[Record]) -> tuple[Array, Array, Array, lis
 def _summary(name: str, records: list[Record], steady: tuple[Array, Array, Array] | None) -> str:
     case = CASES[name]
     named, events = [r["named"] for r in records], [kind for r in records for kind in r["events"]]
+    after = max((each for r in records for each in r["known_after"]), default=None)
+    late = "" if after is None else f", known after {after:.1f} s at most"
     effects = [effect["name"] for r in records for episode in r["episodes"] for effect in episode]
     lines = [
         f"{name}, {len(records)} sessions, {np.median([r['seconds'] for r in records]):.1f} s of one core each",
-        f"  drifts named: {_counts(name for each in named for name in each)}; events: {_counts(events)}",
+        f"  drifts named: {_counts(name for each in named for name in each)}; events: {_counts(events)}{late}",
         f"  effects found: {_counts(effects)}",
         f"  verdicts: {_counts(r['verdict'] for r in records)}",
         f"  verdicts with rls alone: {_counts(r['static_verdict'] for r in records if r['static_verdict'])}",
