@@ -16,6 +16,7 @@ from sms_online.pipeline.statistics import Statistics
 from sms_online.state import Stage, State
 from sms_online.stream import Array
 from sms_online.tables import finite
+from sms_online.trackers.interface import Estimate
 
 if TYPE_CHECKING:
     import pandas
@@ -96,6 +97,14 @@ class History:
         return pandas.DataFrame(self.columns()).set_index("t")
 
 
+def reported_covariance(estimate: Estimate, std: Array) -> Array:
+    """Covariance (n, n) of an estimate with the deviations (n,) that are reported, NaN of what is not determined."""
+    known = np.isfinite(std)
+    # Where rows leave more than noise, reported deviations are larger than the stated noise makes them.
+    scale = np.divide(std, estimate.std, out=np.ones_like(std), where=known & (estimate.std > 0.0))
+    return np.asarray(np.where(np.outer(known, known), estimate.covariance, np.nan) * np.outer(scale, scale))
+
+
 class HistoryState(State):
     """instants: of each, t and how many parameters, then of each tracker their values and upper triangle of covariance.
 
@@ -150,10 +159,7 @@ class Recorder(Stage, Observer):
         packed = [np.array((t, now.base.n))]
         for estimate, std in now.estimates:
             known = np.isfinite(std)
-            # Where rows leave more than noise, reported deviations are larger than the stated noise makes them.
-            scale = np.divide(std, estimate.std, out=np.ones_like(std), where=known & (estimate.std > 0.0))
-            covariance = np.where(np.outer(known, known), estimate.covariance, np.nan) * np.outer(scale, scale)
-            packed += [np.where(known, estimate.pi, np.nan), covariance[upper]]
+            packed += [np.where(known, estimate.pi, np.nan), reported_covariance(estimate, std)[upper]]
         self.state.instants = [*self.state.instants, np.concatenate(packed)]
 
     @property

@@ -6,25 +6,85 @@ And the way back: estimates of base parameters as entries of a system file for t
 from __future__ import annotations
 
 from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from sms_online.description.explain import hint, nearest
 from sms_online.description.schema import Fitted, System
+from sms_online.effects.build import build_model
 from sms_online.errors import InputError
-from sms_online.model.base_parameters import BaseParameters
-from sms_online.result import Parameter
+from sms_online.model.base_parameters import BaseParameters, find_base_parameters
+from sms_online.result import Parameter, Result
 from sms_online.stream import Array
 from sms_online.trackers.interface import Prior
 
 # --prior trusts a maker's nominal value to a tenth.
 NOMINAL_RELATIVE_STD = 0.1
+# What may be known beforehand: nothing, nominal values, or earlier results, their document or the way to it.
+GivenPrior = bool | Result | Mapping[str, Any] | str | Path
 # Quantities that are components of a whole.
 VECTORS = ("first_moment_", "inertia_")
 
 
-def base_prior(system: System, base: BaseParameters, nominal: bool) -> Prior:
+def given_prior(prior: GivenPrior) -> bool | dict[str, Any]:
+    """What a session is told to know beforehand: whether nominal values, or what it needs of earlier results.
+
+    As plain JSON types. Raises InputError where a path leads to no results of a session.
+    """
+    if isinstance(prior, bool):
+        return prior
+    if isinstance(prior, str | Path):
+        from sms_adapters.runs import read_results
+
+        prior = read_results(Path(prior))
+    document = prior.document() if isinstance(prior, Result) else prior
+    parameters = [{key: each[key] for key in ("name", "estimate", "identifiable")} for each in document["parameters"]]
+    return {"system": document["system"], "parameters": parameters, "covariance": document["covariance"]}
+
+
+def base_prior(system: System, base: BaseParameters, prior: bool | Mapping[str, Any]) -> Prior:
     """Prior of the base parameters β = π_independent + mixture π_dependent, NaN where nothing is known.
+
+    prior: see `given_prior`. What earlier results have determined is known with their covariance, and nothing that the
+    system file states of the same combination counts beside it. Raises InputError as `stated_prior`.
+    """
+    stated = stated_prior(system, base, nominal=prior is True)
+    if isinstance(prior, bool):
+        return stated
+    earlier = find_base_parameters(build_model(System.model_validate(prior["system"])))
+    names = [each["name"] for each in prior["parameters"]]
+    i, j = np.triu_indices(len(names))
+    covariance = np.empty((len(names), len(names)))
+    covariance[i, j] = covariance[j, i] = [np.nan if each is None else each for each in prior["covariance"]]
+    combinations = dict(zip((p.name for p in earlier.parameters), _combinations(earlier), strict=True))
+    found = {}
+    for k, (parameter, own) in enumerate(zip(base.parameters, _combinations(base), strict=True)):
+        if combinations.get(parameter.name) != own or parameter.name not in names:
+            continue
+        place = names.index(parameter.name)
+        if prior["parameters"][place]["identifiable"] and covariance[place, place] > 0.0:
+            found[k] = place
+    value, std, correlation = stated.value.copy(), stated.std.copy(), np.eye(base.n)
+    here, there = list(found), list(found.values())
+    value[here] = [prior["parameters"][place]["estimate"] for place in there]
+    std[here] = np.sqrt(np.diag(covariance)[there])
+    correlation[np.ix_(here, here)] = covariance[np.ix_(there, there)] / np.outer(std[here], std[here])
+    return Prior(value, std, correlation)
+
+
+def _combinations(base: BaseParameters) -> list[dict[str, float]]:
+    """Each base parameter as physical ones with their coefficients, rounded to what two descriptions may differ by."""
+    names = [parameter.name for parameter in base.physical]
+    return [
+        {names[index]: 1.0} | {names[d]: round(c, 9) for d, c in zip(base.dependent, row, strict=True) if round(c, 9)}
+        for index, row in zip(base.independent, base.mixture.tolist(), strict=True)
+    ]
+
+
+def stated_prior(system: System, base: BaseParameters, nominal: bool) -> Prior:
+    """Prior of the base parameters from what a system file states, NaN where nothing is known.
 
     Physical parameters have the priors that the system file states; with `nominal`, those that an earlier session has
     found what that states of their whole combination, and the others their nominal value ± 10 %, components of a first

@@ -14,7 +14,7 @@ from sms_online.calibration.found import Calibration
 from sms_online.description.parse import describe
 from sms_online.description.schema import System
 from sms_online.evaluation import NORMAL_95, Evaluation
-from sms_online.history import History, Recorder
+from sms_online.history import History, Recorder, reported_covariance
 from sms_online.pipeline.events import Event
 from sms_online.pipeline.statistics import Method
 from sms_online.stream import Array
@@ -194,7 +194,8 @@ class Result(Documented):
     than its tolerances. trackers: what each says, the judged one, whose estimate `parameters` holds, first; empty where
     no momentum balance gives the estimate.
     physical: None of a session that still runs. diagnosis: episodes of the running diagnosis, as in results.json.
-    history: of the estimates of each tracker, the judged one first.
+    history: of the estimates of each tracker, the judged one first. covariance (n, n): of the parameters, in their
+    order, with the deviations that are reported; NaN of what is not determined.
     """
 
     system: System
@@ -216,6 +217,7 @@ class Result(Documented):
     physical: Consistency | None = field(default=None, repr=False)
     diagnosis: tuple[Mapping[str, Any], ...] = field(default=(), repr=False)
     history: tuple[History, ...] = field(default=(), repr=False)
+    covariance: Array = field(default_factory=lambda: np.empty((0, 0)), repr=False, compare=False)
 
     @property
     def drifts(self) -> tuple[Drift, ...]:
@@ -232,6 +234,7 @@ class Result(Documented):
             "method": self.method,
             "verdict": self.trust.document(),
             "parameters": [parameter.document() for parameter in self.parameters.values()],
+            "covariance": [finite(each) for each in self.covariance[np.triu_indices(len(self.covariance))].tolist()],
             "scale_tolerance": self.system.scale_tolerance,
             "calibration": [each.document() for each in self.calibration],
             "trackers": [each.document() for each in self.trackers],
@@ -343,6 +346,7 @@ def result_of(
         physical=None if projection is None else Consistency(projection.distance, projection.active),
         diagnosis=tuple(episodes),
         history=() if history is None else history.histories,
+        covariance=reported_covariance(estimate, evaluation.std),
     )
 
 

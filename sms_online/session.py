@@ -25,7 +25,7 @@ from sms_online.evaluation import Evaluation
 from sms_online.history import Recorder
 from sms_online.pipeline.estimator import Estimator
 from sms_online.pipeline.statistics import Statistics
-from sms_online.priors import base_prior
+from sms_online.priors import GivenPrior, base_prior, given_prior
 from sms_online.result import Result, result_of
 from sms_online.state import Stage
 from sms_online.stream import Array, Block, Source
@@ -48,13 +48,15 @@ def with_trackers(system: System, tracker: Trackers) -> System:
 class Session:
     """Estimates a system's parameters while samples come, and names effects that the system file lacks.
 
-    system: a `System`, or the name or file of one. channels: names, in the order of the values. prior: use the nominal
-    values as priors, each ± 10 %; priors that the system file states always hold. adopt: add missing effects to the
-    model as soon as they are named. tracker: replaces that of the system file, "rls:forgetting=exponential,memory=5" or
-    "kalman:drift=learned" for instance; of several the first gives the estimate. source: name of the source of the
-    samples, for messages. searcher: makes the searches of the diagnosis, by default at once in this process.
-    checkpoint: state to continue from. The result depends on the samples alone, to the last bit, however they are cut
-    into updates. Raises InputError for a channel that the system does not have, or one that is missing.
+    system: a `System`, or the name or file of one. channels: names, in the order of the values. prior: True for the
+    nominal values, each ± 10 %, or earlier results of the arm, as a `Result`, a results.json or the folder of a run,
+    whose estimates hold with their covariance; priors that the system file states always hold. adopt: add missing
+    effects to the model as soon as they are named. tracker: replaces that of the system file,
+    "rls:forgetting=exponential,memory=5" or "kalman:drift=learned" for instance; of several the first gives the
+    estimate. source: name of the source of the samples, for messages. searcher: makes the searches of the diagnosis, by
+    default at once in this process. checkpoint: state to continue from. The result depends on the samples alone, to the
+    last bit, however they are cut into updates. Raises InputError for a channel that the system does not have, or one
+    that is missing, and where `prior` leads to no results.
     """
 
     def __init__(
@@ -62,7 +64,7 @@ class Session:
         system: Given,
         channels: Sequence[str],
         *,
-        prior: bool = False,
+        prior: GivenPrior = False,
         adopt: bool = False,
         tracker: Trackers = None,
         source: str = "session",
@@ -73,9 +75,10 @@ class Session:
         self.channels = tuple(channels)
         check_channels(self.channels, known_channels(system), source)
         self.estimator = Estimator(system, self.channels, source)
-        if prior or system.priors:
+        known = given_prior(prior)
+        if known or system.priors:
             # A prior is on the base parameters, which the estimator has found.
-            self.estimator.set_prior(base_prior(system, self.estimator.base, prior))
+            self.estimator.set_prior(base_prior(system, self.estimator.base, known))
         # Before the diagnosis, which may have the estimator go on with others.
         self.recorder = Recorder(self.estimator)
         self.estimator.observers.append(self.recorder)
@@ -89,7 +92,7 @@ class Session:
             searcher = Immediate()
         self.diagnosis = OnlineDiagnosis(self.estimator, searcher, adopt)
         self.busy = 0.0  # s of computing
-        self._begun = {"channels": self.channels, "prior": prior, "adopt": adopt, "source": source}
+        self._begun = {"channels": self.channels, "prior": known, "adopt": adopt, "source": source}
         self._source = source
         self._last = -np.inf  # time of the newest sample, s
         self._result: Result | None = None
@@ -233,7 +236,7 @@ def estimate(
     system: Given,
     data: Data,
     *,
-    prior: bool = False,
+    prior: GivenPrior = False,
     adopt: bool = False,
     bound: bool = False,
     tracker: Trackers = None,

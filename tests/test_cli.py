@@ -50,9 +50,9 @@ def test_replay_prints_a_table_and_writes_the_document(bench: Path, capsys: pyte
     names = sorted(path.name for path in (bench / "done").iterdir())
     assert names == ["history.parquet", "report.html", "results.json"]
     assert list(found) == [
-        "schema", "system", "samples", "duration_s", "method", "verdict", "parameters", "scale_tolerance",
-        "calibration", "trackers", "events", "residual", "physical", "condition_number", "throughput_samples_per_s",
-        "lost_samples", "outliers", "warnings", "diagnosis", "history",
+        "schema", "system", "samples", "duration_s", "method", "verdict", "parameters", "covariance",
+        "scale_tolerance", "calibration", "trackers", "events", "residual", "physical", "condition_number",
+        "throughput_samples_per_s", "lost_samples", "outliers", "warnings", "diagnosis", "history",
     ]  # fmt: skip
     assert found["schema"] == "sms-online/results/1"
     assert found["samples"] == 1200
@@ -209,7 +209,7 @@ def test_a_stated_prior_holds_without_the_option() -> None:
     base = find_base_parameters(build_model(system))
     names = [parameter.name for parameter in base.parameters]
     inertia, damping = names.index("link_1.inertia"), names.index("viscous_friction@joint_1.damping")
-    stated, nominal = base_prior(system, base, nominal=False), base_prior(system, base, nominal=True)
+    stated, nominal = base_prior(system, base, prior=False), base_prior(system, base, prior=True)
     for prior in (stated, nominal):
         assert (prior.value[inertia], prior.std[inertia]) == (0.5, 0.05)
     assert math.isnan(stated.std[damping])
@@ -223,7 +223,7 @@ def test_a_combination_has_a_prior_when_all_of_it_has() -> None:
     for description, std in ((half, math.nan), (whole, 5.0)):
         system = parse_system(description, "paper.toml")
         base = find_base_parameters(build_model(system))
-        prior = base_prior(system, base, nominal=False)
+        prior = base_prior(system, base, prior=False)
         k = [parameter.name for parameter in base.parameters].index("spacecraft.mass_with_motor_1")
         assert prior.std[k] == pytest.approx(std, nan_ok=True)
         assert prior.known.sum() == (0 if math.isnan(std) else 1)

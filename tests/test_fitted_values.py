@@ -81,8 +81,8 @@ def test_it_is_simulated_as_found(rig: Path, capsys: pytest.CaptureFixture[str])
 def test_its_deviations_are_priors_where_priors_are_asked_for(rig: Path) -> None:
     system = sms.load_system(rig / "found" / "system.toml")
     base = find_base_parameters(build_model(system))
-    assert not base_prior(system, base, nominal=False).known.any()
-    prior = base_prior(system, base, nominal=True)
+    assert not base_prior(system, base, prior=False).known.any()
+    prior = base_prior(system, base, prior=True)
     for parameter, value, std in zip(base.parameters, prior.value, prior.std, strict=True):
         assert (value, std) == (system.fitted[parameter.name].value, system.fitted[parameter.name].std)
 

@@ -124,7 +124,7 @@ def bound(
     recorded = recorded_session(system, data, folder)
     estimator = Estimator(system, tuple(recorded.source.channels), recorded.name)
     if system.priors:
-        estimator.set_prior(base_prior(system, estimator.base, nominal=False))
+        estimator.set_prior(base_prior(system, estimator.base, prior=False))
     record = MotionRecord(system.sample_rate)
     estimator.observers.append(record)
     for block in recorded.source:

@@ -20,7 +20,7 @@ from sms_online.effects.build import build_model
 from sms_online.errors import InputError
 from sms_online.model.base_parameters import find_base_parameters
 from sms_online.pipeline.estimator import Estimator
-from sms_online.priors import base_prior, with_estimates
+from sms_online.priors import GivenPrior, base_prior, given_prior, with_estimates
 from sms_online.result import Finding, Parameter, Parameters
 from sms_online.session import Data, Recorded, recorded_session
 from sms_online.stream import Block
@@ -133,7 +133,7 @@ def diagnose(
     data: Data | Sequence[Data],
     *,
     holdout: Data | None = None,
-    prior: bool = False,
+    prior: GivenPrior = False,
     progress: Callable[[str, float], None] = lambda what, share: None,
     stop: Callable[[], bool] = lambda: False,
     learned: bool = False,
@@ -143,10 +143,9 @@ def diagnose(
     system, data: as for `estimate`; a list of data, several captures of the same rig, is searched at once: parameters
     and effects are common, initial states are each capture's own, and an effect is selected where it improves captures
     that are predicted from the others. holdout: another capture of the same rig, to check on, of which nothing found
-    depends; without it blocks of the data, each predicted from the others. prior: start from nominal values, each
-    ± 10 %. progress: is called with what is being done, a few words, and the share of all that is done, roughly. stop:
-    is asked between steps whether to end with a partial verdict. learned: whether a curve may be named where no law of
-    the catalogue is.
+    depends; without it blocks of the data, each predicted from the others. prior: as for `Session`. progress: is called
+    with what is being done, a few words, and the share of all that is done, roughly. stop: is asked between steps
+    whether to end with a partial verdict. learned: whether a curve may be named where no law of the catalogue is.
     Raises InputError where the data cannot be read or do not fit the system, a coordinate is
     not measured, parameters jump within the capture, or there is too little motion.
     """
@@ -166,8 +165,10 @@ def diagnose(
     further = [like_the_first(other) for other in others]
     held = [] if holdout is None else like_the_first(recorded_session(system, holdout, folder))
 
+    beforehand = given_prior(prior)
+
     def known(estimator: Estimator) -> Prior | None:
-        return base_prior(system, estimator.base, prior) if prior or system.priors else None
+        return base_prior(system, estimator.base, beforehand) if beforehand or system.priors else None
 
     name = ", ".join(each.name for each in (recorded, *others))
     found = search_for_effects(system, blocks, name, known, held, progress, stop, learned, further)

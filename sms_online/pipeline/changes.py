@@ -33,7 +33,7 @@ from sms_online.pipeline.synchronise import GridSamples
 from sms_online.state import Stage, State
 from sms_online.stream import Array
 from sms_online.trackers.information import Information
-from sms_online.trackers.interface import Prior
+from sms_online.trackers.interface import Prior, joined
 
 # Windows after the event that a decision takes, and where two hypotheses remain, or a gap comes.
 DECISION = 10
@@ -335,11 +335,11 @@ class Changes(Stage):
     def prior(self, described: Prior) -> Prior:
         """What is known beforehand of the current parameters: nothing of those that have jumped."""
         more = np.full(self.base.n - described.value.size, np.nan)
-        std = np.concatenate((described.std, more))
+        whole = joined(described, Prior(more, more))
         jumped = {name for event in self.state.events for name in event.parameters}
         everything_jumped = any(event.kind == "unexplained" for event in self.state.events)
-        std[[everything_jumped or p.name in jumped for p in self.base.parameters]] = np.nan
-        return Prior(np.concatenate((described.value, more)), std)
+        gone = np.array([everything_jumped or p.name in jumped for p in self.base.parameters], dtype=np.bool_)
+        return replace(whole, std=np.where(gone, np.nan, whole.std))
 
     def _extend(self) -> None:
         """Model and base with the parameters that events have added."""

@@ -24,7 +24,7 @@ from sms_online.trackers.drift_filter import STEP
 from sms_online.trackers.drift_search import Ramp
 from sms_online.trackers.drift_state import Found
 from sms_online.trackers.information import Information
-from sms_online.trackers.interface import Estimate, Prior, Rows, Tracker
+from sms_online.trackers.interface import Estimate, Prior, Rows, Tracker, joined
 
 # Path of a judged tracker that is no learned trend: from one check of it to the next, s.
 LOOKED = 1.0
@@ -123,12 +123,8 @@ class TrackerBank(Stage):
         self._nuisances, self._rows_a_window = len(nuisances), rows_a_window
         tolerance = np.array([each.tolerance for each in nuisances])
         nothing = np.full(len(parameters), np.nan)
-        known = Prior(
-            np.concatenate((np.zeros(tolerance.size), nothing if prior is None else prior.value)),
-            np.concatenate(
-                (np.where(np.isfinite(tolerance), tolerance, np.nan), nothing if prior is None else prior.std)
-            ),
-        )
+        tolerances = Prior(np.zeros(tolerance.size), np.where(np.isfinite(tolerance), tolerance, np.nan))
+        known = joined(tolerances, Prior(nothing, nothing) if prior is None else prior)
         self._rows_per_second = rows_per_second(rows_a_window, span)
         rate = self._rows_per_second
         tracked = Tracked(parameters, tolerance.size, known, prior is not None, rate, name)

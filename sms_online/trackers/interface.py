@@ -6,6 +6,7 @@ from abc import ABC, abstractmethod
 from dataclasses import dataclass, field, replace
 
 import numpy as np
+from scipy.linalg import block_diag, cholesky, solve_triangular
 
 from sms_online.state import Stage
 from sms_online.stream import Array
@@ -57,11 +58,13 @@ class Rows:
 class Prior:
     """What is known of the parameters beforehand, value ± std each.
 
-    value, std: (n,). A std of NaN says that nothing is known of that parameter; its value is then ignored.
+    value, std: (n,). A std of NaN says that nothing is known of that parameter; its value is then ignored. correlation
+    (n, n): of their errors, ignored likewise; None where these are independent.
     """
 
     value: Array
     std: Array
+    correlation: Array | None = None
 
     def __post_init__(self) -> None:
         if self.value.shape != self.std.shape or self.value.ndim != 1:
@@ -79,7 +82,7 @@ class Prior:
 
 
 def prior_factor(prior: Prior | None, n: int) -> Array:
-    """The known priors as information rows (k, n + 1): π_j / std_j = value_j / std_j."""
+    """The known priors as information rows (k, n + 1): π_j / std_j = value_j / std_j, errors decorrelated."""
     if prior is None:
         return np.zeros((0, n + 1))
     if prior.std.size != n:
@@ -88,7 +91,18 @@ def prior_factor(prior: Prior | None, n: int) -> Array:
     rows = np.zeros((known.size, n + 1))
     rows[np.arange(known.size), known] = 1.0 / prior.std[known]
     rows[:, n] = prior.value[known] / prior.std[known]
-    return rows
+    if prior.correlation is None:
+        return rows
+    return np.asarray(solve_triangular(cholesky(prior.correlation[np.ix_(known, known)], lower=True), rows, lower=True))
+
+
+def joined(*priors: Prior) -> Prior:
+    """Independent priors of some parameters and of those that come after them, as one."""
+    value, std = (np.concatenate([getattr(prior, name) for prior in priors]) for name in ("value", "std"))
+    if all(prior.correlation is None for prior in priors):
+        return Prior(value, std)
+    blocks = [np.eye(prior.std.size) if prior.correlation is None else prior.correlation for prior in priors]
+    return Prior(value, std, block_diag(*blocks))
 
 
 @dataclass(frozen=True)

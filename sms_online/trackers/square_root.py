@@ -9,7 +9,7 @@ from sms_online.stream import Array
 from sms_online.trackers.factor import solve, triangular_factor
 from sms_online.trackers.forgetting import Forgetting, NoForgetting
 from sms_online.trackers.information import Information
-from sms_online.trackers.interface import Estimate, Prior, Rows, Tracker, checked, prior_factor
+from sms_online.trackers.interface import Estimate, Prior, Rows, Tracker, checked, joined, prior_factor
 from sms_online.trackers.memory import BLOCK_ROWS, Content, memory_for
 from sms_online.trackers.robust import cluster_covariance
 
@@ -95,7 +95,7 @@ def session_tracker(n: int, prior: Prior | None, nuisances: int = 0) -> Recursiv
     """
     if prior is not None and nuisances:
         nothing = np.full(nuisances, np.nan)
-        prior = Prior(np.concatenate((nothing, prior.value)), np.concatenate((nothing, prior.std)))
+        prior = joined(Prior(nothing, nothing), prior)
     return RecursiveLeastSquares(nuisances + n, prior=prior, scaled_by_residual=prior is not None)
 
 

@@ -258,10 +258,10 @@ def _add_part(parser: Parser) -> None:
 
 def _add_prior(parser: Parser) -> None:
     text = (
-        "use the nominal values of the system file as priors, each ± 10 %% (a nominal value of 0 is none); "
-        "priors that the file states itself always hold"
+        "use as priors the nominal values of the system file, each ± 10 %% (a nominal value of 0 is none), or the "
+        "estimates of a run with their covariance; priors that the file states itself always hold"
     )
-    parser.add_argument("--prior", action="store_true", help=text)
+    parser.add_argument("--prior", metavar="RESULTS", nargs="?", const=True, default=False, help=text)
 
 
 def _add_diagnose(verbs: Verbs) -> None:
