@@ -77,6 +77,43 @@ def test_a_drift_that_is_followed_already_is_trusted(drifting: sms.Capture) -> N
     assert again.trust.level == "trust"
 
 
+@pytest.fixture(scope="module")
+def from_the_start() -> sms.Capture:
+    return capture(10.0 * SHARE * np.arange(round(200 * SECONDS)) / 200.0)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("more", ["", RLS])
+def test_a_drift_from_the_start_is_named(more: str, from_the_start: sms.Capture) -> None:
+    found = sms.diagnose(system(more), from_the_start)
+    (drift,) = found.drifts
+    assert drift.parameter == "link_1.inertia"
+    assert drift.rate == pytest.approx(10.0 * RATE, abs=4.0 * drift.std)
+    assert found.effects == ()
+
+
+@pytest.mark.slow
+def test_by_default_a_drift_from_the_start_is_followed(from_the_start: sms.Capture) -> None:
+    """Rows leave more than noise before it is found; that is no lack of the model."""
+    result = sms.estimate(system(), from_the_start)
+    inertia, (drift,) = result.parameters["link_1.inertia"], result.drifts
+    assert inertia.value == pytest.approx(INERTIA + 10.0 * RATE * SECONDS, abs=4.0 * inertia.std)
+    assert drift.since < 2.0
+    assert result.trust.level == "trust"
+
+
+@pytest.mark.slow
+def test_by_default_friction_from_the_start_is_weighed_as_by_least_squares() -> None:
+    block = axis_block(coulomb=0.05)
+    values = dict(zip(block.channels, block.values.T, strict=True))
+    data = sms.Capture.from_arrays(block.t, values)
+    learned, squares = (sms.estimate(system(more), data) for more in ("", RLS))
+    assert learned.drifts == ()
+    assert [(p.value, p.std) for p in learned.parameters.values()] == [
+        (p.value, p.std) for p in squares.parameters.values()
+    ]
+
+
 @pytest.mark.slow
 def test_a_steady_axis_has_no_drift() -> None:
     found = sms.diagnose(system(), capture(np.zeros(2400)))

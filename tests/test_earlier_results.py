@@ -84,7 +84,9 @@ def test_errors_keep_their_correlation(first: sms.Result) -> None:
 
 def test_nothing_is_known_of_an_effect_that_is_new(first: sms.Result) -> None:
     friction = sms.load_system(
-        tomllib.loads(AXIS + '[[effect]]\nname = "coulomb_friction"\nwhere = "joint_1"\ncoefficients = { torque = 0.0 }\n')
+        tomllib.loads(
+            AXIS + '[[effect]]\nname = "coulomb_friction"\nwhere = "joint_1"\ncoefficients = { torque = 0.0 }\n'
+        )
     )
     base = find_base_parameters(build_model(friction))
     known = base_prior(friction, base, given_prior(first)).known
