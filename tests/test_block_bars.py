@@ -103,8 +103,43 @@ def test_block_bars_hold_where_errors_last() -> None:
         estimate = estimated(scale_free(torque_rows(seed)))
         held.append(np.abs(estimate.pi - TRUE) < 1.96 * np.stack(deviations(estimate)))
     alone, blocks = np.mean(held, axis=(0, 2))
-    assert alone < 0.85
+    # One factor for all directions takes rows for nearly as rough as they are; without it 83 % hold.
+    assert 0.85 < alone < blocks
     assert 0.92 < blocks < 0.985
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("lasts", [10.0, 30.0])
+def test_posteriors_hold_where_errors_last(lasts: float) -> None:
+    """Truth is drawn from the prior, 150 seeds by two parameters: 95 % within 91 to 98 %.
+
+    Rows by themselves are off by 0.15 and 0.27, the prior is by 0.1: a posterior is better than either.
+    """
+    std, off, held, bars = 0.1, [], [], []
+    for seed in range(150):
+        true = TRUE + std * np.random.default_rng(10_000 + seed).standard_normal(2)
+        rows = torque_rows(seed, lasts=lasts)
+        rows[..., 2] += rows[..., :2] @ (true - TRUE)
+        known = Beforehand(np.column_stack((np.eye(2), TRUE)) / std, np.zeros((0, 3)))
+        estimate = estimated(replace(scale_free(rows, known), alone=False))
+        bar = np.max(deviations(estimate), axis=0)
+        off.append(estimate.pi - true)
+        held.append(np.abs(off[-1]) < 1.96 * bar)
+        bars.append(bar)
+    assert np.sqrt(np.mean(np.square(off))) < std
+    assert 0.91 < np.mean(held) < 0.98
+    # Of rows that count as independent a quarter and three quarters of the bars are larger than the prior's own.
+    assert np.mean(np.array(bars) > std) < 0.1
+
+
+def test_errors_that_last_are_seen_in_blocks_of_time() -> None:
+    """Factor to the variance of what rows say: one where errors last as long as windows overlap, else several."""
+    short, long = (
+        np.median([scale_free(torque_rows(seed, lasts=lasts)).lasting[0] for seed in range(20)])
+        for lasts in (2.4, 30.0)
+    )
+    assert short < 1.1
+    assert long > 2.0
 
 
 @pytest.mark.slow
@@ -162,4 +197,4 @@ def test_bars_hold_beside_a_gain_that_wanders() -> None:
         held.append((np.abs(estimate.pi - true) < 1.96 * bars)[:, :3])
     alone, reported = np.mean(held, axis=(0, 2))
     assert reported >= 52 / 60, (alone, reported)
-    assert alone < 0.8, (alone, reported)
+    assert alone < reported, (alone, reported)

@@ -198,7 +198,8 @@ class Criterion:
     """The criterion of some rows. lacking, torque (n_v,): which leave more than noise, and which hold a torque.
 
     lasting (n_v,): factor by which errors that last from window to window widen the variance of what a speed's rows
-    say, see `lasting_errors`. Of the matrices only those are kept that some row needs: they are read once for a step, which is what it costs.
+    say, see `lasting_errors`; one by default. Of the matrices only those are kept that some row needs: they are read
+    once for a step, which is what it costs.
     """
 
     def __init__(

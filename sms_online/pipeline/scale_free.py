@@ -1,16 +1,19 @@
 """A session's estimate by the criterion that no scale of the rows changes, with error bars from blocks of time.
 
 What the model lacks is alike from window to window for as long as it likes. The rows' squares as curvature H take rows
-for as independent as windows overlap, and noise in columns for information: their inverse is too small then. So each
-block of time is left out in turn: with δ_c from the minimum of all to that of the others, the covariance is
+for as independent as windows overlap. So each speed's rows are divided by a factor: by how much more the slopes of
+blocks of time scatter than that curvature says. Beside what else is known of the parameters they then weigh what they
+are worth. One factor is a mean over all directions, and noise in columns counts as information in H. So each block of
+time is left out in turn as well: with δ_c from the minimum of all to that of the others, the covariance is
 (C - 1)/C Σ (δ_c - δ̄) (δ_c - δ̄)ᵀ + H⁻¹ P H⁻¹, P the curvature of what is known beside the rows. To first order that is
 the sandwich H⁻¹ J H⁻¹ with J from blocks, in which each score counts by what the others say where it was: a parameter
 that one block determines nearly alone gets the bar that the others leave it. Blocks are as long as a session allows, so
 they are few, and the deviations are those of Student's t.
 
-Sources: Künsch, Annals of Statistics 17 (1989) 1217 (jackknife of blocks of time); MacKinnon, Nielsen and Webb, J.
-Applied Econometrics 38 (2023) 671 (it against other sandwiches); Bester, Conley and Hansen, J. Econometrics 165 (2011)
-137 (few long blocks and Student's t).
+Sources: Ribatet, Cooley and Davison, Statistica Sinica 22 (2012) 813 (a composite likelihood beside a prior, by one
+factor to its logarithm); Künsch, Annals of Statistics 17 (1989) 1217 (jackknife of blocks of time); MacKinnon, Nielsen
+and Webb, J. Applied Econometrics 38 (2023) 671 (it against other sandwiches); Bester, Conley and Hansen, J.
+Econometrics 165 (2011) 137 (few long blocks and Student's t).
 """
 
 from __future__ import annotations
@@ -53,7 +56,12 @@ class ScaleFree:
 
     def minimum(self) -> Minimum:
         """The minimum next to the weights, rows counting as independent as their blocks of time show them to be."""
-        return self._found()[0]
+        return self._found[0]
+
+    @property
+    def lasting(self) -> Array:
+        """Factor (n_v,) by which errors that last from window to window widen the variance of what rows say."""
+        return self._found[1]
 
     def solved(self, squares: Estimate) -> Estimate:
         """That minimum; squares: the estimate by least squares, which says what the rows determine.
@@ -64,12 +72,12 @@ class ScaleFree:
 
     def estimate(self, squares: Estimate) -> Estimate:
         """The same with a robust covariance from blocks of time, which takes three times as long."""
-        found, lasting = self._found()
-        robust = self._of_blocks(found, lasting, squares.determined)
-        return replace(self._solved(found, squares), covariance_robust=robust)
+        robust = self._of_blocks(squares.determined)
+        return replace(self._solved(self.minimum(), squares), covariance_robust=robust)
 
+    @cached_property
     def _found(self) -> tuple[Minimum, Array]:
-        """The minimum, and the factors (n_v,) behind it by which errors that last widen the rows' variance."""
+        """See `minimum` and `lasting`, which follow each other."""
         found = minimum(self.grams, self.lacking, self.torque, [self.weights], self.columns, self.known)
         lasting = np.ones(self.lacking.size)
         for _ in range(PASSES):
@@ -99,11 +107,12 @@ class ScaleFree:
             scale=None if self.alone else 1.0,
         )
 
-    def _of_blocks(self, found: Minimum, lasting: Array, known: NDArray[np.bool_]) -> Array:
-        """Covariance (n, n) of a minimum from what it is without each block of time; known (n,): what has one.
+    def _of_blocks(self, known: NDArray[np.bool_]) -> Array:
+        """Covariance (n, n) of the minimum from what it is without each block of time; known (n,): what has one.
 
         Infinite where blocks are fewer than two, and where one alone determines a parameter.
         """
+        found, lasting = self._found
         without, covariance = self.grams.without_blocks(), found.covariance
         count, w = len(without), np.append(found.beta, -1.0)
         if count < 2:
