@@ -77,6 +77,15 @@ def noise_std(values: Array, times: Array | None = None) -> Array:
     return noise
 
 
+def rough_part(values: Array, times: Array, order: int) -> Array:
+    """What differences of an order leave of samples (B, C) at times (B,), in units of one sample (B - order, C)."""
+    steps = _Steps() if _equal(times) else _UnequalSteps(times)
+    difference, unit = steps.difference(values)
+    for _ in range(order - 1):
+        difference, unit = steps.difference(difference)
+    return np.asarray(difference / unit)
+
+
 def correlation(values: Array, sigma: float) -> float:
     """Correlation a from one sample to the next of a channel's first-order noise, from its samples (B,); 0 if white.
 

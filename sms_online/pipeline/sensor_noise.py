@@ -6,10 +6,23 @@ from dataclasses import dataclass, field
 
 import msgspec
 import numpy as np
+from numpy.typing import NDArray
 
+from sms_online.pipeline.clocks import other_clocks, reference_clock
 from sms_online.pipeline.conditioning import noise_gains
 from sms_online.pipeline.noise import correlation, density_gain, noise_std
 from sms_online.pipeline.sensing import Sensing
+from sms_online.pipeline.stamp_jitter import (
+    Jitter,
+    JitterState,
+    added,
+    by_sensor,
+    jitters,
+    left_and_rates,
+    noise_beside,
+    none,
+    pair_sums,
+)
 from sms_online.state import Stage, State
 from sms_online.stream import Array
 
@@ -32,7 +45,8 @@ class SensorNoise:
     and of measured wrenches. coordinates (n_x,): 1σ of the coordinates x a grid sample, had they white noise of those
     densities, and what taking lags off adds. grid (n_x + drives,): the same of the readings of position sensors and of
     torques. exact: positions have none, but for rounding. coloured: correlation time, s, of channels whose noise is not
-    white; their density is that in the pass band of the windows.
+    white; their density is that in the pass band of the windows. jitters: of devices' stamps. lateness (n_x,): 1σ of
+    a grid sample's by them, s.
     """
 
     sensors: Array
@@ -41,17 +55,20 @@ class SensorNoise:
     grid: Array
     exact: bool
     coloured: dict[str, float] = field(default_factory=dict)
+    jitters: tuple[Jitter, ...] = ()
+    lateness: Array | None = None
 
 
 class NoiseEstimateState(State):
     """What is kept of the channels' samples.
 
     samples: instants and values (2, ·) of each channel's last ones. largest (channels,): reading of each. fresh:
-    instants and values that no channel has yet; unsorted: how many.
+    instants and values that no channel has yet; unsorted: how many. jitter: sums for that of stamps.
     """
 
     samples: list[Array]
     largest: Array
+    jitter: JitterState
     fresh: list[tuple[Array, Array]] = msgspec.field(default_factory=list)
     unsorted: int = 0
 
@@ -66,7 +83,11 @@ class NoiseEstimate(Stage):
         self._sensing, self._pass_band = sensing, pass_band
         self._sample_rate = sample_rate
         count = len(sensing.channels)
-        self.state = NoiseEstimateState([np.empty((2, 0)) for _ in range(count)], np.zeros(count))
+        reference = reference_clock(sensing)
+        own = [] if reference is None else [(reference.name, list(reference.sensors))]
+        self._devices = [*own, *((name, sensors) for (name, _), sensors in other_clocks(sensing).items())]
+        jitter = none(len(sensing.position_columns))
+        self.state = NoiseEstimateState([np.empty((2, 0)) for _ in range(count)], np.zeros(count), jitter)
 
     def push(self, t: Array, values: Array) -> None:
         """Take samples (B, channels) at instants t (B,), NaN where a channel has none."""
@@ -108,17 +129,19 @@ class NoiseEstimate(Stage):
         self._sort()
         sigma = self._sensing.stated_noise
         silent = np.flatnonzero(np.isnan(sigma))
+        period = np.maximum(np.where(np.isnan(periods), 0.0, periods), 1.0 / self._sample_rate)
         for together in self._sampled_together(silent.tolist()):
             samples = np.stack([self.state.samples[k][1] for k in together], axis=1)
             sigma[together] = noise_std(samples, self.state.samples[together[0]][0])
+        whole = sigma.copy()
+        found = self._jitters(sigma, silent, period)
         floor = FINEST * self.state.largest + np.finfo(np.float64).tiny
         positions = self._sensing.position_columns
         exact = bool(np.all(sigma[positions] <= ROUGHLY_EXACT * floor[positions]))
-        period = np.maximum(np.where(np.isnan(periods), 0.0, periods), 1.0 / self._sample_rate)
         density = np.maximum(sigma, floor) ** 2 * period
         coloured: dict[str, float] = {}
         for k in np.intersect1d(silent, positions).tolist() if not exact else ():
-            a = correlation(self.state.samples[k][1], sigma[k])
+            a = correlation(self.state.samples[k][1], whole[k])
             if a > 0.0:
                 density[k] *= density_gain(a, self._pass_band * period[k])
                 coloured[self._sensing.channels[k]] = -float(period[k] / np.log(a))
@@ -128,4 +151,21 @@ class NoiseEstimate(Stage):
         gains = noise_gains(self._sensing.model.system, self._sensing.channels)
         grid = (gains * np.sqrt(density * self._sample_rate))[columns]
         coordinates = self._sensing.coordinate_noise(grid[: len(positions)])
-        return SensorNoise(sensors, inputs, coordinates, grid, exact, coloured)
+        late = by_sensor(found, len(positions), self._sample_rate) if found else None
+        return SensorNoise(sensors, inputs, coordinates, grid, exact, coloured, found, late)
+
+    def _jitters(self, sigma: Array, silent: NDArray[np.int64], period: Array) -> tuple[Jitter, ...]:
+        """Jitters of the devices' stamps; noise (channels,) of silent channels becomes what is beside them."""
+        positions = np.array(self._sensing.position_columns)
+        parts: dict[int, tuple[Array, Array]] = {}
+        for together in self._sampled_together(positions.tolist()):
+            samples = np.stack([self.state.samples[k][1] for k in together], axis=1)
+            left, rates = left_and_rates(samples, self.state.samples[together[0]][0])
+            own = np.flatnonzero(np.isin(positions, together))
+            self.state.jitter = added(self.state.jitter, *pair_sums(left, rates), own)
+            parts |= {k: (left[:, c], rates[:, c]) for c, k in enumerate(together)}
+        found = jitters(self.state.jitter, self._devices, period[positions])
+        for jitter in found:
+            for k in np.intersect1d(positions[list(jitter.sensors)], silent).tolist():
+                sigma[k] = noise_beside(*parts[k], jitter.std)
+        return found
