@@ -447,6 +447,7 @@ class Momentum(Stage):
             scale_free=self.joint.scale_free(self.fit),
             latency=self.latencies.found,
             coloured={} if noise is None else noise.coloured,
+            jitters={} if noise is None else {each.name: each.std for each in noise.jitters},
             suspected=self.bank.suspected,
             shifts=tuple(self.changes.shifts),
             unwatched=self.bank.unwatched,

@@ -30,6 +30,8 @@ from sms_online.stream import Array
 SAMPLES = 4000
 # Fewer give no estimate.
 FEWEST_SAMPLES = 100
+# Estimates of a channel's colour that its mean is over at most; and after which it counts where samples show none.
+MOST_COLOURS, SURE_COLOURS = 16.0, 3.0
 # No sensor is better than this share of its largest reading: what is left is rounding, and interpolation between the
 # samples.
 FINEST = 1e-10
@@ -62,13 +64,15 @@ class SensorNoise:
 class NoiseEstimateState(State):
     """What is kept of the channels' samples.
 
-    samples: instants and values (2, ·) of each channel's last ones. largest (channels,): reading of each. fresh:
-    instants and values that no channel has yet; unsorted: how many. jitter: sums for that of stamps.
+    samples: instants and values (2, ·) of each channel's last ones. largest (channels,): reading of each. jitter: sums
+    for that of stamps. colour (channels, 3): how often one was found; means of the gain in density that it is, and of
+    the inverse of its correlation time, 1/s. fresh: instants and values that no channel has yet; unsorted: how many.
     """
 
     samples: list[Array]
     largest: Array
     jitter: JitterState
+    colour: Array
     fresh: list[tuple[Array, Array]] = msgspec.field(default_factory=list)
     unsorted: int = 0
 
@@ -87,7 +91,9 @@ class NoiseEstimate(Stage):
         own = [] if reference is None else [(reference.name, list(reference.sensors))]
         self._devices = [*own, *((name, sensors) for (name, _), sensors in other_clocks(sensing).items())]
         jitter = none(len(sensing.position_columns))
-        self.state = NoiseEstimateState([np.empty((2, 0)) for _ in range(count)], np.zeros(count), jitter)
+        self.state = NoiseEstimateState(
+            [np.empty((2, 0)) for _ in range(count)], np.zeros(count), jitter, np.zeros((count, 3))
+        )
 
     def push(self, t: Array, values: Array) -> None:
         """Take samples (B, channels) at instants t (B,), NaN where a channel has none."""
@@ -141,10 +147,10 @@ class NoiseEstimate(Stage):
         density = np.maximum(sigma, floor) ** 2 * period
         coloured: dict[str, float] = {}
         for k in np.intersect1d(silent, positions).tolist() if not exact else ():
-            a = correlation(self.state.samples[k][1], whole[k])
-            if a > 0.0:
-                density[k] *= density_gain(a, self._pass_band * period[k])
-                coloured[self._sensing.channels[k]] = -float(period[k] / np.log(a))
+            colour = self._colour(k, correlation(self.state.samples[k][1], whole[k]), float(period[k]))
+            if colour is not None:
+                gain, coloured[self._sensing.channels[k]] = colour
+                density[k] *= gain
         sensors = density[positions]
         inputs = self._sensing.inputs(np.sqrt(density)[None])[0] ** 2
         columns = [*positions, *self._sensing.torque_columns]
@@ -153,6 +159,21 @@ class NoiseEstimate(Stage):
         coordinates = self._sensing.coordinate_noise(grid[: len(positions)])
         late = by_sensor(found, len(positions), self._sample_rate) if found else None
         return SensorNoise(sensors, inputs, coordinates, grid, exact, coloured, found, late)
+
+    def _colour(self, channel: int, correlated: float, period: float) -> tuple[float, float] | None:
+        """Density in the pass band over that at high frequencies, and correlation time, s, of a channel's noise.
+
+        Each is a mean over time of what samples say: those of some seconds hold few slow errors. correlated: what the
+        last ones say, 0 where nothing. None where the noise is white.
+        """
+        count, gain, rate = self.state.colour[channel].tolist()
+        if correlated > 0.0:
+            count = min(count + 1.0, MOST_COLOURS)
+            gain += (density_gain(correlated, self._pass_band * period) - gain) / count
+            rate += (-float(np.log(correlated)) / period - rate) / count
+            self.state.colour = self.state.colour.copy()
+            self.state.colour[channel] = count, gain, rate
+        return (gain, 1.0 / rate) if correlated > 0.0 or count >= SURE_COLOURS else None
 
     def _jitters(self, sigma: Array, silent: NDArray[np.int64], period: Array) -> tuple[Jitter, ...]:
         """Jitters of the devices' stamps; noise (channels,) of silent channels becomes what is beside them."""

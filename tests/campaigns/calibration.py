@@ -226,6 +226,7 @@ def one_session(folder: Path, kind: str, tolerances: str, seed: int) -> Record:
         "chi2": estimate.rss / estimate.dof,
         "level": evaluation.trust.level,
         "sentence": evaluation.trust.sentence,
+        "reasons": list(evaluation.trust.reasons),
         "seconds": process_time() - start,
     }
 
