@@ -39,11 +39,12 @@ EXPLAINED = 1.5
 class RelinearisationState(State):
     """What comes before the balance.
 
-    noise: of the sensors, as estimated at grid index `noise_at`. waiting: samples, until it is known. start_time: of
-    grid index 0, s. patient: see `MomentumState`.
+    noise: of the sensors, as estimated at grid index `noise_at`; made_with: that of the first rows. waiting: samples,
+    until it is known. start_time: of grid index 0, s. patient: see `MomentumState`.
     """
 
     noise: SensorNoise | None = None
+    made_with: SensorNoise | None = None
     noise_at: int = 0
     waiting: list[GridSamples] = msgspec.field(default_factory=list)
     start_time: float = float("nan")
@@ -108,6 +109,11 @@ class Relinearisation(Stage):
         now.waiting.append(piece)
         if (now.noise is None or piece.index[-1] >= now.noise_at + self._renewed) and self._estimate.ready:
             now.noise, now.noise_at = self._estimate.noise(periods), int(piece.index[-1])
+            now.made_with = now.made_with or now.noise
+            if now.noise.outdates(now.made_with) and self.linearisation.state.samples:
+                # The first samples do not show how slow their noise is, or that it moves.
+                now.made_with = now.noise
+                self._make_rows_again(self.momentum.weights, now.noise, last=False)
         if now.noise is None:
             return
         waiting, now.waiting = now.waiting, []

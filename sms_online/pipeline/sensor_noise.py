@@ -32,6 +32,8 @@ SAMPLES = 4000
 FEWEST_SAMPLES = 100
 # Estimates of a channel's colour that its mean is over at most; and after which it counts where samples show none.
 MOST_COLOURS, SURE_COLOURS = 16.0, 3.0
+# Density over that of before from which on rows are made again.
+LOUDER = 2.0
 # No sensor is better than this share of its largest reading: what is left is rounding, and interpolation between the
 # samples.
 FINEST = 1e-10
@@ -59,6 +61,11 @@ class SensorNoise:
     coloured: dict[str, float] = field(default_factory=dict)
     jitters: tuple[Jitter, ...] = ()
     lateness: Array | None = None
+
+    def outdates(self, before: SensorNoise) -> bool:
+        """Whether rows made with a noise of before were made without a jitter, or with far less of a slow noise."""
+        louder = bool(self.coloured) and bool(np.any(self.sensors > LOUDER * before.sensors))
+        return louder or bool(self.jitters and not before.jitters)
 
 
 class NoiseEstimateState(State):
