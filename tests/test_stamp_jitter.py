@@ -67,6 +67,14 @@ def test_an_arm_at_rest_shows_no_jitter() -> None:
     assert found(t, values) == ()
 
 
+def test_a_constant_channel_shows_no_jitter() -> None:
+    t, values = samples(np.random.default_rng(0), 0.0)
+    values[:, 1] = 0.3
+    values[:, 2] = 0.0
+    with np.errstate(all="raise", under="ignore"):
+        assert found(t, values) == ()
+
+
 def test_devices_of_one_clock_have_one_jitter() -> None:
     t, values = samples(np.random.default_rng(1), 3e-4)
     state = added(none(4), *pair_sums(*left_and_rates(values, t)), np.arange(4))

@@ -27,6 +27,8 @@ RATE_SAMPLES = 16
 CERTAIN, LEAST = 10.0, 2e-5
 # Devices have one clock where their jitters have at least this correlation.
 ONE_CLOCK = 0.5
+# A channel that leaves less has no noise: a constant.
+LEAST_VARIANCE = 1e-60
 # What older samples count when newer ones come: an arm at rest shows no jitter.
 KEPT = 0.5
 # Passes in which noise beside jitter and its weights follow each other.
@@ -72,13 +74,14 @@ def pair_sums(left: Array, rates: Array) -> tuple[Array, Array]:
     Both over the variance of what is left: the second is the information on a jitter's square. Products of rates count
     from their mean: what channels have in common at all rates is no jitter. Zero on the diagonal.
     """
-    variance = np.maximum(np.mean(left**2, axis=0), np.finfo(np.float64).tiny)
-    scale = np.outer(variance, variance)
+    variance = np.mean(left**2, axis=0)
+    weight = np.divide(1.0, variance, out=np.zeros_like(variance), where=variance > LEAST_VARIANCE)
+    scale = np.outer(weight, weight)
     mean = rates.T @ rates / len(rates)
     product = (left * rates).T @ (left * rates) - mean * (left.T @ left)
     information = (rates**2).T @ rates**2 - len(rates) * mean**2
     off = 1.0 - np.eye(len(variance))
-    return off * product / scale, off * np.maximum(information, 0.0) / scale
+    return off * scale * product, off * scale * np.maximum(information, 0.0)
 
 
 def jitters(now: JitterState, devices: Sequence[tuple[str, Sequence[int]]], periods: Array) -> tuple[Jitter, ...]:
