@@ -49,8 +49,8 @@ class SensorNoise:
     and of measured wrenches. coordinates (n_x,): 1σ of the coordinates x a grid sample, had they white noise of those
     densities, and what taking lags off adds. grid (n_x + drives,): the same of the readings of position sensors and of
     torques. exact: positions have none, but for rounding. coloured: correlation time, s, of channels whose noise is not
-    white; their density is that in the pass band of the windows. jitters: of devices' stamps. lateness (n_x,): 1σ of
-    a grid sample's by them, s.
+    white; their density is that in the pass band of the windows. slow (n_x,): where that was seen several times.
+    jitters: of devices' stamps. lateness (n_x,): 1σ of a grid sample's by them, s.
     """
 
     sensors: Array
@@ -58,14 +58,15 @@ class SensorNoise:
     coordinates: Array
     grid: Array
     exact: bool
+    slow: NDArray[np.bool_]
     coloured: dict[str, float] = field(default_factory=dict)
     jitters: tuple[Jitter, ...] = ()
     lateness: Array | None = None
 
     def outdates(self, before: SensorNoise) -> bool:
         """Whether rows made with a noise of before were made without a jitter, or with far less of a slow noise."""
-        louder = bool(self.coloured) and bool(np.any(self.sensors > LOUDER * before.sensors))
-        return louder or bool(self.jitters and not before.jitters)
+        louder = self.slow & (self.sensors > LOUDER * before.sensors)
+        return bool(louder.any()) or bool(self.jitters and not before.jitters)
 
 
 class NoiseEstimateState(State):
@@ -165,7 +166,9 @@ class NoiseEstimate(Stage):
         grid = (gains * np.sqrt(density * self._sample_rate))[columns]
         coordinates = self._sensing.coordinate_noise(grid[: len(positions)])
         late = by_sensor(found, len(positions), self._sample_rate) if found else None
-        return SensorNoise(sensors, inputs, coordinates, grid, exact, coloured, found, late)
+        # A signal may look like slow noise for a second.
+        slow = self.state.colour[positions, 0] >= SURE_COLOURS
+        return SensorNoise(sensors, inputs, coordinates, grid, exact, slow, coloured, found, late)
 
     def _colour(self, channel: int, correlated: float, period: float) -> tuple[float, float] | None:
         """Density in the pass band over that at high frequencies, and correlation time, s, of a channel's noise.
