@@ -112,8 +112,7 @@ class Relinearisation(Stage):
             now.made_with = now.made_with or now.noise
             if now.noise.outdates(now.made_with) and self.linearisation.state.samples:
                 # The first samples do not show how slow their noise is, or that it moves.
-                now.made_with = now.noise
-                self._make_rows_again(self.momentum.weights, now.noise, last=False)
+                self._make_with(now.noise)
         if now.noise is None:
             return
         waiting, now.waiting = now.waiting, []
@@ -164,6 +163,14 @@ class Relinearisation(Stage):
                 self.linearisation.forget()
                 return
             before, weights = self.linearisation.point, self.momentum.weights
+
+    def _make_with(self, noise: SensorNoise) -> None:
+        """All rows of the session so far with the noise of now."""
+        weights, self.state.made_with = self.momentum.weights if self.momentum.started else None, noise
+        self.momentum = self._new_momentum()
+        if weights is not None:
+            self.momentum.fit.go_on(weights, noise, self.momentum.fit.plain.misfit)
+        self._advance((piece, noise) for piece, _ in self.linearisation.again())
 
     def _make_rows_again(self, weights: Array | None, noise: SensorNoise, last: bool) -> None:
         """All rows of the session so far, about the point of now, with weights β (n,) and the noise of now.
