@@ -103,8 +103,7 @@ def test_block_bars_hold_where_errors_last() -> None:
         estimate = estimated(scale_free(torque_rows(seed)))
         held.append(np.abs(estimate.pi - TRUE) < 1.96 * np.stack(deviations(estimate)))
     alone, blocks = np.mean(held, axis=(0, 2))
-    # One factor for all directions takes rows for nearly as rough as they are; without it 83 % hold.
-    assert 0.85 < alone < blocks
+    assert alone < 0.85
     assert 0.92 < blocks < 0.985
 
 
@@ -135,7 +134,7 @@ def test_posteriors_hold_where_errors_last(lasts: float) -> None:
 def test_errors_that_last_are_seen_in_blocks_of_time() -> None:
     """Factor to the variance of what rows say: one where errors last as long as windows overlap, else several."""
     short, long = (
-        np.median([scale_free(torque_rows(seed, lasts=lasts)).lasting[0] for seed in range(20)])
+        np.median([replace(scale_free(torque_rows(seed, lasts=lasts)), alone=False).lasting[0] for seed in range(20)])
         for lasts in (2.4, 30.0)
     )
     assert short < 1.1
@@ -197,4 +196,4 @@ def test_bars_hold_beside_a_gain_that_wanders() -> None:
         held.append((np.abs(estimate.pi - true) < 1.96 * bars)[:, :3])
     alone, reported = np.mean(held, axis=(0, 2))
     assert reported >= 52 / 60, (alone, reported)
-    assert alone < reported, (alone, reported)
+    assert alone < 0.8, (alone, reported)

@@ -1,14 +1,14 @@
 """A session's estimate by the criterion that no scale of the rows changes, with error bars from blocks of time.
 
 What the model lacks is alike from window to window for as long as it likes. The rows' squares as curvature H take rows
-for as independent as windows overlap. So each speed's rows are divided by a factor: by how much more the slopes of
-blocks of time scatter than that curvature says. Beside what else is known of the parameters they then weigh what they
-are worth. One factor is a mean over all directions, and noise in columns counts as information in H. So each block of
-time is left out in turn as well: with δ_c from the minimum of all to that of the others, the covariance is
-(C - 1)/C Σ (δ_c - δ̄) (δ_c - δ̄)ᵀ + H⁻¹ P H⁻¹, P the curvature of what is known beside the rows. To first order that is
-the sandwich H⁻¹ J H⁻¹ with J from blocks, in which each score counts by what the others say where it was: a parameter
-that one block determines nearly alone gets the bar that the others leave it. Blocks are as long as a session allows, so
-they are few, and the deviations are those of Student's t.
+for as independent as windows overlap. So beside priors each speed's rows are divided by a factor: by how much more the
+slopes of blocks of time scatter than that curvature says. They then weigh what they are worth. One factor is a mean
+over all directions, and noise in columns counts as information in H. So each block of time is left out in turn as well:
+with δ_c from the minimum of all to that of the others, the covariance is (C - 1)/C Σ (δ_c - δ̄) (δ_c - δ̄)ᵀ + H⁻¹ P H⁻¹,
+P the curvature of what is known beside the rows. To first order that is the sandwich H⁻¹ J H⁻¹ with J from blocks, in
+which each score counts by what the others say where it was: a parameter that one block determines nearly alone gets the
+bar that the others leave it. Blocks are as long as a session allows, so they are few, and the deviations are those of
+Student's t.
 
 Sources: Ribatet, Cooley and Davison, Statistica Sinica 22 (2012) 813 (a composite likelihood beside a prior, by one
 factor to its logarithm); Künsch, Annals of Statistics 17 (1989) 1217 (jackknife of blocks of time); MacKinnon, Nielsen
@@ -60,7 +60,7 @@ class ScaleFree:
 
     @property
     def lasting(self) -> Array:
-        """Factor (n_v,) by which errors that last from window to window widen the variance of what rows say."""
+        """Factor (n_v,) by which errors that last from window to window widen what rows say; one without priors."""
         return self._found[1]
 
     def solved(self, squares: Estimate) -> Estimate:
@@ -80,7 +80,7 @@ class ScaleFree:
         """See `minimum` and `lasting`, which follow each other."""
         found = minimum(self.grams, self.lacking, self.torque, [self.weights], self.columns, self.known)
         lasting = np.ones(self.lacking.size)
-        for _ in range(PASSES):
+        for _ in range(0 if self.alone else PASSES):
             lasting = self._criterion(self.grams, lasting).lasting_errors(self.grams, found, lasting)
             criterion = self._criterion(self.grams, lasting)
             w = descended(criterion, np.append(found.beta, -1.0), self._penalty)
