@@ -24,7 +24,7 @@ from sms_online.row_types import ENERGY, joint_rows, row_types
 from sms_online.stream import Array
 from sms_online.threads import one_blas_thread
 from sms_online.tracker_results import Consistency, Drift, Tracked, TrackerResult
-from sms_online.trackers.interface import Estimate
+from sms_online.trackers.interface import Estimate, Prior
 from sms_online.verdict.evidence import Discrepancy
 from sms_online.verdict.gather import evidence_of
 from sms_online.verdict.judge import judge
@@ -34,6 +34,8 @@ from sms_online.verdict.trust import Residual, Trust
 NORMAL_95 = 1.959963984540054
 # An estimate within three standard deviations of zero is not determined by the data: not even its sign is certain.
 LARGEST_RELATIVE_STD = 1.0 / 3.0
+# Information that is less than this share of what it is a difference of is rounding.
+ROUNDED = 1e-9
 # Mean square of rows over their predicted variance that noise alone may leave: that of the noise is estimated to 7 %.
 LARGEST_ROW_VARIANCE = 1.2
 # Attenuation bias matters where it exceeds this many standard deviations of the estimate.
@@ -45,6 +47,23 @@ POSITIVE = ("mass", "mass_per_length", "stiffness", "damping", "rotor_inertia", 
 def identifiable(beta: Array, std: Array) -> NDArray[np.bool_]:
     """Which parameters β (n,) the data determine: std (n,) is finite, and β three of it from zero."""
     return np.asarray(std <= LARGEST_RELATIVE_STD * np.abs(beta))
+
+
+def beside_prior(estimate: Estimate, std: Array, prior: Prior) -> tuple[Array, Array]:
+    """What is known of each parameter beside its own prior: value (n,), and 1σ (n,), inf where that is nothing.
+
+    It is what, together with the prior, gives the posterior; `std` (n,), as it is reported, widens both alike.
+    """
+    value, out, known = estimate.pi.copy(), std.copy(), np.flatnonzero(prior.known)
+    of_prior, of_both = prior.std[known] ** -2.0, estimate.std[known] ** -2.0
+    rest = of_both - of_prior
+    some = rest > ROUNDED * of_both
+    less = known[~some]
+    value[less], out[less] = 0.0, np.inf
+    known, of_prior, of_both, rest = known[some], of_prior[some], of_both[some], rest[some]
+    value[known] = (of_both * estimate.pi[known] - of_prior * prior.value[known]) / rest
+    out[known] = std[known] * np.sqrt(of_both / rest)
+    return value, out
 
 
 class Evaluation:
@@ -124,8 +143,13 @@ class Evaluation:
 
     @cached_property
     def determined(self) -> NDArray[np.bool_]:
-        """Which parameters the data determine (n,), see `identifiable`."""
-        return identifiable(self.estimate.pi, self.std)
+        """Which parameters the data determine (n,), see `identifiable`: by themselves too, beside a prior's value."""
+        return self._determined(self.estimate, self.std)
+
+    def _determined(self, estimate: Estimate, std: Array) -> NDArray[np.bool_]:
+        """See `determined`; of any tracker's estimate."""
+        out, prior = identifiable(estimate.pi, std), self.statistics.setup.current_prior
+        return out if prior is None else out & identifiable(*beside_prior(estimate, std, prior))
 
     @cached_property
     @one_blas_thread()
@@ -179,7 +203,7 @@ class Evaluation:
             readings = (Reading(now.setup.trackers[0].label, self.estimate, self.estimate.rows / rate),)
         out = []
         for k, (reading, (estimate, std)) in enumerate(zip(readings, self.estimates, strict=True)):
-            numbers = (estimate.pi.tolist(), std.tolist(), identifiable(estimate.pi, std).tolist())
+            numbers = (estimate.pi.tolist(), std.tolist(), self._determined(estimate, std).tolist())
             tracked = {p.name: Tracked(*each) for p, *each in zip(self.parameters, *numbers, strict=True)}
             consistency = Consistency.of(estimate)
             moving = [(self.parameters[drift.column], drift, drift.column) for drift in reading.drifts]

@@ -6,8 +6,10 @@ import numpy as np
 import pytest
 
 from sms_online.description.parse import parse_system
+from sms_online.evaluation import beside_prior, identifiable
 from sms_online.pipeline.estimator import Estimator
 from sms_online.stream import Array, Block
+from sms_online.trackers.interface import Estimate, Prior
 from tests.axis import AXIS, DAMPING, INERTIA
 from tests.evaluated import standard_deviation
 
@@ -44,3 +46,30 @@ def test_error_bars_are_neither_too_small_nor_too_large(torque_noise: float, pos
     rms = np.sqrt(np.mean(normalised_errors(torque_noise, position_noise) ** 2, axis=0))
     assert (rms < 1.35).all(), rms
     assert (rms > 0.2).all(), rms
+
+
+def posterior(prior: Prior, rows: Array, rows_std: Array) -> Estimate:
+    """What priors and independent estimates by rows give together."""
+    information = prior.std**-2.0 + rows_std**-2.0
+    pi = (prior.value / prior.std**2 + rows / rows_std**2) / information
+    determined = np.ones(pi.size, dtype=np.bool_)
+    return Estimate(pi, np.diag(1.0 / information), None, determined, 1.0, 100.0, 90.0, 90.0)
+
+
+def test_what_rows_say_is_the_posterior_less_its_prior() -> None:
+    prior = Prior(np.array([4.0, 4.0]), np.array([0.4, 0.4]))
+    rows, rows_std = np.array([5.5, -2.0]), np.array([0.3, 2.0])
+    estimate = posterior(prior, rows, rows_std)
+    value, std = beside_prior(estimate, estimate.std, prior)
+    np.testing.assert_allclose(value, rows)
+    np.testing.assert_allclose(std, rows_std)
+    # The second is ten of its deviations from zero, but not by what the rows say.
+    assert identifiable(estimate.pi, estimate.std).all()
+    assert identifiable(value, std).tolist() == [True, False]
+
+
+def test_rows_that_say_nothing_leave_a_prior_undetermined() -> None:
+    prior = Prior(np.array([4.0, 4.0]), np.array([0.4, np.nan]))
+    estimate = posterior(Prior(prior.value, np.array([0.4, 1e9])), np.array([4.0, 7.0]), np.array([np.inf, 0.1]))
+    value, std = beside_prior(estimate, estimate.std, prior)
+    assert identifiable(value, std).tolist() == [False, True]

@@ -12,7 +12,7 @@ from sms_adapters.sources import open_source
 from sms_adapters.system_file import load_system, shipped_text
 from sms_online.description.parse import parse_system
 from sms_online.description.schema import System
-from sms_online.evaluation import Evaluation
+from sms_online.evaluation import Evaluation, beside_prior
 from sms_online.session import Session
 
 DATA = Path(__file__).resolve().parents[1].parent / "shared" / "data"
@@ -104,6 +104,22 @@ def test_two_axes_of_a_robot_are_not_determined() -> None:
     assert abs(stiffness - 5.55e6) < 1.96 * std
     # By windows that overlap, and by blocks.
     assert std > 1.5 * evaluation.estimate.std[third]
+
+
+@pytest.mark.long
+def test_a_prior_determines_no_axis_of_a_robot() -> None:
+    """Beside priors of ± 10 % the torque of axes 1 and 2 says nothing that is certain, that of axis 3 does."""
+    system = load_system(str(measured(KUKA / "system.toml")))
+    evaluation = replayed(system, KUKA / "run_a.csv", True)
+    names = [p.name for p in evaluation.parameters]
+    first, second, third = (names.index(f"joint_{i}.stiffness") for i in (1, 2, 3))
+    assert evaluation.determined[[first, second, third]].tolist() == [False, False, True]
+    # Least squares of its torque alone says 5.5 to 5.7e6 N m/rad, the prior 4.1 ± 0.4e6.
+    prior = evaluation.statistics.setup.current_prior
+    assert prior is not None
+    value, std = beside_prior(evaluation.estimate, evaluation.std, prior)
+    assert abs(value[third] - 5.55e6) < 1.96 * std[third]
+    assert evaluation.trust.level == "doubt"
 
 
 @pytest.mark.long

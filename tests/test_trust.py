@@ -86,6 +86,11 @@ def test_what_error_bars_do_not_know_of_is_a_grave_doubt(evidence: Evidence, sai
         (replace(GOOD, discrepancies=(Discrepancy("base", 3.0, "passed"),)), "more than noise for a time"),
         (replace(GOOD, distance=39.0), "the estimate violates physical consistency by 39 standard deviations"),
         (replace(GOOD, lost=0.2), "20 % of the samples are lost"),
+        (replace(GOOD, jitters={"encoders": 5e-4}), "stamps of encoders jitter by 0.5 ms"),
+        (
+            replace(GOOD, coloured={"q_1": 4e-2, "q_2": 2e-2}),
+            "noise of q_1 and of 1 more channels is correlated over 40",
+        ),
         (replace(GOOD, troubles=("drive: silent",)), "drive: silent"),
         (with_row("joint_1", relative=0.4, whitened=2.1), "the residual of joint_1 is 2.1 × noise"),
         (with_row("joint_1", relative=0.4, whitened=None), "40 % of the torque or force of joint_1"),
@@ -104,6 +109,7 @@ def test_what_harms_some_numbers_is_a_doubt_that_is_not_grave(evidence: Evidence
     [
         replace(GOOD, discrepancies=(replace(LACKING, adopted=True), Discrepancy("base", 9.0, "change"))),
         replace(GOOD, lost=1e-4, distance=1.0),
+        replace(GOOD, jitters={"encoders": 3e-5}, coloured={"q_1": 5e-3}),
         with_row("joint_1", relative=0.4, whitened=1.4),
     ],
 )
@@ -124,6 +130,15 @@ def test_lost_samples_come_before_their_residual() -> None:
     judgement = judge(replace(with_row("joint_2", whitened=19.0), lost=0.02))
     assert judgement.sentence == "Do not trust: 2 % of the samples are lost"
     assert judgement.others == ("the residual of joint_2 is 19 × noise",)
+
+
+def test_slow_noise_comes_before_its_residual() -> None:
+    judgement = judge(replace(with_row("joint_2", whitened=4.0), coloured={"q_1": 4e-2}, jitters={"markers": 1e-3}))
+    assert judgement.grave
+    stamps, noise, residual = judgement.reasons
+    assert stamps == "stamps of markers jitter by 1 ms"
+    assert noise == "noise of q_1 is correlated over 40 ms"
+    assert residual == "the residual of joint_2 is 4 × noise"
 
 
 def test_residuals_of_an_unconverged_estimate_show_nothing() -> None:

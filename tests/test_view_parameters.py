@@ -12,10 +12,12 @@ import rerun as rr
 
 from sms_adapters.system_file import load_system
 from sms_online.effects.build import build_model
+from sms_online.evaluation import identifiable
 from sms_online.model.base_parameters import find_base_parameters
 from sms_online.model.parameters import Parameter
 from sms_online.pipeline.events import Event
 from sms_online.pipeline.joint_balance import SquaredResidual
+from sms_online.stream import Array
 from sms_tools.view.frames import Reference
 from sms_tools.view.known import Known
 from sms_tools.view.number_log import NumberLog, markdown_table
@@ -24,6 +26,11 @@ from sms_tools.view.parameter_groups import MOST_LINES, Basis, parameter_groups,
 from sms_tools.view.residuals import RecentResidual
 from sms_tools.view.style import BAD, GOOD, residual_colors
 from tests.recordings import columns
+
+
+def known(t: float, estimate: Array, std: Array) -> Known:
+    """What is known at t, s, without a prior."""
+    return Known(t, estimate, std, identifiable(estimate, std))
 
 
 def about(parameters: Sequence[Parameter]) -> Basis:
@@ -71,7 +78,7 @@ def test_without_a_reference_nothing_is_drawn() -> None:
 def followed(scale: OwnScale, t: float, estimate: list[float], percent: float, converged: bool = True) -> bool:
     """An instant at which every error bar (1σ) is so many percent long."""
     values = np.array(estimate)
-    return scale.follow(Known(t, values, np.abs(values) * percent / 100.0), converged)
+    return scale.follow(known(t, values, np.abs(values) * percent / 100.0), converged)
 
 
 def test_an_axis_is_about_the_estimate_once_converged() -> None:
@@ -106,18 +113,18 @@ def test_an_axis_of_a_restless_estimate_changes_ever_rarer() -> None:
 def test_what_is_determined_later_joins_the_axis_of_the_others() -> None:
     scale = OwnScale([None] * 2)
     values, std = np.array([5.0, 7.0]), np.array([0.01, 0.01])
-    assert scale.follow(Known(1.0, values, np.array([0.01, np.inf])), converged=True)
+    assert scale.follow(known(1.0, values, np.array([0.01, np.inf])), converged=True)
     assert np.isnan(scale.basis.about[1])
     # Everything is drawn anew then, so not at every moment.
-    assert not scale.follow(Known(1.0, values, std), converged=True)
-    assert scale.follow(Known(1.0 + LEAST_REST, values, std), converged=True)
+    assert not scale.follow(known(1.0, values, std), converged=True)
+    assert scale.follow(known(1.0 + LEAST_REST, values, std), converged=True)
     assert scale.basis.about.tolist() == [5.0, 7.0]
 
 
 def test_where_all_true_values_are_known_the_axis_never_changes() -> None:
     scale = OwnScale([Reference(1.0, True)] * 4)
     assert not followed(scale, 5.0, [12.0] * 4, 1.0)
-    assert not scale.follow(Known(9.0, np.full(4, 12.0), np.full(4, 0.1)), converged=True, last=True)
+    assert not scale.follow(known(9.0, np.full(4, 12.0), np.full(4, 0.1)), converged=True, last=True)
 
 
 def test_long_combinations_are_cut_to_a_label() -> None:
@@ -128,7 +135,7 @@ def test_long_combinations_are_cut_to_a_label() -> None:
 
 def test_a_table_has_no_number_of_what_is_not_determined() -> None:
     parameters = [Parameter("joint_1.stiffness", "k_1", "N m/rad", 1000.0)] * 2
-    now = Known(1.0, np.array([1010.0, 7.0]), np.array([5.0, np.inf]))
+    now = known(1.0, np.array([1010.0, 7.0]), np.array([5.0, np.inf]))
     lines = markdown_table(parameters, [Reference(1000.0, True), None], now).splitlines()
     assert lines[2] == "| k_1 | N m/rad | 1010 | 5 | 1000 | +1 % |"
     assert lines[3] == "| k_1 | N m/rad | – | – | – | – |"

@@ -47,7 +47,9 @@ def test_a_warmed_up_filter_whitens_like_one_that_saw_all() -> None:
     x, v, signals = (np.concatenate([getattr(piece, name) for piece in instants]) for name in ("x", "v", "signals"))
     density = POSITION_NOISE**2 / system.sample_rate, TORQUE_NOISE**2 / system.sample_rate
     grid = np.full(n_x + joints, POSITION_NOISE)
-    noise = SensorNoise(np.full(n_x, density[0]), np.full(joints, density[1]), coordinates, grid, False)
+    noise = SensorNoise(
+        np.full(n_x, density[0]), np.full(joints, density[1]), coordinates, grid, False, np.zeros(n_x, bool)
+    )
 
     def information_from(first: int) -> Array:
         """Information about each parameter in the windows compared, by a filter that begins with window `first`."""

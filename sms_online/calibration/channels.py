@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import re
-from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -15,13 +13,10 @@ from sms_online.calibration.nuisance import Nuisance
 from sms_online.description.channels import AXES
 from sms_online.description.schema import Tolerances
 from sms_online.effects.catalogue import ENTRIES
-from sms_online.pipeline.latency import clock_groups
+from sms_online.pipeline.clocks import GAUGES, MARKER, other_clocks
 from sms_online.pipeline.sensing import Sensing
 from sms_online.stream import Array
 
-MARKER = re.compile(r"(?P<marker>link_(?P<link>\d+)\.marker_\d+)\.(?P<kind>u|theta)_(?P<axis>[xyz])")
-# Clocks of what measures links behind flexible joints.
-GAUGES, LINK_ENCODERS = "gauges", "link encoders"
 # Along the link a displacement changes by this rotation, with this sign.
 SLOPES = {"y": ("z", 1.0), "z": ("y", -1.0)}
 
@@ -114,28 +109,8 @@ def _one_torque(joints: Sequence[int], motion: Motion) -> Array:
 
 
 def _clocks(sensing: Sensing, names: Sequence[str], tolerance: float) -> Iterator[Family]:
-    """Later than the torques; from one device, encoders, base and markers have one clock each.
-
-    So have encoders behind flexible joints, beside those of the motors: they come from other electronics.
-    """
-    groups: dict[tuple[str, str], list[int]] = {}
-    if devices := clock_groups(sensing):
-        reference = next((device for device in devices if device.joints), None)
-        others = [device for device in devices if device is not reference]
-        shared = Counter(device.name for device in others)
-        for number, device in enumerate(others, start=1):
-            # Senders on one bus have a clock each.
-            part = str(number) if shared[device.name] > 1 else ""
-            groups[device.name, part] = list(device.sensors)
-    else:
-        base = sensing.model.layout.n_base_positions
-        for k, name in enumerate(names):
-            second = name.startswith("q_") and f"theta_m_{name[2:]}" in names
-            encoders = LINK_ENCODERS if second else "encoders"
-            rest = GAUGES if name.endswith("strain_angle") else encoders
-            kind = "base" if k < base else "markers" if MARKER.fullmatch(name) else rest
-            groups.setdefault((kind, ""), []).append(k)
-    chosen = {name: sensors for name, sensors in groups.items() if sensors}
+    """Later than the torques, by device."""
+    chosen = other_clocks(sensing)
     select = np.zeros((len(names), len(chosen)))
     for column, sensors in zip(select.T, chosen.values(), strict=True):
         column[sensors] = -1.0

@@ -139,7 +139,7 @@ class SessionRows(WeakRows):
                 self.sensing.motion(np.concatenate((segment.values + sign * added, followed), axis=1))
                 for sign in (1.0, -1.0)
             ]
-        windows, instants = balance.push(segment.index, copies, noise.coordinates)
+        windows, instants = balance.push(segment.index, copies, noise.coordinates, noise.lateness)
         dense = balance.dense(windows)
         displacements = np.empty((0, len(DISPLACEMENTS), STEPS + 1, len(self.sensing.position_columns)))
         if windows:

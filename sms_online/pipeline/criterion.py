@@ -87,16 +87,24 @@ class RowGrams(State):
     def _both(self) -> Array:
         return np.stack((self.signal.matrices, self.noise.matrices))
 
+    @property
+    def block_ends(self) -> Array:
+        """Both sums (blocks + 1, 2, n_v, n + 1, n + 1) as they were before the first block of time and after each.
+
+        Windows behind the last whole block are part of it.
+        """
+        whole = self._both
+        return np.stack([np.zeros_like(whole), *self.marks[:-1], whole])
+
     def without_blocks(self) -> list[RowGrams]:
-        """The sums without each block of time in turn; windows behind the last whole block are part of it."""
+        """The sums without each block of time in turn."""
         if not self.marks:
             return []
         whole = self._both
-        ends = [np.zeros_like(whole), *self.marks[:-1], whole]
         windows = np.diff([*(self.length * k for k in range(len(self.marks))), self.windows]).tolist()
         out = []
-        for begin, end, count in zip(ends[:-1], ends[1:], windows, strict=True):
-            signal, noise = whole - (end - begin)
+        for block, count in zip(np.diff(self.block_ends, axis=0), windows, strict=True):
+            signal, noise = whole - block
             out.append(RowGrams(GramSum(signal), GramSum(noise), self.windows - count))
         return out
 
@@ -189,7 +197,9 @@ class _Point:
 class Criterion:
     """The criterion of some rows. lacking, torque (n_v,): which leave more than noise, and which hold a torque.
 
-    Of the matrices only those are kept that some row needs: they are read once for a step, which is what it costs.
+    lasting (n_v,): factor by which errors that last from window to window widen the variance of what a speed's rows
+    say, see `lasting_errors`; one by default. Of the matrices only those are kept that some row needs: they are read
+    once for a step, which is what it costs.
     """
 
     def __init__(
@@ -199,13 +209,16 @@ class Criterion:
         torque: NDArray[np.bool_],
         columns: Columns,
         start: Array,
+        lasting: Array | None = None,
     ) -> None:
         signal, of_noise = grams.signal.matrices, grams.noise.matrices
         self._A, self._lacking = signal, lacking
         self._squares = np.einsum("vii->vi", signal)
         self._count = np.where(lacking, grams.windows / OVERLAP, float(grams.windows))
-        same = np.where(torque[lacking, None, None], columns.of_torque, columns.of_motion)
-        self._M = np.where(same, signal[lacking] - of_noise[lacking], 0.0)
+        if lasting is not None:
+            self._count = self._count / lasting
+        self._same = np.where(torque[lacking, None, None], columns.of_torque, columns.of_motion)
+        self._M = np.where(self._same, signal[lacking] - of_noise[lacking], 0.0)
         diagonal = np.einsum("vii->vi", self._M)
         diagonal[:] = np.maximum(diagonal, 0.0)
         # Rows without noise have a constant deviation: one.
@@ -278,6 +291,30 @@ class Criterion:
         whole += ((2.0 * log / D**2 + 4.0 * plain * S / D**3) * g.T) @ g + cross + cross.T
         return slopes, squares, whole
 
+    def lasting_errors(self, grams: RowGrams, found: Minimum, before: Array) -> Array:
+        """Factor (n_v,) by which errors that last widen the variance of what rows say, at a minimum; one at least.
+
+        Slopes of blocks of time scatter by as much as curvature says where errors are independent. Either counts in the
+        metric of all curvature, so directions that others determine count little. before (n_v,): the factors so far.
+        """
+        out, blocks = before.copy(), np.diff(grams.block_ends, axis=0)
+        if len(blocks) < 2:
+            return out
+        w = np.append(found.beta, -1.0)
+        at = self.at(w)
+        errors = self.errors(at)[self._lacking, None]
+        S, D, n = (v[self._lacking] for v in (self.squares(at), self.predicted(at, self.errors(at)), self._count))
+        A, G = blocks[:, 0][:, self._lacking], blocks[:, 1][:, self._lacking]
+        of_model = np.where(self._same, A - G, 0.0) @ w
+        slopes = (n / S)[:, None] * (A @ w) - (n / D)[:, None] * errors * of_model
+        scattered = (slopes - slopes.mean(axis=0))[..., :-1] @ found.directions
+        scatter = len(blocks) / (len(blocks) - 1) * np.sum(scattered**2, axis=(0, 2))
+        curvature = self._A[self._lacking][:, :-1, :-1] @ found.directions
+        expected = n / S * np.einsum("kr,vkr->v", found.directions, curvature)
+        share = np.divide(scatter, expected, out=np.ones_like(scatter), where=expected > 0.0)
+        out[self._lacking] = np.maximum(1.0, before[self._lacking] * share)
+        return out
+
 
 def minimum(
     grams: RowGrams,
@@ -303,7 +340,12 @@ def minimum(
         for wider in penalties:
             freed = descended(criterion, freed, wider)
         found.append(freed)
-    w = min(found, key=lambda each: criterion.relative(each, columns.nuisances) + penalty.value(each))
+    best = min(found, key=lambda each: criterion.relative(each, columns.nuisances) + penalty.value(each))
+    return at_minimum(criterion, best, penalty)
+
+
+def at_minimum(criterion: Criterion, w: Array, penalty: Penalty) -> Minimum:
+    """What there is to know of the minimum at w (n + 1,)."""
     there = criterion.at(w)
     errors = criterion.errors(there)
     slopes, curvature, _ = criterion.slopes(there, errors)

@@ -70,7 +70,7 @@ class EventRows:
         system, values = self.system, samples.values
         balance = MomentumBalance(model, base, system.sample_rate, system.windows.momentum, moments=self.drifts)
         windows, instants = balance.push(
-            samples.index, [self.sensing.motion(values)] * COPIES, noise.coordinates
+            samples.index, [self.sensing.motion(values)] * COPIES, noise.coordinates, noise.lateness
         )  # fmt: skip
         weights = np.zeros(base.n)
         weights[:n] = before.known.solution().pi[m:]

@@ -23,6 +23,7 @@ from sms_online.pipeline.momentum_windows import COPIES, HOPS, INSTANTS
 from sms_online.pipeline.residual_test import SequentialTest
 from sms_online.pipeline.sensing import Sensing
 from sms_online.pipeline.sensor_noise import SensorNoise
+from sms_online.pipeline.stamp_jitter import RATE_SAMPLES, synthetic
 from sms_online.pipeline.statistics import MomentumStatistics
 from sms_online.pipeline.synchronise import GridSamples
 from sms_online.pipeline.tracker_bank import Change, Reading, TrackerBank
@@ -47,11 +48,13 @@ class MomentumState(State):
 
     sensor_noise: that of the samples so far. newest_row: time of the last window's end, s. start_time: of grid index 0,
     s. random: gives the synthetic noise. patient: whether more than noise in the beginning may be a drift yet to be
-    learned. drift: known to windows to come. held: rows since an alarm that may be false.
+    learned. drift: known to windows to come. held: rows since an alarm that may be false. readings (·, sensors): last
+    ones of the segment.
     """
 
     random: np.random.Generator
     patient: bool
+    readings: Array
     sensor_noise: SensorNoise | None = None
     segment: int = -1
     start_time: float = np.nan
@@ -93,7 +96,7 @@ class Momentum(Stage):
         learns = self._trackers[0].learns
         self.changes = Changes(model, base, sensing, self.nuisances, self._rebuild, point, self._beside_squares, learns)
         self._sources, self._clocks = source_groups(sensing), clock_groups(sensing)
-        self.state = MomentumState(np.random.default_rng(SEED), patient)
+        self.state = MomentumState(np.random.default_rng(SEED), patient, np.empty((0, len(sensing.position_columns))))
         self.bank = self._new_bank()
         self._build()
 
@@ -238,6 +241,7 @@ class Momentum(Stage):
                 self.end_segment(noise)
             self._balance.begin_segment()
             self.state.segment = piece.segment
+            self.state.readings = self.state.readings[:0]
         self.changes.keep(piece)
         self.bank.hold_until(self.state.start_time + int(piece.index[-1]) / self._sample_rate)
         self._process(piece, noise)
@@ -251,7 +255,7 @@ class Momentum(Stage):
 
     def _process(self, piece: GridSamples, noise: SensorNoise) -> None:
         copies = self._copies(piece.values, noise)
-        windows, instants = self._balance.push(piece.index, copies, noise.coordinates)
+        windows, instants = self._balance.push(piece.index, copies, noise.coordinates, noise.lateness)
         self._absorb(self.fit.push(windows, instants, noise))
 
     def _decide(self, noise: SensorNoise, last: bool) -> None:
@@ -293,6 +297,11 @@ class Momentum(Stage):
         added = np.zeros_like(values)
         columns = [*self.sensing.position_columns, *self.sensing.torque_columns]
         added[:, columns] = self.state.random.standard_normal((values.shape[0], len(columns))) * noise.grid
+        positions = list(self.sensing.position_columns)
+        readings, before = values[:, positions], self.state.readings
+        if noise.jitters:
+            added[:, positions] += synthetic(noise.jitters, readings, before, self._sample_rate, self.state.random)
+        self.state.readings = np.concatenate((before, readings))[-RATE_SAMPLES:]
         return [measured, self.sensing.motion(values + added), self.sensing.motion(values - added)]
 
     def finish(self, noise: SensorNoise) -> None:
@@ -438,6 +447,7 @@ class Momentum(Stage):
             scale_free=self.joint.scale_free(self.fit),
             latency=self.latencies.found,
             coloured={} if noise is None else noise.coloured,
+            jitters={} if noise is None else {each.name: each.std for each in noise.jitters},
             suspected=self.bank.suspected,
             shifts=tuple(self.changes.shifts),
             unwatched=self.bank.unwatched,

@@ -150,11 +150,14 @@ class MomentumBalance(Stage):
         self.state = MomentumBalanceState(np.empty((0, columns)))
         self._standstill = Standstill(self._motors.size, self.sample_rate)
 
-    def push(self, index: NDArray[np.int64], copies: list[Array], sigma: Array) -> tuple[list[Window], list[Instants]]:
+    def push(
+        self, index: NDArray[np.int64], copies: list[Array], sigma: Array, lateness: Array | None = None
+    ) -> tuple[list[Window], list[Instants]]:
         """Windows that B consecutive samples complete, and the states at their instants.
 
         index (B,): grid index. copies: x and signals side by side (B, n_x + n_signals) as measured, then with noise
-        added and with the same subtracted. sigma (n_x,): noise of x, 1σ per sample.
+        added and with the same subtracted. sigma (n_x,): noise of x, 1σ per sample. lateness (n_x,): 1σ of how late a
+        sample is, s; None for none.
         """
         if self.state.skip is None:
             self.state.skip = -(int(index[0]) + self.lead) % self.hop if self._prompt else 0
@@ -165,7 +168,7 @@ class MomentumBalance(Stage):
         grid = int(index[-1]) - (self.state.first + self.state.samples.shape[0] - 1)
         chosen: list[tuple[int, int]] = []  # first sample and half width of each window
         while self.state.window + self.width + self.lead + self.margin < self.state.first + self.state.samples.shape[0]:
-            chosen.append((self.state.window, self._choose(sigma)))
+            chosen.append((self.state.window, self._choose(sigma, lateness)))
             self.state.window += self.hop
             self.state.compared.pop(0)
         instants = [piece for window, half_width in chosen for piece in self._instants(window, half_width)]
@@ -182,7 +185,7 @@ class MomentumBalance(Stage):
             self._standstill.drop(self.state.window + self.lead)
         return windows, instants
 
-    def _choose(self, sigma: Array) -> int:
+    def _choose(self, sigma: Array, lateness: Array | None) -> int:
         """Half width for the next window, by all of it but its last hop, which the widest filter does not reach yet.
 
         Sample n of the segment is at n - first + lead of the buffer.
@@ -192,6 +195,10 @@ class MomentumBalance(Stage):
             start = self.state.window + len(self.state.compared) * self.hop - self.state.first + self.lead
             centres = start + (np.arange(COMPARED) * self.hop) // COMPARED
             self.state.compared.append(self._choice.squares(self.state.samples[:, :n_x], centres))
+        if lateness is not None:
+            hops = self.state.window - self.state.first + self.lead + np.arange(HOPS) * self.hop
+            rates = np.diff(self.state.samples[hops, :n_x], axis=0) * (self.sample_rate / self.hop)
+            sigma = np.sqrt(sigma**2 + lateness**2 * np.mean(rates**2, axis=0))
         return self._choice.widest(np.sum(self.state.compared, axis=0) / ((HOPS - 1) * COMPARED), sigma)
 
     def _instants(self, window: int, half_width: int) -> list[Instants]:

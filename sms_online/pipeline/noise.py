@@ -8,6 +8,7 @@ time are unequal, divided differences take the place of differences: they remove
 
 from __future__ import annotations
 
+from functools import cache
 from math import comb
 
 import numpy as np
@@ -37,8 +38,11 @@ QUANTUM_TOLERANCE = 1e-2
 COLOURED = 1.5
 # Natural logarithm of a ratio of densities within which it is that of first-order noise.
 CONSISTENT = 0.35
-# Samples in a mean, the first of them to ask whether there is any colour; and fewest means.
+# Samples in a mean, the first of them to ask whether there is any colour; and fewest means. Where these show noise of
+# first order, longer means say how slow it is, up to those that hold a signal: they are off by more than their scatter.
 MEANS = (4, 2, 8)
+LONG_MEANS = (16, 32, 64)
+LONG_CONSISTENT = 0.7
 FEWEST_MEANS = 60
 # Order of differences at which noise of such colour is distinguished from a slower signal.
 TYPICAL_ORDER = 4
@@ -77,6 +81,15 @@ def noise_std(values: Array, times: Array | None = None) -> Array:
     return noise
 
 
+def rough_part(values: Array, times: Array, order: int) -> Array:
+    """What differences of an order leave of samples (B, C) at times (B,), in units of one sample (B - order, C)."""
+    steps = _Steps() if _equal(times) else _UnequalSteps(times)
+    difference, unit = steps.difference(values)
+    for _ in range(order - 1):
+        difference, unit = steps.difference(difference)
+    return np.asarray(difference / unit)
+
+
 def correlation(values: Array, sigma: float) -> float:
     """Correlation a from one sample to the next of a channel's first-order noise, from its samples (B,); 0 if white.
 
@@ -88,14 +101,39 @@ def correlation(values: Array, sigma: float) -> float:
         return 0.0
     ratios = np.zeros(len(MEANS))
     for k, m in enumerate(MEANS):
-        means = values[: values.size // m * m].reshape(-1, m).mean(axis=1)
-        ratios[k] = m * (float(noise_std(means[:, None])[0]) / sigma) ** 2
+        ratios[k] = _density(values, m) / sigma**2
         if k == 0 and ratios[k] < COLOURED:
             return 0.0
-    off = np.log(np.array([_seen_density(_CORRELATIONS, m) for m in MEANS]) / _seen_density(_CORRELATIONS, 1))
-    off -= np.log(ratios)[:, None]
+    off = _off(ratios, MEANS)
     best = int(np.argmin(np.sum(off**2, axis=0)))
-    return float(_CORRELATIONS[best]) if np.all(np.abs(off[:, best]) < CONSISTENT) else 0.0
+    if np.any(np.abs(off[:, best]) >= CONSISTENT):
+        return 0.0
+    for m in LONG_MEANS:
+        if values.size < m * FEWEST_MEANS:
+            break
+        longer = np.concatenate((off, _off(np.array([_density(values, m) / sigma**2]), (m,))))
+        at = int(np.argmin(np.sum(longer**2, axis=0)))
+        if np.any(np.abs(longer[:, at]) >= LONG_CONSISTENT):
+            break
+        off, best = longer, at
+    return float(_CORRELATIONS[best])
+
+
+def _density(values: Array, m: int) -> float:
+    """Density of noise near f_s / 2m, in units of that of white noise of unit variance, from means of m samples."""
+    means = values[: values.size // m * m].reshape(-1, m).mean(axis=1)
+    return m * float(noise_std(means[:, None])[0]) ** 2
+
+
+def _off(ratios: Array, means: tuple[int, ...]) -> Array:
+    """Logarithms (M, ·) of what first-order noise of each correlation has there over ratios (M,) to single samples."""
+    expected = np.array([_seen_densities(m) for m in means]) / _seen_densities(1)
+    return np.asarray(np.log(expected) - np.log(ratios)[:, None])
+
+
+@cache
+def _seen_densities(m: int) -> Array:
+    return _seen_density(_CORRELATIONS, m)
 
 
 def density_gain(a: float, frequency: float) -> float:

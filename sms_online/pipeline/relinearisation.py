@@ -39,11 +39,12 @@ EXPLAINED = 1.5
 class RelinearisationState(State):
     """What comes before the balance.
 
-    noise: of the sensors, as estimated at grid index `noise_at`. waiting: samples, until it is known. start_time: of
-    grid index 0, s. patient: see `MomentumState`.
+    noise: of the sensors, as estimated at grid index `noise_at`; made_with: that of the first rows. waiting: samples,
+    until it is known. start_time: of grid index 0, s. patient: see `MomentumState`.
     """
 
     noise: SensorNoise | None = None
+    made_with: SensorNoise | None = None
     noise_at: int = 0
     waiting: list[GridSamples] = msgspec.field(default_factory=list)
     start_time: float = float("nan")
@@ -108,6 +109,10 @@ class Relinearisation(Stage):
         now.waiting.append(piece)
         if (now.noise is None or piece.index[-1] >= now.noise_at + self._renewed) and self._estimate.ready:
             now.noise, now.noise_at = self._estimate.noise(periods), int(piece.index[-1])
+            now.made_with = now.made_with or now.noise
+            if now.noise.outdates(now.made_with) and self.linearisation.state.samples:
+                # The first samples do not show how slow their noise is, or that it moves.
+                self._make_with(now.noise)
         if now.noise is None:
             return
         waiting, now.waiting = now.waiting, []
@@ -158,6 +163,14 @@ class Relinearisation(Stage):
                 self.linearisation.forget()
                 return
             before, weights = self.linearisation.point, self.momentum.weights
+
+    def _make_with(self, noise: SensorNoise) -> None:
+        """All rows of the session so far with the noise of now."""
+        weights, self.state.made_with = self.momentum.weights if self.momentum.started else None, noise
+        self.momentum = self._new_momentum()
+        if weights is not None:
+            self.momentum.fit.go_on(weights, noise, self.momentum.fit.plain.misfit)
+        self._advance((piece, noise) for piece, _ in self.linearisation.again())
 
     def _make_rows_again(self, weights: Array | None, noise: SensorNoise, last: bool) -> None:
         """All rows of the session so far, about the point of now, with weights β (n,) and the noise of now.

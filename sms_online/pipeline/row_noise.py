@@ -23,6 +23,7 @@ import numpy as np
 from sms_online.pipeline.latency import SourceGroup
 from sms_online.pipeline.momentum_windows import EXPONENT, HOPS, INSTANTS, STEPS
 from sms_online.pipeline.sensitivity import SPARSE, Sensitivity, nodes
+from sms_online.pipeline.stamp_jitter import Jitter
 from sms_online.pipeline.weak_form import test_function
 from sms_online.state import Stage, State
 from sms_online.stream import Array
@@ -101,6 +102,13 @@ class RowNoise(Stage):
         weights[:, 1:] += 0.5 * kernels[:, 1::2]
         return np.asarray(self._step * np.einsum("wkvs,wks->wvs", weights, rates))
 
+    def jittering(self, kernels: Array, rates: Array, jitters: Sequence[Jitter]) -> Array:
+        """c (W, STEPS + 1, n_v, ·) of a lateness δ(t) of each device whose stamps jitter; rates as in `lateness`."""
+        between = np.repeat(rates, 2, axis=1)[:, :-1]
+        between[:, 1::2] = 0.5 * (rates[:, :-1] + rates[:, 1:])
+        each = [np.einsum("wkvs,wks->wkv", kernels[..., own], between[..., own]) for own in map(_sensors, jitters)]
+        return np.stack(each, axis=3) if each else kernels[..., :0]
+
     def covariances(
         self, kernels: Array, late: Array, sensor_density: Array, torque_density: Array, free: Array, ages: Array,
         wrench: Array | None = None,
@@ -169,6 +177,10 @@ def common(free: Array, before: Array, hops: int) -> Array:
     """
     later = hops * (INSTANTS // HOPS)
     return np.asarray(np.sum(free[:, : INSTANTS - later] * before[:, later:], axis=1))
+
+
+def _sensors(jitter: Jitter) -> list[int]:
+    return list(jitter.sensors)
 
 
 def _interpolation(at: Array, nodes: Array) -> Array:

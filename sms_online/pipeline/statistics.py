@@ -88,7 +88,7 @@ class MomentumStatistics:
     nothing has moved. tracker: its rows so far; bias: what noise in its columns does. rows: unwhitened rows and their
     misfit. started: weights are known. tested: there are rows enough for a test of what they leave. alarm: type of the
     rows that the sequential test finds more than noise in. scale_free: what gives the estimate where rows leave more
-    than noise. latency: source that is late against the others, if one is. coloured: see
+    than noise. latency: source that is late against the others, if one is. coloured, jitters (1σ by device): see
     `SensorNoise`. suspected: a change of parameters that the judged tracker does not follow; unwatched: none is looked
     for. shifts: of the devices' clocks. point (m,): nuisances that samples are corrected by.
     """
@@ -104,6 +104,7 @@ class MomentumStatistics:
     scale_free: ScaleFree | None
     latency: Latency | None
     coloured: dict[str, float]
+    jitters: dict[str, float]
     suspected: Suspected | None
     shifts: tuple[ClockShift, ...]
     unwatched: bool

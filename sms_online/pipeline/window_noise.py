@@ -151,7 +151,9 @@ class WindowNoise(Stage):
             middles = starts + INSTANTS // 2 - self.state.first
             wrench = np.array([self.state.pushes[k] for k in middles]) * np.sqrt(noise.torque[self._joints :])
         torque = noise.torque[: self._joints]
-        covariances = self._noise.covariances(kernels, late, noise.sensors, torque, free, ages, wrench)
+        jittering = np.concatenate((kernels, self._noise.jittering(kernels, sensitivity.rates, noise.jitters)), axis=3)
+        density = np.append(noise.sensors, [each.density for each in noise.jitters])
+        covariances = self._noise.covariances(jittering, late, density, torque, free, ages, wrench)
         for each, own in zip(covariances, errors, strict=True):
             diagonal = np.einsum("ii->i", each[-1])
             diagonal += own

@@ -63,6 +63,7 @@ class Evidence:
     slow: rates, Hz, of sensors that are too slow for the balance.
     outliers: share of the samples that was left out, by channel.
     discrepancies: of the running diagnosis.
+    jitters: 1σ, s, by which stamps of devices are off at random.
     coloured: correlation time of the noise, s, by channel.
     miscalibrated: what is off by more than the description's tolerances allow.
     troubles: of the devices, the recording and the machine of a live session, a short sentence each.
@@ -89,6 +90,7 @@ class Evidence:
     slow: Mapping[str, float] = field(default_factory=dict)
     outliers: Mapping[str, float] = field(default_factory=dict)
     discrepancies: tuple[Discrepancy, ...] = ()
+    jitters: Mapping[str, float] = field(default_factory=dict)
     coloured: Mapping[str, float] = field(default_factory=dict)
     miscalibrated: tuple[Reason, ...] = ()
     troubles: tuple[str, ...] = ()

@@ -43,6 +43,7 @@ def evidence_of(evaluation: Evaluation, discrepancies: Sequence[Discrepancy], tr
         slow=_slow(now),
         outliers={channel: left.number / left.of for channel, left in now.outliers.items()},
         discrepancies=tuple(discrepancies),
+        jitters={} if momentum is None else momentum.jitters,
         coloured={} if momentum is None else momentum.coloured,
         miscalibrated=(*miscalibrated(evaluation), *ambiguous_effects(evaluation)),
         troubles=tuple(troubles),

@@ -24,6 +24,10 @@ JUST_NOISE = 1.05
 LARGEST_LOSS = 0.01
 # Share of a channel's samples that may be outliers before its sensor is at fault.
 MANY_OUTLIERS = 1e-3
+# Jitter, s, from which on it is said: below, devices' own clocks are no better.
+LARGEST_JITTER = 5e-5
+# Correlation time of noise, s, from which on windows share it, while they are whitened as if they did not.
+LONGEST_COLOUR = 1e-2
 # Further from the nearest physically consistent parameters than this, in standard deviations, noise brings no estimate.
 LARGEST_DISTANCE = 3.0
 # A session of so many seconds in which no drift is watched for may hold one that matters.
@@ -44,6 +48,7 @@ CHECK_PRIOR = "check that prior, and run `sms-online diagnose` for what the mode
 CHECK_OUTLIERS = "look at that sensor: reflections and swapped markers, a loose cable, bits that flip"
 CHECK_COLOUR = "look at what filters that sensor, or log its samples as they are"
 STATE_HOLD = "state hold = true under [[sensor]] of the torques"
+CHECK_STAMPS = "stamp samples where they are taken, by the device's clock or its count, not where they arrive"
 BY_SMOOTHER = 'state its rate under [[sensor]], or balance = "smoother"'
 CHECK_LOSSES = "look at the faults that the session counted: a bus that is too busy, a loose cable"
 WEIGH = "weigh one part and state it under [known], or measure a torque constant"
@@ -56,7 +61,8 @@ MOVE = "move all joints, faster and over a larger range, and long enough"
 
 def of_samples(evidence: Evidence) -> list[Reason]:
     """What befell the samples themselves."""
-    return [*_lost(evidence.lost), *_outliers(evidence.outliers), *_slow(evidence.slow)]
+    out = [*_lost(evidence.lost), *_outliers(evidence.outliers), *_slow(evidence.slow)]
+    return [*out, *_jittering(evidence.jitters), *_coloured(evidence.coloured)]
 
 
 def _lost(share: float) -> list[Reason]:
@@ -81,6 +87,24 @@ def _slow(rates: Mapping[str, float]) -> list[Reason]:
     slowest = min(rates.values())
     text = f"{listed([*rates])}: {slowest:.3g} samples/s are too few for the windows of the balance"
     return [Reason(text, False, (), "slow", then=BY_SMOOTHER)]
+
+
+def _jittering(jitters: Mapping[str, float]) -> list[Reason]:
+    return [
+        Reason(f"stamps of {device} jitter by {1e3 * std:.2g} ms", False, (), "stamps jitter", then=CHECK_STAMPS)
+        for device, std in jitters.items()
+        if std > LARGEST_JITTER
+    ]
+
+
+def _coloured(times: Mapping[str, float]) -> list[Reason]:
+    slow = [channel for channel, time in times.items() if time > LONGEST_COLOUR]
+    if not slow:
+        return []
+    worst = max(slow, key=lambda channel: times[channel])
+    others = f" and of {len(slow) - 1} more channels" if len(slow) > 1 else ""
+    text = f"noise of {worst}{others} is correlated over {1e3 * times[worst]:.2g} ms"
+    return [Reason(text, False, tuple(slow), "coloured noise", then=CHECK_COLOUR)]
 
 
 def never_received(names: Sequence[str]) -> Reason:

@@ -7,7 +7,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from sms_online.evaluation import identifiable
 from sms_online.stream import Array
 
 # Error bars and bands are drawn so far to either side, in standard deviations.
@@ -16,13 +15,12 @@ BOUNDS = 2.0
 
 @dataclass(frozen=True)
 class Known:
-    """Estimate (n,) and standard deviation (n,), inf where the data determine nothing, at t, s."""
+    """Estimate (n,) and standard deviation (n,), inf where the data determine nothing, at t, s.
+
+    determined: what the data determine (n,).
+    """
 
     t: float
     estimate: Array
     std: Array
-
-    @property
-    def determined(self) -> NDArray[np.bool_]:
-        """What the data determine (n,)."""
-        return identifiable(self.estimate, self.std)
+    determined: NDArray[np.bool_]

@@ -11,7 +11,7 @@ import numpy as np
 import rerun.blueprint as rrb
 from numpy.typing import NDArray
 
-from sms_online.evaluation import Evaluation
+from sms_online.evaluation import Evaluation, identifiable
 from sms_online.pipeline.statistics import Statistics
 from sms_online.result import event_document
 from sms_online.stream import Array
@@ -221,8 +221,8 @@ class Recorder:
             unknown = np.nan, np.inf
             shown = [self._diagnosed.parameters.get(p.name, unknown) for p in now.parameters]
             estimate, std = np.array(shown).T
-            return Known(t, estimate, std)
-        return Known(t, now.estimate.pi, now.std)
+            return Known(t, estimate, std, identifiable(estimate, std))
+        return Known(t, now.estimate.pi, now.std, now.determined)
 
     def _mark(self, t: float) -> None:
         """A vertical line in all plots of parameters and residuals."""
