@@ -143,13 +143,16 @@ class Evaluation:
 
     @cached_property
     def determined(self) -> NDArray[np.bool_]:
-        """Which parameters the data determine (n,), see `identifiable`: by themselves too, beside a prior's value."""
+        """Which parameters the data determine (n,), see `identifiable`: by themselves too, beside a stated value."""
         return self._determined(self.estimate, self.std)
 
     def _determined(self, estimate: Estimate, std: Array) -> NDArray[np.bool_]:
         """See `determined`; of any tracker's estimate."""
         out, prior = identifiable(estimate.pi, std), self.statistics.setup.current_prior
-        return out if prior is None else out & identifiable(*beside_prior(estimate, std, prior))
+        # What an earlier run has measured, with its correlation, are data too.
+        if prior is None or prior.correlation is not None:
+            return out
+        return out & identifiable(*beside_prior(estimate, std, prior))
 
     @cached_property
     @one_blas_thread()
