@@ -28,6 +28,7 @@ from sms_online.trackers.interface import Estimate, Prior
 from sms_online.verdict.evidence import Discrepancy
 from sms_online.verdict.gather import evidence_of
 from sms_online.verdict.judge import judge
+from sms_online.verdict.truncated import FIRST_ORDER, truncated
 from sms_online.verdict.trust import Residual, Trust
 
 # Half width of a 95 % interval in standard deviations.
@@ -295,7 +296,8 @@ class Evaluation:
     def warnings(self) -> list[str]:
         """What the trust rests on or lacks, in full sentences."""
         projection = projection_warning(self.projection) if self.statistics.finished else []
-        return [*self.trust.warnings, *projection, *smoother_warnings(self.statistics)]
+        coarse = [str(each) for each in truncated(self) if abs(each.share) <= FIRST_ORDER]
+        return [*self.trust.warnings, *coarse, *projection, *smoother_warnings(self.statistics)]
 
     @cached_property
     def notices(self) -> list[str]:
