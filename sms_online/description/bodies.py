@@ -168,7 +168,7 @@ class FlexibleLink(Record):
     root_position: Vector3 = (0.0, 0.0, 0.0)
     root_rotation: Vector3 = (0.0, 0.0, 0.0)
     length: Positive
-    elements: Annotated[int, Field(ge=1)]
+    elements: Annotated[int, Field(ge=1)] = 2
     mass_per_length: Positive
     polar_inertia_per_length: NonNegative = 0.0
     axial_rigidity: NonNegative = 0.0

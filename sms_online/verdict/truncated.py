@@ -1,4 +1,4 @@
-"""Links that have fewer elements than a motion needs: what that would move parameters by, were it not corrected."""
+"""Links that have fewer elements than a motion needs, and what their correction moves parameters by."""
 
 from __future__ import annotations
 
@@ -23,31 +23,39 @@ FIRST_ORDER = 0.1
 class Truncated:
     """A link whose elements are too few for a motion.
 
-    where: `link_i`. elements: as described. parameter: the one that is corrected by most of its error bars. share: of
-    its value, that it would be off by; deviations: the same in its standard deviations.
+    where: `link_i`. elements: as described. amount, std: share, of what more elements change, that rows ask for.
+    parameter: the one that this moves by most of its error bars; share: of its value; deviations: in its standard
+    deviations.
     """
 
     where: str
     elements: int
+    amount: float
+    std: float
     parameter: str
     share: float
     deviations: float
 
     def __str__(self) -> str:
         return (
-            f"{self.where}: {self.elements} elements are too few for this motion: without a correction of first order "
-            f"{self.parameter} would be {100.0 * self.share:+.2g} % off, {self.deviations:.2g} standard deviations"
+            f"{self.where}: {self.elements} elements are too few for this motion: rows are corrected to first order by "
+            f"{100.0 * self.amount:.0f} ± {100.0 * self.std:.0f} % of what {FINER * self.elements} would change, which "
+            f"moves {self.parameter} by {self._moved}, {self.deviations:.2g} standard deviations"
         )
 
     @property
+    def _moved(self) -> str:
+        return f"{100.0 * self.share:+.2g} %"
+
+    @property
     def advice(self) -> str:
-        """What to do where a correction of first order is not enough."""
+        """What to do where a correction of first order is not enough: the smoother knows the shape between markers."""
         return f"describe {self.where} with elements = {FINER * self.elements}; its markers stay where they are"
 
     @property
     def reason(self) -> Reason:
         """Why to doubt the numbers, where a correction of first order is not enough."""
-        text = f"{self.where}: {self.elements} elements are too few: {100.0 * self.share:+.2g} % of {self.parameter}"
+        text = f"{self.where}: {self.elements} elements are too few: {self.parameter} moves by {self._moved}"
         return Reason(text, False, (self.where,), "too few elements", f"{self}: {self.advice}", self.advice)
 
 
@@ -62,14 +70,14 @@ def truncated(evaluation: Evaluation) -> list[Truncated]:
         value, std = float(estimate.nuisances[k]), float(estimate.nuisances_std[k])
         if nuisance.name != "truncation" or not abs(value) > CERTAIN * std:
             continue
-        # The estimate with the nuisance held at zero, less that with what rows say of it.
-        off = -estimate.crossed[k, known] * value / std**2
-        deviations = np.abs(off) / evaluation.std[known]
+        # The estimate with what rows say of the nuisance, less that with the nuisance held at zero.
+        moved = estimate.crossed[k, known] * value / std**2
+        deviations = np.abs(moved) / evaluation.std[known]
         worst = int(np.argmax(deviations))
         if deviations[worst] > 1.0:
             link = evaluation.model.system.links[int(nuisance.where.removeprefix("link_")) - 1]
             assert isinstance(link, FlexibleLink)
-            share = float(off[worst] / abs(estimate.pi[known[worst]]))
+            share = float(moved[worst] / abs(estimate.pi[known[worst]]))
             name = evaluation.parameters[known[worst]].name
-            out.append(Truncated(nuisance.where, link.elements, name, share, float(deviations[worst])))
+            out.append(Truncated(nuisance.where, link.elements, value, std, name, share, float(deviations[worst])))
     return out
