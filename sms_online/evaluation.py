@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sms_online.calibration.found import Calibration, found
+from sms_online.calibration.truncation import left
 from sms_online.model.parameters import Parameter
 from sms_online.nominal import Comparison, compare, unit_factors
 from sms_online.notices import notices, projection_warning, smoother_warnings
@@ -108,12 +109,16 @@ class Evaluation:
         From the residual: the larger of two answers. One takes the rows' errors as independent with the residual's
         variance, the other allows errors that last within clusters of rows. To it comes what errors add that rows of an
         energy window share, which least squares absorbs and no residual shows; it is known while no row is forgotten.
-        Where rows beside a prior leave no more than noise, the posterior's own covariance holds.
+        Where rows beside a prior leave no more than noise, the posterior's own covariance holds. In each case comes
+        what the elements of links leave unknown, see `calibration.truncation`.
         """
         return self._reported(self.estimate)
 
     def _reported(self, estimate: Estimate) -> Array:
         """See `std`; of any tracker's estimate."""
+        return np.hypot(self._of_rows(estimate), np.sqrt(left(estimate, self.statistics.setup.nuisances)))
+
+    def _of_rows(self, estimate: Estimate) -> Array:
         now = self.statistics
         std = np.full(estimate.pi.shape, np.inf)
         if estimate.dof <= 0.0:

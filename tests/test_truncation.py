@@ -222,7 +222,6 @@ def test_torsion_is_wrong_beside_an_exact_description() -> None:
 @pytest.mark.long
 def test_nothing_is_corrected_where_elements_are_enough() -> None:
     evaluation = evaluated(2, 1.0)
-    assert abs(evaluation.estimate.nuisances[0]) < 3.0 * evaluation.estimate.nuisances_std[0]
     assert truncated(evaluation) == []
     error, bar = error_of(evaluation, TWIST)
     assert abs(error) < 1.96 * bar

@@ -1,20 +1,23 @@
 """What a link with few elements leaves out of its shape between its markers: a nuisance for each `exact` link.
 
 A link of more elements has the coordinates E q + N w: E q is the shape that the few elements give, N w moves no marker.
-Where w follows its loads without delay, Nᵀ (Ṗ - G) = 0 at E q + N w, with K of the finer link in G. To first order
+It bears the load F = Ṗ - G, without springs, with a stiffness K. Where w follows its loads without delay,
 
-    NᵀKN w = -Nᵀ (Ṗ - G) at E q,    rows: Eᵀ (Ṗ - G) + EᵀKN w = (Eᵀ - EᵀKN (NᵀKN)⁻¹ Nᵀ) (Ṗ - G).
+    NᵀF + NᵀK (E q + N w) = 0,    so that    TᵀF + TᵀK E q = 0    with    Tᵀ = Eᵀ - EᵀKN (NᵀKN)⁻¹ Nᵀ
 
-Rows of q are thus those of a virtual displacement that is orthogonal in K to what no marker shows. At rest each strain
-field has markers of its own, so that rigidities cancel. The nuisance is the share of this correction: 0 where the link
-has as few degrees of freedom as it is described with, near 1 where it is continuous. The inertia of N w is left out: it
-is smaller by the square of the motion's frequency over those of w. The elements of `linear` links are those of statics.
+to first order: the rows of q are those of a virtual displacement that is orthogonal in K to what no marker shows. With
+stiffness as described, EᵀKE q, they are DᵀF + EᵀKE q = 0 with Dᵀ = EᵀKE (TᵀKE)⁻¹ Tᵀ. So they differ from those that
+are described by (Dᵀ - Eᵀ) F, which holds loads alone: markers' noise times stiffness, of the size of all of it, is not in it. At rest
+each strain field has markers of its own, and rigidities cancel. The nuisance is the share of this difference: 0 where
+the link has as few degrees of freedom as it is described with, 1 where it is continuous. The inertia of N w is left
+out: it is smaller by the square of the motion's frequency over those of w. Elements of `linear` links are those of
+statics, without a difference.
 Source: static condensation, Guyan, AIAA Journal 3 (1965) 380, of the virtual displacement alone.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 from scipy.linalg import null_space
@@ -26,6 +29,7 @@ from sms_online.model.dynamics import Dynamics
 from sms_online.model.model import Model
 from sms_online.model.rod import ExactRod
 from sms_online.stream import Array
+from sms_online.trackers.interface import Estimate
 
 # Elements of the finer link for one of the described: with twice as many the first fields are there that are left out.
 FINER = 2
@@ -37,6 +41,22 @@ def truncations(system: System) -> Iterator[Nuisance]:
     for i, link in enumerate(system.links, start=1):
         if tolerance > 0.0 and isinstance(link, FlexibleLink) and link.kinematics == "exact":
             yield Nuisance("truncation", f"link_{i}", "", tolerance)
+
+
+def left(estimate: Estimate, nuisances: Sequence[Nuisance]) -> Array:
+    """Variance (n,) of π for what the shares may be off by beside their standard deviations.
+
+    Noise in their columns draws shares together: of 0 they come out larger, of 1 smaller, and no link has one between.
+    So each may be off by as much as it is from the nearer of both.
+    """
+    out = np.zeros(estimate.pi.size)
+    if estimate.crossed is None or estimate.nuisances.size != len(nuisances):
+        return out
+    for k, nuisance in enumerate(nuisances):
+        if nuisance.name == "truncation" and estimate.nuisances_std[k] > 0.0:
+            share = abs(float(estimate.nuisances[k]))
+            out += (estimate.crossed[k] / estimate.nuisances_std[k] ** 2 * min(share, abs(1.0 - share))) ** 2
+    return out
 
 
 class Truncation:
@@ -58,7 +78,7 @@ class Truncation:
         self._dynamics: Dynamics | None = None  # of the last π
 
     def _correction(self, model: Model, i: int) -> Array:
-        """EᵀKN (NᵀKN)⁻¹ Nᵀ (n_f, finer n_f) of link i (from 0)."""
+        """Dᵀ - Eᵀ (n_f, finer n_f) of link i (from 0)."""
         coarse, fine = model.chain.flexible[i], self._finer.chain.flexible[i]
         assert isinstance(coarse, ExactRod)
         assert isinstance(fine, ExactRod)
@@ -69,7 +89,8 @@ class Truncation:
         read = np.arange(fine.n_f).reshape(-1, per_marker)[FINER - 1 :: FINER].ravel()
         N = null_space(fine.marker_jacobian(np.zeros((1, fine.n_f)))[0, read])
         K = np.sum(list(fine.stiffness.values()), axis=0)
-        return np.asarray(np.linalg.solve(N.T @ K @ N, N.T @ K @ E).T @ N.T)
+        T = E - N @ np.linalg.solve(N.T @ K @ N, N.T @ K @ E)
+        return np.asarray(E.T @ K @ E @ np.linalg.solve(T.T @ K @ E, T.T) - E.T)
 
     def at(self, pi: Array, x: Array, v: Array, signals: Array) -> Array:
         """What they change momentum and force by (2, K, n_v, c), with parameters π.
@@ -84,8 +105,9 @@ class Truncation:
             self._dynamics = model.dynamics(pi)
         finer_x, finer_v = np.zeros((len(x), model.layout.n_x)), np.zeros((len(v), model.layout.n_v))
         finer_x[:, self._positions], finer_v[:, self._speeds] = x, v
-        parts = self._dynamics.momentum_and_force(finer_x, finer_v, model.inputs(signals))
+        momentum, force = self._dynamics.momentum_and_force(finer_x, finer_v, model.inputs(signals))
+        load = force - self._dynamics.spring_force(finer_x, finer_v)
         for c, (i, correction) in enumerate(zip(self._links, self._corrections, strict=True)):
-            for change, part in zip(out, parts, strict=True):
-                change[:, self._own.q_f[i], c] = -part[:, model.layout.q_f[i]] @ correction.T
+            for change, part in zip(out, (momentum, load), strict=True):
+                change[:, self._own.q_f[i], c] = part[:, model.layout.q_f[i]] @ correction.T
         return out

@@ -15,6 +15,8 @@ from sms_online.verdict.trust import Reason
 if TYPE_CHECKING:
     from sms_online.evaluation import Evaluation
 
+# Share from which on a link is rather a continuous one than one of its elements.
+CONTINUOUS = 0.5
 # A correction of first order leaves its square: of a tenth one per cent, which no error bar counts.
 FIRST_ORDER = 0.1
 
@@ -68,7 +70,7 @@ def truncated(evaluation: Evaluation) -> list[Truncated]:
     out = []
     for k, nuisance in enumerate(nuisances):
         value, std = float(estimate.nuisances[k]), float(estimate.nuisances_std[k])
-        if nuisance.name != "truncation" or not abs(value) > CERTAIN * std:
+        if nuisance.name != "truncation" or not value > max(CONTINUOUS, CERTAIN * std):
             continue
         # The estimate with what rows say of the nuisance, less that with the nuisance held at zero.
         moved = estimate.crossed[k, known] * value / std**2
