@@ -225,3 +225,17 @@ def test_nothing_is_corrected_where_elements_are_enough() -> None:
     assert truncated(evaluation) == []
     error, bar = error_of(evaluation, TWIST)
     assert abs(error) < 1.96 * bar
+
+
+@pytest.mark.long
+def test_four_elements_read_at_two_markers_need_no_correction() -> None:
+    """The smoother estimates the shape between them: within one per cent and its interval."""
+    read = moved(4)
+    names = tuple(re.sub(r"marker_([12])", lambda found: f"marker_{2 * int(found[1])}", name) for name in read.channels)
+    system = with_elements(parse_system(SKEW, "skew"), 4)
+    exactly = system.model_copy(update={"tolerances": Tolerances.model_validate("none")})
+    estimator = session_of(exactly, [Block(read.t, names, read.values)])
+    evaluation = Evaluation(Statistics.of(estimator), estimator.estimate())
+    assert evaluation.statistics.method == "smoother"
+    error, bar = error_of(evaluation, TWIST)
+    assert abs(error) < min(0.01, 1.96 * bar)

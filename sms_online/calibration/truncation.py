@@ -7,11 +7,11 @@ It bears the load F = Ṗ - G, without springs, with a stiffness K. Where w foll
 
 to first order: the rows of q are those of a virtual displacement that is orthogonal in K to what no marker shows. With
 stiffness as described, EᵀKE q, they are DᵀF + EᵀKE q = 0 with Dᵀ = EᵀKE (TᵀKE)⁻¹ Tᵀ. So they differ from those that
-are described by (Dᵀ - Eᵀ) F, which holds loads alone: markers' noise times stiffness, of the size of all of it, is not in it. At rest
-each strain field has markers of its own, and rigidities cancel. The nuisance is the share of this difference: 0 where
-the link has as few degrees of freedom as it is described with, 1 where it is continuous. The inertia of N w is left
-out: it is smaller by the square of the motion's frequency over those of w. Elements of `linear` links are those of
-statics, without a difference.
+are described by (Dᵀ - Eᵀ) F, which holds loads alone, and no markers' noise times stiffness. At rest each strain field
+has markers of its own, and rigidities cancel. The nuisance is the share of this difference: 0 where the link has as few
+degrees of freedom as it is described with, 1 where it is continuous. The inertia of N w is left out: it is smaller by
+the square of the motion's frequency over those of w. Elements of `linear` links are those of statics, without a
+difference.
 Source: static condensation, Guyan, AIAA Journal 3 (1965) 380, of the virtual displacement alone.
 """
 
