@@ -1,7 +1,7 @@
 """What a link with few elements leaves out of its shape between its markers: a nuisance for each `exact` link.
 
 A link of more elements has the coordinates E q + N w: E q is the shape that the few elements give, N w moves no marker.
-It bears the load F = Ṗ - G, without springs, with a stiffness K. Where w follows its loads without delay,
+It carries the load F = Ṗ - G, without springs, with a stiffness K. Where w follows its loads without delay,
 
     NᵀF + NᵀK (E q + N w) = 0,    so that    TᵀF + TᵀK E q = 0    with    Tᵀ = Eᵀ - EᵀKN (NᵀKN)⁻¹ Nᵀ
 
