@@ -17,6 +17,8 @@ if TYPE_CHECKING:
 
 # Share from which on a link is rather a continuous one than one of its elements.
 CONTINUOUS = 0.5
+# A correction that moves no parameter by so much of what rows leave unknown of it is not worth a word.
+LEAST = 0.5
 # A correction of first order leaves its square: of a tenth one per cent, which no error bar counts.
 FIRST_ORDER = 0.1
 
@@ -26,8 +28,8 @@ class Truncated:
     """A link whose elements are too few for a motion.
 
     where: `link_i`. elements: as described. amount, std: share, of what more elements change, that rows ask for.
-    parameter: the one that this moves by most of its error bars; share: of its value; deviations: in its standard
-    deviations.
+    parameter: the one that this moves by most of its standard deviations, by the rows; share: of its value; deviations:
+    in these.
     """
 
     where: str
@@ -62,7 +64,7 @@ class Truncated:
 
 
 def truncated(evaluation: Evaluation) -> list[Truncated]:
-    """Of each link whose truncation is certain and moves a determined parameter by more than its error bar."""
+    """Of each link that is rather a continuous one, where that moves a determined parameter by `LEAST` or more."""
     estimate, nuisances = evaluation.estimate, evaluation.statistics.setup.nuisances
     known = np.flatnonzero(evaluation.determined)
     if estimate.crossed is None or estimate.nuisances.size != len(nuisances) or not known.size:
@@ -74,9 +76,9 @@ def truncated(evaluation: Evaluation) -> list[Truncated]:
             continue
         # The estimate with what rows say of the nuisance, less that with the nuisance held at zero.
         moved = estimate.crossed[k, known] * value / std**2
-        deviations = np.abs(moved) / evaluation.std[known]
+        deviations = np.abs(moved) / estimate.std[known]
         worst = int(np.argmax(deviations))
-        if deviations[worst] > 1.0:
+        if deviations[worst] > LEAST:
             link = evaluation.model.system.links[int(nuisance.where.removeprefix("link_")) - 1]
             assert isinstance(link, FlexibleLink)
             share = float(moved[worst] / abs(estimate.pi[known[worst]]))
