@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sms_online.calibration.found import Calibration, found
+from sms_online.calibration.truncation import left
 from sms_online.model.parameters import Parameter
 from sms_online.nominal import Comparison, compare, unit_factors
 from sms_online.notices import notices, projection_warning, smoother_warnings
@@ -28,6 +29,7 @@ from sms_online.trackers.interface import Estimate, Prior
 from sms_online.verdict.evidence import Discrepancy
 from sms_online.verdict.gather import evidence_of
 from sms_online.verdict.judge import judge
+from sms_online.verdict.truncated import FIRST_ORDER, truncated
 from sms_online.verdict.trust import Residual, Trust
 
 # Half width of a 95 % interval in standard deviations.
@@ -107,12 +109,16 @@ class Evaluation:
         From the residual: the larger of two answers. One takes the rows' errors as independent with the residual's
         variance, the other allows errors that last within clusters of rows. To it comes what errors add that rows of an
         energy window share, which least squares absorbs and no residual shows; it is known while no row is forgotten.
-        Where rows beside a prior leave no more than noise, the posterior's own covariance holds.
+        Where rows beside a prior leave no more than noise, the posterior's own covariance holds. In each case comes
+        what the elements of links leave unknown, see `calibration.truncation`.
         """
         return self._reported(self.estimate)
 
     def _reported(self, estimate: Estimate) -> Array:
         """See `std`; of any tracker's estimate."""
+        return np.hypot(self._of_rows(estimate), np.sqrt(left(estimate, self.statistics.setup.nuisances)))
+
+    def _of_rows(self, estimate: Estimate) -> Array:
         now = self.statistics
         std = np.full(estimate.pi.shape, np.inf)
         if estimate.dof <= 0.0:
@@ -295,7 +301,8 @@ class Evaluation:
     def warnings(self) -> list[str]:
         """What the trust rests on or lacks, in full sentences."""
         projection = projection_warning(self.projection) if self.statistics.finished else []
-        return [*self.trust.warnings, *projection, *smoother_warnings(self.statistics)]
+        coarse = [str(each) for each in truncated(self) if abs(each.share) <= FIRST_ORDER]
+        return [*self.trust.warnings, *coarse, *projection, *smoother_warnings(self.statistics)]
 
     @cached_property
     def notices(self) -> list[str]:

@@ -181,7 +181,9 @@ def _add_segments(root: mujoco.MjsBody, name: str, link: FlexibleLink, cells: in
     for k, (start, stop) in enumerate(zip(starts, ends, strict=True)):
         if k > 0:
             body = body.add_body(pos=(start - starts[k - 1], 0.0, 0.0))
-            for axis, (deformation, rigidity) in zip(AXES, rigidities.items(), strict=True):
+            # Two bends in one order are a twist of half their product: of every other hinge in the other order.
+            axes = list(zip(AXES, rigidities.items(), strict=True))
+            for axis, (deformation, rigidity) in axes if k % 2 else axes[::-1]:
                 if deformation not in link.deformations:
                     continue
                 hinge = body.add_joint(type=mujoco.mjtJoint.mjJNT_HINGE, axis=axis)

@@ -43,7 +43,8 @@ class Rows:
     """Residuals Y β - b of windows of one stretch of motion, exact parameters, for samples and geometries at will."""
 
     def __init__(self, system: System) -> None:
-        system = system.model_copy(update={"tolerances": Tolerances()})
+        # More elements than described change no sample, see `test_truncation`.
+        system = system.model_copy(update={"tolerances": Tolerances(truncation=0.0)})
         self.model = model = build_model(system)
         self.base = find_base_parameters(model)
         self.beta = self.base.values(model.nominal)
@@ -65,7 +66,8 @@ class Rows:
         )
         for piece in instants:
             by_geometry = sensitivities.extend(pi, piece.x, piece.v, piece.signals)
-            calibration.extend(piece.x, piece.signals, sensitivities.rates(len(piece.x)), by_geometry)
+            rates = sensitivities.rates(len(piece.x))
+            calibration.extend(pi, piece.x, piece.v, piece.signals, rates, by_geometry)
         starts = np.array([window.start for window in found])
         sensitivity = sensitivities.windows(starts)
         responses = np.array([window.rough for window in found])

@@ -2,7 +2,8 @@
 
 A reading that is n(t) too large adds ∫ c n dt to Y π, with the c of `row_noise`, so that N = -∫ c n dt. A torque that
 is read too large by n(t) adds ∫ φ n dt to b, so N. With the right geometry momentum and force are others by ∂P π and
-∂G π, and N = -∫ (φ̇ ∂P + φ ∂G) dt π. All three are linear in ν, and hold to first order in ν.
+∂G π, and N = -∫ (φ̇ ∂P + φ ∂G) dt π; so with more elements of a link. All are linear in ν, and hold to first order in
+ν.
 """
 
 from __future__ import annotations
@@ -24,6 +25,7 @@ from sms_online.calibration.channels import (
 )
 from sms_online.calibration.geometry import geometries
 from sms_online.calibration.nuisance import Nuisance
+from sms_online.calibration.truncation import Truncation, truncations
 from sms_online.model.model import Model
 from sms_online.pipeline.momentum_windows import EXPONENT, INSTANTS, STEPS
 from sms_online.pipeline.sensing import Sensing
@@ -44,7 +46,7 @@ def nuisances(sensing: Sensing) -> tuple[Nuisance, ...]:
     low_passes = [each.nuisances for each in low_pass_families(sensing, system.tolerances)]
     torques = [each.nuisances for each in torque_families(sensing, system.tolerances)]
     channels = chain.from_iterable((*positions, *low_passes, *torques))
-    return (*channels, *(each.nuisance for each in geometries(system)))
+    return (*channels, *(each.nuisance for each in geometries(system)), *truncations(system))
 
 
 def _interpolation(at: NDArray[np.int64], derivative: int = 0) -> Array:
@@ -58,7 +60,7 @@ class CalibrationState(State):
 
     From instant number `first` on: what a position sensor reads too much, added (K, sensors, ·), and what has that for
     its rate, before (K, sensors, ·); what a torque reads too much, torque (K, joints, ·); and by what another geometry
-    changes momentum and force (K, n_v, ·), each by nuisance.
+    or more elements change momentum and force (K, n_v, ·), each by nuisance.
     """
 
     first: int
@@ -72,7 +74,7 @@ class CalibrationState(State):
 class CalibrationColumns(Stage):
     """Evaluates the columns window by window, at the instants of the sensitivities.
 
-    count: of nuisances. geometries: those of geometry, which come last.
+    count: of nuisances. geometries: those of geometry, which come last but for those of truncation.
     """
 
     def __init__(self, model: Model, sensing: Sensing, span: float) -> None:
@@ -83,6 +85,7 @@ class CalibrationColumns(Stage):
         self._torques = torque_families(sensing, sensing.model.system.tolerances)
         # Of the session's system: an event's may hold more that has a geometry.
         self.geometries = tuple(geometries(sensing.model.system))
+        self._truncation = Truncation(model)
         self._joint_rows = list(model.layout.theta_m)
         # What is added at the instants, in the sum over steps; and that sum of c, by parts of a `Sensitivity`.
         self._to_steps = _interpolation(np.arange(INSTANTS + 1)) * span / STEPS
@@ -109,17 +112,17 @@ class CalibrationColumns(Stage):
             *np.empty((2, 0, layout.n_v, moved)),
         )
 
-    def extend(self, x: Array, signals: Array, rates: Array, by_geometry: Array) -> None:
-        """Take the next instants: x (K, n_x), signals as in `Instants`, rates (K, sensors) of the readings.
+    def extend(self, pi: Array, x: Array, v: Array, signals: Array, rates: Array, by_geometry: Array) -> None:
+        """Take the next instants: x (K, n_x), v and signals as in `Instants`, rates (K, sensors) of the readings.
 
-        by_geometry (2, K, n_v, c): what geometries change momentum and force by.
+        by_geometry (2, K, n_v, c): what geometries change momentum and force by, with parameters π.
         """
         if not self.count:
             return
         torque = signals[:, : len(self._model.layout.q)]
         _, T_0 = self._model.layout.base_pose(x)
         motion = Motion(self._sensing.readings(x), rates, torque, T_0)
-        momentum, force = by_geometry
+        momentum, force = np.concatenate((by_geometry, self._truncation.at(pi, x, v, signals)), axis=3)
         now = self.state
         now.added = np.concatenate((now.added, self._sum_of(self._positions, motion, now.added)))
         now.before = np.concatenate((now.before, self._sum_of(self._low_passes, motion, now.before)))

@@ -76,6 +76,8 @@ class Calibration:
         if self.name == "gauge_low_pass" and self.estimate > 0.0:
             corner = 1.0 / (2.0 * np.pi * np.sqrt(self.estimate))
             return f"{self.where} behind a low-pass of {_rounded(corner, 0.5 * corner * self.std / self.estimate)} Hz"
+        if self.name == "truncation":
+            return f"{self.where}: {_rounded(100.0 * self.estimate, 100.0 * self.std)} % of what more elements change"
         positive, negative = WORDS.get(self.name, ("off", "off"))
         words = positive if self.estimate >= 0.0 else negative
         value = abs(self.estimate) if positive != negative else self.estimate
@@ -92,6 +94,8 @@ class Calibration:
             return "record them unfiltered, or declare their low-pass as an effect with this corner"
         if self.name == "clock" and self.estimate > 0.0:
             return f"state latency = {self.estimate:.2g} of it, or a larger tolerances.clock"
+        if self.name == "truncation":
+            return f"describe {self.where} with more elements"
         return f"correct the system file or the sensor, or state a larger tolerances.{self.name}"
 
     def document(self) -> dict[str, str | float | None]:

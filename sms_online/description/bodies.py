@@ -151,6 +151,7 @@ class FlexibleLink(Record):
     root_rotation: rotation vector from the joint's frame to the link's frame {i}, rad.
     length: L, m.
     elements: number of elements, of equal length; marker j is at the end of element j unless `markers` are stated.
+    There may be more than are read. What an `exact` link with too few lacks is estimated, see `Tolerances.truncation`.
     markers: points that cameras see, `[[link_i.markers]]`.
     mass_per_length: ρA, kg/m.
     polar_inertia_per_length: ρI_p, kg m.
@@ -168,7 +169,7 @@ class FlexibleLink(Record):
     root_position: Vector3 = (0.0, 0.0, 0.0)
     root_rotation: Vector3 = (0.0, 0.0, 0.0)
     length: Positive
-    elements: Annotated[int, Field(ge=1)]
+    elements: Annotated[int, Field(ge=1)] = 2
     mass_per_length: Positive
     polar_inertia_per_length: NonNegative = 0.0
     axial_rigidity: NonNegative = 0.0

@@ -165,6 +165,8 @@ class Tolerances(Record):
     marker_zero: zero of a marker's displacement, m.
     marker_zero_angle: zero of a marker's rotation, rad.
     camera_scale: scale of the base's position and the markers' displacements.
+    truncation: share of what more elements would change of an `exact` link: 1 of a continuous one, 0 of one that has no
+    more degrees of freedom than its elements give it.
     drive_gain: gain of a joint's torque, that of joint 1 where a parameter is known; else of the others against it.
     drive_offset: zero of a joint's torque or force, after the gear, N m (N); not stated: unknown.
     """
@@ -182,6 +184,7 @@ class Tolerances(Record):
     marker_zero: NonNegative = 1e-4
     marker_zero_angle: NonNegative = 1e-3
     camera_scale: NonNegative = 1e-3
+    truncation: NonNegative = 1.0
     drive_gain: NonNegative = 0.01
     drive_offset: NonNegative | None = None
 

@@ -115,7 +115,7 @@ class WindowNoise(Stage):
             self.state.pushes = [*self.state.pushes, *self._wrenches.by_component(x)]
         by_geometry = self._sensitivities.extend(pi, x, v, signals)
         if self._calibration is not None:
-            self._calibration.extend(x, signals, self._sensitivities.rates(len(x)), by_geometry)
+            self._calibration.extend(pi, x, v, signals, self._sensitivities.rates(len(x)), by_geometry)
 
     def drop(self, instant: int) -> None:
         """Forget what no window that starts at an instant or later needs."""

@@ -12,6 +12,7 @@ from sms_online.effects.catalogue import either, in_words
 from sms_online.row_types import row_types
 from sms_online.verdict.evidence import Dispute
 from sms_online.verdict.reasons import STATE_HOLD, undecided
+from sms_online.verdict.truncated import FIRST_ORDER, truncated
 from sms_online.verdict.trust import Reason
 
 if TYPE_CHECKING:
@@ -29,7 +30,8 @@ def miscalibrated(evaluation: Evaluation) -> list[Reason]:
     """Where the description is wrong by more than its tolerances allow.
 
     Corrections of the rows are linear, up to a bound; samples are moved in time by whatever a clock is late.
-    A clock that moves on the way looks like a change of parameters: beside one, less counts.
+    A clock that moves on the way looks like a change of parameters: beside one, less counts. And where elements are so
+    few that a correction of first order leaves more than error bars count.
     """
     changed = any(event.parameters for event in evaluation.statistics.events)
     held, corrected = _held_torques(evaluation), _corrected_clocks(evaluation)
@@ -43,7 +45,7 @@ def miscalibrated(evaluation: Evaluation) -> list[Reason]:
             moved = each.name == "clock" and (each.where, each.part) in corrected
             grave = tolerances > BOUND and not moved
             out.append(Reason(text, grave, full=f"{each}: {each.advice}", then=each.advice))
-    return out
+    return [*out, *(each.reason for each in truncated(evaluation) if abs(each.share) > FIRST_ORDER)]
 
 
 def _corrected_clocks(evaluation: Evaluation) -> set[tuple[str, str]]:
