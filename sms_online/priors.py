@@ -29,7 +29,7 @@ VECTORS = ("first_moment_", "inertia_")
 
 
 def given_prior(prior: GivenPrior) -> bool | dict[str, Any]:
-    """What a session is told to know beforehand: whether nominal values, or what it needs of earlier results.
+    """What a session knows beforehand: whether nominal values, or what it needs of earlier results.
 
     As plain JSON types. Raises InputError where a path leads to no results of a session.
     """
