@@ -40,7 +40,9 @@ def given_prior(prior: GivenPrior) -> bool | dict[str, Any]:
 
         prior = read_results(Path(prior))
     document = prior.document() if isinstance(prior, Result) else prior
-    parameters = [{key: each[key] for key in ("name", "estimate", "identifiable")} for each in document["parameters"]]
+    if "covariance" not in document:
+        raise InputError("--prior", "covariance", "none", "results of this version: replay the recording once more")
+    parameters = [{key: each[key] for key in ("name", "estimate")} for each in document["parameters"]]
     return {"system": document["system"], "parameters": parameters, "covariance": document["covariance"]}
 
 
@@ -64,7 +66,7 @@ def base_prior(system: System, base: BaseParameters, prior: bool | Mapping[str, 
         if combinations.get(parameter.name) != own or parameter.name not in names:
             continue
         place = names.index(parameter.name)
-        if prior["parameters"][place]["identifiable"] and covariance[place, place] > 0.0:
+        if covariance[place, place] > 0.0:
             found[k] = place
     value, std, correlation = stated.value.copy(), stated.std.copy(), np.eye(base.n)
     here, there = list(found), list(found.values())

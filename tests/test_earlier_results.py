@@ -97,10 +97,58 @@ def test_nothing_is_known_of_an_effect_that_is_new(first: sms.Result) -> None:
 
 def test_what_was_not_determined_is_not_known(first: sms.Result) -> None:
     document = first.document()
-    document["parameters"][0]["identifiable"] = False
+    document["covariance"][:2] = [None, None]
     base = find_base_parameters(build_model(SYSTEM))
     known = base_prior(SYSTEM, base, given_prior(document)).known
     assert known.tolist() == [False] + [True] * (base.n - 1)
+
+
+def test_results_without_covariance_are_refused(first: sms.Result) -> None:
+    document = {key: value for key, value in first.document().items() if key != "covariance"}
+    with pytest.raises(sms.InputError, match="covariance: none"):
+        given_prior(document)
+
+
+def loses(rate: float, seconds: float) -> sms.Capture:
+    """The axis, whose inertia falls by a share `rate` a second from 6 s on."""
+    t = np.arange(round(200 * seconds)) / 200.0
+    q = np.sin(2 * t) + 0.3 * np.sin(5 * t)
+    speed = 2 * np.cos(2 * t) + 1.5 * np.cos(5 * t)
+    momentum = INERTIA * (1.0 - rate * np.maximum(0.0, t - 6.0)) * speed
+    noise = np.random.default_rng(3).standard_normal((2, t.size))
+    torque = np.gradient(momentum, t, edge_order=2) + DAMPING * speed
+    return sms.Capture.from_arrays(t, {"force_1": torque + 0.01 * noise[0], "q_1": q + 1e-4 * noise[1]})
+
+
+@pytest.mark.slow
+def test_what_drifts_leaves_its_prior_without_a_dispute(first: sms.Result) -> None:
+    found = sms.estimate(SYSTEM, loses(0.002, 24.0), prior=first)
+    inertia = found.parameters["link_1.inertia"]
+    assert inertia.value == pytest.approx(INERTIA * (1.0 - 0.002 * 18.0), abs=4.0 * inertia.std)
+    assert [drift.parameter for drift in found.drifts] == ["link_1.inertia"]
+    assert found.trust.level == "trust"
+
+
+@pytest.mark.slow
+def test_a_prior_counts_once_beside_a_drift() -> None:
+    """Nearly all that is known of the damping is the prior's, and so is its deviation."""
+    name, std = "viscous_friction@joint_1.damping", 2e-6
+    system = sms.load_system(tomllib.loads(f'{AXIS}\n[prior]\n"{name}" = {{ value = {DAMPING}, std = {std} }}\n'))
+    data = loses(0.002, 24.0)
+    session = sms.Session(system, data.channels)
+    for block in data:
+        for piece in block.pieces(1000):
+            session.update(piece)
+            session = sms.Session.restore(session.save())
+    session.finish()
+    assert session.result.drifts
+    momentum = session.estimator.momentum
+    assert momentum is not None
+    k = len(momentum.nuisances) + [p.name for p in momentum.changes.base.parameters].index(name)
+    for known in (momentum.bank.information, momentum.joint.tracker.information, momentum.changes.detector.known):
+        assert known.solution().covariance()[k, k] ** 0.5 == pytest.approx(std, rel=0.05)
+    assert session.result.parameters[name].std == pytest.approx(std, rel=0.05)
+    assert numbers(session.result) == numbers(sms.estimate(system, data))
 
 
 def test_joined_priors_are_independent() -> None:

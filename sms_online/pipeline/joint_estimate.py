@@ -42,16 +42,23 @@ class JointEstimateState(State):
 class JointEstimate(Stage):
     """Sums of one session's rows [N Y b], from one event to the next.
 
-    prior: of the parameters, None where there is none. tracker: fed with rows of unit variance, all of which count
-    alike. bias: what noise in the columns does to its estimate. grams: sums of rows by generalized speed, for an
-    estimate where they leave more than noise.
+    prior: of the parameters, None where there is none; within: what the estimate goes on from holds it. tracker: fed
+    with rows of unit variance, all of which count alike. bias: what noise in the columns does to its estimate. grams:
+    sums of rows by generalized speed, for an estimate where they leave more than noise.
     """
 
-    def __init__(self, model: Model, base: BaseParameters, nuisances: Sequence[Nuisance], prior: Prior | None) -> None:
-        self._nuisances, self._prior = tuple(nuisances), prior
+    def __init__(
+        self,
+        model: Model,
+        base: BaseParameters,
+        nuisances: Sequence[Nuisance],
+        prior: Prior | None,
+        within: bool = False,
+    ) -> None:
+        self._nuisances, self._prior, self._within = tuple(nuisances), prior, within
         self._n, self._n_v = base.n, model.layout.n_v
         self._calibration = prior_rows(self._nuisances, base.n)
-        self.tracker: Tracker = session_tracker(base.n, prior, len(self._nuisances))
+        self.tracker: Tracker = session_tracker(base.n, prior, len(self._nuisances), within)
         if self._nuisances:
             self.tracker.begin(known_beforehand(self._nuisances, base.n))
         self.bias, self.grams = self._new_sums()
@@ -68,9 +75,11 @@ class JointEstimate(Stage):
         self.tracker.begin(known)
 
     def begin_drift(self, known: Information) -> None:
-        """Forget the sums of rows that took parameters for constant; the tracker goes on."""
+        """Forget what took parameters for constant, and go on from what is known, priors within."""
         self.bias, self.grams = self._new_sums()
-        self.state.known = known.factor
+        self.state.known, self._within = known.factor, True
+        self.tracker = session_tracker(self._n, self._prior, len(self._nuisances), within=True)
+        self.tracker.begin(known)
 
     def add(self, rows: WhiteRows, t: float) -> None:
         """Take in the rows of a window that ends at t, s."""
@@ -114,7 +123,8 @@ class JointEstimate(Stage):
 
     def beforehand(self) -> Beforehand:
         """What is known of nuisances and parameters beside the rows; tolerances may be released, within bounds."""
-        known = np.pad(prior_factor(self._prior, self._n), ((0, 0), (len(self._nuisances), 0)))
+        prior = None if self._within else self._prior
+        known = np.pad(prior_factor(prior, self._n), ((0, 0), (len(self._nuisances), 0)))
         may = np.array([each.may_give_way for each in self._nuisances if np.isfinite(each.tolerance)], dtype=np.bool_)
         bounds = bound_rows(self._nuisances, self._n)
         certain = np.concatenate((self.state.known, self._calibration[~may], bounds, known))

@@ -48,13 +48,16 @@ class MomentumState(State):
 
     sensor_noise: that of the samples so far. newest_row: time of the last window's end, s. start_time: of grid index 0,
     s. random: gives the synthetic noise. patient: whether more than noise in the beginning may be a drift yet to be
-    learned. drift: known to windows to come. held: rows since an alarm that may be false. readings (·, sensors): last
+    learned. prior_within: what is handed on from a drift holds the prior; bank_within: trackers went on from such.
+    drift: known to windows to come. held: rows since an alarm that may be false. readings (·, sensors): last
     ones of the segment.
     """
 
     random: np.random.Generator
     patient: bool
     readings: Array
+    prior_within: bool = False
+    bank_within: bool = False
     sensor_noise: SensorNoise | None = None
     segment: int = -1
     start_time: float = np.nan
@@ -113,7 +116,7 @@ class Momentum(Stage):
     def _build(self) -> None:
         """Empty stages for the current model and parameters, but for the trackers that were chosen."""
         model, base = self.changes.model, self.changes.base
-        self.joint = JointEstimate(model, base, self.nuisances, self.current_prior)
+        self.joint = JointEstimate(model, base, self.nuisances, self.current_prior, self.state.prior_within)
         self._balance = MomentumBalance(model, base, self._sample_rate, self._span, moments=self.bank.follows)
         self.latencies = Latencies(self._sources, base.n)
         self.fit = MomentumFit(
@@ -124,8 +127,15 @@ class Momentum(Stage):
         self.fit.plain.patient = self.state.patient and self.bank.learned is not None
         self.test = self._new_test()
 
+    def renew(self) -> None:
+        """See Stage."""
+        if self.state.prior_within:
+            self.bank = self._new_bank()
+            self._build()
+
     def _rebuild(self) -> None:
         """The same after an event, trackers included."""
+        self.state.bank_within = self.state.prior_within
         self.bank = self._new_bank()
         self._build()
         self._changed()
@@ -146,10 +156,10 @@ class Momentum(Stage):
 
     def _new_bank(self) -> TrackerBank:
         model, base, nuisances = self.changes.model, self.changes.base, self.nuisances
-        prior, n_v = self.current_prior, model.layout.n_v
+        prior, within, n_v = self.current_prior, self.state.bank_within, model.layout.n_v
         steady = not self._clocks
         return TrackerBank(
-            self._trackers, model.system.name, base.parameters, nuisances, prior, n_v, self._window, steady
+            self._trackers, model.system.name, base.parameters, nuisances, prior, within, n_v, self._window, steady
         )
 
     @property
@@ -408,6 +418,7 @@ class Momentum(Stage):
     def _begin_drift(self, known: Information) -> None:
         """Have what has judged rows by constant parameters begin anew."""
         m = len(self.nuisances)
+        self.state.prior_within = True
         self.changes.detector.begin(known)
         self.joint.begin_drift(known)
         self.fit.plain.clear()

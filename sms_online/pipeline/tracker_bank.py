@@ -103,9 +103,9 @@ class TrackerBank(Stage):
     """The chosen trackers of one session, from one event to the next.
 
     trackers: those of the session. name: of the system. parameters (n,): columns of the rows behind those of the
-    nuisances. prior: of the parameters. span: of a window, s. steady: all channels have one clock; clocks of several
-    devices wander, as if parameters moved, and no drift is suspected. InputError where a choice does not fit the
-    parameters.
+    nuisances. prior: of the parameters; within: what the trackers go on from holds it. span: of a window, s. steady:
+    all channels have one clock; clocks of several devices wander, as if parameters moved, and no drift is suspected.
+    InputError where a choice does not fit the parameters.
     """
 
     def __init__(
@@ -115,6 +115,7 @@ class TrackerBank(Stage):
         parameters: Sequence[Parameter],
         nuisances: Sequence[Nuisance],
         prior: Prior | None,
+        within: bool,
         rows_a_window: int,
         span: float,
         steady: bool,
@@ -124,7 +125,8 @@ class TrackerBank(Stage):
         tolerance = np.array([each.tolerance for each in nuisances])
         nothing = np.full(len(parameters), np.nan)
         tolerances = Prior(np.zeros(tolerance.size), np.where(np.isfinite(tolerance), tolerance, np.nan))
-        known = joined(tolerances, Prior(nothing, nothing) if prior is None else prior)
+        known = joined(tolerances, Prior(nothing, nothing) if prior is None or within else prior)
+        self._weighted = prior is not None
         self._rows_per_second = rows_per_second(rows_a_window, span)
         rate = self._rows_per_second
         tracked = Tracked(parameters, tolerance.size, known, prior is not None, rate, name)
@@ -195,7 +197,8 @@ class TrackerBank(Stage):
     def drift_behind(self, change: Change) -> Ramp | bool:
         """The drift that a change is; whether that is still to be seen, where it is none so far."""
         learned = self.learned
-        if learned is None:
+        if learned is None or self.state.asked == len(WAITED):
+            # A gap may keep the change from being decided on for longer than that.
             return False
         if change.newest < change.alarm + WAITED[self.state.asked]:
             return True
@@ -287,7 +290,8 @@ class TrackerBank(Stage):
             estimate = tracker.estimate_at(t, max(0.0, t - since))
         else:
             estimate = tracker.estimate()
-        if estimate.scale is None and estimate.rows > 0.0:
+        # An estimate that was weighted against a prior stays as it is, see `unbiased`.
+        if estimate.scale is None and not self._weighted and estimate.rows > 0.0:
             # Noise in the columns pulls every weighted mean of the rows alike; the scatter of that grows as rows fade.
             shift, covariance = bias.correction(estimate.determined)
             fewer = max(1.0, bias.windows * self._rows_a_window / estimate.rows)

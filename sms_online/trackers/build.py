@@ -81,7 +81,7 @@ def _least_squares(choice: TrackerChoice, tracked: Tracked) -> Tracker:
 def _kalman(choice: TrackerChoice, tracked: Tracked) -> Tracker:
     if choice.forgetting != "none" or choice.memory is not None:
         raise InputError(tracked.source, "tracker", "forgetting of kalman", 'kind = "rls", or a drift')
-    drifts = drifts_of(choice, tracked)
+    drifts = drifts_of(choice, tracked.parameters, tracked.source)
     std = process_std(choice, tracked, drifts)
     if not {"trend", "learned"} & set(drifts):
         return RandomWalk(tracked.n, std, tracked.prior)
@@ -94,16 +94,16 @@ def _kalman(choice: TrackerChoice, tracked: Tracked) -> Tracker:
 KINDS: dict[str, Callable[[TrackerChoice, Tracked], Tracker]] = {"rls": _least_squares, "kalman": _kalman}
 
 
-def drifts_of(choice: TrackerChoice, tracked: Tracked) -> list[Drift]:
-    """The drift of each parameter; InputError for names that the system does not have."""
+def drifts_of(choice: TrackerChoice, parameters: Sequence[Parameter], source: str) -> list[Drift]:
+    """The drift of each parameter; InputError for names that the system does not have. source: its name."""
     table: Mapping[str, Drift] = {ALL: choice.drift} if isinstance(choice.drift, str) else choice.drift
-    return [_of(p.name, table, "none") for p in _named(tracked, "drift", table)]
+    return [_of(p.name, table, "none") for p in _named(parameters, source, "drift", table)]
 
 
 def process_std(choice: TrackerChoice, tracked: Tracked, drifts: Sequence[Drift]) -> Array:
     """Process noise (m + n,) of walks and trends, 0 of all else; InputError where a walk or trend states none."""
     out = np.zeros(tracked.nuisances + len(drifts))
-    parameters = _named(tracked, "std", choice.std)
+    parameters = _named(tracked.parameters, tracked.source, "std", choice.std)
     for k, (p, drift) in enumerate(zip(parameters, drifts, strict=True), start=tracked.nuisances):
         if drift not in ("random_walk", "trend"):
             continue
@@ -141,15 +141,17 @@ def _forgetting(choice: TrackerChoice, rows_per_second: float) -> Forgetting:
     return Exponential(factor) if choice.forgetting == "exponential" else Directional(factor)
 
 
-def _named(tracked: Tracked, place: str, table: Mapping[str, object]) -> Sequence[Parameter]:
+def _named(
+    parameters: Sequence[Parameter], source: str, place: str, table: Mapping[str, object]
+) -> Sequence[Parameter]:
     """The parameters; InputError where the table names something else."""
-    names = [p.name for p in tracked.parameters]
+    names = [p.name for p in parameters]
     owners = [name.rsplit(".", 1)[0] for name in names]
     for key in table:
         if key not in (*names, *owners, ALL):
             near = nearest(key, [*names, *owners])
-            raise InputError(tracked.source, f"tracker.{place}", repr(key), "an estimated parameter" + hint(near))
-    return tracked.parameters
+            raise InputError(source, f"tracker.{place}", repr(key), "an estimated parameter" + hint(near))
+    return parameters
 
 
 def _of(name: str, table: Mapping[str, Value], default: Value) -> Value:

@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sms_online.stream import Array
-from sms_online.trackers.drift_filter import KNOT, STEP, Block, DriftFilter, Moving, innovation_loss, reach
+from sms_online.trackers.drift_filter import KNOT, START, STEP, Block, DriftFilter, Moving, innovation_loss, reach
 from sms_online.trackers.drift_noise import likeliest
 from sms_online.trackers.drift_search import (
     LARGEST_LEFT,
@@ -88,7 +88,7 @@ class LearnedTrend(Tracker):
     def begin(self, known: Information) -> None:
         """Forget all rows, and go on from given information about π; the prior stays. Drifts are learned anew."""
         factor = triangular_factor(self._prior, checked(known, self._n).factor)
-        moving = [Moving((int(k),), -1, float(self._trends[k])) for k in np.flatnonzero(self._trends)]
+        moving = [Moving((int(k),), START, float(self._trends[k])) for k in np.flatnonzero(self._trends)]
         anchor = DriftFilter.begin(factor, moving, self._walks)
         self.state = DriftState(anchor, anchor, moving, rows=float(known.rows))
 
@@ -96,7 +96,7 @@ class LearnedTrend(Tracker):
         """Take in rows; ValueError where their width is not n."""
         for row, t in zip(self._expanded(rows), rows.t.tolist(), strict=True):
             step = int(np.floor(t / STEP))
-            if self.state.step < 0:
+            if self.state.step == START:
                 self.state.step = step
             if step > self.state.step:
                 self._advance(step)
@@ -286,11 +286,15 @@ class LearnedTrend(Tracker):
         """Time that estimates hold for, s."""
         return max(self.state.newest, self.state.until)
 
+    def _ahead(self, t: float = -np.inf) -> float:
+        """Time from the open step to the instant that estimates hold for, or to a later one, s."""
+        return 0.0 if self.state.step == START else max(self.instant, t) - self.state.step * STEP
+
     @property
     def information(self) -> Information:
         """What is known of π as it is at the newest row."""
         state = self.state.now.absorbed(self._open())
-        factor, ahead = state.factor.copy(), self.instant - self.state.step * STEP
+        factor, ahead = state.factor.copy(), self._ahead()
         for column, place, decay in state.places():
             factor[:, place] -= reach(decay, ahead) * factor[:, column]
         rates = range(self._n, state.size)
@@ -324,7 +328,7 @@ class LearnedTrend(Tracker):
     def rates(self) -> tuple[Array, Array, Array]:
         """Rate of each parameter (n,) now, zero where it does not move, standard deviation, and decay (n,), 1/s."""
         state = self.state.now.absorbed(self._open())
-        solution, ahead = solve(state.factor), self.instant - self.state.step * STEP
+        solution, ahead = solve(state.factor), self._ahead()
         rate, std, decays = np.zeros((3, self._n))
         covariance = solution.covariance()
         for column, place, decay in state.places():
@@ -344,7 +348,7 @@ class LearnedTrend(Tracker):
         """
         state = self.state.now.absorbed(self._open())
         solution = solve(state.factor)
-        ahead = max(self.instant, t) - self.state.step * STEP
+        ahead = self._ahead(t)
         to_now = np.eye(self._n, state.size)
         determined = solution.determined[: self._n].copy()
         for column, place, decay in state.places():

@@ -12,6 +12,8 @@ from sms_online.trackers.factor import extended, reduced, triangular_factor
 
 # Time from one step of the filter to the next, s, and steps from one knot that is looked back at to the next.
 STEP, KNOT = 0.2, 5
+# Number of a step before all, for clocks may begin at any time.
+START = -KNOT * 2**50
 # A direction of less information than this share of its column's is none, in a likelihood.
 NO_INFORMATION = 1e-9
 # Standard deviation of the time of a bend, s, which is anywhere between two knots.
@@ -48,7 +50,7 @@ def reach(decay: float, time: float) -> float:
 
 @dataclass(frozen=True)
 class Moving:
-    """Parameters that move together: their columns, since which knot, -1 from the start, and their process noise.
+    """Parameters that move together: their columns, since which knot, START for all of time, and their process noise.
 
     std: of each rate's walk, per √s. Where the drift was learned it is a share of the accepted `rates`. decay: of the
     rates, 1/s, as of what approaches an end. level, fading: places of both in the choice. breaks: knots at which values
@@ -99,7 +101,7 @@ class Moving:
 
     def remembered(self, knot: int) -> Moving:
         """Without the breaks and bends up to a knot, before which nothing is looked back at; the last of all stays."""
-        last = max((*self.breaks, *self.bends), default=-1)
+        last = max((*self.breaks, *self.bends), default=START)
         breaks, bends = (tuple(at for at in knots if at > knot or at == last) for knots in (self.breaks, self.bends))
         return replace(self, breaks=breaks, bends=bends)
 
@@ -112,13 +114,13 @@ class Moving:
 class DriftFilter:
     """Information at a step on π (n,) and on the rates of those that move, (size + 1, size + 1).
 
-    walks (n,): process noise of values, per √s. knot: number of the step, -1 before the first.
+    walks (n,): process noise of values, per √s. knot: number of the step, START before the first.
     """
 
     factor: Array
     moving: tuple[Moving, ...]
     walks: Array
-    knot: int = -1
+    knot: int = START
 
     @staticmethod
     def begin(known: Array, moving: Sequence[Moving], walks: Array) -> DriftFilter:
@@ -148,7 +150,7 @@ class DriftFilter:
     def uneven(self) -> bool:
         """Whether rates change: by process noise, because they decay, or at a break that is yet to come."""
         walks = any(
-            each.decay > 0.0 or max(each.noise()) > 0.0 or max((*each.breaks, *each.bends), default=-1) > self.knot
+            each.decay > 0.0 or max(each.noise()) > 0.0 or max((*each.breaks, *each.bends), default=START) > self.knot
             for each in self.moving
         )
         return bool(self.walks.any() or walks)

@@ -9,7 +9,7 @@ import numpy as np
 
 from sms_online.state import State
 from sms_online.stream import Array
-from sms_online.trackers.drift_filter import Block, DriftFilter, Moving
+from sms_online.trackers.drift_filter import START, Block, DriftFilter, Moving
 from sms_online.trackers.drift_search import Suspicion
 from sms_online.trackers.rate_change import RateChange
 
@@ -33,11 +33,11 @@ class DriftState(State):
 
     anchor: the filter at the oldest remembered knot; now: at the newest step. blocks: from knot to knot. pending: rows
     [Y, (t - knot) Y, b] since the last knot; fresh: how many of them are not in `now` yet. step: number of the open
-    one, from t = 0 on; knots: since the beginning. rows: so far; newest: time of the last, s. accepted: how often
-    drifts were. quiet: whether rows leave no more than noise, without which no drift is accepted. lacking: whether they
-    leave more in the beginning, which no ramps explain. until: instant that estimates hold for, s; no earlier than that
-    of the newest row. likeliest: change that the last search found, of what does not move; suspected: where it is
-    hardly chance. changes: of rates, that may have been.
+    one, START before the first; knots: since the beginning. rows: so far; newest: time of the last, s. accepted: how
+    often drifts were. quiet: whether rows leave no more than noise, without which no drift is accepted. lacking:
+    whether they leave more in the beginning, which no ramps explain. until: instant that estimates hold for, s; no
+    earlier than that of the newest row. likeliest: change that the last search found, of what does not move; suspected:
+    where it is hardly chance. changes: of rates, that may have been.
     """
 
     anchor: DriftFilter
@@ -46,7 +46,7 @@ class DriftState(State):
     blocks: list[Block] = msgspec.field(default_factory=list)
     pending: list[Array] = msgspec.field(default_factory=list)
     fresh: int = 0
-    step: int = -1
+    step: int = START
     knots: int = 0
     rows: float = 0.0
     newest: float = 0.0

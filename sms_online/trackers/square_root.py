@@ -88,15 +88,19 @@ class RecursiveLeastSquares(Tracker):
         self._memory.begin(checked(known, self._n))
 
 
-def session_tracker(n: int, prior: Prior | None, nuisances: int = 0) -> RecursiveLeastSquares:
+def session_tracker(n: int, prior: Prior | None, nuisances: int = 0, within: bool = False) -> RecursiveLeastSquares:
     """The tracker of a balance's rows, of nuisances and then n parameters.
 
-    Beside a prior on the parameters, the rows' std are right up to a common factor.
+    Beside a prior on the parameters, the rows' std are right up to a common factor. within: it is part of what the
+    tracker goes on from, see `begin`, and not to be added.
     """
+    scaled = prior is not None
+    if within:
+        prior = None
     if prior is not None and nuisances:
         nothing = np.full(nuisances, np.nan)
         prior = joined(Prior(nothing, nothing), prior)
-    return RecursiveLeastSquares(nuisances + n, prior=prior, scaled_by_residual=prior is not None)
+    return RecursiveLeastSquares(nuisances + n, prior=prior, scaled_by_residual=scaled)
 
 
 def _residual_std(content: Content) -> float:

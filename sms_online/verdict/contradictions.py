@@ -10,6 +10,7 @@ from sms_online.calibration.found import CERTAIN
 from sms_online.calibration.nuisance import BOUND
 from sms_online.effects.catalogue import either, in_words
 from sms_online.row_types import row_types
+from sms_online.trackers.build import drifts_of
 from sms_online.verdict.evidence import Dispute
 from sms_online.verdict.reasons import STATE_HOLD, undecided
 from sms_online.verdict.truncated import FIRST_ORDER, truncated
@@ -88,13 +89,29 @@ def ambiguous_effects(evaluation: Evaluation) -> list[Reason]:
     return out
 
 
+def _moving(evaluation: Evaluation) -> list[int]:
+    """Columns of the parameters that drift in the judged estimate: as was found, or as its choice lets them."""
+    now = evaluation.statistics
+    readings = () if now.momentum is None else now.momentum.trackers
+    found = [drift.column for drift in readings[0].drifts] if readings else []
+    choice = now.setup.trackers[0]
+    if choice.kind != "kalman":
+        return found
+    let = drifts_of(choice, evaluation.parameters, evaluation.model.system.name)
+    return [*found, *(k for k, drift in enumerate(let) if drift in ("random_walk", "trend"))]
+
+
 def disputes(evaluation: Evaluation) -> list[Dispute]:
-    """Parameters that the data pull further from what was known of them beforehand than that allows."""
+    """Parameters that the data pull further from what was known of them beforehand than that allows.
+
+    What drifts may go as far as it likes: it was known of the beginning.
+    """
     now, prior = evaluation.statistics, evaluation.statistics.setup.current_prior
     if prior is None:
         return []
     off = np.zeros(prior.std.size)
     off[prior.known] = ((evaluation.estimate.pi - prior.value) / prior.std)[prior.known]
+    off[_moving(evaluation)] = 0.0
     far = np.flatnonzero(np.abs(off) > LARGEST_DISPUTE)
     if not far.size:
         return []
