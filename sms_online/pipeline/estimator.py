@@ -109,7 +109,6 @@ class Estimator(Stage):
         # sake of the lag.
         self._rates = RatesStage(system.sample_rate, *self.sensing.deciding)
         self._followed = FollowedStates(model, self.sensing, system.sample_rate)
-        self.energy = EnergyEstimate(model, base, system.sample_rate)
         # A balance of forces does not hold in a shape that is not the link's; energies tolerate it best.
         by_energy = system.balance == "energy" or self.sensing.missing or (self.smoother is not None and self._slow)
         self.trackers = session_trackers(self.sensing, not by_energy)
@@ -119,6 +118,8 @@ class Estimator(Stage):
         self._relinearisation = (
             None if by_energy else Relinearisation(model, base, self.sensing, self.trackers, self._begin_joints)
         )
+        # Behind what may have it begin anew when states are put back.
+        self.energy = EnergyEstimate(model, base, system.sample_rate)
         self._begin_joints()
         self._first_block, self._block = self._blocks()
         self.finished = False  # no more samples come
