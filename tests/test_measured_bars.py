@@ -86,7 +86,8 @@ def test_halves_of_quanser_runs_agree_within_bars(tmp_path: Path, unit: str) -> 
         capture, middle = tmp_path / "quanser.csv", 10.0
         import_quanser(measured(QUANSER), capture)
     z = apart(with_friction(), capture, True, middle)
-    assert {"joint_1.stiffness", "joint_2.stiffness"} <= z.keys()
+    # Half of the maker's run does not determine hub 2's spring beside its prior.
+    assert {"joint_1.stiffness", *(["joint_2.stiffness"] if unit == "CTU" else [])} <= z.keys()
     assert max(z.values()) < 3.0, z
 
 
