@@ -26,6 +26,7 @@ from tests.saved import resumed
 
 PLANAR = load_system("paper-planar")
 BEGIN = 8.0  # s
+FRICTION = 0.05  # N m
 
 
 def watched(system: System, block: Block, adopt: bool = True, size: int = 64) -> tuple[Estimator, OnlineDiagnosis]:
@@ -151,6 +152,16 @@ def test_a_change_that_an_event_explains_is_named_by_it() -> None:
     assert episode.verdict == "change"
     assert episode.event == estimator.events[0]
     assert "viscous_friction@joint_1.damping" in online.notices[0]
+
+
+@pytest.mark.slow
+def test_an_event_that_is_decided_late_closes_what_was_named() -> None:
+    """Two searches name the friction while it may be a drift; then an event goes on with it."""
+    estimator, online = watched(SYSTEM, axis_block(lambda q, rate: FRICTION * np.sign(rate), BEGIN, 13.0), adopt=False)
+    (event,), (episode,) = estimator.events, online.episodes
+    assert event.kind == "friction"
+    assert [evidence.outcome.keys for evidence in episode.evidence] == [("coulomb_friction@joint_1",)] * 2
+    assert (episode.verdict, episode.event, episode.named) == ("change", event, ())
 
 
 @pytest.mark.long
