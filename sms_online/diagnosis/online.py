@@ -51,11 +51,12 @@ MOST_ADOPTED = 8
 @dataclass(frozen=True)
 class _Onset:
     """Grid indices: the effect is absent up to `last`, None where it may always have been there, and present from
-    `first`. known: from before."""
+    `first`. known: from before. patient: see `MomentumState`; of the rows that show it."""
 
     last: int | None
     first: int
     known: Information
+    patient: bool
 
 
 class OnlineDiagnosis(Observer):
@@ -194,7 +195,9 @@ class OnlineDiagnosis(Observer):
         self._onset, self._pending, self._sure = None, None, False
 
     def _notice(self) -> None:
-        if self._onset is not None or self._quiet:
+        """Open an episode where rows alarm; in rows that were made without patience, the open one may begin anew."""
+        patient = self._momentum.state.patient
+        if self._quiet or self._sure or (self._onset is not None and self._onset.patient == patient):
             return
         detector, test = self._momentum.changes.detector, self._momentum.test
         width = self._momentum.changes.window_samples
@@ -207,12 +210,18 @@ class OnlineDiagnosis(Observer):
             return
         seen = detector.before(last) if last >= 0 else None
         if seen is None or last - self._valid < LEAST_BEFORE * self._unit:
-            self._onset = _Onset(None, self._valid, self._momentum.changes.beforehand)
+            onset = _Onset(None, self._valid, self._momentum.changes.beforehand, patient)
         else:
-            self._onset = _Onset(last, first, seen.known)
-        began = None if self._onset.last is None else self._time(0.5 * (last + first))
+            onset = _Onset(last, first, seen.known, patient)
+        before, self._onset = self._onset, onset
+        noticed = self._now
+        if before is not None:
+            if (before.last, before.first) == (onset.last, onset.first):
+                return
+            noticed, self._pending = self.episodes.pop().noticed, None
+        began = None if onset.last is None else self._time(0.5 * (last + first))
         self._due = 0
-        self.episodes.append(Episode(self._now, row, began))
+        self.episodes.append(Episode(noticed, row, began))
         self.on_verdict(self._now, line(self.episodes[-1]))
 
     def _search(self) -> None:
