@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from sms_adapters.system_file import load_system
-from sms_online.description.schema import Effect, System
+from sms_online.description.schema import LEAST_SQUARES, Effect, System
 from sms_online.diagnosis.online import OnlineDiagnosis, refusal
 from sms_online.diagnosis.online_search import Immediate
 from sms_online.effects.build import build_model
@@ -121,6 +121,31 @@ def test_an_effect_from_the_start_is_named_and_leaves_no_bias() -> None:
     found = estimated(estimator)
     for name, true in (("link_1.inertia", INERTIA), ("viscous_friction@joint_1.damping", DAMPING)):
         assert found[name][0] == pytest.approx(true, abs=4.0 * found[name][1])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("rest", [2.0, 10.0])
+def test_behind_a_rest_friction_from_the_start_is_named_as_by_rls(rest: float) -> None:
+    """Rows at rest show neither a drift nor what the model lacks: no motion that follows them is an event."""
+    block = rested(rest)
+    (first, learned), (second, squares) = (
+        watched(system, block, adopt=False)
+        for system in (SYSTEM, SYSTEM.model_copy(update={"trackers": (LEAST_SQUARES,)}))
+    )
+    assert estimated(first) == estimated(second)
+    assert first.events == second.events == []
+    (episode,), (other,) = learned.episodes, squares.episodes
+    assert (episode.verdict, episode.began, episode.named_at) == ("named", other.began, other.named_at)
+    assert [named.key for named in episode.named] == ["coulomb_friction@joint_1"]
+
+
+def rested(rest: float) -> Block:
+    """The axis at rest for so many seconds, and then with friction along two sines."""
+    moved = axis_block(lambda q, rate: FRICTION * np.sign(rate), seconds=8.0)
+    count = round(rest / (moved.t[1] - moved.t[0]))
+    still = np.random.default_rng(6).standard_normal((count, 2)) * [0.01, 1e-4] + [0.0, moved.values[0, 1]]
+    values = np.concatenate((still, moved.values))
+    return Block(np.arange(len(values)) * moved.t[1], moved.channels, values)
 
 
 @pytest.mark.slow

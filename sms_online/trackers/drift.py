@@ -52,8 +52,8 @@ UNSEARCHED = 3
 RECENT = 2
 # Drifts that begin together, at most.
 MOST_AT_ONCE = 4
-# Knots from the beginning within which more than noise may be a drift yet to be found; but not where ramps leave this
-# share of it or more.
+# Knots with motion from the beginning within which more than noise may be a drift yet to be found; but not where ramps
+# leave this share of it or more. An arm at rest shows neither.
 PATIENCE, RAMPS_LEAVE = 12, 0.5
 # A change is suspected where two searches in a row show one of the same parameters, the later with a chance of at most
 # this to be none. In steady sessions one search in some 500 finds one, ten times as many as normal rows would: their
@@ -184,6 +184,9 @@ class LearnedTrend(Tracker):
         self.state.blocks.append(block)
         self.state.pending = []
         self.state.knots += 1
+        if self.state.knots % SEARCHED == 0:
+            self.state.shown += SEARCHED * self.state.moves
+            self.state.moves = False
         while len(self.state.blocks) > REMEMBERED:
             gone = self.state.blocks.pop(0)
             following = self.state.blocks[0].knot
@@ -229,7 +232,7 @@ class LearnedTrend(Tracker):
             found.append(Moving(ramp.columns, ramp.since, 0.0, tuple(ramp.rates.tolist()), begun=begun))
             tried = self._tried(found)
         new = len(found) > len(self.state.moving)
-        ends = self.state.knots == PATIENCE and not self.state.accepted
+        ends = self.state.shown == PATIENCE and not self.state.accepted
         if not new and not self.patient and not ends:
             return
         # A lack of the model leaves more than noise, whatever ramps it is taken for.
@@ -279,7 +282,7 @@ class LearnedTrend(Tracker):
     @property
     def patient(self) -> bool:
         """Whether more than noise may be a drift that is yet to be found."""
-        return self.state.knots < PATIENCE and not self.state.lacking
+        return self.state.shown < PATIENCE and not self.state.lacking
 
     @property
     def instant(self) -> float:
