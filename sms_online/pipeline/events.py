@@ -97,9 +97,9 @@ class DetectorState(State):
     """What a test keeps of the windows that it has seen, and its sums.
 
     known, history, alarm, onset: see `ChangeDetector`. shown: windows in which the arm moved. tested: windows; levels:
-    sum of their χ² / n_v, none for more than the cumulative sum counts it; level: what the next ones are measured by. sum: the cumulative sum. loud: windows
-    in a row beyond ALARM. lacking: windows in a row since the model is known to lack something. moved (n,): drift that
-    rows of now are free of, None where there is none.
+    sum of their χ² / n_v, none for more than the cumulative sum counts it; level: what the next ones are measured by.
+    sum: the cumulative sum. loud: windows in a row beyond ALARM. lacking: windows in a row since the model is known to
+    lack something. moved (n,): drift that rows of now are free of, None where there is none.
     """
 
     known: Information

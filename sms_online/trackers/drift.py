@@ -184,17 +184,17 @@ class LearnedTrend(Tracker):
         self.state.blocks.append(block)
         self.state.pending = []
         self.state.knots += 1
-        if self.state.knots % SEARCHED == 0:
-            self.state.shown += SEARCHED * self.state.moves
-            self.state.moves = False
+        due = self.state.knots % SEARCHED == 0
+        self.state.shown += SEARCHED * (due and self.state.moves)
         while len(self.state.blocks) > REMEMBERED:
             gone = self.state.blocks.pop(0)
             following = self.state.blocks[0].knot
             self.state.anchor = self.state.anchor.absorbed(gone).advanced(following)
         if not self.state.quiet:
             self.state.likeliest = self.state.suspected = None
-        elif self.state.knots > UNSEARCHED and self.state.knots % SEARCHED == 0:
+        elif self.state.knots > UNSEARCHED and due:
             self._search()
+        self.state.moves = self.state.moves and not due
         found = [each.since for each in self.state.moving if each.learned]
         if found and (self.state.knots % CHOSEN == 0 or self._knot - max(found) < YOUNG * KNOT):
             self._choose()
@@ -232,7 +232,7 @@ class LearnedTrend(Tracker):
             found.append(Moving(ramp.columns, ramp.since, 0.0, tuple(ramp.rates.tolist()), begun=begun))
             tried = self._tried(found)
         new = len(found) > len(self.state.moving)
-        ends = self.state.shown == PATIENCE and not self.state.accepted
+        ends = self.state.shown == PATIENCE and self.state.moves and not self.state.accepted
         if not new and not self.patient and not ends:
             return
         # A lack of the model leaves more than noise, whatever ramps it is taken for.
