@@ -59,6 +59,17 @@ def test_without_drift_it_is_least_squares_to_rounding() -> None:
     assert found.rss == pytest.approx(expected.rss)
 
 
+def test_motion_and_not_rest_ends_the_wait_for_a_drift() -> None:
+    trend, given = learned(), rows(40.0)
+    half = given.t.size // 2
+    trend.update(part(given, 0, half))
+    assert trend.patient
+    for k in range(half, given.t.size):
+        trend.state.moves = True
+        trend.update(part(given, k, k + 1))
+    assert not trend.patient
+
+
 @pytest.mark.parametrize(("trend", "walk"), [(0.3, 0.0), (0.0, 0.2), (0.3, 0.2)])
 def test_trends_and_walks_are_the_dense_solution(trend: float, walk: float) -> None:
     given, column = rows(6.0), 1

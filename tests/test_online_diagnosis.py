@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from sms_adapters.system_file import load_system
-from sms_online.description.schema import Effect, System
+from sms_online.description.schema import LEAST_SQUARES, Effect, System
 from sms_online.diagnosis.online import OnlineDiagnosis, refusal
 from sms_online.diagnosis.online_search import Immediate
 from sms_online.effects.build import build_model
@@ -26,6 +26,7 @@ from tests.saved import resumed
 
 PLANAR = load_system("paper-planar")
 BEGIN = 8.0  # s
+FRICTION = 0.05  # N m
 
 
 def watched(system: System, block: Block, adopt: bool = True, size: int = 64) -> tuple[Estimator, OnlineDiagnosis]:
@@ -123,6 +124,33 @@ def test_an_effect_from_the_start_is_named_and_leaves_no_bias() -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("rest", [2.0, 10.0])
+def test_friction_behind_a_rest_is_named_as_by_rls(rest: float) -> None:
+    """Rows at rest show neither a drift nor what the model lacks: no motion that follows them is an event."""
+    block = rested(rest)
+    (first, learned), (second, squares) = (
+        watched(system, block, adopt=False)
+        for system in (SYSTEM, SYSTEM.model_copy(update={"trackers": (LEAST_SQUARES,)}))
+    )
+    assert estimated(first) == estimated(second)
+    assert first.events == second.events == []
+    (episode,), (other,) = learned.episodes, squares.episodes
+    assert (episode.verdict, episode.began) == (other.verdict, other.began) == ("named", pytest.approx(rest, abs=1.0))
+    assert [named.key for named in episode.named] == ["coulomb_friction@joint_1"]
+    assert episode.named_at is not None
+    assert episode.named_at < rest + 5.0
+
+
+def rested(rest: float) -> Block:
+    """The axis at rest for so many seconds, and then with friction along two sines."""
+    moved = axis_block(lambda q, rate: FRICTION * np.sign(rate), seconds=8.0)
+    count = round(rest / (moved.t[1] - moved.t[0]))
+    still = np.random.default_rng(6).standard_normal((count, 2)) * [0.01, 1e-4] + [0.0, moved.values[0, 1]]
+    values = np.concatenate((still, moved.values))
+    return Block(np.arange(len(values)) * moved.t[1], moved.channels, values)
+
+
+@pytest.mark.slow
 def test_the_evidence_grows_with_the_samples() -> None:
     _, online = cogged(True)
     episode = online.document()[0]
@@ -151,6 +179,16 @@ def test_a_change_that_an_event_explains_is_named_by_it() -> None:
     assert episode.verdict == "change"
     assert episode.event == estimator.events[0]
     assert "viscous_friction@joint_1.damping" in online.notices[0]
+
+
+@pytest.mark.slow
+def test_an_event_that_is_decided_late_closes_what_was_named() -> None:
+    """Two searches name the friction while it may be a drift; then an event goes on with it."""
+    estimator, online = watched(SYSTEM, axis_block(lambda q, rate: FRICTION * np.sign(rate), BEGIN, 13.0), adopt=False)
+    (event,), (episode,) = estimator.events, online.episodes
+    assert event.kind == "friction"
+    assert [evidence.outcome.keys for evidence in episode.evidence] == [("coulomb_friction@joint_1",)] * 2
+    assert (episode.verdict, episode.event, episode.named) == ("change", event, ())
 
 
 @pytest.mark.long

@@ -51,11 +51,12 @@ MOST_ADOPTED = 8
 @dataclass(frozen=True)
 class _Onset:
     """Grid indices: the effect is absent up to `last`, None where it may always have been there, and present from
-    `first`. known: from before."""
+    `first`. known: from before. patient: see `MomentumState`; of the rows that show it."""
 
     last: int | None
     first: int
     known: Information
+    patient: bool
 
 
 class OnlineDiagnosis(Observer):
@@ -79,6 +80,7 @@ class OnlineDiagnosis(Observer):
         self._drifts = 0 if estimator.momentum is None else estimator.momentum.drifts  # that have been followed
         self._quiet = False  # what is lacking has been said, and not added to the model
         self._onset: _Onset | None = None  # of the open episode
+        self._sure = False  # two searches in a row have named the same in the open episode
         self._due = 0  # searches of the open episode that were due so far
         self._begun = 0  # searches that were begun or left out
         self._pending: tuple[int, float] | None = None  # number of a search that runs, and time of its last sample, s
@@ -122,7 +124,7 @@ class OnlineDiagnosis(Observer):
         """After the session's end, which may have decided on a change."""
         if self._estimator.momentum is not None and self._record:
             self._follow_events()
-        if self._adopt and self._onset is not None and self.episodes[-1].verdict == "named":
+        if self._adopt and self._onset is not None and not self._sure and self.episodes[-1].verdict == "named":
             self.episodes[-1].refused = "the session ended before a second search could name the same"
 
     def samples(self, piece: GridSamples) -> None:
@@ -140,6 +142,7 @@ class OnlineDiagnosis(Observer):
             return
         self._follow_events()
         self._follow_drifts()
+        self._settle()
         if done is not None and self._pending is not None and done[0] == self._pending[0]:
             time, self._pending = self._pending[1], None
             if done[1] is not None and self._onset is not None:
@@ -189,10 +192,12 @@ class OnlineDiagnosis(Observer):
         self.on_verdict(self._now, line(episode))
 
     def _close(self) -> None:
-        self._onset, self._pending = None, None
+        self._onset, self._pending, self._sure = None, None, False
 
     def _notice(self) -> None:
-        if self._onset is not None or self._quiet:
+        """Open an episode where rows alarm; in rows that were made without patience, the open one may begin anew."""
+        patient = self._momentum.state.patient
+        if self._quiet or self._sure or (self._onset is not None and self._onset.patient == patient):
             return
         detector, test = self._momentum.changes.detector, self._momentum.test
         width = self._momentum.changes.window_samples
@@ -205,18 +210,24 @@ class OnlineDiagnosis(Observer):
             return
         seen = detector.before(last) if last >= 0 else None
         if seen is None or last - self._valid < LEAST_BEFORE * self._unit:
-            self._onset = _Onset(None, self._valid, self._momentum.changes.beforehand)
+            onset = _Onset(None, self._valid, self._momentum.changes.beforehand, patient)
         else:
-            self._onset = _Onset(last, first, seen.known)
-        began = None if self._onset.last is None else self._time(0.5 * (last + first))
+            onset = _Onset(last, first, seen.known, patient)
+        before, self._onset = self._onset, onset
+        noticed = self._now
+        if before is not None:
+            if (before.last, before.first) == (onset.last, onset.first):
+                return
+            noticed, self._pending = self.episodes.pop().noticed, None
+        began = None if onset.last is None else self._time(0.5 * (last + first))
         self._due = 0
-        self.episodes.append(Episode(self._now, row, began))
+        self.episodes.append(Episode(noticed, row, began))
         self.on_verdict(self._now, line(self.episodes[-1]))
 
     def _search(self) -> None:
         """Begin the search that is due."""
         onset = self._onset
-        if onset is None:
+        if onset is None or self._sure:
             return
         newest = int(self._record[-1].index[-1])
         schedule = DUE_FROM_THE_START if onset.last is None else DUE
@@ -295,10 +306,19 @@ class OnlineDiagnosis(Observer):
         if again and self._adopt:
             self._take_up(episode, outcome)
         self.on_verdict(evidence.known, line(episode))
-        if again:
-            adopted = sum(each.adopted is not None for each in self.episodes)
-            self._quiet = episode.adopted is None or adopted == MOST_ADOPTED
-            self._close()
+        self._sure = again
+        self._settle()
+
+    def _settle(self) -> None:
+        """Close an episode that is named for good; not while rows are held back for an event or a drift behind it."""
+        if not self._sure:
+            return
+        episode, detector = self.episodes[-1], self._momentum.changes.detector
+        if detector.alarm is not None and episode.noticed >= self._time(detector.onset):
+            return
+        adopted = sum(each.adopted is not None for each in self.episodes)
+        self._quiet = episode.adopted is None or adopted == MOST_ADOPTED
+        self._close()
 
     def _take_up(self, episode: Episode, outcome: Outcome) -> None:
         """Go on with what was named."""

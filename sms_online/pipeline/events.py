@@ -24,7 +24,7 @@ from sms_online.stream import Array
 from sms_online.trackers.factor import extended
 from sms_online.trackers.information import Information
 
-# Time before the first test, s, and after an event before the next: a motion must have shown what the model lacks.
+# Motion before the first test, s, and after an event before the next: it must have shown what the model lacks.
 WARM_UP = 4.0
 # Windows that are remembered: an event is found and decided on within five seconds at the usual width.
 REMEMBERED = 125
@@ -96,16 +96,17 @@ class Seen:
 class DetectorState(State):
     """What a test keeps of the windows that it has seen, and its sums.
 
-    known, history, alarm, onset: see `ChangeDetector`. tested: windows; levels: sum of their χ² / n_v, none for more
-    than the cumulative sum counts it; level: what the next ones are measured by. sum: the cumulative sum. loud: windows
-    in a row beyond ALARM. lacking: windows in a row since the model is known to lack something. moved (n,): drift that
-    rows of now are free of, None where there is none.
+    known, history, alarm, onset: see `ChangeDetector`. shown: windows in which the arm moved. tested: windows; levels:
+    sum of their χ² / n_v, none for more than the cumulative sum counts it; level: what the next ones are measured by.
+    sum: the cumulative sum. loud: windows in a row beyond ALARM. lacking: windows in a row since the model is known to
+    lack something. moved (n,): drift that rows of now are free of, None where there is none.
     """
 
     known: Information
     history: list[Seen] = msgspec.field(default_factory=list)
     alarm: int | None = None
     onset: int = -1
+    shown: int = 0
     tested: int = 0
     level: float = 1.0
     levels: float = 0.0
@@ -175,7 +176,8 @@ class ChangeDetector(Stage):
     def _test(self, rows: WhiteRows, misfit: bool) -> None:
         self.state.lacking = self.state.lacking + 1 if misfit else 0
         excess = self._excess(rows)
-        young = self.state.tested <= self._warm_up or 0 < self.state.lacking <= self._warm_up
+        self.state.shown += rows.moves
+        young = self.state.shown <= self._warm_up or 0 < self.state.lacking <= self._warm_up
         if young or (self.state.level > LARGEST_LEVEL and not misfit):
             self.state.sum, self.state.loud = 0.0, 0
             return

@@ -354,7 +354,7 @@ class Momentum(Stage):
         noise = self.state.sensor_noise
         # Rounding moves as it likes where samples are exact.
         quiet = not self.misfit and noise is not None and not noise.exact
-        self.bank.update(self._for_trackers(rows), quiet)
+        self.bank.update(self._for_trackers(rows), quiet, rows.moves)
         if learned is not None:
             self.fit.plain.patient = self.state.patient and learned.patient
             if learned.state.accepted > before:

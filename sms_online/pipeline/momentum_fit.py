@@ -308,7 +308,8 @@ class MomentumFit(Stage):
         moments, centres = self._balance.moments(windows), self._centres(windows)
         ramp = (centres * rows[:, 0, :, :-1] + moments)[..., : self._ramps]
         bend = (0.5 * centres**2 * rows[:, 0, :, :-1] + centres * moments)[..., : self._ramps]
-        weights, misfit = self._known_weights, self.whitening.misfit
+        weights, misfit, sensors = self._known_weights, self.whitening.misfit, self.whitening.noise.sensor_noise
+        assert sensors is not None
         samples = beyond_first_order(rows, weights)
         widths = [window.half_width for window in windows]
         errors = self._errors.push(widths, samples, size(rows[:, 0], weights))
@@ -344,7 +345,7 @@ class MomentumFit(Stage):
             out.append(
                 WhiteRows(
                     white[k, 0], white[k, 1:], raw[k], covariance, noise, window.end, each.late, misfit,
-                    self._known_weights, ramp[k], drifts[k],
+                    self._known_weights, self._moves(window, sensors), ramp[k], drifts[k],
                 )
             )  # fmt: skip
         return out

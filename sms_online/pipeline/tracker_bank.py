@@ -182,11 +182,12 @@ class TrackerBank(Stage):
         judged = self._chosen[0].tracker
         return judged if isinstance(judged, LearnedTrend) else None
 
-    def update(self, rows: Rows, quiet: bool) -> None:
-        """Take in rows of nuisances and parameters; quiet: they leave no more than noise."""
+    def update(self, rows: Rows, quiet: bool, moves: bool) -> None:
+        """Take in rows of nuisances and parameters; quiet: they leave no more than noise; moves: the arm does."""
         for tracker in self._fed:
             if isinstance(tracker, LearnedTrend):
                 tracker.state.quiet = quiet
+                tracker.state.moves |= moves
             tracker.update(rows)
 
     def hold(self, rows: Rows, since: float) -> None:

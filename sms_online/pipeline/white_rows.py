@@ -17,8 +17,8 @@ class WhiteRows:
     with their own covariance (n_v, n_v), of which noise is the part that the sensors make. end: grid index of the
     window's last sample. late (n_v, G): columns of the sources' latencies, independent like Y. misfit (n_v,): what the
     model lacks in each row, over the variance of its noise, as far as it is in the covariance. weights (n,): β behind
-    the covariance. ramp (n_v, n): columns of the parameters' rates about the window's centre,
-    independent like Y; none where nobody asked. drift: the known drift there, of which b is free.
+    the covariance. moves: whether the arm does in the window. ramp (n_v, n): columns of the parameters' rates about the
+    window's centre, independent like Y; none where nobody asked. drift: the known drift there, of which b is free.
     """
 
     Y: Array
@@ -30,5 +30,6 @@ class WhiteRows:
     late: Array
     misfit: Array
     weights: Array
+    moves: bool
     ramp: Array
     drift: DriftLine | None = None

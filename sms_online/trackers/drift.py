@@ -52,8 +52,8 @@ UNSEARCHED = 3
 RECENT = 2
 # Drifts that begin together, at most.
 MOST_AT_ONCE = 4
-# Knots from the beginning within which more than noise may be a drift yet to be found; but not where ramps leave this
-# share of it or more.
+# Knots with motion from the beginning within which more than noise may be a drift yet to be found; but not where ramps
+# leave this share of it or more. An arm at rest shows neither.
 PATIENCE, RAMPS_LEAVE = 12, 0.5
 # A change is suspected where two searches in a row show one of the same parameters, the later with a chance of at most
 # this to be none. In steady sessions one search in some 500 finds one, ten times as many as normal rows would: their
@@ -184,14 +184,17 @@ class LearnedTrend(Tracker):
         self.state.blocks.append(block)
         self.state.pending = []
         self.state.knots += 1
+        due = self.state.knots % SEARCHED == 0
+        self.state.shown += SEARCHED * (due and self.state.moves)
         while len(self.state.blocks) > REMEMBERED:
             gone = self.state.blocks.pop(0)
             following = self.state.blocks[0].knot
             self.state.anchor = self.state.anchor.absorbed(gone).advanced(following)
         if not self.state.quiet:
             self.state.likeliest = self.state.suspected = None
-        elif self.state.knots > UNSEARCHED and self.state.knots % SEARCHED == 0:
+        elif self.state.knots > UNSEARCHED and due:
             self._search()
+        self.state.moves = self.state.moves and not due
         found = [each.since for each in self.state.moving if each.learned]
         if found and (self.state.knots % CHOSEN == 0 or self._knot - max(found) < YOUNG * KNOT):
             self._choose()
@@ -229,7 +232,7 @@ class LearnedTrend(Tracker):
             found.append(Moving(ramp.columns, ramp.since, 0.0, tuple(ramp.rates.tolist()), begun=begun))
             tried = self._tried(found)
         new = len(found) > len(self.state.moving)
-        ends = self.state.knots == PATIENCE and not self.state.accepted
+        ends = self.state.shown == PATIENCE and self.state.moves and not self.state.accepted
         if not new and not self.patient and not ends:
             return
         # A lack of the model leaves more than noise, whatever ramps it is taken for.
@@ -279,7 +282,7 @@ class LearnedTrend(Tracker):
     @property
     def patient(self) -> bool:
         """Whether more than noise may be a drift that is yet to be found."""
-        return self.state.knots < PATIENCE and not self.state.lacking
+        return self.state.shown < PATIENCE and not self.state.lacking
 
     @property
     def instant(self) -> float:

@@ -33,11 +33,12 @@ class DriftState(State):
 
     anchor: the filter at the oldest remembered knot; now: at the newest step. blocks: from knot to knot. pending: rows
     [Y, (t - knot) Y, b] since the last knot; fresh: how many of them are not in `now` yet. step: number of the open
-    one, START before the first; knots: since the beginning. rows: so far; newest: time of the last, s. accepted: how
-    often drifts were. quiet: whether rows leave no more than noise, without which no drift is accepted. lacking:
-    whether they leave more in the beginning, which no ramps explain. until: instant that estimates hold for, s; no
-    earlier than that of the newest row. likeliest: change that the last search found, of what does not move; suspected:
-    where it is hardly chance. changes: of rates, that may have been.
+    one, START before the first; knots: since the beginning; shown: of these, in pairs, those in which the arm moved, as
+    it has since the last pair where `moves`. rows: so far; newest: time of the last, s. accepted: how often drifts
+    were. quiet: whether rows leave no more than noise, without which no drift is accepted. lacking: whether they leave
+    more in the beginning, which no ramps explain. until: instant that estimates hold for, s; no earlier than that of
+    the newest row. likeliest: change that the last search found, of what does not move; suspected: where it is hardly
+    chance. changes: of rates, that may have been.
     """
 
     anchor: DriftFilter
@@ -48,6 +49,8 @@ class DriftState(State):
     fresh: int = 0
     step: int = START
     knots: int = 0
+    shown: int = 0
+    moves: bool = False
     rows: float = 0.0
     newest: float = 0.0
     accepted: int = 0
