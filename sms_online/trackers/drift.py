@@ -233,16 +233,17 @@ class LearnedTrend(Tracker):
             tried = self._tried(found)
         new = len(found) > len(self.state.moving)
         ends = self.state.shown == PATIENCE and self.state.moves and not self.state.accepted
-        if not new and not self.patient and not ends:
+        judged = self.patient or ends or self.state.lacking
+        if not new and not judged:
             return
         # A lack of the model leaves more than noise, whatever ramps it is taken for.
         left = self._excess(found)
         if new and left < LARGEST_LEFT - 1.0:
-            self.state.moving, self.state.changes = found, []
+            self.state.moving, self.state.changes, self.state.lacking = found, [], False
             self._choose()
             self.state.accepted += 1
             self.state.likeliest = self.state.suspected = None
-        elif self.patient or ends:
+        elif judged:
             without = self._excess(self.state.moving) if new else left
             least = 0.0 if ends else RAMPS_LEAVE * without
             self.state.lacking = left >= max(LARGEST_LEFT - 1.0, least)
