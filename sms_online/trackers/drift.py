@@ -32,6 +32,7 @@ from sms_online.trackers.drift_search import (
     best_break,
     best_ramp,
     changes_within,
+    explains,
     likeliest_change,
 )
 from sms_online.trackers.drift_state import DriftState, Found
@@ -256,7 +257,9 @@ class LearnedTrend(Tracker):
     def _tried(self, moving: Sequence[Moving]) -> Tried:
         """Changes of what does not move, within the remembered blocks."""
         taken = {column for each in moving for column in each.columns}
-        free = [group for group in self._groups if not taken & set(group)]
+        rows = np.concatenate([block.factor[:, : self._n] for block in self.state.blocks])
+        sizes = np.linalg.norm(rows, axis=0)
+        free = [group for group in self._groups if not taken & set(group) and not explains(rows, sizes, taken, group)]
         return changes_within(self.state.anchor.with_moving(moving), self.state.blocks, free)
 
     def _suspect(self, tried: Tried) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -95,12 +95,24 @@ def best_ramp(tried: Tried) -> Ramp | None:
         return None
     best = _best(tried.ramps)
     left, sizes = tried.left[best.since]
-    alike = [each.columns for each in tried.ramps if _holds(left, sizes, each.columns, best.columns)]
+    alike = [each.columns for each in tried.ramps if explains(left, sizes, each.columns, best.columns)]
     best = _first(best, [each for each in tried.ramps if each.since == best.since and each.columns in alike])
     steps = max((each.gain for each in tried.steps), default=0.0)
     others = max((each.gain for each in tried.ramps if each.columns not in alike), default=0.0)
     enough = best.gain > LEAST_GAIN * len(best.columns)
     return best if enough and best.gain > max(steps, others) + DECISIVE * len(best.columns) else None
+
+
+def explains(rows: Array, sizes: Array, columns: Iterable[int], others: Iterable[int]) -> bool:
+    """Whether some columns (M, ·) explain all that others do: those are no rival, but the same in other words.
+
+    A payload on a rigid link is a heavier link. sizes: of the columns before anything was taken from them.
+    """
+    inside, outside = rows[:, list(columns)], rows[:, list(others)]
+    norm = np.linalg.norm(inside, axis=0)
+    inside = inside / np.where(norm > 0.0, norm, 1.0)
+    rest = outside - inside @ np.linalg.lstsq(inside, outside, rcond=None)[0]
+    return bool((np.linalg.norm(rest, axis=0) <= FREE * sizes[list(others)]).all())
 
 
 def likeliest_change(tried: Tried, level: float) -> Suspicion | None:
@@ -145,7 +157,7 @@ def best_break(before: DriftFilter, after: Block, groups: Sequence[tuple[int, ..
         return Break()
     best = _best(tried)
     own = _with_ramps(best.columns, n)
-    alike = [each for each in tried if _holds(left, sizes, _with_ramps(each.columns, n), own)]
+    alike = [each for each in tried if explains(left, sizes, _with_ramps(each.columns, n), own)]
     best = _first(best, alike)
     others = max((each.gain for each in tried if all(each is not other for other in alike)), default=0.0)
     size = len(best.columns)
@@ -170,18 +182,6 @@ def _first(best: Ramp, alike: Sequence[Ramp]) -> Ramp:
 def _with_ramps(group: tuple[int, ...], n: int) -> list[int]:
     """Columns of values and their ramps."""
     return [*group, *(n + k for k in group)]
-
-
-def _holds(left: Array, sizes: Array, columns: Sequence[int], others: Sequence[int]) -> bool:
-    """Whether some columns explain all that others do: with those, they are no rival, but the same in other words.
-
-    A payload on a rigid link is a heavier link.
-    """
-    inside, outside = left[:, list(columns)], left[:, list(others)]
-    norm = np.linalg.norm(inside, axis=0)
-    inside = inside / np.where(norm > 0.0, norm, 1.0)
-    rest = outside - inside @ np.linalg.lstsq(inside, outside, rcond=None)[0]
-    return bool((np.linalg.norm(rest, axis=0) <= FREE * sizes[list(others)]).all())
 
 
 def _left(state: DriftFilter, blocks: Sequence[Block], n: int) -> tuple[Array, Array]:
