@@ -9,7 +9,6 @@ import pytest
 from numpy.testing import assert_allclose
 
 import sms_online as sms
-from sms_online.pipeline.errors_in_variables import NoiseBias
 from sms_online.stream import Array
 from sms_online.trackers import Information, Prior, Rows
 from sms_online.trackers.drift import LearnedTrend
@@ -124,19 +123,3 @@ def test_a_lack_does_not_outlive_what_showed_it() -> None:
         lacking.append(tracker.state.lacking)
     assert any(lacking[:12])
     assert not lacking[-1]
-
-
-def test_noise_shifts_nothing_that_its_rows_do_not_say() -> None:
-    """Of two parameters that rows know the sum of, which another source knows apart, the sum alone is corrected."""
-    rng, windows = np.random.default_rng(3), 400
-    bias = NoiseBias.none(2)
-    for _ in range(windows):
-        exact = rng.normal(size=(20, 1))
-        measured, added = exact + 0.3 * rng.normal(size=(20, 1)), 0.3 * rng.normal(size=(20, 1))
-        b = 2.0 * exact
-        noisy = np.stack([np.column_stack((measured + s * added, measured + s * added, b)) for s in (1.0, -1.0)])
-        bias.add(np.column_stack((measured, measured, b)), noisy)
-    shift, _ = bias.correction(np.ones(2, dtype=np.bool_))
-    attenuated = 2.0 / 1.09
-    assert shift.sum() == pytest.approx(2.0 - attenuated, rel=0.1)
-    assert np.abs(shift).max() < 2.0 - attenuated

@@ -109,9 +109,7 @@ class NoiseBias(State):
             return shift, covariance
         # Directions of unit information, and the share of it that noise makes.
         values, vectors = np.linalg.eigh(gram[:-1, :-1])
-        # Along what these rows say nothing of, noise in them does nothing: it is known from before an event.
-        told = values > known.size * np.finfo(np.float64).eps * values[-1]
-        root = vectors[:, told] / np.sqrt(values[told])
+        root = vectors / np.sqrt(np.maximum(values, np.finfo(np.float64).eps * values[-1]))
         share, axes = np.linalg.eigh(root.T @ changed[:-1, :-1] @ root)
         directions = root @ axes
         along = directions.T @ gram[:-1, -1]
