@@ -35,9 +35,7 @@ def triangular_factor(*stacked: Array) -> Array:
     rows = np.concatenate(stacked)
     n1 = rows.shape[1]
     # QR gives a column of zeros a row as well, and leaves in it what belongs to the columns behind.
-    known = rows.any(axis=0)
-    known[-1] = True
-    places = np.flatnonzero(known)
+    places = np.append(np.flatnonzero(rows[:, :-1].any(axis=0)), n1 - 1)
     if len(rows) < places.size:
         rows = np.concatenate((rows, np.zeros((places.size - len(rows), n1))))
     if places.size == n1:
