@@ -62,6 +62,7 @@ class JointEstimate(Stage):
         if self._nuisances:
             self.tracker.begin(known_beforehand(self._nuisances, base.n))
         self.bias, self.grams = self._new_sums()
+        self.earlier = self._new_sums()[0]
         self.state = JointEstimateState(np.zeros((0, len(self._nuisances) + base.n + 1)), np.zeros(self._n_v))
 
     def _new_sums(self) -> tuple[NoiseBias, RowGrams]:
@@ -71,12 +72,13 @@ class JointEstimate(Stage):
     def begin_behind_event(self, known: Information, bias: NoiseBias) -> None:
         """Go on with what is known from before an event, and what noise in the columns did by then."""
         bias.widen(len(self._nuisances) + self._n - bias.parameters)
-        self.bias, self.state.known = bias, known.factor
+        self.bias, self.earlier, self.state.known = bias, state_copy(bias), known.factor
         self.tracker.begin(known)
 
     def begin_drift(self, known: Information) -> None:
         """Forget what took parameters for constant, and go on from what is known, priors within."""
-        self.bias, self.grams = self._new_sums()
+        # What rows before an event did stays: they alone may know parameters apart, as a link and a payload on it.
+        self.bias, self.grams = state_copy(self.earlier), self._new_sums()[1]
         self.state.known, self._within = known.factor, True
         self.tracker = session_tracker(self._n, self._prior, len(self._nuisances), within=True)
         self.tracker.begin(known)

@@ -124,7 +124,7 @@ class Momentum(Stage):
             prior_rows(self.nuisances, base.n), self.joint.beforehand,
             [k for k, each in enumerate(self.nuisances) if each.name == "drive_gain"], self._drift_at, self._point,
         )  # fmt: skip
-        self.fit.plain.patient = self.state.patient and self.bank.learned is not None
+        self.fit.plain.patient = self._patient
         self.test = self._new_test()
 
     def renew(self) -> None:
@@ -139,6 +139,11 @@ class Momentum(Stage):
         self.bank = self._new_bank()
         self._build()
         self._changed()
+
+    @property
+    def _patient(self) -> bool:
+        """Whether more than noise may be a drift that is yet to be learned."""
+        return self.state.patient and self.bank.learned is not None and self.bank.learned.patient
 
     @property
     def current_prior(self) -> Prior | None:
@@ -356,7 +361,7 @@ class Momentum(Stage):
         quiet = not self.misfit and noise is not None and not noise.exact
         self.bank.update(self._for_trackers(rows), quiet, rows.moves)
         if learned is not None:
-            self.fit.plain.patient = self.state.patient and learned.patient
+            self.fit.plain.patient = self._patient
             if learned.state.accepted > before:
                 self._begin_drift(learned.information)
 

@@ -32,6 +32,7 @@ from sms_online.trackers.drift_search import (
     best_break,
     best_ramp,
     changes_within,
+    explains,
     likeliest_change,
 )
 from sms_online.trackers.drift_state import DriftState, Found
@@ -233,16 +234,17 @@ class LearnedTrend(Tracker):
             tried = self._tried(found)
         new = len(found) > len(self.state.moving)
         ends = self.state.shown == PATIENCE and self.state.moves and not self.state.accepted
-        if not new and not self.patient and not ends:
+        judged = self.patient or ends or self.state.lacking
+        if not new and not judged:
             return
         # A lack of the model leaves more than noise, whatever ramps it is taken for.
         left = self._excess(found)
         if new and left < LARGEST_LEFT - 1.0:
-            self.state.moving, self.state.changes = found, []
+            self.state.moving, self.state.changes, self.state.lacking = found, [], False
             self._choose()
             self.state.accepted += 1
             self.state.likeliest = self.state.suspected = None
-        elif self.patient or ends:
+        elif judged:
             without = self._excess(self.state.moving) if new else left
             least = 0.0 if ends else RAMPS_LEAVE * without
             self.state.lacking = left >= max(LARGEST_LEFT - 1.0, least)
@@ -255,7 +257,9 @@ class LearnedTrend(Tracker):
     def _tried(self, moving: Sequence[Moving]) -> Tried:
         """Changes of what does not move, within the remembered blocks."""
         taken = {column for each in moving for column in each.columns}
-        free = [group for group in self._groups if not taken & set(group)]
+        rows = np.concatenate([block.factor[:, : self._n] for block in self.state.blocks])
+        sizes = np.linalg.norm(rows, axis=0)
+        free = [group for group in self._groups if not taken & set(group) and not explains(rows, sizes, taken, group)]
         return changes_within(self.state.anchor.with_moving(moving), self.state.blocks, free)
 
     def _suspect(self, tried: Tried) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -43,10 +43,14 @@ class Ramp:
 
 @dataclass(frozen=True)
 class Tried:
-    """Changes of parameters that may lie within the last blocks: ramps of each group from each start, and steps."""
+    """Changes of parameters that may lie within the last blocks: ramps of each group from each start, and steps.
+
+    left: by the starts' knots, what is left of the ramps' columns, and their sizes.
+    """
 
     ramps: list[Ramp]
     steps: list[Ramp]
+    left: dict[int, tuple[Array, Array]]
 
 
 @dataclass(frozen=True)
@@ -64,7 +68,7 @@ def changes_within(anchor: DriftFilter, blocks: Sequence[Block], groups: Sequenc
     anchor: what is known before the blocks.
     """
     n = anchor.n
-    tried = Tried([], [])
+    tried = Tried([], [], {})
     # Everything from the anchor to each start, then everything after it.
     state, before = replace(anchor, knot=blocks[0].knot), {}
     for k, block in enumerate(blocks):
@@ -76,6 +80,7 @@ def changes_within(anchor: DriftFilter, blocks: Sequence[Block], groups: Sequenc
             break
         since = blocks[-start].knot
         left, columns = _left(before[start].all_moving(), blocks[-start:], n)
+        tried.left[since] = left[:, n:-1], columns[n:]
         for group in groups:
             gain, rates = _explained(left, columns, [n + k for k in group])
             tried.ramps.append(Ramp(group, since, rates, gain))
@@ -86,14 +91,28 @@ def changes_within(anchor: DriftFilter, blocks: Sequence[Block], groups: Sequenc
 
 def best_ramp(tried: Tried) -> Ramp | None:
     """The ramp that explains most, if it is neither chance nor a step."""
-    ranked = sorted(tried.ramps, key=lambda each: each.gain - LEAST_GAIN * len(each.columns), reverse=True)
-    if not ranked:
+    if not tried.ramps:
         return None
-    best = ranked[0]
+    best = _best(tried.ramps)
+    left, sizes = tried.left[best.since]
+    alike = [each.columns for each in tried.ramps if explains(left, sizes, each.columns, best.columns)]
+    best = _first(best, [each for each in tried.ramps if each.since == best.since and each.columns in alike])
     steps = max((each.gain for each in tried.steps), default=0.0)
-    others = max((each.gain for each in ranked if each.columns != best.columns), default=0.0)
+    others = max((each.gain for each in tried.ramps if each.columns not in alike), default=0.0)
     enough = best.gain > LEAST_GAIN * len(best.columns)
     return best if enough and best.gain > max(steps, others) + DECISIVE * len(best.columns) else None
+
+
+def explains(rows: Array, sizes: Array, columns: Iterable[int], others: Iterable[int]) -> bool:
+    """Whether some columns (M, ·) explain all that others do: those are no rival, but the same in other words.
+
+    A payload on a rigid link is a heavier link. sizes: of the columns before anything was taken from them.
+    """
+    inside, outside = rows[:, list(columns)], rows[:, list(others)]
+    norm = np.linalg.norm(inside, axis=0)
+    inside = inside / np.where(norm > 0.0, norm, 1.0)
+    rest = outside - inside @ np.linalg.lstsq(inside, outside, rcond=None)[0]
+    return bool((np.linalg.norm(rest, axis=0) <= FREE * sizes[list(others)]).all())
 
 
 def likeliest_change(tried: Tried, level: float) -> Suspicion | None:
@@ -130,14 +149,17 @@ def best_break(before: DriftFilter, after: Block, groups: Sequence[tuple[int, ..
     n = before.n
     left, sizes = _left(before.all_moving(), [after], n)
     steps = max((_explained(left, sizes, list(group))[0] for group in groups), default=0.0)
-    ranked: list[Ramp] = []
+    tried: list[Ramp] = []
     for group in groups:
-        gain, values = _explained(left, sizes, [*group, *(n + k for k in group)])
-        ranked.append(Ramp(group, after.knot, values[len(group) :], gain))
-    ranked.sort(key=lambda each: each.gain - LEAST_GAIN * len(each.columns), reverse=True)
-    if not ranked:
+        gain, values = _explained(left, sizes, _with_ramps(group, n))
+        tried.append(Ramp(group, after.knot, values[len(group) :], gain))
+    if not tried:
         return Break()
-    best, others = ranked[0], max((each.gain for each in ranked[1:]), default=0.0)
+    best = _best(tried)
+    own = _with_ramps(best.columns, n)
+    alike = [each for each in tried if explains(left, sizes, _with_ramps(each.columns, n), own)]
+    best = _first(best, alike)
+    others = max((each.gain for each in tried if all(each is not other for other in alike)), default=0.0)
     size = len(best.columns)
     rest = float(left[:, -1] @ left[:, -1]) - before.factor[-1, -1] ** 2 - best.gain
     if rest > max(LARGEST_LEFT * after.rows, after.rows + UNEXPLAINED * (best.gain - steps)):
@@ -145,6 +167,21 @@ def best_break(before: DriftFilter, after: Block, groups: Sequence[tuple[int, ..
     if best.gain - steps > (LEAST_GAIN + DECISIVE) * size and best.gain - others > DECISIVE * size:
         return Break(best)
     return Break(unclear=best.gain - steps > DECISIVE * size)
+
+
+def _best(tried: Sequence[Ramp]) -> Ramp:
+    """The ramp that explains most beyond what its parameters cost; the first of several."""
+    return max(tried, key=lambda each: each.gain - LEAST_GAIN * len(each.columns))
+
+
+def _first(best: Ramp, alike: Sequence[Ramp]) -> Ramp:
+    """The first of those that say the same as the best, of no more parameters."""
+    return next((each for each in alike if len(each.columns) == len(best.columns)), best)
+
+
+def _with_ramps(group: tuple[int, ...], n: int) -> list[int]:
+    """Columns of values and their ramps."""
+    return [*group, *(n + k for k in group)]
 
 
 def _left(state: DriftFilter, blocks: Sequence[Block], n: int) -> tuple[Array, Array]:

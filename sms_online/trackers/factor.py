@@ -5,7 +5,8 @@ A factor is the (n + 1, n + 1) upper triangle of a QR decomposition of the white
     [ R  z ]    RᵀR = YᵀY,  Rᵀz = Yᵀb,
     [ 0  ρ ]    ρ² = residual sum of squares,
 
-so that a factor replaces its rows in every later QR. Householder QR is backward stable column by column (Higham,
+so that a factor replaces its rows in every later QR. A column of zeros, of a parameter that nothing is known of, has a
+row of zeros: what the others leave is ρ alone. Householder QR is backward stable column by column (Higham,
 Accuracy and Stability of Numerical Algorithms, 2002, theorem 19.4), so columns of very different units need no scaling
 before the solution; and RᵀR is never formed, which would square the condition number.
 """
@@ -33,9 +34,15 @@ def triangular_factor(*stacked: Array) -> Array:
     """Factor (n + 1, n + 1) of rows and factors (…, n + 1) put below each other."""
     rows = np.concatenate(stacked)
     n1 = rows.shape[1]
-    if len(rows) < n1:
-        rows = np.concatenate((rows, np.zeros((n1 - len(rows), n1))))
-    return np.asarray(np.linalg.qr(rows, mode="r"))
+    # QR gives a column of zeros a row as well, and leaves in it what belongs to the columns behind.
+    places = np.append(np.flatnonzero(rows[:, :-1].any(axis=0)), n1 - 1)
+    if len(rows) < places.size:
+        rows = np.concatenate((rows, np.zeros((places.size - len(rows), n1))))
+    if places.size == n1:
+        return np.asarray(np.linalg.qr(rows, mode="r"))
+    out = np.zeros((n1, n1))
+    out[np.ix_(places, places)] = np.linalg.qr(rows[:, places], mode="r")
+    return out
 
 
 def reduced(rows: Array) -> Array:

@@ -100,6 +100,12 @@ CASES = {
     "step": Case(("joint_2.stiffness:share=-0.05,over=0.001,begin=30",)),
     "small-step": Case(("joint_2.stiffness:share=-0.005,over=0.001,begin=15.3",), duration=30.0),
     "damping-step": Case(("joint_1.damping:share=-0.5,over=0.001,begin=15.3",), duration=30.0),
+    "step-then-drift": Case(
+        ("joint_2.stiffness:share=-0.05,over=0.001,begin=15.3", "joint_1.stiffness:share=-0.1,over=30,begin=30"),
+    ),
+    "drift-then-step": Case(
+        ("joint_1.stiffness:share=-0.1,over=60", "joint_2.stiffness:share=-0.05,over=0.001,begin=30"),
+    ),
     "missing": Case(undeclared=("coulomb_friction@joint_2:torque=1",)),
 }
 # What drifts, once more with the tolerances of a description.
