@@ -71,13 +71,18 @@ def _lost(share: float) -> list[Reason]:
     return [Reason(f"{100.0 * share:.0f} % of the samples are lost", False, then=CHECK_LOSSES)]
 
 
+def _largest(values: Mapping[str, float]) -> tuple[str, float]:
+    """The channel with the largest value in words, with how many more there are, and that value."""
+    worst = max(values, key=lambda channel: values[channel])
+    return worst + (f" and of {len(values) - 1} more channels" if len(values) > 1 else ""), values[worst]
+
+
 def _outliers(shares: Mapping[str, float]) -> list[Reason]:
     many = {channel: share for channel, share in shares.items() if share > MANY_OUTLIERS}
     if not many:
         return []
-    worst = max(many, key=lambda channel: many[channel])
-    others = f" and of {len(many) - 1} more channels" if len(many) > 1 else ""
-    text = f"{100.0 * many[worst]:.1g} % of the samples of {worst}{others} are outliers, left out"
+    of, worst = _largest(many)
+    text = f"{100.0 * worst:.1g} % of the samples of {of} are outliers, left out"
     return [Reason(text, False, tuple(many), "outliers", then=CHECK_OUTLIERS)]
 
 
@@ -98,12 +103,11 @@ def _jittering(jitters: Mapping[str, float]) -> list[Reason]:
 
 
 def _coloured(times: Mapping[str, float]) -> list[Reason]:
-    slow = [channel for channel, time in times.items() if time > LONGEST_COLOUR]
+    slow = {channel: time for channel, time in times.items() if time > LONGEST_COLOUR}
     if not slow:
         return []
-    worst = max(slow, key=lambda channel: times[channel])
-    others = f" and of {len(slow) - 1} more channels" if len(slow) > 1 else ""
-    text = f"noise of {worst}{others} is correlated over {1e3 * times[worst]:.2g} ms"
+    of, worst = _largest(slow)
+    text = f"noise of {of} is correlated over {1e3 * worst:.2g} ms"
     return [Reason(text, False, tuple(slow), "coloured noise", then=CHECK_COLOUR)]
 
 
