@@ -112,7 +112,8 @@ class Relinearisation(Stage):
             now.made_with = now.made_with or now.noise
             if now.noise.outdates(now.made_with) and self.linearisation.state.samples:
                 # The first samples do not show how slow their noise is, or that it moves.
-                self._make_with(now.noise)
+                now.made_with = now.noise
+                self._make_rows_again(self.momentum.weights if self.momentum.started else None, now.noise)
         if now.noise is None:
             return
         waiting, now.waiting = now.waiting, []
@@ -148,7 +149,7 @@ class Relinearisation(Stage):
             self.linearisation.forget()
         if self.momentum.lacking(last) and self.linearisation.state.samples:
             self.state.patient = False
-            self._make_rows_again(None, noise, last)
+            self._make_rows_again(None, None, last)
         if not self.momentum.started or not self.linearisation.looks(self.momentum.fit.plain.windows, last):
             return
         # Where rows hold more than noise and errors of calibration, these look like what the model lacks.
@@ -164,24 +165,14 @@ class Relinearisation(Stage):
                 return
             before, weights = self.linearisation.point, self.momentum.weights
 
-    def _make_with(self, noise: SensorNoise) -> None:
-        """All rows of the session so far with the noise of now."""
-        weights, self.state.made_with = self.momentum.weights if self.momentum.started else None, noise
-        self.momentum = self._new_momentum()
-        if weights is not None:
-            self.momentum.fit.go_on(weights, noise, self.momentum.fit.plain.misfit)
-        self._advance((piece, noise) for piece, _ in self.linearisation.again())
+    def _make_rows_again(self, weights: Array | None, noise: SensorNoise | None, last: bool = False) -> None:
+        """All rows of the session so far, about the point of now.
 
-    def _make_rows_again(self, weights: Array | None, noise: SensorNoise, last: bool) -> None:
-        """All rows of the session so far, about the point of now, with weights β (n,) and the noise of now.
-
-        None to find weights and noise as they were found without patience.
+        weights: β (n,), None to find them anew. noise: of the sensors; None for what was known of it when samples came.
         """
         self.momentum = self._new_momentum()
-        again = self.linearisation.again()
-        if weights is not None:
+        if weights is not None and noise is not None:
             self.momentum.fit.go_on(weights, noise, self.momentum.fit.plain.misfit)
-            again = ((piece, noise) for piece, _ in again)
-        self._advance(again)
-        if last:
-            self.momentum.end_segment(noise)
+        self._advance((piece, noise or then) for piece, then in self.linearisation.again())
+        if last and self.state.noise is not None:
+            self.momentum.end_segment(self.state.noise)
