@@ -135,7 +135,6 @@ class Momentum(Stage):
 
     def _rebuild(self) -> None:
         """The same after an event, trackers included."""
-        self.state.bank_within = self.state.prior_within
         self.bank = self._new_bank()
         self._build()
         self._changed()
@@ -297,6 +296,7 @@ class Momentum(Stage):
     def adopt(self, adoption: Adoption, noise: SensorNoise) -> None:
         """Go on after an event with what is known from before it."""
         bias, self.state.drift, self.state.held = self.joint.bias, None, []
+        self.state.bank_within = self.state.prior_within
         self._rebuild()
         self.joint.begin_behind_event(adoption.known, bias)
         self.bank.begin(adoption.known)
