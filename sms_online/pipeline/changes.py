@@ -14,6 +14,7 @@ from sms_online.description.schema import Effect
 from sms_online.effects.build import changed_model
 from sms_online.model.base_parameters import BaseParameters
 from sms_online.model.model import Model
+from sms_online.pipeline.drift_line import DriftLine
 from sms_online.pipeline.event_hypotheses import (
     Explanation,
     additional,
@@ -22,7 +23,7 @@ from sms_online.pipeline.event_hypotheses import (
     restricted,
 )
 from sms_online.pipeline.event_instant import event_instant
-from sms_online.pipeline.event_rows import CLOCK, LARGEST_SHIFT, EventRows
+from sms_online.pipeline.event_rows import CLOCK, LARGEST_SHIFT, Behind, EventRows
 from sms_online.pipeline.events import REMEMBERED, ChangeDetector, ClockShift, Event, Seen
 from sms_online.pipeline.latency import wandering_clocks
 from sms_online.pipeline.momentum_balance import MARGIN
@@ -85,7 +86,7 @@ class Changes(Stage):
     nuisances and then on the parameters. renewed: called when a saved state has put other events here. point: gives the
     nuisances (m,) that samples are corrected by. off: gives by how much the session's estimate (m + n,) differs from
     least squares, which shrink with noise in the columns of gains where rows leave more than noise. drifts: whether
-    they are learned.
+    they are learned. drift: gives the known one, see `EventRows`.
     """
 
     def __init__(
@@ -98,6 +99,7 @@ class Changes(Stage):
         point: Callable[[], Array],
         off: Callable[[], Array],
         drifts: bool,
+        drift: Callable[[int], DriftLine | None],
     ) -> None:
         self.model, self.base = model, base
         self._point, self._off = point, off
@@ -106,7 +108,7 @@ class Changes(Stage):
         self._sensing = sensing
         self._renewed = renewed
         self._clocks = wandering_clocks(sensing, self._nuisances)
-        self._drifts = drifts
+        self._drifts, self._drift = drifts, drift
         rate, span = self._system.sample_rate, self._system.windows.momentum
         self._half_hop = max(1, round(span * rate / INSTANTS))
         # Where it may have been a drift, an event is decided on later.
@@ -178,11 +180,14 @@ class Changes(Stage):
         )
         return max(0, samples // (2 * self._half_hop))
 
-    def decide(self, noise: SensorNoise, start_time: float, last: bool, steps: bool = False) -> Adoption | None:
-        """The event, once the windows after it suffice to decide; last: in this segment no more of them come.
+    def decide(
+        self, noise: SensorNoise, start_time: float, last: bool, steps: bool = False
+    ) -> Adoption | Behind | None:
+        """The event, once the windows after it suffice to decide; what they show so far where they do not.
 
-        Where the model lacked something before, only a jump that explains the rows is one, and the alarm is dismissed
-        otherwise. start_time: s of grid index 0. steps: it may be a drift yet, and is none only where a jump explains
+        None where there is nothing new to see. Where the model lacked something before, only a jump that explains the
+        rows is one, and the alarm is dismissed otherwise. start_time: s of grid index 0. last: in this segment no more
+        windows come. steps: it may be a drift yet, and is none only where a jump explains
         the rows and does not go on.
         """
         alarm, wanted = self.detector.alarm, min(self.state.wanted, LONGEST_DECISION)
@@ -194,11 +199,12 @@ class Changes(Stage):
         onset = self.detector.onset - MARGIN
         before = self._before(onset)
         samples = self.behind(alarm)
-        explanation, goes_on = self._rows.explain(whole, base, before, samples, (onset, alarm), noise)
-        clear = explanation.explained and explanation.decisive and not (steps and goes_on)
+        behind = self._rows.explain(whole, base, before, samples, (onset, alarm), noise)
+        explanation = behind.explanation
+        clear = explanation.explained and explanation.decisive and not (steps and behind.goes_on)
         if not clear and not last and (steps or self.windows_after < LONGEST_DECISION):
             self.state.wanted = self.windows_after + DECISION
-            return None
+            return behind
         self.state.wanted = DECISION
         if self.detector.uncertain and not (explanation.jump and explanation.explained and explanation.needed):
             self.detector.dismiss()
@@ -225,7 +231,9 @@ class Changes(Stage):
 
     @property
     def _rows(self) -> EventRows:
-        return EventRows(self._system, self._sensing, self._nuisances, self._clocks, self._point, self._drifts)
+        return EventRows(
+            self._system, self._sensing, self._nuisances, self._clocks, self._point, self._drifts, self._drift
+        )
 
     def _before(self, end: int) -> Seen:
         """The last window that ends at or before a grid index, with what was known by then, free of its bias."""
@@ -289,6 +297,9 @@ class Changes(Stage):
         known = self.beforehand
         if jump is not None:
             known = before.known.widened(len(fresh)).without([m + k for k in jumped])
+            drift = self._drift(int(at) + self.window_samples // 2)
+            if drift is not None:
+                known = known.shifted(np.concatenate((np.zeros(m), drift.padded(self.base.n).moved)))
         event = Event(
             time=start_time + at / self._system.sample_rate,
             kind="unexplained" if jump is None else jump.kind,

@@ -9,7 +9,7 @@ for rates that decay: the whitening of a spacecraft's rows looks back for second
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -34,6 +34,15 @@ class DriftLine:
         slowed = -np.expm1(-self.decay * time) / np.where(decaying, self.decay, 1.0)
         moved = self.moved + np.where(decaying, slowed, time) * self.rate
         return DriftLine(moved, self.rate * np.exp(-self.decay * time), self.decay, t)
+
+    def since(self, t: float) -> DriftLine:
+        """The same with what has moved counted from an instant on, s."""
+        return replace(self, moved=self.moved - self.at(t).moved)
+
+    def padded(self, n: int) -> DriftLine:
+        """The same of n parameters, of which further ones do not move."""
+        moved, rate, decay = (np.pad(each, (0, n - each.size)) for each in (self.moved, self.rate, self.decay))
+        return DriftLine(moved, rate, decay, self.t)
 
     def removed(self, rows: Array, ramp: Array, bend: Array | None = None) -> Array:
         """Rows [Y b] (…, n_v, n + 1) of a window centred at t as if nothing had moved.

@@ -17,6 +17,7 @@ from sms_online.calibration.nuisance import Nuisance, prior_rows
 from sms_online.description.schema import System
 from sms_online.model.base_parameters import BaseParameters
 from sms_online.model.model import Model
+from sms_online.pipeline.drift_line import DriftLine
 from sms_online.pipeline.event_hypotheses import Explanation, Jump, explain, goes_on, hypotheses
 from sms_online.pipeline.events import Seen
 from sms_online.pipeline.momentum_balance import MomentumBalance
@@ -25,6 +26,7 @@ from sms_online.pipeline.momentum_windows import COPIES, OVERLAP
 from sms_online.pipeline.sensing import Sensing
 from sms_online.pipeline.sensor_noise import SensorNoise
 from sms_online.pipeline.synchronise import GridSamples
+from sms_online.pipeline.white_rows import WhiteRows
 from sms_online.pipeline.window_noise import WindowNoise
 from sms_online.stream import Array
 
@@ -41,11 +43,25 @@ LARGEST_PROGRESS, HIDDEN = 0.2, 2.0
 
 
 @dataclass(frozen=True)
+class Behind:
+    """Samples behind a change, as the best of the steps explains them.
+
+    goes_on: whether what jumped may drift. rows: of these samples, with the columns of what may begin behind those of
+    the parameters of now.
+    """
+
+    explanation: Explanation
+    goes_on: bool
+    rows: list[WhiteRows]
+
+
+@dataclass(frozen=True)
 class EventRows:
     """Makes rows behind a change, and compares what may explain them.
 
     clocks: nuisances that are those of wandering ones. point: gives the nuisances (m,) that samples are corrected by.
-    drifts: whether a change may be the beginning of a drift.
+    drifts: whether a change may be the beginning of a drift. drift: gives that which is known, in the window that ends
+    at a grid index, counted from when the rows before the change are of.
     """
 
     system: System
@@ -54,12 +70,13 @@ class EventRows:
     clocks: tuple[int, ...]
     point: Callable[[], Array]
     drifts: bool
+    drift: Callable[[int], DriftLine | None]
 
     def explain(
         self, model: Model, base: BaseParameters, before: Seen, samples: GridSamples, between: tuple[int, int],
         noise: SensorNoise,
-    ) -> tuple[Explanation, bool]:  # fmt: skip
-        """The best explanation of samples behind a change, and whether what jumped may drift.
+    ) -> Behind:  # fmt: skip
+        """The best explanation of samples behind a change by a step.
 
         model, base: with every parameter that may jump, those of now first. before: the last window before the change.
         between: grid indices that it lies between.
@@ -84,29 +101,36 @@ class EventRows:
             calibration = CalibrationColumns(model, self.sensing, balance.span) if m else None
             return WindowNoise(model, base, balance, self.sensing.displacements, calibration=calibration)
 
+        def drift(end: int) -> DriftLine | None:
+            line = self.drift(end)
+            return None if line is None else line.padded(base.n)
+
         for _ in range(PASSES):
             prior = prior_rows(self.nuisances, base.n)
             known = partial(np.append, np.zeros(m), weights)
-            fit = MomentumFit(model, base, balance, new_noise, known, calibration=prior, point=self.point)
+            fit = MomentumFit(
+                model, base, balance, new_noise, known, calibration=prior, drift=drift, point=self.point
+            )  # fmt: skip
             fit.go_on(weights, noise, before.misfit)
             white = fit.push(windows, instants, noise)
             rows = np.concatenate([each.Y for each in white])
             explanation = explain(factor / left, rows / left, jumps, alike)
             clocks = self._of_clocks(factor / left, rows / left, alike)
             if clocks is not None:
-                return clocks, False
+                return Behind(clocks, False, white)
             weights = np.zeros(base.n)
             weights[:n] = explanation.beta[m:]
             if explanation.jump is not None:
                 weights[[k - m for k in explanation.jump.columns]] += explanation.sizes
         if explanation.jump is None or not self.drifts:
-            return explanation, self.drifts
+            return Behind(explanation, self.drifts, white)
         onset, alarm = between
         after = [each.end / system.sample_rate - 0.5 * balance.span - alarm / system.sample_rate for each in white]
         ramp = np.concatenate([t * each.Y[:, m:-1] + each.ramp for t, each in zip(after, white, strict=True)])
         ramps = ramp[:, [k - m for k in explanation.jump.columns]]
         share = goes_on(factor / left, rows / left, ramps / left, explanation, alike)
-        return explanation, share * max((alarm - onset) / system.sample_rate, HIDDEN) > LARGEST_PROGRESS
+        progress = share * max((alarm - onset) / system.sample_rate, HIDDEN)
+        return Behind(explanation, progress > LARGEST_PROGRESS, white)
 
     def _of_clocks(self, factor: Array, rows: Array, alike: float) -> Explanation | None:
         """What shifts of clocks alone leave of the rows, where that is little but noise; see `explain`."""

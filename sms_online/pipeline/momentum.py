@@ -15,6 +15,7 @@ from sms_online.model.model import Model
 from sms_online.pipeline.changes import Adoption, Changes
 from sms_online.pipeline.description import nearer
 from sms_online.pipeline.drift_line import DriftLine
+from sms_online.pipeline.event_rows import Behind
 from sms_online.pipeline.joint_estimate import JointEstimate
 from sms_online.pipeline.latency import Latencies, clock_groups, source_groups, wandering_clocks
 from sms_online.pipeline.momentum_balance import MomentumBalance, half_hop
@@ -97,7 +98,9 @@ class Momentum(Stage):
         self._span = system.windows.momentum
         self._trackers = tuple(trackers)
         learns = self._trackers[0].learns
-        self.changes = Changes(model, base, sensing, self.nuisances, self._rebuild, point, self._beside_squares, learns)
+        self.changes = Changes(
+            model, base, sensing, self.nuisances, self._rebuild, point, self._beside_squares, learns, self._drift_since
+        )
         self._sources, self._clocks = source_groups(sensing), clock_groups(sensing)
         self.state = MomentumState(np.random.default_rng(SEED), patient, np.empty((0, len(sensing.position_columns))))
         self.bank = self._new_bank()
@@ -175,6 +178,11 @@ class Momentum(Stage):
         """The known drift in the window that ends at a grid index."""
         drift = self.state.drift
         return None if drift is None else drift.at(self._centre(end))
+
+    def _drift_since(self, end: int) -> DriftLine | None:
+        """The same, counted from when what is known of the parameters is of."""
+        drift = self.state.drift
+        return None if drift is None else drift.since(drift.t).at(self._centre(end))
 
     def _centre(self, end: int) -> float:
         """Centre of the window that ends at a grid index, s."""
@@ -275,13 +283,13 @@ class Momentum(Stage):
     def _decide(self, noise: SensorNoise, last: bool) -> None:
         """Where rows are held back for an event: decide on it, once there are enough of them, and go on."""
         may_drift = not last and self._may_drift
-        adoption = self.changes.decide(noise, self.state.start_time, last, steps=may_drift)
-        if adoption is None and may_drift:
-            if self._drift_decided(noise):
-                return
-            adoption = self.changes.decide(noise, self.state.start_time, last)
-        if adoption is not None:
-            self.adopt(adoption, noise)
+        found = self.changes.decide(noise, self.state.start_time, last, steps=may_drift)
+        if may_drift and isinstance(found, Behind):
+            self._decide_on_drift(found, noise)
+            if self.bank.state.none:
+                found = self.changes.decide(noise, self.state.start_time, last)
+        if isinstance(found, Adoption):
+            self.adopt(found, noise)
         self._take_back()
 
     def _take_back(self) -> None:
@@ -337,7 +345,7 @@ class Momentum(Stage):
                 self.test.push(rows, detector.known.factor, COLOURED_NOISE if noise.coloured else 1.0)
             if not detector.push(rows, self.misfit):
                 onset = self.state.start_time + detector.onset / self._sample_rate - self._window
-                self.bank.hold(self._for_trackers(rows), onset)
+                self.bank.hold(onset)
                 if detector.uncertain:
                     self.state.held = [*self.state.held, rows]
                 continue
@@ -367,21 +375,23 @@ class Momentum(Stage):
 
     def _for_trackers(self, rows: WhiteRows) -> Rows:
         """Rows with the drift that was subtracted from them."""
-        m, centre, b, ramp = len(self.nuisances), self._centre(rows.end), rows.Y[:, -1], None
+        m, n, b, ramp = len(self.nuisances), self.changes.base.n, rows.Y[:, -1], None
+        # Rows behind an alarm have columns of what may begin there, too.
+        Y = rows.Y[:, : m + n]
         if self.bank.follows:
-            ramp = np.pad(rows.ramp, ((0, 0), (m, 0)))
+            ramp = np.pad(rows.ramp[:, :n], ((0, 0), (m, 0)))
         if rows.drift is not None:
-            b = b + rows.Y[:, m:-1] @ rows.drift.moved + rows.ramp @ rows.drift.rate
-        return Rows(rows.Y[:, :-1], b, np.ones(b.size), np.full(b.size, centre), ramp)
+            b = b + Y[:, m:] @ rows.drift.moved[:n] + rows.ramp[:, :n] @ rows.drift.rate[:n]
+        return Rows(Y, b, np.ones(b.size), np.full(b.size, self._centre(rows.end)), ramp)
 
     @property
     def _may_drift(self) -> bool:
         """Whether rows are held back that may be those of a drift; where rows leave more than noise none is learned."""
-        detector = self.changes.detector
-        return detector.alarm is not None and self.bank.learned is not None and not detector.uncertain
+        detector, bank = self.changes.detector, self.bank
+        return detector.alarm is not None and bank.learned is not None and not (detector.uncertain or bank.state.none)
 
-    def _drift_decided(self, noise: SensorNoise) -> bool:
-        """Whether rows held back need no event decided on: not yet, or they were those of a drift."""
+    def _decide_on_drift(self, behind: Behind, noise: SensorNoise) -> None:
+        """Where rows held back are those of a drift: go on with it."""
         detector, learned = self.changes.detector, self.bank.learned
         assert detector.alarm is not None
         assert learned is not None
@@ -390,22 +400,22 @@ class Momentum(Stage):
             for end in (detector.onset, detector.alarm, detector.history[-1].end)
         )
         change = Change(onset - self._window, alarm, newest)
-        drift = self.bank.drift_behind(change)
-        if isinstance(drift, bool):
-            return drift
+        rows = [self._for_trackers(each) for each in behind.rows]
+        drift = self.bank.drift_behind(change, rows, behind.explanation.explained and behind.goes_on)
+        if drift is None:
+            return
         samples, before = self.changes.behind(detector.alarm), state_copy(learned.state)
-        self.bank.go_on_behind(change, drift, held=True)
+        self.bank.go_on_behind(change, drift, rows)
         known = learned.information
         self._build()
         self._begin_drift(known)
         self._renew_drift()
-        # Rows come again as behind an event, whitened among themselves: those held back hold parameters of before.
+        # Rows come again, free of the drift as it is known now.
         learned.state = before
-        self.bank.go_on_behind(change, drift, held=False)
+        self.bank.go_on_behind(change, drift)
         self.bank.release()
         self.fit.go_on(known.solution().pi[len(self.nuisances) :], noise, self.fit.plain.misfit)
         self._process(samples, noise)
-        return True
 
     def _renew_drift(self) -> None:
         """Have windows to come know of the drift so far; not those whose rows are made already."""

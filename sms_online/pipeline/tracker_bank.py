@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
-import msgspec
 import numpy as np
 
 from sms_online.calibration.nuisance import Nuisance
@@ -28,9 +27,9 @@ from sms_online.trackers.interface import Estimate, Prior, Rows, Tracker, joined
 
 # Path of a judged tracker that is no learned trend: from one check of it to the next, s.
 LOOKED = 1.0
-# Times behind an alarm when it is asked whether it was a drift, s, where the judged tracker is a learned trend: the
-# first shows nothing but a fast drift, the second a step too, and the last is for what is unclear till then.
-WAITED = (3.0, 4.4, 6.5)
+# Times behind an alarm, s, before which a drift may yet show where the judged tracker learns them, and where it is
+# unclear till then whether it was one.
+WAITED, LONGEST_WAITED = 4.4, 6.5
 
 
 def session_trackers(sensing: Sensing, momentum: bool) -> tuple[TrackerChoice, ...]:
@@ -88,15 +87,14 @@ class Suspected:
 
 
 class BankState(State):
-    """reference (n,): parameters from which a drift counts, None where nothing has moved. held: rows since an alarm.
+    """reference (n,): parameters from which a drift counts, None where nothing has moved.
 
-    since: s, when what it is of may have begun. asked: how often it was asked what that was.
+    since: s, when what an alarm is of may have begun, inf without one. none: it is of no drift.
     """
 
     reference: Array | None = None
-    held: list[Rows] = msgspec.field(default_factory=list)
     since: float = np.inf
-    asked: int = 0
+    none: bool = False
 
 
 class TrackerBank(Stage):
@@ -190,33 +188,30 @@ class TrackerBank(Stage):
                 tracker.state.moves |= moves
             tracker.update(rows)
 
-    def hold(self, rows: Rows, since: float) -> None:
-        """Keep rows from behind an alarm until it is known what that was; since: s, when that may have begun."""
+    def hold(self, since: float) -> None:
+        """Wait until it is known what an alarm is of, which may have begun at `since`, s."""
         if self.learned is not None:
-            self.state.held, self.state.since = [*self.state.held, rows], since
+            self.state.since = since
 
-    def drift_behind(self, change: Change) -> Ramp | bool:
-        """The drift that a change is; whether that is still to be seen, where it is none so far."""
-        learned = self.learned
-        if learned is None or self.state.asked == len(WAITED):
-            # A gap may keep the change from being decided on for longer than that.
-            return False
-        if change.newest < change.alarm + WAITED[self.state.asked]:
-            return True
-        found = learned.break_between(change.onset, change.alarm, self.state.held)
-        self.state.asked += 1
-        if found.drift is None and (self.state.asked == 1 or (found.unclear and self.state.asked < len(WAITED))):
-            return True
-        return False if found.drift is None else found.drift
+    def drift_behind(self, change: Change, behind: Sequence[Rows], unclear: bool) -> Ramp | None:
+        """The drift that a change is, None where it is none so far.
 
-    def go_on_behind(self, change: Change, drift: Ramp, held: bool) -> None:
-        """Go on behind a change that is a drift; held: with the rows held back, or without them."""
+        behind: rows since the alarm. unclear: a step that they show may go on.
+        """
         assert self.learned is not None
-        self.learned.go_on_behind(change.onset, change.alarm, drift, self.state.held if held else ())
+        found = self.learned.break_between(change.onset, change.alarm, behind)
+        waited = change.newest - change.alarm
+        self.state.none = waited >= (LONGEST_WAITED if unclear or found.unclear else WAITED)
+        return found.drift
+
+    def go_on_behind(self, change: Change, drift: Ramp, behind: Sequence[Rows] = ()) -> None:
+        """Go on behind a change that is a drift, and with rows behind it."""
+        assert self.learned is not None
+        self.learned.go_on_behind(change.onset, change.alarm, drift, behind)
 
     def release(self) -> None:
-        """Forget the rows held back."""
-        self.state.held, self.state.since, self.state.asked = [], np.inf, 0
+        """It is known what the alarm was of."""
+        self.state.since, self.state.none = np.inf, False
 
     def hold_until(self, t: float) -> None:
         """Have estimates of parameters that drift hold at t, s."""
@@ -279,7 +274,7 @@ class TrackerBank(Stage):
 
     def _as_least_squares(self, tracker: Tracker) -> bool:
         """Whether a tracker has learned of no drift: what is known is then the session's own least squares."""
-        return tracker is self.learned and not self.learned.moves.any() and not self.state.held
+        return tracker is self.learned and not self.learned.moves.any() and self.state.since == np.inf
 
     def _reading(self, chosen: _Chosen, own: Estimate, bias: NoiseBias, t: float) -> Reading:
         tracker = chosen.tracker

@@ -17,6 +17,7 @@ linear trend) and 3.4 (likelihood of its innovations).
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,6 +27,8 @@ from sms_online.trackers.drift_filter import KNOT, START, STEP, Block, DriftFilt
 from sms_online.trackers.drift_noise import likeliest
 from sms_online.trackers.drift_search import (
     LARGEST_LEFT,
+    STARTS,
+    STARTS_BEFORE_ALARM,
     Break,
     Ramp,
     Tried,
@@ -34,6 +37,7 @@ from sms_online.trackers.drift_search import (
     changes_within,
     explains,
     likeliest_change,
+    may_be_ramp,
 )
 from sms_online.trackers.drift_state import DriftState, Found
 from sms_online.trackers.factor import masked_covariance, solve, triangular_factor
@@ -112,35 +116,51 @@ class LearnedTrend(Tracker):
         rates = np.zeros_like(rows.Y) if rows.ramp is None else rows.ramp / rows.std[:, None]
         return np.concatenate((whitened[:, :-1], rates, whitened[:, -1:]), axis=1)
 
-    def break_between(self, onset: float, alarm: float, held: Sequence[Rows]) -> Break:
+    def break_between(self, onset: float, alarm: float, behind: Sequence[Rows]) -> Break:
         """Whether a change that lies between two instants, s, is that of a drift.
 
-        held: rows since the alarm, of which the first are left out, for they hold parameters of before.
+        behind: rows since the alarm, whitened among themselves.
         """
         knot = _knot(alarm)
-        behind = _later_half(held, alarm)
         before, moving = self._before(onset)
         if not before or not behind:
             return Break()
         after = [self._expanded(rows) for rows in behind]
         for rows, own in zip(behind, after, strict=True):
             own[:, self._n : -1] += (rows.t - knot * STEP)[:, None] * own[:, : self._n]
-        state = self._through(before, moving, knot)[0]
         block = Block.of(np.concatenate(after), knot, behind[-1].t[-1] - knot * STEP)
-        return best_break(state, block, self._groups)
+        found = best_break(self._through(before, moving, knot)[0], block, self._groups)
+        return self._begun_before(block) if found.drift is None else found
 
-    def go_on_behind(self, onset: float, alarm: float, drift: Ramp, held: Sequence[Rows]) -> None:
-        """Go on behind the break of a drift; rows of the last knot before it are given up. held: as before."""
+    def _begun_before(self, behind: Block) -> Break:
+        """Whether rows behind an alarm go on with a drift that had begun before it, too weak to be seen by then."""
+        blocks, moving = [*self.state.blocks, behind], self.state.moving
+        tried = self._tried(moving, blocks, STARTS_BEFORE_ALARM)
+        ramp = best_ramp(tried)
+        if ramp is None:
+            return Break(unclear=may_be_ramp(tried))
+        state = self._through(self.state.blocks, [*moving, ramp.moving()], behind.knot)[0]
+        left = state.absorbed(behind).factor[-1, -1] ** 2 - state.factor[-1, -1] ** 2
+        return Break(unclear=True) if left > LARGEST_LEFT * behind.rows else Break(ramp)
+
+    def go_on_behind(self, onset: float, alarm: float, drift: Ramp, behind: Sequence[Rows]) -> None:
+        """Go on behind the break of a drift, or with one that had begun before it; behind: see `break_between`.
+
+        Rows of the last knot before are given up.
+        """
         (before, moving), knot, begin = self._before(onset), _knot(alarm), int(np.ceil(alarm / STEP))
-        moving = [each.broken(drift.columns, knot, drift.rates) for each in moving]
-        if not any(each.columns == drift.columns for each in moving):
-            moving.append(Moving(drift.columns, knot, 0.0, tuple(drift.rates.tolist()), breaks=(knot,), begun=onset))
+        if drift.since < knot:
+            before, moving = self.state.blocks, [*self.state.moving, drift.moving()]
+        else:
+            moving = [each.broken(drift.columns, knot, drift.rates) for each in moving]
+            if not any(each.columns == drift.columns for each in moving):
+                moving.append(replace(drift.moving(), breaks=(knot,), begun=onset))
         now = self._through(before, moving, begin)[0]
         self.state.blocks, self.state.changes = before, []
         self._move(moving, now)
         self.state.pending, self.state.fresh, self.state.step = [], 0, begin
         self.state.accepted += 1
-        for rows in _later_half(held, alarm):
+        for rows in behind:
             self.update(rows)
 
     def _before(self, onset: float) -> tuple[list[Block], list[Moving]]:
@@ -223,15 +243,14 @@ class LearnedTrend(Tracker):
 
     def _search(self) -> None:
         """Whether one more parameter moves."""
-        found, tried = list(self.state.moving), self._tried(self.state.moving)
+        found, tried = list(self.state.moving), self._tried(self.state.moving, self.state.blocks)
         self._suspect(tried)
         for _ in range(MOST_AT_ONCE if self._follow else 0):
             ramp = best_ramp(tried)
             if ramp is None:
                 break
-            begun = ramp.since * STEP
-            found.append(Moving(ramp.columns, ramp.since, 0.0, tuple(ramp.rates.tolist()), begun=begun))
-            tried = self._tried(found)
+            found.append(ramp.moving())
+            tried = self._tried(found, self.state.blocks)
         new = len(found) > len(self.state.moving)
         ends = self.state.shown == PATIENCE and self.state.moves and not self.state.accepted
         judged = self.patient or ends or self.state.lacking
@@ -254,13 +273,13 @@ class LearnedTrend(Tracker):
         left = self._filtered(moving)[0].factor[-1, -1] ** 2 - self.state.anchor.factor[-1, -1] ** 2
         return float(left / sum(block.rows for block in self.state.blocks) - 1.0)
 
-    def _tried(self, moving: Sequence[Moving]) -> Tried:
-        """Changes of what does not move, within the remembered blocks."""
+    def _tried(self, moving: Sequence[Moving], blocks: Sequence[Block], starts: Sequence[int] = STARTS) -> Tried:
+        """Changes of what does not move, within blocks that follow on the anchor."""
         taken = {column for each in moving for column in each.columns}
-        rows = np.concatenate([block.factor[:, : self._n] for block in self.state.blocks])
+        rows = np.concatenate([block.factor[:, : self._n] for block in blocks])
         sizes = np.linalg.norm(rows, axis=0)
         free = [group for group in self._groups if not taken & set(group) and not explains(rows, sizes, taken, group)]
-        return changes_within(self.state.anchor.with_moving(moving), self.state.blocks, free)
+        return changes_within(self.state.anchor.with_moving(moving), blocks, free, starts)
 
     def _suspect(self, tried: Tried) -> None:
         """Whether a change is hardly chance, for the second time."""
@@ -377,11 +396,6 @@ class LearnedTrend(Tracker):
             rss=solution.rss,
             dof=max(self.state.rows + len(self._prior) - solution.rank, 0.0),
         )
-
-
-def _later_half(held: Sequence[Rows], alarm: float) -> list[Rows]:
-    """Rows whose whitening holds the least of parameters before the alarm: for a second and a half, or two, it does."""
-    return [rows for rows in held if rows.t[0] >= 0.5 * (alarm + held[-1].t[0])]
 
 
 def _knot(t: float) -> int:

@@ -9,11 +9,13 @@ import numpy as np
 from scipy.special import chdtrc
 
 from sms_online.stream import Array
-from sms_online.trackers.drift_filter import STEP, Block, DriftFilter, decaying
+from sms_online.trackers.drift_filter import STEP, Block, DriftFilter, Moving, decaying
 from sms_online.trackers.factor import extended
 
 # Starts of a ramp that are tried, knots before now.
 STARTS = (4, 8, 16, 32)
+# And those of a change that has given an alarm, blocks: the last block is all that is behind it.
+STARTS_BEFORE_ALARM = (1, 2, 3, 4, 8, 16, 32)
 # What a ramp must take off the rows' sum of squares, for each parameter in it: 6.3 standard deviations of chance, of
 # some 1e5 that are tried in an hour.
 LEAST_GAIN = 40.0
@@ -40,6 +42,10 @@ class Ramp:
     rates: Array
     gain: float
 
+    def moving(self) -> Moving:
+        """The parameters as they move from then on, without process noise."""
+        return Moving(self.columns, self.since, 0.0, tuple(self.rates.tolist()), begun=self.since * STEP)
+
 
 @dataclass(frozen=True)
 class Tried:
@@ -62,8 +68,10 @@ class Suspicion:
     chance: float
 
 
-def changes_within(anchor: DriftFilter, blocks: Sequence[Block], groups: Sequence[tuple[int, ...]]) -> Tried:
-    """What a ramp, and a step, of each group explains of the last blocks, from each start.
+def changes_within(
+    anchor: DriftFilter, blocks: Sequence[Block], groups: Sequence[tuple[int, ...]], starts: Sequence[int] = STARTS
+) -> Tried:
+    """What a ramp, and a step, of each group explains of the last blocks, from each start, blocks before the end.
 
     anchor: what is known before the blocks.
     """
@@ -75,7 +83,7 @@ def changes_within(anchor: DriftFilter, blocks: Sequence[Block], groups: Sequenc
         before[len(blocks) - k] = state
         following = blocks[k + 1].knot if k + 1 < len(blocks) else block.knot + 1
         state = state.absorbed(block).advanced(following)
-    for start in STARTS:
+    for start in starts:
         if start > len(blocks):
             break
         since = blocks[-start].knot
@@ -101,6 +109,12 @@ def best_ramp(tried: Tried) -> Ramp | None:
     others = max((each.gain for each in tried.ramps if each.columns not in alike), default=0.0)
     enough = best.gain > LEAST_GAIN * len(best.columns)
     return best if enough and best.gain > max(steps, others) + DECISIVE * len(best.columns) else None
+
+
+def may_be_ramp(tried: Tried) -> bool:
+    """Whether no step explains clearly more than every ramp."""
+    ramps, steps = (max((each.gain for each in some), default=0.0) for some in (tried.ramps, tried.steps))
+    return ramps > LEAST_GAIN and ramps > steps - DECISIVE
 
 
 def explains(rows: Array, sizes: Array, columns: Iterable[int], others: Iterable[int]) -> bool:
