@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import json
 import re
 
 import pytest
 
-from tests.net import RECORDED
 from tests.net.numbers import Numbers, differences, environment, numbers
+from tests.net.recorded import Recorded, packed, unpacked
 from tests.net.sessions import QUICK, SESSIONS
 
 ESTIMATE = re.compile(r"(whole|continued)\.parameters\[.*\]\.estimate$")
@@ -25,9 +24,9 @@ MARKS = {"gap": pytest.mark.long, "axis-adopted": pytest.mark.long, "axis-event"
 
 @pytest.mark.parametrize("name", [pytest.param(name, marks=MARKS.get(name, ())) for name in QUICK])
 def test_no_number_of_a_session_moves(name: str) -> None:
-    recorded, now = json.loads(RECORDED.read_text()), numbers(SESSIONS[name]())
-    before = recorded["sessions"][name]
-    if recorded["environment"] == environment():
+    recorded, now = Recorded.read(), numbers(SESSIONS[name]())
+    before = recorded.sessions[name]
+    if recorded.environment == environment():
         assert list(differences(before, now, 0.0)) == []
     else:
         assert list(_differing_elsewhere(before, now)) == []
@@ -56,6 +55,14 @@ def test_a_moved_bit_a_lost_name_and_a_new_number_are_seen() -> None:
     assert len(list(differences(before, after, 0.0))) == 5
     assert [line[0] for line in sorted(differences(before, after, 1e-12))] == ["b", "c", "d", "t"]
     assert list(differences(before, dict(before), 0.0)) == []
+
+
+def test_the_file_holds_lists_together_and_nothing_twice() -> None:
+    whole: Numbers = {"whole.c[0]": 0.1, "whole.c[1]": None, "whole.p[a].std": 2.0, "whole.level": "trust"}
+    continued: Numbers = {path.replace("whole", "continued"): value for path, value in whole.items()}
+    assert packed(whole | continued) == {"whole.c": [0.1, None], "whole.p[a].std": 2.0, "whole.level": "trust"}
+    for moved in ({}, {"continued.c[1]": 0.1 + 2**-54}, {"continued.level": "doubt"}, {"continued.new": 1}):
+        assert unpacked(packed(whole | continued | moved)) == whole | continued | moved
 
 
 @pytest.mark.parametrize("quantity", ["estimate", "std"])

@@ -7,12 +7,11 @@ python -m tests.net compare [--tolerance 1e-10] [SESSION …]
 from __future__ import annotations
 
 import argparse
-import json
 import sys
 from time import process_time
 
-from tests.net import RECORDED
 from tests.net.numbers import differences, environment, numbers
+from tests.net.recorded import Recorded
 from tests.net.sessions import SESSIONS
 
 
@@ -25,9 +24,9 @@ def main() -> int:
     parser.add_argument("--tolerance", type=float, default=0.0, help="relative; 0 by default: not a bit may differ")
     args = parser.parse_args()
     names = args.session or list(SESSIONS)
-    recorded = json.loads(RECORDED.read_text()) if RECORDED.exists() else {"sessions": {}}
-    if args.verb == "compare" and recorded["environment"] != environment():
-        print(f"recorded elsewhere: {recorded['environment']}; here: {environment()}")
+    recorded = Recorded.read()
+    if args.verb == "compare" and recorded.environment != environment():
+        print(f"recorded elsewhere: {recorded.environment}; here: {environment()}")
     differing = 0
     for name in names:
         begun = process_time()
@@ -36,11 +35,11 @@ def main() -> int:
         found = numbers(session)
         took = f"made in {made - begun:.1f} s of processor time, run in {process_time() - made:.1f} s"
         if args.verb == "record":
-            recorded = {"environment": environment(), "sessions": recorded["sessions"] | {name: found}}
-            RECORDED.write_text(json.dumps(recorded, indent=0) + "\n")
+            recorded = Recorded(environment(), recorded.sessions | {name: found})
+            recorded.write()
             print(f"{name}: {len(found)} recorded, {took}", flush=True)
             continue
-        lines = sorted(differences(recorded["sessions"][name], found, args.tolerance))
+        lines = sorted(differences(recorded.sessions[name], found, args.tolerance))
         differing += bool(lines)
         print(f"{name}: {len(lines)} of {len(found)} differ, {took}", flush=True)
         print("".join(f"  {line}\n" for line in lines), end="", flush=True)
