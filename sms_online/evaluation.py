@@ -1,12 +1,11 @@
-"""Evaluation of a session's statistics: estimate, error bars, residuals and trust, each on request.
+"""Evaluation of a session's statistics: estimate, error bars and residuals, each on request.
 
 A pure function of `Statistics`, so that the estimator's process, the view's and a reader of saved statistics say the
-same. `result_of` makes one record of all of it.
+same. `verdict.judged` adds whether to trust it.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from functools import cached_property
 
 import numpy as np
@@ -16,7 +15,6 @@ from sms_online.calibration.found import Calibration, found
 from sms_online.calibration.truncation import left
 from sms_online.model.parameters import Parameter
 from sms_online.nominal import Comparison, compare, unit_factors
-from sms_online.notices import notices, projection_warning, smoother_warnings
 from sms_online.physical import PhysicalSet, Projection
 from sms_online.pipeline.description import described, nearer
 from sms_online.pipeline.statistics import Statistics
@@ -26,11 +24,7 @@ from sms_online.stream import Array
 from sms_online.threads import one_blas_thread
 from sms_online.tracker_results import Consistency, Drift, Tracked, TrackerResult
 from sms_online.trackers.interface import Estimate, Prior
-from sms_online.verdict.evidence import Discrepancy
-from sms_online.verdict.gather import evidence_of
-from sms_online.verdict.judge import judge
-from sms_online.verdict.truncated import FIRST_ORDER, truncated
-from sms_online.verdict.trust import Residual, Trust
+from sms_online.verdict.trust import Residual
 
 # Half width of a 95 % interval in standard deviations.
 NORMAL_95 = 1.959963984540054
@@ -71,21 +65,13 @@ def beside_prior(estimate: Estimate, std: Array, prior: Prior) -> tuple[Array, A
 class Evaluation:
     """The statistics of an instant, evaluated.
 
-    estimate: the one that follows from them, where it is at hand: to make it costs milliseconds. discrepancies: of the
-    running diagnosis. troubles: whatever else speaks against the numbers, see `verdict.evidence.Evidence`.
+    estimate: the one that follows from them, where it is at hand: to make it costs milliseconds.
     """
 
-    def __init__(
-        self,
-        statistics: Statistics,
-        estimate: Estimate | None = None,
-        discrepancies: Sequence[Discrepancy] = (),
-        troubles: Sequence[str] = (),
-    ) -> None:
+    def __init__(self, statistics: Statistics, estimate: Estimate | None = None) -> None:
         self.statistics = statistics
         self.model, self.base = statistics.setup.model, statistics.setup.base
         self._estimate = estimate
-        self._discrepancies, self._troubles = tuple(discrepancies), tuple(troubles)
 
     @property
     def parameters(self) -> tuple[Parameter, ...]:
@@ -291,20 +277,3 @@ class Evaluation:
         return [
             p.name for p, each in zip(self.parameters, upper, strict=True) if each < 0.0 and p.name.endswith(POSITIVE)
         ]
-
-    @cached_property
-    def trust(self) -> Trust:
-        """May the estimate be trusted? The answer changes while a session runs."""
-        return judge(evidence_of(self, self._discrepancies, self._troubles))
-
-    @cached_property
-    def warnings(self) -> list[str]:
-        """What the trust rests on or lacks, in full sentences."""
-        projection = projection_warning(self.projection) if self.statistics.finished else []
-        coarse = [str(each) for each in truncated(self) if abs(each.share) <= FIRST_ORDER]
-        return [*self.trust.warnings, *coarse, *projection, *smoother_warnings(self.statistics)]
-
-    @cached_property
-    def notices(self) -> list[str]:
-        """What happened to the samples, a sentence each."""
-        return notices(self.statistics)

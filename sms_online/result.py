@@ -13,13 +13,14 @@ import numpy as np
 from sms_online.calibration.found import Calibration
 from sms_online.description.parse import describe
 from sms_online.description.schema import System
-from sms_online.evaluation import NORMAL_95, Evaluation
+from sms_online.evaluation import NORMAL_95
 from sms_online.history import History, Recorder, reported_covariance
 from sms_online.pipeline.events import Event
 from sms_online.pipeline.statistics import Method
 from sms_online.stream import Array
 from sms_online.tables import Documented, Table, finite, formatter
 from sms_online.tracker_results import Drift, TrackerResult
+from sms_online.verdict.judged import JudgedEvaluation
 from sms_online.verdict.trust import Residual, Residuals, Trust
 
 if TYPE_CHECKING:
@@ -278,7 +279,7 @@ class Result(Documented):
 
 
 def result_of(
-    evaluation: Evaluation,
+    evaluation: JudgedEvaluation,
     truth: Mapping[str, float] | None = None,
     bound: Array | None = None,
     warnings: Sequence[str] = (),

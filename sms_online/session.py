@@ -21,7 +21,6 @@ from sms_online.description.schema import System, TrackerChoice
 from sms_online.diagnosis.online import OnlineDiagnosis
 from sms_online.diagnosis.searcher import Searcher
 from sms_online.errors import InputError
-from sms_online.evaluation import Evaluation
 from sms_online.history import Recorder
 from sms_online.pipeline.estimator import Estimator
 from sms_online.pipeline.statistics import Statistics
@@ -31,6 +30,7 @@ from sms_online.state import Stage
 from sms_online.stream import Array, Block, Source
 from sms_online.trackers.parse import parse_tracker
 from sms_online.truth import true_values
+from sms_online.verdict.judged import JudgedEvaluation
 
 # One or several trackers, as texts or records; None for those of the system file.
 Trackers = str | TrackerChoice | Sequence[str | TrackerChoice] | None
@@ -167,10 +167,10 @@ class Session:
             self._result = self.evaluate()
         return self._result
 
-    def evaluation(self, troubles: Sequence[str] = ()) -> Evaluation:
+    def evaluation(self, troubles: Sequence[str] = ()) -> JudgedEvaluation:
         """The evaluation of the samples so far, computed on request. troubles: further reasons to doubt."""
         statistics = Statistics.of(self.estimator)
-        return Evaluation(statistics, self.estimator.estimate(), self.diagnosis.discrepancies, troubles)
+        return JudgedEvaluation(statistics, self.estimator.estimate(), self.diagnosis.discrepancies, troubles)
 
     def evaluate(
         self,

@@ -6,18 +6,18 @@ import pickle
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from sms_online.evaluation import Evaluation
 from sms_online.pipeline.estimator import Estimator
 from sms_online.pipeline.statistics import Statistics
 from sms_online.result import result_of
 from sms_online.stream import Array
 from sms_online.trackers.interface import Estimate
+from sms_online.verdict.judged import JudgedEvaluation
 from sms_online.verdict.trust import Trust
 
 
-def evaluated(estimator: Estimator, estimate: Estimate | None = None) -> Evaluation:
+def evaluated(estimator: Estimator, estimate: Estimate | None = None) -> JudgedEvaluation:
     """What an estimator knows, evaluated."""
-    return Evaluation(Statistics.of(estimator), estimator.estimate() if estimate is None else estimate)
+    return JudgedEvaluation(Statistics.of(estimator), estimator.estimate() if estimate is None else estimate)
 
 
 def standard_deviation(estimator: Estimator, estimate: Estimate | None = None) -> Array:
@@ -43,4 +43,4 @@ def results_document(
 
 def elsewhere(statistics: Statistics) -> dict[str, Any]:
     """results.json as another process makes it of the statistics."""
-    return result_of(Evaluation(pickle.loads(pickle.dumps(statistics)))).document()
+    return result_of(JudgedEvaluation(pickle.loads(pickle.dumps(statistics)))).document()

@@ -14,7 +14,6 @@ from sms_online.calibration.nuisance import Nuisance, known_beforehand, prior_ro
 from sms_online.description.parse import parse_system, shipped_text
 from sms_online.description.schema import Tolerances
 from sms_online.errors import InputError
-from sms_online.evaluation import Evaluation
 from sms_online.pipeline.estimator import Estimator
 from sms_online.pipeline.events import Event
 from sms_online.pipeline.statistics import Statistics
@@ -22,6 +21,7 @@ from sms_online.session import Session
 from sms_online.stream import Array, Block
 from sms_online.trackers.interface import Rows
 from sms_online.trackers.square_root import session_tracker
+from sms_online.verdict.judged import JudgedEvaluation
 from sms_sim.simulate import sampled_blocks
 from tests.exactly_known import EXACTLY
 from tests.sessions_of import session_of
@@ -77,13 +77,13 @@ def estimated(block: Block) -> Estimator:
     return session_of(system, [block])
 
 
-def evaluated(exact: Block, changed: dict[str, Array] | None = None, seed: int = 3) -> Evaluation:
+def evaluated(exact: Block, changed: dict[str, Array] | None = None, seed: int = 3) -> JudgedEvaluation:
     """Of noisy samples."""
-    return Evaluation(Statistics.of(estimated(noisy(exact, changed, seed))))
+    return JudgedEvaluation(Statistics.of(estimated(noisy(exact, changed, seed))))
 
 
 @pytest.fixture(scope="module")
-def slightly_late(exact: Block) -> Evaluation:
+def slightly_late(exact: Block) -> JudgedEvaluation:
     """A camera that is 100 µs late, two tolerances."""
     return evaluated(exact, late(exact, 1e-4))
 
@@ -94,7 +94,7 @@ def very_late(exact: Block) -> Estimator:
     return estimated(noisy(exact, late(exact, 4e-3)))
 
 
-def off(evaluation: Evaluation) -> Array:
+def off(evaluation: JudgedEvaluation) -> Array:
     """Errors of the parameters over their bars."""
     base = evaluation.base
     return np.asarray((evaluation.estimate.pi - base.values(evaluation.model.nominal)) / evaluation.std)
@@ -107,13 +107,13 @@ def late(exact: Block, seconds: float) -> dict[str, Array]:
     return dict(zip(seen, between(exact.t - seconds).T, strict=True))
 
 
-def of(evaluation: Evaluation, name: str, where: str) -> Calibration:
+def of(evaluation: JudgedEvaluation, name: str, where: str) -> Calibration:
     (found,) = (each for each in evaluation.calibration if (each.name, each.where) == (name, where))
     return found
 
 
 @pytest.mark.slow
-def test_a_late_camera_within_tolerance_is_said_and_corrected(slightly_late: Evaluation) -> None:
+def test_a_late_camera_within_tolerance_is_said_and_corrected(slightly_late: JudgedEvaluation) -> None:
     assert np.abs(off(slightly_late)).max() < 4.0
     for where in ("base", "markers"):
         clock = of(slightly_late, "clock", where)
@@ -126,7 +126,7 @@ def test_a_late_camera_within_tolerance_is_said_and_corrected(slightly_late: Eva
 @pytest.mark.slow
 def test_a_camera_milliseconds_late_is_said_and_corrected(very_late: Estimator) -> None:
     """Rows that are linear about no lateness at all say 2.2 ms."""
-    evaluation = Evaluation(Statistics.of(very_late))
+    evaluation = JudgedEvaluation(Statistics.of(very_late))
     assert np.abs(off(evaluation)).max() < 4.0
     for where in ("base", "markers"):
         clock = of(evaluation, "clock", where)
@@ -171,10 +171,10 @@ def test_noise_determines_no_unit_of_length(exact: Block) -> None:
 
 
 @pytest.mark.slow
-def test_a_change_beside_a_clock_that_may_have_moved_is_in_doubt(slightly_late: Evaluation) -> None:
+def test_a_change_beside_a_clock_that_may_have_moved_is_in_doubt(slightly_late: JudgedEvaluation) -> None:
     statistics = slightly_late.statistics
     change = Event(4.0, "payload", ("payload.mass",), ("kg",), (1.0,), (0.1,), 0)
-    steady, changed = (Evaluation(replace(statistics, events=events)).trust for events in ((), (change,)))
+    steady, changed = (JudgedEvaluation(replace(statistics, events=events)).trust for events in ((), (change,)))
     assert not any("tolerances" in reason for reason in steady.reasons)
     assert any("late: 2 tolerances" in reason for reason in changed.reasons)
 
@@ -183,7 +183,7 @@ def test_a_change_beside_a_clock_that_may_have_moved_is_in_doubt(slightly_late: 
 def test_a_camera_later_than_its_tolerance_is_not_trusted(exact: Block) -> None:
     """Five seconds of it."""
     whole = noisy(exact, late(exact, 5e-4))
-    evaluation = Evaluation(Statistics.of(estimated(next(iter(whole.pieces(5001))))))
+    evaluation = JudgedEvaluation(Statistics.of(estimated(next(iter(whole.pieces(5001))))))
     assert evaluation.trust.level == "doubt"
     assert any("late: " in reason and "tolerances" in reason for reason in evaluation.trust.reasons)
     assert any("latency" in warning for warning in evaluation.trust.warnings)

@@ -12,8 +12,9 @@ from sms_adapters.sources import open_source
 from sms_adapters.system_file import load_system, shipped_text
 from sms_online.description.parse import parse_system
 from sms_online.description.schema import System
-from sms_online.evaluation import Evaluation, beside_prior
+from sms_online.evaluation import beside_prior
 from sms_online.session import Session
+from sms_online.verdict.judged import JudgedEvaluation
 
 DATA = Path(__file__).resolve().parents[1].parent / "shared" / "data"
 EMPS = DATA / "emps" / "DATA_EMPS.mat"
@@ -30,7 +31,7 @@ def measured(path: Path) -> Path:
 
 def replayed(
     system: System, capture: Path, prior: bool, start: float | None = None, stop: float | None = None
-) -> Evaluation:
+) -> JudgedEvaluation:
     source = open_source(capture, system, start, stop)
     # Constant parameters: what friction with memory leaves may look like a drift.
     session = Session(system, source.channels, prior=prior, tracker="rls")

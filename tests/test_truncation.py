@@ -14,11 +14,11 @@ from sms_online.calibration.truncation import Truncation
 from sms_online.description.parse import parse_system
 from sms_online.description.schema import System, Tolerances
 from sms_online.effects.build import build_model
-from sms_online.evaluation import Evaluation
 from sms_online.model.model import Model
 from sms_online.pipeline.sensing import Sensing
 from sms_online.pipeline.statistics import Statistics
 from sms_online.stream import Array, Block
+from sms_online.verdict.judged import JudgedEvaluation
 from sms_online.verdict.truncated import truncated
 from sms_sim.plant import Plant
 from tests.sessions_of import session_of
@@ -184,15 +184,15 @@ def moved(n: int) -> Block:
 
 
 @cache
-def evaluated(n: int, tolerance: float) -> Evaluation:
+def evaluated(n: int, tolerance: float) -> JudgedEvaluation:
     """A session of it that is described with two elements and measured out exactly but for a truncation's tolerance."""
     system = parse_system(SKEW, "skew")
     tolerances = Tolerances.model_validate("none").model_copy(update={"truncation": tolerance})
     estimator = session_of(system.model_copy(update={"tolerances": tolerances}), [moved(n)])
-    return Evaluation(Statistics.of(estimator), estimator.estimate())
+    return JudgedEvaluation(Statistics.of(estimator), estimator.estimate())
 
 
-def error_of(evaluation: Evaluation, name: str) -> tuple[float, float]:
+def error_of(evaluation: JudgedEvaluation, name: str) -> tuple[float, float]:
     """Relative error of a parameter and its error bar, 1σ."""
     k = [p.name for p in evaluation.parameters].index(name)
     true = evaluation.base.values(evaluation.model.nominal)[k]
@@ -235,7 +235,7 @@ def test_four_elements_read_at_two_markers_need_no_correction() -> None:
     system = with_elements(parse_system(SKEW, "skew"), 4)
     exactly = system.model_copy(update={"tolerances": Tolerances.model_validate("none")})
     estimator = session_of(exactly, [Block(read.t, names, read.values)])
-    evaluation = Evaluation(Statistics.of(estimator), estimator.estimate())
+    evaluation = JudgedEvaluation(Statistics.of(estimator), estimator.estimate())
     assert evaluation.statistics.method == "smoother"
     error, bar = error_of(evaluation, TWIST)
     assert abs(error) < min(0.01, 1.96 * bar)

@@ -44,6 +44,7 @@ from sms_online.pipeline.statistics import Statistics
 from sms_online.stream import Array, Block
 from sms_online.threads import one_blas_thread
 from sms_online.tracker_results import Drift
+from sms_online.verdict.judged import JudgedEvaluation
 from sms_online.verdict.reasons import LARGEST_RESIDUAL
 
 # What is found may leave so many times of the held-out torque that the description leaves: of rows without a torque it
@@ -249,7 +250,7 @@ def diagnose(
     said = verdict(
         named, share_left(bare.excess, after.excess), after.test, bare.test, [each.candidate for each in findings]
     )
-    grave = said == "clean" and Evaluation(Statistics.of(before), before.estimate()).trust.grave
+    grave = said == "clean" and JudgedEvaluation(Statistics.of(before), before.estimate()).trust.grave
     # What is left unexplained takes such numbers anywhere.
     calibration = () if said == "unexplained" else _miscalibrated(estimator_after)
     if said == "clean" and (mistakes or calibration):

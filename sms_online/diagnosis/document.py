@@ -17,7 +17,7 @@ from sms_online.diagnosis.hypothesis import LARGEST_SHARE_LEFT
 from sms_online.diagnosis.reported import Coefficients, of_constant, of_unknowns
 from sms_online.diagnosis.shape import slopes
 from sms_online.effects.catalogue import ENTRIES, declarable, either, in_words, traits_of
-from sms_online.evaluation import NORMAL_95, Evaluation, identifiable
+from sms_online.evaluation import NORMAL_95, identifiable
 from sms_online.model.parameters import Parameter
 from sms_online.pipeline.estimator import Estimator
 from sms_online.pipeline.statistics import Statistics
@@ -26,6 +26,7 @@ from sms_online.stream import Array
 from sms_online.threads import one_blas_thread
 from sms_online.verdict.evidence import Evidence
 from sms_online.verdict.judge import judge, judge_diagnosis
+from sms_online.verdict.judged import JudgedEvaluation
 from sms_online.verdict.reasons import undecided
 from sms_online.verdict.trust import Reason, Residual, Trust
 
@@ -109,9 +110,9 @@ def diagnosis_document(
     }
 
 
-def evaluation(session: Estimator) -> Evaluation:
+def evaluation(session: Estimator) -> JudgedEvaluation:
     """The evaluation of a session of a diagnosis."""
-    return Evaluation(Statistics.of(session), session.estimate())
+    return JudgedEvaluation(Statistics.of(session), session.estimate())
 
 
 def _from_rows(diagnosis: Diagnosis) -> bool:
@@ -119,7 +120,7 @@ def _from_rows(diagnosis: Diagnosis) -> bool:
     return diagnosis.attempt.by_rows or diagnosis.partial
 
 
-def _after(diagnosis: Diagnosis, session: Evaluation) -> Trust:
+def _after(diagnosis: Diagnosis, session: JudgedEvaluation) -> Trust:
     """May the parameters after be trusted?"""
     if not _from_rows(diagnosis):
         return session.trust
@@ -128,7 +129,7 @@ def _after(diagnosis: Diagnosis, session: Evaluation) -> Trust:
     return judge(Evidence((sum(known), len(known)), residual=_part(diagnosis.after.fit)))
 
 
-def trust_of(diagnosis: Diagnosis, after: Evaluation | None = None) -> Trust:
+def trust_of(diagnosis: Diagnosis, after: JudgedEvaluation | None = None) -> Trust:
     """May the parameters after be trusted, and the system file?
 
     after: the evaluation of the session with what was found, where it is at hand.

@@ -2,22 +2,18 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 
 from sms_online.calibration.found import CERTAIN
 from sms_online.calibration.nuisance import BOUND
 from sms_online.effects.catalogue import either, in_words
+from sms_online.evaluation import Evaluation
 from sms_online.row_types import row_types
 from sms_online.trackers.build import drifts_of
 from sms_online.verdict.evidence import Dispute
 from sms_online.verdict.reasons import STATE_HOLD, undecided
 from sms_online.verdict.truncated import FIRST_ORDER, truncated
 from sms_online.verdict.trust import Reason
-
-if TYPE_CHECKING:
-    from sms_online.evaluation import Evaluation
 
 # An estimate further from its prior than this many of the prior's deviations agrees with it by no chance.
 LARGEST_DISPUTE = 3.0

@@ -3,20 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from sms_online.description.sources import source_channels
+from sms_online.evaluation import Evaluation
 from sms_online.pipeline.periods import LONGEST_HOLE
 from sms_online.pipeline.sensing import is_slow
 from sms_online.pipeline.statistics import Statistics
 from sms_online.pipeline.synchronise import SIDE
 from sms_online.verdict.contradictions import ambiguous_effects, disputes, miscalibrated
 from sms_online.verdict.evidence import Discrepancy, Evidence
-
-if TYPE_CHECKING:
-    from sms_online.evaluation import Evaluation
 
 # Rows of the energy balance, for each parameter, from which on its first transient is forgotten.
 ROWS_A_PARAMETER = 10

@@ -3,17 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from sms_online.calibration.found import CERTAIN
 from sms_online.calibration.truncation import FINER
 from sms_online.description.bodies import FlexibleLink
+from sms_online.evaluation import Evaluation
 from sms_online.verdict.trust import Reason
-
-if TYPE_CHECKING:
-    from sms_online.evaluation import Evaluation
 
 # Share from which on a link is rather a continuous one than one of its elements.
 CONTINUOUS = 0.5

@@ -11,10 +11,11 @@ import numpy as np
 import rerun.blueprint as rrb
 from numpy.typing import NDArray
 
-from sms_online.evaluation import Evaluation, identifiable
+from sms_online.evaluation import identifiable
 from sms_online.pipeline.statistics import Statistics
 from sms_online.result import event_document
 from sms_online.stream import Array
+from sms_online.verdict.judged import JudgedEvaluation
 from sms_online.verdict.reasons import LARGEST_RESIDUAL, LARGEST_WHITENED
 from sms_online.verdict.trust import Trust
 from sms_tools.report import event_line
@@ -60,7 +61,7 @@ class Recorder:
 
     def __init__(self, start: Start, opened: Callable[[str], None]) -> None:
         self.waiting = 0  # pictures in the batch
-        self._now = now = Evaluation(start.statistics)
+        self._now = now = JudgedEvaluation(start.statistics)
         self._references = start.references
         self._live, self._diagnosed = start.live, start.diagnosed
         self._opened: Callable[[str], None] | None = opened
@@ -175,7 +176,7 @@ class Recorder:
             self._sink.close()
 
     def _take(self, t: float, state: Statistics, circumstances: Circumstances, last: bool = False) -> None:
-        self._now = now = Evaluation(state, None, circumstances.discrepancies, circumstances.troubles)
+        self._now = now = JudgedEvaluation(state, None, circumstances.discrepancies, circumstances.troubles)
         more = self._follow_events()
         known = self._known(t)
         slow = t >= self._slow_due or last
