@@ -12,7 +12,7 @@ import numpy as np
 from sms_online.evaluation import Evaluation
 from sms_online.pipeline.estimator import Estimator
 from sms_online.pipeline.observer import Observer
-from sms_online.pipeline.statistics import Statistics
+from sms_online.pipeline.snapshot import statistics_of
 from sms_online.state import Stage, State
 from sms_online.stream import Array
 from sms_online.tables import finite
@@ -153,7 +153,7 @@ class Recorder(Stage, Observer):
         return int(np.clip(MOST_NUMBERS // numbers, 2, MOST_INSTANTS))
 
     def _look(self, t: float) -> None:
-        now = Evaluation(Statistics.of(self._estimator, t))
+        now = Evaluation(statistics_of(self._estimator, t))
         self.latest = t, now
         upper = np.triu_indices(now.base.n)
         packed = [np.array((t, now.base.n))]

@@ -23,7 +23,7 @@ from sms_online.diagnosis.searcher import Searcher
 from sms_online.errors import InputError
 from sms_online.history import Recorder
 from sms_online.pipeline.estimator import Estimator
-from sms_online.pipeline.statistics import Statistics
+from sms_online.pipeline.snapshot import statistics_of
 from sms_online.priors import GivenPrior, base_prior, given_prior
 from sms_online.result import Result, result_of
 from sms_online.state import Stage
@@ -169,7 +169,7 @@ class Session:
 
     def evaluation(self, troubles: Sequence[str] = ()) -> JudgedEvaluation:
         """The evaluation of the samples so far, computed on request. troubles: further reasons to doubt."""
-        statistics = Statistics.of(self.estimator)
+        statistics = statistics_of(self.estimator)
         return JudgedEvaluation(statistics, self.estimator.estimate(), self.diagnosis.discrepancies, troubles)
 
     def evaluate(

@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from sms_online.pipeline.estimator import Estimator
+from sms_online.pipeline.snapshot import statistics_of
 from sms_online.pipeline.statistics import Statistics
 from sms_online.result import result_of
 from sms_online.stream import Array
@@ -17,7 +18,7 @@ from sms_online.verdict.trust import Trust
 
 def evaluated(estimator: Estimator, estimate: Estimate | None = None) -> JudgedEvaluation:
     """What an estimator knows, evaluated."""
-    return JudgedEvaluation(Statistics.of(estimator), estimator.estimate() if estimate is None else estimate)
+    return JudgedEvaluation(statistics_of(estimator), estimator.estimate() if estimate is None else estimate)
 
 
 def standard_deviation(estimator: Estimator, estimate: Estimate | None = None) -> Array:

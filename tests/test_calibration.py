@@ -16,7 +16,7 @@ from sms_online.description.schema import Tolerances
 from sms_online.errors import InputError
 from sms_online.pipeline.estimator import Estimator
 from sms_online.pipeline.events import Event
-from sms_online.pipeline.statistics import Statistics
+from sms_online.pipeline.snapshot import statistics_of
 from sms_online.session import Session
 from sms_online.stream import Array, Block
 from sms_online.trackers.interface import Rows
@@ -79,7 +79,7 @@ def estimated(block: Block) -> Estimator:
 
 def evaluated(exact: Block, changed: dict[str, Array] | None = None, seed: int = 3) -> JudgedEvaluation:
     """Of noisy samples."""
-    return JudgedEvaluation(Statistics.of(estimated(noisy(exact, changed, seed))))
+    return JudgedEvaluation(statistics_of(estimated(noisy(exact, changed, seed))))
 
 
 @pytest.fixture(scope="module")
@@ -126,7 +126,7 @@ def test_a_late_camera_within_tolerance_is_said_and_corrected(slightly_late: Jud
 @pytest.mark.slow
 def test_a_camera_milliseconds_late_is_said_and_corrected(very_late: Estimator) -> None:
     """Rows that are linear about no lateness at all say 2.2 ms."""
-    evaluation = JudgedEvaluation(Statistics.of(very_late))
+    evaluation = JudgedEvaluation(statistics_of(very_late))
     assert np.abs(off(evaluation)).max() < 4.0
     for where in ("base", "markers"):
         clock = of(evaluation, "clock", where)
@@ -183,7 +183,7 @@ def test_a_change_beside_a_clock_that_may_have_moved_is_in_doubt(slightly_late: 
 def test_a_camera_later_than_its_tolerance_is_not_trusted(exact: Block) -> None:
     """Five seconds of it."""
     whole = noisy(exact, late(exact, 5e-4))
-    evaluation = JudgedEvaluation(Statistics.of(estimated(next(iter(whole.pieces(5001))))))
+    evaluation = JudgedEvaluation(statistics_of(estimated(next(iter(whole.pieces(5001))))))
     assert evaluation.trust.level == "doubt"
     assert any("late: " in reason and "tolerances" in reason for reason in evaluation.trust.reasons)
     assert any("latency" in warning for warning in evaluation.trust.warnings)

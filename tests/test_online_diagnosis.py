@@ -15,7 +15,7 @@ from sms_online.diagnosis.online_search import Immediate
 from sms_online.effects.build import build_model
 from sms_online.model.base_parameters import find_base_parameters
 from sms_online.pipeline.estimator import Estimator
-from sms_online.pipeline.statistics import Statistics
+from sms_online.pipeline.snapshot import statistics_of
 from sms_online.stream import Block
 from sms_sim.simulate import Simulation
 from tests.axis import DAMPING, INERTIA
@@ -232,7 +232,7 @@ def test_a_session_with_an_adopted_effect_resumes_to_the_bit() -> None:
 
 def test_pickled_statistics_say_the_same_after_an_adoption() -> None:
     estimator, _ = cogged(True)
-    assert elsewhere(Statistics.of(estimator)) == results_document(estimator, 0.0, [])
+    assert elsewhere(statistics_of(estimator)) == results_document(estimator, 0.0, [])
 
 
 def test_what_acts_before_the_balance_is_not_adopted_live() -> None:

@@ -7,7 +7,7 @@ import pytest
 
 from sms_online.evaluation import Evaluation
 from sms_online.pipeline.estimator import Estimator
-from sms_online.pipeline.statistics import Statistics
+from sms_online.pipeline.snapshot import statistics_of
 from sms_online.stream import Block
 from tests.slow_encoder import bench, session
 
@@ -21,7 +21,7 @@ def test_a_zero_that_a_session_finds_leaves_no_torque() -> None:
     estimator = Estimator(bench(), block.channels, "test")
     estimator.push(Block(block.t[some], block.channels, values))
     estimator.finish()
-    found = Evaluation(Statistics.of(estimator), estimator.estimate())
+    found = Evaluation(statistics_of(estimator), estimator.estimate())
     assert {each.name for each in found.calibration if each.certain} == {"encoder_zero"}
     left = found.residuals["joint_1"].relative
     assert left is not None

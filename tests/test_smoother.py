@@ -22,7 +22,7 @@ from sms_online.description.schema import Effect, Sensor, System
 from sms_online.errors import InputError
 from sms_online.linearised import Motion
 from sms_online.pipeline.estimator import Estimator
-from sms_online.pipeline.statistics import Statistics
+from sms_online.pipeline.snapshot import statistics_of
 from sms_online.sensor_set import sensor_set
 from sms_online.stream import Array, Block
 from sms_online.trackers.interface import Prior
@@ -94,7 +94,7 @@ def test_results_say_what_gave_the_numbers(first: Estimator) -> None:
     assert all(p["identifiable"] for p in document["parameters"])
     assert_array_equal(session_bound(first, MotionRecord(500.0)), first.estimate().std)
     # A view's process says the same.
-    assert elsewhere(Statistics.of(first))["parameters"] == document["parameters"]
+    assert elsewhere(statistics_of(first))["parameters"] == document["parameters"]
 
 
 def test_a_weighed_part_sharpens_what_hangs_on_it(simulation: Simulation, first: Estimator) -> None:

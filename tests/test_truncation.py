@@ -16,7 +16,7 @@ from sms_online.description.schema import System, Tolerances
 from sms_online.effects.build import build_model
 from sms_online.model.model import Model
 from sms_online.pipeline.sensing import Sensing
-from sms_online.pipeline.statistics import Statistics
+from sms_online.pipeline.snapshot import statistics_of
 from sms_online.stream import Array, Block
 from sms_online.verdict.judged import JudgedEvaluation
 from sms_online.verdict.truncated import truncated
@@ -189,7 +189,7 @@ def evaluated(n: int, tolerance: float) -> JudgedEvaluation:
     system = parse_system(SKEW, "skew")
     tolerances = Tolerances.model_validate("none").model_copy(update={"truncation": tolerance})
     estimator = session_of(system.model_copy(update={"tolerances": tolerances}), [moved(n)])
-    return JudgedEvaluation(Statistics.of(estimator), estimator.estimate())
+    return JudgedEvaluation(statistics_of(estimator), estimator.estimate())
 
 
 def error_of(evaluation: JudgedEvaluation, name: str) -> tuple[float, float]:
@@ -235,7 +235,7 @@ def test_four_elements_read_at_two_markers_need_no_correction() -> None:
     system = with_elements(parse_system(SKEW, "skew"), 4)
     exactly = system.model_copy(update={"tolerances": Tolerances.model_validate("none")})
     estimator = session_of(exactly, [Block(read.t, names, read.values)])
-    evaluation = JudgedEvaluation(Statistics.of(estimator), estimator.estimate())
+    evaluation = JudgedEvaluation(statistics_of(estimator), estimator.estimate())
     assert evaluation.statistics.method == "smoother"
     error, bar = error_of(evaluation, TWIST)
     assert abs(error) < min(0.01, 1.96 * bar)

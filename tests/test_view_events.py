@@ -12,7 +12,7 @@ from rerun.chunk import RrdReader
 
 from sms_adapters.capture import CaptureWriter
 from sms_online.description.parse import parse_system
-from sms_online.pipeline.statistics import Statistics
+from sms_online.pipeline.snapshot import statistics_of
 from sms_online.stream import Block
 from sms_tools.cli import main
 from tests.axis import AXIS, DAMPING, INERTIA
@@ -51,7 +51,7 @@ def shown(session: Block, tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_pickled_statistics_say_the_same_after_an_event(session: Block) -> None:
     estimator = session_of(SYSTEM, [session])
     assert estimator.base.n == 3
-    assert elsewhere(Statistics.of(estimator)) == results_document(estimator, 0.0, [])
+    assert elsewhere(statistics_of(estimator)) == results_document(estimator, 0.0, [])
 
 
 @pytest.mark.slow

@@ -22,7 +22,7 @@ from sms_adapters.truth import write_truth
 from sms_online.effects.build import build_model
 from sms_online.model.base_parameters import find_base_parameters
 from sms_online.pipeline.estimator import Estimator
-from sms_online.pipeline.statistics import Statistics
+from sms_online.pipeline.snapshot import statistics_of
 from sms_online.stream import Block
 from sms_sim.sensors import Sensors
 from sms_sim.simulate import Simulation, sampled_blocks
@@ -125,7 +125,7 @@ def test_statistics_stay_those_of_when_they_were_taken(samples: Block) -> None:
     estimator = Estimator(system, samples.channels, "test")
     half = samples.t.size // 2
     estimator.push(Block(samples.t[:half], samples.channels, samples.values[:half]))
-    taken = Statistics.of(estimator)
+    taken = statistics_of(estimator)
     then = results_document(estimator, 0.0, [])
     estimator.push(Block(samples.t[half:], samples.channels, samples.values[half:]))
     assert elsewhere(taken) == then

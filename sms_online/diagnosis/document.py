@@ -20,7 +20,7 @@ from sms_online.effects.catalogue import ENTRIES, declarable, either, in_words, 
 from sms_online.evaluation import NORMAL_95, identifiable
 from sms_online.model.parameters import Parameter
 from sms_online.pipeline.estimator import Estimator
-from sms_online.pipeline.statistics import Statistics
+from sms_online.pipeline.snapshot import statistics_of
 from sms_online.result import residual_document, result_of
 from sms_online.stream import Array
 from sms_online.threads import one_blas_thread
@@ -112,7 +112,7 @@ def diagnosis_document(
 
 def evaluation(session: Estimator) -> JudgedEvaluation:
     """The evaluation of a session of a diagnosis."""
-    return JudgedEvaluation(Statistics.of(session), session.estimate())
+    return JudgedEvaluation(statistics_of(session), session.estimate())
 
 
 def _from_rows(diagnosis: Diagnosis) -> bool:

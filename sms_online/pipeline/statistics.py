@@ -1,7 +1,6 @@
 """What an estimator knows at an instant, as one record: whatever is said of a session is a function of it.
 
-Taking it costs microseconds: what is large is shared, for the estimator writes such arrays once. It can be pickled, and
-says the same in another process. A session cannot be continued from it, but from a checkpoint.
+It can be pickled, and says the same in another process. A session cannot be continued from it, but from a checkpoint.
 """
 
 from __future__ import annotations
@@ -30,13 +29,11 @@ from sms_online.pipeline.scale_free import ScaleFree
 from sms_online.pipeline.sensing import Sensing
 from sms_online.pipeline.synchronise import SyncCounters
 from sms_online.pipeline.tracker_bank import Reading, Suspected
-from sms_online.state import snapshot, state_copy
 from sms_online.stream import Array
 from sms_online.threads import one_blas_thread
 from sms_online.trackers.interface import Estimate, Prior, Tracker
 
 if TYPE_CHECKING:
-    from sms_online.pipeline.estimator import Estimator
     from sms_online.smoother.session import SmootherStatistics
 
 # What the estimate comes from.
@@ -138,33 +135,6 @@ class Statistics:
     joints: tuple[SquaredResidual, ...]
     momentum: MomentumStatistics | None
     smoother: SmootherStatistics | None
-
-    @staticmethod
-    def of(estimator: Estimator, at: float | None = None) -> Statistics:
-        """The statistics of now; nothing in them changes as the session goes on.
-
-        at: instant, s, that parameters which drift hold for; by default that of the newest sample.
-        """
-        momentum, smoother = estimator.momentum, estimator.smoother
-        return Statistics(
-            setup=estimator.setup,
-            method=estimator.method,
-            finished=estimator.finished,
-            samples=estimator.samples,
-            duration=estimator.duration,
-            dropped_rows=estimator.energy.state.dropped_rows,
-            counters=state_copy(estimator.counters),
-            outliers=estimator.outliers,
-            swaps=tuple(estimator.swaps),
-            last_time=estimator.last_time,
-            periods=estimator.periods.copy(),
-            events=tuple(estimator.events),
-            energy=snapshot(estimator.energy.tracker),
-            shared=state_copy(estimator.energy.shared),
-            joints=tuple(state_copy(estimator.energy.joint_residuals)),
-            momentum=None if momentum is None else momentum.statistics(estimator.end if at is None else at),
-            smoother=None if smoother is None else smoother.known,
-        )
 
     @one_blas_thread()
     def estimate(self) -> Estimate:

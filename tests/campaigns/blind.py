@@ -42,7 +42,7 @@ from sms_online.effects.spacecraft import TableTilt
 from sms_online.evaluation import Evaluation
 from sms_online.model.base_parameters import find_base_parameters
 from sms_online.pipeline.estimator import Estimator
-from sms_online.pipeline.statistics import Statistics
+from sms_online.pipeline.snapshot import statistics_of
 from sms_online.stream import Array, Block
 from sms_tools.archive.runner import Work
 from tests.campaigns.accuracy import flagged
@@ -253,7 +253,7 @@ def _declared(system: System, block: Block, effect: Effect) -> dict[str, float]:
 
 def _left(session: Estimator) -> dict[str, float]:
     """What the rows of a session leave, over the noise predicted for them, by kind of row."""
-    rows = Evaluation(Statistics.of(session)).residuals
+    rows = Evaluation(statistics_of(session)).residuals
     return {name: row.whitened for name, row in rows.items() if row.whitened is not None}
 
 

@@ -25,7 +25,7 @@ from scipy.spatial.transform import Rotation
 from sms_adapters.system_file import load_system
 from sms_online.description.schema import System, Tolerances
 from sms_online.evaluation import NORMAL_95
-from sms_online.pipeline.statistics import Statistics
+from sms_online.pipeline.snapshot import statistics_of
 from sms_online.stream import Array, Block
 from sms_online.verdict.judged import JudgedEvaluation
 from tests.campaigns.results import Record, campaign, complete, summed
@@ -215,7 +215,7 @@ def one_session(folder: Path, kind: str, tolerances: str, seed: int) -> Record:
     system = disguised(described, random).model_copy(update={"tolerances": stated})
     start = process_time()
     estimator = session_of(system, block.pieces(PIECE))
-    evaluation = JudgedEvaluation(Statistics.of(estimator))
+    evaluation = JudgedEvaluation(statistics_of(estimator))
     estimate, nuisances = evaluation.estimate, evaluation.statistics.setup.nuisances
     found = zip(nuisances, estimate.nuisances.tolist(), estimate.nuisances_std.tolist(), strict=True)
     said = {(each.name, each.where, each.part) for each in evaluation.calibration if each.certain}

@@ -25,7 +25,7 @@ from sms_online.diagnosis.document import diagnosis_document
 from sms_online.diagnosis.online import OnlineDiagnosis
 from sms_online.diagnosis.online_search import Immediate
 from sms_online.pipeline.estimator import Estimator
-from sms_online.pipeline.statistics import Statistics
+from sms_online.pipeline.snapshot import statistics_of
 from sms_online.priors import base_prior
 from sms_online.result import result_of
 from sms_online.stream import Block
@@ -89,7 +89,7 @@ def _results(name: str, estimator: Estimator, online: OnlineDiagnosis, pieces: l
         estimator.push(piece)
     estimator.finish()
     online.finish()
-    evaluation = JudgedEvaluation(Statistics.of(estimator), estimator.estimate(), online.discrepancies)
+    evaluation = JudgedEvaluation(statistics_of(estimator), estimator.estimate(), online.discrepancies)
     return leaves(name, result_of(evaluation, episodes=online.document()).document())
 
 

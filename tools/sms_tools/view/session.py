@@ -21,7 +21,7 @@ import numpy as np
 
 from sms_adapters.files import reading
 from sms_online.pipeline.estimator import Estimator
-from sms_online.pipeline.statistics import Statistics
+from sms_online.pipeline.snapshot import statistics_of
 from sms_online.stream import Block
 from sms_tools.interruption import Interruption
 from sms_tools.view.choice import Choice, chosen
@@ -135,7 +135,7 @@ class View:
         if self._handover is None:
             return
         if kind is None:
-            self._put(End(self._t, Statistics.of(self._estimator), self.circumstances()))
+            self._put(End(self._t, statistics_of(self._estimator), self.circumstances()))
             self._close(self._handover)
         self._handover.close()
         if self._handover.dropped:
@@ -155,7 +155,7 @@ class View:
     def _show(self, blocks: tuple[Block, ...], with_state: bool) -> None:
         assert self._handover is not None
         health = self._health() if with_state and self._health is not None else {}
-        state = Statistics.of(self._estimator) if with_state else None
+        state = statistics_of(self._estimator) if with_state else None
         circumstances = self.circumstances() if with_state else Circumstances()
         self._put(Picture(blocks, state, health, circumstances, perf_counter(), self._handover.dropped))
 
@@ -222,7 +222,7 @@ def open_view(
         with reading(directory, "a directory that can be made"):
             directory.mkdir(parents=True, exist_ok=True)
     start = Start(
-        statistics=Statistics.of(estimator),
+        statistics=statistics_of(estimator),
         channels=channels,
         choice=parsed,
         recording=recording,

@@ -1,0 +1,37 @@
+"""The statistics of a running session, taken from its estimator.
+
+Taking them costs microseconds: what is large is shared, for the estimator writes such arrays once.
+"""
+
+from __future__ import annotations
+
+from sms_online.pipeline.estimator import Estimator
+from sms_online.pipeline.statistics import Statistics
+from sms_online.state import snapshot, state_copy
+
+
+def statistics_of(estimator: Estimator, at: float | None = None) -> Statistics:
+    """The statistics of a session up to now; nothing in them changes as it goes on.
+
+    at: instant, s, that parameters which drift hold for; by default that of the newest sample.
+    """
+    momentum, smoother = estimator.momentum, estimator.smoother
+    return Statistics(
+        setup=estimator.setup,
+        method=estimator.method,
+        finished=estimator.finished,
+        samples=estimator.samples,
+        duration=estimator.duration,
+        dropped_rows=estimator.energy.state.dropped_rows,
+        counters=state_copy(estimator.counters),
+        outliers=estimator.outliers,
+        swaps=tuple(estimator.swaps),
+        last_time=estimator.last_time,
+        periods=estimator.periods.copy(),
+        events=tuple(estimator.events),
+        energy=snapshot(estimator.energy.tracker),
+        shared=state_copy(estimator.energy.shared),
+        joints=tuple(state_copy(estimator.energy.joint_residuals)),
+        momentum=None if momentum is None else momentum.statistics(estimator.end if at is None else at),
+        smoother=None if smoother is None else smoother.known,
+    )
