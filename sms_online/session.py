@@ -2,19 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
-from itertools import chain
-from pathlib import Path
+from collections.abc import Mapping, Sequence
 from time import perf_counter
 from typing import Any, overload
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from sms_online.capture import Capture, check_channels
+from sms_online.capture import check_channels
 from sms_online.checkpoint import Checkpoint
 from sms_online.cramer_rao import MotionRecord, session_bound
+from sms_online.data import Data, recorded_session
 from sms_online.description.channels import channels as known_channels
 from sms_online.description.given import Given, given_system
 from sms_online.description.schema import System, TrackerChoice
@@ -27,7 +25,7 @@ from sms_online.pipeline.snapshot import statistics_of
 from sms_online.priors import GivenPrior, base_prior, given_prior
 from sms_online.result import Result, result_of
 from sms_online.state import Stage
-from sms_online.stream import Array, Block, Source
+from sms_online.stream import Array, Block
 from sms_online.trackers.parse import parse_tracker
 from sms_online.truth import true_values
 from sms_online.verdict.judged import JudgedEvaluation
@@ -212,26 +210,6 @@ class Session:
         return Session(system, begun.pop("channels"), checkpoint=checkpoint, **begun)
 
 
-@dataclass(frozen=True)
-class Recorded:
-    """A recorded session: its samples, a name for messages, and what was recorded with them.
-
-    truth: of a simulation. checkpoint: what the session resumed from. searcher: of its diagnosis, from whether effects
-    are adopted; None for the session's own. trackers: those that were asked for in place of the system file's, if any.
-    """
-
-    source: Source
-    name: str
-    truth: Mapping[str, Any] | None = None
-    checkpoint: Checkpoint | None = None
-    searcher: Callable[[bool], Searcher | None] = lambda adopt: None
-    trackers: tuple[TrackerChoice, ...] = ()
-
-
-# What can be estimated from: a capture, the path of one, of a log or of a recording, or blocks in order of time.
-Data = Capture | Recorded | str | Path | Iterable[Block]
-
-
 def estimate(
     system: Given,
     data: Data,
@@ -268,40 +246,3 @@ def estimate(
     session.finish()
     least = None if record is None else session_bound(session.estimator, record)
     return session.evaluate(recorded.truth, least, source.warnings)
-
-
-def recorded_session(system: System, data: Data, folder: Path | None = None) -> Recorded:
-    """Data as a recorded session; InputError if a path cannot be read, or there are no blocks.
-
-    folder: of the system's file, where a log finds its DBC.
-    """
-    if isinstance(data, Recorded):
-        return data
-    if isinstance(data, Capture):
-        return Recorded(data, data.source, data.truth)
-    if isinstance(data, str | Path):
-        from sms_adapters.recorded import recorded_at
-        from sms_adapters.sources import open_source
-
-        return recorded_at(Path(data), open_source(Path(data), system, directory=folder))
-    return Recorded(_Blocks(data), "blocks")
-
-
-class _Blocks:
-    """Blocks as a source, once."""
-
-    def __init__(self, data: Iterable[Block]) -> None:
-        blocks = iter(data)
-        first = next(blocks, None)
-        if first is None:
-            raise InputError("blocks", "", "none", "at least one block of samples")
-        self.channels = first.channels
-        self._data, self._blocks = data, chain([first], blocks)
-
-    @property
-    def warnings(self) -> Sequence[str]:
-        """Warnings of the source so far."""
-        return getattr(self._data, "warnings", ())
-
-    def __iter__(self) -> Iterator[Block]:
-        return self._blocks

@@ -10,6 +10,7 @@ import numpy as np
 
 from sms_online.capture import check_channels
 from sms_online.cramer_rao import MotionRecord
+from sms_online.data import Data, recorded_session
 from sms_online.description.channels import channels as known_channels
 from sms_online.description.schema import System
 from sms_online.diagnosis.evidence import RANK_TOLERANCE
@@ -21,7 +22,6 @@ from sms_online.pipeline.estimator import Estimator
 from sms_online.pipeline.joint_balance import SquaredResidual
 from sms_online.result import Parameters
 from sms_online.row_types import joint_rows
-from sms_online.session import Data, recorded_session
 from sms_online.stream import Array
 from sms_online.tables import Tabled
 

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from sms_adapters.channel_check import UNIT_TOLERANCE, ChannelCheck, Remark
+from sms_online.data import Data, recorded_session
 from sms_online.description.channels import channel_unit, drive_channels, sensed_channels
 from sms_online.description.given import Given, given_system
 from sms_online.description.schema import System
@@ -18,7 +19,6 @@ from sms_online.errors import InputError
 from sms_online.pipeline.estimator import Estimator
 from sms_online.pipeline.outliers import LeftOut, Outliers
 from sms_online.sample_faults import PIECE, StuckGuard, unit_of_stamps
-from sms_online.session import Data, recorded_session
 from sms_online.stream import Array, Block
 from sms_online.tables import Tabled, html_table, text_table
 from sms_online.verdict.reasons import MANY_OUTLIERS

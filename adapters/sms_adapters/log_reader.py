@@ -13,7 +13,7 @@ from sms_adapters.capture import BLOCK
 from sms_adapters.log_bags import Bag, is_bag, open_bag
 from sms_adapters.log_lanes import Lane, Origin
 from sms_adapters.log_merge import LogMerge
-from sms_adapters.log_tables import Table, open_table
+from sms_adapters.log_tables import ARRAY_ENDINGS, PARQUET_ENDINGS, ParquetTable, Table
 from sms_adapters.log_topics import Topic
 from sms_online.description.explain import hint, nearest
 from sms_online.description.schema import System
@@ -148,3 +148,22 @@ class LogReader:
                 lanes.append(Lane(self._path, self._system, source, f"topic {topic}", of_topic))
                 self._topics.append(topic)
         return lanes
+
+
+def open_table(path: Path, on_bytes: Callable[[int], None] | None = None) -> Table:
+    """The table in a file, by the ending of its name; InputError where there is no such file.
+
+    on_bytes: called with the bytes consumed so far; where a format does not say, with the share of its rows.
+    """
+    if not path.is_file():
+        raise InputError(str(path), "", "no such file", "a readable file")
+    if path.suffix in PARQUET_ENDINGS:
+        return ParquetTable(path, on_bytes)
+    # Each of the others costs an import.
+    if path.suffix in ARRAY_ENDINGS:
+        from sms_adapters.log_arrays import ArrayTable
+
+        return ArrayTable(path, on_bytes)
+    from sms_adapters.log_csv import CsvTable
+
+    return CsvTable(path, on_bytes)

@@ -40,25 +40,6 @@ class Table(Protocol):
         """Stamps and values of the columns from the beginning; InputError for no such column, or no table."""
 
 
-def open_table(path: Path, on_bytes: Callable[[int], None] | None = None) -> Table:
-    """The table in a file, by the ending of its name; InputError where there is no such file.
-
-    on_bytes: called with the bytes consumed so far; where a format does not say, with the share of its rows.
-    """
-    # Each format costs an import that the others need not pay.
-    if not path.is_file():
-        raise InputError(str(path), "", "no such file", "a readable file")
-    if path.suffix in PARQUET_ENDINGS:
-        return ParquetTable(path, on_bytes)
-    if path.suffix in ARRAY_ENDINGS:
-        from sms_adapters.log_arrays import ArrayTable
-
-        return ArrayTable(path, on_bytes)
-    from sms_adapters.log_csv import CsvTable
-
-    return CsvTable(path, on_bytes)
-
-
 def missing(path: Path, name: str, names: Sequence[str]) -> InputError:
     """The error of a column that a file does not have."""
     near = nearest(name, names)

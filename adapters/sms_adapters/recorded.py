@@ -18,7 +18,7 @@ from sms_adapters.truth import read_truth, write_truth
 from sms_online.capture import Capture
 from sms_online.description.given import Given, given_system
 from sms_online.errors import InputError
-from sms_online.session import Recorded
+from sms_online.recorded import Recorded
 from sms_online.stream import Source
 
 

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from sms_online.cramer_rao import STEP, MotionRecord, cramer_rao_bound, session_bound
+from sms_online.data import Data, recorded_session
 from sms_online.description.channels import drive_channels, sensed_channels, wrench_channels
 from sms_online.description.given import Given, given_system
 from sms_online.description.schema import System
@@ -20,7 +21,6 @@ from sms_online.model.readings import readable_channels
 from sms_online.pipeline.estimator import Estimator
 from sms_online.priors import base_prior
 from sms_online.sensor_set import SensorSet, sensor_set
-from sms_online.session import Data, recorded_session
 from sms_online.stream import Array
 from sms_online.tables import Tabled
 from sms_sim.capture import Simulated

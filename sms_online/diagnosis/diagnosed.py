@@ -9,6 +9,7 @@ from html import escape
 from typing import Any
 
 from sms_online.capture import check_channels
+from sms_online.data import Data, recorded_session
 from sms_online.description.channels import channels as known_channels
 from sms_online.description.given import Given, given_system
 from sms_online.description.schema import System
@@ -21,8 +22,8 @@ from sms_online.errors import InputError
 from sms_online.model.base_parameters import find_base_parameters
 from sms_online.pipeline.estimator import Estimator
 from sms_online.priors import GivenPrior, base_prior, given_prior, with_estimates
+from sms_online.recorded import Recorded
 from sms_online.result import Finding, Parameter, Parameters
-from sms_online.session import Data, Recorded, recorded_session
 from sms_online.stream import Block
 from sms_online.tables import Documented, html_table, text_table
 from sms_online.tracker_results import Drift

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import math
 
-from sms_online.session import Recorded
+from sms_online.recorded import Recorded
 from sms_sim.bound import bound
 from sms_tools.exit_codes import NOTHING_DETERMINED, OK
 from sms_tools.report import say, table

@@ -7,7 +7,7 @@ import argparse
 from rich.text import Text
 
 from sms_adapters.data_check import check, joined
-from sms_online.session import Recorded
+from sms_online.recorded import Recorded
 from sms_tools.exit_codes import NOT_FIT, OK
 from sms_tools.report import say, table
 from sms_tools.results_file import results_directory, write_document

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from sms_adapters.runs import read_results
 from sms_online.description.schema import System
-from sms_online.session import Recorded
+from sms_online.recorded import Recorded
 from sms_online.validation import validate
 from sms_tools.exit_codes import OK
 from sms_tools.report import say, table
