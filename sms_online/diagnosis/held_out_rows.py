@@ -6,7 +6,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from sms_online.diagnosis.candidate_rows import CandidateRows, Key
+from sms_online.diagnosis.candidate_fits import Key
+from sms_online.diagnosis.candidate_rows import CandidateRows
 from sms_online.diagnosis.evidence import least_squares_without
 from sms_online.stream import Array
 
@@ -80,7 +81,7 @@ class HeldOutRows(CandidateRows):
         return np.asarray(np.sqrt((n - 1) / n * squares))[: squares.size - self.calibrated.count]
 
     def _forget(self) -> None:
-        """See `CandidateRows`."""
+        """See `CandidateFits`."""
         super()._forget()
         self._held_out: dict[Key, Array] = {}
         self._fitted: dict[Key, Array] = {}
