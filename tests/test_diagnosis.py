@@ -17,8 +17,9 @@ from sms_adapters.system_file import load_system
 from sms_online.description.parse import describe, parse_system
 from sms_online.description.schema import Effect, System
 from sms_online.diagnosis.candidates import CandidateColumns
-from sms_online.diagnosis.diagnose import Diagnosis, diagnose
+from sms_online.diagnosis.diagnose import diagnose
 from sms_online.diagnosis.document import coefficients, diagnosis_document
+from sms_online.diagnosis.search import Search
 from sms_online.effects.catalogue import parse_effect
 from sms_online.errors import InputError
 from sms_online.pipeline.momentum_windows import HOPS
@@ -51,15 +52,15 @@ def block_of(*texts: str) -> Block:
 
 
 @cache
-def diagnosed(*texts: str) -> Diagnosis:
+def diagnosed(*texts: str) -> Search:
     return diagnose(unlike(load_system("paper-planar")), [block_of(*texts)], "test", lambda estimator: None)
 
 
-def keys(diagnosis: Diagnosis) -> list[str]:
+def keys(diagnosis: Search) -> list[str]:
     return [finding.candidate.key for finding in diagnosis.findings]
 
 
-def reported(diagnosis: Diagnosis) -> dict[str, float]:
+def reported(diagnosis: Search) -> dict[str, float]:
     return {name: value for name, (value, _) in coefficients(diagnosis, diagnosis.findings[0]).items()}
 
 

@@ -12,8 +12,9 @@ import pytest
 
 from sms_adapters.system_file import load_system
 from sms_online.description.schema import Effect
-from sms_online.diagnosis.diagnose import Diagnosis, diagnose
+from sms_online.diagnosis.diagnose import diagnose
 from sms_online.diagnosis.document import diagnosis_document
+from sms_online.diagnosis.search import Search
 from sms_online.stream import Block
 from sms_sim.simulate import sampled_blocks, simulate
 from tests.campaigns.calibration import Samples, clock, torque_gain, tracked_point
@@ -32,7 +33,7 @@ def exact(friction: float) -> Block:
     return Block(t, blocks[0].channels, values)
 
 
-def diagnosed(friction: float, *imperfections: Samples) -> Diagnosis:
+def diagnosed(friction: float, *imperfections: Samples) -> Search:
     system, true = load_system("paper-planar"), exact(friction)
     block = Block(true.t, true.channels, true.values.copy())
     random = np.random.default_rng(1)
@@ -41,7 +42,7 @@ def diagnosed(friction: float, *imperfections: Samples) -> Diagnosis:
     return diagnose(disguised(system, random), [noisy_session(system, block, "B", 3)], "test", lambda _: None)
 
 
-def keys(found: Diagnosis) -> list[str]:
+def keys(found: Search) -> list[str]:
     return [finding.candidate.key for finding in found.findings]
 
 

@@ -18,9 +18,10 @@ from sms_adapters.system_file import load_system
 from sms_online.description.channels import channels
 from sms_online.description.parse import parse_system
 from sms_online.description.schema import Effect, Fitted
-from sms_online.diagnosis.diagnose import Diagnosis, diagnose
+from sms_online.diagnosis.diagnose import diagnose
 from sms_online.diagnosis.document import diagnosis_document
 from sms_online.diagnosis.force_curves import added_variables, force_curves
+from sms_online.diagnosis.search import Search
 from sms_online.diagnosis.unexplained import describe_residual
 from sms_online.effects.build import build_model
 from sms_online.truth import true_values
@@ -38,23 +39,23 @@ COULOMB = 0.2  # N m
 TURNING = 0.8
 
 
-def diagnosed(coulomb: float) -> Diagnosis:
+def diagnosed(coulomb: float) -> Search:
     return diagnose(parse_system(AXIS, "axis"), [axis_block(coulomb)], "test", lambda estimator: None)
 
 
 @pytest.fixture(scope="module")
-def diagnosis() -> Diagnosis:
+def diagnosis() -> Search:
     """Of the axis with Coulomb friction."""
     return diagnosed(COULOMB)
 
 
-def page_of(diagnosis: Diagnosis, directory: Path, added: list[str]) -> tuple[Document, str]:
+def page_of(diagnosis: Search, directory: Path, added: list[str]) -> tuple[Document, str]:
     document = diagnosis_document(diagnosis, ["a warning with <angle brackets>"], None)
     return document, write_diagnosis(directory, document, diagnosis, "run.csv", added).read_text()
 
 
 @pytest.mark.slow
-def test_the_curve_from_the_data_is_the_friction_that_was_there(diagnosis: Diagnosis) -> None:
+def test_the_curve_from_the_data_is_the_friction_that_was_there(diagnosis: Search) -> None:
     (curve,) = force_curves(diagnosis)
     assert [effect.name for effect in curve.effects] == ["coulomb_friction"]
     moving = np.abs(curve.at) > TURNING
@@ -63,7 +64,7 @@ def test_the_curve_from_the_data_is_the_friction_that_was_there(diagnosis: Diagn
     assert added_variables(diagnosis) == []
 
 
-def test_the_page_is_whole_and_well_formed(diagnosis: Diagnosis, tmp_path: Path) -> None:
+def test_the_page_is_whole_and_well_formed(diagnosis: Search, tmp_path: Path) -> None:
     document, page = page_of(diagnosis, tmp_path, ['name = "coulomb_friction" # & more'])
     assert not re.search(r"src=|(href=\"|url\()(?!#)|https?://|@import|<script", page)
     drawings = re.findall(r"<svg.*?</svg>", page, re.DOTALL)
@@ -80,7 +81,7 @@ def test_the_page_is_whole_and_well_formed(diagnosis: Diagnosis, tmp_path: Path)
         assert p["name"] in page.replace("<wbr>", "")
 
 
-def test_candidates_are_drawn_by_the_share_that_they_explain(diagnosis: Diagnosis, tmp_path: Path) -> None:
+def test_candidates_are_drawn_by_the_share_that_they_explain(diagnosis: Search, tmp_path: Path) -> None:
     _, page = page_of(diagnosis, tmp_path, [])
     drawn = [float(width) for width in re.findall(r'class="share.*?width: ([\d.]+)%', page)]
     assert drawn == sorted(drawn, reverse=True)
@@ -91,7 +92,7 @@ def test_candidates_are_drawn_by_the_share_that_they_explain(diagnosis: Diagnosi
     assert len(drawn) < len(diagnosis.ranking)
 
 
-def test_what_was_found_has_no_nominal_value(diagnosis: Diagnosis, tmp_path: Path) -> None:
+def test_what_was_found_has_no_nominal_value(diagnosis: Search, tmp_path: Path) -> None:
     document, page = page_of(diagnosis, tmp_path, [])
     nominal = re.findall(r'<td data-label="nominal">(.*?)</td>', page)
     stated = {p.name: p.nominal for p in diagnosis.estimator_before.base.parameters}
@@ -101,7 +102,7 @@ def test_what_was_found_has_no_nominal_value(diagnosis: Diagnosis, tmp_path: Pat
 
 
 @pytest.mark.long
-def test_the_same_session_gives_the_same_page(diagnosis: Diagnosis, tmp_path: Path) -> None:
+def test_the_same_session_gives_the_same_page(diagnosis: Search, tmp_path: Path) -> None:
     assert page_of(diagnosis, tmp_path, [])[1] == page_of(diagnosed(COULOMB), tmp_path, [])[1]
 
 
@@ -115,7 +116,7 @@ def test_a_clean_session_has_a_page_without_effects(tmp_path: Path) -> None:
     assert "none explains more of the residual than chance" in page
 
 
-def test_what_nothing_explains_is_marked_and_drawn(diagnosis: Diagnosis, tmp_path: Path) -> None:
+def test_what_nothing_explains_is_marked_and_drawn(diagnosis: Search, tmp_path: Path) -> None:
     before, rows = diagnosis.before, diagnosis.attempt.rows
     unexplained = describe_residual(rows, diagnosis.attempt.tracing.columns([]), before.residual, before.test)
     nothing = {"verdict": "unexplained", "findings": [], "chosen": [], "after": before}

@@ -12,8 +12,8 @@ from sms_adapters.system_file import load_system
 from sms_online.description.schema import Effect, System
 from sms_online.diagnosis import exact_links
 from sms_online.diagnosis.candidate import Candidate
-from sms_online.diagnosis.diagnose import predicts_worse
 from sms_online.diagnosis.hypothesis import verdict
+from sms_online.diagnosis.improvement import predicts_worse
 from sms_online.diagnosis.record import Segment
 from sms_online.diagnosis.residuals import RowResidual
 from sms_online.diagnosis.reversals import Reversals

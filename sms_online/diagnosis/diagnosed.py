@@ -13,10 +13,10 @@ from sms_online.data import Data, recorded_session
 from sms_online.description.channels import channels as known_channels
 from sms_online.description.given import Given, given_system
 from sms_online.description.schema import System
-from sms_online.diagnosis.diagnose import Diagnosis as Search
 from sms_online.diagnosis.diagnose import diagnose as search_for_effects
 from sms_online.diagnosis.document import diagnosis_document, trust_of
 from sms_online.diagnosis.mistakes import Mistake
+from sms_online.diagnosis.search import Search
 from sms_online.effects.build import build_model
 from sms_online.errors import InputError
 from sms_online.model.base_parameters import find_base_parameters

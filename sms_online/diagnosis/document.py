@@ -11,10 +11,10 @@ import numpy as np
 from sms_online.description.schema import Effect
 from sms_online.diagnosis.attempt import Attempt, Part
 from sms_online.diagnosis.candidate import Finding
-from sms_online.diagnosis.diagnose import Diagnosis
 from sms_online.diagnosis.drifts import sentence, summary_of, trust_with
 from sms_online.diagnosis.hypothesis import LARGEST_SHARE_LEFT
 from sms_online.diagnosis.reported import Coefficients, of_constant, of_unknowns
+from sms_online.diagnosis.search import Search
 from sms_online.diagnosis.shape import slopes
 from sms_online.effects.catalogue import ENTRIES, declarable, either, in_words, traits_of
 from sms_online.evaluation import NORMAL_95, identifiable
@@ -37,7 +37,7 @@ NO_RIVAL = {"next": None, "next_held_out_improvement": None}
 
 @one_blas_thread()
 def diagnosis_document(
-    diagnosis: Diagnosis, warnings: Sequence[str] = (), truth: Mapping[str, float] | None = None
+    diagnosis: Search, warnings: Sequence[str] = (), truth: Mapping[str, float] | None = None
 ) -> dict[str, Any]:
     """diagnosis.json.
 
@@ -115,12 +115,12 @@ def evaluation(session: Estimator) -> JudgedEvaluation:
     return JudgedEvaluation(statistics_of(session), session.estimate())
 
 
-def _from_rows(diagnosis: Diagnosis) -> bool:
+def _from_rows(diagnosis: Search) -> bool:
     """Whether parameters come from the rows of the diagnosis, not from a session."""
     return diagnosis.attempt.by_rows or diagnosis.partial
 
 
-def _after(diagnosis: Diagnosis, session: JudgedEvaluation) -> Trust:
+def _after(diagnosis: Search, session: JudgedEvaluation) -> Trust:
     """May the parameters after be trusted?"""
     if not _from_rows(diagnosis):
         return session.trust
@@ -129,7 +129,7 @@ def _after(diagnosis: Diagnosis, session: JudgedEvaluation) -> Trust:
     return judge(Evidence((sum(known), len(known)), residual=_part(diagnosis.after.fit)))
 
 
-def trust_of(diagnosis: Diagnosis, after: JudgedEvaluation | None = None) -> Trust:
+def trust_of(diagnosis: Search, after: JudgedEvaluation | None = None) -> Trust:
     """May the parameters after be trusted, and the system file?
 
     after: the evaluation of the session with what was found, where it is at hand.
@@ -155,12 +155,12 @@ def trust_of(diagnosis: Diagnosis, after: JudgedEvaluation | None = None) -> Tru
     return Trust("doubt", (*wrong, *(rest.grounds if rest.level != "trust" else ())), grave=True)
 
 
-def summary(diagnosis: Diagnosis) -> str:
+def summary(diagnosis: Search) -> str:
     """The verdict in a sentence, after one for each mistake."""
     return f"Partial, the search was interrupted. {_whole(diagnosis)}" if diagnosis.partial else _whole(diagnosis)
 
 
-def _whole(diagnosis: Diagnosis) -> str:
+def _whole(diagnosis: Search) -> str:
     wrong = ["".join((m.sentence[:1].upper(), m.sentence[1:], ".")) for m in diagnosis.mistakes]
     for k, mistake in enumerate(diagnosis.mistakes):
         if mistake.or_else:
@@ -171,7 +171,7 @@ def _whole(diagnosis: Diagnosis) -> str:
     return " ".join((*wrong, *(["With that undone:"] if wrong else []), _of_effects(diagnosis)))
 
 
-def _of_effects(diagnosis: Diagnosis) -> str:
+def _of_effects(diagnosis: Search) -> str:
     """What is missing in a sentence."""
     if diagnosis.drifts:
         return summary_of(diagnosis.drifts)
@@ -203,7 +203,7 @@ def _share(left: float) -> str:
     return f"{100.0 * left:.0f} %" if left < 1.0 else "all"
 
 
-def _near(diagnosis: Diagnosis) -> bool:
+def _near(diagnosis: Search) -> bool:
     """Whether the effects named leave little, though it is no noise and no error of their laws."""
     return bool(_named(diagnosis)) and diagnosis.left <= LARGEST_SHARE_LEFT
 
@@ -213,12 +213,12 @@ def _times(value: float) -> str:
     return f"{value:.3g}" if value < 1000.0 else f"{value:,.0f}"
 
 
-def _named(diagnosis: Diagnosis) -> list[dict[str, str]]:
+def _named(diagnosis: Search) -> list[dict[str, str]]:
     found = [{"name": f.candidate.effect.name, "where": f.candidate.effect.where} for f in diagnosis.findings]
     return [{"name": each["name"], "where": each["where"]} for each in _by_comparison(diagnosis)] + found
 
 
-def _named_in_words(diagnosis: Diagnosis, named: Mapping[str, str]) -> str:
+def _named_in_words(diagnosis: Search, named: Mapping[str, str]) -> str:
     other = either(Effect(name=named["name"], where=named["where"]), diagnosis.after.system)
     return f"{named['name']} at {named['where']}" + (f" or {other}" if other else "")
 
@@ -227,7 +227,7 @@ def _part(part: Part) -> dict[str, Residual]:
     return {row: Residual(part.relative.get(row), whitened) for row, whitened in part.whitened.items()}
 
 
-def _effect(diagnosis: Diagnosis, finding: Finding) -> dict[str, Any]:
+def _effect(diagnosis: Search, finding: Finding) -> dict[str, Any]:
     effect = finding.candidate.effect
     entry, found = ENTRIES[effect.name], coefficients(diagnosis, finding)
     units = declarable(entry, diagnosis.after.system)
@@ -253,13 +253,13 @@ def _effect(diagnosis: Diagnosis, finding: Finding) -> dict[str, Any]:
     }
 
 
-def _said(diagnosis: Diagnosis, effect: Effect, found: Coefficients) -> str:
+def _said(diagnosis: Search, effect: Effect, found: Coefficients) -> str:
     if traits_of(effect).learned:
         return _curve_in_words(diagnosis, effect)
     return in_words(effect, diagnosis.after.system, {name: value for name, (value, _) in found.items()})
 
 
-def _curve_in_words(diagnosis: Diagnosis, curve: Effect) -> str:
+def _curve_in_words(diagnosis: Search, curve: Effect) -> str:
     """What a curve takes off the torque of its joint, blocks predicted from the others."""
     relative = [diagnosis.before.holdout.relative, *(step.relative for step in diagnosis.steps)]
     taken = [step.taken for step in diagnosis.steps].index(f"{curve.name}@{curve.where}")
@@ -271,7 +271,7 @@ def _curve_in_words(diagnosis: Diagnosis, curve: Effect) -> str:
     )
 
 
-def _undecided(diagnosis: Diagnosis) -> list[Reason]:
+def _undecided(diagnosis: Search) -> list[Reason]:
     """Findings that may as well be their opposite elsewhere."""
     system = diagnosis.after.system
     found = [(finding, either(finding.candidate.effect, system)) for finding in diagnosis.findings]
@@ -282,7 +282,7 @@ def _undecided(diagnosis: Diagnosis) -> list[Reason]:
     ]
 
 
-def _by_comparison(diagnosis: Diagnosis) -> list[dict[str, Any]]:
+def _by_comparison(diagnosis: Search) -> list[dict[str, Any]]:
     """Effects that replace all rows, found by comparing whole descriptions: late sensors, kinematics of links."""
     late = [
         {
@@ -325,7 +325,7 @@ def _by_comparison(diagnosis: Diagnosis) -> list[dict[str, Any]]:
     return [*late, *kinematics]
 
 
-def coefficients(diagnosis: Diagnosis, finding: Finding) -> Coefficients:
+def coefficients(diagnosis: Search, finding: Finding) -> Coefficients:
     """What a person reads of an effect."""
     effect, attempt = finding.candidate.effect, diagnosis.attempt
     for k, (constant, candidate) in enumerate(zip(attempt.constants, attempt.fixed, strict=True)):

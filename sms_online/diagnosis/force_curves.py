@@ -15,8 +15,8 @@ import numpy as np
 from sms_online.description.schema import Effect
 from sms_online.diagnosis.attempt import Attempt
 from sms_online.diagnosis.candidate import Candidate
-from sms_online.diagnosis.diagnose import Diagnosis
 from sms_online.diagnosis.evidence import basis, free_of, gain
+from sms_online.diagnosis.search import Search
 from sms_online.diagnosis.splines import DEGREE, Variable, design, spline_columns
 from sms_online.diagnosis.weak_windows import Motion
 from sms_online.effects.base import position
@@ -68,7 +68,7 @@ class AddedVariable:
     std: Array
 
 
-def force_curves(diagnosis: Diagnosis) -> list[ForceCurve]:
+def force_curves(diagnosis: Search) -> list[ForceCurve]:
     """Curves of the effects found that have a variable of their own; those of the same joint and variable share one."""
     attempt = diagnosis.attempt
     groups: dict[tuple[str, Curve, float | None], list[int]] = {}
@@ -80,7 +80,7 @@ def force_curves(diagnosis: Diagnosis) -> list[ForceCurve]:
     return [_curve(diagnosis, where, curve, order, own) for (where, curve, order), own in groups.items()]
 
 
-def _curve(diagnosis: Diagnosis, where: str, curve: Curve, order: float | None, own: list[int]) -> ForceCurve:
+def _curve(diagnosis: Search, where: str, curve: Curve, order: float | None, own: list[int]) -> ForceCurve:
     name, jumps = curve.over, curve.over == "motor speed"
     attempt, after = diagnosis.attempt, diagnosis.after
     rows, candidates = attempt.rows, attempt.tracing.candidates
@@ -145,7 +145,7 @@ def _knots(values: Array, jumps: bool) -> tuple[Array, Array]:
     return np.concatenate([*knots, np.full(DEGREE + 1, high)]), np.unique(np.concatenate(points))
 
 
-def _law(diagnosis: Diagnosis, own: list[int], variable: Variable, at: Array) -> Array:
+def _law(diagnosis: Search, own: list[int], variable: Variable, at: Array) -> Array:
     """Force (P,) of the effects at values of their variable, from where the session came nearest to them."""
     attempt = diagnosis.attempt
     layout = attempt.rows.model.layout
@@ -167,7 +167,7 @@ def _law(diagnosis: Diagnosis, own: list[int], variable: Variable, at: Array) ->
     return np.interp(at, seen, np.concatenate(law)[first])
 
 
-def _coefficients(diagnosis: Diagnosis, k: int) -> Array:
+def _coefficients(diagnosis: Search, k: int) -> Array:
     """Coefficients (c,) of one of the candidates chosen."""
     attempt = diagnosis.attempt
     before = [*attempt.fixed, *(attempt.tracing.candidates[j] for j in diagnosis.chosen[: diagnosis.chosen.index(k)])]
@@ -175,7 +175,7 @@ def _coefficients(diagnosis: Diagnosis, k: int) -> Array:
     return diagnosis.after.solution[start : start + len(attempt.tracing.candidates[k].parameters)]
 
 
-def added_variables(diagnosis: Diagnosis) -> list[AddedVariable]:
+def added_variables(diagnosis: Search) -> list[AddedVariable]:
     """Rows of the effects found that have no curve."""
     attempt, described = diagnosis.attempt, diagnosis.described
     chosen = [attempt.tracing.candidates[k] for k in diagnosis.chosen]

@@ -18,8 +18,9 @@ from time import process_time
 
 from sms_adapters.system_file import load_system
 from sms_online.description.parse import describe
-from sms_online.diagnosis.diagnose import Diagnosis, diagnose
+from sms_online.diagnosis.diagnose import diagnose
 from sms_online.diagnosis.document import coefficients
+from sms_online.diagnosis.search import Search
 from sms_online.pipeline.estimator import Estimator
 from sms_online.stream import Block
 from tests.campaigns.results import Record, absolute, campaign, complete, summed
@@ -83,7 +84,7 @@ def diagnosed(cache: Path, name: str) -> Record:
     return {**_record(case, found), "seconds": process_time() - begin}
 
 
-def _record(case: Case, found: Diagnosis) -> Record:
+def _record(case: Case, found: Search) -> Record:
     """What was found, and how far base parameters are off before and after, %."""
     keys = [finding.candidate.key for finding in found.findings]
     declared = [f"{effect.name}@{effect.where}" for effect in found.after.system.effects]

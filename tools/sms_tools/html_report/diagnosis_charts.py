@@ -7,8 +7,8 @@ from collections.abc import Sequence
 import numpy as np
 
 from sms_online.diagnosis.attempt import State
-from sms_online.diagnosis.diagnose import Diagnosis
 from sms_online.diagnosis.force_curves import AddedVariable, ForceCurve, added_variables, force_curves
+from sms_online.diagnosis.search import Search
 from sms_online.diagnosis.weak_windows import Windows
 from sms_online.row_types import row_types
 from sms_online.stream import Array
@@ -23,7 +23,7 @@ SHOWN = 0.99
 TIME = "time, s"
 
 
-def residual_charts(diagnosis: Diagnosis) -> list[Chart]:
+def residual_charts(diagnosis: Search) -> list[Chart]:
     """Charts of each row type's worst coordinate, before and after; noise close up where it was far off."""
     before, after = diagnosis.before, diagnosis.after
     rows, rows_after = diagnosis.described.rows, diagnosis.attempt.rows
@@ -66,7 +66,7 @@ def _residual(state: State, windows: Windows, t: Array, speed: int, color: str) 
     return Series("", np.insert(t, starts, t[starts]), y, color=color)
 
 
-def law_charts(diagnosis: Diagnosis) -> list[Chart]:
+def law_charts(diagnosis: Search) -> list[Chart]:
     """Charts of each effect found: the force in the data over what it depends on, or its rows, beside the law."""
     charts = [_curve_chart(curve) for curve in force_curves(diagnosis)]
     charts += [_added_chart(added) for added in added_variables(diagnosis)]

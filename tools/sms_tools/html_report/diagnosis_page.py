@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from markupsafe import Markup
 
-from sms_online.diagnosis.diagnose import Diagnosis
+from sms_online.diagnosis.search import Search
 from sms_tools.found_effects import cells_of, look_alikes, why
 from sms_tools.html_report.arm_drawing import marked_arm
 from sms_tools.html_report.diagnosis_charts import AFTER, BEFORE, law_charts, residual_charts
@@ -26,9 +26,7 @@ LISTED = 12
 WAY_POINTS = 300
 
 
-def write_diagnosis(
-    directory: Path, document: Document, diagnosis: Diagnosis, source: str, added: Sequence[str]
-) -> Path:
+def write_diagnosis(directory: Path, document: Document, diagnosis: Search, source: str, added: Sequence[str]) -> Path:
     """Write diagnosis.html beside diagnosis.json, whose content `document` is.
 
     source: the capture. added: lines that the system file gains. Raises InputError where the file cannot be written.
@@ -65,7 +63,7 @@ def write_diagnosis(
     )
 
 
-def _nominal(diagnosis: Diagnosis) -> dict[str, float]:
+def _nominal(diagnosis: Search) -> dict[str, float]:
     """What the system file states of the parameters after, by name."""
     before, after = (each.base.parameters for each in (diagnosis.estimator_before, diagnosis.estimator_after))
     # What was found is not described.
@@ -73,7 +71,7 @@ def _nominal(diagnosis: Diagnosis) -> dict[str, float]:
     return {p.name: p.nominal for p in after if p.nominal and ("@" not in p.name or p.name in described)}
 
 
-def _arm(document: Document, diagnosis: Diagnosis) -> Markup:
+def _arm(document: Document, diagnosis: Search) -> Markup:
     """The arm in the middle of the session, with the effects' numbers at their places."""
     rows = diagnosis.attempt.rows
     # Windows of each filter's width hold another part of the motion.
@@ -91,7 +89,7 @@ def _arm(document: Document, diagnosis: Diagnosis) -> Markup:
     return marked_arm(Scene(rows.model), x, len(x) // 2, {place: ", ".join(texts) for place, texts in marks.items()})
 
 
-def _candidates(document: Document, diagnosis: Diagnosis) -> list[dict[str, Any]]:
+def _candidates(document: Document, diagnosis: Search) -> list[dict[str, Any]]:
     """The best by what each alone explains of the whole residual, and those found; none that explains nothing."""
     numbers = {(e["name"], e["where"]): n for n, e in enumerate(document["effects"], start=1)}
     like: dict[str, list[str]] = {}

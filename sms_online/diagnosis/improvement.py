@@ -1,0 +1,101 @@
+"""What a search has found, improved: constants in place of effects, and nothing that predicts torques worse."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from functools import partial
+
+import numpy as np
+
+from sms_online.description.schema import Effect, System
+from sms_online.diagnosis.attempt import SEARCHED, Attempt, Case, Progress, State
+from sms_online.diagnosis.candidate import Finding
+from sms_online.diagnosis.constants import possible
+from sms_online.diagnosis.folds import LEAST_RISE
+from sms_online.diagnosis.hypothesis import corrections
+from sms_online.stream import Array
+
+# What is found may leave so many times of the held-out torque that the description leaves: of rows without a torque it
+# may explain all, and torques of noise differ by less.
+WORSE = 1.1
+
+
+def _trial(attempt: Attempt, forces: Sequence[Effect], constants: Sequence[Effect], beta: Array) -> Attempt:
+    return attempt.trial(attempt.system, constants, beta, forces)
+
+
+def with_constants(
+    case: Case, attempt: Attempt, chosen: list[int], bare: State, progress: Progress
+) -> tuple[Attempt, list[int], list[Finding]]:
+    """The attempt with constants in place of the effects found that become such, what is found beside them, and these.
+
+    Samples are corrected by the constants, and what these leave, or have hidden, is searched again; not by those with
+    which held-out torques are predicted worse than by the description alone, whose state is `bare`.
+    """
+    n = attempt.rows.base.n
+    findings: list[Finding] = []
+    while any(attempt.tracing.candidates[k].constant for k in chosen):
+        progress("improving constants", SEARCHED)
+        before = attempt, [k for k in chosen if not attempt.tracing.candidates[k].constant]
+        findings += [attempt.tracing.finding(chosen, k) for k in chosen if attempt.tracing.candidates[k].constant]
+        solution = attempt.solution(chosen)
+        fresh, forces = attempt.found(chosen, solution)
+        constants, beta = [*attempt.constants, *fresh], solution[:n]
+        trial = partial(_trial, attempt, forces)
+        for correction in corrections(trial, constants, beta):
+            constants, beta = correction.constants, correction.solution[:n]
+            if correction.converged or case.stop():
+                break
+        keys = {(effect.name, effect.where) for effect in constants}
+        constants = [effect for effect in constants if possible(effect, case.session.system.sample_rate)]
+        tried = [candidate.effect for candidate in attempt.tracing.candidates]
+        others = [effect for effect in tried if (effect.name, effect.where) not in keys]
+        attempt = Attempt(case, attempt.system, constants, beta, others)
+        # Forces that only stood for a constant have nothing left to explain.
+        chosen = attempt.search(forces)
+        attempt.conclude(chosen)
+        if predicts_worse(bare.holdout.relative, attempt.state(chosen).holdout.relative):
+            attempt, chosen = before
+            break
+    standing = {(effect.name, effect.where) for effect in attempt.constants}
+    findings = [f for f in findings if (f.candidate.effect.name, f.candidate.effect.where) in standing]
+    return attempt, chosen, findings
+
+
+def explaining_alone(case: Case, system: System, attempt: Attempt, chosen: Sequence[int]) -> list[Effect]:
+    """Effects found beside a sensor's lag that leave no more than noise without it; none where they leave more.
+
+    Few windows do not distinguish a lag from what was not yet in the model when it was looked for.
+    """
+    forces = [attempt.tracing.candidates[k].effect for k in chosen]
+    if not forces or attempt.tracing.freed:
+        return []
+    alone = Attempt(case, system, candidates=forces)
+    beyond = any(row.beyond for row in alone.test(range(len(alone.tracing.candidates))).values())
+    return [] if beyond else forces
+
+
+def no_joint_worse(attempt: Attempt, chosen: list[int]) -> list[int]:
+    """Those chosen, or the last of the search's steps to them after which no joint's held-out torque is predicted worse
+    than without any: what serves one axis by way of the masses may harm another.
+
+    All of those chosen where rows leave no more than noise: by that torques differ.
+    """
+    if not attempt.tracing.freed:
+        return chosen
+    before = attempt.state([]).holdout.relative
+    for step in (chosen, *(step for _, step in reversed(attempt.tracing.path) if step != chosen)):
+        after = attempt.state(step).holdout.relative
+        if all(after[row] <= (1.0 + LEAST_RISE) * before[row] for row in before.keys() & after.keys()):
+            return step
+    return []
+
+
+def predicts_worse(before: Mapping[str, float], after: Mapping[str, float]) -> bool:
+    """Whether shares of the torque left of blocks that were not fitted, by joint, are larger after than before.
+
+    Corrections are found to first order; taken whole, they may leave more than they explained.
+    """
+    both = [(before[row], after[row]) for row in before.keys() & after.keys()]
+    squares = np.sum(np.square(both), axis=0) if both else np.zeros(2)
+    return bool(squares[1] > WORSE**2 * squares[0])

@@ -1,0 +1,64 @@
+"""What a search of a whole capture has found, as one record."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+from sms_online.calibration.found import Calibration
+from sms_online.diagnosis.attempt import Attempt, State, Step
+from sms_online.diagnosis.candidate import Finding, Ranked
+from sms_online.diagnosis.hypothesis import share_left
+from sms_online.diagnosis.late_sensors import LateSensor
+from sms_online.diagnosis.mistakes import Mistake
+from sms_online.diagnosis.unexplained import Unexplained
+from sms_online.effects.build import build_model
+from sms_online.model.model import Model
+from sms_online.pipeline.estimator import Estimator
+from sms_online.tracker_results import Drift
+
+
+@dataclass(frozen=True)
+class Search:
+    """What was found.
+
+    verdict: "clean", "named" or "unexplained". partial: the search was ended before it was done, and parameters after
+    are those of its rows. mistakes: of wiring, units and signs, undone in all that follows.
+    calibration: what the description is off by, beyond its tolerances, that no effect of the catalogue says.
+    findings: constants first, then the effects that are unknowns of π.
+    late: sensors far behind the others, whose lag the description of the last attempt states. steps: of the last
+    search, its effects one after the other.
+    described, attempt: first and last description against the samples; chosen: of the last one's candidates.
+    estimator_before, estimator_after: sessions of the two systems over the whole capture; the first one again where the
+    search is partial or parameters come from its own rows. drifts: parameters that drift, which the second follows;
+    nothing else is searched then.
+    """
+
+    verdict: str
+    partial: bool
+    mistakes: tuple[Mistake, ...]
+    calibration: tuple[Calibration, ...]
+    findings: list[Finding]
+    late: list[LateSensor]
+    ranking: list[Ranked]
+    described: Attempt
+    attempt: Attempt
+    steps: list[Step]
+    chosen: list[int]
+    before: State
+    after: State
+    estimator_before: Estimator
+    estimator_after: Estimator
+    unexplained: Unexplained | None
+    drifts: tuple[Drift, ...] = ()
+
+    @property
+    def left(self) -> float:
+        """Share of what was beyond noise that is left with what was found."""
+        return share_left(self.before.excess, self.after.excess)
+
+    @cached_property
+    def model(self) -> Model:
+        """Of the system with what was found, whether or not there was a session of it."""
+        same = self.estimator_after.system == self.after.system
+        return self.estimator_after.model if same else build_model(self.after.system)
