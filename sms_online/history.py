@@ -17,6 +17,7 @@ from sms_online.state import Stage, State
 from sms_online.stream import Array
 from sms_online.tables import finite
 from sms_online.trackers.interface import Estimate
+from sms_online.triangle import symmetric, upper
 
 if TYPE_CHECKING:
     import pandas
@@ -56,11 +57,7 @@ class History:
     @property
     def covariance(self) -> Array:
         """Covariance (N, n, n), NaN of what was not determined."""
-        n = len(self.parameters)
-        i, j = np.triu_indices(n)
-        out = np.empty((self.t.size, n, n))
-        out[:, i, j] = out[:, j, i] = self.upper
-        return out
+        return symmetric(self.upper)
 
     def document(self) -> dict[str, Any]:
         """As results.json holds it: evenly thinned to `MOST_WRITTEN` instants, the last one kept."""
@@ -155,11 +152,10 @@ class Recorder(Stage, Observer):
     def _look(self, t: float) -> None:
         now = Evaluation(statistics_of(self._estimator, t))
         self.latest = t, now
-        upper = np.triu_indices(now.base.n)
         packed = [np.array((t, now.base.n))]
         for estimate, std in now.estimates:
             known = np.isfinite(std)
-            packed += [np.where(known, estimate.pi, np.nan), reported_covariance(estimate, std)[upper]]
+            packed += [np.where(known, estimate.pi, np.nan), upper(reported_covariance(estimate, std))]
         self.state.instants = [*self.state.instants, np.concatenate(packed)]
 
     @property

@@ -19,6 +19,7 @@ from sms_online.model.base_parameters import BaseParameters, find_base_parameter
 from sms_online.result import Parameter, Result
 from sms_online.stream import Array
 from sms_online.trackers.interface import Prior
+from sms_online.triangle import symmetric
 
 # --prior trusts a maker's nominal value to a tenth.
 NOMINAL_RELATIVE_STD = 0.1
@@ -57,9 +58,7 @@ def base_prior(system: System, base: BaseParameters, prior: bool | Mapping[str, 
         return stated
     earlier = find_base_parameters(build_model(System.model_validate(prior["system"])))
     names = [each["name"] for each in prior["parameters"]]
-    i, j = np.triu_indices(len(names))
-    covariance = np.empty((len(names), len(names)))
-    covariance[i, j] = covariance[j, i] = [np.nan if each is None else each for each in prior["covariance"]]
+    covariance = symmetric(np.array([np.nan if each is None else each for each in prior["covariance"]]))
     combinations = dict(zip((p.name for p in earlier.parameters), _combinations(earlier), strict=True))
     found = {}
     for k, (parameter, own) in enumerate(zip(base.parameters, _combinations(base), strict=True)):

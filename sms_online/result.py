@@ -20,6 +20,7 @@ from sms_online.pipeline.statistics import Method
 from sms_online.stream import Array
 from sms_online.tables import Documented, Table, finite, formatter
 from sms_online.tracker_results import Drift, TrackerResult
+from sms_online.triangle import upper
 from sms_online.verdict.judged import JudgedEvaluation
 from sms_online.verdict.trust import Residual, Residuals, Trust
 
@@ -235,7 +236,7 @@ class Result(Documented):
             "method": self.method,
             "verdict": self.trust.document(),
             "parameters": [parameter.document() for parameter in self.parameters.values()],
-            "covariance": [finite(each) for each in self.covariance[np.triu_indices(len(self.covariance))].tolist()],
+            "covariance": [finite(each) for each in upper(self.covariance).tolist()],
             "scale_tolerance": self.system.scale_tolerance,
             "calibration": [each.document() for each in self.calibration],
             "trackers": [each.document() for each in self.trackers],
