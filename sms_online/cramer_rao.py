@@ -144,7 +144,7 @@ def cramer_rao_bound(dynamics: Dynamics, base: BaseParameters, motions: Sequence
 def _followed(model: Model) -> list[str]:
     """Effects that need torques or internal states, but for measured wrenches, whose noise is an input's."""
     declared = model.effects if model.wrenches is None else model.effects[1:]
-    return [f"{effect.name}@{effect.where}" for effect in declared if effect.needs_torque or effect.n_states]
+    return [effect.key for effect in declared if effect.needs_torque or effect.n_states]
 
 
 def _middle(samples: Array) -> Array:

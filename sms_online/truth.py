@@ -18,8 +18,8 @@ def true_values(truth: Mapping[str, Any], described: System, adopted: System) ->
     session is no truth.
     """
     injected = tuple(e for e in map(Effect.model_validate, truth.get("effects", ())) if _fits(described, e))
-    places = {(effect.name, effect.where) for effect in injected}
-    others = tuple(effect for effect in described.effects if (effect.name, effect.where) not in places)
+    places = {effect.key for effect in injected}
+    others = tuple(effect for effect in described.effects if effect.key not in places)
     declared = described.model_copy(update={"effects": (*others, *injected), "fitted": {}})
     stated = {p.name: p.nominal for p in build_model(declared).parameters if "@" in p.name}
     absent = {p.name: 0.0 for p in build_model(adopted).parameters if "@" in p.name}

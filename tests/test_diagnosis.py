@@ -99,7 +99,7 @@ def test_the_missing_effect_is_named_with_its_place_and_size(text: str, accuracy
     effect = parse_effect(text, load_system("paper-planar"))
     diagnosis = diagnosed(text)
     assert diagnosis.verdict == "named"
-    assert keys(diagnosis) == [f"{effect.name}@{effect.where}"]
+    assert keys(diagnosis) == [effect.key]
     found = reported(diagnosis)
     assert {name: found[name] for name in effect.coefficients} == pytest.approx(effect.coefficients, rel=accuracy)
     assert any(row.beyond for row in diagnosis.before.test.values())

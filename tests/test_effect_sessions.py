@@ -135,10 +135,10 @@ def test_reported_coefficients_are_those_that_were_injected(session: tuple[Syste
     true, estimator = session
     estimate = estimator.estimate()
     names = [p.name for p in estimator.base.parameters]
-    declared = {f"{effect.name}@{effect.where}": effect.coefficients for effect in true.effects}
+    declared = {effect.key: effect.coefficients for effect in true.effects}
     for effect in estimator.model.effects:
         for name, (value, std) in report(effect, names, estimate.pi, estimate.covariance).items():
-            injected = declared[f"{effect.name}@{effect.where}"].get(name)
+            injected = declared[effect.key].get(name)
             if name in effect.shapes:
                 assert std == 0.0
             elif injected is not None:

@@ -60,15 +60,15 @@ class Simulated:
         for effect in effects:
             whole = system.model_copy(update={"effects": (*system.effects, *injected)})
             if isinstance(effect, Effect):
-                check_effect(whole, effect, "effects", f"{effect.name}@{effect.where}")
+                check_effect(whole, effect, "effects", effect.key)
                 injected.append(effect)
             else:
                 injected.append(parse_effect(effect, whole))
         for effect in injected:
             if ENTRIES[effect.name].coefficients and not any(effect.coefficients.values()):
                 (first, *_) = ENTRIES[effect.name].coefficients
-                key = f"{effect.name}@{effect.where}"
-                raise InputError("effects", key, "nothing of it", f"its size, such as {key}:{first}=1")
+                expected = f"its size, such as {effect.key}:{first}=1"
+                raise InputError("effects", effect.key, "nothing of it", expected)
         if duration is not None and not 0.0 < duration <= LONGEST:
             raise InputError("simulate", "duration", f"{duration:g} s", f"more than 0, at most {LONGEST:g} s")
         whole = system.model_copy(update={"effects": (*system.effects, *injected)})

@@ -162,9 +162,9 @@ def _with_pair(system: System, separate: Sequence[str]) -> System:
     effects: list[Effect] = []
     for text in separate:
         whole = system.model_copy(update={"effects": (*system.effects, *effects)})
-        known = {(e.name, e.where): e for e in system.effects}
+        known = {effect.key: effect for effect in system.effects}
         head = text.partition(":")[0]
-        if tuple(head.split("@")) in known:
+        if head in known:
             if ":" in text:
                 expected = f"{head} alone, of the declared size"
                 raise InputError("--separate", text, "an effect that the system file declares", expected)

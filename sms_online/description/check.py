@@ -246,7 +246,7 @@ def _numbered(system: System) -> list[str]:
 def _check_effects(system: System, names: tuple[str, ...], source: str) -> None:
     """Places and repetitions; which effects there are and with what coefficients, the effects' catalogue says."""
     places = ("base", *_numbered(system), "tip")
-    seen: set[tuple[str, str]] = set()
+    seen: set[str] = set()
     for k, effect in enumerate(system.effects, start=1):
         if effect.where not in places and not any(fnmatchcase(name, effect.where) for name in names):
             near = nearest(effect.where, (*places, *names))
@@ -256,11 +256,9 @@ def _check_effects(system: System, names: tuple[str, ...], source: str) -> None:
                 repr(effect.where),
                 f"{', '.join(places)}, a channel or a pattern of channels{hint(near)}",
             )
-        if (effect.name, effect.where) in seen:
-            raise InputError(
-                source, f"effect {k}", f"{effect.name}@{effect.where} again", "each effect once at a place"
-            )
-        seen.add((effect.name, effect.where))
+        if effect.key in seen:
+            raise InputError(source, f"effect {k}", f"{effect.key} again", "each effect once at a place")
+        seen.add(effect.key)
 
 
 def _check_parameter_names(system: System, source: str) -> None:
@@ -269,7 +267,7 @@ def _check_parameter_names(system: System, source: str) -> None:
     owners += _numbered(system)
     owners += [f"motor_{i}" for i, motor in enumerate(system.motors, start=1) if motor is not None]
     owners += ["payload"] if system.payload is not None else []
-    owners += [f"{effect.name}@{effect.where}" for effect in system.effects]
+    owners += [effect.key for effect in system.effects]
     for table, parameters in (("known", system.known), ("prior", system.priors), ("fitted", system.fitted)):
         for name in parameters:
             parts = PARAMETER_NAME.fullmatch(name)

@@ -61,6 +61,11 @@ class Effect(Record):
     over: Over | None = None
     knots: tuple[float, ...] = ()
 
+    @property
+    def key(self) -> str:
+        """name@where, which a system has once."""
+        return f"{self.name}@{self.where}"
+
 
 class Prior(Record):
     """What is known of a parameter beforehand, from weighing a part for instance.

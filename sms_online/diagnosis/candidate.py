@@ -42,7 +42,7 @@ class Candidate:
     @property
     def key(self) -> str:
         """name@where."""
-        return f"{self.effect.name}@{self.effect.where}"
+        return self.effect.key
 
     @property
     def extends(self) -> str | None:

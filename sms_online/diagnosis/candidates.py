@@ -369,7 +369,7 @@ class CandidateColumns:
             elif self._weak is self.rows.weak:
                 response = sign * self.rows.responses[displacement][:, :, acts].sum(axis=2)
             columns.append(response)
-            parameters.append(Parameter(f"{effect.name}@{effect.where}.{quantity}", quantity, unit, 0.0))
+            parameters.append(Parameter(f"{effect.key}.{quantity}", quantity, unit, 0.0))
         # An angle turns the arm by as much; a delay counts beside the time in which rows see the motion change.
         span = self._weak.windows.width / self.system.sample_rate
         late = any(each.unit == "s" for each in LINEAR[effect.name])

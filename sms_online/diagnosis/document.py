@@ -262,7 +262,7 @@ def _said(diagnosis: Search, effect: Effect, found: Coefficients) -> str:
 def _curve_in_words(diagnosis: Search, curve: Effect) -> str:
     """What a curve takes off the torque of its joint, blocks predicted from the others."""
     relative = [diagnosis.before.holdout.relative, *(step.relative for step in diagnosis.steps)]
-    taken = [step.taken for step in diagnosis.steps].index(f"{curve.name}@{curve.where}")
+    taken = [step.taken for step in diagnosis.steps].index(curve.key)
     before, after = (relative[k].get(curve.where, 0.0) for k in (taken, taken + 1))
     over = f"this curve over the {curve.over} of {curve.where}"
     return (
@@ -329,7 +329,7 @@ def coefficients(diagnosis: Search, finding: Finding) -> Coefficients:
     """What a person reads of an effect."""
     effect, attempt = finding.candidate.effect, diagnosis.attempt
     for k, (constant, candidate) in enumerate(zip(attempt.constants, attempt.fixed, strict=True)):
-        if (constant.name, constant.where) == (effect.name, effect.where):
+        if constant.key == effect.key:
             at = attempt.rows.base.n + sum(len(other.parameters) for other in attempt.fixed[:k])
             own = slice(at, at + len(candidate.parameters))
             covariance = attempt.tracing.covariance(diagnosis.chosen)[own, own]

@@ -65,7 +65,7 @@ class Hypothesis:
             self.prior,
             self.fixed,
             self.make,
-            declared=(f"{effect.name}@{effect.where}" for effect in model.system.effects),
+            declared=(effect.key for effect in model.system.effects),
             types=row_types(model.layout).values(),
             of_effects=["@" in p.name for p in self.rows.base.parameters],
             positive=[not_negative(p.name) for p in self.rows.base.parameters],

@@ -46,10 +46,10 @@ def with_constants(
             constants, beta = correction.constants, correction.solution[:n]
             if correction.converged or case.stop():
                 break
-        keys = {(effect.name, effect.where) for effect in constants}
+        keys = {effect.key for effect in constants}
         constants = [effect for effect in constants if possible(effect, case.session.system.sample_rate)]
         tried = [candidate.effect for candidate in attempt.tracing.candidates]
-        others = [effect for effect in tried if (effect.name, effect.where) not in keys]
+        others = [effect for effect in tried if effect.key not in keys]
         attempt = Attempt(case, attempt.system, constants, beta, others)
         # Forces that only stood for a constant have nothing left to explain.
         chosen = attempt.search(forces)
@@ -57,8 +57,8 @@ def with_constants(
         if predicts_worse(bare.holdout.relative, attempt.state(chosen).holdout.relative):
             attempt, chosen = before
             break
-    standing = {(effect.name, effect.where) for effect in attempt.constants}
-    findings = [f for f in findings if (f.candidate.effect.name, f.candidate.effect.where) in standing]
+    standing = {effect.key for effect in attempt.constants}
+    findings = [f for f in findings if f.candidate.key in standing]
     return attempt, chosen, findings
 
 

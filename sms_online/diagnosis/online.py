@@ -97,11 +97,11 @@ class OnlineDiagnosis(Observer):
         for key in dict.fromkeys(name.rsplit(".", 1)[0] for name in changed if "@" in name):
             name, _, where = key.partition("@")
             found.append(Effect(name=name, where=where))
-        held = {(effect.name, effect.where) for effect in system.effects}
-        fresh: dict[tuple[str, str], Effect] = {}
+        held = {effect.key for effect in system.effects}
+        fresh: dict[str, Effect] = {}
         for effect in found:
-            if (effect.name, effect.where) not in held:
-                fresh.setdefault((effect.name, effect.where), effect)
+            if effect.key not in held:
+                fresh.setdefault(effect.key, effect)
         forces = [effect for effect in fresh.values() if not is_constant(effect)]
         declared = system.model_copy(update={"effects": (*system.effects, *forces)})
         return applied(declared, [effect for effect in fresh.values() if is_constant(effect)])

@@ -32,7 +32,7 @@ def of_unknowns(
     """
     covariance = np.where(np.isfinite(covariance), covariance, 0.0)
     for force in model.effects:
-        if (force.name, force.where) == (effect.name, effect.where):
+        if force.key == effect.key:
             # What only a combination of parameters is known of counts as zero in the others' favour.
             wanted = [*(p.name for p in force.parameters), *force.relative_to]
             absent = [name for name in wanted if name not in names]

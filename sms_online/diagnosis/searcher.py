@@ -58,7 +58,7 @@ class Named:
     @property
     def key(self) -> str:
         """name@where."""
-        return f"{self.effect.name}@{self.effect.where}"
+        return self.effect.key
 
 
 @dataclass(frozen=True)

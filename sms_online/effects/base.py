@@ -192,7 +192,7 @@ class Force(ForceEffect):
         self.shapes: Mapping[str, float] = {} if shapes is None else shapes
         self.relative_to: tuple[str, ...] = ()
         self.parameters = tuple(
-            Parameter(f"{self.name}@{self.where}.{quantity}", symbol, site.unit(unit), nominal)
+            Parameter(f"{self.key}.{quantity}", symbol, site.unit(unit), nominal)
             for quantity, (symbol, unit, nominal) in linear.items()
         )
 

@@ -34,7 +34,7 @@ def refuse_unknown_masses(model: Model) -> None:
     """InputError on a declared effect whose columns hold masses that are yet to be found."""
     for effect in model.effects:
         if effect.needs_masses:
-            place, found = f"effect {effect.name}@{effect.where}", "a product with masses, which are unknown"
+            place, found = f"effect {effect.key}", "a product with masses, which are unknown"
             expected = "the system's gravity, or a tilt that is found from a whole capture"
             raise InputError(model.system.name, place, found, expected)
 

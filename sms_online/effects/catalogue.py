@@ -206,7 +206,7 @@ def parse_effect(text: str, system: System, source: str = "--effect") -> Effect:
         coefficients[key] = value
     effect = Effect(name=name, where=where, coefficients=coefficients)
     check_effect(system, effect, text, source)
-    if any((other.name, other.where) == (name, where) for other in system.effects):
+    if any(other.key == effect.key for other in system.effects):
         raise InputError(source, text, f"{head} again", "each effect once at a place")
     return effect
 
@@ -237,11 +237,11 @@ def candidates(system: System) -> list[Effect]:
     A lag is that of a whole group of channels, as the sensors' tables form them; an offset and an eccentricity are
     those of one encoder, an offset also that of a strain gauge. What the system declares already is left out.
     """
-    declared = {(effect.name, effect.where) for effect in system.effects}
+    declared = {effect.key for effect in system.effects}
     out = []
     for entry in ENTRIES.values():
         for where in _groups(system, entry) if entry.kind == "channel" else places(system, entry.at):
-            if (entry.name, where) not in declared:
+            if f"{entry.name}@{where}" not in declared:
                 out.append(with_shapes(Effect(name=entry.name, where=where), system))
     return out
 

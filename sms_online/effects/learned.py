@@ -147,7 +147,7 @@ class LearnedForce(Force):
         seen = f"{self.knots[0]:.3g} to {self.knots[-1]:.3g}"
         reached = f"{u.min():.3g} to {u.max():.3g}"
         return (
-            f"{self.name}@{self.where} was seen over a {self.over} of {seen} alone, and here it is {reached}: "
+            f"{self.key} was seen over a {self.over} of {seen} alone, and here it is {reached}: "
             f"held constant beyond, {100.0 * outside:.2g} % of the time"
         )
 

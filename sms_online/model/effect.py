@@ -52,6 +52,11 @@ class ForceEffect(Protocol):
     dry: bool
     needs_masses: bool
 
+    @property
+    def key(self) -> str:
+        """name@where."""
+        return f"{self.name}@{self.where}"
+
     def force(self, layout: Layout, x: Array, v: Array, inputs: Inputs | None) -> Array:
         """Columns f_j (B, n_v, coefficients): generalized force of one unit of each coefficient."""
 

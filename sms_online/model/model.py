@@ -290,7 +290,7 @@ class Model:
         """Each effect with its columns in π and its own inputs; ValueError where it lacks some."""
         for effect, columns, states in zip(self.effects, self.effect_slices, self.state_slices, strict=True):
             if inputs is None and (effect.needs_torque or effect.n_states):
-                raise ValueError(f"{effect.name}@{effect.where} needs torques and its internal states")
+                raise ValueError(f"{effect.key} needs torques and its internal states")
             yield effect, columns, None if inputs is None else replace(inputs, states=inputs.states[:, states])
 
     def state_rate(self, x: Array, v: Array, z: Array) -> Array:

@@ -78,11 +78,10 @@ class Explanation:
 
 def everything(system: System) -> System:
     """The system with a payload, and with every effect that may begin in a session at every joint."""
-    declared = {(effect.name, effect.where) for effect in system.effects}
+    declared = {effect.key for effect in system.effects}
     joints = [f"joint_{i}" for i in range(1, len(system.joints) + 1)]
-    missing = [
-        Effect(name=name, where=where) for where in joints for name in BEGINNING if (name, where) not in declared
-    ]
+    every = [Effect(name=name, where=where) for where in joints for name in BEGINNING]
+    missing = [effect for effect in every if effect.key not in declared]
     payload = RigidBody() if system.payload is None else system.payload
     return system.model_copy(update={"payload": payload, "effects": (*system.effects, *missing)})
 
@@ -99,12 +98,8 @@ def restricted(system: System, names: Iterable[str]) -> System:
     whole = everything(system)
     payload = whole.payload if any(name.startswith("payload.") for name in names) else system.payload
     owners = {name.rsplit(".", 1)[0] for name in names}
-    effects = [effect for effect in whole.effects if effect in system.effects or _owner(effect) in owners]
+    effects = [effect for effect in whole.effects if effect in system.effects or effect.key in owners]
     return system.model_copy(update={"payload": payload, "effects": tuple(effects)})
-
-
-def _owner(effect: Effect) -> str:
-    return f"{effect.name}@{effect.where}"
 
 
 def extended(base: BaseParameters, model: Model, names: Iterable[str]) -> BaseParameters:

@@ -78,7 +78,7 @@ def ambiguous_effects(evaluation: Evaluation) -> list[Reason]:
     estimates = dict(zip((p.name for p in evaluation.parameters), evaluation.estimate.pi.tolist(), strict=True))
     for effect in system.effects:
         other = either(effect, system)
-        key = f"{effect.name}@{effect.where}."
+        key = f"{effect.key}."
         values = {name.removeprefix(key): value for name, value in estimates.items() if name.startswith(key)}
         if other and scale is not None and any(abs(value) > scale for value in values.values()):
             out.append(undecided(in_words(effect, system, values), effect.where, other))

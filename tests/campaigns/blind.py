@@ -79,7 +79,7 @@ def one_pair(folder: Path, names: list[str], seed: int) -> Record:
     effects = tuple(draw.effect(str(name), seed) for name in rng.choice(names, 2, replace=False))
     return {
         "name": "+".join(effect.name for effect in effects),
-        "true": {f"{effect.name}@{effect.where}": effect.coefficients for effect in effects},
+        "true": {effect.key: effect.coefficients for effect in effects},
         **_told(diagnose(disguised(draw.system), [draw.session(effects, seed)], "case", lambda _: None)),
     }
 
@@ -104,7 +104,7 @@ def _told(found: Search) -> Record:
 
 def _keys(found: Search) -> list[str]:
     exact = [e for e in found.attempt.system.effects if e not in found.described.system.effects]
-    return [f"{e.name}@{e.where}" for e in exact] + [finding.candidate.key for finding in found.findings]
+    return [effect.key for effect in exact] + [finding.candidate.key for finding in found.findings]
 
 
 def one_single(folder: Path, name: str, seed: int) -> Record:
@@ -164,8 +164,8 @@ def one_struck(folder: Path, name: str, seed: int) -> Record:
     Q = basis(rows.white(rows.Y))
     columns = {}
     for each in draw.make.effects():
-        columns.setdefault(f"{each.name}@{each.where}", []).append(rows.white(draw.make.of(each).columns))
-    key = f"{effect.name}@{effect.where}"
+        columns.setdefault(each.key, []).append(rows.white(draw.make.of(each).columns))
+    key = effect.key
     own = columns.get(key, [])
     near = {
         other
@@ -176,7 +176,7 @@ def one_struck(folder: Path, name: str, seed: int) -> Record:
     inner = CandidateColumns.effects
 
     def allowed(self: CandidateColumns, learned: bool = False) -> Iterator[Effect]:
-        return (e for e in inner(self, learned) if f"{e.name}@{e.where}" not in near)
+        return (effect for effect in inner(self, learned) if effect.key not in near)
 
     with patch.object(CandidateColumns, "effects", allowed):
         found = diagnose(disguised(draw.system), [block], "case", lambda _: None)

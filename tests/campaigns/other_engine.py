@@ -87,7 +87,7 @@ def diagnosed(cache: Path, name: str) -> Record:
 def _record(case: Case, found: Search) -> Record:
     """What was found, and how far base parameters are off before and after, %."""
     keys = [finding.candidate.key for finding in found.findings]
-    declared = [f"{effect.name}@{effect.where}" for effect in found.after.system.effects]
+    declared = [effect.key for effect in found.after.system.effects]
     reported = {
         finding.candidate.key: {name: value for name, (value, _) in coefficients(found, finding).items()}
         for finding in found.findings

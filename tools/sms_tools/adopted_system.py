@@ -48,7 +48,7 @@ def adopted_text(described: str, before: System, after: System, remarks: Mapping
             if effect.over is not None:
                 lines.append(f'over = "{effect.over}"')
                 lines.append(f"knots = [{', '.join(f'{knot:.9g}' for knot in effect.knots)}]")
-            if remark := remarks.get(f"{effect.name}@{effect.where}"):
+            if remark := remarks.get(effect.key):
                 lines.append(f"# found: {remark}")
     if after.trackers != before.trackers:
         _remove_tables(lines, TRACKER)

@@ -91,7 +91,7 @@ def _arm(document: Document, diagnosis: Search) -> Markup:
 
 def _candidates(document: Document, diagnosis: Search) -> list[dict[str, Any]]:
     """The best by what each alone explains of the whole residual, and those found; none that explains nothing."""
-    numbers = {(e["name"], e["where"]): n for n, e in enumerate(document["effects"], start=1)}
+    numbers = {f"{e['name']}@{e['where']}": n for n, e in enumerate(document["effects"], start=1)}
     like: dict[str, list[str]] = {}
     for found, effect in enumerate(document["effects"], start=1):
         for key in effect["ambiguous_with"]:
@@ -104,7 +104,7 @@ def _candidates(document: Document, diagnosis: Search) -> list[dict[str, Any]]:
             "name": effect.name,
             "where": effect.where,
             "explained": 100.0 * ranked.explained,
-            "found": numbers.get((effect.name, effect.where)),
+            "found": numbers.get(effect.key),
             "like": like.get(ranked.candidate.key, []),
         }
         if ranked.explained and (rank <= LISTED or row["found"]):
