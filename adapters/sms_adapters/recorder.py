@@ -107,7 +107,6 @@ class Recorder:
     """
 
     def __init__(self, directory: Path, header: SessionHeader, files: Mapping[str, bytes] | None = None) -> None:
-        self.directory = directory
         self.problem: str | None = None  # why nothing can be written now
         self.unrecorded = 0
         self._header = header

@@ -242,16 +242,14 @@ class Step:
     stages: Array
 
 
-def march(
-    f: RightHandSide, y0: Array, duration: float, tolerance: Array, stages: int = STAGES, longest: float = np.inf
-) -> Iterator[Step]:
+def march(f: RightHandSide, y0: Array, duration: float, tolerance: Array, longest: float) -> Iterator[Step]:
     """Integrate ẏ = f(t, y) from y0 (n,) at t = 0 over `duration` (s) with step control, a step at a time.
 
     tolerance (n,): bound of the estimated local error of each state in its unit. longest: step, s. The estimate is of
     the order of the polynomial between steps, and step ends are better; it does not see what a state that only follows
     a fast pole loses between steps. Raises ArithmeticError where no step is short enough. Source: Hairer & Wanner IV.8.
     """
-    collocation = Collocation(f, 0.0, y0, stages)
+    collocation = Collocation(f, 0.0, y0, STAGES)
     t, y = 0.0, y0
     h = FIRST_STEP
     fresh = True
@@ -273,7 +271,7 @@ def march(
             continue
         Z, F, contraction = solved
         error = float(np.sqrt(np.mean((collocation.error(h, F) / tolerance) ** 2)))
-        factor = SAFETY * max(error, 1e-20) ** (-1.0 / (stages + 1))
+        factor = SAFETY * max(error, 1e-20) ** (-1.0 / (STAGES + 1))
         factor = min(GROW, max(SHRINK, factor))
         if error >= 1.0:
             h *= factor
@@ -300,7 +298,7 @@ def solve(
 ) -> Dense:
     """All of `march` as one solution; progress: is called with the end of each step, s."""
     steps = []
-    for step in march(f, y0, duration, tolerance, longest=longest):
+    for step in march(f, y0, duration, tolerance, longest):
         steps.append(step)
         progress(step.t)
     return dense(STAGES, 0.0, y0, steps)

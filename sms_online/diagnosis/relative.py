@@ -27,7 +27,7 @@ class RelativeResiduals:
     def __init__(self, rows: SessionRows, make: CandidateColumns) -> None:
         layout = rows.model.layout
         self._joints = list(layout.theta_m)
-        self._windows = weak = joint_windows(rows)
+        weak = joint_windows(rows)
         # The relative residual of a session (`JointBalance`), too, foretells friction at a standstill by its law.
         self._make = make.within(weak, resting=True)
         starts, segments = weak.windows.start, weak.windows.segment

@@ -102,16 +102,14 @@ class Synchroniser(Stage):
     A segment is a run of grid points at which every channel has a value; a hole in any channel ends it. Whatever the
     blocks, the values are the same bits. Limitation: a channel faster than the grid is picked, not averaged.
 
-    channels: names, in the order of the columns. sample_rate: of the grid, Hz. gap_limit: longest interval between
-    two samples of a channel that is bridged, in periods of that channel (the median of its first intervals), at
-    most 1 s.
+    channels: names, in the order of the columns. sample_rate: of the grid, Hz.
     """
 
-    def __init__(self, channels: Sequence[str], sample_rate: float, gap_limit: int = GAP_LIMIT) -> None:
+    def __init__(self, channels: Sequence[str], sample_rate: float) -> None:
         count = len(channels)
         self.channels = tuple(channels)
         self.sample_rate = sample_rate
-        self._periods = Periods(count, gap_limit)
+        self._periods = Periods(count, GAP_LIMIT)
         self.resumed = np.nan  # time of the last sample before the session was resumed, s
         nothing = np.empty(0), np.empty((0, count))
         self.state = SynchroniserState(*nothing, np.full(count, -np.inf), SyncCounters())
