@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from sms_online.calibration.found import Calibration, found
 from sms_online.calibration.truncation import left
 from sms_online.model.parameters import Parameter
-from sms_online.nominal import Comparison, compare, unit_factors
+from sms_online.nominal import NominalComparison, compare, unit_factors
 from sms_online.physical import PhysicalSet, Projection
 from sms_online.pipeline.description import described, nearer
 from sms_online.pipeline.statistics import Statistics
@@ -263,7 +263,7 @@ class Evaluation:
             return None
 
     @cached_property
-    def comparison(self) -> Comparison:
+    def comparison(self) -> NominalComparison:
         """The determined parameters against the values that the system file states; those of effects count as none."""
         known = np.flatnonzero(self.determined)
         names = [self.parameters[k].name for k in known]

@@ -113,7 +113,7 @@ class HistoryState(State):
     due: float = -np.inf
 
 
-class Recorder(Stage, Observer):
+class HistoryRecorder(Stage, Observer):
     """Looks at a session's estimates as its samples pass; put into `Estimator.observers`.
 
     It looks between internal blocks, so that the same samples give the same history however they are cut.

@@ -36,7 +36,7 @@ class Apart:
 
 
 @dataclass(frozen=True)
-class Comparison:
+class NominalComparison:
     """An estimate against nominal values.
 
     common: factor by which nearly all parameters exceed their nominal values, None where there is none beyond
@@ -49,12 +49,12 @@ class Comparison:
     apart: tuple[Apart, ...] = ()
 
 
-AS_STATED = Comparison()
+AS_STATED = NominalComparison()
 
 
 def compare(
     names: Sequence[str], value: Array, std: Array, nominal: Mapping[str, float], factors: Mapping[str, float]
-) -> Comparison:
+) -> NominalComparison:
     """Compare estimates `value` ± `std` (n,), of determined parameters alone, with nominal values by name.
 
     factors: what units and gears would make of all values, by what each looks like, see `unit_factors`.
@@ -73,12 +73,12 @@ def compare(
     if common and (sign < 0.0 or abs(middle) > math.log(LARGEST_COMMON_FACTOR)):
         factor = sign * math.exp(middle)
         causes = [each for each, size in factors.items() if 1.0 / SAME_UNIT < factor / size < SAME_UNIT]
-        return Comparison(factor, causes[0] if causes else "")
+        return NominalComparison(factor, causes[0] if causes else "")
     # The end of the 95 % interval that is nearer to the nominal value.
     nearer = value[stated] - np.clip(value[stated] - described, -2.0 * std[stated], 2.0 * std[stated])
     share = nearer / described
     beyond = (share > LARGEST_FACTOR) | (share < 1.0 / LARGEST_FACTOR)
-    return Comparison(
+    return NominalComparison(
         apart=tuple(Apart(names[k], float(value[k]), nominal[names[k]]) for k in np.array(stated)[beyond].tolist())
     )
 

@@ -14,7 +14,7 @@ from sms_online.calibration.found import Calibration
 from sms_online.description.parse import describe
 from sms_online.description.schema import System
 from sms_online.evaluation import NORMAL_95
-from sms_online.history import History, Recorder, reported_covariance
+from sms_online.history import History, HistoryRecorder, reported_covariance
 from sms_online.pipeline.events import Event
 from sms_online.pipeline.statistics import Method
 from sms_online.stream import Array
@@ -173,7 +173,7 @@ class Finding:
 
 
 @dataclass(frozen=True)
-class Consistency:
+class PhysicalConsistency:
     """Physical consistency: distance from the estimate to the nearest consistent parameters, in standard deviations.
 
     active: the conditions that bind, as names of parameters and bodies; empty at distance 0.
@@ -216,7 +216,7 @@ class Result(Documented):
     throughput: float = 0.0
     calibration: tuple[Calibration, ...] = ()
     trackers: tuple[TrackerResult, ...] = field(default=(), repr=False)
-    physical: Consistency | None = field(default=None, repr=False)
+    physical: PhysicalConsistency | None = field(default=None, repr=False)
     diagnosis: tuple[Mapping[str, Any], ...] = field(default=(), repr=False)
     history: tuple[History, ...] = field(default=(), repr=False)
     covariance: Array = field(default_factory=lambda: np.empty((0, 0)), repr=False, compare=False)
@@ -286,7 +286,7 @@ def result_of(
     warnings: Sequence[str] = (),
     episodes: Sequence[Mapping[str, Any]] = (),
     throughput: float = 0.0,
-    history: Recorder | None = None,
+    history: HistoryRecorder | None = None,
 ) -> Result:
     """An evaluation as one record.
 
@@ -345,7 +345,7 @@ def result_of(
         throughput=throughput,
         calibration=tuple(evaluation.calibration),
         trackers=evaluation.trackers,
-        physical=None if projection is None else Consistency(projection.distance, projection.active),
+        physical=None if projection is None else PhysicalConsistency(projection.distance, projection.active),
         diagnosis=tuple(episodes),
         history=() if history is None else history.histories,
         covariance=reported_covariance(estimate, evaluation.std),

@@ -19,7 +19,7 @@ from sms_online.description.schema import System, TrackerChoice
 from sms_online.diagnosis.online import OnlineDiagnosis
 from sms_online.diagnosis.searcher import Searcher
 from sms_online.errors import InputError
-from sms_online.history import Recorder
+from sms_online.history import HistoryRecorder
 from sms_online.pipeline.estimator import Estimator
 from sms_online.pipeline.snapshot import statistics_of
 from sms_online.priors import GivenPrior, base_prior, given_prior
@@ -78,7 +78,7 @@ class Session:
             # A prior is on the base parameters, which the estimator has found.
             self.estimator.set_prior(base_prior(system, self.estimator.base, known))
         # Before the diagnosis, which may have the estimator go on with others.
-        self.recorder = Recorder(self.estimator)
+        self.recorder = HistoryRecorder(self.estimator)
         self.estimator.observers.append(self.recorder)
         if checkpoint is not None:
             checkpoint.put_into(self.estimator)

@@ -20,7 +20,7 @@ from sms_online.diagnosis.record import SampleRecord, Segment, excerpts
 from sms_online.diagnosis.residuals import RowResidual
 from sms_online.diagnosis.rows import SessionRows
 from sms_online.diagnosis.unexplained import describe_residual
-from sms_online.diagnosis.weak_windows import WeakWindows, Windows
+from sms_online.diagnosis.weak_windows import WeakWindows, WindowPlaces
 from sms_online.effects.build import build_model
 from sms_online.model.effect import Inputs
 from sms_online.pipeline.estimator import Estimator
@@ -242,7 +242,7 @@ def test_rows_share_a_force_that_is_off_at_every_sample(half_hop: int) -> None:
     segment = np.array([0] * 14 + [1] * 5)
     start = np.concatenate([np.arange(count) * 2 * half_hop + 10 for count in (14, 5)])
     half_width = np.array([4, 4, 7, 7, 7, 4, 4, 4, 7, 7, 4, 4, 4, 4, 4, 4, 7, 7, 4])
-    windows = Windows(segment, start, half_width, width, EXPONENT, lambda M: 1)
+    windows = WindowPlaces(segment, start, half_width, width, EXPONENT, lambda M: 1)
     sensing: Any = SimpleNamespace(coordinates=lambda values: values[:, :2], inputs=lambda values: values[:, 2:])
     layout: Any = SimpleNamespace(n_v=2, n_x=2, speeds=lambda x, x_dot: x_dot)
     samples = [Segment(np.arange(200), np.zeros((200, 3))) for _ in range(2)]

@@ -8,7 +8,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from sms_online.diagnosis.scale_free import ScaleFree
+from sms_online.diagnosis.scale_free import HomogeneousRows
 from sms_online.stream import Array
 
 TRUE = np.array([2.0, 3.0])
@@ -26,7 +26,7 @@ def rows(lack: float) -> tuple[Array, Array]:
 
 
 def solved(Y: Array, b: Array, start: Array) -> Array:
-    free = ScaleFree(Y, [1], np.zeros(2, dtype=bool))
+    free = HomogeneousRows(Y, [1], np.zeros(2, dtype=bool))
     return free.solved(NOTHING, b, start, start, 1e-4, np.zeros(2, dtype=bool))
 
 
@@ -49,7 +49,7 @@ def test_least_squares_of_the_same_rows_shrinks_them() -> None:
 
 def test_the_parameters_themselves_are_no_direction_of_freed_rows() -> None:
     Y, b = rows(lack=0.5)
-    columns, added = ScaleFree(Y, [1], np.zeros(2, dtype=bool)).about(TRUE, b - Y @ TRUE)
+    columns, added = HomogeneousRows(Y, [1], np.zeros(2, dtype=bool)).about(TRUE, b - Y @ TRUE)
     np.testing.assert_allclose(columns[:, 1] @ TRUE, 0.0, atol=1e-12)
     np.testing.assert_array_equal(columns[:, 0], Y[:, 0])
     np.testing.assert_allclose(added[:, 1], -Y[:, 1] @ TRUE)
@@ -57,7 +57,7 @@ def test_the_parameters_themselves_are_no_direction_of_freed_rows() -> None:
 
 def test_what_rows_leave_is_compared_at_one_size() -> None:
     Y, b = rows(lack=0.5)
-    free = ScaleFree(Y, [1], np.zeros(2, dtype=bool))
+    free = HomogeneousRows(Y, [1], np.zeros(2, dtype=bool))
     small = 0.1 * TRUE
     one, other = (free.squares(pi, b - Y @ pi, TRUE)[1] for pi in (TRUE, small))
     assert other == pytest.approx(one)
@@ -65,5 +65,5 @@ def test_what_rows_leave_is_compared_at_one_size() -> None:
 
 def test_parameters_of_nothing_are_no_fit_and_no_warning() -> None:
     Y, b = rows(lack=0.5)
-    free = ScaleFree(Y, [1], np.zeros(2, dtype=bool))
+    free = HomogeneousRows(Y, [1], np.zeros(2, dtype=bool))
     assert not np.isfinite(free.squares(np.zeros(2), b, TRUE)[1])

@@ -7,7 +7,7 @@ from dataclasses import replace
 import pytest
 
 from sms_online.description.parse import parse_system
-from sms_online.nominal import Apart, Comparison
+from sms_online.nominal import Apart, NominalComparison
 from sms_online.pipeline.estimator import Estimator
 from sms_online.verdict.evidence import Discrepancy, Dispute, Evidence
 from sms_online.verdict.judge import judge, judge_diagnosis
@@ -65,7 +65,7 @@ def test_a_torque_that_is_mostly_noise_is_weak_data() -> None:
         (replace(GOOD, alarm="base"), "the residual of base is more than noise", {"base": "more than noise"}),
         (replace(GOOD, negative=("motor_2.mass",)), "motor_2.mass is negative", {"joint_2": "negative"}),
         (
-            replace(GOOD, comparison=Comparison(50.0, "tau_i looks like X")),
+            replace(GOOD, comparison=NominalComparison(50.0, "tau_i looks like X")),
             "50 × its description: tau_i looks like X",
             {},
         ),
@@ -95,7 +95,7 @@ def test_what_error_bars_do_not_know_of_is_a_grave_doubt(evidence: Evidence, sai
         (with_row("joint_1", relative=0.4, whitened=2.1), "the residual of joint_1 is 2.1 × noise"),
         (with_row("joint_1", relative=0.4, whitened=None), "40 % of the torque or force of joint_1"),
         (replace(GOOD, undetermined=("joint_1.stiffness",)), "not determined: joint_1.stiffness"),
-        (replace(GOOD, comparison=Comparison(apart=(SOFT,))), "joint_1.stiffness is 39.8, described as 100"),
+        (replace(GOOD, comparison=NominalComparison(apart=(SOFT,))), "joint_1.stiffness is 39.8, described as 100"),
     ],
 )
 def test_what_harms_some_numbers_is_a_doubt_that_is_not_grave(evidence: Evidence, said: str) -> None:
@@ -283,7 +283,7 @@ def test_every_grave_doubt_states_what_to_do_next() -> None:
         replace(GOOD, alarm="base"),
         replace(GOOD, disputed=(Dispute("link_1.mass", 3.4, None),)),
         replace(GOOD, negative=("motor_2.mass",)),
-        replace(GOOD, comparison=Comparison(50.0)),
+        replace(GOOD, comparison=NominalComparison(50.0)),
     ):
         assert judge(evidence).grave
         assert judge(evidence).next_step

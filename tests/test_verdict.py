@@ -18,7 +18,7 @@ from sms_online.diagnosis.record import Segment
 from sms_online.diagnosis.residuals import RowResidual
 from sms_online.diagnosis.reversals import Reversals
 from sms_online.diagnosis.standstill import SessionStandstill
-from sms_online.diagnosis.weak_windows import Motion
+from sms_online.diagnosis.weak_windows import SeenMotion
 from sms_online.effects.catalogue import ENTRIES
 from sms_online.pipeline.smoothing import smooth
 
@@ -148,7 +148,7 @@ def test_the_integral_of_a_sign_is_as_uncertain_as_stated(noise: float) -> None:
     off, predicted = [], []
     for k, turn in enumerate(turns):
         nothing = np.zeros((samples.size, 1))
-        motion = Motion(k, 80, samples, nothing, nothing, nothing)
+        motion = SeenMotion(k, 80, samples, nothing, nothing, nothing)
         sign = reversals.mean(lambda v: np.tanh(v / 1e-4)[..., None], motion)[:, 0, 0]
         # Cells of half a sample beyond both ends.
         true = (turn - t[100] + 0.5e-3) - (t[299] + 0.5e-3 - turn)

@@ -55,7 +55,7 @@ class Part:
 
 
 @dataclass(frozen=True)
-class State:
+class ModelFit:
     """What a model, with or without the effects found, makes of the session.
 
     system: with the effects. solution (n + c,): parameters and coefficients. residual (W, n_v): of all windows, over
@@ -289,7 +289,7 @@ class Attempt(Hypothesis):
         self.tracing.weigh(chosen)
         return ResidualTest(self.rows).of(self.residual(chosen))
 
-    def state(self, chosen: Sequence[int]) -> State:
+    def state(self, chosen: Sequence[int]) -> ModelFit:
         """Residuals of the model with the effects chosen."""
         rows, tracing = self.rows, self.tracing
         tracing.weigh(chosen)
@@ -302,7 +302,7 @@ class Attempt(Hypothesis):
         else:
             predicted = tracing.predicted(chosen, without)
             holdout = Part(whitened(rows, predicted), self._joints.of(solution, self._blocks(without)))
-        return State(
+        return ModelFit(
             system=self.adopted(chosen),
             solution=solution,
             residual=residual,

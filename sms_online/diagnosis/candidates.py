@@ -18,7 +18,7 @@ from sms_online.diagnosis.quadratic_forms import QuadraticForms
 from sms_online.diagnosis.reversals import Reversals
 from sms_online.diagnosis.rows import SessionRows
 from sms_online.diagnosis.standstill import LEAVING, SessionStandstill
-from sms_online.diagnosis.weak_windows import Motion, WeakWindows
+from sms_online.diagnosis.weak_windows import SeenMotion, WeakWindows
 from sms_online.effects.base import Ranges, joints_of, position
 from sms_online.effects.build import build_model
 from sms_online.effects.catalogue import ENTRIES, LINEAR, candidates, curve_variables, periods, traits_of
@@ -74,11 +74,11 @@ class CandidateColumns:
             self._made[law] = build_model(self._declaring(effect))
         return self._made[law]
 
-    def inputs(self, motion: Motion) -> Inputs:
+    def inputs(self, motion: SeenMotion) -> Inputs:
         """What the effects that the system declares need beside the motion."""
         return self._inputs(self.rows.model, motion)
 
-    def _inputs(self, model: Model, motion: Motion) -> Inputs:
+    def _inputs(self, model: Model, motion: SeenMotion) -> Inputs:
         states = np.zeros((len(motion.samples), 0))
         if model.n_states:
             states = self._followed.states(model, motion.segment, motion.samples)
@@ -174,7 +174,7 @@ class CandidateColumns:
         parameters = [model.parameters[k] for k in added]
         if ENTRIES[effect.name].kind == "inertia":
 
-            def inertia(motion: Motion) -> tuple[Array | None, Array]:
+            def inertia(motion: SeenMotion) -> tuple[Array | None, Array]:
                 P, G = model.momentum_columns(motion.x, motion.v, inputs=self.inputs(motion))
                 return P[..., added], G[..., added]
 
@@ -189,7 +189,7 @@ class CandidateColumns:
         """Columns (W, n_v, c) of a model's last effect."""
         force = model.effects[-1]
 
-        def columns(motion: Motion) -> tuple[Array | None, Array]:
+        def columns(motion: SeenMotion) -> tuple[Array | None, Array]:
             inputs = self._inputs(model, motion)
             inputs = replace(inputs, states=inputs.states[:, model.state_slices[-1]])
 
@@ -260,7 +260,7 @@ class CandidateColumns:
         turned, held = self._reversals(force.where), self._standstill(force.where)
         leaving_for = round(LEAVING * self.system.sample_rate)
 
-        def squares(motion: Motion) -> Array:
+        def squares(motion: SeenMotion) -> Array:
             inputs = self._inputs(model, motion)
 
             def along(v: Array) -> Array:
@@ -285,7 +285,7 @@ class CandidateColumns:
         factor = coefficients[rough.coefficients[own] - columns.start]
         to_row = np.eye(model.layout.n_v)[rough.rows[own]]
 
-        def slopes(motion: Motion) -> tuple[Array, Array]:
+        def slopes(motion: SeenMotion) -> tuple[Array, Array]:
             inputs = self._inputs(model, motion)
             signals = np.concatenate((inputs.torque, inputs.states), axis=1)
             both = rough.slopes(motion.x, motion.v, signals, np.zeros_like(motion.v))
@@ -346,7 +346,7 @@ class CandidateColumns:
         i = int(where.removeprefix("joint_")) - 1
         motor = self.rows.model.layout.theta_m[i]
 
-        def columns(motion: Motion) -> tuple[Array, Array]:
+        def columns(motion: SeenMotion) -> tuple[Array, Array]:
             P = np.zeros((*motion.v.shape, 1))
             P[:, motor, 0] = motion.torque[:, i]
             return P, np.zeros_like(P)

@@ -18,7 +18,7 @@ from sms_online.diagnosis.candidate import Candidate
 from sms_online.diagnosis.evidence import basis, free_of, gain
 from sms_online.diagnosis.search import Search
 from sms_online.diagnosis.splines import DEGREE, Variable, design, spline_columns
-from sms_online.diagnosis.weak_windows import Motion
+from sms_online.diagnosis.weak_windows import SeenMotion
 from sms_online.effects.base import position
 from sms_online.effects.build import build_model
 from sms_online.effects.catalogue import periods
@@ -116,7 +116,7 @@ def _variable(attempt: Attempt, i: int, name: str, order: float) -> Variable:
     layout, gear = model.layout, model.system.joints[i].gear_ratio
     motor, link = layout.theta_m[i], layout.q[i]
 
-    def values(motion: Motion) -> Array:
+    def values(motion: SeenMotion) -> Array:
         match name:
             case "motor speed":
                 return motion.v[:, motor]

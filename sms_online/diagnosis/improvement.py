@@ -8,7 +8,7 @@ from functools import partial
 import numpy as np
 
 from sms_online.description.schema import Effect, System
-from sms_online.diagnosis.attempt import SEARCHED, Attempt, Case, Progress, State
+from sms_online.diagnosis.attempt import SEARCHED, Attempt, Case, ModelFit, Progress
 from sms_online.diagnosis.candidate import Finding
 from sms_online.diagnosis.constants import possible
 from sms_online.diagnosis.folds import LEAST_RISE
@@ -25,7 +25,7 @@ def _trial(attempt: Attempt, forces: Sequence[Effect], constants: Sequence[Effec
 
 
 def with_constants(
-    case: Case, attempt: Attempt, chosen: list[int], bare: State, progress: Progress
+    case: Case, attempt: Attempt, chosen: list[int], bare: ModelFit, progress: Progress
 ) -> tuple[Attempt, list[int], list[Finding]]:
     """The attempt with constants in place of the effects found that become such, what is found beside them, and these.
 

@@ -7,13 +7,13 @@ from collections.abc import Iterable, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from sms_online.calibration.channels import Motion as Readings
+from sms_online.calibration.channels import Motion
 from sms_online.calibration.joints import JointCalibration
 from sms_online.calibration.nuisance import Nuisance
 from sms_online.description.schema import Effect
 from sms_online.diagnosis.candidates import CandidateColumns
 from sms_online.diagnosis.rows import SessionRows, joint_windows
-from sms_online.diagnosis.weak_windows import Motion, WeakWindows
+from sms_online.diagnosis.weak_windows import SeenMotion, WeakWindows
 from sms_online.row_types import joint_rows
 from sms_online.stream import Array
 
@@ -36,7 +36,7 @@ class RelativeResiduals:
         self.times = np.asarray(middles / rows.model.system.sample_rate, dtype=np.float64)
         self.segment = segments
 
-        def model(motion: Motion) -> tuple[Array, Array]:
+        def model(motion: SeenMotion) -> tuple[Array, Array]:
             inputs = self._make.inputs(motion)
             return rows.model.momentum_columns(motion.x, motion.v, layout.theta_m, inputs)
 
@@ -57,12 +57,12 @@ class RelativeResiduals:
         sensing, layout, calibration = rows.sensing, rows.model.layout, JointCalibration(rows.sensing)
         number = {nuisance: k for k, nuisance in enumerate(rows.calibrated.nuisances)}
 
-        def read(motion: Motion) -> Array:
+        def read(motion: SeenMotion) -> Array:
             values = rows.segments[motion.segment].values[:, sensing.position_columns]
             rates = np.gradient(values, axis=0) * rows.model.system.sample_rate
             turned = np.broadcast_to(np.eye(3), (len(motion.x), 3, 3))
             torque = motion.torque[:, : len(layout.q)]  # without the wrenches behind them
-            given = Readings(values[motion.samples], rates[motion.samples], torque, turned)
+            given = Motion(values[motion.samples], rates[motion.samples], torque, turned)
             return np.concatenate((calibration.deflections(given), calibration.torque(given)), axis=2)
 
         def spread(each: Array, nuisances: Sequence[Nuisance]) -> Array:

@@ -18,7 +18,7 @@ from scipy.ndimage import uniform_filter1d
 
 from sms_online.diagnosis.record import Segment
 from sms_online.diagnosis.standstill import SessionStandstill
-from sms_online.diagnosis.weak_windows import Motion
+from sms_online.diagnosis.weak_windows import SeenMotion
 from sms_online.effects.base import STANDSTILL, position
 from sms_online.pipeline.rough_forces import WITHIN
 from sms_online.pipeline.sensing import Sensing
@@ -94,7 +94,7 @@ class Reversals:
         alone, between = (self._noise * float(np.linalg.norm(w)) * self._rate for w in (own, wide - np.pad(own, M)))
         return alone, between
 
-    def mean(self, force: Callable[[Array], Array], motion: Motion) -> Array:
+    def mean(self, force: Callable[[Array], Array], motion: SeenMotion) -> Array:
         """Forces (K, n_v, c) of speeds (K, n_v), averaged over each sample of a motion."""
         M = min(motion.half_width, self._half_width)
         v = motion.v.copy()
@@ -104,7 +104,7 @@ class Reversals:
             total = total + force(v)
         return np.asarray(total / len(WITHIN))
 
-    def squares(self, force: Callable[[Array], Array], motion: Motion) -> Array:
+    def squares(self, force: Callable[[Array], Array], motion: SeenMotion) -> Array:
         """Squares (K, n_v) of what a force (K, n_v) of speeds is off by, as of one that is off anew at each sample.
 
         At the samples before a reversal by the jump's place. Elsewhere by what the filter rounds off of the rate, which

@@ -17,8 +17,8 @@ from sms_online.diagnosis.evidence import least_squares
 from sms_online.diagnosis.possible import not_negative
 from sms_online.diagnosis.record import Segment
 from sms_online.diagnosis.rows import SessionRows
-from sms_online.diagnosis.scale_free import ScaleFree
-from sms_online.diagnosis.weak_windows import Motion, WeakWindows, Windows
+from sms_online.diagnosis.scale_free import HomogeneousRows
+from sms_online.diagnosis.weak_windows import SeenMotion, WeakWindows, WindowPlaces
 from sms_online.effects.friction import sign
 from sms_online.model.effect import Inputs
 from sms_online.pipeline.estimator import Estimator
@@ -62,7 +62,7 @@ class RoughRows:
         self.count = count = sum(each.size for each in starts)
         if 2 * base.n > count * layout.n_v:
             raise np.linalg.LinAlgError("too few windows without a gap")
-        where = Windows(
+        where = WindowPlaces(
             segment=np.repeat(np.arange(len(starts)), [each.size for each in starts]),
             start=np.concatenate(starts),
             half_width=np.full(count, M),
@@ -73,11 +73,11 @@ class RoughRows:
         weak = WeakWindows(where, layout, session.sensing, segments, rate)
         self._motors = list(layout.theta_m)
 
-        def inertia(motion: Motion) -> tuple[Array, Array]:
+        def inertia(motion: SeenMotion) -> tuple[Array, Array]:
             inputs = Inputs(motion.torque, np.zeros((len(motion.samples), model.n_states)))
             return model.momentum_columns(motion.x, motion.v, inputs=inputs)
 
-        def drives(motion: Motion) -> tuple[None, Array]:
+        def drives(motion: SeenMotion) -> tuple[None, Array]:
             G = np.zeros((*motion.v.shape, 1 + LAWS * len(self._motors)))
             for i, motor in enumerate(self._motors):
                 speed = motion.v[:, motor]
@@ -136,7 +136,7 @@ class RoughRows:
         Y, friction = self._Y / self._size[:, None], self._friction / self._size[:, None]
         b = (self._torque - self._known) / self._size
         speeds, n = np.flatnonzero(self._homogeneous).tolist(), Y.shape[2]
-        free = ScaleFree(Y[fitted], speeds, self._inertial)
+        free = HomogeneousRows(Y[fitted], speeds, self._inertial)
         solution = free.solved(friction[fitted], b[fitted], self._nominal, self._nominal, SMALLEST, self._positive)
         left = b - np.concatenate((Y, friction), axis=2) @ solution
         squares = free.squares(solution[:n], left[~fitted], self._nominal)

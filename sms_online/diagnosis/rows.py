@@ -16,7 +16,7 @@ from sms_online.diagnosis.calibrated import Calibrated
 from sms_online.diagnosis.followed import FollowedMotion
 from sms_online.diagnosis.record import Segment
 from sms_online.diagnosis.weak_rows import WeakRows
-from sms_online.diagnosis.weak_windows import WeakWindows, Windows
+from sms_online.diagnosis.weak_windows import WeakWindows, WindowPlaces
 from sms_online.model.base_parameters import BaseParameters
 from sms_online.model.model import Model
 from sms_online.pipeline.joint_balance import EXPONENT as JOINT_EXPONENT
@@ -107,7 +107,7 @@ class SessionRows(WeakRows):
         super().__init__(stacked[..., :-1], stacked[..., -1], rate)
         half = balance.width / 2
         self.time = np.array([window.end - half for _, window in windows]) / rate
-        where = Windows(
+        where = WindowPlaces(
             segment=np.array([number for number, _ in windows], dtype=np.int64),
             # The filter of a window's first sample begins with the segment's.
             start=np.array([window.start * balance.half_hop + balance.margin for _, window in windows], dtype=np.int64),
@@ -244,7 +244,7 @@ def joint_windows(rows: SessionRows) -> WeakWindows:
         np.arange(M, segment.index.size - M - balance.width - 1, balance.hop, dtype=np.int64)
         for segment in rows.segments
     ]
-    where = Windows(
+    where = WindowPlaces(
         segment=np.repeat(np.arange(len(starts)), [each.size for each in starts]),
         start=np.concatenate(starts),
         half_width=np.full(sum(each.size for each in starts), M),

@@ -30,7 +30,7 @@ NEAR = 1e-3
 SAME = 1e-3
 
 
-class ScaleFree:
+class HomogeneousRows:
     """Frees some speeds' rows (W, n_v, n) of a model."""
 
     def __init__(self, Y: Array, speeds: Sequence[int], inertial: NDArray[np.bool_]) -> None:
@@ -137,7 +137,7 @@ class Scale:
         Each type of rows counts by what it leaves, those without a torque by their size. Mean squares (n_v,), then the
         same with these as large as the parameters behind the weights make them.
         """
-        free, n = ScaleFree(Y, np.flatnonzero(self.homogeneous).tolist(), self._inertial), Y.shape[2]
+        free, n = HomogeneousRows(Y, np.flatnonzero(self.homogeneous).tolist(), self._inertial), Y.shape[2]
         solution = free.solved(beside, b, self.at, self._expected, 1.0, positive)
         left = b - np.concatenate((Y, beside), axis=2) @ solution
         return solution, np.mean(left**2, axis=0), free.squares(solution[:n], left, self._expected)
@@ -153,7 +153,7 @@ class Scale:
         rest (W, n_v, c): columns beside them. solve: takes columns and right-hand side about a point, gives the
         solution (n + c,), that of the least cost last.
         """
-        free, n, W = ScaleFree(white, self.freed, self._inertial), white.shape[2], len(white)
+        free, n, W = HomogeneousRows(white, self.freed, self._inertial), white.shape[2], len(white)
         lengths = np.diag(self.near(white.reshape(-1, n))[0])
 
         def left(solution: Array) -> Array:

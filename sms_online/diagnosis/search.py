@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from functools import cached_property
 
 from sms_online.calibration.found import Calibration
-from sms_online.diagnosis.attempt import Attempt, State, Step
+from sms_online.diagnosis.attempt import Attempt, ModelFit, Step
 from sms_online.diagnosis.candidate import Finding, Ranked
 from sms_online.diagnosis.hypothesis import share_left
 from sms_online.diagnosis.late_sensors import LateSensor
@@ -45,8 +45,8 @@ class Search:
     attempt: Attempt
     steps: list[Step]
     chosen: list[int]
-    before: State
-    after: State
+    before: ModelFit
+    after: ModelFit
     estimator_before: Estimator
     estimator_after: Estimator
     unexplained: Unexplained | None

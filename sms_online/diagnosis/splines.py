@@ -8,14 +8,14 @@ import numpy as np
 from scipy.interpolate import BSpline
 
 from sms_online.diagnosis.rows import SessionRows
-from sms_online.diagnosis.weak_windows import Motion
+from sms_online.diagnosis.weak_windows import SeenMotion
 from sms_online.stream import Array
 
 # Degree of all splines.
 DEGREE = 3
 
 # Values (K,) along a motion.
-Variable = Callable[[Motion], Array]
+Variable = Callable[[SeenMotion], Array]
 
 
 def design(values: Array, knots: Array) -> Array:
@@ -30,7 +30,7 @@ def spline_columns(rows: SessionRows, variable: Variable, knots: Array, directio
     dense: see `WeakWindows.columns`.
     """
 
-    def weak(motion: Motion) -> tuple[None, Array]:
+    def weak(motion: SeenMotion) -> tuple[None, Array]:
         return None, direction[:, None] * design(variable(motion), knots)[:, None, :]
 
     return rows.weak.columns(weak, dense)

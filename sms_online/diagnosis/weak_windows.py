@@ -21,7 +21,7 @@ from sms_online.stream import Array
 
 
 @dataclass(frozen=True)
-class Motion:
+class SeenMotion:
     """Smoothed motion at the samples that some windows see.
 
     segment: its number. half_width: of the filter, samples. samples (K,): numbers in the segment. x (K, n_x), v (K,
@@ -37,11 +37,11 @@ class Motion:
 
 
 # Columns of momentum and force (K, n_v, c) of d/dt(P c) - G c = Q along a motion; no P where there is none.
-WeakColumns = Callable[[Motion], tuple[Array | None, Array]]
+WeakColumns = Callable[[SeenMotion], tuple[Array | None, Array]]
 
 
 @dataclass(frozen=True)
-class Windows:
+class WindowPlaces:
     """Where windows are and how they see the motion.
 
     segment, start, half_width (W,): number of the segment, first sample in it, M of the filter. width: samples from
@@ -60,7 +60,7 @@ class WeakWindows:
     """Evaluates columns in the windows of a session: -∫ (φ̇ P + φ G) dt."""
 
     def __init__(
-        self, windows: Windows, layout: Layout, sensing: Sensing, segments: Sequence[Segment], sample_rate: float
+        self, windows: WindowPlaces, layout: Layout, sensing: Sensing, segments: Sequence[Segment], sample_rate: float
     ) -> None:
         self.windows, self.segments = windows, segments
         self._layout, self._rate = layout, sample_rate
@@ -68,7 +68,7 @@ class WeakWindows:
             np.concatenate((sensing.coordinates(segment.values), sensing.inputs(segment.values)), axis=1)
             for segment in segments
         ]
-        self._motions: dict[bool, list[tuple[Motion, NDArray[np.int64]]]] = {}
+        self._motions: dict[bool, list[tuple[SeenMotion, NDArray[np.int64]]]] = {}
         self._operators: dict[bool, list[tuple[scipy.sparse.csr_array, scipy.sparse.csr_array]]] = {}
 
     @property
@@ -76,7 +76,7 @@ class WeakWindows:
         """Number of windows W."""
         return self.windows.start.size
 
-    def motions(self, dense: bool = False) -> list[tuple[Motion, NDArray[np.int64]]]:
+    def motions(self, dense: bool = False) -> list[tuple[SeenMotion, NDArray[np.int64]]]:
         """Motion of each segment and filter width, and the numbers of the windows that see it; dense: every sample."""
         if dense not in self._motions:
             self._motions[dense] = [
@@ -89,7 +89,7 @@ class WeakWindows:
     def _step(self, M: int, dense: bool) -> int:
         return 1 if dense else self.windows.stride(M)
 
-    def _motion(self, number: int, M: int, dense: bool) -> tuple[Motion, NDArray[np.int64]]:
+    def _motion(self, number: int, M: int, dense: bool) -> tuple[SeenMotion, NDArray[np.int64]]:
         w, n_x = self.windows, self._layout.n_x
         signals = self._signals[number]
         which = np.flatnonzero((w.segment == number) & (w.half_width == M))
@@ -101,7 +101,7 @@ class WeakWindows:
             smoothed, rates = smooth(signals, seen, M, self._rate)
         x = smoothed[:, :n_x]
         v = self._layout.speeds(x, rates[:, :n_x])
-        return Motion(number, M, seen, x, v, smoothed[:, n_x:]), which
+        return SeenMotion(number, M, seen, x, v, smoothed[:, n_x:]), which
 
     @property
     def alike(self) -> float:
@@ -129,7 +129,7 @@ class WeakWindows:
         assert out is not None
         return out
 
-    def squares(self, squares: Callable[[Motion], Array]) -> Array:
+    def squares(self, squares: Callable[[SeenMotion], Array]) -> Array:
         """Squares (W, INSTANTS, n_v) of the rows' parts by half hops, of a force that is off anew at every sample.
 
         squares: gives those of what it is off by, (K, n_v).
@@ -155,7 +155,7 @@ class WeakWindows:
             out[later, hops] = common(parts[later], parts[later - hops], hops)
         return out
 
-    def spread(self, slopes: Callable[[Motion], tuple[Array, Array]]) -> Array:
+    def spread(self, slopes: Callable[[SeenMotion], tuple[Array, Array]]) -> Array:
         """Variance of the rows (W, n_v) for white noise of some readings, to first order.
 
         slopes: gives (S, K, n_v) of a force by the smoothed value of each of S readings, and by its change from sample
@@ -181,7 +181,7 @@ class WeakWindows:
         return self._operators[dense]
 
     def _sum(
-        self, motion: Motion, which: NDArray[np.int64], dense: bool
+        self, motion: SeenMotion, which: NDArray[np.int64], dense: bool
     ) -> tuple[scipy.sparse.csr_array, scipy.sparse.csr_array]:
         w = self.windows
         step = self._step(int(w.half_width[which[0]]), dense)

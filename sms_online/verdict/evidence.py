@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
-from sms_online.nominal import AS_STATED, Comparison
+from sms_online.nominal import AS_STATED, NominalComparison
 from sms_online.pipeline.tracker_bank import Suspected
 from sms_online.tracker_results import Consistency
 from sms_online.verdict.trust import Reason, Residuals
@@ -85,7 +85,7 @@ class Evidence:
     disputed: tuple[Dispute, ...] = ()
     undecided: tuple[float, ...] = ()
     distance: float = 0.0
-    comparison: Comparison = AS_STATED
+    comparison: NominalComparison = AS_STATED
     lost: float = 0.0
     slow: Mapping[str, float] = field(default_factory=dict)
     outliers: Mapping[str, float] = field(default_factory=dict)

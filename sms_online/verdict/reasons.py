@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 
-from sms_online.nominal import Comparison
+from sms_online.nominal import NominalComparison
 from sms_online.pipeline.tracker_bank import Suspected
 from sms_online.tracker_results import Consistency
 from sms_online.verdict.evidence import Discrepancy, Dispute, Evidence
@@ -134,7 +134,7 @@ def unconverged(why: str) -> Reason:
     return Reason(why, False, then=MOVE)
 
 
-def scaled(comparison: Comparison) -> list[Reason]:
+def scaled(comparison: NominalComparison) -> list[Reason]:
     """One factor that everything is off by, which rows cannot show."""
     factor = comparison.common
     if factor is None:
@@ -275,7 +275,7 @@ def disputed(disputes: Sequence[Dispute]) -> list[Reason]:
     return out
 
 
-def apart(comparison: Comparison) -> list[Reason]:
+def apart(comparison: NominalComparison) -> list[Reason]:
     """Parameters that are not as described."""
     return [
         Reason(

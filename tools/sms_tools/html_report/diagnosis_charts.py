@@ -6,10 +6,10 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from sms_online.diagnosis.attempt import State
+from sms_online.diagnosis.attempt import ModelFit
 from sms_online.diagnosis.force_curves import AddedVariable, ForceCurve, added_variables, force_curves
 from sms_online.diagnosis.search import Search
-from sms_online.diagnosis.weak_windows import Windows
+from sms_online.diagnosis.weak_windows import WindowPlaces
 from sms_online.row_types import row_types
 from sms_online.stream import Array
 from sms_tools.html_report.figures import Chart, Series, chart
@@ -50,7 +50,7 @@ def residual_charts(diagnosis: Search) -> list[Chart]:
     return out
 
 
-def _worst(state: State, speeds: Sequence[int]) -> int:
+def _worst(state: ModelFit, speeds: Sequence[int]) -> int:
     return max(speeds, key=lambda k: float(np.sum(state.residual[:, k] ** 2)))
 
 
@@ -59,7 +59,7 @@ def _noise(t: Array) -> Series:
     return Series("", np.array((t.min(), t.max())), np.zeros(2), -bound, bound, True, NOISE)
 
 
-def _residual(state: State, windows: Windows, t: Array, speed: int, color: str) -> Series:
+def _residual(state: ModelFit, windows: WindowPlaces, t: Array, speed: int, color: str) -> Series:
     """A line that is interrupted between stretches of the session."""
     starts = np.flatnonzero(np.diff(windows.segment)) + 1
     y = np.insert(state.residual[:, speed], starts, np.nan)
