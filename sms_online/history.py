@@ -103,7 +103,9 @@ def reported_covariance(estimate: Estimate, std: Array) -> Array:
 
 
 class HistoryState(State):
-    """instants: of each, t and how many parameters, then of each tracker their values and upper triangle of covariance.
+    """The instants of a session that are kept.
+
+    instants: of each, t and how many parameters, then of each tracker their values and upper triangle of covariance.
 
     interval: from one to the next, s. due: time of the next one, s.
     """

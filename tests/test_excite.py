@@ -39,7 +39,7 @@ def designed() -> Excitation:
 
 @pytest.fixture(scope="module")
 def one_way() -> Excitation:
-    """A motion for two effects that the described one cannot tell apart."""
+    """A motion for two effects that the described one cannot separate."""
     separate = [f"{name}:torque=1" for name in ALIKE]
     return excite(parse_system(ONE_WAY, "axis.toml"), separate=separate, limits=Limits(angle=1.0), iterations=2)
 

@@ -108,9 +108,9 @@ def test_other_messages_pass_and_damaged_ones_are_counted() -> None:
         reads.push(CanFrames(*([np.empty(0)] * 6)))  # type: ignore[arg-type]
 
 
-@pytest.mark.parametrize(("told", "sends"), [((3, 1), (4, 1)), ((4, 1), (3, 1)), ((2, 9), (3, 1)), ((3, 1), (2, 9))])
-def test_another_version_gives_no_samples(told: tuple[int, int], sends: tuple[int, int]) -> None:
-    reads = decoder(told)
+@pytest.mark.parametrize(("stated", "sends"), [((3, 1), (4, 1)), ((4, 1), (3, 1)), ((2, 9), (3, 1)), ((3, 1), (2, 9))])
+def test_another_version_gives_no_samples(stated: tuple[int, int], sends: tuple[int, int]) -> None:
+    reads = decoder(stated)
     samples = reads.push(*chunks([sent(k, sends) for k in range(5)]))
     assert not samples.values.size
     assert reads.counters["bad_frame"] == 5

@@ -29,7 +29,9 @@ DYNAMICS = {f"{name}@joint_{{}}.{part}": attribute for attribute, (name, part) i
 
 @dataclass(frozen=True)
 class Exported:
-    """text: the URDF. links, joints: names of those changed. impossible: links whose inertial no body has."""
+    """A URDF with estimates.
+
+    text: of it. links, joints: names of those changed. impossible: links whose inertial no body has."""
 
     text: str
     links: tuple[str, ...]

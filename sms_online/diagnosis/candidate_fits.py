@@ -25,7 +25,7 @@ Key = tuple[tuple[int, ...], frozenset[int] | None]
 class CandidateFits:
     """Gains and solutions of candidates beside a model, each solved once until rows are whitened anew.
 
-    Whoever whitens the rows sets what stands below; `_forget` drops what was solved before.
+    Whoever whitens the rows sets the attributes declared here; `_forget` drops what was solved before.
     """
 
     # White columns (M, n) of the model and (M, m) of calibration, and b (M,); of each candidate; and rows, of these M,

@@ -31,7 +31,7 @@ def with_exact_links(case: Case, attempt: Attempt, chosen: Sequence[int]) -> Att
         return None
 
     beta = attempt.rows.beta
-    # What was found may be there beside it, or may only have stood for it.
+    # What was found may be there beside it, or may only have mimicked it.
     effects = [attempt.tracing.candidates[k].effect for k in chosen]
 
     def excess(links: Sequence[Effect]) -> float:

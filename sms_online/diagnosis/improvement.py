@@ -51,14 +51,14 @@ def with_constants(
         tried = [candidate.effect for candidate in attempt.tracing.candidates]
         others = [effect for effect in tried if effect.key not in keys]
         attempt = Attempt(case, attempt.system, constants, beta, others)
-        # Forces that only stood for a constant have nothing left to explain.
+        # Forces that only mimicked a constant have nothing left to explain.
         chosen = attempt.search(forces)
         attempt.conclude(chosen)
         if predicts_worse(bare.holdout.relative, attempt.state(chosen).holdout.relative):
             attempt, chosen = before
             break
-    standing = {effect.key for effect in attempt.constants}
-    findings = [f for f in findings if f.candidate.key in standing]
+    kept = {effect.key for effect in attempt.constants}
+    findings = [f for f in findings if f.candidate.key in kept]
     return attempt, chosen, findings
 
 

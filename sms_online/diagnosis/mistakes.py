@@ -72,7 +72,9 @@ class Mistake:
 
 @dataclass(frozen=True)
 class Corrected:
-    """mistakes: what was found, one after the other; samples: undoes them in values (B, channels), in place of the
+    """Samples and system without the mistakes that were found.
+
+    mistakes: what was found, one after the other; samples: undoes them in values (B, channels), in place of the
     channels of a session. system: with what of it the description states."""
 
     mistakes: tuple[Mistake, ...]
@@ -235,7 +237,9 @@ class _Search:
 
 @dataclass(frozen=True)
 class _Tried:
-    """fit: with the mistake undone. common: whether it scales all torques alike."""
+    """A fit with a mistake undone.
+
+    fit: that one. common: whether it scales all torques alike."""
 
     undoing: Undoing
     fit: RoughFit

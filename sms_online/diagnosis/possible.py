@@ -1,4 +1,4 @@
-"""What can be: parameters and coefficients that no real body, spring or friction has negative."""
+"""What can be: parameters and coefficients that are negative of no body, spring or friction."""
 
 from __future__ import annotations
 

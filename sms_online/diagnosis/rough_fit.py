@@ -40,7 +40,9 @@ LAWS = 3
 
 @dataclass(frozen=True)
 class RoughFit:
-    """left (rows,): rms share of each coordinate's rows that is not explained. nominal (rows,): the same with nominal
+    """What least squares leaves of samples.
+
+    left (rows,): rms share of each coordinate's rows that is not explained. nominal (rows,): the same with nominal
     values in place of those fitted."""
 
     left: Array

@@ -162,7 +162,9 @@ class Columns:
 
 @dataclass(frozen=True)
 class Minimum:
-    """beta (n,): where the criterion is least. directions (n, rank): of unit curvature, those with information. slopes
+    """The least value of the criterion, and how it rises from there.
+
+    beta (n,): where it is. directions (n, rank): of unit curvature, those with information. slopes
     (n_v, n): of each speed's part of it, which add up to what priors pull with. errors (n_v,): the share e that each
     column is off by beyond noise.
     """

@@ -18,7 +18,9 @@ from sms_online.stream import Array
 
 @dataclass(frozen=True)
 class DriftLine:
-    """moved (n,): by how much parameters have moved at t, s, from a reference; rate (n,): per s, from there on.
+    """A line for each parameter that drifts.
+
+    moved (n,): by how much parameters have moved at t, s, from a reference; rate (n,): per s, from there on.
 
     decay (n,): of the rates, 1/s.
     """

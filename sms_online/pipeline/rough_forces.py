@@ -176,7 +176,9 @@ def _through_filter(half_width: int, width: int, steps: int) -> Array:
 
 
 def responses(slopes: Array, phi: Array, half_width: int, sample_rate: float, steps: int) -> Array:
-    """c (steps + 1, E): what a displacement n(t) of a reading adds to a row is ∫ c(t) n(t) dt, for unit coefficients.
+    """Responses of a row to displacements of a reading, by way of rough forces.
+
+    c (steps + 1, E): what a displacement n(t) of a reading adds to a row is ∫ c(t) n(t) dt, for unit coefficients.
 
     slopes (width + 1, 2 E): `RoughForces.slopes` along the window. phi (width + 1,): test function at the samples.
     """

@@ -82,7 +82,9 @@ class RowNoise(Stage):
         self.state = RowNoiseState()
 
     def kernels(self, windows: Sensitivity) -> Array:
-        """c (W, STEPS + 1, n_v, sensors): what a displacement n(t) of each sensor adds to the rows is ∫ c(t) n(t) dt.
+        """Responses of rows to displacements of the sensors.
+
+        c (W, STEPS + 1, n_v, sensors): what a displacement n(t) of each sensor adds to the rows is ∫ c(t) n(t) dt.
 
         But for rough forces, which see the motion through the filter: `RoughForces.kernels`.
         """

@@ -87,7 +87,9 @@ class Suspected:
 
 
 class BankState(State):
-    """reference (n,): parameters from which a drift counts, None where nothing has moved.
+    """What a bank of trackers keeps beside them.
+
+    reference (n,): parameters from which a drift counts, None where nothing has moved.
 
     since: s, when what an alarm is of may have begun, inf without one. none: it is of no drift.
     """

@@ -80,7 +80,7 @@ def one_pair(folder: Path, names: list[str], seed: int) -> Record:
     return {
         "name": "+".join(effect.name for effect in effects),
         "true": {effect.key: effect.coefficients for effect in effects},
-        **_told(diagnose(disguised(draw.system), [draw.session(effects, seed)], "case", lambda _: None)),
+        **_summary(diagnose(disguised(draw.system), [draw.session(effects, seed)], "case", lambda _: None)),
     }
 
 
@@ -95,10 +95,10 @@ def one_clean(folder: Path, grade: str, seed: int) -> Record:
     """The diagnosis of a session that nothing is missing in."""
     system = load_system(SYSTEM)
     block = noisy_session(system, exact_session(system, folder / CLEAN), grade, seed)
-    return _told(diagnose(disguised(system, factor=SLIGHT), [block], "case", lambda _: None))
+    return _summary(diagnose(disguised(system, factor=SLIGHT), [block], "case", lambda _: None))
 
 
-def _told(found: Search) -> Record:
+def _summary(found: Search) -> Record:
     return {"verdict": found.verdict, "found": _keys(found), "holdout": found.after.holdout.whitened}
 
 
@@ -122,8 +122,8 @@ def one_single(folder: Path, name: str, seed: int) -> Record:
     return {
         "where": effect.where,
         "true": effect.coefficients,
-        **_told(found),
-        "told": reported,
+        **_summary(found),
+        "reported": reported,
         "ambiguous": {finding.candidate.key: list(finding.ambiguous) for finding in found.findings},
         "before": {row: test.whitened for row, test in found.before.test.items()},
         "after": {row: test.whitened for row, test in found.after.test.items()},
@@ -184,7 +184,7 @@ def one_struck(folder: Path, name: str, seed: int) -> Record:
     return {
         "where": effect.where,
         "struck": sorted(near),
-        **_told(found),
+        **_summary(found),
         "row": None if found.unexplained is None else found.unexplained.row,
         "worst": worst,
         "left": found.left,
@@ -204,10 +204,10 @@ def summary(records: list[Record]) -> str:
         first = r["found"][:1] == [key]
         inside = first or any(key in r["ambiguous"].get(found, []) for found in r["found"][:1])
         right, group = right + first, group + inside
-        for coefficient, value in r["told"].get(key, {}).items():
+        for coefficient, value in r["reported"].get(key, {}).items():
             if r["true"].get(coefficient):
                 ratios.setdefault(r["name"], []).append(abs(value / r["true"][coefficient] - 1.0))
-        reported = r["told"].get(key, {})
+        reported = r["reported"].get(key, {})
         lines.append(f"{'ok ' if first else 'grp' if inside else 'BAD'} {key:36} {r['true']} → {r['found']} {reported}")
     if singles:
         n = len(singles)

@@ -96,7 +96,7 @@ def _record(case: Case, found: Search) -> Record:
         "verdict": found.verdict,
         "found": [*keys, *(key for key in declared if key not in keys)],
         "expected": case.found,
-        "told": reported,
+        "reported": reported,
         "before": {name: row.whitened for name, row in found.before.test.items()},
         "after": {name: row.whitened for name, row in found.after.test.items()},
         "holdout": found.after.holdout.whitened,
@@ -124,7 +124,7 @@ def summary(records: list[Record]) -> str:
             for side in ("off_before", "off_after")
         ]
         lines.append(
-            f"{'ok ' if right else 'BAD'} {r['case']:8} {r['verdict']:11} {r['found']} {r['told']}\n"
+            f"{'ok ' if right else 'BAD'} {r['case']:8} {r['verdict']:11} {r['found']} {r['reported']}\n"
             f"    worst row {worst[0]:.2f} → {worst[1]:.2f}, held out {worst[2]:.2f} times noise;"
             f" spacecraft {craft[0]:.3f} → {craft[1]:.4f} % off; {r['seconds']:.0f} s"
         )
