@@ -218,7 +218,7 @@ def random_states(layout: Layout, count: int, seed: int, elastic: float = 0.2) -
     """Positions x (count, n_x) and speeds v (count, n_v): standard normal, elastic coordinates `elastic` times that."""
     rng = np.random.default_rng(seed)
     x, v = rng.normal(size=(count, layout.n_x)), rng.normal(size=(count, layout.n_v))
-    offset = layout.n_base_positions - layout.n_base_speeds
+    offset = layout.offset
     for s in layout.q_f:
         x[:, s.start + offset : s.stop + offset] *= elastic
     if layout.free and not layout.planar:

@@ -31,7 +31,7 @@ class Motion:
 def prescribed(model: Model, samples: int, seed: int) -> Motion:
     """Sines of random phase on every coordinate; joints move forward all the time, so that friction keeps its sign."""
     layout, rng = model.layout, np.random.default_rng(seed)
-    offset = layout.n_base_positions - layout.n_base_speeds
+    offset = layout.offset
     frequency = rng.uniform(SLOWEST, FASTEST, layout.n_x)
     phase = rng.uniform(0.0, 2.0 * np.pi, layout.n_x)
     amplitude = np.full(layout.n_x, WIDE)

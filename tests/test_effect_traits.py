@@ -64,7 +64,7 @@ def test_a_force_reverses_where_it_follows_its_rate_s_sign() -> None:
         if effect.needs_torque or effect.n_states:
             continue
         x, v = np.full((2, layout.n_x), 0.1), np.zeros((2, layout.n_v))
-        x[:, layout.theta_m[0] + layout.n_base_positions - layout.n_base_speeds] = 0.2
+        x[:, layout.theta_m[0] + layout.offset] = 0.2
         v[:, layout.theta_m[0]] = 0.01, -0.01
         up, down = effect.force(layout, x, v, None)[:, layout.theta_m[0]]
         v[:, layout.theta_m[0]] = 0.02, 0.0

@@ -23,7 +23,7 @@ COULOMB = Effect(name="coulomb_friction", where="joint_1", coefficients={"torque
 MODEL = build_model(paper(effects=(COULOMB,)))
 BASE = find_base_parameters(MODEL)
 MOTOR = MODEL.layout.theta_m[0]
-ANGLE = MOTOR + MODEL.layout.n_base_positions - MODEL.layout.n_base_speeds
+ANGLE = MOTOR + MODEL.layout.offset
 
 
 def windows_of(angle: Array, sigma: float, hops: int = 1) -> list[Window]:

@@ -18,6 +18,11 @@ def mounts(system: System) -> tuple[Mount, ...]:
     return (*system.joints, *system.fixed_joints)
 
 
+def index_of(place: str) -> int:
+    """Number from 0 of the joint or link that a place names: 2 of `joint_3`."""
+    return int(place.rpartition("_")[2]) - 1
+
+
 def parent_of(mount: Mount, i: int) -> int:
     """Number from 0 of the link that joint i (from 0) is mounted on, or BASE."""
     if mount.parent is None:

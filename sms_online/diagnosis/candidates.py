@@ -11,6 +11,7 @@ from itertools import product
 import numpy as np
 
 from sms_online.description.schema import Effect, System
+from sms_online.description.tree import index_of
 from sms_online.diagnosis.candidate import Candidate, Unmodelled
 from sms_online.diagnosis.constants import is_constant
 from sms_online.diagnosis.followed import FollowedMotion
@@ -134,7 +135,7 @@ class CandidateColumns:
 
     def _variables(self, effect: Effect) -> dict[str, Array]:
         """Values (K,) that the variables of a joint's curves go through, by name."""
-        layout, i = self.rows.model.layout, int(effect.where.removeprefix("joint_")) - 1
+        layout, i = self.rows.model.layout, index_of(effect.where)
         motor, link = layout.theta_m[i], layout.q[i]
         x, v = (np.concatenate([getattr(m, part) for m, _ in self.rows.weak.motions()]) for part in ("x", "v"))
         deflection = position(layout, x, motor) - position(layout, x, link)
@@ -144,8 +145,8 @@ class CandidateColumns:
 
     def _turns(self, where: str, order: float) -> bool:
         """Whether an effect of so many periods a motor turn goes through one: less of it is a constant or a gain."""
-        layout, i = self.rows.model.layout, int(where.removeprefix("joint_")) - 1
-        theta_m = layout.theta_m[i] + layout.n_base_positions - layout.n_base_speeds
+        layout, i = self.rows.model.layout, index_of(where)
+        theta_m = layout.theta_m[i] + layout.offset
         angles = np.concatenate([motion.x[:, theta_m] for motion, _ in self.rows.weak.motions()])
         return bool(order * self.system.joints[i].gear_ratio * np.ptp(angles) > 2.0 * np.pi)
 
@@ -153,14 +154,13 @@ class CandidateColumns:
         """How far the session goes at a place."""
         layout = self.rows.model.layout
         joints = joints_of(where) or range(len(layout.q))
-        offset = layout.n_base_positions - layout.n_base_speeds
         theta_m, q = np.array(layout.theta_m)[list(joints)], np.array(layout.q)[list(joints)]
         motions = [motion for motion, _ in self.rows.weak.motions()]
         speed = max(float(np.abs(motion.v[:, theta_m]).max()) for motion in motions)
-        angles = [motion.x[:, theta_m + offset] for motion in motions]
+        angles = [motion.x[:, theta_m + layout.offset] for motion in motions]
         swing = float(np.ptp(np.concatenate(angles), axis=0).max())
         pairs = zip(angles, motions, strict=True)
-        deflection = max(float(np.abs(angle - motion.x[:, q + offset]).max()) for angle, motion in pairs)
+        deflection = max(float(np.abs(angle - motion.x[:, q + layout.offset]).max()) for angle, motion in pairs)
         rate = self.system.sample_rate
         longest = max(segment.index.size for segment in self.rows.segments[self._since :])
         return Ranges(speed, swing, deflection, longest / rate, rate)
@@ -319,7 +319,7 @@ class CandidateColumns:
     def _standstill(self, where: str) -> SessionStandstill:
         """Standstill of a joint's motor."""
         if where not in self._held:
-            rows, joint = self.rows, int(where.removeprefix("joint_")) - 1
+            rows, joint = self.rows, index_of(where)
             noise = self._noise_of(joint)
             self._held[where] = SessionStandstill(rows.sensing, rows.segments, joint, noise, self.system.sample_rate)
         return self._held[where]
@@ -327,7 +327,7 @@ class CandidateColumns:
     def _reversals(self, where: str) -> Reversals:
         """Reversals of a joint's motor, in the windows' own samples."""
         if where not in self._turned:
-            rows, joint = self.rows, int(where.removeprefix("joint_")) - 1
+            rows, joint = self.rows, index_of(where)
             parts = self._noise_of(joint), self.system.sample_rate, self._standstill(where)
             self._turned[where] = Reversals(rows.sensing, self._weak.segments, joint, *parts)
         return self._turned[where]
@@ -343,7 +343,7 @@ class CandidateColumns:
 
     def _torque_rate(self, where: str) -> Array:
         """∫ φ d(n τ)/dt dt of a joint in its motor's row (W, n_v), differentiated by way of φ."""
-        i = int(where.removeprefix("joint_")) - 1
+        i = index_of(where)
         motor = self.rows.model.layout.theta_m[i]
 
         def columns(motion: SeenMotion) -> tuple[Array, Array]:

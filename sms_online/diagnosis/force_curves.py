@@ -13,6 +13,7 @@ from itertools import pairwise
 import numpy as np
 
 from sms_online.description.schema import Effect
+from sms_online.description.tree import index_of
 from sms_online.diagnosis.attempt import Attempt
 from sms_online.diagnosis.candidate import Candidate
 from sms_online.diagnosis.evidence import basis, free_of, gain
@@ -84,7 +85,7 @@ def _curve(diagnosis: Search, where: str, curve: Curve, order: float | None, own
     name, jumps = curve.over, curve.over == "motor speed"
     attempt, after = diagnosis.attempt, diagnosis.after
     rows, candidates = attempt.rows, attempt.tracing.candidates
-    layout, i = rows.model.layout, int(where.removeprefix("joint_")) - 1
+    layout, i = rows.model.layout, index_of(where)
     effects = tuple(candidates[k].effect for k in own)
     direction = np.eye(layout.n_v)[layout.theta_m[i]]
     if curve.between:
@@ -159,7 +160,7 @@ def _law(diagnosis: Search, own: list[int], variable: Variable, at: Array) -> Ar
             force = forces[effect.name, effect.where]
             inputs = Inputs(motion.torque, np.zeros((len(motion.x), 0)))
             columns = force.force(layout, motion.x, motion.v, inputs)
-            speed = layout.theta_m[int(effect.where.removeprefix("joint_")) - 1]
+            speed = layout.theta_m[index_of(effect.where)]
             total += columns[:, speed] @ _coefficients(diagnosis, k)
         values.append(variable(motion))
         law.append(total)

@@ -102,7 +102,6 @@ def _variables(rows: SessionRows, speed: int) -> dict[str, Variable]:
     Not the torque on that very speed, which explains itself, with an arm that has no mass.
     """
     layout = rows.model.layout
-    offset = layout.n_base_positions - layout.n_base_speeds
     out: dict[str, Variable] = {}
     for k, name in enumerate(layout.position_names):
         out[name] = _position(k)
@@ -110,7 +109,7 @@ def _variables(rows: SessionRows, speed: int) -> dict[str, Variable]:
         out[f"rate of {name}"] = _speed(k)
     for i, (q, theta_m) in enumerate(zip(layout.q, layout.theta_m, strict=True)):
         if q != theta_m:
-            out[f"deflection of joint_{i + 1}"] = _difference(theta_m + offset, q + offset)
+            out[f"deflection of joint_{i + 1}"] = _difference(theta_m + layout.offset, q + layout.offset)
         if speed not in (q, theta_m):
             out[f"torque of joint_{i + 1}"] = _torque(i)
     rate = rows.model.system.sample_rate

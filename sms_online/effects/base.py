@@ -13,6 +13,7 @@ from typing import ClassVar, Literal
 import numpy as np
 
 from sms_online.description.schema import Effect, Over, System
+from sms_online.description.tree import index_of
 from sms_online.effects.traits import Traits
 from sms_online.model.chain import Chain
 from sms_online.model.effect import ForceEffect
@@ -35,7 +36,7 @@ DIFFERENCE = 1e-6
 
 def joints_of(where: str) -> tuple[int, ...]:
     """Indices, from 0, of the joint or the two joints of a place, `joint_i` or `joint_i+joint_j`; none of another."""
-    return tuple(int(each.removeprefix("joint_")) - 1 for each in where.split("+") if each.startswith("joint_"))
+    return tuple(index_of(each) for each in where.split("+") if each.startswith("joint_"))
 
 
 @dataclass(frozen=True)
@@ -199,7 +200,7 @@ class Force(ForceEffect):
 
 def position(layout: Layout, x: Array, speed: int) -> Array:
     """Position (B,) whose rate is a speed beyond the base's."""
-    return np.asarray(x[:, speed + layout.n_base_positions - layout.n_base_speeds])
+    return np.asarray(x[:, speed + layout.offset])
 
 
 def report(

@@ -9,6 +9,7 @@ import numpy as np
 
 from sms_online.description.bodies import FlexibleLink
 from sms_online.description.schema import System
+from sms_online.description.tree import index_of
 from sms_online.effects.base import Site
 from sms_online.effects.catalogue import FORCE_CLASSES, GEOMETRIC_STIFFENING, INERTIA_CLASSES, check_effect, with_shapes
 from sms_online.errors import InputError
@@ -58,7 +59,7 @@ def with_kinematics(system: System) -> System:
     for k, effect in enumerate(system.effects, start=1):
         if effect.name == GEOMETRIC_STIFFENING.name and effect.where not in exact:
             check_effect(system, effect, f"effect {k}", system.name)
-            i = int(effect.where.removeprefix("link_")) - 1
+            i = index_of(effect.where)
             links[i] = links[i].model_copy(update={"kinematics": "exact"})
     return system.model_copy(update={"links": tuple(links)}) if links != list(system.links) else system
 

@@ -14,6 +14,7 @@ from sms_online.description.bodies import FlexibleLink
 from sms_online.description.channels import channels, drive_channels, has_motor_side, strain_channel
 from sms_online.description.explain import hint, nearest
 from sms_online.description.schema import Effect, System
+from sms_online.description.tree import index_of
 from sms_online.effects.base import Constant, Entry, Place, Site
 from sms_online.effects.channel import ChannelEffect, EncoderEccentricity, EncoderOffset, Linear
 from sms_online.effects.coupled import CoupledFriction, CoupledInertia, GravitySpring
@@ -166,7 +167,7 @@ def _check_curve(system: System, effect: Effect, place: str, source: str) -> Non
 
 def curve_variables(system: System, effect: Effect) -> tuple[str, ...]:
     """What a curve of an effect may be over at its joint; one without a spring has neither deflection nor load."""
-    joint = system.joints[int(effect.where.removeprefix("joint_")) - 1]
+    joint = system.joints[index_of(effect.where)]
     return tuple(over for over in ENTRIES[effect.name].over if has_motor_side(joint) or over not in OF_SPRINGS)
 
 

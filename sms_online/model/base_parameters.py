@@ -88,13 +88,13 @@ def random_states(model: Model, count: int, rng: np.random.Generator) -> tuple[A
     """Random positions x (count, n_x) and speeds v (count, n_v) within a testbed's range."""
     layout = model.layout
     x = rng.uniform(-1.0, 1.0, size=(count, layout.n_x))
-    offset = layout.n_base_positions - layout.n_base_speeds
+    offset = layout.offset
     for q, theta_m in zip(layout.q, layout.theta_m, strict=True):
         x[:, q + offset] = rng.uniform(-np.pi, np.pi, size=count)
         if theta_m != q:
             x[:, theta_m + offset] = x[:, q + offset] + ELASTIC_AMPLITUDE * x[:, theta_m + offset]
-    for elastic in layout.q_f:
-        x[:, elastic.start + offset : elastic.stop + offset] *= ELASTIC_AMPLITUDE
+    for i in range(len(layout.q_f)):
+        x[:, layout.elastic(i)] *= ELASTIC_AMPLITUDE
     if layout.free and not layout.planar:
         x[:, 3:7] /= np.linalg.norm(x[:, 3:7], axis=1)[:, None]
     return x, rng.uniform(-1.0, 1.0, size=(count, layout.n_v))

@@ -180,9 +180,7 @@ class Chain:
 
     def elastic(self, x: Array, i: int) -> Array:
         """Elastic coordinates (B, n_f) of link i (from 0)."""
-        offset = self.layout.n_base_positions - self.layout.n_base_speeds
-        s = self.layout.q_f[i]
-        return x[:, s.start + offset : s.stop + offset]
+        return x[:, self.layout.elastic(i)]
 
 
 class Configuration:
@@ -194,12 +192,11 @@ class Configuration:
         layout = chain.layout
         self.size = x.shape[0]
         self.r_S, self.T_0 = layout.base_pose(x)
-        offset = layout.n_base_positions - layout.n_base_speeds
         self._shapes: dict[int, Shape] = {}
         self.turns: list[Array] = []  # A_i(q_i), (B, 3, 3)
         self.slides: list[Array | None] = []  # displacement of a prismatic joint in its mount frame, (B, 3)
         for i, joint in enumerate(chain.joints):
-            q = x[:, layout.q[i] + offset]
+            q = x[:, layout.q[i] + layout.offset]
             if joint.kind == "revolute":
                 self.turns.append(so3.about(chain.turn_basis[i], q))
                 self.slides.append(None)

@@ -67,6 +67,15 @@ class Layout:
         """Number of the base's generalized speeds."""
         return len(self.base_linear) + len(self.base_angular)
 
+    @property
+    def offset(self) -> int:
+        """Number of a position beyond the base's, less that of its speed: of an attitude's four numbers three turn."""
+        return self.n_base_positions - self.n_base_speeds
+
+    def elastic(self, i: int) -> slice:
+        """Where positions hold the elastic coordinates of link i (from 0)."""
+        return slice(self.q_f[i].start + self.offset, self.q_f[i].stop + self.offset)
+
     def joint_positions(self, x: Array) -> Array:
         """Positions (B, ·) whose rates are speeds: all but the base's; speed i is column i - n_base_speeds."""
         return x[:, self.n_base_positions :]

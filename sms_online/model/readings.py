@@ -47,7 +47,7 @@ class Readings:
         if layout.free:
             _, T_0 = layout.base_pose(x)
             parts.append((self._omega(v)[:, None] @ T_0)[:, 0, list(layout.base_angular)])
-        offset = layout.n_base_positions - layout.n_base_speeds
+        offset = layout.offset
         parts += [x[:, [layout.q[i] + offset]] - x[:, [layout.theta_m[i] + offset]] for i in self._strips]
         if self._points is not None:
             parts.append(self._points(x))

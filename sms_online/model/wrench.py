@@ -8,7 +8,7 @@ import numpy as np
 
 from sms_online.description.channels import WRENCH_COMPONENTS, wrench_components
 from sms_online.description.schema import System
-from sms_online.description.tree import BASE
+from sms_online.description.tree import BASE, index_of
 from sms_online.model.chain import Chain
 from sms_online.model.effect import ForceEffect, Inputs
 from sms_online.model.layout import Layout
@@ -33,7 +33,7 @@ class MeasuredWrenches(ForceEffect):
         self._chain = chain
         self._places = [
             (
-                BASE if wrench.where == "base" else int(wrench.where.removeprefix("link_")) - 1,
+                BASE if wrench.where == "base" else index_of(wrench.where),
                 [WRENCH_COMPONENTS.index(name) for name in wrench_components(system, wrench)],
             )
             for wrench in system.wrenches

@@ -118,8 +118,7 @@ class MomentumBalance(Stage):
         self._physical = np.array(base.independent)[self.columns]
         self.rough = RoughForces(model)
         self._rough = np.flatnonzero(np.isin(self._physical, self.rough.columns))
-        offset = model.layout.n_base_positions - model.layout.n_base_speeds
-        self._motors = np.unique(self.rough.motors) + offset  # coordinates of those with dry friction
+        self._motors = np.unique(self.rough.motors) + model.layout.offset  # coordinates of those with dry friction
         self._widths = half_widths(self.width)
         # Samples before and after a window that its filter needs.
         self.lead = self._widths[-1]
@@ -274,8 +273,7 @@ class MomentumBalance(Stage):
         parts = np.cumsum([COPIES * (self._rough.size + self.model.layout.n_v), 2 * self.rough.rows.size])
         entries = int(parts[-1]) + self.rough.dry.size
         kept = self._sampling.kept(self.state.dense, half_width, 1, windows[0], entries)
-        offset = self.model.layout.n_base_positions - self.model.layout.n_base_speeds
-        motor_of = np.searchsorted(self._motors, self.rough.motors + offset)
+        motor_of = np.searchsorted(self._motors, self.rough.motors + self.model.layout.offset)
         # Entries of columns and slopes by laws of dry friction: at a standstill their sign is noise's, not friction's.
         by_law = [
             places[:, None] == self.rough.dry for places in (self._physical[self._rough], self.rough.coefficients)
@@ -334,7 +332,7 @@ class MomentumBalance(Stage):
         """What the rates of joints with rough forces change by from the sample before (K, n_v), of the motion v."""
         layout, before = self.model.layout, self.lead - self.state.first
         speeds = np.unique(self.rough.coordinates)
-        angles = self.state.samples[:, speeds + layout.n_base_positions - layout.n_base_speeds]
+        angles = self.state.samples[:, speeds + layout.offset]
         out = np.zeros_like(v)
         if speeds.size:
             # The first sample of all has none before it.

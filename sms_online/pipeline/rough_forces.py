@@ -85,7 +85,6 @@ class RoughForces:
         position as its rate does with that speed.
         """
         layout, K = self._model.layout, len(x)
-        offset = layout.n_base_positions - layout.n_base_speeds
         by_position, by_rate = [np.empty((K, 0))], [np.empty((K, 0))]
         acting = list(self._model.acting(self._model.inputs(np.tile(signals, (4, 1)))))
         for k, speeds in self._joints.items():
@@ -95,7 +94,7 @@ class RoughForces:
                 within = np.maximum(DIFFERENCE, 0.5 * np.abs(change[:, speed]))
                 # Each position there and back, then each rate.
                 x_n, v_n, z_n = np.tile(x, (4, 1)), np.tile(v, (4, 1)), own.states.copy()
-                x_n[: 2 * K, speed + offset] += np.repeat((DIFFERENCE, -DIFFERENCE), K)
+                x_n[: 2 * K, speed + layout.offset] += np.repeat((DIFFERENCE, -DIFFERENCE), K)
                 v_n[2 * K :, speed] += np.concatenate((within, -within))
                 if effect.n_states:
                     rates = effect.state_rate(layout, x_n[2 * K :], v_n[2 * K :], z_n[2 * K :])

@@ -188,10 +188,9 @@ class Sensing:
         for angle, motor in self._beyond_coordinates:
             out[:, angle] -= x[:, motor]
         layout = self.model.layout
-        offset = layout.n_base_positions - layout.n_base_speeds
-        for i, (kinematics, q_f) in enumerate(zip(self.model.chain.flexible, layout.q_f, strict=True)):
+        for i, kinematics in enumerate(self.model.chain.flexible):
             if kinematics is not None:
-                own = slice(q_f.start + offset, q_f.stop + offset)
+                own = layout.elastic(i)
                 out[:, own] = kinematics.markers(self.model.chain.elastic(x, i))
         return out
 
@@ -202,10 +201,9 @@ class Sensing:
         by_sensor = np.broadcast_to(np.eye(n_x), (K, n_x, n_x)).copy()
         for angle, motor in self._beyond_coordinates:
             by_sensor[:, angle, motor] = 1.0
-        offset = layout.n_base_positions - layout.n_base_speeds
-        for i, (kinematics, q_f) in enumerate(zip(self.model.chain.flexible, layout.q_f, strict=True)):
+        for i, kinematics in enumerate(self.model.chain.flexible):
             if kinematics is not None and not isinstance(kinematics, LinearLink):  # whose markers are its coordinates
-                own = slice(q_f.start + offset, q_f.stop + offset)
+                own = layout.elastic(i)
                 by_sensor[:, own, own] = np.linalg.inv(kinematics.marker_jacobian(self.model.chain.elastic(x, i)))
         every = np.repeat(x, n_x, axis=0)
         moved = layout.speeds(every, by_sensor.swapaxes(1, 2).reshape(-1, n_x))
@@ -217,10 +215,9 @@ class Sensing:
         out = sensors.copy()
         for angle, motor in self._beyond_coordinates:
             out[angle] = np.hypot(out[angle], sensors[motor])
-        offset = layout.n_base_positions - layout.n_base_speeds
-        for kinematics, q_f in zip(self.model.chain.flexible, layout.q_f, strict=True):
+        for i, kinematics in enumerate(self.model.chain.flexible):
             if kinematics is not None:
-                own = slice(q_f.start + offset, q_f.stop + offset)
+                own = layout.elastic(i)
                 inverse = np.linalg.inv(kinematics.marker_jacobian(np.zeros((1, kinematics.n_f)))[0])
                 out[own] = np.sqrt(inverse**2 @ sensors[own] ** 2)
         return out

@@ -9,6 +9,7 @@ import numpy as np
 from sms_online.calibration.found import CERTAIN
 from sms_online.calibration.truncation import FINER
 from sms_online.description.bodies import FlexibleLink
+from sms_online.description.tree import index_of
 from sms_online.evaluation import Evaluation
 from sms_online.verdict.trust import Reason
 
@@ -76,7 +77,7 @@ def truncated(evaluation: Evaluation) -> list[Truncated]:
         deviations = np.abs(moved) / estimate.std[known]
         worst = int(np.argmax(deviations))
         if deviations[worst] > LEAST:
-            link = evaluation.model.system.links[int(nuisance.where.removeprefix("link_")) - 1]
+            link = evaluation.model.system.links[index_of(nuisance.where)]
             assert isinstance(link, FlexibleLink)
             share = float(moved[worst] / abs(estimate.pi[known[worst]]))
             name = evaluation.parameters[known[worst]].name

@@ -67,12 +67,11 @@ def figure_6(simulation: Simulation) -> list[Chart]:
     t = np.linspace(0.0, simulation.duration, POINTS)
     exact = exact_states(simulation, t)
     system, layout = simulation.plant.system, simulation.plant.model.layout
-    offset = layout.n_base_positions - layout.n_base_speeds
     angles, rates, torques = [], [], []
     for i, (q, theta_m) in enumerate(zip(layout.q, layout.theta_m, strict=True)):
         number = "₁₂"[i]
-        angles.append(Series(f"q{number}", t, exact.x[:, q + offset]))
-        angles.append(Series(f"θ_m{number}", t, exact.x[:, theta_m + offset]))
+        angles.append(Series(f"q{number}", t, exact.x[:, q + layout.offset]))
+        angles.append(Series(f"θ_m{number}", t, exact.x[:, theta_m + layout.offset]))
         rates += [Series(f"q̇{number}", t, exact.v[:, q]), Series(f"θ̇_m{number}", t, exact.v[:, theta_m])]
         torques.append(Series(f"τ{number}", t, exact.torque[:, i] / system.joints[i].gear_ratio))
     return [

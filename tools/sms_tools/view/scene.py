@@ -76,10 +76,10 @@ class Scene:
         self._points = [LinkPoints(system, model.chain, i) for i in links]
         self.markers = tuple((i + 1, j + 1) for i in links for j in range(len(system.links[i].points)))
         layout = model.layout
-        offset = layout.n_base_positions - layout.n_base_speeds
-        self._q = [index + offset for index in layout.q]
-        self._theta_m = [index + offset for index in layout.theta_m]
-        self._elastic = np.concatenate([np.arange(s.start, s.stop) + offset for s in layout.q_f]).astype(np.int64)
+        self._q = [index + layout.offset for index in layout.q]
+        self._theta_m = [index + layout.offset for index in layout.theta_m]
+        numbers = np.arange(layout.n_x)
+        self._elastic = np.concatenate([numbers[layout.elastic(i)] for i in range(len(layout.q_f))])
 
     def draw(self, x: Array) -> Drawing:
         """Pictures of the positions x (B, n_x)."""
