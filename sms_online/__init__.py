@@ -22,10 +22,11 @@ if TYPE_CHECKING:
     from sms_online.pipeline.events import Event
     from sms_online.repeatability import Comparison
     from sms_online.result import Coefficient, Finding, Parameter, Parameters, Result
+    from sms_online.row_types import Residual
     from sms_online.session import Session, estimate
     from sms_online.stream import Block
     from sms_online.validation import Validation, validate
-    from sms_online.verdict.trust import Residual, Trust
+    from sms_online.verdict.trust import Trust
     from sms_sim.bound import Bounds, bound
     from sms_sim.capture import simulate
     from sms_sim.excitation import Excitation, excite
@@ -51,7 +52,7 @@ _HOMES = {
     "Limits": "sms_sim.motion_limits",
     "Parameter": "sms_online.result",
     "Parameters": "sms_online.result",
-    "Residual": "sms_online.verdict.trust",
+    "Residual": "sms_online.row_types",
     "Result": "sms_online.result",
     "Session": "sms_online.session",
     "System": "sms_online.description.schema",

@@ -19,12 +19,11 @@ from sms_online.physical import PhysicalSet, Projection
 from sms_online.pipeline.description import described, nearer
 from sms_online.pipeline.statistics import Statistics
 from sms_online.pipeline.tracker_bank import Reading, rows_per_second
-from sms_online.row_types import ENERGY, joint_rows, row_types
+from sms_online.row_types import ENERGY, Residual, joint_rows, row_types
 from sms_online.stream import Array
 from sms_online.threads import one_blas_thread
 from sms_online.tracker_results import Consistency, Drift, Tracked, TrackerResult
 from sms_online.trackers.interface import Estimate, Prior
-from sms_online.verdict.trust import Residual
 
 # Half width of a 95 % interval in standard deviations.
 NORMAL_95 = 1.959963984540054

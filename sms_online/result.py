@@ -17,12 +17,13 @@ from sms_online.evaluation import NORMAL_95
 from sms_online.history import History, HistoryRecorder, reported_covariance
 from sms_online.pipeline.events import Event
 from sms_online.pipeline.statistics import Method
+from sms_online.row_types import Residual, Residuals
 from sms_online.stream import Array
 from sms_online.tables import Documented, Table, finite, formatter
 from sms_online.tracker_results import Drift, TrackerResult
 from sms_online.triangle import upper
 from sms_online.verdict.judged import JudgedEvaluation
-from sms_online.verdict.trust import Residual, Residuals, Trust
+from sms_online.verdict.trust import Trust
 
 if TYPE_CHECKING:
     import pandas

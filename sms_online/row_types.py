@@ -1,11 +1,28 @@
-"""Types of the rows that residuals are reported by, named after what they act on."""
+"""Types of the rows, named after what they act on, and the residuals that are reported by them."""
 
 from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import NamedTuple
 
 from sms_online.model.layout import Layout
 
 # Rows of the energy balance.
 ENERGY = "energy"
+
+
+class Residual(NamedTuple):
+    """What one type of rows leaves, root mean square; None where it is not known.
+
+    relative: to the measured torque or force. whitened: over the standard deviation that the sensors' noise predicts,
+    so that 1 is noise alone.
+    """
+
+    relative: float | None
+    whitened: float | None
+
+
+Residuals = Mapping[str, Residual]  # by type of the rows
 
 
 def joint_rows(joint: int) -> str:

@@ -13,12 +13,12 @@ import pytest
 import sms_online as sms
 from sms_online.pipeline.estimator import Estimator
 from sms_online.pipeline.tracker_bank import Suspected
+from sms_online.row_types import Residual
 from sms_online.session import with_trackers
 from sms_online.tracker_results import Consistency
 from sms_online.verdict.evidence import Evidence
 from sms_online.verdict.judge import judge
 from sms_online.verdict.reasons import DIAGNOSE, FOLLOW, GO_ON
-from sms_online.verdict.trust import Residual
 from tests.axis import AXIS, MOTION
 from tests.bus_streams import axis_testbed
 

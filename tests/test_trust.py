@@ -9,10 +9,11 @@ import pytest
 from sms_online.description.parse import parse_system
 from sms_online.nominal import Apart, NominalComparison
 from sms_online.pipeline.estimator import Estimator
+from sms_online.row_types import Residual
 from sms_online.verdict.evidence import Discrepancy, Dispute, Evidence
 from sms_online.verdict.judge import judge, judge_diagnosis
 from sms_online.verdict.reasons import CHECK_ROWS, MOVE, place_of
-from sms_online.verdict.trust import LONGEST_SENTENCE, Residual
+from sms_online.verdict.trust import LONGEST_SENTENCE
 from tests.axis import AXIS, axis_block
 from tests.evaluated import judged, results_document
 from tests.sessions_of import session_of

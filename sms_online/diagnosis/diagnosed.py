@@ -24,12 +24,13 @@ from sms_online.pipeline.estimator import Estimator
 from sms_online.priors import GivenPrior, base_prior, given_prior, with_estimates
 from sms_online.recorded import Recorded
 from sms_online.result import Finding, Parameter, Parameters
+from sms_online.row_types import Residual, Residuals
 from sms_online.stream import Block
 from sms_online.tables import Documented, html_table, text_table
 from sms_online.tracker_results import Drift
 from sms_online.trackers.interface import Prior
 from sms_online.truth import true_values
-from sms_online.verdict.trust import Residual, Residuals, Trust
+from sms_online.verdict.trust import Trust
 
 
 @dataclass(frozen=True)

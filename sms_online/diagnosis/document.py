@@ -22,13 +22,14 @@ from sms_online.model.parameters import Parameter
 from sms_online.pipeline.estimator import Estimator
 from sms_online.pipeline.snapshot import statistics_of
 from sms_online.result import residual_document, result_of
+from sms_online.row_types import Residual
 from sms_online.stream import Array
 from sms_online.threads import one_blas_thread
 from sms_online.verdict.evidence import Evidence
 from sms_online.verdict.judge import judge, judge_diagnosis
 from sms_online.verdict.judged import JudgedEvaluation
 from sms_online.verdict.reasons import undecided
-from sms_online.verdict.trust import Reason, Residual, Trust
+from sms_online.verdict.trust import Reason, Trust
 
 SCHEMA = "sms-online/diagnosis/1"
 # What was found by comparing whole descriptions competes with no columns.

@@ -7,8 +7,9 @@ from dataclasses import dataclass, field
 
 from sms_online.nominal import AS_STATED, NominalComparison
 from sms_online.pipeline.tracker_bank import Suspected
+from sms_online.row_types import Residuals
 from sms_online.tracker_results import Consistency
-from sms_online.verdict.trust import Reason, Residuals
+from sms_online.verdict.trust import Reason
 
 
 @dataclass(frozen=True)

@@ -6,9 +6,10 @@ from collections.abc import Iterable, Mapping, Sequence
 
 from sms_online.nominal import NominalComparison
 from sms_online.pipeline.tracker_bank import Suspected
+from sms_online.row_types import Residual, Residuals
 from sms_online.tracker_results import Consistency
 from sms_online.verdict.evidence import Discrepancy, Dispute, Evidence
-from sms_online.verdict.trust import Reason, Residual, Residuals
+from sms_online.verdict.trust import Reason
 
 # A joint whose unexplained torque reaches this share of the measured one lacks an effect, whatever the error bars say.
 LARGEST_RESIDUAL = 0.5

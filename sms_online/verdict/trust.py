@@ -1,29 +1,14 @@
-"""Trust in a session's numbers as a record: level, reasons, next step; and what rows leave, by their type."""
+"""Trust in a session's numbers as a record: level, reasons, next step."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal
 
 # A sentence is read at a glance, and fits on a line.
 LONGEST_SENTENCE = 100
 
 Level = Literal["trust", "doubt", "not yet"]
-
-
-class Residual(NamedTuple):
-    """What one type of rows leaves, root mean square; None where it is not known.
-
-    relative: to the measured torque or force. whitened: over the standard deviation that the sensors' noise predicts,
-    so that 1 is noise alone.
-    """
-
-    relative: float | None
-    whitened: float | None
-
-
-Residuals = Mapping[str, Residual]  # by type of the rows
 
 
 @dataclass(frozen=True)
