@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from sms_online.capture import Capture
     from sms_online.description.parse import shipped_systems
     from sms_online.description.schema import System
-    from sms_online.diagnosis.diagnosed import Diagnosis, diagnose
+    from sms_online.diagnosed import Diagnosis, diagnose
     from sms_online.errors import InputError
     from sms_online.history import History
     from sms_online.pipeline.events import Event
@@ -43,7 +43,7 @@ _HOMES = {
     "Check": "sms_adapters.data_check",
     "Coefficient": "sms_online.result",
     "Comparison": "sms_online.repeatability",
-    "Diagnosis": "sms_online.diagnosis.diagnosed",
+    "Diagnosis": "sms_online.diagnosed",
     "Event": "sms_online.pipeline.events",
     "Excitation": "sms_sim.excitation",
     "Finding": "sms_online.result",
@@ -61,7 +61,7 @@ _HOMES = {
     "bound": "sms_sim.bound",
     "check": "sms_adapters.data_check",
     "compare": "sms_adapters.runs",
-    "diagnose": "sms_online.diagnosis.diagnosed",
+    "diagnose": "sms_online.diagnosed",
     "estimate": "sms_online.session",
     "excite": "sms_sim.excitation",
     "load_system": "sms_adapters.system_file",

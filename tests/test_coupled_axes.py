@@ -7,7 +7,7 @@ import pytest
 from numpy.testing import assert_allclose
 
 from sms_online.description.schema import Effect
-from sms_online.diagnosis.diagnosed import diagnose
+from sms_online.diagnosed import diagnose
 from sms_online.effects.build import build_model
 from sms_online.effects.catalogue import candidates, check_effect
 from sms_online.errors import InputError

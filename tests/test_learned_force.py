@@ -18,8 +18,8 @@ from numpy.testing import assert_allclose
 import sms_online as sms
 from sms_online.description.parse import parse_system
 from sms_online.description.schema import Effect, System
+from sms_online.diagnosed import Diagnosis
 from sms_online.diagnosis.candidates import CandidateColumns
-from sms_online.diagnosis.diagnosed import Diagnosis
 from sms_online.diagnosis.force_curves import force_curves
 from sms_online.effects.base import Force
 from sms_online.effects.build import build_model

@@ -13,7 +13,7 @@ import pytest
 
 import sms_online as sms
 from sms_online.description.schema import System
-from sms_online.diagnosis.diagnosed import Diagnosis
+from sms_online.diagnosed import Diagnosis
 from tests.campaigns.sessions import disguised
 
 GAIN = 1.03

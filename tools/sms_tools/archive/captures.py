@@ -18,7 +18,7 @@ from sms_adapters.runs import NAME as RESULTS
 from sms_adapters.sources import NAMES, is_recorded, open_source
 from sms_online.description.parse import describe
 from sms_online.description.schema import System
-from sms_online.diagnosis.diagnosed import diagnose
+from sms_online.diagnosed import diagnose
 from sms_online.errors import InputError
 from sms_online.session import estimate
 from sms_tools.archive.rows import Row, RowFile

@@ -14,7 +14,7 @@ from sms_adapters.recorded import captured, recorded_at
 from sms_adapters.session_log import SYSTEM
 from sms_online.capture import Capture
 from sms_online.description.schema import System
-from sms_online.diagnosis.diagnosed import Diagnosis, diagnose
+from sms_online.diagnosed import Diagnosis, diagnose
 from sms_online.errors import InputError
 from sms_online.pipeline.estimator import Estimator
 from sms_online.priors import base_prior, given_prior
