@@ -23,13 +23,11 @@ from sms_online.diagnosis.search import Search
 from sms_online.diagnosis.unexplained import describe_residual
 from sms_online.effects.catalogue import kinematic_candidates
 from sms_online.errors import InputError
-from sms_online.evaluation import Evaluation
 from sms_online.pipeline.estimator import Estimator
-from sms_online.pipeline.snapshot import statistics_of
 from sms_online.stream import Block
 from sms_online.threads import one_blas_thread
 from sms_online.tracker_results import Drift
-from sms_online.verdict.judged import JudgedEvaluation
+from sms_online.verdict.judged import evaluated
 from sms_online.verdict.reasons import LARGEST_RESIDUAL
 
 
@@ -143,7 +141,7 @@ def diagnose(
     said = verdict(
         named, share_left(bare.excess, after.excess), after.test, bare.test, [each.candidate for each in findings]
     )
-    grave = said == "clean" and JudgedEvaluation(statistics_of(before), before.estimate()).trust.grave
+    grave = said == "clean" and evaluated(before).trust.grave
     # What is left unexplained takes such numbers anywhere.
     calibration = () if said == "unexplained" else _miscalibrated(estimator_after)
     if said == "clean" and (mistakes or calibration):
@@ -178,7 +176,7 @@ def _drifting(case: Case, followed: Estimator, drifts: tuple[Drift, ...], mistak
     """What a session that follows drifts has found; residuals after are of its rows, with the drift taken off."""
     before = case.session
     attempt = Attempt(case, before.system, candidates=())
-    bare, now = attempt.state([]), Evaluation(statistics_of(followed), followed.estimate())
+    bare, now = attempt.state([]), evaluated(followed)
     left = {row: each for row, each in now.residuals.items() if row in bare.fit.whitened}
     part = Part(
         {row: each.whitened for row, each in left.items() if each.whitened is not None},
@@ -207,7 +205,7 @@ def _drifting(case: Case, followed: Estimator, drifts: tuple[Drift, ...], mistak
 
 def _miscalibrated(session: Estimator) -> tuple[Calibration, ...]:
     """Errors of a session's description beyond its tolerances that no effect of the catalogue covers."""
-    every = Evaluation(statistics_of(session), session.estimate()).calibration
+    every = evaluated(session).calibration
     return tuple(each for each in every if each.beyond and each.name not in sayable(session.system))
 
 

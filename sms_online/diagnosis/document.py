@@ -19,15 +19,13 @@ from sms_online.diagnosis.shape import slopes
 from sms_online.effects.catalogue import ENTRIES, declarable, either, in_words, traits_of
 from sms_online.evaluation import NORMAL_95, identifiable
 from sms_online.model.parameters import Parameter
-from sms_online.pipeline.estimator import Estimator
-from sms_online.pipeline.snapshot import statistics_of
 from sms_online.result import residual_document, result_of
 from sms_online.row_types import Residual
 from sms_online.stream import Array
 from sms_online.threads import one_blas_thread
 from sms_online.verdict.evidence import Evidence
 from sms_online.verdict.judge import judge, judge_diagnosis
-from sms_online.verdict.judged import JudgedEvaluation
+from sms_online.verdict.judged import JudgedEvaluation, evaluated
 from sms_online.verdict.reasons import undecided
 from sms_online.verdict.trust import Reason, Trust
 
@@ -45,7 +43,7 @@ def diagnosis_document(
     truth: true values of physical parameters by name, of a simulated capture; they enter this report alone.
     """
     before, after = diagnosis.before, diagnosis.after
-    sessions = {"before": evaluation(diagnosis.estimator_before), "after": evaluation(diagnosis.estimator_after)}
+    sessions = {"before": evaluated(diagnosis.estimator_before), "after": evaluated(diagnosis.estimator_after)}
     results = {name: result_of(session, truth).document() for name, session in sessions.items()}
     unexplained, given = diagnosis.unexplained, _from_rows(diagnosis)
     return {
@@ -111,11 +109,6 @@ def diagnosis_document(
     }
 
 
-def evaluation(session: Estimator) -> JudgedEvaluation:
-    """The evaluation of a session of a diagnosis."""
-    return JudgedEvaluation(statistics_of(session), session.estimate())
-
-
 def _from_rows(diagnosis: Search) -> bool:
     """Whether parameters come from the rows of the diagnosis, not from a session."""
     return diagnosis.attempt.by_rows or diagnosis.partial
@@ -135,7 +128,7 @@ def trust_of(diagnosis: Search, after: JudgedEvaluation | None = None) -> Trust:
 
     after: the evaluation of the session with what was found, where it is at hand.
     """
-    after = evaluation(diagnosis.estimator_after) if after is None else after
+    after = evaluated(diagnosis.estimator_after) if after is None else after
     effects = [f"{effect['name']}@{effect['where']}" for effect in _named(diagnosis)]
     row = None if diagnosis.unexplained is None else diagnosis.unexplained.row
     rest = _after(diagnosis, after)
@@ -179,7 +172,7 @@ def _of_effects(diagnosis: Search) -> str:
     if diagnosis.verdict == "clean":
         return "Nothing but noise is left: the model explains the capture."
     if diagnosis.verdict == "unexplained" and diagnosis.unexplained is None:
-        reason = _after(diagnosis, evaluation(diagnosis.estimator_after)).reasons[0]
+        reason = _after(diagnosis, evaluated(diagnosis.estimator_after)).reasons[0]
         return f"No effect of the catalogue is seen in what the rows leave, but {reason}."
     keys = [_named_in_words(diagnosis, effect) for effect in _named(diagnosis)]
     before, after = diagnosis.before.holdout.whitened, diagnosis.after.holdout.whitened

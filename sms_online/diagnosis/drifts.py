@@ -16,11 +16,10 @@ import numpy as np
 from sms_online.description.schema import LEARNED, System
 from sms_online.diagnosis.evidence import least_squares
 from sms_online.diagnosis.weak_rows import WeakRows
-from sms_online.evaluation import Evaluation
 from sms_online.pipeline.estimator import Estimator
-from sms_online.pipeline.snapshot import statistics_of
 from sms_online.tables import formatter
 from sms_online.tracker_results import Drift
+from sms_online.verdict.judged import evaluated
 from sms_online.verdict.reasons import FOLLOW
 from sms_online.verdict.trust import Reason, Trust
 
@@ -65,7 +64,7 @@ def explained_by_drifts(session: Estimator) -> tuple[Drift, ...]:
     """The drifts that a session follows; none where its rows hold more than those and noise."""
     if session.momentum is None or not session.by_momentum or session.events:
         return ()
-    (judged, *_) = Evaluation(statistics_of(session), session.estimate()).trackers
+    (judged, *_) = evaluated(session).trackers
     nis = judged.consistency
     if session.momentum.test.alarm is not None or session.momentum.misfit or nis.nis is None or nis.nis > nis.upper:
         return ()

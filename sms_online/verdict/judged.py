@@ -7,6 +7,8 @@ from functools import cached_property
 
 from sms_online.evaluation import Evaluation
 from sms_online.notices import notices, projection_warning, smoother_warnings
+from sms_online.pipeline.estimator import Estimator
+from sms_online.pipeline.snapshot import statistics_of
 from sms_online.pipeline.statistics import Statistics
 from sms_online.trackers.interface import Estimate
 from sms_online.verdict.evidence import Discrepancy
@@ -48,3 +50,8 @@ class JudgedEvaluation(Evaluation):
     def notices(self) -> list[str]:
         """What happened to the samples, a sentence each."""
         return notices(self.statistics)
+
+
+def evaluated(estimator: Estimator) -> JudgedEvaluation:
+    """What an estimator knows now, evaluated."""
+    return JudgedEvaluation(statistics_of(estimator), estimator.estimate())
