@@ -116,7 +116,7 @@ def test_an_axis_is_at_rest_where_its_rate_is_noise_for_long(noise: float) -> No
     rest = ((t >= 1.0) & (t < 1.6)) | ((t >= 2.5) & (t < 2.6))
     rate = np.where(t < 1.0, np.cos(2.0 * np.pi * t), np.where(rest, 0.0, np.where(t < 2.5, 1.0, -1.0)))
     position = np.cumsum(rate)[:, None] / 1000.0 + noise * np.random.default_rng(5).standard_normal((t.size, 1))
-    layout = SimpleNamespace(theta_m=(0,), n_base_positions=3, n_base_speeds=3)
+    layout = SimpleNamespace(theta_m=(0,), offset=0)
     sensing: Any = SimpleNamespace(model=SimpleNamespace(layout=layout), coordinates=lambda values: values)
     held = SessionStandstill(sensing, [Segment(np.arange(t.size), position)], 0, noise, 1000.0)
     rested = smooth(position, np.arange(1150, 1550, 4), 28, 1000.0)[1]
@@ -137,7 +137,7 @@ def test_an_axis_is_at_rest_where_its_rate_is_noise_for_long(noise: float) -> No
 def test_the_integral_of_a_sign_is_as_uncertain_as_stated(noise: float) -> None:
     """A rate that falls by 6 rad/s² to zero and by 2 beyond, as of a motor that dry friction has slowed down."""
     random = np.random.default_rng(8)
-    layout = SimpleNamespace(theta_m=(0,), n_base_positions=3, n_base_speeds=3)
+    layout = SimpleNamespace(theta_m=(0,), offset=0)
     sensing: Any = SimpleNamespace(model=SimpleNamespace(layout=layout), coordinates=lambda values: values)
     t = np.arange(400) / 1000.0
     turns = random.uniform(0.19, 0.21, 60)
