@@ -77,7 +77,7 @@ class OnlineDiagnosis(Observer):
         self._valid = 0  # grid index from which on the current model, or what it lacks, has been there
         self._blocks = 0
         self._events = len(estimator.events)
-        self._drifts = 0 if estimator.momentum is None else estimator.momentum.drifts  # that have been followed
+        self._drifts = 0 if estimator.momentum is None else estimator.momentum.bank.accepted  # that have been followed
         self._quiet = False  # what is lacking has been said, and not added to the model
         self._onset: _Onset | None = None  # of the open episode
         self._sure = False  # two searches in a row have named the same in the open episode
@@ -181,10 +181,10 @@ class OnlineDiagnosis(Observer):
 
     def _follow_drifts(self) -> None:
         """A drift that is followed explains what was noticed before it was found, or before its rate had changed."""
-        before, self._drifts = self._drifts, self._momentum.drifts
+        before, self._drifts = self._drifts, self._momentum.bank.accepted
         if self._drifts <= before or self._onset is None:
             return
-        episode, drifting = self.episodes[-1], self._momentum.drifting
+        episode, drifting = self.episodes[-1], self._momentum.bank.drifting
         fresh = tuple(name for name in drifting if not any(name in each.drifting for each in self.episodes))
         episode.verdict, episode.named, episode.named_at = "drift", (), self._now
         episode.drifting = fresh or drifting

@@ -20,11 +20,11 @@ from sms_online.pipeline.joint_estimate import JointEstimate
 from sms_online.pipeline.latency import Latencies, clock_groups, source_groups, wandering_clocks
 from sms_online.pipeline.momentum_balance import MomentumBalance, half_hop
 from sms_online.pipeline.momentum_fit import FIRST_MOTION, MomentumFit
-from sms_online.pipeline.momentum_windows import COPIES, HOPS, INSTANTS
+from sms_online.pipeline.momentum_windows import HOPS, INSTANTS
+from sms_online.pipeline.noisy_copies import NoisyCopies
 from sms_online.pipeline.residual_test import SequentialTest
 from sms_online.pipeline.sensing import Sensing
 from sms_online.pipeline.sensor_noise import SensorNoise
-from sms_online.pipeline.stamp_jitter import RATE_SAMPLES, synthetic
 from sms_online.pipeline.statistics import MomentumStatistics
 from sms_online.pipeline.synchronise import GridSamples
 from sms_online.pipeline.tracker_bank import Change, Reading, TrackerBank
@@ -35,8 +35,6 @@ from sms_online.stream import Array
 from sms_online.trackers.information import Information
 from sms_online.trackers.interface import Estimate, Prior, Rows
 
-# The synthetic noise is the same in every session, so that the same samples give the same bits.
-SEED = 6
 # Motion, s, in which a lack that was there from the start is noticed as a rule: that of the first fit, and a second.
 TESTED = FIRST_MOTION + 1.0
 # Variance of rows over the predicted one, at most, where noise is not white: its density at low frequencies follows
@@ -48,15 +46,12 @@ class MomentumState(State):
     """What a momentum balance keeps beside its stages.
 
     sensor_noise: that of the samples so far. newest_row: time of the last window's end, s. start_time: of grid index 0,
-    s. random: gives the synthetic noise. patient: whether more than noise in the beginning may be a drift yet to be
-    learned. prior_within: what is handed on from a drift holds the prior; bank_within: trackers went on from such.
-    drift: known to windows to come. held: rows since an alarm that may be false. readings (·, sensors): last
-    ones of the segment.
+    s. patient: whether more than noise in the beginning may be a drift yet to be learned. prior_within: what is handed
+    on from a drift holds the prior; bank_within: trackers went on from such. drift: known to windows to come. held:
+    rows since an alarm that may be false.
     """
 
-    random: np.random.Generator
     patient: bool
-    readings: Array
     prior_within: bool = False
     bank_within: bool = False
     sensor_noise: SensorNoise | None = None
@@ -102,7 +97,8 @@ class Momentum(Stage):
             model, base, sensing, self.nuisances, self._rebuild, point, self._beside_squares, learns, self._drift_since
         )
         self._sources, self._clocks = source_groups(sensing), clock_groups(sensing)
-        self.state = MomentumState(np.random.default_rng(SEED), patient, np.empty((0, len(sensing.position_columns))))
+        self.state = MomentumState(patient)
+        self.copies = NoisyCopies(sensing, system.sample_rate)
         self.bank = self._new_bank()
         self._build()
 
@@ -203,11 +199,10 @@ class Momentum(Stage):
 
         last: the session ends, and a drift that was not learned so far is none.
         """
-        learned = self.bank.learned
-        if not self.state.patient or learned is None or not self.started:
+        if not self.state.patient or self.bank.learned is None or not self.started:
             return False
-        unlearned = last and self.fit.plain.patient and not learned.state.accepted
-        return learned.state.lacking or (unlearned and bool(self.fit.plain.excess(self._solved()).any()))
+        unlearned = last and self.fit.plain.patient and not self.bank.accepted
+        return self.bank.learned.state.lacking or (unlearned and bool(self.fit.plain.excess(self._solved()).any()))
 
     @property
     def misfit(self) -> bool:
@@ -263,7 +258,7 @@ class Momentum(Stage):
                 self.end_segment(noise)
             self._balance.begin_segment()
             self.state.segment = piece.segment
-            self.state.readings = self.state.readings[:0]
+            self.copies.begin_segment()
         self.changes.keep(piece)
         self.bank.hold_until(self.state.start_time + int(piece.index[-1]) / self._sample_rate)
         self._process(piece, noise)
@@ -276,7 +271,7 @@ class Momentum(Stage):
         self._decide(noise, last=True)
 
     def _process(self, piece: GridSamples, noise: SensorNoise) -> None:
-        copies = self._copies(piece.values, noise)
+        copies = self.copies.of(piece.values, noise)
         windows, instants = self._balance.push(piece.index, copies, noise.coordinates, noise.lateness)
         self._absorb(self.fit.push(windows, instants, noise))
 
@@ -311,21 +306,6 @@ class Momentum(Stage):
         self.fit.go_on(adoption.weights, noise, adoption.misfit)
         if adoption.samples.index.size:
             self._process(adoption.samples, noise)
-
-    def _copies(self, values: Array, noise: SensorNoise) -> list[Array]:
-        """Coordinates and joint torques as measured, and with synthetic noise added and subtracted."""
-        measured = self.sensing.motion(values)
-        if noise.exact:
-            return [measured] * COPIES
-        added = np.zeros_like(values)
-        columns = [*self.sensing.position_columns, *self.sensing.torque_columns]
-        added[:, columns] = self.state.random.standard_normal((values.shape[0], len(columns))) * noise.grid
-        positions = list(self.sensing.position_columns)
-        readings, before = values[:, positions], self.state.readings
-        if noise.jitters:
-            added[:, positions] += synthetic(noise.jitters, readings, before, self._sample_rate, self.state.random)
-        self.state.readings = np.concatenate((before, readings))[-RATE_SAMPLES:]
-        return [measured, self.sensing.motion(values + added), self.sensing.motion(values - added)]
 
     def finish(self, noise: SensorNoise) -> None:
         """The session ends: what rows held back for an event hold is not known."""
@@ -362,27 +342,16 @@ class Momentum(Stage):
 
     def _follow(self, rows: WhiteRows) -> None:
         """Hand rows to the chosen trackers, and to what watches for drifts."""
-        learned = self.bank.learned
-        before = 0 if learned is None else learned.state.accepted
-        noise = self.state.sensor_noise
+        before, noise = self.bank.accepted, self.state.sensor_noise
         # Rounding moves as it likes where samples are exact.
         quiet = not self.misfit and noise is not None and not noise.exact
-        self.bank.update(self._for_trackers(rows), quiet, rows.moves)
-        if learned is not None:
-            self.fit.plain.patient = self._patient
-            if learned.state.accepted > before:
-                self._begin_drift(learned.information)
+        self.bank.update(self._followed(rows), quiet, rows.moves)
+        self.fit.plain.patient = self._patient
+        if self.bank.accepted > before:
+            self._begin_drift(self.bank.information)
 
-    def _for_trackers(self, rows: WhiteRows) -> Rows:
-        """Rows with the drift that was subtracted from them."""
-        m, n, b, ramp = len(self.nuisances), self.changes.base.n, rows.Y[:, -1], None
-        # Rows behind an alarm have columns of what may begin there, too.
-        Y = rows.Y[:, : m + n]
-        if self.bank.follows:
-            ramp = np.pad(rows.ramp[:, :n], ((0, 0), (m, 0)))
-        if rows.drift is not None:
-            b = b + Y[:, m:] @ rows.drift.moved[:n] + rows.ramp[:, :n] @ rows.drift.rate[:n]
-        return Rows(Y, b, np.ones(b.size), np.full(b.size, self._centre(rows.end)), ramp)
+    def _followed(self, rows: WhiteRows) -> Rows:
+        return self.bank.rows(rows, self._centre(rows.end))
 
     @property
     def _may_drift(self) -> bool:
@@ -400,7 +369,7 @@ class Momentum(Stage):
             for end in (detector.onset, detector.alarm, detector.history[-1].end)
         )
         change = Change(onset - self._window, alarm, newest)
-        rows = [self._for_trackers(each) for each in behind.rows]
+        rows = [self._followed(each) for each in behind.rows]
         drift = self.bank.drift_behind(change, rows, behind.explanation.explained and behind.goes_on)
         if drift is None:
             return
@@ -440,18 +409,6 @@ class Momentum(Stage):
         self.test = self._new_test()
         self.bank.refer(known.solution().pi[m:])
         self.state.drift = None
-
-    @property
-    def drifts(self) -> int:
-        """How often the judged tracker has found one to begin or to change, since the last event."""
-        return 0 if self.bank.learned is None else self.bank.learned.state.accepted
-
-    @property
-    def drifting(self) -> tuple[str, ...]:
-        """Parameters that the judged tracker has found to drift."""
-        learned, m = self.bank.learned, len(self.nuisances)
-        columns = [] if learned is None else learned.columns
-        return tuple(self.changes.base.parameters[column - m].name for column in columns)
 
     @property
     def _reference(self) -> Array | None:

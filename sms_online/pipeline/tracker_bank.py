@@ -15,6 +15,7 @@ from sms_online.pipeline.errors_in_variables import NoiseBias
 from sms_online.pipeline.latency import clock_groups
 from sms_online.pipeline.momentum_windows import HOPS
 from sms_online.pipeline.sensing import Sensing
+from sms_online.pipeline.white_rows import WhiteRows
 from sms_online.state import Stage, State
 from sms_online.stream import Array
 from sms_online.trackers.build import Tracked, build_tracker, build_watch
@@ -181,6 +182,30 @@ class TrackerBank(Stage):
         """The judged tracker, if it learns drifts."""
         judged = self._chosen[0].tracker
         return judged if isinstance(judged, LearnedTrend) else None
+
+    @property
+    def accepted(self) -> int:
+        """How often the judged tracker has found a drift to begin or to change, since the last event."""
+        return 0 if self.learned is None else self.learned.state.accepted
+
+    @property
+    def drifting(self) -> tuple[str, ...]:
+        """Parameters that the judged tracker has found to drift."""
+        columns = [] if self.learned is None else self.learned.columns
+        return tuple(self._names[column - self._nuisances] for column in columns)
+
+    def rows(self, white: WhiteRows, t: float) -> Rows:
+        """Rows of a window centred at t, s, with the drift that was subtracted from them.
+
+        Columns of what may begin behind an alarm, which follow those of the parameters, are left out.
+        """
+        m, n, b, ramp = self._nuisances, len(self._names), white.Y[:, -1], None
+        Y = white.Y[:, : m + n]
+        if self.follows:
+            ramp = np.pad(white.ramp[:, :n], ((0, 0), (m, 0)))
+        if white.drift is not None:
+            b = b + Y[:, m:] @ white.drift.moved[:n] + white.ramp[:, :n] @ white.drift.rate[:n]
+        return Rows(Y, b, np.ones(b.size), np.full(b.size, t), ramp)
 
     def update(self, rows: Rows, quiet: bool, moves: bool) -> None:
         """Take in rows of nuisances and parameters; quiet: they leave no more than noise; moves: the arm does."""
