@@ -37,9 +37,9 @@ class DriftLine:
         moved = self.moved + np.where(decaying, slowed, time) * self.rate
         return DriftLine(moved, self.rate * np.exp(-self.decay * time), self.decay, t)
 
-    def since(self, t: float) -> DriftLine:
-        """The same with what has moved counted from an instant on, s."""
-        return replace(self, moved=self.moved - self.at(t).moved)
+    def from_now(self) -> DriftLine:
+        """The same with what has moved counted from t on."""
+        return replace(self, moved=np.zeros_like(self.moved))
 
     def padded(self, n: int) -> DriftLine:
         """The same of n parameters, of which further ones do not move."""

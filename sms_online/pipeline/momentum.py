@@ -25,12 +25,11 @@ from sms_online.pipeline.noisy_copies import NoisyCopies
 from sms_online.pipeline.residual_test import SequentialTest
 from sms_online.pipeline.sensing import Sensing
 from sms_online.pipeline.sensor_noise import SensorNoise
-from sms_online.pipeline.statistics import MomentumStatistics
 from sms_online.pipeline.synchronise import GridSamples
 from sms_online.pipeline.tracker_bank import Change, Reading, TrackerBank
 from sms_online.pipeline.white_rows import WhiteRows
 from sms_online.pipeline.window_noise import WindowNoise
-from sms_online.state import Stage, State, snapshot, state_copy
+from sms_online.state import Stage, State, state_copy
 from sms_online.stream import Array
 from sms_online.trackers.information import Information
 from sms_online.trackers.interface import Estimate, Prior, Rows
@@ -69,9 +68,9 @@ class Momentum(Stage):
     joint: sums of rows of unit variance, which weights follow. bank: the trackers that the person has chosen, fed with
     the same. fit: what makes rows independent, and its sums. latencies: of the sources, since the last event. test:
     whether rows leave more than noise, likewise. changes: events, and the model and parameters that the session goes on
-    with after them. nuisances: what the description may be wrong in. prior: what is known of the described ones
-    beforehand. trackers: of the session. point: gives the nuisances (m,) that samples are corrected by. changed: called
-    where others come to be estimated. patient: see `MomentumState`.
+    with after them. nuisances: what the description may be wrong in. prior: of the described parameters. point: gives
+    the nuisances (m,) that samples are corrected by. changed: called where other parameters come to be estimated.
+    patient: see `MomentumState`.
     """
 
     def __init__(
@@ -88,14 +87,13 @@ class Momentum(Stage):
     ) -> None:
         system = model.system
         self.sensing, self.nuisances, self.prior = sensing, tuple(nuisances), prior
-        self._point, self._changed = point, changed
-        self._sample_rate = system.sample_rate
-        self._span = system.windows.momentum
+        self.point, self._changed = point, changed
+        self._sample_rate, self._span = system.sample_rate, system.windows.momentum
         self._trackers = tuple(trackers)
-        learns = self._trackers[0].learns
         self.changes = Changes(
-            model, base, sensing, self.nuisances, self._rebuild, point, self._beside_squares, learns, self._drift_since
-        )
+            model, base, sensing, self.nuisances, self._rebuild, point, self._beside_squares, trackers[0].learns,
+            self._drift_since,
+        )  # fmt: skip
         self._sources, self._clocks = source_groups(sensing), clock_groups(sensing)
         self.state = MomentumState(patient)
         self.copies = NoisyCopies(sensing, system.sample_rate)
@@ -121,9 +119,9 @@ class Momentum(Stage):
         self.fit = MomentumFit(
             model, base, self._balance, self._new_noise, self._solved, self._sources,
             prior_rows(self.nuisances, base.n), self.joint.beforehand,
-            [k for k, each in enumerate(self.nuisances) if each.name == "drive_gain"], self._drift_at, self._point,
+            [k for k, each in enumerate(self.nuisances) if each.name == "drive_gain"], self._drift_at, self.point,
         )  # fmt: skip
-        self.fit.plain.patient = self._patient
+        self.fit.plain.patient = self.state.patient and self.bank.patient
         self.test = self._new_test()
 
     def renew(self) -> None:
@@ -137,11 +135,6 @@ class Momentum(Stage):
         self.bank = self._new_bank()
         self._build()
         self._changed()
-
-    @property
-    def _patient(self) -> bool:
-        """Whether more than noise may be a drift that is yet to be learned."""
-        return self.state.patient and self.bank.learned is not None and self.bank.learned.patient
 
     @property
     def current_prior(self) -> Prior | None:
@@ -158,12 +151,12 @@ class Momentum(Stage):
         return SequentialTest(self.changes.model.layout, self._balance.span / HOPS, self.nuisances, clocks)
 
     def _new_bank(self) -> TrackerBank:
-        model, base, nuisances = self.changes.model, self.changes.base, self.nuisances
+        model, parameters = self.changes.model, self.changes.base.parameters
         prior, within, n_v = self.current_prior, self.state.bank_within, model.layout.n_v
-        steady = not self._clocks
         return TrackerBank(
-            self._trackers, model.system.name, base.parameters, nuisances, prior, within, n_v, self._window, steady
-        )
+            self._trackers, model.system.name, parameters, self.nuisances, prior, within, n_v, self._window,
+            steady=not self._clocks,
+        )  # fmt: skip
 
     @property
     def _window(self) -> float:
@@ -177,8 +170,7 @@ class Momentum(Stage):
 
     def _drift_since(self, end: int) -> DriftLine | None:
         """The same, counted from when what is known of the parameters is of."""
-        drift = self.state.drift
-        return None if drift is None else drift.since(drift.t).at(self._centre(end))
+        return None if self.state.drift is None else self.state.drift.from_now().at(self._centre(end))
 
     def _centre(self, end: int) -> float:
         """Centre of the window that ends at a grid index, s."""
@@ -228,11 +220,6 @@ class Momentum(Stage):
 
     def _beside_squares(self) -> Array:
         return self.joint.solved(self.fit).pi - self.joint.tracker.estimate().pi
-
-    @property
-    def row_variance(self) -> float:
-        """Mean square of what the rows leave, in units of their predicted variance."""
-        return self.joint.row_variance(self.fit)
 
     @property
     def weights(self) -> Array:
@@ -319,8 +306,7 @@ class Momentum(Stage):
             if not np.isfinite(rows.Y).all():
                 self.state.dropped_windows += 1
                 continue
-            detector = self.changes.detector
-            noise = self.state.sensor_noise
+            detector, noise = self.changes.detector, self.state.sensor_noise
             if noise is not None and not noise.exact:
                 self.test.push(rows, detector.known.factor, COLOURED_NOISE if noise.coloured else 1.0)
             if not detector.push(rows, self.misfit):
@@ -346,7 +332,7 @@ class Momentum(Stage):
         # Rounding moves as it likes where samples are exact.
         quiet = not self.misfit and noise is not None and not noise.exact
         self.bank.update(self._followed(rows), quiet, rows.moves)
-        self.fit.plain.patient = self._patient
+        self.fit.plain.patient = self.state.patient and self.bank.patient
         if self.bank.accepted > before:
             self._begin_drift(self.bank.information)
 
@@ -356,8 +342,8 @@ class Momentum(Stage):
     @property
     def _may_drift(self) -> bool:
         """Whether rows are held back that may be those of a drift; where rows leave more than noise none is learned."""
-        detector, bank = self.changes.detector, self.bank
-        return detector.alarm is not None and bank.learned is not None and not (detector.uncertain or bank.state.none)
+        detector, none = self.changes.detector, self.bank.learned is None or self.bank.state.none
+        return detector.alarm is not None and not (detector.uncertain or none)
 
     def _decide_on_drift(self, behind: Behind, noise: SensorNoise) -> None:
         """Where rows held back are those of a drift: go on with it."""
@@ -368,8 +354,7 @@ class Momentum(Stage):
             self.state.start_time + end / self._sample_rate
             for end in (detector.onset, detector.alarm, detector.history[-1].end)
         )
-        change = Change(onset - self._window, alarm, newest)
-        rows = [self._followed(each) for each in behind.rows]
+        change, rows = Change(onset - self._window, alarm, newest), [self._followed(each) for each in behind.rows]
         drift = self.bank.drift_behind(change, rows, behind.explanation.explained and behind.goes_on)
         if drift is None:
             return
@@ -411,28 +396,6 @@ class Momentum(Stage):
         self.state.drift = None
 
     @property
-    def _reference(self) -> Array | None:
+    def reference(self) -> Array | None:
         """Nuisances and parameters that the rows without the known drift have; None where nothing has moved."""
         return None if self.state.drift is None else self.joint.solved(self.fit).pi
-
-    def statistics(self, t: float) -> MomentumStatistics:
-        """What is known now; nothing in it changes as the session goes on. t: of the newest sample, s."""
-        alarm, noise = self.test.alarm, self.state.sensor_noise
-        return MomentumStatistics(
-            trackers=self.readings(t),
-            reference=self._reference,
-            tracker=snapshot(self.joint.tracker),
-            bias=state_copy(self.joint.bias),
-            rows=state_copy(self.fit.plain),
-            started=self.started,
-            tested=self.testable,
-            alarm=None if alarm is None else alarm.row,
-            scale_free=self.joint.scale_free(self.fit),
-            latency=self.latencies.found,
-            coloured={} if noise is None else noise.coloured,
-            jitters={} if noise is None else {each.name: each.std for each in noise.jitters},
-            suspected=self.bank.suspected,
-            shifts=tuple(self.changes.shifts),
-            unwatched=self.bank.unwatched,
-            point=self._point(),
-        )

@@ -152,18 +152,22 @@ class Relinearisation(Stage):
             self._make_rows_again(None, None, last)
         if not self.momentum.started or not self.linearisation.looks(self.momentum.fit.plain.windows, last):
             return
-        # Where rows hold more than noise and errors of calibration, these look like what the model lacks.
-        if self.momentum.row_variance > EXPLAINED:
+        if self._lacks:
             return
         before, weights = self.linearisation.point, self.momentum.weights
         while self.linearisation.moves(self.momentum.joint_estimate):
             self._make_rows_again(self.momentum.weights, noise, last)
-            if self.momentum.row_variance > EXPLAINED:
+            if self._lacks:
                 self.linearisation.go_back(before)
                 self._make_rows_again(weights, noise, last)
                 self.linearisation.forget()
                 return
             before, weights = self.linearisation.point, self.momentum.weights
+
+    @property
+    def _lacks(self) -> bool:
+        """Whether rows hold more than noise and errors of calibration: these look like what the model lacks there."""
+        return self.momentum.joint.row_variance(self.momentum.fit) > EXPLAINED
 
     def _make_rows_again(self, weights: Array | None, noise: SensorNoise | None, last: bool = False) -> None:
         """All rows of the session so far, about the point of now.

@@ -6,7 +6,8 @@ Taking them costs microseconds: what is large is shared, for the estimator write
 from __future__ import annotations
 
 from sms_online.pipeline.estimator import Estimator
-from sms_online.pipeline.statistics import Statistics
+from sms_online.pipeline.momentum import Momentum
+from sms_online.pipeline.statistics import MomentumStatistics, Statistics
 from sms_online.state import snapshot, state_copy
 
 
@@ -32,6 +33,29 @@ def statistics_of(estimator: Estimator, at: float | None = None) -> Statistics:
         energy=snapshot(estimator.energy.tracker),
         shared=state_copy(estimator.energy.shared),
         joints=tuple(state_copy(estimator.energy.joint_residuals)),
-        momentum=None if momentum is None else momentum.statistics(estimator.end if at is None else at),
+        momentum=None if momentum is None else _of_momentum(momentum, estimator.end if at is None else at),
         smoother=None if smoother is None else smoother.known,
+    )
+
+
+def _of_momentum(momentum: Momentum, t: float) -> MomentumStatistics:
+    """The same of a momentum balance. t: of the newest sample, s."""
+    alarm, noise = momentum.test.alarm, momentum.sensor_noise
+    return MomentumStatistics(
+        trackers=momentum.readings(t),
+        reference=momentum.reference,
+        tracker=snapshot(momentum.joint.tracker),
+        bias=state_copy(momentum.joint.bias),
+        rows=state_copy(momentum.fit.plain),
+        started=momentum.started,
+        tested=momentum.testable,
+        alarm=None if alarm is None else alarm.row,
+        scale_free=momentum.joint.scale_free(momentum.fit),
+        latency=momentum.latencies.found,
+        coloured={} if noise is None else noise.coloured,
+        jitters={} if noise is None else {each.name: each.std for each in noise.jitters},
+        suspected=momentum.bank.suspected,
+        shifts=tuple(momentum.changes.shifts),
+        unwatched=momentum.bank.unwatched,
+        point=momentum.point(),
     )

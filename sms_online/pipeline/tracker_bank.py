@@ -189,6 +189,11 @@ class TrackerBank(Stage):
         return 0 if self.learned is None else self.learned.state.accepted
 
     @property
+    def patient(self) -> bool:
+        """Whether more than noise may be a drift that is yet to be learned."""
+        return self.learned is not None and self.learned.patient
+
+    @property
     def drifting(self) -> tuple[str, ...]:
         """Parameters that the judged tracker has found to drift."""
         columns = [] if self.learned is None else self.learned.columns

@@ -37,7 +37,7 @@ from sms_online.trackers.drift_search import (
     changes_within,
     explains,
     likeliest_change,
-    may_be_ramp,
+    ramp_before,
 )
 from sms_online.trackers.drift_state import DriftState, Found
 from sms_online.trackers.factor import masked_covariance, solve, triangular_factor
@@ -121,8 +121,7 @@ class LearnedTrend(Tracker):
 
         behind: rows since the alarm, whitened among themselves.
         """
-        knot = _knot(alarm)
-        before, moving = self._before(onset)
+        (before, moving), knot = self._before(onset), _knot(alarm)
         if not before or not behind:
             return Break()
         after = [self._expanded(rows) for rows in behind]
@@ -134,14 +133,12 @@ class LearnedTrend(Tracker):
 
     def _begun_before(self, behind: Block) -> Break:
         """Whether rows behind an alarm go on with a drift that had begun before it, too weak to be seen by then."""
-        blocks, moving = [*self.state.blocks, behind], self.state.moving
-        tried = self._tried(moving, blocks, STARTS_BEFORE_ALARM)
-        ramp = best_ramp(tried)
-        if ramp is None:
-            return Break(unclear=may_be_ramp(tried))
-        state = self._through(self.state.blocks, [*moving, ramp.moving()], behind.knot)[0]
+        found = ramp_before(self._tried(self.state.moving, [*self.state.blocks, behind], STARTS_BEFORE_ALARM))
+        if found.drift is None:
+            return found
+        state = self._through(self.state.blocks, [*self.state.moving, found.drift.moving()], behind.knot)[0]
         left = state.absorbed(behind).factor[-1, -1] ** 2 - state.factor[-1, -1] ** 2
-        return Break(unclear=True) if left > LARGEST_LEFT * behind.rows else Break(ramp)
+        return Break(unclear=True) if left > LARGEST_LEFT * behind.rows else found
 
     def go_on_behind(self, onset: float, alarm: float, drift: Ramp, behind: Sequence[Rows]) -> None:
         """Go on behind the break of a drift, or with one that had begun before it; behind: see `break_between`.

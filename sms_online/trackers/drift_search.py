@@ -111,12 +111,6 @@ def best_ramp(tried: Tried) -> Ramp | None:
     return best if enough and best.gain > max(steps, others) + DECISIVE * len(best.columns) else None
 
 
-def may_be_ramp(tried: Tried) -> bool:
-    """Whether no step explains clearly more than every ramp."""
-    ramps, steps = (max((each.gain for each in some), default=0.0) for some in (tried.ramps, tried.steps))
-    return ramps > LEAST_GAIN and ramps > steps - DECISIVE
-
-
 def explains(rows: Array, sizes: Array, columns: Iterable[int], others: Iterable[int]) -> bool:
     """Whether some columns (M, ·) explain all that others do: those are no rival, but the same in other words.
 
@@ -146,12 +140,18 @@ def likeliest_change(tried: Tried, level: float) -> Suspicion | None:
 class Break:
     """What rows behind a change show. drift: one that began or changed there, None where they show none.
 
-    unclear: a drift explains more than any step, but not yet so much that it could not be chance, or more than noise is
-    left so far.
+    unclear: where they do not, a drift explains as much as any step, but not yet so much that it could not be chance,
+    or more than noise is left so far.
     """
 
     drift: Ramp | None = None
     unclear: bool = False
+
+
+def ramp_before(tried: Tried) -> Break:
+    """Whether a change that has given an alarm is that of a ramp, which began before or with it, or a step."""
+    ramps, steps = (max((each.gain for each in some), default=0.0) for some in (tried.ramps, tried.steps))
+    return Break(best_ramp(tried), unclear=ramps > max(LEAST_GAIN, steps - DECISIVE))
 
 
 def best_break(before: DriftFilter, after: Block, groups: Sequence[tuple[int, ...]]) -> Break:
