@@ -86,10 +86,9 @@ class Momentum(Stage):
         patient: bool,
     ) -> None:
         system = model.system
-        self.sensing, self.nuisances, self.prior = sensing, tuple(nuisances), prior
+        self.sensing, self.nuisances, self.prior, self._trackers = sensing, tuple(nuisances), prior, tuple(trackers)
         self.point, self._changed = point, changed
         self._sample_rate, self._span = system.sample_rate, system.windows.momentum
-        self._trackers = tuple(trackers)
         self.changes = Changes(
             model, base, sensing, self.nuisances, self._rebuild, point, self._beside_squares, trackers[0].learns,
             self._drift_since,
