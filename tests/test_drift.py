@@ -12,6 +12,7 @@ from sms_online.stream import Array
 from sms_online.trackers import Prior, RecursiveLeastSquares, Rows
 from sms_online.trackers.drift import LearnedTrend
 from sms_online.trackers.drift_filter import STEP
+from sms_online.trackers.drift_search import Break
 from tests.saved import resumed
 
 N = 4
@@ -181,6 +182,26 @@ def test_an_alarm_behind_the_end_of_a_drift_is_of_that_end() -> None:
     assert change is not None
     assert change.columns == (2,)
     assert change.rates[0] == pytest.approx(-0.5, abs=0.02)
+
+
+def behind_alarm(change: Callable[[Array], Array]) -> Break:
+    """What rows from an alarm at 20 s on show of a change that began before it, of column 1."""
+    tracker, given = learned(), rows(24.0, lambda t: only(1, change(t)), noise=0.05)
+    tracker.update(part(given, 0, round(20.0 * RATE)))
+    assert tracker.state.moving == []
+    return tracker.break_between(18.0, 20.0, [part(given, k, k + 1) for k in range(round(20.0 * RATE), given.t.size)])
+
+
+def test_a_drift_may_begin_before_its_alarm() -> None:
+    found = behind_alarm(lambda t: 0.02 * np.maximum(0.0, t - 17.0))
+    assert found.drift is not None
+    assert found.drift.columns == (1,)
+    assert found.drift.since * STEP == pytest.approx(17.0, abs=1.5)
+    assert found.drift.rates[0] == pytest.approx(0.02, abs=0.005)
+
+
+def test_a_step_before_its_alarm_is_no_drift() -> None:
+    assert behind_alarm(lambda t: 0.1 * (t > 19.5)) == Break()
 
 
 def test_a_step_is_no_drift() -> None:

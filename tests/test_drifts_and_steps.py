@@ -15,11 +15,12 @@ from sms_online.trackers.drift import LearnedTrend
 from sms_online.trackers.factor import solve, triangular_factor
 from tests.axis import AXIS, DAMPING, INERTIA
 
+SYSTEM = sms.load_system(tomllib.loads(AXIS))
 STEPPED, SHARE = 0.2, 0.0005  # of the inertia, and what it loses of itself in a second
 DAMPED = 0.05  # N m s/rad
 
 
-def estimated(seconds: float, begin: float, share: float, step: float, heavier: bool) -> sms.Result:
+def axis_run(seconds: float, begin: float, share: float, step: float, heavier: bool, seed: int = 3) -> sms.Capture:
     """The axis along two sines: from `begin`, s, its inertia is lost evenly; at `step`, s, it or its damping grows."""
     t = np.arange(round(200 * seconds)) / 200.0
     q = np.sin(2 * t) + 0.3 * np.sin(5 * t)
@@ -28,9 +29,8 @@ def estimated(seconds: float, begin: float, share: float, step: float, heavier: 
     inertia = INERTIA * (1.0 - share * np.maximum(0.0, t - begin) + STEPPED * heavier * stepped)
     damping = DAMPING + DAMPED * (not heavier) * stepped
     torque = inertia * acceleration - INERTIA * share * (t > begin) * rate + damping * rate
-    noise = np.random.default_rng(3).standard_normal((2, t.size))
-    data = sms.Capture.from_arrays(t, {"force_1": torque + 0.01 * noise[0], "q_1": q + 1e-4 * noise[1]})
-    return sms.estimate(sms.load_system(tomllib.loads(AXIS)), data)
+    noise = np.random.default_rng(seed).standard_normal((2, t.size))
+    return sms.Capture.from_arrays(t, {"force_1": torque + 0.01 * noise[0], "q_1": q + 1e-4 * noise[1]})
 
 
 @pytest.mark.slow
@@ -42,7 +42,7 @@ def estimated(seconds: float, begin: float, share: float, step: float, heavier: 
 def test_a_step_and_a_drift_are_both_named(
     seconds: float, begin: float, share: float, step: float, heavier: bool
 ) -> None:
-    result = estimated(seconds, begin, share, step, heavier)
+    result = sms.estimate(SYSTEM, axis_run(seconds, begin, share, step, heavier))
     (event,), (drift,) = result.events, result.drifts
     assert event.kind == ("payload" if heavier else "friction")
     assert event.time == pytest.approx(step, abs=0.1)
@@ -57,6 +57,36 @@ def test_a_step_and_a_drift_are_both_named(
     whole = sum(result.parameters[name].value for name in expected)
     assert whole == pytest.approx(sum(expected.values()), abs=0.002 * INERTIA)
     assert result.trust.level == "trust"
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", range(3))
+def test_a_weak_drift_after_a_long_steady_stretch_is_no_step(seed: int) -> None:
+    """It had run for three seconds before the alarm."""
+    result = sms.estimate(SYSTEM, axis_run(46.0, 34.0, 2.0 * SHARE, np.inf, False, seed))
+    (drift,) = result.drifts
+    assert result.events == ()
+    assert drift.parameter == "link_1.inertia"
+    assert drift.since == pytest.approx(34.0, abs=1.5)
+    assert drift.rate == pytest.approx(-2.0 * SHARE * INERTIA, abs=4.0 * drift.std)
+    assert result.trust.level == "trust"
+
+
+@pytest.mark.slow
+def test_a_session_restored_behind_a_step_and_a_drift_goes_on_to_the_same_bits() -> None:
+    """With a prior, which is within what was known at the step, and again within what the drift went on from."""
+    data = axis_run(44.0, 30.0, SHARE, 15.0, False)
+    prior = sms.estimate(SYSTEM, axis_run(8.0, np.inf, 0.0, np.inf, False, seed=7))
+    expected = sms.estimate(SYSTEM, data, prior=prior)
+    assert len(expected.events) == len(expected.drifts) == 1
+    session = sms.Session(SYSTEM, data.channels, prior=prior)
+    for block in data:
+        for piece in block.pieces(1000):
+            session.update(piece)
+            session = sms.Session.restore(session.save())
+    session.finish()
+    assert session.result.parameters == expected.parameters
+    assert (session.result.events, session.result.drifts) == (expected.events, expected.drifts)
 
 
 def test_what_is_unknown_holds_nothing_of_a_residual() -> None:
