@@ -24,7 +24,7 @@ from sms_online.pipeline.joint_balance import JointBalance
 from sms_online.pipeline.latency import clock_groups
 from sms_online.pipeline.momentum_balance import MomentumBalance
 from sms_online.pipeline.momentum_windows import COPIES, EXPONENT, STEPS, Instants, Window
-from sms_online.pipeline.second_order import SecondOrderNoise, beyond_first_order, rounding, size
+from sms_online.pipeline.second_order import SecondOrderNoise, beyond_first_order, numerical, size
 from sms_online.pipeline.sensing import Sensing
 from sms_online.pipeline.sensor_noise import SensorNoise
 from sms_online.pipeline.smoothing import smooth_all, stride
@@ -173,7 +173,7 @@ class SessionRows(WeakRows):
             noise.begin(beta, self.noise, 0)
             self._extend(noise, part.instants)
             largest = np.maximum.accumulate(size(part.copies[:, 0], beta), axis=0)
-            errors = rounding(largest)
+            errors = numerical(largest)
             errors += np.array([self.second_order.variance(window.half_width) for window in part.windows]).reshape(
                 errors.shape
             )
