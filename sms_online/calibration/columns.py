@@ -60,7 +60,7 @@ class CalibrationState(State):
 
     From instant number `first` on: what a position sensor reads too much, added (K, sensors, ·), and what has that for
     its rate, before (K, sensors, ·); what a torque reads too much, torque (K, joints, ·); and by what another geometry
-    or more elements change momentum and force (K, n_v, ·), each by nuisance.
+    changes momentum and force (K, n_v, ·), and more elements both (K, 2, n_v, ·), each by nuisance.
     """
 
     first: int
@@ -69,6 +69,7 @@ class CalibrationState(State):
     torque: Array
     momentum: Array
     force: Array
+    truncation: Array
 
 
 class CalibrationColumns(Stage):
@@ -85,7 +86,7 @@ class CalibrationColumns(Stage):
         self._torques = torque_families(sensing, sensing.model.system.tolerances)
         # Of the session's system: an event's may hold more that has a geometry.
         self.geometries = tuple(geometries(sensing.model.system))
-        self._truncation = Truncation(model)
+        self._truncation = Truncation(model, span / INSTANTS)
         self._joint_rows = list(model.layout.theta_m)
         # What is added at the instants, in the sum over steps; and that sum of c, by parts of a `Sensitivity`.
         self._to_steps = _interpolation(np.arange(INSTANTS + 1)) * span / STEPS
@@ -103,13 +104,16 @@ class CalibrationColumns(Stage):
         sensors = len(self._sensing.position_columns)
         families = (self._positions, self._low_passes, self._torques)
         widths = [sum(len(each.nuisances) for each in family) for family in families]
-        moved = self.count - sum(widths)
+        moved = self.count - sum(widths) - self._truncation.count
+        self._truncation.begin_segment()
         self.state = CalibrationState(
             next_instant,
             np.empty((0, sensors, widths[0])),
             np.empty((0, sensors, widths[1])),
             np.empty((0, len(layout.q), widths[2])),
-            *np.empty((2, 0, layout.n_v, moved)),
+            np.empty((0, layout.n_v, moved)),
+            np.empty((0, layout.n_v, moved)),
+            np.empty((0, 2, layout.n_v, self._truncation.count)),
         )
 
     def extend(self, pi: Array, x: Array, v: Array, signals: Array, rates: Array, by_geometry: Array) -> None:
@@ -122,8 +126,10 @@ class CalibrationColumns(Stage):
         torque = signals[:, : len(self._model.layout.q)]
         _, T_0 = self._model.layout.base_pose(x)
         motion = Motion(self._sensing.readings(x), rates, torque, T_0)
-        momentum, force = np.concatenate((by_geometry, self._truncation.at(pi, x, v, signals)), axis=3)
+        momentum, force = by_geometry
         now = self.state
+        again, truncation = self._truncation.extend(pi, x, v, signals)
+        now.truncation = np.concatenate((now.truncation[: len(now.truncation) - again], truncation))
         now.added = np.concatenate((now.added, self._sum_of(self._positions, motion, now.added)))
         now.before = np.concatenate((now.before, self._sum_of(self._low_passes, motion, now.before)))
         now.torque = np.concatenate((now.torque, self._sum_of(self._torques, motion, now.torque)))
@@ -174,7 +180,9 @@ class CalibrationColumns(Stage):
         torques = np.zeros((W, n_v, now.torque.shape[2]))
         torques[:, self._joint_rows] = self._over(self._phi, now.torque[inside])
         moved = -self._over(self._phi_dot, now.momentum[inside]) - self._over(self._phi, now.force[inside])
-        return np.concatenate((*positions, torques, moved), axis=2)
+        momentum, force = now.truncation[inside].swapaxes(0, 2).swapaxes(1, 2)
+        finer = -self._over(self._phi_dot, momentum) - self._over(self._phi, force)
+        return np.concatenate((*positions, torques, moved, finer), axis=2)
 
     @staticmethod
     def _over(weights: Array, values: Array) -> Array:
@@ -188,4 +196,5 @@ class CalibrationColumns(Stage):
             self.state.added, self.state.before = self.state.added[kept], self.state.before[kept]
             self.state.torque = self.state.torque[kept]
             self.state.momentum, self.state.force = self.state.momentum[kept], self.state.force[kept]
+            self.state.truncation = self.state.truncation[kept]
         self.state.first = before
