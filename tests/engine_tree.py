@@ -20,6 +20,8 @@ AXES = np.eye(3)
 READINGS = {
     "u_y": "bending_z", "u_z": "bending_y", "theta_x": "torsion", "theta_y": "bending_y", "theta_z": "bending_z",
 }  # fmt: skip
+# Steps towards equilibrium, each to a hundredth of the one before; the time step of an engine that is never run, s.
+STATIC_STEPS, STATIC_STEP = 12, 1e-4
 
 
 class EngineTree(EngineArm):
@@ -127,10 +129,7 @@ class EngineTree(EngineArm):
         for row, own, data in zip(seen, readings, self._visit(motion), strict=True):
             row[:] = data.body("base").xquat
             for k, (link, marker) in enumerate(markers):
-                root, site = data.site(f"{link}.root"), data.site(marker)
-                frame = root.xmat.reshape(3, 3)
-                own[k, :2] = (frame.T @ (site.xpos - root.xpos))[1:]
-                own[k, 2:] = Rotation.from_matrix(frame.T @ site.xmat.reshape(3, 3)).as_rotvec()
+                own[k] = _reading(data, f"{link}.root", marker)
         columns.append(seen)
         for k, (link, marker) in enumerate(markers):
             described = self.system.links[int(link.removeprefix("link_")) - 1]
@@ -146,6 +145,35 @@ def tree_capture(system: System, duration: float, cells: int, step: float) -> Bl
     """The tree along its own trajectory from rest for `duration` s, as a noise-free capture at the system's rate."""
     arm = EngineTree(system, cells, step)
     return arm.block(arm.run(duration, round(1.0 / (system.sample_rate * step))))
+
+
+def hanging_end(system: System, cells: int) -> Array:
+    """Readings u_y, u_z, θ_x, θ_y, θ_z of a first link's end that hangs at rest from its clamped root.
+
+    Without polar inertia, which would be too large for a body as thin as a fine chain has them.
+    """
+    spec, link = _empty(STATIC_STEP), system.links[0]
+    assert isinstance(link, FlexibleLink)
+    spec.option.gravity = np.array(system.gravity)
+    _add_segments(spec.worldbody.add_body(), "link", link.model_copy(update={"polar_inertia_per_length": 1e-9}), cells)
+    model = spec.compile()
+    data = mujoco.MjData(model)
+    # What the link weighs hardly depends on its shape: so few steps by its springs alone find that.
+    for _ in range(STATIC_STEPS):
+        mujoco.mj_forward(model, data)
+        left = data.qfrc_passive - data.qfrc_bias
+        data.qpos += left / model.jnt_stiffness
+    assert np.abs(left).max() < 1e-10
+    mujoco.mj_forward(model, data)
+    return _reading(data, "link.root", f"link.marker_{link.elements}")
+
+
+def _reading(data: mujoco.MjData, root: str, marker: str) -> Array:
+    """Displacements and rotation vector of a marker in its link's frame: u_y, u_z, θ_x, θ_y, θ_z."""
+    start, site = data.site(root), data.site(marker)
+    frame = start.xmat.reshape(3, 3)
+    turn = Rotation.from_matrix(frame.T @ site.xmat.reshape(3, 3)).as_rotvec()
+    return np.append((frame.T @ (site.xpos - start.xpos))[1:], turn)
 
 
 def _tensor(i: Inertia) -> Array:

@@ -6,10 +6,12 @@ import numpy as np
 import pytest
 
 from sms_online.description.parse import parse_system
+from sms_online.effects.build import build_model
 from sms_sim.simulate import sampled_blocks, simulate
-from tests.engine_tree import tree_capture
+from tests.engine_tree import hanging_end, tree_capture
 from tests.exactly_known import exactly_known
 from tests.sessions_of import session_of
+from tests.test_truncation import HELD, PER_MARKER, hanging, with_elements
 
 # Coarse links, whose static deflections are exact: the motion starts without a jolt and is slow against their modes.
 CELLS, STEP = 8, 1.25e-4
@@ -198,3 +200,21 @@ def test_the_simulator_moves_as_the_second_engine(name: str) -> None:
         other = ours[:, blocks[0].channels.index(channel)]
         size = 1.0 if channel in ("eta",) else max(float(np.ptp(column)), 1e-3)
         assert np.abs(other - column).max() < (5e-3 if channel.startswith("link") else 3e-4) * size, channel
+
+
+@pytest.mark.slow
+def test_a_finer_chain_twists_as_the_exact_rod() -> None:
+    """A link that hangs bent in both planes: a chain bends right with few cells, but twists too much.
+
+    The elements of the rod are so many that more change nothing.
+    """
+    system = parse_system(HELD, "held")
+    rod = build_model(with_elements(system, 8))
+    end = rod.chain.flexible[0].markers(rod.chain.elastic(hanging(rod), 0))[0, -PER_MARKER:]
+    off = {cells: hanging_end(system, cells) / end - 1.0 for cells in (12, 24, 48)}
+    twist = {cells: float(each[2]) for cells, each in off.items()}
+    bending = np.delete([*off.values()], 2, axis=1)
+    assert np.abs(bending).max() < 1e-4
+    assert 0.05 < twist[12] < 0.08
+    assert twist[24] < 0.25 * twist[12]
+    assert twist[48] < 0.25 * twist[24] < 0.003
