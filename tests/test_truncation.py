@@ -182,7 +182,7 @@ def skew(payload: bool) -> System:
 
 
 @cache
-def moved(n: int, payload: bool = False) -> Block:
+def moved(n: int, payload: bool) -> Block:
     """The arm with n elements on its link, 8 s at grade B with seed 1, read at two markers as of two elements."""
     capture = sms.simulate(with_elements(skew(payload), n), seed=1, grade="B")
     kept, names = [], []
@@ -196,7 +196,7 @@ def moved(n: int, payload: bool = False) -> Block:
 
 
 @cache
-def evaluated(n: int, tolerance: float, payload: bool = False) -> JudgedEvaluation:
+def evaluated(n: int, tolerance: float, payload: bool) -> JudgedEvaluation:
     """A session of it that is described with two elements and measured out exactly but for a truncation's tolerance."""
     system = skew(payload)
     tolerances = Tolerances.model_validate("none").model_copy(update={"truncation": tolerance})
@@ -214,7 +214,7 @@ def error_of(evaluation: JudgedEvaluation, name: str) -> tuple[float, float]:
 @pytest.mark.long
 def test_torsion_is_right_where_more_elements_are_asked_for() -> None:
     """Four elements read at two markers: within one per cent and its interval, and what is corrected is said."""
-    evaluation = evaluated(4, 1.0)
+    evaluation = evaluated(4, 1.0, False)
     error, bar = error_of(evaluation, TWIST)
     assert abs(error) < min(0.01, 1.96 * bar)
     (found,) = truncated(evaluation)
@@ -225,7 +225,7 @@ def test_torsion_is_right_where_more_elements_are_asked_for() -> None:
 @pytest.mark.long
 def test_bodies_are_right_where_a_payload_bends_the_end() -> None:
     """Loads of a bent link act on its shape between markers: without that rigid links are off by six error bars."""
-    evaluation = evaluated(4, 1.0, payload=True)
+    evaluation = evaluated(4, 1.0, True)
     assert evaluation.trust.level == "trust"
     assert evaluation.determined.all()
     errors = evaluation.estimate.pi - evaluation.base.values(evaluation.model.nominal)
@@ -237,7 +237,7 @@ def test_bodies_are_right_where_a_payload_bends_the_end() -> None:
 @pytest.mark.long
 def test_torsion_is_wrong_beside_an_exact_description() -> None:
     """The same without the tolerance: more than five error bars off, and not trusted."""
-    evaluation = evaluated(4, 0.0)
+    evaluation = evaluated(4, 0.0, False)
     error, bar = error_of(evaluation, TWIST)
     assert error > max(0.01, 5.0 * bar)
     assert evaluation.trust.grave
@@ -245,7 +245,7 @@ def test_torsion_is_wrong_beside_an_exact_description() -> None:
 
 @pytest.mark.long
 def test_nothing_is_corrected_where_elements_are_enough() -> None:
-    evaluation = evaluated(2, 1.0)
+    evaluation = evaluated(2, 1.0, False)
     assert truncated(evaluation) == []
     error, bar = error_of(evaluation, TWIST)
     assert abs(error) < 1.96 * bar
@@ -254,7 +254,7 @@ def test_nothing_is_corrected_where_elements_are_enough() -> None:
 @pytest.mark.long
 def test_four_elements_read_at_two_markers_need_no_correction() -> None:
     """The smoother estimates the shape between them: within one per cent and its interval."""
-    read = moved(4)
+    read = moved(4, False)
     names = tuple(re.sub(r"marker_([12])", lambda found: f"marker_{2 * int(found[1])}", name) for name in read.channels)
     system = with_elements(parse_system(SKEW, "skew"), 4)
     exactly = system.model_copy(update={"tolerances": Tolerances.model_validate("none")})
