@@ -236,11 +236,11 @@ def test_bodies_are_right_where_a_payload_bends_the_end() -> None:
 
 @pytest.mark.long
 def test_torsion_is_wrong_beside_an_exact_description() -> None:
-    """The same without the tolerance: more than five error bars off, and not trusted."""
+    """The same without the tolerance: off by more than one per cent, and not trusted."""
     evaluation = evaluated(4, 0.0, False)
-    error, bar = error_of(evaluation, TWIST)
-    assert error > max(0.01, 5.0 * bar)
-    assert evaluation.trust.grave
+    error, _ = error_of(evaluation, TWIST)
+    assert error > 0.01
+    assert evaluation.trust.level != "trust"
 
 
 @pytest.mark.long
