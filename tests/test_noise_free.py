@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from sms_adapters.system_file import load_system
-from sms_online.evaluation import Evaluation
-from sms_online.pipeline.statistics import Statistics
+from sms_online.pipeline.snapshot import statistics_of
+from sms_online.verdict.judged import JudgedEvaluation
 from sms_sim.simulate import sampled_blocks, simulate
 from tests.exactly_known import exactly_known
 from tests.sessions_of import session_of
@@ -22,7 +22,7 @@ LARGEST_ERROR = 1e-4
 def test_exact_samples_are_trusted(name: str) -> None:
     system = exactly_known(load_system(name))
     estimator = session_of(system, sampled_blocks(simulate(system, DURATION)))
-    evaluation = Evaluation(Statistics.of(estimator), estimator.estimate())
+    evaluation = JudgedEvaluation(statistics_of(estimator), estimator.estimate())
     assert estimator.by_momentum
     assert estimator.events == []
     assert evaluation.determined.all()

@@ -40,7 +40,7 @@ from sms_online.trackers.interface import Estimate
 
 # Elements of the finer link for one of the described: with twice as many the first fields are there that are left out.
 FINER = 2
-# Instants in a difference of fourth order, and those behind an instant that a rate of a rate needs.
+# FinerInstants in a difference of fourth order, and those behind an instant that a rate of a rate needs.
 STENCIL = 5
 BEHIND = STENCIL - 1
 # Step of the differences by the link's motion, s: 1e-8 of a rate is lost to curvature, as much to rounding.
@@ -103,7 +103,7 @@ class FinerLink:
         return E.T @ K @ E @ by_load, -N @ np.linalg.solve(own, across - across @ K @ E @ by_load)
 
 
-class Instants(State):
+class FinerInstants(State):
     """A model with finer links at some instants, with E q alone: x (K, n_x), v (K, n_v), signals (K, n_signals).
 
     momentum, load (K, n_v): P π and G π without springs.
@@ -130,7 +130,7 @@ class Condensed(State):
 class TruncationState(State):
     """The last instants, and each link there."""
 
-    instants: Instants
+    instants: FinerInstants
     links: list[Condensed]
 
 
@@ -174,7 +174,7 @@ class Truncation(Stage):
         """The next instant follows none."""
         layout = self._finer.layout
         widths = (layout.n_x, layout.n_v, self._finer.n_signals, layout.n_v, layout.n_v)
-        instants = Instants(*(np.empty((0, width)) for width in widths))
+        instants = FinerInstants(*(np.empty((0, width)) for width in widths))
         links = []
         for i in self._links:
             few, many = (q.stop - q.start for q in (self._own.q_f[i], layout.q_f[i]))
@@ -203,14 +203,14 @@ class Truncation(Stage):
         now.instants, now.links = _last(instants, 2 * BEHIND), [_last(link, 2 * BEHIND) for link in links]
         return again, np.stack(changes, axis=3)
 
-    def _instants(self, dynamics: Dynamics, x: Array, v: Array, signals: Array) -> Instants:
+    def _instants(self, dynamics: Dynamics, x: Array, v: Array, signals: Array) -> FinerInstants:
         """With states of the model as described."""
         layout = self._finer.layout
         finer_x, finer_v = np.zeros((len(x), layout.n_x)), np.zeros((len(v), layout.n_v))
         finer_x[:, self._positions], finer_v[:, self._speeds] = x, v
-        return Instants(finer_x, finer_v, signals, *self._loads(dynamics, finer_x, finer_v, signals))
+        return FinerInstants(finer_x, finer_v, signals, *self._loads(dynamics, finer_x, finer_v, signals))
 
-    def _condensed(self, dynamics: Dynamics, c: int, at: Instants) -> Condensed:
+    def _condensed(self, dynamics: Dynamics, c: int, at: FinerInstants) -> Condensed:
         """Link of nuisance c."""
         q, K = self._finer.layout.q_f[self._links[c]], len(at.x)
         here, moved = self._finer.chain.elastic(at.x, self._links[c]), STEP * at.v[:, q]
@@ -218,7 +218,7 @@ class Truncation(Stage):
         virtual, shape = self._rods[c].condensed(np.concatenate((here, here + moved, here - moved)), stiffness)
         return Condensed(virtual[:K], (virtual[K : 2 * K] - virtual[2 * K :]) / (2.0 * STEP), shape[:K])
 
-    def _change(self, dynamics: Dynamics, c: int, instants: Instants, link: Condensed, count: int) -> Array:
+    def _change(self, dynamics: Dynamics, c: int, instants: FinerInstants, link: Condensed, count: int) -> Array:
         """What nuisance c changes momentum and force by (count, 2, n_v) at the last of some instants."""
         i, at = self._links[c], _last(instants, count)
         finer, own = self._finer.layout.q_f[i], self._own.q_f[i]
