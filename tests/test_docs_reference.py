@@ -39,8 +39,8 @@ def test_channels_and_meanings_match_one_to_one() -> None:
 
 
 def paths(value: Any, at: str = "") -> Iterator[str]:
-    """Paths of all that is in a document, [] for the items of a list."""
-    if isinstance(value, dict):
+    """Paths of all that is in a document, [] for the items of a list; that of an object with nothing in it is its own."""
+    if isinstance(value, dict) and value:
         for key, item in value.items():
             yield from paths(item, f"{at}.{key}" if at else key)
     elif isinstance(value, list):

@@ -184,12 +184,15 @@ def test_an_alarm_behind_the_end_of_a_drift_is_of_that_end() -> None:
     assert change.rates[0] == pytest.approx(-0.5, abs=0.02)
 
 
-def behind_alarm(change: Callable[[Array], Array]) -> Break:
-    """What rows from an alarm at 20 s on show of a change that began before it, of column 1."""
-    tracker, given = learned(), rows(24.0, lambda t: only(1, change(t)), noise=0.05)
-    tracker.update(part(given, 0, round(20.0 * RATE)))
+def behind_alarm(change: Callable[[Array], Array], seed: int = 0) -> Break:
+    """Whether 4.4 s of rows from an alarm at 20 s on are of a drift of column 1 that had begun before it."""
+    tracker, given = learned(), rows(24.4, lambda t: only(1, change(t)), seed, noise=0.05)
+    first = round(20.0 * RATE)
+    tracker.update(part(given, 0, first))
     assert tracker.state.moving == []
-    return tracker.break_between(18.0, 20.0, [part(given, k, k + 1) for k in range(round(20.0 * RATE), given.t.size)])
+    behind = [part(given, k, k + 1) for k in range(first, given.t.size)]
+    assert tracker.break_between(18.0, 20.0, behind).drift is None
+    return tracker.ramp_before(18.0, 20.0, behind)
 
 
 def test_a_drift_may_begin_before_its_alarm() -> None:
@@ -200,8 +203,13 @@ def test_a_drift_may_begin_before_its_alarm() -> None:
     assert found.drift.rates[0] == pytest.approx(0.02, abs=0.005)
 
 
-def test_a_step_before_its_alarm_is_no_drift() -> None:
-    assert behind_alarm(lambda t: 0.1 * (t > 19.5)) == Break()
+@pytest.mark.parametrize("size", [0.02, 0.04, 0.1])
+@pytest.mark.parametrize("at", [18.3, 18.9, 19.5])
+def test_a_step_before_its_alarm_is_no_drift(at: float, size: float) -> None:
+    """Wherever in a block of a second it is, so that no step of those that are tried is quite the one."""
+    found = [behind_alarm(lambda t: size * (t > at), seed) for seed in range(4)]
+    assert [each.drift for each in found] == [None] * 4
+    assert size < 0.1 or found == [Break()] * 4
 
 
 def test_a_step_is_no_drift() -> None:

@@ -40,7 +40,7 @@ from sms_online.trackers.interface import Estimate
 
 # Elements of the finer link for one of the described: with twice as many the first fields are there that are left out.
 FINER = 2
-# FinerInstants in a difference of fourth order, and those behind an instant that a rate of a rate needs.
+# Instants in a difference of fourth order, and those behind an instant that a rate of a rate needs.
 STENCIL = 5
 BEHIND = STENCIL - 1
 # Step of the differences by the link's motion, s: 1e-8 of a rate is lost to curvature, as much to rounding.

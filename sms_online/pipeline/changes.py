@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sms_online.calibration.nuisance import Nuisance, known_beforehand
-from sms_online.description.schema import Effect
+from sms_online.description.schema import Effect, TrackerChoice
 from sms_online.effects.build import changed_model
 from sms_online.model.base_parameters import BaseParameters
 from sms_online.model.model import Model
@@ -85,8 +85,8 @@ class Changes(Stage):
     model, base: current ones, with what events have added to the system's own. Information is on the session's
     nuisances and then on the parameters. renewed: called when a saved state has put other events here. point: gives the
     nuisances (m,) that samples are corrected by. off: gives by how much the session's estimate (m + n,) differs from
-    least squares, which shrink with noise in the columns of gains where rows leave more than noise. drifts: whether
-    they are learned. drift: gives the known one, see `EventRows`.
+    least squares, which shrink with noise in the columns of gains where rows leave more than noise. judged: the tracker
+    that is judged. drift: gives the known one, see `EventRows`.
     """
 
     def __init__(
@@ -98,7 +98,7 @@ class Changes(Stage):
         renewed: Callable[[], None],
         point: Callable[[], Array],
         off: Callable[[], Array],
-        drifts: bool,
+        judged: TrackerChoice,
         drift: Callable[[int], DriftLine | None],
     ) -> None:
         self.model, self.base = model, base
@@ -108,11 +108,11 @@ class Changes(Stage):
         self._sensing = sensing
         self._renewed = renewed
         self._clocks = wandering_clocks(sensing, self._nuisances)
-        self._drifts, self._drift = drifts, drift
+        self._judged, self._drift = judged, drift
         rate, span = self._system.sample_rate, self._system.windows.momentum
         self._half_hop = max(1, round(span * rate / INSTANTS))
         # Where it may have been a drift, an event is decided on later.
-        self._remembered = 2 * REMEMBERED if self._drifts else REMEMBERED
+        self._remembered = 2 * REMEMBERED if judged.learns else REMEMBERED
         self.detector = self._new_detector()
         columns = len(sensing.channels) + model.n_states
         self.state = ChangesState(np.empty(0, dtype=np.int64), np.empty((0, columns)))
@@ -187,8 +187,7 @@ class Changes(Stage):
 
         None where there is nothing new to see. Where the model lacked something before, only a jump that explains the
         rows is one, and the alarm is dismissed otherwise. start_time: s of grid index 0. last: in this segment no more
-        windows come. steps: it may be a drift yet, and is none only where a jump explains
-        the rows and does not go on.
+        windows come. steps: it may be a drift yet, and is none only where a jump explains the rows and does not go on.
         """
         alarm, wanted = self.detector.alarm, min(self.state.wanted, LONGEST_DECISION)
         if alarm is None or self.windows_after < (LEAST_DECISION if last else self.state.wanted if steps else wanted):
@@ -202,7 +201,7 @@ class Changes(Stage):
         behind = self._rows.explain(whole, base, before, samples, (onset, alarm), noise)
         explanation = behind.explanation
         clear = explanation.explained and explanation.decisive and not (steps and behind.goes_on)
-        if not clear and not last and (steps or self.windows_after < LONGEST_DECISION):
+        if not clear and (steps or (not last and self.windows_after < LONGEST_DECISION)):
             self.state.wanted = self.windows_after + DECISION
             return behind
         self.state.wanted = DECISION
@@ -212,6 +211,11 @@ class Changes(Stage):
         if explanation.jump is not None and explanation.jump.kind == CLOCK:
             return self._follow_clocks(explanation, onset, alarm, start_time)
         return self._adopt(whole, base, explanation, onset, alarm, start_time)
+
+    def follow_drift(self, known: Information) -> None:
+        """What has given an alarm, or was found without one, is a drift: test rows to come against what is known."""
+        self.state.wanted = DECISION
+        self.detector.begin(known)
 
     def abandon(self, start_time: float) -> Adoption | None:
         """The session ends while rows are held back: what was known before the event is all there is."""
@@ -225,15 +229,21 @@ class Changes(Stage):
         time = start_time + 0.5 * (onset + self.detector.alarm) / self._system.sample_rate
         dropped = sum(seen.end > before.end for seen in self.detector.history)
         self.state.events.append(Event(time, "undecided", (), (), (), (), dropped))
-        weights = self.parameters(before.known)
+        known = self._known_at(before, int(self.state.index[-1]))
         nothing = GridSamples(self.state.index[:0], self.state.values[:0], self.state.segment)
-        return Adoption(self.model, self.base, before.known, weights, before.misfit, nothing)
+        return Adoption(self.model, self.base, known, self.parameters(known), before.misfit, nothing)
+
+    def _known_at(self, before: Seen, index: int) -> Information:
+        """What was known before a change, of the parameters as they would be at a grid index: drifts go on."""
+        drift = self._drift(index + self.window_samples // 2)
+        return before.known if drift is None else before.known.shifted(np.pad(drift.moved, (len(self._nuisances), 0)))
 
     @property
     def _rows(self) -> EventRows:
         return EventRows(
-            self._system, self._sensing, self._nuisances, self._clocks, self._point, self._drifts, self._drift
-        )
+            self._system, self._sensing, self._nuisances, self._clocks, self._point,
+            not self._judged.static, self._judged.learns, self._drift,
+        )  # fmt: skip
 
     def _before(self, end: int) -> Seen:
         """The last window that ends at or before a grid index, with what was known by then, free of its bias."""
@@ -255,7 +265,7 @@ class Changes(Stage):
         again = np.zeros((len(shifted), m + n + 1))
         again[np.arange(len(shifted)), shifted] = [1.0 / each.tolerance for each in wide]
         before = self._before(onset - MARGIN)
-        known = before.known.without(shifted).with_rows(again)
+        known = self._known_at(before, (onset + alarm) // 2).without(shifted).with_rows(again)
         if (np.abs(explanation.sizes) >= LARGEST_SHIFT).any():
             known = self.beforehand.without(shifted).with_rows(again)
         self.detector = self._new_detector()
@@ -296,10 +306,7 @@ class Changes(Stage):
         # What no hypothesis explains leaves nothing of what was known.
         known = self.beforehand
         if jump is not None:
-            known = before.known.widened(len(fresh)).without([m + k for k in jumped])
-            drift = self._drift(int(at) + self.window_samples // 2)
-            if drift is not None:
-                known = known.shifted(np.concatenate((np.zeros(m), drift.padded(self.base.n).moved)))
+            known = self._known_at(before, int(at)).widened(len(fresh)).without([m + k for k in jumped])
         event = Event(
             time=start_time + at / self._system.sample_rate,
             kind="unexplained" if jump is None else jump.kind,

@@ -60,8 +60,9 @@ class EventRows:
     """Makes rows behind a change, and compares what may explain them.
 
     clocks: nuisances that are those of wandering ones. point: gives the nuisances (m,) that samples are corrected by.
-    drifts: whether a change may be the beginning of a drift. drift: gives that which is known, in the window that ends
-    at a grid index, counted from when the rows before the change are of.
+    follows: whether parameters move in the judged estimate; learns: whether a change may be the beginning of a drift.
+    drift: gives that which is known, in the window that ends at a grid index, counted from the instant that what is
+    known of the parameters before the change holds for.
     """
 
     system: System
@@ -69,7 +70,8 @@ class EventRows:
     nuisances: tuple[Nuisance, ...]
     clocks: tuple[int, ...]
     point: Callable[[], Array]
-    drifts: bool
+    follows: bool
+    learns: bool
     drift: Callable[[int], DriftLine | None]
 
     def explain(
@@ -85,7 +87,7 @@ class EventRows:
         n = len(before.known.factor) - 1 - m
         jumps = [replace(jump, columns=tuple(m + k for k in jump.columns)) for jump in hypotheses(base.parameters)]
         system, values = self.system, samples.values
-        balance = MomentumBalance(model, base, system.sample_rate, system.windows.momentum, moments=self.drifts)
+        balance = MomentumBalance(model, base, system.sample_rate, system.windows.momentum, moments=self.follows)
         windows, instants = balance.push(
             samples.index, [self.sensing.motion(values)] * COPIES, noise.coordinates, noise.lateness
         )  # fmt: skip
@@ -122,8 +124,8 @@ class EventRows:
             weights[:n] = explanation.beta[m:]
             if explanation.jump is not None:
                 weights[[k - m for k in explanation.jump.columns]] += explanation.sizes
-        if explanation.jump is None or not self.drifts:
-            return Behind(explanation, self.drifts, white)
+        if explanation.jump is None or not self.learns:
+            return Behind(explanation, self.learns, white)
         onset, alarm = between
         after = [each.end / system.sample_rate - 0.5 * balance.span - alarm / system.sample_rate for each in white]
         ramp = np.concatenate([t * each.Y[:, m:-1] + each.ramp for t, each in zip(after, white, strict=True)])

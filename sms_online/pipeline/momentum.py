@@ -90,7 +90,7 @@ class Momentum(Stage):
         self.point, self._changed = point, changed
         self._sample_rate, self._span = system.sample_rate, system.windows.momentum
         self.changes = Changes(
-            model, base, sensing, self.nuisances, self._rebuild, point, self._beside_squares, trackers[0].learns,
+            model, base, sensing, self.nuisances, self._rebuild, point, self._beside_squares, trackers[0],
             self._drift_since,
         )  # fmt: skip
         self._sources, self._clocks = source_groups(sensing), clock_groups(sensing)
@@ -205,12 +205,13 @@ class Momentum(Stage):
 
         By the tracker that is chosen first. t: of the newest sample, s, for which parameters that drift hold.
         """
-        own = self._own()
+        own = self.joint_estimate.without_nuisances(len(self.nuisances))
         return self.bank.judged(own, self.joint.bias, t) if self.bank.others else own
 
     def readings(self, t: float) -> tuple[Reading, ...]:
         """Readings of each chosen tracker, the judged one first; empty where that is the session's own alone."""
-        return self.bank.readings(self._own(), self.joint.bias, t) if self.bank.others else ()
+        own = self.joint_estimate.without_nuisances(len(self.nuisances))
+        return self.bank.readings(own, self.joint.bias, t) if self.bank.others else ()
 
     @property
     def joint_estimate(self) -> Estimate:
@@ -224,9 +225,6 @@ class Momentum(Stage):
     def weights(self) -> Array:
         """β (n,) to weight rows with."""
         return self._solved()[len(self.nuisances) :]
-
-    def _own(self) -> Estimate:
-        return self.joint_estimate.without_nuisances(len(self.nuisances))
 
     def _solved(self) -> Array:
         """Nuisances and β, of the rows and, where these determine little, of the description."""
@@ -263,10 +261,10 @@ class Momentum(Stage):
 
     def _decide(self, noise: SensorNoise, last: bool) -> None:
         """Where rows are held back for an event: decide on it, once there are enough of them, and go on."""
-        may_drift = not last and self._may_drift
+        may_drift = self._may_drift
         found = self.changes.decide(noise, self.state.start_time, last, steps=may_drift)
         if may_drift and isinstance(found, Behind):
-            self._decide_on_drift(found, noise)
+            self._decide_on_drift(found, noise, last)
             if self.bank.state.none:
                 found = self.changes.decide(noise, self.state.start_time, last)
         if isinstance(found, Adoption):
@@ -344,17 +342,15 @@ class Momentum(Stage):
         detector, none = self.changes.detector, self.bank.learned is None or self.bank.state.none
         return detector.alarm is not None and not (detector.uncertain or none)
 
-    def _decide_on_drift(self, behind: Behind, noise: SensorNoise) -> None:
+    def _decide_on_drift(self, behind: Behind, noise: SensorNoise, last: bool) -> None:
         """Where rows held back are those of a drift: go on with it."""
         detector, learned = self.changes.detector, self.bank.learned
         assert detector.alarm is not None
         assert learned is not None
-        onset, alarm, newest = (
-            self.state.start_time + end / self._sample_rate
-            for end in (detector.onset, detector.alarm, detector.history[-1].end)
-        )
+        start, rate, last_seen = self.state.start_time, self._sample_rate, detector.history[-1].end
+        onset, alarm, newest = (start + end / rate for end in (detector.onset, detector.alarm, last_seen))
         change, rows = Change(onset - self._window, alarm, newest), [self._followed(each) for each in behind.rows]
-        drift = self.bank.drift_behind(change, rows, behind.explanation.explained and behind.goes_on)
+        drift = self.bank.decide_on_drift(change, rows, behind.explanation.explained and behind.goes_on, last)
         if drift is None:
             return
         samples, before = self.changes.behind(detector.alarm), state_copy(learned.state)
@@ -363,35 +359,39 @@ class Momentum(Stage):
         self._build()
         self._begin_drift(known)
         self._renew_drift()
-        # Rows come again, free of the drift as it is known now.
+        # Rows come again, free of the drift as it is known now, to what knows nothing of them.
         learned.state = before
         self.bank.go_on_behind(change, drift)
         self.bank.release()
+        self._follow_line()
         self.fit.go_on(known.solution().pi[len(self.nuisances) :], noise, self.fit.plain.misfit)
         self._process(samples, noise)
 
     def _renew_drift(self) -> None:
         """Have windows to come know of the drift so far; not those whose rows are made already."""
-        centre, m = self.state.newest_row - 0.5 * self._window, len(self.nuisances)
+        centre = self.state.newest_row - 0.5 * self._window
         line = self.bank.drift(self.joint.tracker.estimate, centre, self.state.drift)
         if line is None or line is self.state.drift:
             return
-        # What takes parameters for constant goes on from what the judged tracker knows of them, less the drift.
         self.state.drift = line
-        moved = np.concatenate((np.zeros(m), line.moved))
+        self._follow_line()
+
+    def _follow_line(self) -> None:
+        """Have what takes parameters for constant go on from what the judged tracker knows of them, less the drift."""
+        moved = np.zeros(self.changes.base.n) if self.state.drift is None else self.state.drift.moved
+        moved = np.pad(moved, (len(self.nuisances), 0))
         known = self.bank.information.shifted(-moved)
         self.joint.tracker.begin(known)
         self.changes.detector.follow(known, moved)
 
     def _begin_drift(self, known: Information) -> None:
         """Have what has judged rows by constant parameters begin anew."""
-        m = len(self.nuisances)
         self.state.prior_within = True
-        self.changes.detector.begin(known)
+        self.changes.follow_drift(known)
         self.joint.begin_drift(known)
         self.fit.plain.clear()
         self.test = self._new_test()
-        self.bank.refer(known.solution().pi[m:])
+        self.bank.refer(known.solution().pi[len(self.nuisances) :])
         self.state.drift = None
 
     @property

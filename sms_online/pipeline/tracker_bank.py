@@ -90,9 +90,8 @@ class Suspected:
 class BankState(State):
     """What a bank of trackers keeps beside them.
 
-    reference (n,): parameters from which a drift counts, None where nothing has moved.
-
-    since: s, when what an alarm is of may have begun, inf without one. none: it is of no drift.
+    reference (n,): parameters from which a drift counts, None where nothing has moved. since: s, when what an alarm
+    is of may have begun, inf without one. none: it is of no drift.
     """
 
     reference: Array | None = None
@@ -225,15 +224,18 @@ class TrackerBank(Stage):
         if self.learned is not None:
             self.state.since = since
 
-    def drift_behind(self, change: Change, behind: Sequence[Rows], unclear: bool) -> Ramp | None:
-        """The drift that a change is, None where it is none so far.
+    def decide_on_drift(self, change: Change, behind: Sequence[Rows], unclear: bool, last: bool) -> Ramp | None:
+        """The drift that a change is; None where it is none, so that an event is decided on, or none so far.
 
-        behind: rows since the alarm. unclear: a step that they show may go on.
+        behind: rows since the alarm. unclear: a step that they show may go on. last: no more rows come.
         """
         assert self.learned is not None
         found = self.learned.break_between(change.onset, change.alarm, behind)
         waited = change.newest - change.alarm
-        self.state.none = waited >= (LONGEST_WAITED if unclear or found.unclear else WAITED)
+        if found.drift is None and (last or waited >= WAITED):
+            earlier = self.learned.ramp_before(change.onset, change.alarm, behind)
+            found = replace(earlier, unclear=earlier.unclear or found.unclear)
+        self.state.none = last or waited >= (LONGEST_WAITED if unclear or found.unclear else WAITED)
         return found.drift
 
     def go_on_behind(self, change: Change, drift: Ramp, behind: Sequence[Rows] = ()) -> None:

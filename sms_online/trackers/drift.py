@@ -23,12 +23,22 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sms_online.stream import Array
-from sms_online.trackers.drift_filter import KNOT, START, STEP, Block, DriftFilter, Moving, innovation_loss, reach
+from sms_online.trackers.drift_filter import (
+    KNOT,
+    START,
+    STEP,
+    Block,
+    DriftFilter,
+    Moving,
+    block_of,
+    expanded,
+    innovation_loss,
+    reach,
+    through,
+)
 from sms_online.trackers.drift_noise import likeliest
 from sms_online.trackers.drift_search import (
     LARGEST_LEFT,
-    STARTS,
-    STARTS_BEFORE_ALARM,
     Break,
     Ramp,
     Tried,
@@ -99,7 +109,7 @@ class LearnedTrend(Tracker):
 
     def update(self, rows: Rows) -> None:
         """Take in rows; ValueError where their width is not n."""
-        for row, t in zip(self._expanded(rows), rows.t.tolist(), strict=True):
+        for row, t in zip(expanded(rows, self._n), rows.t.tolist(), strict=True):
             step = int(np.floor(t / STEP))
             if self.state.step == START:
                 self.state.step = step
@@ -110,35 +120,26 @@ class LearnedTrend(Tracker):
             self.state.fresh += 1
             self.state.rows, self.state.newest = self.state.rows + 1.0, t
 
-    def _expanded(self, rows: Rows) -> Array:
-        """Whitened rows [Y, what rates add about t, b] (M, 2 n + 1)."""
-        whitened = rows.whitened(self._n)
-        rates = np.zeros_like(rows.Y) if rows.ramp is None else rows.ramp / rows.std[:, None]
-        return np.concatenate((whitened[:, :-1], rates, whitened[:, -1:]), axis=1)
-
     def break_between(self, onset: float, alarm: float, behind: Sequence[Rows]) -> Break:
-        """Whether a change that lies between two instants, s, is that of a drift.
+        """Whether a change that lies between two instants, s, is the beginning or a turn of a drift.
 
         behind: rows since the alarm, whitened among themselves.
         """
-        (before, moving), knot = self._before(onset), _knot(alarm)
+        before, moving = self._before(onset)
         if not before or not behind:
             return Break()
-        after = [self._expanded(rows) for rows in behind]
-        for rows, own in zip(behind, after, strict=True):
-            own[:, self._n : -1] += (rows.t - knot * STEP)[:, None] * own[:, : self._n]
-        block = Block.of(np.concatenate(after), knot, behind[-1].t[-1] - knot * STEP)
-        found = best_break(self._through(before, moving, knot)[0], block, self._groups)
-        return self._begun_before(block) if found.drift is None else found
+        block = block_of(behind, _knot(alarm), self._n)
+        return best_break(self._through(before, moving, block.knot)[0], block, self._groups)
 
-    def _begun_before(self, behind: Block) -> Break:
-        """Whether rows behind an alarm go on with a drift that had begun before it, too weak to be seen by then."""
-        found = ramp_before(self._tried(self.state.moving, [*self.state.blocks, behind], STARTS_BEFORE_ALARM))
-        if found.drift is None:
-            return found
-        state = self._through(self.state.blocks, [*self.state.moving, found.drift.moving()], behind.knot)[0]
-        left = state.absorbed(behind).factor[-1, -1] ** 2 - state.factor[-1, -1] ** 2
-        return Break(unclear=True) if left > LARGEST_LEFT * behind.rows else found
+    def ramp_before(self, onset: float, alarm: float, behind: Sequence[Rows]) -> Break:
+        """Whether the same is a drift that had begun before the alarm, too weak to be seen by then."""
+        blocks, moving = self.state.blocks, self.state.moving
+        if not blocks or not behind:
+            return Break()
+        block = block_of(behind, _knot(alarm), self._n)
+        between = sum(each.knot + KNOT > onset / STEP for each in blocks) + 1
+        free = self._free(moving, [*blocks, block])
+        return ramp_before(self.state.anchor.with_moving(moving), [*blocks, block], free, self._groups, between)
 
     def go_on_behind(self, onset: float, alarm: float, drift: Ramp, behind: Sequence[Rows]) -> None:
         """Go on behind the break of a drift, or with one that had begun before it; behind: see `break_between`.
@@ -231,23 +232,18 @@ class LearnedTrend(Tracker):
         return self._through(self.state.blocks, moving, self.state.step)
 
     def _through(self, blocks: Sequence[Block], moving: Sequence[Moving], end: int) -> tuple[DriftFilter, float]:
-        state, loss = self.state.anchor.with_moving(moving), 0.0
-        for k, block in enumerate(blocks):
-            after = state.absorbed(block)
-            loss += innovation_loss(state, after)
-            state = after.advanced(blocks[k + 1].knot if k + 1 < len(blocks) else end)
-        return state, loss
+        return through(self.state.anchor.with_moving(moving), blocks, end)
 
     def _search(self) -> None:
         """Whether one more parameter moves."""
-        found, tried = list(self.state.moving), self._tried(self.state.moving, self.state.blocks)
+        found, tried = list(self.state.moving), self._tried(self.state.moving)
         self._suspect(tried)
         for _ in range(MOST_AT_ONCE if self._follow else 0):
             ramp = best_ramp(tried)
             if ramp is None:
                 break
             found.append(ramp.moving())
-            tried = self._tried(found, self.state.blocks)
+            tried = self._tried(found)
         new = len(found) > len(self.state.moving)
         ends = self.state.shown == PATIENCE and self.state.moves and not self.state.accepted
         judged = self.patient or ends or self.state.lacking
@@ -270,13 +266,17 @@ class LearnedTrend(Tracker):
         left = self._filtered(moving)[0].factor[-1, -1] ** 2 - self.state.anchor.factor[-1, -1] ** 2
         return float(left / sum(block.rows for block in self.state.blocks) - 1.0)
 
-    def _tried(self, moving: Sequence[Moving], blocks: Sequence[Block], starts: Sequence[int] = STARTS) -> Tried:
-        """Changes of what does not move, within blocks that follow on the anchor."""
+    def _tried(self, moving: Sequence[Moving]) -> Tried:
+        """Changes of what does not move, within the remembered blocks."""
+        blocks, free = self.state.blocks, self._free(moving, self.state.blocks)
+        return changes_within(self.state.anchor.with_moving(moving), blocks, free, free)
+
+    def _free(self, moving: Sequence[Moving], blocks: Sequence[Block]) -> list[tuple[int, ...]]:
+        """Groups that do not move, nor say the same as what does."""
         taken = {column for each in moving for column in each.columns}
         rows = np.concatenate([block.factor[:, : self._n] for block in blocks])
         sizes = np.linalg.norm(rows, axis=0)
-        free = [group for group in self._groups if not taken & set(group) and not explains(rows, sizes, taken, group)]
-        return changes_within(self.state.anchor.with_moving(moving), blocks, free, starts)
+        return [group for group in self._groups if not taken & set(group) and not explains(rows, sizes, taken, group)]
 
     def _suspect(self, tried: Tried) -> None:
         """Whether a change is hardly chance, for the second time."""

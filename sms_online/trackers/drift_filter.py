@@ -9,6 +9,7 @@ import numpy as np
 
 from sms_online.stream import Array
 from sms_online.trackers.factor import extended, reduced, triangular_factor
+from sms_online.trackers.interface import Rows
 
 # Time from one step of the filter to the next, s, and steps from one knot that is looked back at to the next.
 STEP, KNOT = 0.2, 5
@@ -230,3 +231,28 @@ def innovation_loss(before: DriftFilter, after: DriftFilter) -> float:
         logs.append(float(np.sum(np.log(np.maximum(own, NO_INFORMATION * np.where(size > 0.0, size, 1.0))))))
     squares = after.factor[-1, -1] ** 2 - before.factor[-1, -1] ** 2
     return float(squares + 2.0 * (logs[1] - logs[0]))
+
+
+def through(state: DriftFilter, blocks: Sequence[Block], end: int) -> tuple[DriftFilter, float]:
+    """A filter behind some blocks, at step `end`, and minus twice the log likelihood of these."""
+    loss = 0.0
+    for k, block in enumerate(blocks):
+        after = state.absorbed(block)
+        loss += innovation_loss(state, after)
+        state = after.advanced(blocks[k + 1].knot if k + 1 < len(blocks) else end)
+    return state, loss
+
+
+def expanded(rows: Rows, n: int) -> Array:
+    """Whitened rows [Y, what rates add about t, b] (M, 2 n + 1)."""
+    whitened = rows.whitened(n)
+    rates = np.zeros_like(rows.Y) if rows.ramp is None else rows.ramp / rows.std[:, None]
+    return np.concatenate((whitened[:, :-1], rates, whitened[:, -1:]), axis=1)
+
+
+def block_of(windows: Sequence[Rows], knot: int, n: int) -> Block:
+    """Rows of several windows as one block that begins at a knot."""
+    after = [expanded(rows, n) for rows in windows]
+    for rows, own in zip(windows, after, strict=True):
+        own[:, n : 2 * n] += (rows.t - knot * STEP)[:, None] * own[:, :n]
+    return Block.of(np.concatenate(after), knot, windows[-1].t[-1] - knot * STEP)

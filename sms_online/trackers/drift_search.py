@@ -9,13 +9,15 @@ import numpy as np
 from scipy.special import chdtrc
 
 from sms_online.stream import Array
-from sms_online.trackers.drift_filter import STEP, Block, DriftFilter, Moving, decaying
+from sms_online.trackers.drift_filter import STEP, Block, DriftFilter, Moving, decaying, through
 from sms_online.trackers.factor import extended
 
 # Starts of a ramp that are tried, knots before now.
 STARTS = (4, 8, 16, 32)
-# And those of a change that has given an alarm, blocks: the last block is all that is behind it.
+# And those of a change that has given an alarm: the last block is all that is behind it.
 STARTS_BEFORE_ALARM = (1, 2, 3, 4, 8, 16, 32)
+# Blocks that are left out for a step which lies in the first of them: rows of the next hold parameters of before it.
+STEPPED = 2
 # What a ramp must take off the rows' sum of squares, for each parameter in it: 6.3 standard deviations of chance, of
 # some 1e5 that are tried in an hour.
 LEAST_GAIN = 40.0
@@ -69,9 +71,13 @@ class Suspicion:
 
 
 def changes_within(
-    anchor: DriftFilter, blocks: Sequence[Block], groups: Sequence[tuple[int, ...]], starts: Sequence[int] = STARTS
+    anchor: DriftFilter,
+    blocks: Sequence[Block],
+    ramps: Sequence[tuple[int, ...]],
+    steps: Sequence[tuple[int, ...]],
+    starts: Sequence[int] = STARTS,
 ) -> Tried:
-    """What a ramp, and a step, of each group explains of the last blocks, from each start, blocks before the end.
+    """What ramps of some groups, and steps of some, explain of the last blocks, from each start, blocks before the end.
 
     anchor: what is known before the blocks.
     """
@@ -89,9 +95,10 @@ def changes_within(
         since = blocks[-start].knot
         left, columns = _left(before[start].all_moving(), blocks[-start:], n)
         tried.left[since] = left[:, n:-1], columns[n:]
-        for group in groups:
+        for group in ramps:
             gain, rates = _explained(left, columns, [n + k for k in group])
             tried.ramps.append(Ramp(group, since, rates, gain))
+        for group in steps:
             gain, sizes = _explained(left, columns, list(group))
             tried.steps.append(Ramp(group, since, sizes, gain))
     return tried
@@ -140,18 +147,53 @@ def likeliest_change(tried: Tried, level: float) -> Suspicion | None:
 class Break:
     """What rows behind a change show. drift: one that began or changed there, None where they show none.
 
-    unclear: where they do not, a drift explains as much as any step, but not yet so much that it could not be chance,
-    or more than noise is left so far.
+    unclear: where they do not, no step explains clearly more than a drift, which may yet be chance, or more than noise
+    is left so far.
     """
 
     drift: Ramp | None = None
     unclear: bool = False
 
 
-def ramp_before(tried: Tried) -> Break:
-    """Whether a change that has given an alarm is that of a ramp, which began before or with it, or a step."""
-    ramps, steps = (max((each.gain for each in some), default=0.0) for some in (tried.ramps, tried.steps))
-    return Break(best_ramp(tried), unclear=ramps > max(LEAST_GAIN, steps - DECISIVE))
+def ramp_before(
+    anchor: DriftFilter,
+    blocks: Sequence[Block],
+    ramps: Sequence[tuple[int, ...]],
+    steps: Sequence[tuple[int, ...]],
+    between: int,
+) -> Break:
+    """Whether a change that has given an alarm is that of a ramp which had begun before it.
+
+    blocks: the last is all that is behind the alarm, and the change lies in one of the last `between` before it. Within
+    a block nobody knows when a step was, so the ramp must explain more than steps with each of these left out.
+    """
+    last = len(blocks) - 1
+    found: list[Ramp | None] = []
+    unclear = True
+    for k in range(max(0, last - between), last):
+        kept = [*blocks[:k], *blocks[min(k + STEPPED, last) :]]
+        tried = changes_within(anchor, kept, ramps, steps, STARTS_BEFORE_ALARM)
+        found.append(best_ramp(tried))
+        best, step = (max((each.gain for each in some), default=0.0) for some in (tried.ramps, tried.steps))
+        unclear &= best > max(LEAST_GAIN, step - DECISIVE)
+    whole = best_ramp(changes_within(anchor, blocks, ramps, steps, STARTS_BEFORE_ALARM))
+    if not found or whole is None or whole.since == blocks[-1].knot:
+        return Break(unclear=bool(found) and unclear)
+    if not all(each is not None and each.columns == whole.columns for each in found):
+        return Break(unclear=unclear)
+    # Nothing but noise is left, since it began and behind the alarm.
+    moving, since = (
+        anchor.with_moving([*anchor.moving, whole.moving()]),
+        [each.knot for each in blocks].index(whole.since),
+    )
+    rests = [through(moving, blocks[:k], blocks[k].knot)[0] for k in (since, last)]
+    rests.append(rests[-1].absorbed(blocks[-1]))
+    parts = zip(rests, rests[1:], (blocks[since:last], blocks[last:]), strict=False)
+    noise = all(
+        after.factor[-1, -1] ** 2 - before.factor[-1, -1] ** 2 <= LARGEST_LEFT * sum(each.rows for each in part)
+        for before, after, part in parts
+    )
+    return Break(whole if noise else None, unclear=True)
 
 
 def best_break(before: DriftFilter, after: Block, groups: Sequence[tuple[int, ...]]) -> Break:
