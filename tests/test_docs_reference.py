@@ -39,7 +39,7 @@ def test_channels_and_meanings_match_one_to_one() -> None:
 
 
 def paths(value: Any, at: str = "") -> Iterator[str]:
-    """Paths of all that is in a document, [] for the items of a list; that of an object with nothing in it is its own."""
+    """Paths of all that is in a document, [] for the items of a list; of an empty object its own."""
     if isinstance(value, dict) and value:
         for key, item in value.items():
             yield from paths(item, f"{at}.{key}" if at else key)
