@@ -26,7 +26,7 @@ from sms_online.priors import GivenPrior, base_prior, given_prior
 from sms_online.result import Result, result_of
 from sms_online.state import Stage
 from sms_online.stream import Array, Block
-from sms_online.trackers.parse import parse_tracker
+from sms_online.trackers.parse import GRAMMAR, parse_tracker
 from sms_online.truth import true_values
 from sms_online.verdict.judged import JudgedEvaluation
 
@@ -35,10 +35,13 @@ Trackers = str | TrackerChoice | Sequence[str | TrackerChoice] | None
 
 
 def with_trackers(system: System, tracker: Trackers) -> System:
-    """The system with these trackers in place of its own, if any; InputError for a text that is none."""
+    """The system with these trackers in place of its own, if any; InputError for what is none."""
     if tracker is None:
         return system
     asked = [tracker] if isinstance(tracker, str | TrackerChoice) else list(tracker)
+    for each in asked:
+        if not isinstance(each, str | TrackerChoice):
+            raise InputError("tracker", "", repr(each), GRAMMAR)
     chosen = tuple(parse_tracker(each) if isinstance(each, str) else each for each in asked)
     return system.model_copy(update={"trackers": chosen}) if chosen else system
 

@@ -185,6 +185,11 @@ def test_a_choice_that_does_not_fit_the_system_is_refused(choice: TrackerChoice,
         sms.Session(SYSTEM, data.channels, tracker=choice)
 
 
+def test_what_is_no_text_is_no_tracker() -> None:
+    with pytest.raises(sms.InputError, match="tracker: 3; expected rls"):
+        sms.Session(sms.load_system("paper-planar"), (), tracker=["rls", 3])  # type: ignore[list-item]
+
+
 def test_a_system_without_momentum_rows_refuses_a_tracker(data: sms.Capture) -> None:
     text = shipped_text("paper-planar").replace("sample_rate", 'balance = "energy"\nsample_rate', 1)
     system = parse_system(text, "system.toml")

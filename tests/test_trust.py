@@ -275,6 +275,12 @@ def test_a_judgement_is_plain_data_in_results() -> None:
     }
 
 
+def test_a_tracker_that_lets_nothing_move_may_be_what_is_wrong() -> None:
+    found = judge(replace(with_row("joint_2", whitened=5.0), still=True)).document()["next_step"]
+    assert found.startswith("replay it with `--tracker kalman:drift=learned`")
+    assert found.endswith(CHECK_ROWS)
+
+
 def test_every_grave_doubt_states_what_to_do_next() -> None:
     for evidence in (
         with_row("joint_2", whitened=62.0),

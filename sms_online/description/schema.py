@@ -239,6 +239,11 @@ class TrackerChoice(Record):
         return "learned" in ([self.drift] if isinstance(self.drift, str) else self.drift.values())
 
     @property
+    def still(self) -> bool:
+        """Whether it lets no parameter move."""
+        return self.kind != "kalman" or self.drift == "none"
+
+    @property
     def static(self) -> bool:
         """Whether it is the session's own least squares, in which every row counts alike."""
         return self == LEAST_SQUARES

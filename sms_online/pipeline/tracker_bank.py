@@ -136,8 +136,7 @@ class TrackerBank(Stage):
         ]
         self._names = [p.name for p in parameters]
         # A judged tracker that lets nothing move is watched: rows that show a drift speak against it.
-        judged = trackers[0]
-        self._still = judged.kind != "kalman" or judged.drift == "none"
+        self._still = trackers[0].still
         self._watch = build_watch(tracked) if steady and self._still else None
         # By name, for each is saved as a stage within.
         for k, chosen in enumerate(self._chosen):

@@ -70,6 +70,7 @@ class Evidence:
     troubles: of the devices, the recording and the machine of a live session, a short sentence each.
     weaknesses: of an estimate by the way it is made, a short sentence each.
     suspected: parameters that seem to move, which the judged tracker does not follow.
+    still: whether the tracker that was asked for lets no parameter move.
     unwatched: s of a session in which no drift is watched for and none is followed; 0 elsewhere.
     consistency: of the judged tracker's rows with its error bars.
     scale: 1σ of the factor that all parameters have in common, where nothing else fixes it.
@@ -97,6 +98,7 @@ class Evidence:
     troubles: tuple[str, ...] = ()
     weaknesses: tuple[str, ...] = ()
     suspected: Suspected | None = None
+    still: bool = False
     unwatched: float = 0.0
     consistency: Consistency | None = None
     scale: float | None = None

@@ -46,6 +46,7 @@ def evidence_of(evaluation: Evaluation, discrepancies: Sequence[Discrepancy], tr
         troubles=tuple(troubles),
         weaknesses=tuple(_weaknesses(now)),
         suspected=None if momentum is None or now.method != "momentum" else momentum.suspected,
+        still=any(each.still for each in now.setup.system.trackers[:1]),
         unwatched=now.duration if now.method == "momentum" and momentum is not None and momentum.unwatched else 0.0,
         consistency=trackers[0].consistency if trackers else None,
         scale=now.setup.system.scale_tolerance,

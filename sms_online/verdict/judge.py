@@ -44,8 +44,8 @@ def _wrong(evidence: Evidence) -> list[Reason]:
     converged = not evidence.unconverged
     out = [*reasons.scaled(evidence.comparison), *reasons.lacking(evidence.discrepancies)]
     if converged:
-        out += reasons.unexplained_torques(evidence.residual)
-        out += reasons.beyond_limit(evidence.residual)
+        rows = [*reasons.unexplained_torques(evidence.residual), *reasons.beyond_limit(evidence.residual)]
+        out += reasons.or_drifting(rows) if evidence.still else rows
         out += [each for each in evidence.miscalibrated if each.grave]
     out += reasons.unnamed(evidence.discrepancies)
     out += [each for each in _alarmed(evidence) if each.grave]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
 
 from sms_online.nominal import NominalComparison
 from sms_online.pipeline.tracker_bank import Suspected
@@ -54,6 +55,7 @@ BY_SMOOTHER = 'state its rate under [[sensor]], or balance = "smoother"'
 CHECK_LOSSES = "look at the faults that the session counted: a bus that is too busy, a loose cable"
 WEIGH = "weigh one part and state it under [known], or measure a torque constant"
 FOLLOW = "replay it with `--tracker kalman:drift=learned` (tracker = kalman, drift = learned)"
+OR_DRIFTS = f"{FOLLOW}, if a parameter may have drifted; else "
 GO_ON = "record for longer: a drift is followed once it is certain; then run `sms-online diagnose`"
 CHECK_DEVICE = "look at power, cable and address of what is silent, and at its table in the system file"
 CHECK_TROUBLE = "see to the devices, the recording and the machine first"
@@ -220,6 +222,11 @@ def beyond_limit(residual: Residuals) -> list[Reason]:
     )
     mark = f"{noise:.0f} × noise"
     return [Reason(f"the residual of {worst} is {mark}", True, (worst,), mark, full, CHECK_ROWS)]
+
+
+def or_drifting(found: Sequence[Reason]) -> list[Reason]:
+    """The same where the tracker lets no parameter move: one that drifts leaves as much in the rows."""
+    return [replace(each, then=OR_DRIFTS + each.then) for each in found]
 
 
 def beyond_noise(residual: Residuals) -> list[Reason]:
