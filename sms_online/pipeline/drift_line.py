@@ -21,7 +21,6 @@ class DriftLine:
     """A line for each parameter that drifts.
 
     moved (n,): by how much parameters have moved at t, s, from a reference; rate (n,): per s, from there on.
-
     decay (n,): of the rates, 1/s.
     """
 

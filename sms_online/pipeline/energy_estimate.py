@@ -19,7 +19,8 @@ from sms_online.trackers.square_root import session_tracker
 class EnergyEstimateState(State):
     """What the energy balance keeps beside its tracker.
 
-    segment: of the last samples. newest_row: time of the last row, s. dropped_rows: those not finite."""
+    segment: of the last samples. newest_row: time of the last row, s. dropped_rows: those not finite.
+    """
 
     segment: int = -1
     newest_row: float = -np.inf
