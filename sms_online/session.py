@@ -26,6 +26,7 @@ from sms_online.priors import GivenPrior, base_prior, given_prior
 from sms_online.result import Result, result_of
 from sms_online.state import Stage
 from sms_online.stream import Array, Block
+from sms_online.trackers.build import check_trackers
 from sms_online.trackers.parse import GRAMMAR, parse_tracker
 from sms_online.truth import true_values
 from sms_online.verdict.judged import JudgedEvaluation
@@ -43,6 +44,7 @@ def with_trackers(system: System, tracker: Trackers) -> System:
         if not isinstance(each, str | TrackerChoice):
             raise InputError("tracker", "", repr(each), GRAMMAR)
     chosen = tuple(parse_tracker(each) if isinstance(each, str) else each for each in asked)
+    check_trackers(chosen, "--tracker")
     return system.model_copy(update={"trackers": chosen}) if chosen else system
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -178,16 +179,39 @@ def test_an_unknown_kind_is_refused_with_all_that_are_known(monkeypatch: pytest.
         TrackerChoice(kind="kalman", forgetting="window", memory=3.0),
         TrackerChoice(kind="kalman", drift="random_walk"),
         TrackerChoice(kind="kalman", drift={"joint_7.stiffness": "random_walk"}, share=1e-3),
+        TrackerChoice(kind="kalman", drift="learned", share=1e-3),
+        TrackerChoice(kind="kalman", std={"joint_1.stiffness": 20.0}),
     ],
 )
 def test_a_choice_that_does_not_fit_the_system_is_refused(choice: TrackerChoice, data: sms.Capture) -> None:
-    with pytest.raises(sms.InputError, match="tracker"):
+    with pytest.raises(sms.InputError, match=f"tracker {choice.label}[:,]"):
         sms.Session(SYSTEM, data.channels, tracker=choice)
 
 
-def test_what_is_no_text_is_no_tracker() -> None:
-    with pytest.raises(sms.InputError, match="tracker: 3; expected rls"):
-        sms.Session(sms.load_system("paper-planar"), (), tracker=["rls", 3])  # type: ignore[list-item]
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        (["rls", 3], "tracker: 3; expected rls"),
+        (["rls", "rls"], "tracker: rls, twice; expected trackers that differ"),
+    ],
+)
+def test_what_is_no_list_of_trackers_is_refused(given: list[Any], message: str) -> None:
+    with pytest.raises(sms.InputError, match=message):
+        sms.Session(sms.load_system("paper-planar"), (), tracker=given)
+
+
+@pytest.mark.parametrize(
+    ("tables", "message"),
+    [
+        ('[tracker]\nkind = "kalmann"\n', r"'kalmann'; expected one of rls, kalman \(did you mean 'kalman'\?\)"),
+        ('[[tracker]]\nkind = "rls"\n' * 2, "rls, twice; expected trackers that differ"),
+    ],
+)
+def test_a_file_with_trackers_that_cannot_be_is_refused(tables: str, message: str, tmp_path: Path) -> None:
+    file = tmp_path / "bad.toml"
+    file.write_text(f"{shipped_text('paper-planar')}\n{tables}", encoding="utf-8")
+    with pytest.raises(sms.InputError, match=f"bad.toml, tracker.*: {message}"):
+        sms.load_system(file)
 
 
 def test_a_system_without_momentum_rows_refuses_a_tracker(data: sms.Capture) -> None:

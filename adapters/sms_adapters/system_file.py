@@ -10,6 +10,7 @@ from sms_online.description.explain import hint, nearest
 from sms_online.description.parse import parse_system, shipped_systems, shipped_text, system_of
 from sms_online.description.schema import System
 from sms_online.errors import InputError
+from sms_online.trackers.build import check_trackers
 
 
 def load_system(described: str | Path | Mapping[str, Any]) -> System:
@@ -18,10 +19,18 @@ def load_system(described: str | Path | Mapping[str, Any]) -> System:
     InputError, one line with file and key, where it is neither, or where what it says is wrong.
     """
     if isinstance(described, Mapping):
-        return system_of(described, str(described.get("name", "system")))
-    path_or_name = str(described)
+        source = str(described.get("name", "system"))
+        system = system_of(described, source)
+    else:
+        source = str(described)
+        system = parse_system(_text(source), source)
+    check_trackers(system.trackers, source)
+    return system
+
+
+def _text(path_or_name: str) -> str:
     if path_or_name in shipped_systems():
-        return parse_system(shipped_text(path_or_name), path_or_name)
+        return shipped_text(path_or_name)
     path = Path(path_or_name)
     if path.suffix != ".toml":
         names = shipped_systems()
@@ -30,13 +39,12 @@ def load_system(described: str | Path | Mapping[str, Any]) -> System:
             path_or_name, "", "no shipped system of this name", f"a .toml file or one of {', '.join(names)}{suggestion}"
         )
     try:
-        text = path.read_bytes().decode("utf-8")
+        return path.read_bytes().decode("utf-8")
     except UnicodeDecodeError as error:
         raise InputError(path_or_name, f"byte {error.start}", "not UTF-8 text", "a TOML file in UTF-8") from None
     except OSError as error:
         reason = error.strerror or type(error).__name__
         raise InputError(path_or_name, "", reason[0].lower() + reason[1:], "a readable system file") from None
-    return parse_system(text, path_or_name)
 
 
 def system_text(path_or_name: str) -> str:

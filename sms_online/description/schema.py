@@ -224,14 +224,18 @@ class TrackerChoice(Record):
 
     @property
     def label(self) -> str:
-        """Name for people, such as "rls", "rls exponential 5 s" or "kalman learned"."""
-        if self.kind == "rls":
-            return "rls" if self.memory is None else f"rls {self.forgetting} {self.memory:g} s"
+        """Name for people, such as "rls exponential 5 s" or "kalman random walk 0.001"; every choice has its own."""
         if self.kind != "kalman":
-            return self.kind if self.memory is None else f"{self.kind} {self.memory:g} s"
-        if isinstance(self.drift, str):
-            return "kalman" if self.drift == "none" else f"kalman {self.drift.replace('_', ' ')}"
-        return f"kalman {', '.join(f'{name} {drift}' for name, drift in self.drift.items())}".replace("_", " ")
+            words = [self.kind, *([] if self.forgetting == "none" else [self.forgetting])]
+            return " ".join([*words, *([] if self.memory is None else [f"{self.memory:g} s"])])
+        drifts = {"*": self.drift} if isinstance(self.drift, str) else self.drift
+        noise = ({} if self.share is None else {"*": self.share}) | self.std
+        parts = []
+        for name in {**drifts, **noise}:
+            drift = drifts.get(name, "none").replace("_", " ")
+            words = ([] if name == "*" else [name]) + ([] if drift == "none" else [drift])
+            parts.append(" ".join([*words, *([f"{noise[name]:g}"] if name in noise else [])]))
+        return f"kalman {', '.join(parts)}".strip()
 
     @property
     def learns(self) -> bool:

@@ -49,10 +49,17 @@ class Tracked:
         return self.nuisances + len(self.parameters)
 
 
+def check_trackers(choices: Sequence[TrackerChoice], source: str) -> None:
+    """InputError for a kind of tracker that there is not, and for one that is chosen twice."""
+    for k, choice in enumerate(choices):
+        if choice.kind not in KINDS:
+            raise InputError(source, "tracker.kind", repr(choice.kind), kinds(choice.kind))
+        if choice in choices[:k]:
+            raise InputError(source, "tracker", f"{choice.label}, twice", "trackers that differ")
+
+
 def build_tracker(choice: TrackerChoice, tracked: Tracked) -> Tracker:
     """The empty tracker of a choice; InputError where it does not fit the system's parameters."""
-    if choice.kind not in KINDS:
-        raise InputError(tracked.source, "tracker.kind", repr(choice.kind), kinds(choice.kind))
     return KINDS[choice.kind](choice, tracked)
 
 
@@ -70,17 +77,17 @@ def build_watch(tracked: Tracked) -> LearnedTrend:
 
 def _least_squares(choice: TrackerChoice, tracked: Tracked) -> Tracker:
     if choice.drift != "none" or choice.std or choice.share is not None:
-        raise InputError(tracked.source, "tracker", "drift of rls", 'kind = "kalman", or a forgetting')
+        raise InputError(tracked.source, _place(choice), "a drift of rls", 'kind = "kalman", or a forgetting')
     if (choice.forgetting == "none") != (choice.memory is None):
         found = "no memory" if choice.memory is None else f"a memory of {choice.memory:g} s and no forgetting"
-        raise InputError(tracked.source, "tracker", found, "forgetting and its memory in s, or neither")
+        raise InputError(tracked.source, _place(choice), found, "forgetting and its memory in s, or neither")
     forgetting = _forgetting(choice, tracked.rows_per_second)
     return RecursiveLeastSquares(tracked.n, forgetting, tracked.prior, tracked.scaled)
 
 
 def _kalman(choice: TrackerChoice, tracked: Tracked) -> Tracker:
     if choice.forgetting != "none" or choice.memory is not None:
-        raise InputError(tracked.source, "tracker", "forgetting of kalman", 'kind = "rls", or a drift')
+        raise InputError(tracked.source, _place(choice), "a forgetting of kalman", 'kind = "rls", or a drift')
     drifts = drifts_of(choice, tracked.parameters, tracked.source)
     std = process_std(choice, tracked, drifts)
     if not {"trend", "learned"} & set(drifts):
@@ -97,13 +104,19 @@ KINDS: dict[str, Callable[[TrackerChoice, Tracked], Tracker]] = {"rls": _least_s
 def drifts_of(choice: TrackerChoice, parameters: Sequence[Parameter], source: str) -> list[Drift]:
     """The drift of each parameter; InputError for names that the system does not have. source: its name."""
     table: Mapping[str, Drift] = {ALL: choice.drift} if isinstance(choice.drift, str) else choice.drift
-    return [_of(p.name, table, "none") for p in _named(parameters, source, "drift", table)]
+    return [_of(p.name, table, "none") for p in _named(parameters, source, _place(choice, "drift"), table)]
 
 
 def process_std(choice: TrackerChoice, tracked: Tracked, drifts: Sequence[Drift]) -> Array:
-    """Process noise (m + n,) of walks and trends, 0 of all else; InputError where a walk or trend states none."""
+    """Process noise (m + n,) of walks and trends, 0 of all else.
+
+    InputError where a walk or trend states none, and where one is stated that nothing uses.
+    """
     out = np.zeros(tracked.nuisances + len(drifts))
-    parameters = _named(tracked.parameters, tracked.source, "std", choice.std)
+    if (choice.std or choice.share is not None) and not {"random_walk", "trend"} & set(drifts):
+        found = "a process noise, and no drift that has one"
+        raise InputError(tracked.source, _place(choice), found, "random_walk or trend beside std or share")
+    parameters = _named(tracked.parameters, tracked.source, _place(choice, "std"), choice.std)
     for k, (p, drift) in enumerate(zip(parameters, drifts, strict=True), start=tracked.nuisances):
         if drift not in ("random_walk", "trend"):
             continue
@@ -112,9 +125,14 @@ def process_std(choice: TrackerChoice, tracked: Tracked, drifts: Sequence[Drift]
         if std is None:
             found = f"{drift} of {p.name} without std"
             expected = "std of this parameter" + ("" if choice.share is None else ", whose stated value is zero")
-            raise InputError(tracked.source, "tracker", found, f"{expected}, or share of the stated values")
+            raise InputError(tracked.source, _place(choice), found, f"{expected}, or share of the stated values")
         out[k] = std
     return out
+
+
+def _place(choice: TrackerChoice, key: str = "") -> str:
+    """Where a message finds a choice, wherever it was made."""
+    return f"tracker {choice.label}" + (f", {key}" if key else "")
 
 
 def _columns(drifts: Sequence[Drift], kind: Drift, nuisances: int) -> NDArray[np.bool_]:
@@ -150,7 +168,7 @@ def _named(
     for key in table:
         if key not in (*names, *owners, ALL):
             near = nearest(key, [*names, *owners])
-            raise InputError(source, f"tracker.{place}", repr(key), "an estimated parameter" + hint(near))
+            raise InputError(source, place, repr(key), "an estimated parameter" + hint(near))
     return parameters
 
 

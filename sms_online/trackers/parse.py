@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import get_args
 
+from sms_online.description.explain import hint, nearest
 from sms_online.description.schema import Drift, Forgetting, TrackerChoice
 from sms_online.errors import InputError
 from sms_online.trackers.build import KINDS, kinds
@@ -53,5 +54,5 @@ def _number(text: str, option: str, value: str) -> float:
 
 def _one_of(text: str, option: str, value: str, names: tuple[str, ...]) -> str:
     if value not in names:
-        raise InputError("--tracker", text, repr(option), f"one of {', '.join(names)}")
+        raise InputError("--tracker", text, repr(option), f"one of {', '.join(names)}{hint(nearest(value, names))}")
     return value

@@ -20,19 +20,29 @@ MARGIN = 0.08
 
 
 def moved_charts(document: Document) -> list[Chart]:
-    """A chart for each parameter that a tracker says has moved: value ± 2σ, a colour for each tracker."""
+    """A chart for each parameter that has moved: value ± 2σ, a colour for each tracker.
+
+    It has moved where a tracker has found a drift, or where its judged estimates are far apart: other estimates may
+    wander because another parameter drifts.
+    """
     histories = document.get("history", [])
     if not histories or len(histories[0]["t"]) < 2:
         return []
-    drifting = {drift["parameter"] for tracker in document["trackers"] for drift in tracker["drifts"]}
+    drifting = drifting_parameters(document)
+    (judged,) = (history for history in histories if history["judged"])
     far = {}
     for p in document["parameters"]:
-        furthest = max(_furthest(*estimates(history, p["name"])) for history in histories)
+        furthest = _furthest(*estimates(judged, p["name"]))
         if p["name"] in drifting or furthest > STEADY:
             far[p["name"]] = (p["name"] in drifting, furthest)
     chosen = sorted(far, key=lambda name: far[name], reverse=True)[:MOST_CHARTS]
     marks = [event["time"] for event in document["events"]]
     return [_chart(p, histories, marks) for p in document["parameters"] if p["name"] in chosen]
+
+
+def drifting_parameters(document: Document) -> set[str]:
+    """Names of the parameters that a tracker has found to drift."""
+    return {drift["parameter"] for tracker in document.get("trackers", []) for drift in tracker["drifts"]}
 
 
 def estimates(history: Document, name: str) -> tuple[Array, Array]:

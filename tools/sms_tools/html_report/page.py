@@ -12,7 +12,7 @@ from sms_online.model.parameters import Parameter
 from sms_tools.html_report.arm_drawing import arm_drawings
 from sms_tools.html_report.course import Course
 from sms_tools.html_report.figures import Chart, Series, chart
-from sms_tools.html_report.moved import estimates, moved_charts
+from sms_tools.html_report.moved import drifting_parameters, estimates, moved_charts
 from sms_tools.html_report.pages import write_page
 from sms_tools.html_report.parameter_rows import parameter_rows, with_subscripts
 from sms_tools.report import METHODS, Document, drift_lines, event_line, tracker_facts, value_cell
@@ -81,7 +81,11 @@ def _convergence(document: Document, nominal: Mapping[str, float]) -> list[Chart
     judged = next((each for each in document.get("history", []) if each["judged"]), None)
     if judged is None:
         return []
-    described, t = document["parameters"], np.array(judged["t"])
+    # What drifts has a chart of its own: it converges to nothing.
+    drifting, t = drifting_parameters(document), np.array(judged["t"])
+    described = [p for p in document["parameters"] if p["name"] not in drifting]
+    if not described:
+        return []
     columns = zip(*(estimates(judged, p["name"]) for p in described), strict=True)
     estimate, std = map(np.column_stack, columns)
     estimate[~identifiable(estimate, std)] = np.nan
