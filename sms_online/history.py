@@ -22,9 +22,9 @@ from sms_online.triangle import symmetric, upper
 if TYPE_CHECKING:
     import pandas
 
-# From one instant to the next to begin with, s: one costs milliseconds. Where there are as many as are kept, every
-# other one goes and the interval doubles.
-FIRST_INTERVAL = 0.25
+# From one instant to the next to begin with, s, of so many parameters: one costs milliseconds. Of more it grows with
+# their square. Where there are as many as are kept, every other one goes and the interval doubles.
+FIRST_INTERVAL, FEW_PARAMETERS = 0.25, 48
 # Instants that are kept, at most; and numbers, 16 MB, for the covariance of many parameters is large.
 MOST_INSTANTS, MOST_NUMBERS = 1200, 2_000_000
 # Instants of results.json, which holds no covariances: as many as a plot can show.
@@ -110,8 +110,8 @@ class HistoryState(State):
     interval: from one to the next, s. due: time of the next one, s.
     """
 
+    interval: float
     instants: list[Array] = msgspec.field(default_factory=list)
-    interval: float = FIRST_INTERVAL
     due: float = -np.inf
 
 
@@ -124,7 +124,7 @@ class HistoryRecorder(Stage, Observer):
     def __init__(self, estimator: Estimator) -> None:
         self._estimator = estimator
         self.latest: tuple[float, Evaluation] | None = None  # the newest instant, s, and what was known then
-        self.state = HistoryState()
+        self.state = HistoryState(FIRST_INTERVAL * max(1.0, estimator.base.n / FEW_PARAMETERS) ** 2)
 
     def block_through(self) -> None:
         """See `Observer`."""

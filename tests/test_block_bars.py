@@ -9,8 +9,9 @@ import pytest
 from scipy.signal import lfilter
 
 from sms_online.pipeline.beforehand import Beforehand
-from sms_online.pipeline.criterion import MOST_BLOCKS, SHORTEST_BLOCK, Columns, RowGrams
+from sms_online.pipeline.criterion import Columns
 from sms_online.pipeline.estimator import Estimator
+from sms_online.pipeline.row_grams import MOST_BLOCKS, SHORTEST_BLOCK, RowGrams
 from sms_online.pipeline.scale_free import ScaleFree
 from sms_online.stream import Array
 from sms_online.trackers.interface import Estimate

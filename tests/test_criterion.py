@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 
 from sms_online.pipeline.beforehand import Beforehand, Penalty
-from sms_online.pipeline.criterion import Columns, RowGrams, minimum
+from sms_online.pipeline.criterion import Columns, minimum
 from sms_online.pipeline.estimator import Estimator
 from sms_online.pipeline.momentum_windows import OVERLAP
+from sms_online.pipeline.row_grams import RowGrams
 from sms_online.stream import Array
 from sms_online.trackers.interface import Prior
 from tests.evaluated import judged, standard_deviation

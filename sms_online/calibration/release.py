@@ -25,16 +25,19 @@ PASSES, SAME = 20, 1e-6
 LEAST = 1e-9
 
 
+def at_most_tolerances(block: Array) -> Array:
+    """A covariance (k, k) in units of tolerances that are part of it: rounding may make it larger than these alone."""
+    size, axes = np.linalg.eigh(block)
+    return np.asarray((axes * np.minimum(size, 1.0)) @ axes.T)
+
+
 def release_gain(block: Array, weight: Array) -> Array:
     """What a covariance gains where tolerances keep a share of their information: G (k, k) in P + C G Cᵀ.
 
-    block (k, k): covariance of k nuisances in units of their tolerances, whose information is part of it. weight (k,):
-    the shares. C (n, k): covariances with the nuisances in these units. Source: the identity of Woodbury.
+    block (k, k): covariance of k nuisances in units of their tolerances, see `at_most_tolerances`. weight (k,): the
+    shares. C (n, k): covariances with the nuisances in these units. Source: the identity of Woodbury.
     """
     lost = 1.0 - weight
-    # Rounding may make a variance larger than that of the tolerance alone.
-    size, axes = np.linalg.eigh(block)
-    block = (axes * np.minimum(size, 1.0)) @ axes.T
     return np.asarray(np.linalg.solve(np.eye(lost.size) - lost[:, None] * block, np.diag(lost)))
 
 
@@ -54,7 +57,7 @@ def released(estimate: Estimate, nuisances: Sequence[Nuisance], squares: Array) 
     # Beside a prior all rows were weighted with one factor, these among them.
     unit = tolerance[known] * (1.0 if estimate.scale is None else estimate.scale)
     C, start = squares[:, known] / unit, estimate.pi[known] / unit
-    block = C[known] / unit[:, None]
+    block = at_most_tolerances(C[known] / unit[:, None])
     names = np.array([nuisances[k].name for k in known.tolist()])
     # What is wrong in one kind alone may look like a little of many: such are the minima to begin from.
     begun = [start, *(_value(start, block, np.where(names == name, LEAST, 1.0))[0] for name in dict.fromkeys(names))]

@@ -26,14 +26,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import msgspec
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import cho_solve, solve_triangular
 
 from sms_online.pipeline.beforehand import WIDENED, Beforehand, Penalty
-from sms_online.pipeline.gram_sum import GramSum
-from sms_online.pipeline.momentum_windows import HOPS, OVERLAP
-from sms_online.state import State
+from sms_online.pipeline.momentum_windows import OVERLAP
+from sms_online.pipeline.row_grams import RowGrams
 from sms_online.stream import Array
 
 # Directions of scaled columns with less information than this share of the largest are not moved along.
@@ -48,87 +47,6 @@ LEAST_NOISE = 0.1
 ROUNDED = 16.0
 # A step is halved until it gains this share of what the slope promises, so many times at most.
 SUFFICIENT, HALVINGS = 1e-4, 30
-# A block of time is two windows long at least, for neighbours to share little. When there are so many, they merge: with
-# eight to sixteen, their scatter is known to a quarter, and they are as long as a session allows. Even.
-SHORTEST_BLOCK, MOST_BLOCKS = 2 * HOPS, 16
-
-
-class RowGrams(State):
-    """Sums over windows of whitened rows, by generalized speed.
-
-    signal (n_v, n + 1, n + 1): Gram matrices of [Y b]. noise: the same of what the sensors' noise adds to the rows, of
-    first and of second order, from synthetic noise. windows: how many. marks (2, n_v, n + 1, n + 1): both as they were
-    after each block of time, of `length` windows each.
-    """
-
-    signal: GramSum
-    noise: GramSum
-    windows: int = 0
-    marks: list[Array] = msgspec.field(default_factory=list)
-    length: int = SHORTEST_BLOCK
-
-    @staticmethod
-    def none(n_v: int, n: int) -> RowGrams:
-        """Gram matrices of no windows, with rows of n_v speeds and n parameters."""
-        return RowGrams(GramSum.none(n_v, n + 1), GramSum.none(n_v, n + 1))
-
-    def add(self, rows: Array, noisy: Array) -> None:
-        """Rows [Y b] (n_v, n + 1) of a window; noisy (2, n_v, n + 1): with synthetic noise added and subtracted."""
-        first, second = 0.5 * (noisy[0] - noisy[1]), 0.5 * (noisy[0] + noisy[1]) - rows
-        self.signal.add(rows[:, None])
-        self.noise.add(np.stack((first, second), axis=1))
-        self.windows += 1
-        if self.windows % self.length == 0:
-            self.marks.append(self._both)
-            if len(self.marks) == MOST_BLOCKS:
-                self.marks, self.length = self.marks[1::2], 2 * self.length
-
-    @property
-    def _both(self) -> Array:
-        return np.stack((self.signal.matrices, self.noise.matrices))
-
-    @property
-    def block_ends(self) -> Array:
-        """Both sums (blocks + 1, 2, n_v, n + 1, n + 1) as they were before the first block of time and after each.
-
-        Windows behind the last whole block are part of it.
-        """
-        whole = self._both
-        return np.stack([np.zeros_like(whole), *self.marks[:-1], whole])
-
-    def without_blocks(self) -> list[RowGrams]:
-        """The sums without each block of time in turn."""
-        if not self.marks:
-            return []
-        whole = self._both
-        windows = np.diff([*(self.length * k for k in range(len(self.marks))), self.windows]).tolist()
-        out = []
-        for block, count in zip(np.diff(self.block_ends, axis=0), windows, strict=True):
-            signal, noise = whole - block
-            out.append(RowGrams(GramSum(signal), GramSum(noise), self.windows - count))
-        return out
-
-    def whiten_anew(self, before: tuple[Array, Array], now: tuple[Array, Array]) -> None:
-        """Have the rows so far count as those to come, whose variance others predict: their weights and misfit.
-
-        Either (n,), of the parameters behind the variance, and (n_v,). Rows that leave more than noise are weighted by
-        what they were thought to leave then: it may differ a hundredfold from one time to the next. Rows to come that
-        leave no more are whitened against each other, as those before were not: these count no more than they did.
-        """
-        noise = self.noise.matrices
-        then, later = ((1.0 + misfit) * self._of_noise(noise, weights) for weights, misfit in (before, now))
-        share = np.divide(then, later, out=np.ones_like(then), where=(then > 0.0) & (later > 0.0))
-        lacking = now[1] > 0.0
-        share = np.where(lacking, share, np.minimum(1.0, (1.0 + before[1]) / (1.0 + now[1])))
-        self.signal.scale(share)
-        self.noise.scale(share)
-        self.marks = [share[:, None, None] * mark for mark in self.marks]
-
-    @staticmethod
-    def _of_noise(noise: Array, weights: Array) -> Array:
-        """Sum of squares (n_v,) of the rows' noise with parameters β (n,); nuisances before them make none."""
-        w = np.append(weights, -1.0)
-        return np.asarray(noise[:, -w.size :, -w.size :] @ w @ w)
 
 
 @dataclass(frozen=True)
@@ -359,26 +277,49 @@ def _basis(information: Array) -> Array:
     """Directions (n, rank) of unit information."""
     size = np.sqrt(np.diag(information))
     scale = np.divide(1.0, size, out=np.zeros_like(size), where=size > 0.0)
-    values, vectors = np.linalg.eigh(information * np.outer(scale, scale))
+    scaled = information * np.outer(scale, scale)
+    # No eigenvalue is above n, so that none is to be left out here; eigenvectors take twenty times as long.
+    factor = _factor_above(scaled, RANK_TOLERANCE * size.size)
+    if factor is not None:
+        inverse = solve_triangular(factor, np.eye(size.size), lower=True)
+        return np.asarray(scale[:, None] * inverse.T)
+    values, vectors = np.linalg.eigh(scaled)
     kept = values > RANK_TOLERANCE * values[-1]
     return np.asarray(scale[:, None] * vectors[:, kept] / np.sqrt(values[kept]))
 
 
+def _newton_step(curvature: Array, slope: Array) -> Array:
+    """Step (rank,) downhill in directions of unit information, no curvature taken for less than the least."""
+    factor = _factor_above(curvature, LEAST_CURVATURE)
+    if factor is not None:
+        return np.asarray(cho_solve((factor, True), -slope))
+    values, vectors = np.linalg.eigh(curvature)
+    return np.asarray(-vectors @ ((vectors.T @ slope) / np.maximum(np.abs(values), LEAST_CURVATURE)))
+
+
+def _factor_above(matrix: Array, least: float) -> Array | None:
+    """Lower Cholesky factor of a symmetric matrix all of whose eigenvalues are above the least; None for another."""
+    try:
+        np.linalg.cholesky(matrix - least * np.eye(len(matrix)))
+    except np.linalg.LinAlgError:
+        return None
+    return np.asarray(np.linalg.cholesky(matrix), dtype=np.float64)
+
+
 def descended(criterion: Criterion, w: Array, penalty: Penalty) -> Array:
     """Newton steps from w; e follows from step to step."""
+    at = criterion.at(w)
     for _ in range(MOST_STEPS):
-        at = criterion.at(w)
         errors = criterion.errors(at)
         slopes, squares, whole = criterion.slopes(at, errors)
-        pull, known = penalty.derivatives(w)
+        pull, known = penalty.derivatives(at.w)
         directions = _basis(squares[:-1, :-1] + known)
         slope = directions.T @ (slopes.sum(axis=0)[:-1] + pull)
-        values, vectors = np.linalg.eigh(directions.T @ (whole[:-1, :-1] + known) @ directions)
-        step = -vectors @ ((vectors.T @ slope) / np.maximum(np.abs(values), LEAST_CURVATURE))
+        step = _newton_step(directions.T @ (whole[:-1, :-1] + known) @ directions, slope)
         gain = -float(slope @ step)
         if gain < CONVERGED:
             break
-        before, length = criterion.value(at, errors) + penalty.value(w), 1.0
+        before, length = criterion.value(at, errors) + penalty.value(at.w), 1.0
         along = criterion.at(np.append(directions @ step, 0.0))
         for _ in range(HALVINGS):
             moved = at.moved(along, length)
@@ -387,5 +328,5 @@ def descended(criterion: Criterion, w: Array, penalty: Penalty) -> Array:
             length *= 0.5
         else:
             break
-        w = moved.w
-    return w
+        at = moved
+    return at.w

@@ -14,8 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sms_online.pipeline.beforehand import Beforehand
-from sms_online.pipeline.criterion import Columns, RowGrams, minimum
+from sms_online.pipeline.criterion import Columns, minimum
 from sms_online.pipeline.plain_rows import PlainRows
+from sms_online.pipeline.row_grams import RowGrams
 from sms_online.pipeline.white_rows import WhiteRows
 from sms_online.stream import Array
 

@@ -15,9 +15,9 @@ from sms_online.calibration.release import released
 from sms_online.model.base_parameters import BaseParameters
 from sms_online.model.model import Model
 from sms_online.pipeline.beforehand import Beforehand
-from sms_online.pipeline.criterion import RowGrams
 from sms_online.pipeline.errors_in_variables import NoiseBias, unbiased
 from sms_online.pipeline.momentum_fit import MomentumFit
+from sms_online.pipeline.row_grams import RowGrams
 from sms_online.pipeline.scale_free import ScaleFree
 from sms_online.pipeline.white_rows import WhiteRows
 from sms_online.state import Stage, State, state_copy

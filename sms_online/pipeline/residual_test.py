@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sms_online.calibration.nuisance import BOUND, Nuisance
-from sms_online.calibration.release import release_gain
+from sms_online.calibration.release import at_most_tolerances, release_gain
 from sms_online.model.layout import Layout
 from sms_online.pipeline.latency import WANDER
 from sms_online.pipeline.momentum_windows import HOPS
@@ -141,7 +141,7 @@ class SequentialTest(Stage):
     def _loosen(self) -> None:
         now, unit = self.state, self._tolerances
         C = now.root @ now.root[self._loose].T / unit
-        gain = release_gain(C[self._loose] / unit[:, None], np.full(unit.size, BOUND**-2))
+        gain = release_gain(at_most_tolerances(C[self._loose] / unit[:, None]), np.full(unit.size, BOUND**-2))
         size, axes = np.linalg.eigh(0.5 * (gain + gain.T))
         now.beta = now.beta + C @ (gain @ (now.beta[self._loose] / unit))
         now.root = np.concatenate((now.root, C @ (axes * np.sqrt(np.maximum(size, 0.0)))), axis=1)

@@ -26,7 +26,8 @@ from numpy.typing import NDArray
 from scipy.special import stdtrit
 
 from sms_online.pipeline.beforehand import Beforehand, Penalty
-from sms_online.pipeline.criterion import Columns, Criterion, Minimum, RowGrams, at_minimum, descended, minimum
+from sms_online.pipeline.criterion import Columns, Criterion, Minimum, at_minimum, descended, minimum
+from sms_online.pipeline.row_grams import RowGrams
 from sms_online.stream import Array
 from sms_online.trackers.factor import masked_covariance
 from sms_online.trackers.interface import Estimate
