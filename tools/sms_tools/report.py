@@ -139,7 +139,7 @@ def tracker_facts(trackers: list[Document]) -> dict[str, list[str]]:
     nis = [
         "–"
         if t["nis"] is None
-        else f"{t['nis']:.3f} ({t['nis_lower']:.3f} … {t['nis_upper']:.3f}{'' if t['consistent'] else ', outside'})"
+        else f"{t['nis']:.4g} ({t['nis_lower']:.3g} … {t['nis_upper']:.3g}{'' if t['consistent'] else ', outside'})"
         for t in trackers
     ]
     return {"innovations squared": nis, "memory": [f"{t['memory_s']:.3g} s" for t in trackers]}

@@ -63,6 +63,7 @@ class View:
         self._patience = STALL if patient else 0.0
         self._health = health
         self._t = 0.0
+        self._opened = False
         self._room = perf_counter()  # when the last frame was taken without one being dropped
         self._process: subprocess.Popen[bytes] | None = None
         self._handover: Handover | None = None
@@ -171,7 +172,7 @@ class View:
         """Give the view up; the session goes on."""
         if not self.status:
             self.status = f"no view: {text}"
-            self.warnings.append(f"the view ended at {self._t:.1f} s: {text}" if self._t else self.status)
+            self.warnings.append(f"the view ended at {self._t:.1f} s: {text}" if self._opened else self.status)
             print(self.status, file=sys.stderr)
         self._done.set()
 
@@ -179,6 +180,7 @@ class View:
         for line in messages:
             message: dict[str, str] = json.loads(line)
             if "place" in message:
+                self._opened = True
                 print(f"view: {message['place']}", file=sys.stderr)
             elif "trouble" in message:
                 self._trouble(message["trouble"])
