@@ -257,7 +257,7 @@ def test_drifts_do_not_depend_on_how_rows_come() -> None:
 
 
 def test_a_known_drift_goes_on_as_it_decays() -> None:
-    line = DriftLine(np.array([1.0, 1.0]), np.array([2.0, 2.0]), np.array([0.1, 0.0]), 3.0)
+    line = DriftLine(np.array([1.0, 1.0]), np.array([2.0, 2.0]), np.array([0.1, 0.0]), 3.0, 4.0)
     later = line.at(8.0)
     np.testing.assert_allclose(later.moved, [1.0 + 20.0 * (1.0 - np.exp(-0.5)), 11.0])
     np.testing.assert_allclose(later.rate, [2.0 * np.exp(-0.5), 2.0])
@@ -266,7 +266,8 @@ def test_a_known_drift_goes_on_as_it_decays() -> None:
 
 def test_whitened_rows_are_free_of_a_drift_that_decays() -> None:
     """A row looks back for 2 s, a fifteenth of the time in which the rate decays: what is left is of third order."""
-    line, rng = DriftLine(np.array([1.0]), np.array([-2.0]), np.array([1.0 / 30.0]), 50.0), np.random.default_rng(0)
+    line = DriftLine(np.array([1.0]), np.array([-2.0]), np.array([1.0 / 30.0]), 50.0, 51.0)
+    rng = np.random.default_rng(0)
     back, weights = -np.arange(0.0, 2.0, 0.1), rng.normal(size=20)
     Y, path = rng.normal(size=20), np.array([line.at(50.0 + t).moved[0] for t in back])
     rows = np.array([[weights @ Y, weights @ (Y * path)]])

@@ -38,7 +38,7 @@ from sms_online.stream import Array
 # Directions of scaled columns with less information than this share of the largest are not moved along.
 RANK_TOLERANCE = 1e-10
 # Half the square of the Newton step in standard deviations at which the minimum is found, and steps at most.
-CONVERGED, MOST_STEPS = 1e-8, 100
+CONVERGED, MOST_STEPS = 1e-6, 100
 # Curvature of the criterion is no less than this share of that of its squares, for the length of a step.
 LEAST_CURVATURE = 1e-2
 # Noise in whitened rows below this share of their variance is none: their weights follow from the rest of it.

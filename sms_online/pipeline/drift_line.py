@@ -21,20 +21,21 @@ class DriftLine:
     """A line for each parameter that drifts.
 
     moved (n,): by how much parameters have moved at t, s, from a reference; rate (n,): per s, from there on.
-    decay (n,): of the rates, 1/s.
+    decay (n,): of the rates, 1/s. due: when a newer one is to take its place, s.
     """
 
     moved: Array
     rate: Array
     decay: Array
     t: float
+    due: float
 
     def at(self, t: float) -> DriftLine:
         """The same at another instant."""
         time, decaying = t - self.t, self.decay > 0.0
         slowed = -np.expm1(-self.decay * time) / np.where(decaying, self.decay, 1.0)
         moved = self.moved + np.where(decaying, slowed, time) * self.rate
-        return DriftLine(moved, self.rate * np.exp(-self.decay * time), self.decay, t)
+        return replace(self, moved=moved, rate=self.rate * np.exp(-self.decay * time), t=t)
 
     def from_now(self) -> DriftLine:
         """The same with what has moved counted from t on."""
@@ -43,7 +44,7 @@ class DriftLine:
     def padded(self, n: int) -> DriftLine:
         """The same of n parameters, of which further ones do not move."""
         moved, rate, decay = (np.pad(each, (0, n - each.size)) for each in (self.moved, self.rate, self.decay))
-        return DriftLine(moved, rate, decay, self.t)
+        return replace(self, moved=moved, rate=rate, decay=decay)
 
     def removed(self, rows: Array, ramp: Array, bend: Array | None = None) -> Array:
         """Rows [Y b] (…, n_v, n + 1) of a window centred at t as if nothing had moved.

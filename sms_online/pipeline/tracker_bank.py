@@ -26,8 +26,9 @@ from sms_online.trackers.drift_state import Found
 from sms_online.trackers.information import Information
 from sms_online.trackers.interface import Estimate, Prior, Rows, Tracker, joined
 
-# Path of a judged tracker that is no learned trend: from one check of it to the next, s.
-LOOKED = 1.0
+# From one look at what the judged tracker says of drifts to the next, s; sooner where by then their rates would lead
+# further off than this share of the error of what drifts.
+LOOKED, LED_OFF = 1.0, 0.3
 # Times behind an alarm, s, before which a drift may yet show where the judged tracker learns them, and where it is
 # unclear till then whether it was one.
 WAITED, LONGEST_WAITED = 4.4, 6.5
@@ -263,7 +264,7 @@ class TrackerBank(Stage):
         own: the estimate by the session's least squares. before: the last such line.
         """
         judged = self._chosen[0].tracker
-        if judged is None or (before is not None and t < before.t + LOOKED):
+        if judged is None or (before is not None and t < before.due):
             return before
         if isinstance(judged, LearnedTrend) and not judged.moves.any():
             return None
@@ -275,13 +276,15 @@ class TrackerBank(Stage):
         if not estimate.determined[m:].all():
             return None
         moves, rate = np.ones(estimate.pi.size, dtype=np.bool_), np.zeros(estimate.pi.size)
-        decay = rate
+        decay, holds, instant = rate, LOOKED, t
         if isinstance(judged, LearnedTrend):
-            moves, (rate, _, decay) = judged.moves, judged.rates()
+            moves, (rate, std, decay), instant = judged.moves, judged.rates(), judged.instant
+            known = moves & (std > 0.0)
+            holds = min(LOOKED, LED_OFF * float(np.min(estimate.std[known] / std[known], initial=np.inf)))
         if self.state.reference is None:
             self.state.reference = own().pi[m:]
         moved = np.where(moves[m:], estimate.pi[m:] - self.state.reference, 0.0)
-        return DriftLine(moved, rate[m:], decay[m:], judged.instant if isinstance(judged, LearnedTrend) else t)
+        return DriftLine(moved, rate[m:], decay[m:], instant, instant + holds)
 
     @property
     def information(self) -> Information:

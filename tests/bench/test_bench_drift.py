@@ -79,9 +79,9 @@ def steady_rows(system: sms.System, data: sms.Capture) -> list[Rows]:
     seen: list[Rows] = []
     update = TrackerBank.update
 
-    def watched(bank: TrackerBank, rows: Rows, quiet: bool) -> None:
+    def watched(bank: TrackerBank, rows: Rows, quiet: bool, moves: bool) -> None:
         seen.append(rows)
-        update(bank, rows, quiet)
+        update(bank, rows, quiet, moves)
 
     with patch.object(TrackerBank, "update", watched):
         sms.estimate(system, data, tracker=LEARNED)
