@@ -10,6 +10,8 @@ from numpy.testing import assert_allclose
 
 import sms_online as sms
 from sms_online.pipeline.changes import DECISION
+from sms_online.pipeline.drift_line import DriftLine
+from sms_online.pipeline.tracker_bank import LOOKED
 from sms_online.stream import Array
 from sms_online.trackers import Information, Prior, Rows
 from sms_online.trackers.drift import LearnedTrend
@@ -60,6 +62,24 @@ def test_a_step_and_a_drift_are_both_named(
     whole = sum(result.parameters[name].value for name in expected)
     assert whole == pytest.approx(sum(expected.values()), abs=0.002 * INERTIA)
     assert result.trust.level == "trust"
+
+
+@pytest.mark.slow
+def test_the_line_of_a_young_drift_is_renewed_sooner() -> None:
+    """Its rate is hardly known: rows of a second later, less such a line, would hold more than noise."""
+    session = sms.Session(SYSTEM, ("force_1", "q_1"))
+    lines: list[DriftLine] = []
+    for block in axis_run(14.0, 6.0, 60.0 * SHARE, np.inf, False):
+        for piece in block.pieces(20):
+            session.update(piece)
+            momentum = session.estimator.momentum
+            line = None if momentum is None else momentum.state.drift
+            if line is not None and (not lines or line.t != lines[-1].t):
+                lines.append(line)
+    holds = [line.due - line.t for line in lines]
+    assert holds[0] < 0.5 * LOOKED
+    assert holds == sorted(holds)
+    assert holds[-1] <= LOOKED
 
 
 @pytest.mark.slow
