@@ -172,7 +172,7 @@ def one_session(name: str, cache: Path, seed: int) -> Record:
             named.setdefault(drift.parameter, float(piece.t[-1]))
     session.finish()
     result, taken = session.result, process_time() - start
-    static = Session(system, block.channels)
+    static = Session(system, block.channels, tracker="rls")
     if alone:
         static.update(block)
         static.finish()
