@@ -246,7 +246,7 @@ def test_rows_come_in_the_estimators_portions_and_none_late(tmp_path: Path) -> N
         out.append((np.concatenate(t), np.concatenate(came)))
         portions.append(len(t))
     (t, came), (_, could) = out
-    ends = t[0] + steps.first + steps.period * np.arange(2.0 / steps.period, 6.0 / steps.period)
+    ends = t[0] + steps.first + steps.period * np.arange(round(2.0 / steps.period), round(6.0 / steps.period))
     rows = np.searchsorted(t, ends) - 1  # the last of each portion
     assert np.mean(came[rows] - could[rows]) < 0.2
     assert np.max(came[rows] - could[rows]) <= 1
