@@ -214,6 +214,12 @@ def test_a_file_with_trackers_that_cannot_be_is_refused(tables: str, message: st
         sms.load_system(file)
 
 
+def test_a_system_described_elsewhere_with_a_kind_that_is_none_is_refused(data: sms.Capture) -> None:
+    system = SYSTEM.model_copy(update={"trackers": (TrackerChoice(kind="lms"),)})
+    with pytest.raises(sms.InputError, match="'lms'; expected one of rls, kalman"):
+        sms.Session(system, data.channels)
+
+
 def test_a_system_without_momentum_rows_refuses_a_tracker(data: sms.Capture) -> None:
     text = shipped_text("paper-planar").replace("sample_rate", 'balance = "energy"\nsample_rate', 1)
     system = parse_system(text, "system.toml")

@@ -60,6 +60,7 @@ def check_trackers(choices: Sequence[TrackerChoice], source: str) -> None:
 
 def build_tracker(choice: TrackerChoice, tracked: Tracked) -> Tracker:
     """The empty tracker of a choice; InputError where it does not fit the system's parameters."""
+    check_trackers([choice], tracked.source)
     return KINDS[choice.kind](choice, tracked)
 
 
