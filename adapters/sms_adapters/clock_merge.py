@@ -41,7 +41,7 @@ START_PATIENCE = 3.0
 # for asking in vain costs as much as asking, and asking late costs a tick.
 EARLY = 1e-3
 # What arrives is left aside no longer than this, s, whatever is still missing: how long it has waited counts from then.
-LONGEST_ASIDE = 0.1
+LONGEST_ASIDE = 0.2
 
 
 @dataclass(frozen=True)

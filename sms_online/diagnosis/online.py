@@ -80,7 +80,8 @@ class OnlineDiagnosis(Observer):
         self._drifts = 0 if estimator.momentum is None else estimator.momentum.bank.accepted  # that have been followed
         self._quiet = False  # what is lacking has been said, and not added to the model
         self._onset: _Onset | None = None  # of the open episode
-        self._sure = False  # two searches in a row have named the same in the open episode
+        self._agreed = False  # two searches in a row have named the same in the open episode
+        self._sure = False  # and nothing else explains it as well, as far as is known
         self._due = 0  # searches of the open episode that were due so far
         self._begun = 0  # searches that were begun or left out
         self._pending: tuple[int, float] | None = None  # number of a search that runs, and time of its last sample, s
@@ -142,7 +143,7 @@ class OnlineDiagnosis(Observer):
             return
         self._follow_events()
         self._follow_drifts()
-        self._settle()
+        self._conclude()
         if done is not None and self._pending is not None and done[0] == self._pending[0]:
             time, self._pending = self._pending[1], None
             if done[1] is not None and self._onset is not None:
@@ -192,7 +193,7 @@ class OnlineDiagnosis(Observer):
         self.on_verdict(self._now, line(episode))
 
     def _close(self) -> None:
-        self._onset, self._pending, self._sure = None, None, False
+        self._onset, self._pending, self._agreed, self._sure = None, None, False, False
 
     def _notice(self) -> None:
         """Open an episode where rows alarm; in rows that were made without patience, the open one may begin anew."""
@@ -218,7 +219,7 @@ class OnlineDiagnosis(Observer):
         if before is not None:
             if (before.last, before.first) == (onset.last, onset.first):
                 return
-            noticed, self._pending = self.episodes.pop().noticed, None
+            noticed, self._pending, self._agreed = self.episodes.pop().noticed, None, False
         began = None if onset.last is None else self._time(0.5 * (last + first))
         self._due = 0
         self.episodes.append(Episode(noticed, row, began))
@@ -245,7 +246,10 @@ class OnlineDiagnosis(Observer):
             self._give_up()
 
     def _give_up(self) -> None:
-        """Nothing was named twice by all that is remembered."""
+        """All that is remembered was searched: what was not named twice is not known."""
+        if self._agreed:
+            self._settle()
+            return
         episode = self.episodes[-1]
         passed = bool(episode.evidence) and episode.evidence[-1].outcome.verdict == "clean"
         episode.verdict, episode.named, episode.named_at = "passed" if passed else "unexplained", (), None
@@ -297,22 +301,41 @@ class OnlineDiagnosis(Observer):
         episode.evidence.append(evidence)
         self.on_evidence(evidence.known, outcome.scores)
         if outcome.verdict != "named":
+            self._agreed = False
             episode.verdict, episode.named, episode.named_at = "noticed", (), None
             return
         again = before is not None and before.verdict == "named" and before.keys == outcome.keys
         if not again:
             episode.named_at = evidence.known
-        episode.verdict, episode.named = "named", outcome.named
-        if again and self._adopt:
-            self._take_up(episode, outcome)
+        episode.verdict, episode.named, self._agreed = "named", outcome.named, again
         self.on_verdict(evidence.known, line(episode))
-        self._sure = again
-        self._settle()
+        self._conclude()
+
+    def _conclude(self) -> None:
+        """Take what two searches agree on.
+
+        Rows that may show a drift yet are linear about a point that the effect has moved: of laws that explain as much,
+        another one may be the best there.
+        """
+        if self._agreed and not self._sure and self._onset is not None:
+            momentum = self._momentum
+            ambiguous = any(named.ambiguous for named in self.episodes[-1].named)
+            # Rows that were made again since may tell better when it began.
+            made_again = self._onset.patient != momentum.state.patient
+            if not ambiguous or not (momentum.fit.plain.patient or made_again):
+                self._settle()
+        if self._sure:
+            self._close_settled()
 
     def _settle(self) -> None:
+        """Name for good what two searches agree on, and adopt it if wanted."""
+        self._sure, episode = True, self.episodes[-1]
+        if self._adopt:
+            self._take_up(episode, episode.evidence[-1].outcome)
+            self.on_verdict(self._now, line(episode))
+
+    def _close_settled(self) -> None:
         """Close an episode that is named for good; not while rows are held back for an event or a drift behind it."""
-        if not self._sure:
-            return
         episode, detector = self.episodes[-1], self._momentum.changes.detector
         if detector.alarm is not None and episode.noticed >= self._time(detector.onset):
             return

@@ -13,9 +13,9 @@ from sms_online.pipeline.synchronise import SIDE
 # energy balance alone has long ones, in periods of the grid. With momentum rows a block ends when a window can be
 # completed, for whoever waits for an estimate or an event waits for the block too.
 ENERGY_BLOCK = 256
-# Short windows are completed more often than anybody looks: a block is as many hops as there are in this time, s, which
-# is a hop of the usual windows.
-LEAST_BLOCK = 0.04
+# Windows are completed more often than anybody looks: a block is as many hops as there are in this time, s, three of
+# the usual windows. With one hop a block, NumPy's calls take most of a session's time.
+LEAST_BLOCK = 0.12
 # Of a period of the grid: blocks end between its instants, or rounding would decide to which one a sample belongs.
 BETWEEN = 0.5
 

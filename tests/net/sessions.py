@@ -101,7 +101,7 @@ def change() -> Session:
     system = load_system("paper-planar")
     drag = Effect(name="air_drag", where="base", coefficients={"damping": 60.0})
     changed = system.model_copy(update={"effects": (drag,)})
-    block = changed_session(simulate(system, 3.0, position_tolerance=TOLERANCE), changed, 3.0, 5.0)
+    block = changed_session(simulate(system, 3.0, position_tolerance=TOLERANCE), changed, 3.0, 6.5)
     return Session(system, noisy(system, block, "B", 1), adopt=True)
 
 
