@@ -70,7 +70,7 @@ def test_only_axes_in_a_row_share_a_shaft() -> None:
     assert "gravity_spring" not in {effect.name for effect in candidates(weightless)}
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_coupled_wrist_is_named() -> None:
     """Friction and inertia of a shaft that turns with both last axes, under torque noise of 1 % that is coloured."""
     coupled = (

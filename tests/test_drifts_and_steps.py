@@ -124,7 +124,7 @@ def test_a_step_is_named_beside_a_tracker_that_lets_all_move(tracker: str) -> No
     assert event.sizes[0] == pytest.approx(DAMPED, abs=4.0 * event.stds[0])
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_session_restored_behind_a_step_and_a_drift_goes_on_to_the_same_bits() -> None:
     """With a prior, which is within what was known at the step, and again within what the drift went on from."""
     data = axis_run(44.0, 30.0, SHARE, 15.0, False)

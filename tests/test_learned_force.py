@@ -66,7 +66,7 @@ def by_law(text: str) -> Diagnosis:
     return sms.diagnose(described(), capture(text), learned=True)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_curve_replaces_a_law_that_is_struck() -> None:
     found, true = learned(HARDENING), by_law(HARDENING)
     curve = found.system.effects[-1]

@@ -106,7 +106,7 @@ def test_a_wrong_gear_is_corrected_in_the_system() -> None:
     assert f"gear_ratio = {ratio:.4g} # found; the file said 50" in text
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_diagnosis_goes_on_with_the_mistake_undone() -> None:
     diagnosis = diagnose(stated(), [wrong(times(-1.0, "tau_2"))], "test", lambda estimator: None)
     document = diagnosis_document(diagnosis)

@@ -77,7 +77,7 @@ def streamed(name: str, block: Block) -> Estimator:
     return session_of(load_system(name), [block])
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_the_stream_gives_all_but_one_to_a_hundredth_percent(planar_block: Block) -> None:
     estimator = streamed("paper-planar", planar_block)
     truth = estimator.base.values(estimator.model.nominal)

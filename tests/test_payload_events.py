@@ -49,7 +49,7 @@ def steady() -> Estimator:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", [1, 2, 3])
+@pytest.mark.parametrize("seed", [1, *(pytest.param(seed, marks=pytest.mark.long) for seed in (2, 3))])
 def test_a_payload_is_an_event_beside_friction(seed: int) -> None:
     picked_up = 14.0
     capture = carrying(24.0, seed, MASS, picked_up)
@@ -67,7 +67,7 @@ def test_a_payload_is_an_event_beside_friction(seed: int) -> None:
     assert estimated_mass(estimator) == pytest.approx(MASS, rel=WITHIN)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_two_runs_tell_the_payload_of_the_second() -> None:
     """As docs/how-to/payloads.md has it: the loaded run goes on behind a pause. Seeds 4 and 5."""
     empty, loaded = carrying(14.0, 4, 0.0, np.inf), carrying(10.0, 5, MASS, 0.0)
@@ -81,7 +81,7 @@ def test_two_runs_tell_the_payload_of_the_second() -> None:
     assert estimated_mass(estimator) == pytest.approx(MASS, rel=WITHIN)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_friction_that_no_law_fits_is_no_event() -> None:
     estimator = steady()
     assert estimator.momentum is not None
@@ -89,7 +89,7 @@ def test_friction_that_no_law_fits_is_no_event() -> None:
     assert estimator.events == []
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_rows_held_back_for_no_event_are_taken_in() -> None:
     """An alarm without a change, raised by hand and saved meanwhile: it is dismissed, and no row is lost."""
     capture = carrying(24.0, 2, 0.0, np.inf, lacking=3.0)

@@ -92,7 +92,7 @@ def jittering(size: float, seed: int) -> Block:
     return Block(block.t, block.channels, values)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_bars_hold_beside_stamps_that_jitter() -> None:
     """Ten seeds of five parameters; jitter makes 20 times the encoders' noise. Chance has 44 to 50 of 50 hold."""
     true, held = np.array([I_M / GEAR**2, I_L, K, B, F]), []

@@ -73,7 +73,7 @@ def test_no_choice_learns_drifts_and_begins_as_rls(data: sms.Capture, several: s
     assert not tracker.drifts
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_what_no_ramps_explain_is_a_lack_from_the_first_row() -> None:
     """Patience with a drift yet to be learned ends, and rows are made again with weights that allow for friction."""
     data = sms.simulate(SYSTEM, duration=8.0, grade="B", effects=["coulomb_friction@joint_2:torque=8"])

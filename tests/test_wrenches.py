@@ -118,7 +118,7 @@ def test_energies_alone_know_the_push(moved: tuple[Simulated, Simulation]) -> No
     assert stiffness == pytest.approx(1000.0, rel=1e-3)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("plugin", [StoragePlugin.SQLITE3, StoragePlugin.MCAP])
 def test_a_bag_with_wrenches_gives_the_same_estimate(tmp_path: Path, plugin: StoragePlugin) -> None:
     capture = sms.simulate(planar(), duration=3.0, grade="B", seed=4)
