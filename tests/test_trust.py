@@ -133,6 +133,14 @@ def test_lost_samples_come_before_their_residual() -> None:
     assert judgement.others == ("the residual of joint_2 is 19 × noise",)
 
 
+@pytest.mark.parametrize(("share", "first"), [(0.002, "the residual"), (0.05, "5 % of the samples of q_1")])
+def test_few_outliers_come_behind_what_they_do_not_cause(share: float, first: str) -> None:
+    judgement = judge(replace(with_row("joint_2", whitened=19.0), outliers={"q_1": share}))
+    assert judgement.grave
+    assert judgement.reasons[0].startswith(first)
+    assert len(judgement.reasons) == 2
+
+
 def test_slow_noise_comes_before_its_residual() -> None:
     judgement = judge(replace(with_row("joint_2", whitened=4.0), coloured={"q_1": 4e-2}, jitters={"markers": 1e-3}))
     assert judgement.grave

@@ -24,9 +24,10 @@ def judge(evidence: Evidence) -> Trust:
     wrong = _wrong(evidence)
     colour = _colour(evidence)
     # What befell the samples comes before what that may have done to the estimate.
-    samples = reasons.of_samples(evidence)
+    samples, few = reasons.of_samples(evidence), reasons.outliers(evidence.outliers, few=True)
     if wrong:
-        return Trust("doubt", (*samples, *wrong, *_cautions(evidence)), grave=True)
+        return Trust("doubt", (*samples, *wrong, *few, *_cautions(evidence)), grave=True)
+    samples += few
     if never := [name for name, since in evidence.silent.items() if math.isinf(since)]:
         return Trust("not yet", (reasons.never_received(never), *samples, *_cautions(evidence)))
     if evidence.unconverged:

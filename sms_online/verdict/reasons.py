@@ -63,8 +63,8 @@ MOVE = "move all joints, faster and over a larger range, and long enough"
 
 
 def of_samples(evidence: Evidence) -> list[Reason]:
-    """What befell the samples themselves."""
-    out = [*_lost(evidence.lost), *_outliers(evidence.outliers), *_slow(evidence.slow)]
+    """What befell the samples themselves, but for a few outliers."""
+    out = [*_lost(evidence.lost), *outliers(evidence.outliers, few=False), *_slow(evidence.slow)]
     return [*out, *_jittering(evidence.jitters), *_coloured(evidence.coloured)]
 
 
@@ -80,9 +80,10 @@ def _largest(values: Mapping[str, float]) -> tuple[str, float]:
     return worst + (f" and of {len(values) - 1} more channels" if len(values) > 1 else ""), values[worst]
 
 
-def _outliers(shares: Mapping[str, float]) -> list[Reason]:
+def outliers(shares: Mapping[str, float], few: bool) -> list[Reason]:
+    """Outliers, left out; few: those so few that no estimate is wrong by what the other samples have of them."""
     many = {channel: share for channel, share in shares.items() if share > MANY_OUTLIERS}
-    if not many:
+    if not many or few != (max(many.values()) <= LARGEST_LOSS):
         return []
     of, worst = _largest(many)
     text = f"{100.0 * worst:.1g} % of the samples of {of} are outliers, left out"
@@ -92,8 +93,7 @@ def _outliers(shares: Mapping[str, float]) -> list[Reason]:
 def _slow(rates: Mapping[str, float]) -> list[Reason]:
     if not rates:
         return []
-    slowest = min(rates.values())
-    text = f"{listed([*rates])}: {slowest:.3g} samples/s are too few for the windows of the balance"
+    text = f"{listed([*rates])}: {min(rates.values()):.3g} samples/s are too few for the windows of the balance"
     return [Reason(text, False, (), "slow", then=BY_SMOOTHER)]
 
 
