@@ -165,6 +165,12 @@ def test_an_alarm_under_diagnosis_is_no_doubt_of_its_own() -> None:
     assert judge(replace(GOOD, alarm="joint_1", discrepancies=(replace(LACKING, adopted=True),))).grave
 
 
+def test_what_explains_some_of_it_is_said_where_nothing_explains_all() -> None:
+    noticed = Discrepancy("joint_2", 3.0, "noticed", ("sensor_lag@q_*",))
+    said = "more than noise in the residual of joint_2 since 3.0 s, not named yet, nearest sensor_lag@q_*"
+    assert judge(replace(GOOD, discrepancies=(noticed,))).reasons[0] == said
+
+
 def test_a_prior_that_data_pull_from_is_a_grave_doubt() -> None:
     off = Dispute("joint_2.stiffness", -6.2, "link_2")
     judgement = judge(replace(GOOD, disputed=(Dispute("link_1.mass", 3.4, None), off)))

@@ -56,10 +56,7 @@ def line(episode: Episode) -> str:
             taken = f"; not added to the model: {episode.refused}"
         return f"{where}: the model lacks {effects}{taken}"
     if episode.verdict == "unexplained":
-        nearest = ""
-        if episode.evidence and (last := episode.evidence[-1].outcome).keys:
-            nearest = f"; the nearest ({', '.join(last.keys)}) leave {100.0 * last.left:.0f} % of it"
-        return f"{where}, which no known effect explains{nearest}"
+        return f"{where}, which no known effect explains{_beside(_nearest(episode))}"
     if episode.verdict == "passed":
         return f"{where}, of which the last samples show nothing"
     if episode.drifting:
@@ -67,12 +64,27 @@ def line(episode: Episode) -> str:
     if episode.event is not None:
         jumps = zip(episode.event.parameters, episode.event.sizes, episode.event.units, strict=True)
         return f"{where}: {', '.join(f'{name} {size:+.4g} {unit}' for name, size, unit in jumps)}"
-    return f"{where}, not named yet"
+    return f"{where}, not named yet{_beside(_nearest(episode))}"
+
+
+def _nearest(episode: Episode) -> Outcome | None:
+    """The last search, where it has found what explains some of it, but leaves too much to be named."""
+    last = episode.evidence[-1].outcome if episode.evidence else None
+    return last if last is not None and last.keys and last.left < 1.0 else None
+
+
+def _beside(nearest: Outcome | None) -> str:
+    """What that is, a clause."""
+    if nearest is None:
+        return ""
+    return f"; the nearest ({', '.join(nearest.keys)}) leave {100.0 * nearest.left:.0f} % of it"
 
 
 def discrepancy(episode: Episode) -> Discrepancy:
     """An episode as the judgement of the session takes it."""
     named = tuple(each.key for each in episode.named)
+    if episode.verdict in ("noticed", "unexplained"):
+        named = nearest.keys if (nearest := _nearest(episode)) is not None else ()
     return Discrepancy(episode.row, episode.noticed, episode.verdict, named, episode.adopted is not None)
 
 

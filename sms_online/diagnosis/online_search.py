@@ -17,7 +17,15 @@ from sms_online.diagnosis.candidate import Candidate, Unmodelled
 from sms_online.diagnosis.candidates import CandidateColumns
 from sms_online.diagnosis.constants import applied, corrected, improved, is_constant, possible
 from sms_online.diagnosis.folds import Folds
-from sms_online.diagnosis.hypothesis import REWEIGHED, Hypothesis, corrections, share_left, verdict
+from sms_online.diagnosis.hypothesis import (
+    LARGEST_SHARE_LEFT,
+    REWEIGHED,
+    Hypothesis,
+    corrections,
+    share_left,
+    verdict,
+)
+from sms_online.diagnosis.late_sensors import LateSensor, find_late
 from sms_online.diagnosis.record import bounded, excerpts
 from sms_online.diagnosis.reported import of_constant, of_unknowns
 from sms_online.diagnosis.residuals import ResidualTest
@@ -101,15 +109,37 @@ def _search(request: Request) -> Outcome | None:
     if int(late.sum()) < LEAST_WINDOWS or rows.count * rows.model.layout.n_v < 2 * rows.base.n:
         return None
     everything = CandidateColumns(rows, system, since=request.late).all()
-    outcome = _trace(request, rows, everything, request.late)
+    some = _hypothesis(request, rows, everything, request.late)
+    if request.late == 0 and np.any(some.tracing.floor) and (found := find_late(rows)) is not None:
+        # Against a sensor that is far behind the others no force explains anything.
+        return _of_late(found, request)
+    outcome = _trace(request, some, everything, request.late)
     for _ in range(0 if request.whitened else REWEIGHED):
         # Hardly anything was known of the rows' noise, for nothing explained the torques.
         rows.reweight(outcome.beta)
-        outcome = _trace(request, rows, everything, request.late)
+        outcome = _trace(request, _hypothesis(request, rows, everything, request.late), everything, request.late)
     if outcome.verdict != "unexplained" or request.late == 0:
         return outcome
-    always = _trace(request, rows, everything, 0)
+    always = _trace(request, _hypothesis(request, rows, everything, 0), everything, 0)
     return always if always.verdict == "named" or always.left < outcome.left else outcome
+
+
+def _of_late(found: LateSensor, request: Request) -> Outcome:
+    """What a search says of a sensor that is late."""
+    left = (found.after / found.before) ** 2
+    named = Named(
+        effect=found.effect,
+        parameters=(),
+        units=(),
+        values=np.empty(0),
+        stds=np.empty(0),
+        coefficients={"corner": (found.corner, found.std, "Hz")},
+        gain=found.gain,
+        limit=found.limit,
+        ambiguous=found.ambiguous,
+    )
+    said = "named" if left <= LARGEST_SHARE_LEFT else "unexplained"
+    return Outcome(said, (named,), {named.key: found.gain}, left, False, request.beta)
 
 
 def _bounded(request: Request) -> Request:
@@ -137,13 +167,16 @@ def _folds(rows: SessionRows, late: int) -> Folds:
     return Folds.of(segment, rows.time, segment >= late)
 
 
-def _trace(request: Request, rows: SessionRows, everything: Sequence[Candidate], late: int) -> Outcome:
-    """One search, for effects that act from a segment on."""
-    system = request.model.system
-    make = LateColumns(rows, system, late)
+def _hypothesis(request: Request, rows: SessionRows, everything: Sequence[Candidate], late: int) -> Hypothesis:
+    """That some of the candidates act from a segment on."""
+    make = LateColumns(rows, request.model.system, late)
     limited = [make.limited(candidate) for candidate in everything]
-    some = Hypothesis(make, [c for c in limited if np.any(c.columns)], _folds(rows, late), request.prior)
-    tracing = some.tracing
+    return Hypothesis(make, [c for c in limited if np.any(c.columns)], _folds(rows, late), request.prior)
+
+
+def _trace(request: Request, some: Hypothesis, everything: Sequence[Candidate], late: int) -> Outcome:
+    """One search, for effects that act from a segment on."""
+    system, rows, tracing = request.model.system, some.rows, some.tracing
     ranking = tracing.ranking()[:REPORTED]
     chosen = some.run()
     findings = [tracing.finding(chosen, k) for k in chosen]
@@ -163,7 +196,8 @@ def _trace(request: Request, rows: SessionRows, everything: Sequence[Candidate],
         used = list(final.everything)
         if not possible(constants[0], system.sample_rate):
             key = tracing.candidates[chosen[-1]].key
-            return _trace(request, rows, [candidate for candidate in everything if candidate.key != key], late)
+            others = [candidate for candidate in everything if candidate.key != key]
+            return _trace(request, _hypothesis(request, rows, others, late), others, late)
     left = share_left(before, final.excess(used))
     test = ResidualTest(final.rows).of(final.residual(used))
     candidates = [final.tracing.candidates[k] for k in used]

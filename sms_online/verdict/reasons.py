@@ -144,10 +144,8 @@ def scaled(comparison: NominalComparison) -> list[Reason]:
         return []
     cause = f": {comparison.cause}" if comparison.cause else ""
     text = f"everything is {factor:.3g} × its description{cause}"
-    full = (
-        f"all parameters are about {factor:.3g} × what the system file states{cause}; no residual shows such a factor"
-    )
-    return [Reason(text, True, (), "", full, CHECK_SCALE)]
+    means = f"all parameters are about {factor:.3g} × what the system file states{cause}"
+    return [Reason(text, True, (), "", f"{means}; no residual shows such a factor", CHECK_SCALE)]
 
 
 def lacking(discrepancies: Iterable[Discrepancy]) -> list[Reason]:
@@ -167,6 +165,7 @@ def unnamed(discrepancies: Iterable[Discrepancy]) -> list[Reason]:
     for each in discrepancies:
         if each.verdict in ("noticed", "unexplained"):
             why = "not named yet" if each.verdict == "noticed" else "no known effect explains it"
+            why += f", nearest {listed(each.effects)}" if each.effects else ""
             text = f"more than noise in the residual of {each.row} since {each.noticed:.1f} s, {why}"
             out.append(Reason(text, True, (each.row,), "more than noise", then=DIAGNOSE))
     return out
