@@ -87,12 +87,6 @@ def diagnose(
     drifts = explained_by_drifts(followed)
     if drifts:
         return _drifting(case, followed, drifts, mistakes)
-    # Windows that nothing explained are a diagnosis's own affair; a change of parameters is not.
-    changes = [event for event in before.events if event.parameters]
-    if changes:
-        event = changes[0]
-        expected = "a part without it: -ss or -to"
-        raise InputError(source, f"{event.time:.2f} s", f"an event ({event.kind}) within the capture", expected)
     late: list[LateSensor] = []
     while (_explains_little(before) or attempt.tracing.freed) and (found := find_late(attempt.rows)):
         progress("taking off a sensor's lag", TRACED)
@@ -141,6 +135,9 @@ def diagnose(
     said = verdict(
         named, share_left(bare.excess, after.excess), after.test, bare.test, [each.candidate for each in findings]
     )
+    # Where the model lacks something, its rows may look like those of a change; with that there is none.
+    if not partial and (said != "named" or estimator_after is not before):
+        _check_unchanged(estimator_after if said == "named" else before, source)
     grave = said == "clean" and evaluated(before).trust.grave
     # What is left unexplained takes such numbers anywhere.
     calibration = () if said == "unexplained" else _miscalibrated(estimator_after)
@@ -170,6 +167,16 @@ def diagnose(
         estimator_after=estimator_after,
         unexplained=unexplained,
     )
+
+
+def _check_unchanged(session: Estimator, source: str) -> None:
+    """Raise InputError where parameters change within a capture."""
+    # Windows that nothing explained are a diagnosis's own affair; a change of parameters is not.
+    changes = [event for event in session.events if event.parameters]
+    if changes:
+        event = changes[0]
+        expected = "a part without it: -ss or -to"
+        raise InputError(source, f"{event.time:.2f} s", f"an event ({event.kind}) within the capture", expected)
 
 
 def _drifting(case: Case, followed: Estimator, drifts: tuple[Drift, ...], mistakes: tuple[Mistake, ...]) -> Search:
