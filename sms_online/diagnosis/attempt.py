@@ -247,6 +247,8 @@ class Attempt(Hypothesis):
         """
         chosen = self.run(begun)
         for _ in range(REWEIGHED):
+            # A refined shape may explain what nothing did when the rows were first whitened.
+            self.tracing.weigh(chosen)
             beta = self.solution(chosen)[: self.rows.base.n]
             if self.prior is not None:
                 beta = np.where(self.prior.known, self.prior.value, beta)

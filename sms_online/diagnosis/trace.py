@@ -109,6 +109,11 @@ class Tracing(Acceptance):
         seen: set[frozenset[int]] = {frozenset()}
         self.weigh(start)
         chosen = self._begun_with(start)
+        for k in chosen:
+            # In other weights its shape may have been known to a thousandth alone.
+            refine(chosen, k)
+        self.reweight(chosen)
+        self._take(chosen)
         while True:
             chosen = self._grown(chosen, seen, refine, watch)
             if watch(chosen) or any(self.candidates[k].constant for k in chosen):
