@@ -40,8 +40,10 @@ class Acceptance(HeldOutRows):
             return False  # not even of the rows that it is fitted to
         before, after = (self.held_out(each, chosen) for each in (chosen, together))
         own = fall(before[:, acts].sum(axis=1), after[:, acts].sum(axis=1))
-        types = (fall(before[:, each].sum(axis=1), after[:, each].sum(axis=1)) for each in self._types)
-        return own.share >= least and own.certain and not any(each.rises for each in types)
+        # A constant is taken off to first order: the rest may raise one type until the samples are corrected.
+        types = [list(range(self._n_v))] if self.candidates[candidate].constant else self._types
+        falls = (fall(before[:, each].sum(axis=1), after[:, each].sum(axis=1)) for each in types)
+        return own.share >= least and own.certain and not any(each.rises for each in falls)
 
     def improvement(self, chosen: Sequence[int], candidate: int) -> Fall:
         """Fall of the rms of the held-out rows that a candidate acts on, beside those chosen.

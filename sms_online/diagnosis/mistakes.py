@@ -35,6 +35,9 @@ LEAST_RATIO = 10.0
 # Where samples show it by themselves, by this; where it scales everything alike, which nominal values alone show, by
 # that.
 LEAST_SHOWN, LEAST_COMMON = 1.2, 3.0
+# A torque in its right unit or gear leaves no coordinate more than this multiple of what it left before, unless that is
+# little: else what the model lacks has only been moved from one coordinate to another.
+MOST_WORSE = 2.0
 # Mistakes whose ratios differ by less than this factor are not distinguishable.
 SAME_RATIO = 1.5
 # Torque constants and gears differ from their data sheets by less.
@@ -153,8 +156,10 @@ class _Search:
         """Factors of torques that explain the samples."""
         before = _left(given)
         if before > LEAST_COMMON:
+            most = np.maximum(MOST_WORSE * given.left, PHYSICS)
             for each in self._torques(rows):
-                if before / _left(each.fit) > (LEAST_COMMON if each.common else LEAST_RATIO):
+                better = before / _left(each.fit) > (LEAST_COMMON if each.common else LEAST_RATIO)
+                if better and np.all(each.fit.left <= most):
                     yield each
 
     def _take(self, best: _Tried, before: float, others: tuple[str, ...]) -> None:
