@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from sms_adapters.system_file import load_system
-from sms_online.description.schema import System
+from sms_online.description.schema import Effect, System
 from sms_online.diagnosis.diagnose import diagnose
 from sms_online.diagnosis.document import diagnosis_document
 from sms_online.diagnosis.mistakes import Corrected, find_mistakes, wrong_clock
@@ -20,10 +20,11 @@ from sms_online.diagnosis.record import SampleRecord, Segment
 from sms_online.diagnosis.sample_mistakes import shown, without_gaps
 from sms_online.pipeline.estimator import Estimator
 from sms_online.stream import Array, Block
-from sms_sim.simulate import sampled_blocks
+from sms_sim.simulate import sampled_blocks, simulate
 from sms_tools.adopted_system import adopted_text
 from tests import simulations
 from tests.campaigns.mistakes import described
+from tests.campaigns.sessions import disguised
 
 DURATION = 6.0
 Change = Callable[[dict[str, Array]], None]
@@ -116,6 +117,21 @@ def test_a_diagnosis_goes_on_with_the_mistake_undone() -> None:
     assert document["judgement"]["grave"]
     assert document["judgement"]["next_step"] == "turn the sign of tau_2"
     assert max(rows["whitened"] for rows in document["after"]["fit"].values()) < 1.4
+
+
+@pytest.mark.long
+def test_a_link_that_stiffens_has_no_wrong_gear() -> None:
+    """Described as straight, it leaves something of every torque; another gear would leave it to one of them."""
+    system = load_system("paper-planar")
+    stiff = Effect(name="geometric_stiffening", where="link_2")
+    exact = simulate(system.model_copy(update={"effects": (stiff,)}), 12.0, position_tolerance=1e-8)
+    blocks = list(sampled_blocks(exact, "B", seed=3))
+    estimator, record = Estimator(disguised(system), blocks[0].channels, "test"), SampleRecord(system.sample_rate)
+    estimator.observers.append(record)
+    for block in blocks:
+        estimator.push(block)
+    estimator.finish()
+    assert find_mistakes(estimator, record.segments()).mistakes == ()
 
 
 def one(column: Array) -> list[Segment]:

@@ -320,7 +320,7 @@ class OnlineDiagnosis(Observer):
         if self._agreed and not self._sure and self._onset is not None:
             momentum = self._momentum
             ambiguous = any(named.ambiguous for named in self.episodes[-1].named)
-            # Rows that were made again since may tell better when it began.
+            # Rows that were made again since show better when it began.
             made_again = self._onset.patient != momentum.state.patient
             if not ambiguous or not (momentum.fit.plain.patient or made_again):
                 self._settle()
