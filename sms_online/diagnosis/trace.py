@@ -108,12 +108,7 @@ class Tracing(Acceptance):
         self._held: set[int] = set()
         seen: set[frozenset[int]] = {frozenset()}
         self.weigh(start)
-        chosen = self._begun_with(start)
-        for k in chosen:
-            # In other weights its shape may have been known to a thousandth alone.
-            refine(chosen, k)
-        self.reweight(chosen)
-        self._take(chosen)
+        chosen = self._begun_with(start, refine)
         while True:
             chosen = self._grown(chosen, seen, refine, watch)
             if watch(chosen) or any(self.candidates[k].constant for k in chosen):
@@ -126,7 +121,7 @@ class Tracing(Acceptance):
             self.reweight(chosen)
             self._take(chosen)
 
-    def _begun_with(self, start: Sequence[int]) -> list[int]:
+    def _begun_with(self, start: Sequence[int], refine: Callable[[Sequence[int], int], None]) -> list[int]:
         """Those of a search before that are of use in these rows too, each in its best form beside the others."""
         if not start:
             return []
@@ -134,6 +129,11 @@ class Tracing(Acceptance):
         chosen = self._weeded(self._revised(list(start)))
         self._refused = set()  # beside others they may be of use again
         self.path = [(k, chosen[: n + 1]) for n, k in enumerate(chosen)]
+        for k in chosen:
+            # In other weights its shape may have been known to a thousandth alone.
+            refine(chosen, k)
+        self.reweight(chosen)
+        self._take(chosen)
         return chosen
 
     def _grown(
