@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from sms_online.description.explain import hint, nearest
+from sms_online.description.explain import expected_channel
 from sms_online.errors import InputError
 from sms_online.stream import Array, Block
 
@@ -123,6 +123,4 @@ def check_channels(channels: tuple[str, ...], known: tuple[str, ...], source: st
     """InputError for a channel that a system does not have, with the one that was probably meant."""
     for channel in channels:
         if channel not in known:
-            near = nearest(channel, known)
-            expected = f"a channel of this system, such as {near or known[0]!r}{hint(near)}"
-            raise InputError(source, "channels", f"unknown channel {channel!r}", expected)
+            raise InputError(source, "channels", f"unknown channel {channel!r}", expected_channel(channel, known))

@@ -89,6 +89,7 @@ def test_the_bench_itself_is_in_order(bench: Path, capsys: pytest.CaptureFixture
             "run.csv, line 1",
             "unknown channel 'q1'; expected a channel of this system",
         ),
+        ("t,tau_1,q_1\n0,1,2\n", "run.csv, line 1", "expected 'force_1', the drive of joint 1, which has no gear"),
         ("t,q_1\n0,1\n", "run.csv, header", "force_1"),
     ],
 )

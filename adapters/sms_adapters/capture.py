@@ -14,7 +14,7 @@ import pyarrow.csv
 
 from sms_adapters.files import WholeFile
 from sms_adapters.lines import CHUNK, LineReader, sampled_line
-from sms_online.description.explain import nearest
+from sms_online.description.explain import expected_channel
 from sms_online.errors import InputError
 from sms_online.stream import Array, Block
 
@@ -50,7 +50,7 @@ class CaptureReader:
         if known is not None:
             for channel in self._channels:
                 if channel not in known:
-                    expected = f"a channel of this system, such as {nearest(channel, known) or known[0]!r}"
+                    expected = expected_channel(channel, known)
                     raise InputError(str(path), "line 1", f"unknown channel {channel!r}", expected)
         self._reset()
 

@@ -13,7 +13,7 @@ from sms_online.description.bodies import Deformation, FlexibleLink, Inertia, Jo
 from sms_online.description.channels import channels, sensed_channels, wrench_components
 from sms_online.description.check_sources import check_sources
 from sms_online.description.check_tree import check_tips, check_tree
-from sms_online.description.explain import hint, nearest, quoted
+from sms_online.description.explain import expected_channel, hint, nearest, quoted
 from sms_online.description.schema import System
 from sms_online.errors import InputError
 
@@ -220,8 +220,7 @@ def _check_sensors(system: System, names: tuple[str, ...], source: str) -> None:
     for k, sensor in enumerate(system.sensors, start=1):
         for pattern in sensor.channels:
             if not sensed_channels(system, sensor.model_copy(update={"channels": (pattern,)})):
-                near = nearest(pattern, names)
-                expected = f"a channel of this system, such as {near or names[0]!r}"
+                expected = expected_channel(pattern, names)
                 raise InputError(source, f"sensor {k}.channels", f"{pattern!r} matches no channel", expected)
         sensed = sensed_channels(system, sensor)
         if sensor.hold and (other := [name for name in sensed if not name.startswith(("tau_", "force_"))]):

@@ -6,7 +6,7 @@ import re
 from collections.abc import Sequence
 from ipaddress import AddressValueError, IPv4Address
 
-from sms_online.description.explain import hint, nearest
+from sms_online.description.explain import expected_channel, hint, nearest
 from sms_online.description.schema import System
 from sms_online.description.sources import (
     BagSource,
@@ -79,8 +79,7 @@ def _check_number(
     if signal.channel is None:
         return
     if signal.channel not in names:
-        near = nearest(signal.channel, names)
-        expected = f"a channel of this system, such as {near or names[0]!r}"
+        expected = expected_channel(signal.channel, names)
         raise InputError(source, where, f"unknown channel {signal.channel!r}", expected)
     if signal.channel in fed:
         found = f"{signal.channel!r}, which {fed[signal.channel]} fills too"

@@ -76,6 +76,16 @@ def nearest(word: str, names: Sequence[str]) -> str | None:
     return matches[0] if matches else None
 
 
+def expected_channel(channel: str, known: Sequence[str]) -> str:
+    """What was expected in place of a channel that a system does not have."""
+    drive, _, joint = channel.partition("_")
+    other = {"tau": "force", "force": "tau"}.get(drive)
+    if other is not None and f"{other}_{joint}" in known:
+        why = "which has no gear" if other == "force" else "at the motor shaft, before the gear"
+        return f"'{other}_{joint}', the drive of joint {joint}, {why}"
+    return f"a channel of this system, such as {nearest(channel, known) or known[0]!r}"
+
+
 def unknown_key(
     source: str, place: str, key: str, known: Sequence[str], listed: Sequence[str] | None = None
 ) -> InputError:
