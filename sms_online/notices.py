@@ -48,7 +48,9 @@ def notices(now: Statistics) -> list[str]:
     period = 1.0 / system.sample_rate
     fastest = float(np.nanmin(now.periods, initial=np.inf))
     if np.isfinite(fastest) and not 0.8 < fastest / period < 1.25:
-        out.append(f"the capture has {1.0 / fastest:.4g} samples/s, the system file says {system.sample_rate:g}")
+        rate = f"{1.0 / fastest:.4g}"
+        said = f"the capture has {rate} samples/s, the system file says {system.sample_rate:g}"
+        out.append(f"{said}: state sample_rate = {rate}, for interpolated samples hold nothing new and take time")
     late = [name for sensor in system.sensors if sensor.delay(system.sample_rate) for name in sensor.channels]
     if late and now.method == "smoother":
         out.append(f"latency of {', '.join(late)} is described but not corrected by the smoother")

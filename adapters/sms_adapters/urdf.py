@@ -173,6 +173,7 @@ def _text(name: str, file: str, root: Any, placed: Sequence[Placed]) -> str:
     tips = _tips(placed)
     lines = [HEADER.format(name=name, file=file, root=root.name), f"name = {json.dumps(name or Path(file).stem)}"]
     lines += ['motion = "spatial"', "gravity = [0.0, 0.0, -9.81] # m/s², along -z of the root; 0 in orbit"]
+    lines += ["sample_rate = 1000.0 # to be completed: samples/s of the log or the bus"]
     lines += ["", *_spacecraft(root)] if body_of(root).mass > 0.0 else []
     carrying = {each.parent for each in placed if each.joint.type in MOVING}
     for i, each in enumerate(placed, start=1):
