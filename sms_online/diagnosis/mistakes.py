@@ -15,7 +15,7 @@ import numpy as np
 from sms_online.description.channels import drive_channel
 from sms_online.description.schema import System
 from sms_online.diagnosis.record import Segment, excerpts
-from sms_online.diagnosis.rough_fit import RoughFit, RoughRows
+from sms_online.diagnosis.rough_fit import HOPS, LAWS, RoughFit, RoughRows
 from sms_online.diagnosis.sample_mistakes import Undoing, scaled, shown, undoings, without_gaps
 from sms_online.nominal import is_geared
 from sms_online.pipeline.estimator import Estimator
@@ -24,6 +24,8 @@ from sms_online.stream import Array
 
 # Seconds of a session, in stretches, that show a mistake: it is there all the time.
 SOME, STRETCH = 8.0, 4.0
+# Rows for each unknown at least, and those wanted where a session is long enough.
+LEAST_ROWS, WANTED_ROWS = 5.0, 6.0
 # A coordinate of whose rows less is left than this is explained as well as a rough fit can.
 EXPLAINED = 0.02
 # One of whose rows less is left than this lacks physics at most, no unit or sign of a position.
@@ -90,7 +92,10 @@ def find_mistakes(session: Estimator, segments: Sequence[Segment]) -> Corrected:
 
     session: that of the system as described; segments: its samples.
     """
-    some = excerpts(segments, round(STRETCH * session.system.sample_rate), round(SOME * session.system.sample_rate))
+    rate = session.system.sample_rate
+    windows = WANTED_ROWS * (session.base.n + LAWS * len(session.system.joints)) / session.model.layout.n_v
+    duration = max(SOME, STRETCH * np.ceil(windows * session.system.windows.momentum / HOPS / STRETCH))
+    some = excerpts(segments, round(STRETCH * rate), round(duration * rate))
     search = _Search(session, some)
     while len(search.found) < MOST and search.step():
         pass
@@ -131,8 +136,8 @@ class _Search:
             rows = RoughRows(self.session, self._segments)
         except np.linalg.LinAlgError:
             return False
-        if rows.count <= self.session.base.n:
-            return False  # as many parameters as windows explain any coordinate's rows
+        if rows.for_each < LEAST_ROWS:
+            return False  # so many parameters explain any samples
         given = rows.fit()
         found = [
             each

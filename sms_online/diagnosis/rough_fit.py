@@ -50,7 +50,10 @@ class RoughFit:
 
 
 class RoughRows:
-    """Rows of some samples as a session reads them, errors and all. count: number of windows."""
+    """Rows of some samples as a session reads them, errors and all.
+
+    count: number of windows. for_each: rows for each unknown of a fit.
+    """
 
     def __init__(self, session: Estimator | SessionRows, segments: Sequence[Segment]) -> None:
         """Raises numpy.linalg.LinAlgError where there is no window, or rows are no numbers."""
@@ -107,6 +110,7 @@ class RoughRows:
         self._size: Array = np.asarray(np.where(stated > 0.0, stated, largest))
         self._used: NDArray[np.int64] = np.flatnonzero(self._size > LEAST_SIZE * self._size.max())
         self._size = np.maximum(self._size, LEAST_SIZE * self._size.max())
+        self.for_each = count * self._used.size / (base.n + LAWS * len(self._motors))
 
     def fit(self, factors: Array | None = None) -> RoughFit:
         """The fit with the torques of the joints times factors (joints,), ones unless given."""
