@@ -25,6 +25,8 @@ if TYPE_CHECKING:
 # From one instant to the next to begin with, s, of so many parameters: one costs milliseconds. Of more it grows with
 # their square. Where there are as many as are kept, every other one goes and the interval doubles.
 FIRST_INTERVAL, FEW_PARAMETERS = 0.25, 48
+# Where rows leave more than noise, an estimate with error bars from blocks of time takes as long as so many others.
+MISFIT_FACTOR = 8.0
 # Instants that are kept, at most; and numbers, 16 MB, for the covariance of many parameters is large.
 MOST_INSTANTS, MOST_NUMBERS = 1200, 2_000_000
 # Instants of results.json, which holds no covariances: as many as a plot can show.
@@ -134,7 +136,9 @@ class HistoryRecorder(Stage, Observer):
         self._look(t)
         if len(self.state.instants) >= self._most:
             self.state.instants, self.state.interval = self.state.instants[::2], 2.0 * self.state.interval
-        self.state.due = (t // self.state.interval + 1.0) * self.state.interval
+        momentum = self._estimator.momentum
+        interval = self.state.interval * (MISFIT_FACTOR if momentum is not None and momentum.misfit else 1.0)
+        self.state.due = (t // interval + 1.0) * interval
 
     def finish(self) -> None:
         """The session's end, after the estimator has finished: the last instant is what the results say."""

@@ -210,8 +210,10 @@ class Momentum(Stage):
 
     def readings(self, t: float) -> tuple[Reading, ...]:
         """Readings of each chosen tracker, the judged one first; empty where that is the session's own alone."""
+        if not self.bank.others:
+            return ()
         own = self.joint_estimate.without_nuisances(len(self.nuisances))
-        return self.bank.readings(own, self.joint.bias, t) if self.bank.others else ()
+        return self.bank.readings(own, self.joint.bias, t)
 
     @property
     def joint_estimate(self) -> Estimate:
