@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+import sms_online as sms
 from sms_online.pipeline.beforehand import Beforehand, Penalty
 from sms_online.pipeline.criterion import Columns, minimum
 from sms_online.pipeline.estimator import Estimator
@@ -189,3 +190,21 @@ def test_priors_do_not_bend_what_a_wrong_encoder_leaves(corner: float | None, on
 def test_a_prior_that_is_wrong_is_said_to_be() -> None:
     estimator, _ = _identified(None, 0.0, 2.0, prior=True)
     assert any("off its prior" in reason for reason in judged(estimator).reasons)
+
+
+@pytest.mark.slow
+def test_one_torque_with_friction_fixes_the_scale() -> None:
+    """Where the gain of the other is wrong too: its rows, which say 1e10 times as much, then hold no scale."""
+    lacking = [
+        "coulomb_friction@joint_1:torque=12",
+        "stribeck_friction@joint_2:torque=6",
+        "torque_gain@joint_2:ratio=.1",
+    ]
+    data = sms.simulate("paper-planar", duration=20.0, grade="B", effects=lacking)
+    result = sms.estimate("paper-planar", data)
+    share = result.residuals["joint_1"].relative
+    assert share is not None
+    assert share < 0.05
+    nominal = result.parameters["joint_1.stiffness"].nominal
+    assert nominal is not None
+    assert result.parameters["joint_1.stiffness"].value == pytest.approx(nominal, rel=0.1)

@@ -28,15 +28,16 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import cho_solve, solve_triangular
+from scipy.linalg import cho_factor, cho_solve, solve_triangular
 
 from sms_online.pipeline.beforehand import WIDENED, Beforehand, Penalty
 from sms_online.pipeline.momentum_windows import OVERLAP
 from sms_online.pipeline.row_grams import RowGrams
 from sms_online.stream import Array
 
-# Directions of scaled columns with less information than this share of the largest are not moved along.
-RANK_TOLERANCE = 1e-10
+# Directions of scaled columns with less information than this share of the largest are rounding, and not moved along.
+# Where one joint's torque alone fixes the scale and its rows leave much, they say 1e-10 of what other rows do.
+RANK_TOLERANCE = 1e-11
 # Half the square of the Newton step in standard deviations at which the minimum is found, and steps at most.
 CONVERGED, MOST_STEPS = 1e-6, 100
 # Curvature of the criterion is no less than this share of that of its squares, for the length of a step.
@@ -275,35 +276,44 @@ def at_minimum(criterion: Criterion, w: Array, penalty: Penalty) -> Minimum:
 
 def _basis(information: Array) -> Array:
     """Directions (n, rank) of unit information."""
-    size = np.sqrt(np.diag(information))
-    scale = np.divide(1.0, size, out=np.zeros_like(size), where=size > 0.0)
+    scale = _unit_scale(information)
     scaled = information * np.outer(scale, scale)
     # No eigenvalue is above n, so that none is to be left out here; eigenvectors take twenty times as long.
-    factor = _factor_above(scaled, RANK_TOLERANCE * size.size)
-    if factor is not None:
-        inverse = solve_triangular(factor, np.eye(size.size), lower=True)
+    if _all_above(scaled, RANK_TOLERANCE * scale.size * np.eye(scale.size)):
+        inverse = solve_triangular(np.linalg.cholesky(scaled), np.eye(scale.size), lower=True)
         return np.asarray(scale[:, None] * inverse.T)
     values, vectors = np.linalg.eigh(scaled)
     kept = values > RANK_TOLERANCE * values[-1]
     return np.asarray(scale[:, None] * vectors[:, kept] / np.sqrt(values[kept]))
 
 
-def _newton_step(curvature: Array, slope: Array) -> Array:
-    """Step (rank,) downhill in directions of unit information, no curvature taken for less than the least."""
-    factor = _factor_above(curvature, LEAST_CURVATURE)
-    if factor is not None:
-        return np.asarray(cho_solve((factor, True), -slope))
-    values, vectors = np.linalg.eigh(curvature)
-    return np.asarray(-vectors @ ((vectors.T @ slope) / np.maximum(np.abs(values), LEAST_CURVATURE)))
+def _unit_scale(information: Array) -> Array:
+    """Scale (n,) of parameters that makes their own information one, zero where they have none."""
+    size = np.sqrt(np.diag(information))
+    return np.divide(1.0, size, out=np.zeros_like(size), where=size > 0.0)
 
 
-def _factor_above(matrix: Array, least: float) -> Array | None:
-    """Lower Cholesky factor of a symmetric matrix all of whose eigenvalues are above the least; None for another."""
+def _newton_step(information: Array, curvature: Array, slope: Array) -> Array:
+    """Step (n,) downhill where there is information, no curvature taken for less than the least share of that."""
+    scale = _unit_scale(information)
+    both = np.outer(scale, scale)
+    scaled, curved = information * both, curvature * both
+    rank_is_full = _all_above(scaled, RANK_TOLERANCE * scale.size * np.eye(scale.size))
+    if rank_is_full and _all_above(curved, LEAST_CURVATURE * scaled):
+        return np.asarray(scale * cho_solve(cho_factor(curved, lower=True), -scale * slope))
+    directions = _basis(information)
+    values, vectors = np.linalg.eigh(directions.T @ curvature @ directions)
+    axes = directions @ vectors
+    return np.asarray(-axes @ ((axes.T @ slope) / np.maximum(np.abs(values), LEAST_CURVATURE)))
+
+
+def _all_above(matrix: Array, least: Array) -> bool:
+    """Whether a symmetric matrix (n, n) is above another in every direction."""
     try:
-        np.linalg.cholesky(matrix - least * np.eye(len(matrix)))
+        np.linalg.cholesky(matrix - least)
     except np.linalg.LinAlgError:
-        return None
-    return np.asarray(np.linalg.cholesky(matrix), dtype=np.float64)
+        return False
+    return True
 
 
 def descended(criterion: Criterion, w: Array, penalty: Penalty) -> Array:
@@ -313,14 +323,13 @@ def descended(criterion: Criterion, w: Array, penalty: Penalty) -> Array:
         errors = criterion.errors(at)
         slopes, squares, whole = criterion.slopes(at, errors)
         pull, known = penalty.derivatives(at.w)
-        directions = _basis(squares[:-1, :-1] + known)
-        slope = directions.T @ (slopes.sum(axis=0)[:-1] + pull)
-        step = _newton_step(directions.T @ (whole[:-1, :-1] + known) @ directions, slope)
+        slope = slopes.sum(axis=0)[:-1] + pull
+        step = _newton_step(squares[:-1, :-1] + known, whole[:-1, :-1] + known, slope)
         gain = -float(slope @ step)
         if gain < CONVERGED:
             break
         before, length = criterion.value(at, errors) + penalty.value(at.w), 1.0
-        along = criterion.at(np.append(directions @ step, 0.0))
+        along = criterion.at(np.append(step, 0.0))
         for _ in range(HALVINGS):
             moved = at.moved(along, length)
             if criterion.value(moved, errors) + penalty.value(moved.w) <= before - SUFFICIENT * length * gain:
