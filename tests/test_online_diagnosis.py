@@ -12,6 +12,7 @@ from sms_adapters.system_file import load_system
 from sms_online.description.schema import LEAST_SQUARES, Effect, System
 from sms_online.diagnosis.online import OnlineDiagnosis, refusal
 from sms_online.diagnosis.online_search import Immediate
+from sms_online.diagnosis.searcher import Outcome, Request
 from sms_online.effects.build import build_model
 from sms_online.model.base_parameters import find_base_parameters
 from sms_online.pipeline.estimator import Estimator
@@ -189,6 +190,32 @@ def test_an_event_that_is_decided_late_closes_what_was_named() -> None:
     assert event.kind == "friction"
     assert [evidence.outcome.keys for evidence in episode.evidence] == [("coulomb_friction@joint_1",)] * 2
     assert (episode.verdict, episode.event, episode.named) == ("change", event, ())
+
+
+class _Overwhelmed(Immediate):
+    """A searcher that finds more lacking than it may look for."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.durations: list[float] = []
+
+    def submit(self, number: int, request: Request) -> bool:
+        self.durations.append(sum(s.index.size for s in request.segments) / request.model.system.sample_rate)
+        lacking = Outcome("unexplained", (), {}, 0.5, began=False, beta=request.beta, ended=True)
+        self._done = number, lacking
+        return True
+
+
+def test_where_too_much_is_lacking_only_the_whole_record_is_searched_again() -> None:
+    block = axis_block(cogging, seconds=20.0)
+    estimator = Estimator(SYSTEM, block.channels, "test")
+    searcher = _Overwhelmed()
+    online = OnlineDiagnosis(estimator, searcher, adopt=False)
+    estimator.push(block)
+    estimator.finish()
+    first, last = searcher.durations
+    assert last > 3.0 * first
+    assert online.episodes[0].verdict == "unexplained"
 
 
 @pytest.mark.long

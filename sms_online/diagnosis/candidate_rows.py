@@ -34,8 +34,11 @@ SMALL_CHANGE = 0.1
 class CandidateRows(CandidateFits):
     """Rows of a session beside a model and candidates for what it lacks, whitened together.
 
-    folds: blocks of the windows (W,) that are held out in turn.
+    folds: blocks of the windows (W,) that are held out in turn. whitenings: how often rows were whitened so far, which
+    takes most of a search's time.
     """
+
+    whitenings = 0
 
     def __init__(
         self,
@@ -157,6 +160,7 @@ class CandidateRows(CandidateFits):
     def _whiten(self) -> None:
         """Whiten the rows with what the laws of the effects of the last `reweight` do not determine."""
         rows = self.rows
+        self.whitenings += 1
         self._forget()
         self.std = np.sqrt(rows.std**2 + self._own + self._free[:, 0])
         self._plain_model = self._model / self.std[..., None]

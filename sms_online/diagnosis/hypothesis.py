@@ -34,6 +34,10 @@ LARGEST_SHARE_LEFT = 0.03
 MOST_LEFT = 2.0
 
 
+# Effects that are looked for in turn: each joint may have friction, and one more.
+MOST_EFFECTS, EFFECTS_A_JOINT = 8, 2
+
+
 class Hypothesis:
     """A model, constants that its samples are corrected by, and candidates for what it lacks, against a session's rows.
 
@@ -76,7 +80,8 @@ class Hypothesis:
     def run(self, begun: Sequence[Effect] = ()) -> list[int]:
         """Numbers of the candidates found, with the rows' weights as they are; begun: effects to go on from."""
         start = [k for k, candidate in enumerate(self.tracing.candidates) if candidate.effect in begun]
-        return self.tracing.run(lambda chosen, k: refine(self.tracing, self.make, chosen, k), self.watch, start)
+        most = max(MOST_EFFECTS, EFFECTS_A_JOINT * len(self.rows.model.system.joints))
+        return self.tracing.run(lambda chosen, k: refine(self.tracing, self.make, chosen, k), self.watch, start, most)
 
     def watch(self, chosen: Sequence[int]) -> bool:
         """Whether to end the search with those chosen so far."""

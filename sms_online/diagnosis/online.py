@@ -231,7 +231,7 @@ class OnlineDiagnosis(Observer):
         if onset is None or self._sure:
             return
         newest = int(self._record[-1].index[-1])
-        schedule = DUE_FROM_THE_START if onset.last is None else DUE
+        schedule = self._schedule(onset)
         first = max(onset.first, int(self._record[0].index[0]))
         due = int(np.count_nonzero((newest - first) / self._unit >= np.array(schedule)))
         if self._pending is not None:
@@ -244,6 +244,10 @@ class OnlineDiagnosis(Observer):
                 self._pending = self._begun, self._now
         elif self._due == len(schedule):
             self._give_up()
+
+    @staticmethod
+    def _schedule(onset: _Onset) -> tuple[float, ...]:
+        return DUE_FROM_THE_START if onset.last is None else DUE
 
     def _give_up(self) -> None:
         """All that is remembered was searched: what was not named twice is not known."""
@@ -300,6 +304,9 @@ class OnlineDiagnosis(Observer):
         before = episode.evidence[-1].outcome if episode.evidence else None
         episode.evidence.append(evidence)
         self.on_evidence(evidence.known, outcome.scores)
+        if outcome.ended and self._onset is not None:
+            # So much is lacking that only all that can be remembered is worth another search.
+            self._due = max(self._due, len(self._schedule(self._onset)) - 1)
         if outcome.verdict != "named":
             self._agreed = False
             episode.verdict, episode.named, episode.named_at = "noticed", (), None

@@ -43,6 +43,9 @@ LEAST_WINDOWS = 12
 # What takes less than this share of what the best effect takes is rather an error of that one's model, for real
 # friction has no corner; else it is found once the others are in the model.
 LEAST_SHARE = 0.01
+# Times that rows are whitened in a search at most: one effect takes some fifteen, three some forty. A session that
+# lacks more is for `diagnose`.
+MOST_WHITENINGS = 80
 # Candidates whose evidence is reported, the best ones.
 REPORTED = 8
 
@@ -93,6 +96,14 @@ class LateColumns(CandidateColumns):
         return Unmodelled(whole.own * acts[..., 0], whole.free * acts)
 
 
+class _Bounded(Hypothesis):
+    """A hypothesis whose search ends when it has taken long."""
+
+    def watch(self, chosen: Sequence[int]) -> bool:
+        """See `Hypothesis`."""
+        return self.tracing.whitenings > MOST_WHITENINGS
+
+
 @one_blas_thread()
 def search(request: Request) -> Outcome | None:
     """Trace what the record holds beyond the model; None where it is too short, or its rows are degenerate."""
@@ -114,11 +125,11 @@ def _search(request: Request) -> Outcome | None:
         # Against a sensor that is far behind the others no force explains anything.
         return _of_late(found, request)
     outcome = _trace(request, some, everything, request.late)
-    for _ in range(0 if request.whitened else REWEIGHED):
+    for _ in range(0 if request.whitened or outcome.ended else REWEIGHED):
         # Hardly anything was known of the rows' noise, for nothing explained the torques.
         rows.reweight(outcome.beta)
         outcome = _trace(request, _hypothesis(request, rows, everything, request.late), everything, request.late)
-    if outcome.verdict != "unexplained" or request.late == 0:
+    if outcome.verdict != "unexplained" or request.late == 0 or outcome.ended:
         return outcome
     always = _trace(request, _hypothesis(request, rows, everything, 0), everything, 0)
     return always if always.verdict == "named" or always.left < outcome.left else outcome
@@ -171,7 +182,7 @@ def _hypothesis(request: Request, rows: SessionRows, everything: Sequence[Candid
     """That some of the candidates act from a segment on."""
     make = LateColumns(rows, request.model.system, late)
     limited = [make.limited(candidate) for candidate in everything]
-    return Hypothesis(make, [c for c in limited if np.any(c.columns)], _folds(rows, late), request.prior)
+    return _Bounded(make, [c for c in limited if np.any(c.columns)], _folds(rows, late), request.prior)
 
 
 def _trace(request: Request, some: Hypothesis, everything: Sequence[Candidate], late: int) -> Outcome:
@@ -179,6 +190,7 @@ def _trace(request: Request, some: Hypothesis, everything: Sequence[Candidate], 
     system, rows, tracing = request.model.system, some.rows, some.tracing
     ranking = tracing.ranking()[:REPORTED]
     chosen = some.run()
+    ended = some.watch(chosen)
     findings = [tracing.finding(chosen, k) for k in chosen]
     gains = {k: finding.gain.gain for k, finding in zip(chosen, findings, strict=True)}
     kept = [k for k in chosen if gains[k] >= LEAST_SHARE * max(gains.values())]
@@ -225,8 +237,8 @@ def _trace(request: Request, some: Hypothesis, everything: Sequence[Candidate], 
             )
         )
     scores = {ranked.candidate.key: ranked.gain for ranked in ranking}
-    said = verdict(bool(chosen), left, test)
-    return Outcome(said, tuple(named), scores, left, late > 0, solution[: rows.base.n])
+    said = "unexplained" if ended else verdict(bool(chosen), left, test)
+    return Outcome(said, tuple(named), scores, left, late > 0, solution[: rows.base.n], ended)
 
 
 def _corrected(request: Request, some: Hypothesis, chosen: Sequence[int], late: int) -> tuple[Hypothesis, list[Effect]]:

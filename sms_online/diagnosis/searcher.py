@@ -67,7 +67,8 @@ class Outcome:
 
     named: the effects found, also where they leave more than noise. scores: gain of the best candidates alone, by key.
     left: share of what was beyond noise that is left. began: whether the effects are absent from the segments before
-    the late ones. beta (n,): parameters with the effects.
+    the late ones. beta (n,): parameters with the effects. ended: so much is lacking that the search ended before it
+    had found all.
     """
 
     verdict: str
@@ -76,6 +77,7 @@ class Outcome:
     left: float
     began: bool
     beta: Array
+    ended: bool = False
 
     @property
     def keys(self) -> tuple[str, ...]:

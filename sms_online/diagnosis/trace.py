@@ -35,8 +35,6 @@ HARDLY_MORE = 1.02
 MUCH_REST = 0.05
 # Laws of it that are compared, with their shape constants, those that explain most.
 RIVALS = 3
-# At most so many effects are looked for in turn.
-MOST_EFFECTS = 8
 
 
 class Tracing(Acceptance):
@@ -94,14 +92,15 @@ class Tracing(Acceptance):
         refine: Callable[[Sequence[int], int], None],
         watch: Callable[[Sequence[int]], bool] = lambda chosen: False,
         start: Sequence[int] = (),
+        most: int = 8,
     ) -> list[int]:
         """Numbers of the candidates found, in the order of what they explain.
 
         refine: improves the shape constants of one of those chosen, before what it leaves is given to others. watch:
         is called with those chosen before each further one; true ends the search with these. start: those that a
-        search of nearly the same rows has found, to go on from.
+        search of nearly the same rows has found, to go on from. most: effects that are looked for in turn.
         """
-        self.path = []
+        self.path, self._most = [], most
         self._taken: dict[int, float] = {}  # gains of the effects chosen
         self._leaves: dict[int, float] = {}
         self._refused: set[str] = set()
@@ -146,7 +145,7 @@ class Tracing(Acceptance):
         """Those chosen and what comes to them, one effect after the other; seen: sets of effects so far."""
         useless: set[str] = set()
         found, deviances = self.gains(chosen), dict[int | None, float]()
-        while len(chosen) < MOST_EFFECTS and not watch(chosen):
+        while len(chosen) < self._most and not watch(chosen):
             eligible = self._eligible(chosen, self._refused | useless)
             # What a constant leaves while it is only approximately taken off must not be given to others.
             eligible = [k for k in eligible if found[k].gain > self._left_over(k)]
