@@ -233,7 +233,7 @@ def played(source: CanSource, run: str, speed: float) -> NDArray[np.float64]:
 
 @pytest.mark.skipif(not DATA.is_dir(), reason="the AK80 pendulum's measurements are not at hand (shared/data)")
 @pytest.mark.parametrize("interface", [{"interface": "virtual", "channel": "ak80"}, UDP])
-@pytest.mark.parametrize("speed", [50.0, pytest.param(1.0, marks=pytest.mark.realtime)])
+@pytest.mark.parametrize("speed", [50.0, pytest.param(1.0, marks=[pytest.mark.realtime, pytest.mark.long])])
 def test_real_words_on_a_bus_equal_the_published_numbers(interface: dict[str, object], speed: float) -> None:
     """The pendulum's candump, read and decoded live: every sample."""
     published = np.loadtxt(DATA / "energy_shaping.csv", delimiter=",", skiprows=1)

@@ -167,7 +167,7 @@ def start_viewer() -> tuple[subprocess.Popen[bytes], str]:
     return viewer, f"127.0.0.1:{port}"
 
 
-@pytest.mark.parametrize("killed", ["view", "viewer"])
+@pytest.mark.parametrize("killed", [pytest.param("view", marks=pytest.mark.long), "viewer"])
 def test_a_killed_view_is_named_and_the_session_goes_on(
     tmp_path: Path, started: list[subprocess.Popen[Any]], killed: str
 ) -> None:

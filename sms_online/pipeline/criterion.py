@@ -36,8 +36,8 @@ from sms_online.pipeline.row_grams import RowGrams
 from sms_online.stream import Array
 
 # Directions of scaled columns with less information than this share of the largest are rounding, and not moved along.
-# Where one joint's torque alone fixes the scale and its rows leave much, they say 1e-10 of what other rows do.
-RANK_TOLERANCE = 1e-11
+# Where one joint's torque alone fixes the scale and its rows leave much, they say 1e-10 of what other rows do, or less.
+RANK_TOLERANCE = 1e-13
 # Half the square of the Newton step in standard deviations at which the minimum is found, and steps at most.
 CONVERGED, MOST_STEPS = 1e-6, 100
 # Curvature of the criterion is no less than this share of that of its squares, for the length of a step.

@@ -56,9 +56,11 @@ def evidence_of(evaluation: Evaluation, discrepancies: Sequence[Discrepancy], tr
 def _unconverged(evaluation: Evaluation) -> str:
     """Why the estimate will still move by more than its error bars."""
     now, estimate = evaluation.statistics, evaluation.estimate
-    if not evaluation.determined.any():
-        return f"no parameter is determined by the motion of {now.duration:.3g} s"
     smoother, momentum = now.smoother, now.momentum
+    # Rows that hold more than noise do so whether or not they determine anything.
+    lacking = momentum is not None and momentum.tested and bool(momentum.rows.misfit.any())
+    if not evaluation.determined.any() and not lacking:
+        return f"no parameter is determined by the motion of {now.duration:.3g} s"
     if smoother is not None and smoother.spans == 0 and not smoother.failures:
         return "the smoother has not processed its first span"
     if now.method == "smoother":
