@@ -14,6 +14,7 @@ from sms_online.pipeline.statistics import Statistics
 from sms_online.pipeline.synchronise import SIDE
 from sms_online.verdict.contradictions import ambiguous_effects, disputes, miscalibrated
 from sms_online.verdict.evidence import Discrepancy, Evidence
+from sms_online.verdict.reasons import unexplained_torques
 
 # Rows of the energy balance, for each parameter, from which on its first transient is forgotten.
 ROWS_A_PARAMETER = 10
@@ -57,8 +58,8 @@ def _unconverged(evaluation: Evaluation) -> str:
     """Why the estimate will still move by more than its error bars."""
     now, estimate = evaluation.statistics, evaluation.estimate
     smoother, momentum = now.smoother, now.momentum
-    # Rows that hold more than noise do so whether or not they determine anything.
-    lacking = momentum is not None and momentum.tested and bool(momentum.rows.misfit.any())
+    # Of a torque that is noise for the most part no motion determines anything; where it is not, the model is at fault.
+    lacking = momentum is not None and momentum.tested and bool(unexplained_torques(evaluation.residuals))
     if not evaluation.determined.any() and not lacking:
         return f"no parameter is determined by the motion of {now.duration:.3g} s"
     if smoother is not None and smoother.spans == 0 and not smoother.failures:
