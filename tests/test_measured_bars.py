@@ -80,28 +80,35 @@ def test_halves_of_emps_agree_within_their_bars(tmp_path: Path) -> None:
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("unit", ["CTU", "maker"])
+@pytest.mark.parametrize(
+    "unit",
+    [
+        "CTU",
+        pytest.param("maker", marks=pytest.mark.xfail(strict=True, reason="half of this run determines no spring")),
+    ],
+)
 def test_halves_of_quanser_runs_agree_within_bars(tmp_path: Path, unit: str) -> None:
     capture, middle = measured(FACTORY), 9.7
     if unit == "CTU":
         capture, middle = tmp_path / "quanser.csv", 10.0
         import_quanser(measured(QUANSER), capture)
     z = apart(with_friction(), capture, True, middle)
-    # Half of the maker's run determines no spring beside its prior.
-    assert z
-    assert unit != "CTU" or {"joint_1.stiffness", "joint_2.stiffness"} <= z.keys()
+    # Half of the maker's run does not determine hub 2's spring beside its prior.
+    assert {"joint_1.stiffness", *(["joint_2.stiffness"] if unit == "CTU" else [])} <= z.keys()
     assert max(z.values()) < 3.0, z
 
 
 @pytest.mark.long
+@pytest.mark.xfail(strict=True, reason="without priors the criterion has several minima")
 def test_two_axes_of_a_robot_are_not_determined() -> None:
     """Their friction has memory, and the torque of axis 1 alone gives any stiffness; axis 3 has 5.5 to 5.7e6 N m/rad
-    by least squares of three runs. Without priors the criterion has several minima, and its bar holds that value."""
+    by least squares of three runs."""
     system = load_system(str(measured(KUKA / "system.toml")))
     evaluation = replayed(system, KUKA / "run_a.csv", False)
     names = [p.name for p in evaluation.parameters]
     first, second, third = (names.index(f"joint_{i}.stiffness") for i in (1, 2, 3))
     assert not evaluation.determined[[first, second]].any()
+    assert evaluation.determined[third]
     stiffness, std = evaluation.estimate.pi[third], evaluation.std[third]
     assert abs(stiffness - 5.55e6) < 1.96 * std
     # By windows that overlap, and by blocks.
@@ -109,13 +116,14 @@ def test_two_axes_of_a_robot_are_not_determined() -> None:
 
 
 @pytest.mark.long
-def test_a_prior_does_not_determine_the_first_axis_of_a_robot() -> None:
-    """Beside priors of ± 10 % the torque of axis 1 says nothing that is certain, that of axis 3 does."""
+@pytest.mark.xfail(strict=True, reason="the second axis comes out as determined")
+def test_a_prior_determines_no_axis_of_a_robot() -> None:
+    """Beside priors of ± 10 % the torque of axes 1 and 2 says nothing that is certain, that of axis 3 does."""
     system = load_system(str(measured(KUKA / "system.toml")))
     evaluation = replayed(system, KUKA / "run_a.csv", True)
     names = [p.name for p in evaluation.parameters]
-    first, third = (names.index(f"joint_{i}.stiffness") for i in (1, 3))
-    assert evaluation.determined[[first, third]].tolist() == [False, True]
+    first, second, third = (names.index(f"joint_{i}.stiffness") for i in (1, 2, 3))
+    assert evaluation.determined[[first, second, third]].tolist() == [False, False, True]
     # Least squares of its torque alone says 5.5 to 5.7e6 N m/rad, the prior 4.1 ± 0.4e6.
     prior = evaluation.statistics.setup.current_prior
     assert prior is not None
@@ -125,8 +133,10 @@ def test_a_prior_does_not_determine_the_first_axis_of_a_robot() -> None:
 
 
 @pytest.mark.long
+@pytest.mark.xfail(strict=True, reason="halves determine nothing without priors")
 def test_halves_of_a_robot_run_agree_within_their_bars() -> None:
-    """Without a prior, from the rows alone: hardly a parameter is determined in five seconds."""
+    """Without a prior, from the rows alone: few parameters are determined in five seconds."""
     system = load_system(str(measured(KUKA / "system.toml")))
     z = apart(system, KUKA / "run_a.csv", False, 5.0)
-    assert max(z.values(), default=0.0) < 3.0, z
+    assert z
+    assert max(z.values()) < 3.0, z
