@@ -15,7 +15,7 @@ from sms_online.diagnosis.folds import Folds
 from sms_online.diagnosis.possible import not_negative
 from sms_online.diagnosis.residuals import RowResidual
 from sms_online.diagnosis.shape import refine
-from sms_online.diagnosis.trace import Tracing
+from sms_online.diagnosis.trace import MOST_EFFECTS, Tracing
 from sms_online.effects.traits import INEXACT
 from sms_online.row_types import row_types
 from sms_online.stream import Array
@@ -32,10 +32,8 @@ REWEIGHED = 2
 LARGEST_SHARE_LEFT = 0.03
 # No right effect leaves a row type more than this multiple of its noise, unless that is what its law is uncertain by.
 MOST_LEFT = 2.0
-
-
-# Effects that are looked for in turn: each joint may have friction, and one more.
-MOST_EFFECTS, EFFECTS_A_JOINT = 8, 2
+# Effects that are looked for in turn on arms of many joints: each may have friction, and one more.
+EFFECTS_A_JOINT = 2
 
 
 class Hypothesis:

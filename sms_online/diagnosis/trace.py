@@ -35,6 +35,8 @@ HARDLY_MORE = 1.02
 MUCH_REST = 0.05
 # Laws of it that are compared, with their shape constants, those that explain most.
 RIVALS = 3
+# At most so many effects are looked for in turn, where no other number is asked for.
+MOST_EFFECTS = 8
 
 
 class Tracing(Acceptance):
@@ -92,7 +94,7 @@ class Tracing(Acceptance):
         refine: Callable[[Sequence[int], int], None],
         watch: Callable[[Sequence[int]], bool] = lambda chosen: False,
         start: Sequence[int] = (),
-        most: int = 8,
+        most: int = MOST_EFFECTS,
     ) -> list[int]:
         """Numbers of the candidates found, in the order of what they explain.
 
