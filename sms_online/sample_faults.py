@@ -46,9 +46,12 @@ def wrapped_at(steps: Array) -> tuple[float, int] | None:
         found = int(np.count_nonzero(np.abs(size / turn - 1.0) < TURN_TOLERANCE))
         if found and usual < TURN_TOLERANCE * turn:
             return turn, found
-    jumps = size[size > JUMP * max(usual, 1e-12)]
-    if jumps.size and jumps.min() > (1.0 - SAME_STEP) * jumps.max():
-        return float(np.median(jumps)), jumps.size
+    jumps = np.flatnonzero(size > JUMP * max(usual, 1e-12))
+    if jumps.size and size[jumps].min() > (1.0 - SAME_STEP) * size[jumps].max():
+        # The reading moves on while it jumps, as it does before and after.
+        near = np.delete(np.arange(steps.size), jumps)
+        moved = np.interp(jumps, near, steps[near]) if near.size else np.zeros(jumps.size)
+        return float(np.median(np.abs(steps[jumps] - moved))), jumps.size
     return None
 
 

@@ -154,6 +154,17 @@ def test_a_wrapped_encoder_is_unwrapped() -> None:
     np.testing.assert_allclose(values - values[0], angle - angle[0], atol=1e-9)
 
 
+def test_whole_turns_are_those_of_the_other_encoder() -> None:
+    """A reading that wraps at other than a whole turn would else be off by some of its turns."""
+    rng = np.random.default_rng(5)
+    motor = 1.5 + np.sin(np.linspace(0.0, 20.0, 5000))
+    link, names = motor + 1e-4 * rng.standard_normal(motor.size), ("q_1", "theta_m_1")
+    wrapped = np.stack((np.mod(link, 1.2), motor), axis=1)
+    (undoing,) = shown(names, [Segment(np.arange(motor.size), wrapped)])
+    assert (undoing.name, undoing.where) == ("wrapped", "q_1")
+    assert np.abs(undoing.apply(names, wrapped)[:, 0] - link).max() < 1e-3
+
+
 def test_a_stuck_encoder_is_left_out_and_one_at_rest_is_not() -> None:
     rng = np.random.default_rng(3)
     t = np.linspace(0.0, 20.0, 5000)

@@ -193,12 +193,20 @@ def _wrapped(positions: Sequence[str], channels: Sequence[str], segments: Sequen
 
 
 def _unwrapped(name: str, turn: float) -> Callable[[tuple[str, ...], Array], Array]:
+    """Whole turns that a wrapped reading does not tell are those of the joint's other encoder."""
+    kind, _, joint = name.rpartition("_")
+    other = f"theta_m_{joint}" if kind == "q" else f"q_{joint}"
+
     def apply(channels: tuple[str, ...], values: Array) -> Array:
         out = values.copy()
         if name in channels:
             k = channels.index(name)
             read = np.flatnonzero(np.isfinite(values[:, k]))
             out[read, k] = np.unwrap(values[read, k], period=turn)
+            if other in channels:
+                apart = out[:, k] - values[:, channels.index(other)]
+                known = apart[np.isfinite(apart)]
+                out[:, k] -= turn * np.round(np.median(known) / turn) if known.size else 0.0
         return out
 
     return apply
