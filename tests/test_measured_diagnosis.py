@@ -136,6 +136,13 @@ def test_what_is_found_of_a_robot_predicts_its_torques_better(robot: dict[str, A
     before, after = np.linalg.norm(left, axis=1)
     assert after < 0.9 * before
     assert robot["after"]["holdout"]["joint_3"]["relative"] < 0.09
+    assert "of joint_3" in robot["summary"]
+
+
+@pytest.mark.long
+def test_a_robot_that_lacks_physics_has_no_mistake(robot: dict[str, Any]) -> None:
+    """Its link encoders are late, its payload is not described, and its brakes hold axes at the end."""
+    assert robot["mistakes"] == []
 
 
 def test_a_holdout_that_is_the_capture_itself_needs_an_end(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

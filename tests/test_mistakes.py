@@ -179,6 +179,17 @@ def test_a_stuck_encoder_is_left_out_and_one_at_rest_is_not() -> None:
     assert list(shown(["q_1"], one(resting))) == []
 
 
+def test_an_arm_that_stops_is_not_stuck() -> None:
+    """Brakes hold both encoders of the joint to the last digit."""
+    rng = np.random.default_rng(3)
+    t, names = np.linspace(0.0, 20.0, 5000), ("q_1", "theta_m_1")
+    moving = np.sin(t)[:, None] + 1e-5 * rng.standard_normal((t.size, 2))
+    for held, found in (([0], ["q_1"]), ([0, 1], [])):
+        values = moving.copy()
+        values[4000:, held] = values[4000, held]
+        assert [each.where for each in shown(names, [Segment(np.arange(t.size), values)])] == found
+
+
 def test_a_held_command_is_joined_where_it_changes() -> None:
     t = np.arange(4000) / 1000.0
     held = np.repeat(np.sin(3.0 * t)[::20], 20)

@@ -30,6 +30,8 @@ from sms_online.verdict.reasons import undecided
 from sms_online.verdict.trust import Reason, Trust
 
 SCHEMA = "sms-online/diagnosis/1"
+# A torque is explained better where less is left of it by this share.
+LEAST_FALL = 0.1
 # What was found by comparing whole descriptions competes with no columns.
 NO_RIVAL = {"next": None, "next_held_out_improvement": None}
 
@@ -189,12 +191,22 @@ def _of_effects(diagnosis: Search) -> str:
             f"What the model lacks comes near {', '.join(keys)}, but is more or something else: {falls}, and "
             f"what is left {rest}."
         )
-    tried = f" The nearest known effects ({', '.join(keys)}) leave {_share(diagnosis.left)} of it." if keys else ""
+    tried = f" {_nearest(diagnosis, keys)}" if keys else ""
     return f"The model lacks something that no known effect explains: it {rest}.{tried}"
 
 
-def _share(left: float) -> str:
-    return f"{100.0 * left:.0f} %" if left < 1.0 else "all"
+def _nearest(diagnosis: Search, keys: Sequence[str]) -> str:
+    """What known effects do where they leave much: they may explain torques all the same."""
+    before, after = diagnosis.before.holdout.relative, diagnosis.after.holdout.relative
+    falls = [
+        f"from {100.0 * before[joint]:.2g} to {100.0 * left:.2g} % of {joint}"
+        for joint, left in after.items()
+        if joint in before and left < (1.0 - LEAST_FALL) * before[joint]
+    ]
+    if not falls:
+        left = f"{100.0 * diagnosis.left:.0f} %" if diagnosis.left < 1.0 else "all"
+        return f"The nearest known effects ({', '.join(keys)}) leave {left} of it."
+    return f"With {', '.join(keys)} what is left of the torques on data not fitted falls {', '.join(falls)}."
 
 
 def _near(diagnosis: Search) -> bool:

@@ -9,6 +9,7 @@ capture has hardly more windows than there are parameters, and fits itself with 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
 
@@ -18,8 +19,9 @@ from scipy.optimize import minimize_scalar
 from sms_online.description.schema import Effect
 from sms_online.diagnosis.constants import corrected
 from sms_online.diagnosis.evidence import threshold
+from sms_online.diagnosis.record import Segment
 from sms_online.diagnosis.rough_fit import HOPS as ROUGH_HOPS
-from sms_online.diagnosis.rough_fit import RoughRows
+from sms_online.diagnosis.rough_fit import RoughRows, stretches
 from sms_online.diagnosis.rows import SessionRows
 from sms_online.effects.catalogue import lag_places
 from sms_online.effects.delay import HELD, LONGEST_FOUND, delay_of, lag, lagging, late_keys
@@ -32,6 +34,9 @@ CORNERS = (delay_of(LONGEST_FOUND), 2.0, 3.5, 6.0, delay_of(0.01), delay_of(0.00
 LEAST_IMPROVEMENT = 0.1
 # Probability that any sensor seems late by accident.
 FALSE_ALARM = 0.01
+# Lags are tried on part of a session; those that gain there at least this share of what the best does are tried on all
+# of it, so many at most.
+NEAR_BEST, MOST_NEAR = 0.5, 8
 # Lags whose gain differs by less than this share are not distinguished.
 SAME_SHARE = 0.03
 # One sensor of a group is late alone where that gains more than its whole group does by this factor.
@@ -77,10 +82,10 @@ class LateSensor:
 
 
 class Lags:
-    """Asks how well readings can be explained with a lag taken off; rows: model, sensors and samples."""
+    """Asks how well readings can be explained with a lag taken off; rows: model and sensors, segments: samples."""
 
-    def __init__(self, rows: SessionRows) -> None:
-        self._rows = rows
+    def __init__(self, rows: SessionRows, segments: Sequence[Segment]) -> None:
+        self._rows, self._segments = rows, list(segments)
         self._independent = 0
 
     def places(self) -> dict[str, list[str]]:
@@ -104,7 +109,7 @@ class Lags:
 
         Without a lag unless where is given. Infinite where readings are of no shape of the links.
         """
-        segments = self._rows.segments
+        segments = self._segments
         if where is not None:
             system = self._rows.model.system
             lagging = system.model_copy(update={"effects": (lag(where, corner),)})
@@ -125,7 +130,7 @@ class Lags:
 
 def find_late(rows: SessionRows) -> LateSensor | None:
     """The sensors whose lag, taken off, lets the rows be explained better; None where no lag does so."""
-    lags = Lags(rows)
+    lags = Lags(rows, rows.segments)
     places = lags.places()
     if not places:
         return None
@@ -135,8 +140,9 @@ def find_late(rows: SessionRows) -> LateSensor | None:
     # A drive that holds its command over a sample acts half a sample late.
     least = HELD / rows.model.system.sample_rate
     corners = [corner for corner in CORNERS if delay_of(corner) > least]
-    tried = [(lags.left(where, corner), where, corner) for where in places for corner in corners]
-    limit = threshold(FALSE_ALARM, len(tried), 1)
+    every = [(where, corner) for where in places for corner in corners]
+    limit = threshold(FALSE_ALARM, len(every), 1)
+    tried = [(lags.left(where, corner), where, corner) for where, corner in _near_best(rows, every, limit)]
     # A lag that is none leaves some types of rows with less and others with more.
     tried = [each for each in tried if lags.gains(before, each[0]).min() > -limit]
     best, where, corner = min(tried, key=lambda each: each[0].sum(), default=(before, "", np.inf))
@@ -152,13 +158,31 @@ def find_late(rows: SessionRows) -> LateSensor | None:
         after, where = alone
         gain = lags.gains(before, after).sum()
     others = [(left, other) for left, other, _ in tried] + parts
-    near = (1.0 - SAME_SHARE) * gain
-    alike = dict.fromkeys(o for left, o in others if o != where and lags.gains(before, left).sum() > near)
+    same = (1.0 - SAME_SHARE) * gain
+    alike = dict.fromkeys(o for left, o in others if o != where and lags.gains(before, left).sum() > same)
     std = _std(lags, where, corner, after)
     if std > corner / DETERMINED:
         return None
     shares = float(np.exp(before.mean())), float(np.exp(after.mean()))
     return LateSensor(lag(where, corner), std, float(gain), limit, *shares, tuple(late_keys((), alike)))
+
+
+def _near_best(rows: SessionRows, every: list[tuple[str, float]], limit: float) -> list[tuple[str, float]]:
+    """Lags (place, corner) that gain nearly as much as the best does, by part of a session where that is longer.
+
+    limit: what gains by accident, or loses.
+    """
+    some = stretches(rows, rows.segments)
+    if sum(part.index.size for part in some) == sum(part.index.size for part in rows.segments):
+        return every
+    lags = Lags(rows, some)
+    before = lags.left()
+    if not np.all(np.isfinite(before)):
+        return every
+    by_type = [lags.gains(before, lags.left(where, corner)) for where, corner in every]
+    gains = np.array([each.sum() if each.min() > -limit else -np.inf for each in by_type])
+    best = np.argsort(-gains, kind="stable")[:MOST_NEAR]
+    return [every[k] for k in best.tolist() if gains[k] > max(0.0, NEAR_BEST * gains.max())]
 
 
 def _refined(lags: Lags, where: str, corner: float) -> float:

@@ -14,18 +14,16 @@ import numpy as np
 
 from sms_online.description.channels import drive_channel
 from sms_online.description.schema import System
-from sms_online.diagnosis.record import Segment, excerpts
-from sms_online.diagnosis.rough_fit import HOPS, LAWS, RoughFit, RoughRows
+from sms_online.diagnosis.record import Segment
+from sms_online.diagnosis.rough_fit import RoughFit, RoughRows, stretches
 from sms_online.diagnosis.sample_mistakes import Undoing, scaled, shown, undoings, without_gaps
 from sms_online.nominal import is_geared
 from sms_online.pipeline.estimator import Estimator
 from sms_online.sample_faults import unit_of_stamps
 from sms_online.stream import Array
 
-# Seconds of a session, in stretches, that show a mistake: it is there all the time.
-SOME, STRETCH = 8.0, 4.0
-# Rows for each unknown at least, and those wanted where a session is long enough.
-LEAST_ROWS, WANTED_ROWS = 5.0, 6.0
+# Rows for each unknown at least.
+LEAST_ROWS = 5.0
 # A coordinate of whose rows less is left than this is explained as well as a rough fit can.
 EXPLAINED = 0.02
 # One of whose rows less is left than this lacks physics at most, no unit or sign of a position.
@@ -40,6 +38,8 @@ LEAST_SHOWN, LEAST_COMMON = 1.2, 3.0
 # A torque in its right unit or gear leaves no coordinate more than this multiple of what it left before, unless that is
 # little: else what the model lacks has only been moved from one coordinate to another.
 MOST_WORSE = 2.0
+# Nor is it further from what nominal values make of it than before, by this factor: friction is no part of them.
+MOST_OFF = 2.0
 # Mistakes whose ratios differ by less than this factor are not distinguishable.
 SAME_RATIO = 1.5
 # Torque constants and gears differ from their data sheets by less.
@@ -48,8 +48,8 @@ LARGEST_GAIN = 1.3
 SAME_CLOCK = 20.0
 # At most so many mistakes are looked for in turn.
 MOST = 3
-# Factors of a gear that are tried, from its inverse on, and how finely.
-LARGEST_GEAR, COARSE, FINE = 30.0, 41, 31
+# A gear is described as smaller or larger by less than this factor.
+LARGEST_GEAR = 30.0
 
 
 @dataclass(frozen=True)
@@ -92,11 +92,7 @@ def find_mistakes(session: Estimator, segments: Sequence[Segment]) -> Corrected:
 
     session: that of the system as described; segments: its samples.
     """
-    rate = session.system.sample_rate
-    windows = WANTED_ROWS * (session.base.n + LAWS * len(session.system.joints)) / session.model.layout.n_v
-    duration = max(SOME, STRETCH * np.ceil(windows * session.system.windows.momentum / HOPS / STRETCH))
-    some = excerpts(segments, round(STRETCH * rate), round(duration * rate))
-    search = _Search(session, some)
+    search = _Search(session, stretches(session, segments))
     while len(search.found) < MOST and search.step():
         pass
     return Corrected(tuple(search.found), search.undo, search.system)
@@ -138,34 +134,34 @@ class _Search:
             return False
         if rows.for_each < LEAST_ROWS:
             return False  # so many parameters explain any samples
-        given = rows.fit()
-        found = [
-            each
-            for each in self._samples(shown(self._channels, self._segments))
-            if _left(given) / _left(each.fit) > LEAST_SHOWN
-        ]
+        given, freed = rows.fit(), rows.freed()
+        found = list(self._samples(shown(self._channels, self._segments), given, EXPLAINED, LEAST_SHOWN))
         if not found:
-            found = list(self._scaled(rows, given))
+            found = list(self._scaled(rows, freed))
             if _left(given, PHYSICS) > LEAST_RATIO:
-                moved = self._samples(undoings(self.system, self._channels))
-                found += [each for each in moved if _left(given, PHYSICS) / _left(each.fit, PHYSICS) > LEAST_RATIO]
+                found += self._samples(undoings(self.system, self._channels), given, PHYSICS, LEAST_RATIO)
         if not found:
             return False
         left = [_left(each.fit) for each in found]
         best = int(np.argmin(left))
         others = [found[k] for k in range(len(found)) if k != best and left[k] < SAME_RATIO * left[best]]
-        self._take(found[best], _left(given), tuple(each.undoing.sentence for each in others))
+        self._take(found[best], _left(freed), tuple(each.undoing.sentence for each in others))
         return True
 
     def _scaled(self, rows: RoughRows, given: RoughFit) -> Iterator[_Tried]:
-        """Factors of torques that explain the samples."""
+        """Factors of torques that explain the samples, by fits in which rows without a torque do not follow one.
+
+        Such a fit has several minima. So without the factor it begins as well where it led to with it.
+        """
         before = _left(given)
-        if before > LEAST_COMMON:
-            most = np.maximum(MOST_WORSE * given.left, PHYSICS)
-            for each in self._torques(rows):
-                better = before / _left(each.fit) > (LEAST_COMMON if each.common else LEAST_RATIO)
-                if better and np.all(each.fit.left <= most):
-                    yield each
+        if before <= LEAST_COMMON:
+            return
+        most = np.maximum(MOST_WORSE * given.left, PHYSICS)
+        for each in self._torques(rows):
+            explained = (LEAST_COMMON if each.common else LEAST_RATIO) * _left(each.fit)
+            better = before > explained and np.all(each.fit.left <= most)
+            if better and _left(rows.freed(start=each.fit.solution)) > explained:
+                yield each
 
     def _take(self, best: _Tried, before: float, others: tuple[str, ...]) -> None:
         u = best.undoing
@@ -180,46 +176,50 @@ class _Search:
         made = (replace(each, values=undoing.apply(self._channels, each.values)) for each in self._segments)
         return [part for each in made for part in without_gaps(each)]
 
-    def _samples(self, tried: Iterable[Undoing]) -> Iterator[_Tried]:
+    def _samples(self, tried: Iterable[Undoing], given: RoughFit, explained: float, least: float) -> Iterator[_Tried]:
+        """Those that divide what a fit leaves by a ratio at least.
+
+        By least squares, which has one minimum: freed rows may get to a better one by chance where others do not.
+        """
         for undoing in tried:
             try:
-                fit = RoughRows(self.session, self._corrected(undoing)).fit()
+                rows = RoughRows(self.session, self._corrected(undoing))
+                better = _left(given, explained) / _left(rows.fit(), explained) > least
             except np.linalg.LinAlgError:
                 continue  # readings that no shape of the links gives
-            yield _Tried(undoing, fit)
+            if better:
+                yield _Tried(undoing, rows.freed())
 
     def _torques(self, rows: RoughRows) -> Iterator[_Tried]:
-        """Known factors of each joint's torque and of all, and the gear ratio of each that explains most."""
-        joints = range(len(self._drives))
+        """Known factors of each joint's torque and of all, and the gear ratio of each that the other rows ask for."""
+        joints, stated = range(len(self._drives)), rows.stated()
+
+        def likely(which: Sequence[int], factor: float) -> bool:
+            known = stated[list(which)]
+            known = known[known > 0.0]
+            return bool(np.all(np.abs(np.log(abs(factor) * known)) <= np.abs(np.log(known)) + np.log(MOST_OFF)))
 
         def times(which: Sequence[int], factor: float) -> Array:
             factors = np.ones(len(joints))
             factors[list(which)] = factor
             return factors
 
-        def left(which: Sequence[int], factor: float) -> float:
-            return _left(rows.fit(times(which, factor)))
-
         for which in dict.fromkeys(((*joints,), *((i,) for i in joints))):
             for factor, undoing in self._causes(which):
-                yield _Tried(undoing, rows.fit(times(which, factor)), common=len(which) == len(joints))
+                if likely(which, factor):
+                    yield _Tried(undoing, rows.freed(times(which, factor)), len(which) == len(joints))
         for i in joints:
             gear = self.system.joints[i].gear_ratio
             if len(joints) == 1 or not is_geared(self.system.joints[i]):
                 continue
-            coarse = np.geomspace(1.0 / LARGEST_GEAR, LARGEST_GEAR, COARSE)
-            best = min(coarse.tolist(), key=lambda factor: left([i], factor))
-            step = coarse[1] / coarse[0]
-            near = (best * np.geomspace(1.0 / step, step, FINE)).tolist()
-            # Nominal values say which joint it is, but not to a percent.
-            best = min(near, key=lambda factor: float(np.sum(np.log(rows.fit(times([i], factor)).left))))
-            if not 1.0 / LARGEST_GAIN < best < LARGEST_GAIN:
+            best = rows.factor(i)
+            gained = 1.0 / LARGEST_GAIN < best < LARGEST_GAIN
+            if not gained and 1.0 / LARGEST_GEAR < best < LARGEST_GEAR and likely([i], best):
                 where, ratio = f"joint_{i + 1}", gear * best
                 said = f"the gear ratio of {where} looks like {ratio:.3g}, described as {gear:g}"
                 then = f"check the gear ratio of {where}, then its torque constant"
-                yield _Tried(
-                    Undoing("gear_ratio", where, said, then, _same, _geared(i, best)), rows.fit(times([i], best))
-                )
+                undoing = Undoing("gear_ratio", where, said, then, _same, _geared(i, best))
+                yield _Tried(undoing, rows.freed(times([i], best)))
 
     def _causes(self, joints: Sequence[int]) -> Iterator[tuple[float, Undoing]]:
         """What torques of some joints may be in place of what they should, with the factor that undoes it."""
@@ -249,7 +249,7 @@ class _Search:
 class _Tried:
     """A fit with a mistake undone.
 
-    fit: that one. common: whether it scales all torques alike."""
+    fit: that one, rows without a torque freed. common: whether it scales all torques alike."""
 
     undoing: Undoing
     fit: RoughFit

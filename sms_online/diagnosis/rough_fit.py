@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from sms_online.diagnosis.evidence import least_squares
 from sms_online.diagnosis.possible import not_negative
-from sms_online.diagnosis.record import Segment
+from sms_online.diagnosis.record import Segment, excerpts
 from sms_online.diagnosis.rows import SessionRows
 from sms_online.diagnosis.scale_free import HomogeneousRows
 from sms_online.diagnosis.weak_windows import SeenMotion, WeakWindows, WindowPlaces
@@ -36,17 +36,31 @@ LEAST_SIZE = 1e-9
 SMALLEST = 1e-6
 # Laws of friction and offset that every joint may have.
 LAWS = 3
+# Seconds of a session, in stretches, that show what is there all the time.
+SOME, STRETCH = 8.0, 4.0
+# Rows for each unknown that are wanted where a session is long enough.
+WANTED_ROWS = 6.0
 
 
 @dataclass(frozen=True)
 class RoughFit:
     """What least squares leaves of samples.
 
-    left (rows,): rms share of each coordinate's rows that is not explained. nominal (rows,): the same with nominal
-    values in place of those fitted."""
+    solution (n + c,): parameters, and coefficients of friction and offset. left (rows,): rms share of each coordinate's
+    rows that is not explained. nominal (rows,): the same with nominal values in place of those fitted.
+    """
 
+    solution: Array
     left: Array
     nominal: Array
+
+
+def stretches(session: Estimator | SessionRows, segments: Sequence[Segment]) -> list[Segment]:
+    """Parts of a session that suffice for a rough fit."""
+    system, rate = session.model.system, session.model.system.sample_rate
+    windows = WANTED_ROWS * (session.base.n + LAWS * len(system.joints)) / session.model.layout.n_v
+    duration = max(SOME, STRETCH * np.ceil(windows * system.windows.momentum / HOPS / STRETCH))
+    return excerpts(segments, round(STRETCH * rate), round(duration * rate))
 
 
 class RoughRows:
@@ -112,46 +126,99 @@ class RoughRows:
         self._size = np.maximum(self._size, LEAST_SIZE * self._size.max())
         self.for_each = count * self._used.size / (base.n + LAWS * len(self._motors))
 
-    def fit(self, factors: Array | None = None) -> RoughFit:
-        """The fit with the torques of the joints times factors (joints,), ones unless given."""
-        scale = np.ones(self._torque.shape[1])
-        if factors is not None:
-            scale[self._motors] = factors
-        size = self._size * np.abs(scale)
-        b = self._torque * scale - self._known
-        by_nominal = _left(self._friction, b - self._Y @ self._nominal, size)[1]
+    def fit(self) -> RoughFit:
+        """The fit of all rows."""
+        b = self._torque - self._known
+        size = self._size.copy()
         # A common factor of all torques is one of all parameters: rows without a torque count by theirs.
-        alike = self._ratio(size)
+        alike = self._ratio(self._torque)
         size[self._homogeneous] *= alike
         solution, left = _left(np.concatenate((self._Y, self._friction), axis=2), b, size)
         # Nor do they count less where the parameters have not followed, or those of other rows alone.
         beta = solution[: self._nominal.size]
-        explained = np.sqrt(np.mean((self._Y @ beta) ** 2, axis=0))
         terms = np.sqrt(np.mean(np.sum((self._Y * beta) ** 2, axis=2), axis=0))
         smallest = SMALLEST * size
         followed = size / np.maximum(terms, smallest)
-        followed = np.maximum(followed, alike / max(self._ratio(explained), SMALLEST * alike))
+        followed = np.maximum(followed, alike / max(self._ratio(self._Y @ beta), SMALLEST * alike))
         left[self._homogeneous] *= followed[self._homogeneous]
-        return RoughFit(left[self._used], by_nominal[self._used])
+        return RoughFit(solution, left[self._used], self._by_nominal(b, self._size))
+
+    def freed(self, factors: Array | None = None, start: Array | None = None) -> RoughFit:
+        """The fit with the torques of the joints times factors (joints,), ones unless given.
+
+        Rows without a torque count as in `shares`: else they follow a torque that is too large. start (n + c,): a
+        solution to begin with, near nominal values unless given.
+        """
+        scale = np.ones(self._torque.shape[1])
+        if factors is not None:
+            scale[self._motors] = factors
+        size, every = self._size * np.abs(scale), np.ones(self.count, dtype=np.bool_)
+        # A common factor of all torques is one of all parameters.
+        near = self._nominal * self._ratio(self._torque * scale)
+        solution, left = self._free(self._torque * scale, size, every, every, near, start=start)
+        return RoughFit(solution, left, self._by_nominal(self._torque * scale - self._known, size))
 
     def shares(self, fitted: NDArray[np.bool_]) -> Array:
         """rms shares (rows,) of what a fit of some windows (W,) leaves of the others.
 
         Of rows without a torque a share of the size of their terms, which no scale of the parameters changes.
         """
-        Y, friction = self._Y / self._size[:, None], self._friction / self._size[:, None]
-        b = (self._torque - self._known) / self._size
+        return self._free(self._torque, self._size, fitted, ~fitted, self._nominal)[1]
+
+    def factor(self, joint: int) -> float:
+        """Factor of a joint's torque with which its rows follow from all others, where another torque fixes the scale.
+
+        joint: its index. Other rows tell the parameters, but for what only its own rows hold.
+        """
+        motor, every = self._motors[joint], np.ones(self.count, dtype=np.bool_)
+        others, own = self._torque.copy(), np.zeros((*self._torque.shape, 1))
+        own[:, motor, 0], others[:, motor] = -self._torque[:, motor], 0.0
+        return float(self._free(others, self._size, every, every, self._nominal * self._ratio(others), own)[0][-1])
+
+    def stated(self) -> Array:
+        """Each joint's torque (joints,) over what nominal values make of it, rms; NaN where they make none."""
+        rms, expected = np.sqrt(np.mean(self._torque**2, axis=0)), self._expected
+        ratio: Array = np.divide(rms, expected, out=np.full_like(rms, np.nan), where=expected > 0.0)
+        return ratio[self._motors]
+
+    def _free(
+        self,
+        torque: Array,
+        size: Array,
+        fitted: NDArray[np.bool_],
+        others: NDArray[np.bool_],
+        near: Array,
+        beside: Array | None = None,
+        start: Array | None = None,
+    ) -> tuple[Array, Array]:
+        """Solution (n + c,) of some windows (W,), rows with torques (W, n_v) by their size (n_v,), and shares (rows,).
+
+        near (n,): parameters that what the rows do not determine stays near. beside (W, n_v, k): columns that are
+        fitted with those of friction. start: as in `freed`.
+        """
+        Y, friction = self._Y / size[:, None], self._friction / size[:, None]
+        positive = self._positive
+        if beside is not None:
+            friction = np.concatenate((friction, beside / size[:, None]), axis=2)
+            positive = np.append(positive, [False] * beside.shape[2])
+        b = (torque - self._known) / size
         speeds, n = np.flatnonzero(self._homogeneous).tolist(), Y.shape[2]
         free = HomogeneousRows(Y[fitted], speeds, self._inertial)
-        solution = free.solved(friction[fitted], b[fitted], self._nominal, self._nominal, SMALLEST, self._positive)
+        start = near if start is None else start[:n]
+        solution = free.solved(friction[fitted], b[fitted], start, near, SMALLEST, positive)
         left = b - np.concatenate((Y, friction), axis=2) @ solution
-        squares = free.squares(solution[:n], left[~fitted], self._nominal)
-        return np.asarray(np.sqrt(squares[self._used]))
+        squares = free.squares(solution[:n], left[others], self._nominal)
+        return solution, np.asarray(np.sqrt(squares[self._used]))
 
-    def _ratio(self, torques: Array) -> float:
-        """Geometric mean over the joints of torques (n_v,), rms, to those that nominal values make; 1 without these."""
-        driven = [motor for motor in self._motors if self._expected[motor] > 0.0 and torques[motor] > 0.0]
-        return float(np.exp(np.mean(np.log(torques[driven] / self._expected[driven])))) if driven else 1.0
+    def _ratio(self, torque: Array) -> float:
+        """Geometric mean over the joints of torques (W, n_v) to those that nominal values make; 1 without either."""
+        rms = np.sqrt(np.mean(torque**2, axis=0))
+        driven = [motor for motor in self._motors if self._expected[motor] > 0.0 and rms[motor] > 0.0]
+        return float(np.exp(np.mean(np.log(rms[driven] / self._expected[driven])))) if driven else 1.0
+
+    def _by_nominal(self, b: Array, size: Array) -> Array:
+        """What nominal values, friction and offsets leave of rows b (W, n_v), over their size (n_v,), of those used."""
+        return _left(self._friction, b - self._Y @ self._nominal, size)[1][self._used]
 
 
 def _left(columns: Array, b: Array, size: Array) -> tuple[Array, Array]:

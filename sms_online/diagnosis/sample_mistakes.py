@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from itertools import combinations
 
 import numpy as np
+from numpy.typing import NDArray
 
 from sms_online.description.schema import System
 from sms_online.diagnosis.record import Segment
@@ -17,6 +18,8 @@ from sms_online.stream import Array
 DEGREE = math.pi / 180.0
 # Values that repeat in runs of at least this length, most of which are equal, are those of a held command.
 HELD_RUN, MOST_RUNS = 3, 0.8
+# A reading that moves by less than this share of what it usually does is at rest.
+AT_REST = 0.2
 
 
 @dataclass(frozen=True)
@@ -192,10 +195,20 @@ def _wrapped(positions: Sequence[str], channels: Sequence[str], segments: Sequen
             yield Undoing("wrapped", name, said, f"state wrap for {name}, or unwrap it", _unwrapped(name, turn))
 
 
+def _beside(name: str, positions: Sequence[str]) -> list[str]:
+    """The joint's other encoder, or all other readings where it has none."""
+    other = _other_encoder(name)
+    return [other] if other in positions else [each for each in positions if each != name]
+
+
+def _other_encoder(name: str) -> str:
+    kind, _, joint = name.rpartition("_")
+    return f"theta_m_{joint}" if kind == "q" else f"q_{joint}"
+
+
 def _unwrapped(name: str, turn: float) -> Callable[[tuple[str, ...], Array], Array]:
     """Whole turns that a wrapped reading does not tell are those of the joint's other encoder."""
-    kind, _, joint = name.rpartition("_")
-    other = f"theta_m_{joint}" if kind == "q" else f"q_{joint}"
+    other = _other_encoder(name)
 
     def apply(channels: tuple[str, ...], values: Array) -> Array:
         out = values.copy()
@@ -215,11 +228,20 @@ def _unwrapped(name: str, turn: float) -> Callable[[tuple[str, ...], Array], Arr
 def _stuck(positions: Sequence[str], channels: Sequence[str], segments: Sequence[Segment]) -> Iterator[Undoing]:
     for name in positions:
         k = list(channels).index(name)
-        stuck = sum(int(stuck_samples(each.values[:, k]).sum()) for each in segments)
-        if stuck:
-            said = f"{name} is stuck at one value for {stuck} samples while it moves before"
+        stuck = [stuck_samples(each.values[:, k]) for each in segments]
+        others = [list(channels).index(other) for other in _beside(name, positions)]
+        if any(each.any() for each in stuck) and _moves(stuck, [each.values[:, others] for each in segments]):
+            count = sum(int(each.sum()) for each in stuck)
+            said = f"{name} is stuck at one value for {count} samples while it moves before"
             step = f"check encoder and cable of {name}; leave that time out with -ss and -to"
             yield Undoing("stuck", name, said, step, _without_stuck(name))
+
+
+def _moves(when: Sequence[NDArray[np.bool_]], readings: Sequence[Array]) -> bool:
+    """Whether any of some readings (B, c) of segments moves at times (B,): else the arm is at rest."""
+    speed = np.concatenate([np.abs(np.gradient(each, axis=0)) for each in readings])
+    then = np.concatenate(when)
+    return not speed.shape[1] or bool(np.any(speed[then].mean(axis=0) > AT_REST * speed.mean(axis=0)))
 
 
 def _without_stuck(name: str) -> Callable[[tuple[str, ...], Array], Array]:
