@@ -130,11 +130,11 @@ class _Search:
         """Look for one more; whether there is one."""
         try:
             rows = RoughRows(self.session, self._segments)
+            given, freed = rows.fit(), rows.freed()
         except np.linalg.LinAlgError:
             return False
         if rows.for_each < LEAST_ROWS:
             return False  # so many parameters explain any samples
-        given, freed = rows.fit(), rows.freed()
         found = list(self._samples(shown(self._channels, self._segments), given, EXPLAINED, LEAST_SHOWN))
         if not found:
             found = list(self._scaled(rows, freed))
