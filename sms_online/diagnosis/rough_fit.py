@@ -168,7 +168,7 @@ class RoughRows:
     def factor(self, joint: int) -> float:
         """Factor of a joint's torque with which its rows follow from all others, where another torque fixes the scale.
 
-        joint: its index. Other rows tell the parameters, but for what only its own rows hold.
+        joint: its index. Other rows determine the parameters, but for what only its own rows hold.
         """
         motor, every = self._motors[joint], np.ones(self.count, dtype=np.bool_)
         others, own = self._torque.copy(), np.zeros((*self._torque.shape, 1))
