@@ -207,7 +207,7 @@ def _other_encoder(name: str) -> str:
 
 
 def _unwrapped(name: str, turn: float) -> Callable[[tuple[str, ...], Array], Array]:
-    """Whole turns that a wrapped reading leaves open are those of the joint's other encoder."""
+    """Whole turns that wrapping loses are those of the joint's other encoder."""
     other = _other_encoder(name)
 
     def apply(channels: tuple[str, ...], values: Array) -> Array:
