@@ -208,7 +208,8 @@ class RoughRows:
         solution = free.solved(friction[fitted], b[fitted], start, near, SMALLEST, positive)
         left = b - np.concatenate((Y, friction), axis=2) @ solution
         squares = free.squares(solution[:n], left[others], self._nominal)
-        return solution, np.asarray(np.sqrt(squares[self._used]))
+        # Of rows that the parameters leave no terms nothing is explained.
+        return solution, np.nan_to_num(np.sqrt(squares[self._used]), nan=1.0)
 
     def _ratio(self, torque: Array) -> float:
         """Geometric mean over the joints of torques (W, n_v) to those that nominal values make; 1 without either."""
