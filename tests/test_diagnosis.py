@@ -18,7 +18,8 @@ from sms_online.description.parse import describe, parse_system
 from sms_online.description.schema import Effect, System
 from sms_online.diagnosis.candidates import CandidateColumns
 from sms_online.diagnosis.diagnose import diagnose
-from sms_online.diagnosis.document import coefficients, diagnosis_document
+from sms_online.diagnosis.document import diagnosis_document
+from sms_online.diagnosis.posterior import coefficients
 from sms_online.diagnosis.search import Search
 from sms_online.effects.catalogue import parse_effect
 from sms_online.errors import InputError

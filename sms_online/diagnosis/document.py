@@ -3,25 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any
 
-import numpy as np
-
 from sms_online.description.schema import Effect
-from sms_online.diagnosis.attempt import Attempt, Part
+from sms_online.diagnosis.attempt import Part
 from sms_online.diagnosis.candidate import Finding
 from sms_online.diagnosis.drifts import sentence, summary_of, trust_with
 from sms_online.diagnosis.hypothesis import LARGEST_SHARE_LEFT
-from sms_online.diagnosis.reported import Coefficients, of_constant, of_unknowns
+from sms_online.diagnosis.posterior import coefficients, posterior
+from sms_online.diagnosis.reported import Coefficients
 from sms_online.diagnosis.search import Search
-from sms_online.diagnosis.shape import slopes
 from sms_online.effects.catalogue import ENTRIES, declarable, either, in_words, traits_of
-from sms_online.evaluation import NORMAL_95, identifiable
-from sms_online.model.parameters import Parameter
 from sms_online.result import residual_document, result_of
 from sms_online.row_types import Residual
-from sms_online.stream import Array
 from sms_online.threads import one_blas_thread
 from sms_online.verdict.evidence import Evidence
 from sms_online.verdict.judge import judge, judge_diagnosis
@@ -77,7 +71,7 @@ def diagnosis_document(
                 "fit": residual_document(_part(state.fit)),
                 "holdout": residual_document(_part(state.holdout)),
                 "limit": {row: test.limit for row, test in state.test.items()},
-                "parameters": _posterior(attempt, chosen) if _from_rows(diagnosis) else results[name]["parameters"],
+                "parameters": posterior(attempt, chosen) if _from_rows(diagnosis) else results[name]["parameters"],
             }
             for name, state, attempt, chosen in (
                 ("before", before, diagnosis.described, []),
@@ -120,8 +114,8 @@ def _after(diagnosis: Search, session: JudgedEvaluation) -> Trust:
     """May the parameters after be trusted?"""
     if not _from_rows(diagnosis):
         return session.trust
-    # Parameters come from the rows of the diagnosis then, see `_posterior`.
-    known = [p["identifiable"] for p in _posterior(diagnosis.attempt, diagnosis.chosen)]
+    # Parameters come from the rows of the diagnosis then, see `posterior`.
+    known = [p["identifiable"] for p in posterior(diagnosis.attempt, diagnosis.chosen)]
     return judge(Evidence((sum(known), len(known)), residual=_part(diagnosis.after.fit)))
 
 
@@ -329,74 +323,3 @@ def _by_comparison(diagnosis: Search) -> list[dict[str, Any]]:
         if effect not in known
     ]
     return [*late, *kinematics]
-
-
-def coefficients(diagnosis: Search, finding: Finding) -> Coefficients:
-    """What a person reads of an effect."""
-    effect, attempt = finding.candidate.effect, diagnosis.attempt
-    for k, (constant, candidate) in enumerate(zip(attempt.constants, attempt.fixed, strict=True)):
-        if constant.key == effect.key:
-            at = attempt.rows.base.n + sum(len(other.parameters) for other in attempt.fixed[:k])
-            own = slice(at, at + len(candidate.parameters))
-            covariance = attempt.tracing.covariance(diagnosis.chosen)[own, own]
-            return of_constant(constant, covariance)
-    batch, model = _batch(attempt, diagnosis.chosen), diagnosis.model
-    names = [p.name for p in batch.parameters]
-    reported = of_unknowns(effect, finding.candidate.parameters, model, names, batch.values, batch.covariance)
-    shapes = {name: std for (key, name), std in batch.shapes.items() if key == finding.candidate.key}
-    return {name: (value, shapes.get(name, std)) for name, (value, std) in reported.items()}
-
-
-def _posterior(attempt: Attempt, chosen: Sequence[int]) -> list[dict[str, Any]]:
-    """Parameters as in results.json, from the rows of the diagnosis: these tolerate a prior where the model lacks much.
-
-    A session whitens rows by the sensors' noise alone until it knows better, and against that no prior counts.
-    """
-    batch = _batch(attempt, chosen)
-    parameters, values, stds = batch.parameters, batch.values, np.sqrt(np.diag(batch.covariance))
-    return [
-        {
-            "name": p.name,
-            "symbol": p.symbol,
-            "unit": p.unit,
-            "estimate": float(value),
-            "std": float(std) if np.isfinite(std) else None,
-            "lower95": float(value - NORMAL_95 * std) if np.isfinite(std) else None,
-            "upper95": float(value + NORMAL_95 * std) if np.isfinite(std) else None,
-            "nominal": p.nominal or None,
-            "true": None,
-            "identifiable": bool(known),
-        }
-        for p, value, std, known in zip(parameters, values, stds, identifiable(values, stds), strict=True)
-    ]
-
-
-@dataclass(frozen=True)
-class _Batch:
-    """Parameters of the model and of the effects chosen (k,), with values and covariance (k, k) from all rows.
-
-    shapes: deviations of shape constants, by key of the effect and name; those of the others include their error.
-    """
-
-    parameters: list[Parameter]
-    values: Array
-    covariance: Array
-    shapes: dict[tuple[str, str], float]
-
-
-def _batch(attempt: Attempt, chosen: Sequence[int]) -> _Batch:
-    columns = [*attempt.fixed, *(attempt.tracing.candidates[k] for k in chosen)]
-    parameters = [*attempt.rows.base.parameters, *(p for candidate in columns for p in candidate.parameters)]
-    constants = {p.name for candidate in attempt.fixed for p in candidate.parameters}
-    kept = [k for k, p in enumerate(parameters) if p.name not in constants]
-    shapes, moved = slopes(attempt.tracing, attempt.make, chosen)
-    covariance = attempt.tracing.covariance(chosen, moved)
-    # Rows that leave more than noise determine coefficients no better than the blocks of the session agree on them.
-    white, blocks = np.sqrt(np.diag(covariance)), np.zeros(len(covariance))
-    blocks[: len(parameters)] = attempt.tracing.spread(chosen)
-    wider = np.maximum(1.0, np.divide(blocks, white, out=np.ones_like(white), where=np.isfinite(white) & (white > 0.0)))
-    covariance = covariance * wider * wider[:, None]
-    stds = np.sqrt(np.diag(covariance)[len(parameters) :]).tolist()
-    known = {shape: std for shape, std in zip(shapes, stds, strict=True) if np.isfinite(std)}
-    values = attempt.solution(chosen)[kept]
-    return _Batch([parameters[k] for k in kept], values, covariance[np.ix_(kept, kept)], known)

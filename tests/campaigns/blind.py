@@ -29,8 +29,8 @@ from sms_adapters.system_file import load_system
 from sms_online.description.schema import Effect, System
 from sms_online.diagnosis.candidates import CandidateColumns
 from sms_online.diagnosis.diagnose import diagnose
-from sms_online.diagnosis.document import coefficients
 from sms_online.diagnosis.evidence import angle, basis
+from sms_online.diagnosis.posterior import coefficients
 from sms_online.diagnosis.search import Search
 from sms_online.effects.build import build_model
 from sms_online.effects.catalogue import ENTRIES, candidates

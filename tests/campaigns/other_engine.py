@@ -19,7 +19,7 @@ from time import process_time
 from sms_adapters.system_file import load_system
 from sms_online.description.parse import describe
 from sms_online.diagnosis.diagnose import diagnose
-from sms_online.diagnosis.document import coefficients
+from sms_online.diagnosis.posterior import coefficients
 from sms_online.diagnosis.search import Search
 from sms_online.pipeline.estimator import Estimator
 from sms_online.stream import Block
