@@ -239,7 +239,7 @@ def _stuck(positions: Sequence[str], channels: Sequence[str], segments: Sequence
 
 def _moves(when: Sequence[NDArray[np.bool_]], readings: Sequence[Array]) -> bool:
     """Whether any of some readings (B, c) of segments moves at times (B,): else the arm is at rest."""
-    speed = np.concatenate([np.abs(np.gradient(each, axis=0)) for each in readings])
+    speed = np.concatenate([np.abs(np.diff(each, axis=0, prepend=each[:1])) for each in readings])
     then = np.concatenate(when)
     return not speed.shape[1] or bool(np.any(speed[then].mean(axis=0) > AT_REST * speed.mean(axis=0)))
 
