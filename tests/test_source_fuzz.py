@@ -235,7 +235,6 @@ def test_candump_lines_are_those_of_the_grammar(
         error = len(match[4]) == 8 and bool(id_ & 1 << 29)
         assert frames.id[0] == (id_ & (1 << 29) - 1 | EXTENDED if len(match[4]) == 8 else id_)
         assert frames.flags[0] == error * ERROR_FRAME | bool(match[5]) * REMOTE_FRAME | (b"##" in line) * FD_FRAME
-        # A remote frame has no data; its length is that of the frame it asks for.
         asked = frames.data[0, : frames.length[0]]
         # A remote frame has no data; its length is that of the frame it asks for.
         data = b"\0" * asked.size if match[5] else bytes.fromhex((match[6] or b"").decode())

@@ -160,7 +160,7 @@ class _Search:
         for each in self._torques(rows):
             explained = (LEAST_COMMON if each.common else LEAST_RATIO) * _left(each.fit)
             better = before > explained and np.all(each.fit.left <= most)
-            if better and _left(rows.freed(start=each.fit.solution)) > explained:
+            if better and _left(rows.freed(start=each.fit.beta)) > explained:
                 yield each
 
     def _take(self, best: _Tried, before: float, others: tuple[str, ...]) -> None:

@@ -46,11 +46,11 @@ WANTED_ROWS = 6.0
 class RoughFit:
     """What least squares leaves of samples.
 
-    solution (n + c,): parameters, and coefficients of friction and offset. left (rows,): rms share of each coordinate's
-    rows that is not explained. nominal (rows,): the same with nominal values in place of those fitted.
+    beta (n,): parameters. left (rows,): rms share of each coordinate's rows that is not explained. nominal (rows,): the
+    same with nominal values in place of those fitted.
     """
 
-    solution: Array
+    beta: Array
     left: Array
     nominal: Array
 
@@ -141,13 +141,13 @@ class RoughRows:
         followed = size / np.maximum(terms, smallest)
         followed = np.maximum(followed, alike / max(self._ratio(self._Y @ beta), SMALLEST * alike))
         left[self._homogeneous] *= followed[self._homogeneous]
-        return RoughFit(solution, left[self._used], self._by_nominal(b, self._size))
+        return RoughFit(beta, left[self._used], self._by_nominal(b, self._size))
 
     def freed(self, factors: Array | None = None, start: Array | None = None) -> RoughFit:
         """The fit with the torques of the joints times factors (joints,), ones unless given.
 
-        Rows without a torque count as in `shares`: else they follow a torque that is too large. start (n + c,): a
-        solution to begin with, near nominal values unless given.
+        Rows without a torque count as in `shares`: else they follow a torque that is too large. start (n,): parameters
+        to begin with, near nominal values unless given.
         """
         scale = np.ones(self._torque.shape[1])
         if factors is not None:
@@ -156,7 +156,7 @@ class RoughRows:
         # A common factor of all torques is one of all parameters.
         near = self._nominal * self._ratio(self._torque * scale)
         solution, left = self._free(self._torque * scale, size, every, every, near, start=start)
-        return RoughFit(solution, left, self._by_nominal(self._torque * scale - self._known, size))
+        return RoughFit(solution[: near.size], left, self._by_nominal(self._torque * scale - self._known, size))
 
     def shares(self, fitted: NDArray[np.bool_]) -> Array:
         """rms shares (rows,) of what a fit of some windows (W,) leaves of the others.
@@ -175,11 +175,15 @@ class RoughRows:
         own[:, motor, 0], others[:, motor] = -self._torque[:, motor], 0.0
         return float(self._free(others, self._size, every, every, self._nominal * self._ratio(others), own)[0][-1])
 
-    def stated(self) -> Array:
-        """Each joint's torque (joints,) over what nominal values make of it, rms; NaN where they make none."""
-        rms, expected = np.sqrt(np.mean(self._torque**2, axis=0)), self._expected
-        ratio: Array = np.divide(rms, expected, out=np.full_like(rms, np.nan), where=expected > 0.0)
-        return ratio[self._motors]
+    def stated(self, torque: Array | None = None) -> Array:
+        """Torques of the joints (joints,) over what nominal values make of them, rms; NaN where they make none.
+
+        torque (W, n_v): those of the samples unless given.
+        """
+        expected = self._expected[self._motors]
+        own = (self._torque if torque is None else torque)[:, self._motors]
+        rms = np.sqrt(np.mean(own**2, axis=0))
+        return np.asarray(np.divide(rms, expected, out=np.full_like(rms, np.nan), where=expected > 0.0))
 
     def _free(
         self,
@@ -204,18 +208,18 @@ class RoughRows:
         b = (torque - self._known) / size
         speeds, n = np.flatnonzero(self._homogeneous).tolist(), Y.shape[2]
         free = HomogeneousRows(Y[fitted], speeds, self._inertial)
-        start = near if start is None else start[:n]
-        solution = free.solved(friction[fitted], b[fitted], start, near, SMALLEST, positive)
+        begin = near if start is None else start
+        solution = free.solved(friction[fitted], b[fitted], begin, near, SMALLEST, positive)
         left = b - np.concatenate((Y, friction), axis=2) @ solution
         squares = free.squares(solution[:n], left[others], self._nominal)
         # Of rows that the parameters leave no terms nothing is explained.
         return solution, np.nan_to_num(np.sqrt(squares[self._used]), nan=1.0)
 
     def _ratio(self, torque: Array) -> float:
-        """Geometric mean over the joints of torques (W, n_v) to those that nominal values make; 1 without either."""
-        rms = np.sqrt(np.mean(torque**2, axis=0))
-        driven = [motor for motor in self._motors if self._expected[motor] > 0.0 and rms[motor] > 0.0]
-        return float(np.exp(np.mean(np.log(rms[driven] / self._expected[driven])))) if driven else 1.0
+        """Geometric mean of what is `stated` of torques (W, n_v), over the joints that have both; 1 without any."""
+        known = self.stated(torque)
+        known = known[known > 0.0]
+        return float(np.exp(np.mean(np.log(known)))) if known.size else 1.0
 
     def _by_nominal(self, b: Array, size: Array) -> Array:
         """What nominal values, friction and offsets leave of rows b (W, n_v), over their size (n_v,), of those used."""
