@@ -13,7 +13,7 @@ from sms_adapters.devices import make_decoder
 from sms_online.description.schema import System
 from sms_online.description.sources import CanopenSource, CanSource, Device
 from sms_online.errors import InputError
-from sms_online.pipeline.blocks import momentum_blocks
+from sms_online.pipeline.blocks import blocks
 
 
 def lanes(system: System, directory: Path | None) -> list[SourceLane]:
@@ -35,7 +35,7 @@ def merger(system: System, directory: Path | None, start: float = 0.0) -> Merger
     slowest = max(stream.period for lane in sources for stream in lane.streams)
     steps = None
     if system.balance != "energy":
-        first, block = momentum_blocks(system, slowest)
+        first, block = blocks(system, slowest)
         steps = Steps(first + 1.0 / system.sample_rate, block)  # the sample behind an end shows that it is one
     return Merger(sources, start, steps)
 

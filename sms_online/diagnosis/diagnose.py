@@ -244,7 +244,7 @@ def _session(
 
     progress: is called with the share of the samples processed.
     """
-    estimator = Estimator(system, runs[0][0].channels, source)
+    estimator = Estimator(system, runs[0][0].channels, source, whole=True)
     record = SampleRecord(system.sample_rate)
     estimator.observers.append(record)
     known = prior(estimator)

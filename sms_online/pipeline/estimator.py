@@ -22,7 +22,7 @@ from sms_online.effects.catalogue import channel_effects
 from sms_online.errors import InputError
 from sms_online.model.base_parameters import BaseParameters, find_base_parameters
 from sms_online.model.model import Model
-from sms_online.pipeline.blocks import ENERGY_BLOCK, energy_blocks, momentum_blocks
+from sms_online.pipeline.blocks import ENERGY_BLOCK, blocks
 from sms_online.pipeline.changes import Adoption
 from sms_online.pipeline.conditioning import Conditioning
 from sms_online.pipeline.energy_estimate import EnergyEstimate
@@ -70,11 +70,14 @@ class Estimator(Stage):
     channels: what the source's blocks hold. source: its name, for messages. Raises InputError when a channel is missing
     that the model needs, or where the system declares a tilt of the table and there is no reference.
     reference: π (n_pi,) of the system whose masses that tilt acts on, from an estimate without it or from a scale.
-    observers: watch what passes, in this order.
+    observers: watch what passes, in this order. whole: samples are those of a whole capture, see `blocks`.
     """
 
     @one_blas_thread()
-    def __init__(self, system: System, channels: tuple[str, ...], source: str, reference: Array | None = None) -> None:
+    def __init__(
+        self, system: System, channels: tuple[str, ...], source: str, reference: Array | None = None,
+        whole: bool = False,
+    ) -> None:  # fmt: skip
         self.system = system
         self._model = model = build_model(system, reference)
         if reference is None:
@@ -121,7 +124,8 @@ class Estimator(Stage):
         # Behind what may have it begin anew when states are put back.
         self.energy = EnergyEstimate(model, base, system.sample_rate)
         self._begin_joints()
-        self._first_block, self._block = self._blocks()
+        slowest = None if by_energy else stated_period(system, self.sensing.channels)
+        self._first_block, self._block = blocks(system, slowest, whole)
         self.finished = False  # no more samples come
         self.prior: Prior | None = None
         self._setup: tuple[int, Setup] | None = None  # and the number of events that it is since
@@ -150,12 +154,6 @@ class Estimator(Stage):
         """See Stage."""
         self._setup = None
         self._synchroniser.resumed = self.end
-
-    def _blocks(self) -> tuple[float, float]:
-        """See `blocks`."""
-        if self.momentum is None:
-            return energy_blocks(self.system)
-        return momentum_blocks(self.system, stated_period(self.system, self.sensing.channels))
 
     @one_blas_thread()
     def set_prior(self, prior: Prior) -> None:
