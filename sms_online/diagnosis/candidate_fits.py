@@ -82,6 +82,7 @@ class CandidateFits:
         """Which numbers of calibration (m,) are held at zero beside those chosen: effects replace them, or have to."""
         m, key = self.calibrated.count, frozenset(chosen)
         if key not in self._zeroed:
+            chosen = sorted(chosen)  # whatever their order, the same to the last bit
             rows = np.column_stack((self._Y, *(self._Z[k] for k in chosen), self._N, self._b))
             self._zeroed[key], solution = self._released(chosen, rows[: len(rows) - m])
             if m:
@@ -156,8 +157,9 @@ class CandidateFits:
         Kept until rows are whitened anew.
         """
         key = self._key(chosen, beside)
-        if key not in self._solved:
-            self._solved[key] = self._fitted_to(chosen, self._columns(chosen, beside), self._b)
+        columns = None if key in self._solved else self._columns(chosen, beside)
+        if columns is not None and key not in self._solved:  # else `zeroed` has solved it
+            self._solved[key] = self._fitted_to(chosen, columns, self._b)
         return self._solved[key]
 
     def _fitted_to(self, chosen: Sequence[int], columns: Array, b: Array) -> Array:

@@ -89,18 +89,22 @@ class CandidateRows(CandidateFits):
         self._explained = 0.0, rows.std
         self._scale.begin()
         self._whiten()
-        self._begun = True
+        self._weighed: tuple[int, ...] | None = ()  # what rows are whitened for from the beginning on, if so
 
     def weigh(self, chosen: Sequence[int]) -> None:
         """Whiten the rows for those chosen from the beginning, until the weights are those of their coefficients.
 
         So they follow from the rows and those chosen alone, and not from what was asked before.
         """
-        if not self._begun:
+        if self._weighed == tuple(chosen):
+            self._beside = tuple(chosen)
+            return
+        if self._weighed != ():
             self._begin()
         for _ in range(ROUNDS):
             if not self.reweight(chosen):
                 break
+        self._weighed = tuple(chosen)
 
     def reweight(self, chosen: Sequence[int], solution: Array | None = None) -> bool:
         """Whiten the rows with what the laws of the chosen effects do not determine too; whether the weights change.
@@ -117,10 +121,10 @@ class CandidateRows(CandidateFits):
         self._beside = tuple(chosen)
         if not np.any(np.abs(wanted - used) > SMALL_CHANGE * (self.rows.std**2 + used)):
             if moved and self.freed:
-                self._begun = False
+                self._weighed = None
                 self._whiten()
             return False
-        self._begun = False
+        self._weighed = None
         self._own, self._free = own, free
         self._whiten()
         # Rows that leave more than noise even so are uncertain by that: what the laws do not determine there would grow
@@ -269,7 +273,7 @@ class CandidateRows(CandidateFits):
     def put(self, k: int, candidate: Candidate) -> None:
         """Put another form of an effect in the place of a candidate."""
         self.candidates[k] = candidate
-        self._begun = False
+        self._weighed = None
         self._plain[k] = candidate.columns / self.std[..., None]
         self._Z[k] = self._whitened(candidate.columns)
         self._forget()
