@@ -173,9 +173,10 @@ class CandidateColumns:
         added = [k for k, p in enumerate(model.parameters) if p.name not in self._own]
         parameters = [model.parameters[k] for k in added]
         if ENTRIES[effect.name].kind == "inertia":
+            alone = model.of_parameters(added)
 
             def inertia(motion: SeenMotion) -> tuple[Array | None, Array]:
-                P, G = model.momentum_columns(motion.x, motion.v, inputs=self.inputs(motion))
+                P, G = alone.momentum_columns(motion.x, motion.v, inputs=self.inputs(motion))
                 return P[..., added], G[..., added]
 
             return self._candidate(effect, parameters, self._weak.columns(inertia))

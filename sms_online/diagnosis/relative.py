@@ -36,9 +36,11 @@ class RelativeResiduals:
         self.times = np.asarray(middles / rows.model.system.sample_rate, dtype=np.float64)
         self.segment = segments
 
+        needed = rows.model.of_parameters(rows.base.needed)
+
         def model(motion: SeenMotion) -> tuple[Array, Array]:
             inputs = self._make.inputs(motion)
-            return rows.model.momentum_columns(motion.x, motion.v, layout.theta_m, inputs)
+            return needed.momentum_columns(motion.x, motion.v, layout.theta_m, inputs)
 
         physical = weak.columns(model)
         self._Y = rows.base.columns(physical)

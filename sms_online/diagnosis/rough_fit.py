@@ -92,9 +92,11 @@ class RoughRows:
         weak = WeakWindows(where, layout, session.sensing, segments, rate)
         self._motors = list(layout.theta_m)
 
+        needed = model.of_parameters(base.needed)
+
         def inertia(motion: SeenMotion) -> tuple[Array, Array]:
             inputs = Inputs(motion.torque, np.zeros((len(motion.samples), model.n_states)))
-            return model.momentum_columns(motion.x, motion.v, inputs=inputs)
+            return needed.momentum_columns(motion.x, motion.v, inputs=inputs)
 
         def drives(motion: SeenMotion) -> tuple[None, Array]:
             G = np.zeros((*motion.v.shape, 1 + LAWS * len(self._motors)))

@@ -60,6 +60,11 @@ class BaseParameters:
         """Number of base parameters."""
         return len(self.parameters)
 
+    @property
+    def needed(self) -> frozenset[int]:
+        """Physical parameters whose columns `columns` and `known_part` need."""
+        return frozenset((*self.independent, *(index for index, _ in self.known)))
+
     def columns(self, Y: Array) -> Array:
         """Columns (..., n) of the base parameters out of the physical parameters' (..., n_pi)."""
         return np.asarray(Y[..., self.independent])

@@ -7,7 +7,8 @@ body axes), and the force F at ν̇ = 0; all as columns (B, d, n).
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Collection
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -42,6 +43,11 @@ class BodyTerm(Term):
     """Rigid bodies that share a frame: matrices (n, d, d), one for each parameter."""
 
     matrices: Array
+
+    def of_parameters(self, wanted: Collection[int]) -> BodyTerm:
+        """The same with some parameters of π alone."""
+        kept = [k for k, parameter in enumerate(self.parameters) if parameter in wanted]
+        return replace(self, parameters=tuple(self.parameters[k] for k in kept), matrices=self.matrices[kept])
 
     def momentum(self, nu: Array) -> Array:
         """p (B, d, n) of each parameter."""

@@ -6,7 +6,7 @@ One set of kinetic terms serves the energy balance (43), (44), the weak form of 
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from copy import copy
 from dataclasses import replace
 
@@ -73,14 +73,8 @@ class Model:
             self._add_inertia(parameters, inertia)
         # Frames that something sits in: the last one, at the tip, holds the payload alone.
         self._frames = 1 + max(term.frame for term in (*self.bodies, *self.links))
-        # Kinetic terms from the tips to the base, the first of each one's columns then, and the columns' places in π.
-        terms = (*self.bodies, *self.links)
-        self._moving = self.chain.moving(term.frame for term in terms)
-        self._kinetic: list[int] = []
-        self._kinetic_order: list[tuple[int, int]] = []
-        for k in sorted(range(len(terms)), key=lambda k: self.chain.inwards(terms[k].frame)):
-            self._kinetic_order.append((k, len(self._kinetic)))
-            self._kinetic += terms[k].parameters
+        self._moving = self.chain.moving(term.frame for term in (*self.bodies, *self.links))
+        self._order_kinetic_terms()
         # Of each effect, its columns in π and its internal states in `Inputs.states`.
         self.effect_slices: list[slice] = []
         self.state_slices: list[slice] = []
@@ -94,6 +88,15 @@ class Model:
         self.parameters = with_fitted(parameters, system)
         self.nominal = np.array([p.nominal for p in self.parameters])
         self.reference = self.nominal if reference is None else reference
+
+    def _order_kinetic_terms(self) -> None:
+        """Kinetic terms from the tips to the base, the first of each one's columns then, and these columns' places."""
+        terms = (*self.bodies, *self.links)
+        self._kinetic: list[int] = []
+        self._kinetic_order: list[tuple[int, int]] = []
+        for k in sorted(range(len(terms)), key=lambda k: self.chain.inwards(terms[k].frame)):
+            self._kinetic_order.append((k, len(self._kinetic)))
+            self._kinetic += terms[k].parameters
 
     def _add_bodies(self, parameters: list[Parameter]) -> None:
         system, planar = self.system, self.layout.planar
@@ -192,6 +195,15 @@ class Model:
         out.springs, out.dampers = [], []
         out.gravity = np.repeat([other.gravity for other in others], repeats, axis=0)
         out.effects, out.effect_slices, out.state_slices = (), [], []
+        return out
+
+    def of_parameters(self, wanted: Collection[int]) -> Model:
+        """This model with the kinetic terms of some parameters of π alone: columns of the other masses are zero."""
+        out = copy(self)
+        bodies = (body.of_parameters(wanted) for body in self.bodies)
+        out.bodies = [body for body in bodies if body.parameters]
+        out.links = [link for link in self.links if not set(link.parameters).isdisjoint(wanted)]
+        out._order_kinetic_terms()
         return out
 
     @property

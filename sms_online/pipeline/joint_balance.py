@@ -86,7 +86,7 @@ class JointBalance(Stage):
     """
 
     def __init__(self, model: Model, base: BaseParameters, sample_rate: float, sensing: Sensing | None = None) -> None:
-        self.model = model
+        self.model = model.of_parameters(base.needed)
         self.base = base
         self._sensing, self._sample_rate = sensing, sample_rate
         self._calibration = None if sensing is None else JointCalibration(sensing)

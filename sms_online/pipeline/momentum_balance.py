@@ -108,6 +108,7 @@ class MomentumBalance(Stage):
         moments: bool = False,
     ) -> None:  # fmt: skip
         self.model = model
+        self._needed = model.of_parameters(base.needed)
         self.base = base
         self.sample_rate = sample_rate
         self.half_hop = half_hop(sample_rate, span)
@@ -310,7 +311,7 @@ class MomentumBalance(Stage):
         """
         x, v, signals = self._states(samples)
         own, K = self._distinct(x, v, signals)
-        P, G = self.model.momentum_columns(own[0], own[1], inputs=self.model.inputs(own[2]))
+        P, G = self._needed.momentum_columns(own[0], own[1], inputs=self.model.inputs(own[2]))
         G[:, :, self.rough.columns] = 0.0
         everywhere = np.arange(self.rows.size)
         packed = [self._packed(part, everywhere, K) for part in (P, G)]
