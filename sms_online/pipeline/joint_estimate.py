@@ -63,6 +63,7 @@ class JointEstimate(Stage):
             self.tracker.begin(known_beforehand(self._nuisances, base.n))
         self.bias, self.grams = self._new_sums()
         self.earlier = self._new_sums()[0]
+        self._kept: ScaleFree | None = None  # of the rows so far
         self.state = JointEstimateState(np.zeros((0, len(self._nuisances) + base.n + 1)), np.zeros(self._n_v))
 
     def _new_sums(self) -> tuple[NoiseBias, RowGrams]:
@@ -71,12 +72,14 @@ class JointEstimate(Stage):
 
     def begin_behind_event(self, known: Information, bias: NoiseBias) -> None:
         """Go on with what is known from before an event, and what noise in the columns did by then."""
+        self._kept = None
         bias.widen(len(self._nuisances) + self._n - bias.parameters)
         self.bias, self.earlier, self.state.known = bias, state_copy(bias), known.factor
         self.tracker.begin(known)
 
     def begin_drift(self, known: Information) -> None:
         """Forget what took parameters for constant, and go on from what is known, priors within."""
+        self._kept = None
         # What rows before an event did stays: they alone may know parameters apart, as a link and a payload on it.
         self.bias, self.grams = state_copy(self.earlier), self._new_sums()[1]
         self.state.known, self._within = known.factor, True
@@ -85,7 +88,7 @@ class JointEstimate(Stage):
 
     def add(self, rows: WhiteRows, t: float) -> None:
         """Take in the rows of a window that ends at t, s."""
-        M = rows.Y.shape[0]
+        self._kept, M = None, rows.Y.shape[0]
         self.tracker.update(Rows(rows.Y[:, :-1], rows.Y[:, -1], np.ones(M), np.full(M, t)))
         self.bias.add(rows.Y, rows.noisy)
         now, before = self.state, self.state.weights
@@ -114,14 +117,21 @@ class JointEstimate(Stage):
         return estimate.rss / max(estimate.dof, 1.0) * (1.0 + float(fit.plain.misfit.mean()))
 
     def scale_free(self, fit: MomentumFit) -> ScaleFree | None:
-        """Where rows leave more than noise, what gives the estimate in place of least squares."""
+        """Where rows leave more than noise, what gives the estimate in place of least squares.
+
+        The same until rows come, for its minimum and its covariance take time.
+        """
         if not fit.plain.misfit.any() or self.grams.windows == 0:
             return None
         assert fit.weights is not None
         weights = np.pad(fit.weights, (len(self._nuisances), 0))
         lacking = fit.plain.misfit > 0.0
-        known, unscaled = self.beforehand(), self._prior is None
-        return ScaleFree(state_copy(self.grams), lacking, fit.torque, weights, fit.columns, known, unscaled)
+        kept = self._kept
+        if kept is None or np.any(kept.lacking != lacking) or np.any(kept.weights != weights):
+            known, unscaled = self.beforehand(), self._prior is None
+            kept = ScaleFree(state_copy(self.grams), lacking, fit.torque, weights, fit.columns, known, unscaled)
+            self._kept = kept
+        return kept
 
     def beforehand(self) -> Beforehand:
         """What is known of nuisances and parameters beside the rows; tolerances may be released, within bounds."""

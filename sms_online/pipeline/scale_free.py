@@ -18,7 +18,7 @@ Econometrics 165 (2011) 137 (few long blocks and Student's t).
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
@@ -54,6 +54,7 @@ class ScaleFree:
     columns: Columns
     known: Beforehand
     alone: bool
+    _robust: dict[bytes, Array] = field(default_factory=dict, init=False, repr=False, compare=False)
 
     def minimum(self) -> Minimum:
         """The minimum next to the weights, rows counting as independent as their blocks of time show them to be."""
@@ -73,7 +74,10 @@ class ScaleFree:
 
     def estimate(self, squares: Estimate) -> Estimate:
         """The same with a robust covariance from blocks of time, which takes three times as long."""
-        robust = self._of_blocks(squares.determined)
+        known = squares.determined
+        robust = self._robust.get(known.tobytes())
+        if robust is None:
+            robust = self._robust[known.tobytes()] = self._of_blocks(known)
         return replace(self._solved(self.minimum(), squares), covariance_robust=robust)
 
     @cached_property
