@@ -138,6 +138,11 @@ class Correction:
     constants: list[Effect]
 
     @property
+    def excess(self) -> float:
+        """Sum of squares that is left beyond noise."""
+        return self.hypothesis.excess(self.hypothesis.everything)
+
+    @property
     def converged(self) -> bool:
         """Whether the next one would change nothing."""
         return self.hypothesis.converged(self.solution)

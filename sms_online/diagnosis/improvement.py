@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -12,7 +13,8 @@ from sms_online.diagnosis.attempt import SEARCHED, Attempt, Case, ModelFit, Prog
 from sms_online.diagnosis.candidate import Finding
 from sms_online.diagnosis.constants import possible
 from sms_online.diagnosis.folds import LEAST_RISE
-from sms_online.diagnosis.hypothesis import corrections
+from sms_online.diagnosis.hypothesis import Correction, corrections
+from sms_online.diagnosis.trace import DECISIVE
 from sms_online.stream import Array
 
 # What is found may leave so many times of the held-out torque that the description leaves: of rows without a torque it
@@ -32,20 +34,17 @@ def with_constants(
     Samples are corrected by the constants, and what these leave, or have hidden, is searched again; not by those with
     which held-out torques are predicted worse than by the description alone, whose state is `bare`.
     """
-    n = attempt.rows.base.n
     findings: list[Finding] = []
     while any(attempt.tracing.candidates[k].constant for k in chosen):
         progress("improving constants", SEARCHED)
         before = attempt, [k for k in chosen if not attempt.tracing.candidates[k].constant]
-        findings += [attempt.tracing.finding(chosen, k) for k in chosen if attempt.tracing.candidates[k].constant]
-        solution = attempt.solution(chosen)
-        fresh, forces = attempt.found(chosen, solution)
-        constants, beta = [*attempt.constants, *fresh], solution[:n]
-        trial = partial(_trial, attempt, forces)
-        for correction in corrections(trial, constants, beta):
-            constants, beta = correction.constants, correction.solution[:n]
-            if correction.converged or case.stop():
-                break
+        chosen, correction, refuted = _distinguished(case, attempt, chosen)
+        found = [attempt.tracing.finding(chosen, k) for k in chosen if attempt.tracing.candidates[k].constant]
+        findings += [
+            replace(each, ambiguous=tuple(key for key in each.ambiguous if key not in refuted)) for each in found
+        ]
+        constants, beta = correction.constants, correction.solution[: attempt.rows.base.n]
+        forces = attempt.found(chosen, attempt.solution(chosen))[1]
         keys = {effect.key for effect in constants}
         constants = [effect for effect in constants if possible(effect, case.session.system.sample_rate)]
         tried = [candidate.effect for candidate in attempt.tracing.candidates]
@@ -60,6 +59,40 @@ def with_constants(
     kept = {effect.key for effect in attempt.constants}
     findings = [f for f in findings if f.candidate.key in kept]
     return attempt, chosen, findings
+
+
+def _improved(case: Case, attempt: Attempt, chosen: Sequence[int]) -> Correction:
+    """The constants among those chosen, beside those that samples are corrected by already, improved together."""
+    solution = attempt.solution(chosen)
+    fresh, forces = attempt.found(chosen, solution)
+    beta = solution[: attempt.rows.base.n]
+    for correction in corrections(partial(_trial, attempt, forces), [*attempt.constants, *fresh], beta):
+        if correction.converged or case.stop():
+            break
+    return correction
+
+
+def _distinguished(case: Case, attempt: Attempt, chosen: list[int]) -> tuple[list[int], Correction, set[str]]:
+    """Those chosen, with a rival in the place of a constant where samples that it corrects leave clearly less; the
+    improved constants; and keys of those that leave clearly more than the ones in their place.
+
+    To first order the zero of an encoder may be that of the other one of its joint. Corrected samples show which it is.
+    """
+    candidates, refuted = attempt.tracing.candidates, set[str]()
+    best = _improved(case, attempt, chosen)
+    for place in [n for n, k in enumerate(chosen) if candidates[k].constant]:
+        keys = attempt.tracing.finding(chosen, chosen[place]).ambiguous
+        for rival in [j for j, each in enumerate(candidates) if each.constant and each.key in keys]:
+            if case.stop():
+                break
+            instead = [*chosen[:place], rival, *chosen[place + 1 :]]
+            other = _improved(case, attempt, instead)
+            gained = best.excess - other.excess
+            if abs(gained) > DECISIVE:
+                refuted.add(candidates[chosen[place] if gained > 0.0 else rival].key)
+            if gained > DECISIVE:
+                best, chosen = other, instead
+    return chosen, best, refuted
 
 
 def explaining_alone(case: Case, system: System, attempt: Attempt, chosen: Sequence[int]) -> list[Effect]:
