@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 
 from sms_online.description.schema import Effect
 from sms_online.diagnosis.attempt import Attempt, Case
@@ -26,6 +27,7 @@ def attempt() -> Attempt:
     return Attempt(case, system, candidates=EFFECTS)
 
 
+@pytest.mark.slow
 def test_what_effects_leave_does_not_depend_on_questions_before() -> None:
     bench = attempt()
     assert bench.tracing.freed
@@ -38,6 +40,7 @@ def test_what_effects_leave_does_not_depend_on_questions_before() -> None:
         assert again.test == before.test
 
 
+@pytest.mark.slow
 def test_a_search_finds_the_same_whatever_was_asked_before() -> None:
     one, other = attempt(), attempt()
     for chosen in ([2], [0], [1, 2]):

@@ -114,6 +114,7 @@ def test_start_and_stop_choose_the_samples(bench: Path) -> None:
     assert estimates(found)["link_1.inertia"] == pytest.approx(INERTIA, rel=1e-4)
 
 
+@pytest.mark.slow
 def test_replay_in_step_with_the_clock_changes_no_bit(bench: Path) -> None:
     short = ["replay", "run.csv", "--system", "axis.toml", "-to", "1.5"]
     assert main([*short, "--out", "fast"]) == 0

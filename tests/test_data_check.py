@@ -110,6 +110,7 @@ def test_times_in_milliseconds_are_recognised() -> None:
     assert "q_1: time in ms, not in s: a sample every 5" in found
 
 
+@pytest.mark.slow
 def test_times_are_recognised_without_described_sensors() -> None:
     found = grave(capture(t=lambda t: 1000.0 * t), parse_system(AXIS, "axis.toml"))
     assert ": time in ms, not in s: a sample every 5" in found
@@ -180,6 +181,7 @@ def test_the_check_and_the_estimate_count_the_same_outliers() -> None:
     assert "q_1: 3 outliers left out, the first at 2.500 s" in found.lines
 
 
+@pytest.mark.slow
 def test_a_few_outliers_are_no_reason_to_refuse() -> None:
     block = axis_block(coulomb=0.0)
     values = block.values.copy()

@@ -82,6 +82,7 @@ def test_whitened_rows_give_the_estimate_of_the_stream() -> None:
         (Effect(name="torque_delay", where="joint_2", coefficients={"time": 5e-4}), 5e-4),
     ],
 )
+@pytest.mark.slow
 def test_a_channels_column_is_the_change_of_corrected_rows(effect: Effect, linear: float) -> None:
     """Residuals of rows from corrected samples against those of the session: first order, so to 3 %."""
     _, rows = session()

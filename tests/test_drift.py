@@ -158,6 +158,7 @@ def test_the_end_of_a_drift_is_seen_within_three_seconds(seed: int) -> None:
     assert drift.std < 0.01
 
 
+@pytest.mark.slow
 def test_changes_of_a_rate_are_kept_for_half_a_minute() -> None:
     """The rate turns every 12 s; what is no more looked back at is forgotten, but for the last turn."""
     tracker = learned()

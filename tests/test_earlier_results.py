@@ -56,6 +56,7 @@ def test_two_runs_weigh_what_each_knows(first: sms.Result) -> None:
         assert found.value == pytest.approx(mean, abs=0.3 * found.std)
 
 
+@pytest.mark.slow
 def test_result_file_and_folder_are_the_same_prior(first: sms.Result, folder: Path) -> None:
     expected = numbers(sms.estimate(SYSTEM, run(2), prior=first))
     for given in (folder, str(folder / "results.json"), first.document()):

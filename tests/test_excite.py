@@ -105,6 +105,7 @@ def test_a_stated_limit_holds_in_place_of_the_described_motions() -> None:
     assert found.system.trajectory.duration == 2.0
 
 
+@pytest.mark.slow
 def test_without_a_described_motion_limits_are_enough() -> None:
     system = parse_system(AXIS + MOTION.partition("[trajectory]")[0], "axis.toml")
     found = excite(system, limits=Limits(angle=0.5), duration=2.0, iterations=1)

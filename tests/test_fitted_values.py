@@ -98,6 +98,7 @@ def test_a_second_diagnosis_replaces_the_fitted_values(rig: Path) -> None:
     assert second.fitted != first.fitted
 
 
+@pytest.mark.slow
 def test_a_combination_is_fitted_as_its_leading_parameter() -> None:
     system = sms.load_system("paper-planar")
     found = sms.estimate(system, planar_capture(1.0, "A"))

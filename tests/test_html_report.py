@@ -197,6 +197,7 @@ def test_a_course_of_a_long_session_is_thinned_evenly(monkeypatch: pytest.Monkey
     assert course.tested[-1] == block.t[-1]
 
 
+@pytest.mark.slow
 def test_replay_writes_it_beside_the_results(tmp_path: Path, planar_block: Block) -> None:
     capture = tmp_path / "run.csv"
     with CaptureWriter(capture, planar_block.channels) as writer:

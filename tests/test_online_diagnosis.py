@@ -206,6 +206,7 @@ class _Overwhelmed(Immediate):
         return True
 
 
+@pytest.mark.slow
 def test_where_too_much_is_lacking_only_the_whole_record_is_searched_again() -> None:
     block = axis_block(cogging, seconds=20.0)
     estimator = Estimator(SYSTEM, block.channels, "test")
@@ -257,6 +258,7 @@ def test_a_session_with_an_adopted_effect_resumes_to_the_bit() -> None:
     assert results_document(continued, 0.0, []) == results_document(running, 0.0, [])
 
 
+@pytest.mark.slow
 def test_pickled_statistics_say_the_same_after_an_adoption() -> None:
     estimator, _ = cogged(True)
     assert elsewhere(statistics_of(estimator)) == results_document(estimator, 0.0, [])

@@ -62,6 +62,7 @@ def test_a_tracker_alone_estimates_as_beside_others(choice: str, data: sms.Captu
         assert here.std == pytest.approx(there.std, rel=0.02)
 
 
+@pytest.mark.slow
 def test_no_choice_learns_drifts_and_begins_as_rls(data: sms.Capture, several: sms.Result) -> None:
     plain, learned = sms.estimate(SYSTEM, data), sms.estimate(SYSTEM, data, tracker="kalman:drift=learned")
     assert list(plain.parameters.values()) == list(learned.parameters.values())

@@ -77,6 +77,7 @@ def hanging(model: Model) -> Array:
     return x
 
 
+@pytest.mark.slow
 def test_rows_of_a_hanging_link_close_with_the_correction() -> None:
     """Statics of eight elements, read at two markers: what twists and bends the link is left to a hundredth."""
     described = truncation_alone(parse_system(HELD, "held"))

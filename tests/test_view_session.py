@@ -72,6 +72,7 @@ def results(directory: Path) -> dict[str, Any]:
     return found
 
 
+@pytest.mark.slow
 def test_the_recordings_last_values_are_the_results(recorded: Path) -> None:
     found = {p["symbol"]: p for p in results(recorded)["parameters"]}
     seen = set()

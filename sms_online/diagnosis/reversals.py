@@ -9,7 +9,7 @@ samples resolves a jump to half a sample only, so forces are averaged over insta
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from functools import cached_property
+from functools import cache, cached_property
 from typing import Any
 
 import numpy as np
@@ -33,6 +33,13 @@ LARGEST = 0.06
 BESIDE = 10.0
 
 
+@cache
+def _gains(M: int) -> tuple[float, float]:
+    """Deviations of a rate, and of what a filter twice as wide changes of it, for unit noise at unit sample rate."""
+    own, wide = kernel(M)[:, 1], kernel(2 * M)[:, 1]
+    return float(np.linalg.norm(own)), float(np.linalg.norm(wide - np.pad(own, M)))
+
+
 class Reversals:
     """Rates of one motor.
 
@@ -47,7 +54,7 @@ class Reversals:
         self._motor = layout.theta_m[joint]
         self._angles = [position(layout, sensing.coordinates(each.values), self._motor)[:, None] for each in segments]
         self._noise, self._rate, self._standstill = noise, sample_rate, standstill
-        self._known: dict[tuple[int, int], Array] = {}
+        self._known: dict[int, list[Array]] = {}
 
     @cached_property
     def _half_width(self) -> int:
@@ -68,10 +75,14 @@ class Reversals:
 
     def _rates(self, segment: int, M: int, at: NDArray[Any]) -> Array:
         """θ̇_m (K,) at samples `at` (K,) of a segment, between whole ones too, rad/s."""
-        key = segment, M
-        if key not in self._known:
-            self._known[key] = smooth_all(self._angles[segment], M, self._rate)[1][:, 0]
-        known = self._known[key]
+        if M not in self._known:
+            # All segments at once, for a search may see a hundred short ones.
+            lengths = [len(angle) for angle in self._angles]
+            rates = smooth_all(np.concatenate(self._angles), M, self._rate)[1][:, 0]
+            firsts = np.cumsum([0, *lengths[:-1]]).tolist()
+            ends = zip(firsts, lengths, strict=True)
+            self._known[M] = [rates[first : first + max(0, length - 2 * M)] for first, length in ends]
+        known = self._known[M][segment]
         return np.asarray(np.interp(at, np.arange(known.size) + M, known))
 
     def _turns(self, segment: int, samples: NDArray[np.int64], M: int) -> tuple[NDArray[np.intp], Array]:
@@ -90,8 +101,7 @@ class Reversals:
 
     def _noise_of(self, M: int) -> tuple[float, float]:
         """Deviation of the rate by noise, and of what it differs by from that of a filter twice as wide, rad/s."""
-        own, wide = kernel(M)[:, 1], kernel(2 * M)[:, 1]
-        alone, between = (self._noise * float(np.linalg.norm(w)) * self._rate for w in (own, wide - np.pad(own, M)))
+        alone, between = (self._noise * self._rate * gain for gain in _gains(M))
         return alone, between
 
     def mean(self, force: Callable[[Array], Array], motion: SeenMotion) -> Array:

@@ -15,10 +15,10 @@ from dataclasses import dataclass, replace
 
 import msgspec
 import numpy as np
-import scipy.linalg
 
 from sms_online.pipeline.latency import WANDER
 from sms_online.pipeline.white_rows import WhiteRows
+from sms_online.pipeline.whitening import forward_solved
 from sms_online.state import Stage, State
 from sms_online.stream import Array
 from sms_online.trackers.factor import extended
@@ -195,8 +195,8 @@ class ChangeDetector(Stage):
     def _excess(self, rows: WhiteRows) -> float:
         """χ² of the window less its expectation, in standard deviations √(2 n_v)."""
         late = WANDER * rows.raw[:, self._clocks]
-        L = np.linalg.cholesky(rows.covariance + late @ late.T)
-        own = scipy.linalg.solve_triangular(L, rows.raw, lower=True, check_finite=False)
+        L = np.asarray(np.linalg.cholesky(rows.covariance + late @ late.T), dtype=np.float64)
+        own = forward_solved(L, rows.raw)
         # What the rows add to the residual sum of squares is χ² of their innovations, with the estimate's own
         # uncertainty counted; directions that nothing is known of add nothing.
         known = self.state.known.factor.copy()

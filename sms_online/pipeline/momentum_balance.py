@@ -130,7 +130,9 @@ class MomentumBalance(Stage):
         self._sampling = WindowSampling(self.width, self.hop, self.margin)
         self._choice = WidthChoice(self._widths)
         self.with_moments = moments
-        self._phi = {s: self._weights(s) for s in {1, *(stride(M, self.hop) for M in self._widths)}}
+        strides = {1, *(stride(M, self.hop) for M in self._widths)}
+        self._phi = {s: self._weights(s) for s in strides}
+        self._moment_phi = {s: self._moment_weights(s) for s in strides}
         self.begin_segment()
 
     def _weights(self, s: int) -> tuple[Array, Array]:
@@ -262,7 +264,7 @@ class MomentumBalance(Stage):
             none = np.empty((STEPS + 1, 0)), np.empty((INSTANTS, 0))
             moment = np.empty(0)
             if self.with_moments:
-                psi, psi_dot = self._moment_weights(s)
+                psi, psi_dot = self._moment_phi[s]
                 moment = -(psi_dot @ values[:, :entries] + psi @ values[:, width : width + entries])
             out.append(Window(window // self.half_hop, last, weak[:, :entries], b, half_width, *none, moment))
         return out
@@ -293,7 +295,7 @@ class MomentumBalance(Stage):
             Y[:, self._rough] = weak[:, : self._rough.size]
             moment = row.moment.copy()
             if self.with_moments:
-                moment[self._rough] = -self._moment_weights(1)[0] @ columns[:, 0, : self._rough.size]
+                moment[self._rough] = -self._moment_phi[1][0] @ columns[:, 0, : self._rough.size]
             rough = responses(slopes, phi * self.sample_rate, half_width, self.sample_rate, STEPS)
             rest = stiction_std(breaking, still, phi)
             out.append(replace(row, Y=Y, b=row.b - weak[:, self._rough.size :], rough=rough, rest=rest, moment=moment))

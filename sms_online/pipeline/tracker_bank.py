@@ -206,7 +206,7 @@ class TrackerBank(Stage):
         m, n, b, ramp = self._nuisances, len(self._names), white.Y[:, -1], None
         Y = white.Y[:, : m + n]
         if self.follows:
-            ramp = np.pad(white.ramp[:, :n], ((0, 0), (m, 0)))
+            ramp = np.concatenate((np.zeros((len(Y), m)), white.ramp[:, :n]), axis=1)
         if white.drift is not None:
             b = b + Y[:, m:] @ white.drift.moved[:n] + white.ramp[:, :n] @ white.drift.rate[:n]
         return Rows(Y, b, np.ones(b.size), np.full(b.size, t), ramp)

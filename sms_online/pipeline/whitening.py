@@ -41,14 +41,14 @@ class Factor(State):
         size = n_v * (len(covariances) - 1)
         L = self.L[len(self.L) - size :, len(self.L) - size :]
         cross = np.concatenate([np.empty((n_v, 0)), *covariances[:-1]], axis=1).T  # (size, n_v)
-        X = _solved(L, cross) if size else cross
+        X = forward_solved(L, cross) if size else cross
         self.L = np.zeros((size + n_v, size + n_v))
         self.L[:size, :size] = L
         self.L[size:, :size], self.L[size:, size:] = X.T, np.linalg.cholesky(own - X.T @ X)
         return self.L[size:]
 
 
-def _solved(L: Array, right: Array) -> Array:
+def forward_solved(L: Array, right: Array) -> Array:
     """L⁻¹ times right-hand sides, L lower triangular: by LAPACK itself, for SciPy's checks take longer than it."""
     solution, _ = dtrtrs(L.T, right, lower=0, trans=1)
     return np.asarray(solution)
@@ -80,7 +80,7 @@ class Whitener(Stage):
         own = self.state.factor.push(covariances)
         seen = own.shape[1] - len(own)
         white = self.state.white[len(self.state.white) - seen :]
-        out = _solved(own[:, seen:], rows - own[:, :seen] @ white)
+        out = forward_solved(own[:, seen:], rows - own[:, :seen] @ white)
         self.state.white = np.concatenate((white, out))
         return out
 
