@@ -200,7 +200,7 @@ def test_one_torque_with_friction_fixes_the_scale() -> None:
         "stribeck_friction@joint_2:torque=6",
         "torque_gain@joint_2:ratio=.1",
     ]
-    data = sms.simulate("paper-planar", duration=20.0, grade="B", effects=lacking)
+    data = sms.simulate("paper-planar", duration=10.0, grade="B", effects=lacking)
     result = sms.estimate("paper-planar", data)
     share = result.residuals["joint_1"].relative
     assert share is not None
