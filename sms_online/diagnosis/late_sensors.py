@@ -140,9 +140,9 @@ def find_late(rows: SessionRows) -> LateSensor | None:
     # A drive that holds its command over a sample acts half a sample late.
     least = HELD / rows.model.system.sample_rate
     corners = [corner for corner in CORNERS if delay_of(corner) > least]
-    every = [(where, corner) for where in places for corner in corners]
-    limit = threshold(FALSE_ALARM, len(every), 1)
-    tried = [(lags.left(where, corner), where, corner) for where, corner in _near_best(rows, every, limit)]
+    limit = threshold(FALSE_ALARM, len(places) * len(corners), 1)
+    near = _near_best(rows, list(places), corners, limit)
+    tried = [(lags.left(where, corner), where, corner) for where, corner in near]
     # A lag that is none leaves some types of rows with less and others with more.
     tried = [each for each in tried if lags.gains(before, each[0]).min() > -limit]
     best, where, corner = min(tried, key=lambda each: each[0].sum(), default=(before, "", np.inf))
@@ -167,11 +167,14 @@ def find_late(rows: SessionRows) -> LateSensor | None:
     return LateSensor(lag(where, corner), std, float(gain), limit, *shares, tuple(late_keys((), alike)))
 
 
-def _near_best(rows: SessionRows, every: list[tuple[str, float]], limit: float) -> list[tuple[str, float]]:
+def _near_best(
+    rows: SessionRows, places: Sequence[str], corners: Sequence[float], limit: float
+) -> list[tuple[str, float]]:
     """Lags (place, corner) that gain nearly as much as the best does, by part of a session where that is longer.
 
-    limit: what gains by accident, or loses.
+    limit: what gains by accident, or loses. Where a short lag loses more, a longer one of that place does too.
     """
+    every = [(where, corner) for where in places for corner in corners]
     some = stretches(rows, rows.segments)
     if sum(part.index.size for part in some) == sum(part.index.size for part in rows.segments):
         return every
@@ -179,10 +182,16 @@ def _near_best(rows: SessionRows, every: list[tuple[str, float]], limit: float) 
     before = lags.left()
     if not np.all(np.isfinite(before)):
         return every
-    by_type = [lags.gains(before, lags.left(where, corner)) for where, corner in every]
-    gains = np.array([each.sum() if each.min() > -limit else -np.inf for each in by_type])
-    best = np.argsort(-gains, kind="stable")[:MOST_NEAR]
-    return [every[k] for k in best.tolist() if gains[k] > max(0.0, NEAR_BEST * gains.max())]
+    gains: dict[tuple[str, float], float] = {}
+    for where in places:
+        for corner in sorted(corners, key=delay_of):
+            gained = lags.gains(before, lags.left(where, corner))
+            gains[where, corner] = float(gained.sum()) if gained.min() > -limit else -np.inf
+            if gained.sum() < -limit:
+                break
+    most = max(0.0, NEAR_BEST * max(gains.values()))
+    near = sorted((each for each in gains if gains[each] > most), key=lambda each: -gains[each])
+    return near[:MOST_NEAR]
 
 
 def _refined(lags: Lags, where: str, corner: float) -> float:

@@ -139,7 +139,8 @@ class _Search:
         if not found:
             found = list(self._scaled(rows, freed))
             if _left(given, PHYSICS) > LEAST_RATIO:
-                found += self._samples(undoings(self.system, self._channels), given, PHYSICS, LEAST_RATIO)
+                likely = self._likely(undoings(self.system, self._channels))
+                found += self._samples(likely, given, PHYSICS, LEAST_RATIO)
         if not found:
             return False
         left = [_left(each.fit) for each in found]
@@ -167,14 +168,33 @@ class _Search:
         u = best.undoing
         self._undone.append(u)
         self.found.append(Mistake(u.name, u.where, u.sentence, u.step, before, _left(best.fit), others))
-        self._segments = self._corrected(u)
+        self._segments = self._corrected(u, self._segments)
         if u.system is not None:
             self.system = u.system(self.system)
             self.session = Estimator(self.system, self.session.sensing.channels, "")
 
-    def _corrected(self, undoing: Undoing) -> list[Segment]:
-        made = (replace(each, values=undoing.apply(self._channels, each.values)) for each in self._segments)
+    def _corrected(self, undoing: Undoing, segments: Sequence[Segment]) -> list[Segment]:
+        made = (replace(each, values=undoing.apply(self._channels, each.values)) for each in segments)
         return [part for each in made for part in without_gaps(each)]
+
+    def _likely(self, tried: Iterable[Undoing]) -> Iterator[Undoing]:
+        """Those that divide what is left of the first stretch by the root of LEAST_RATIO, or all if it is too short."""
+        first = self._segments[:1]
+        try:
+            rows = RoughRows(self.session, first)
+        except np.linalg.LinAlgError:
+            rows = None
+        if len(self._segments) == 1 or rows is None or rows.for_each < LEAST_ROWS:
+            yield from tried
+            return
+        least = _left(rows.fit(), PHYSICS) / np.sqrt(LEAST_RATIO)
+        for undoing in tried:
+            try:
+                left = _left(RoughRows(self.session, self._corrected(undoing, first)).fit(), PHYSICS)
+            except np.linalg.LinAlgError:
+                continue  # readings that no shape of the links gives
+            if left <= least:
+                yield undoing
 
     def _samples(self, tried: Iterable[Undoing], given: RoughFit, explained: float, least: float) -> Iterator[_Tried]:
         """Those that divide what a fit leaves by a ratio at least.
@@ -183,7 +203,7 @@ class _Search:
         """
         for undoing in tried:
             try:
-                rows = RoughRows(self.session, self._corrected(undoing))
+                rows = RoughRows(self.session, self._corrected(undoing, self._segments))
                 better = _left(given, explained) / _left(rows.fit(), explained) > least
             except np.linalg.LinAlgError:
                 continue  # readings that no shape of the links gives
