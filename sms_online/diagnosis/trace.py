@@ -218,6 +218,7 @@ class Tracing(Acceptance):
         laws = sorted((k for k in beside if self._holds(k)), key=lambda k: -gains[k].gain)[:RIVALS]
         if not laws:
             return None
+        before = len(known)
         for k in laws:
             if k not in known:
                 known[k] = self._deviance([*chosen, k], acting=k)
@@ -230,7 +231,8 @@ class Tracing(Acceptance):
 
         rivals = [rival for rival in (None, best) if rival != law]
         decisive = known[law] < np.inf and all(known[law] < deviance(rival) - DECISIVE for rival in rivals)
-        self.reweight(chosen)
+        if len(known) > before:
+            self.reweight(chosen)
         return law if decisive else None
 
     def _iterated(self, chosen: Sequence[int]) -> None:
