@@ -25,6 +25,8 @@ TURNS, TURN_TOLERANCE = (2.0 * np.pi, np.pi, 360.0), 0.1
 # A reading that wraps elsewhere steps by more than this multiple of its usual steps, every time by the same within
 # this share.
 JUMP, SAME_STEP = 20.0, 0.05
+# Samples on either side of such a step that its size is found from.
+BESIDE_JUMP = 25
 # Units of time that stamps may be in by mistake, by how many of them are a second.
 CLOCKS = {"ms": 1e3, "µs": 1e6, "ns": 1e9}
 
@@ -48,11 +50,23 @@ def wrapped_at(steps: Array) -> tuple[float, int] | None:
             return turn, found
     jumps = np.flatnonzero(size > JUMP * max(usual, 1e-12))
     if jumps.size and size[jumps].min() > (1.0 - SAME_STEP) * size[jumps].max():
-        # The reading moves on while it jumps, as it does before and after.
-        near = np.delete(np.arange(steps.size), jumps)
-        moved = np.interp(jumps, near, steps[near]) if near.size else np.zeros(jumps.size)
-        return float(np.median(np.abs(steps[jumps] - moved))), jumps.size
+        ends = np.concatenate(([-1], jumps, [steps.size]))
+        sizes = [_jump(steps[a + 1 : c], b - a - 1) for a, b, c in zip(ends[:-2], jumps, ends[2:], strict=True)]
+        return float(np.median(np.abs(sizes))), jumps.size
     return None
+
+
+def _jump(steps: Array, at: int) -> float:
+    """Size of the jump in a reading's steps (B,) from sample to sample at index `at`, beside a cubic that it follows.
+
+    From some samples on either side: the noise of the two at the jump would stay in all readings behind it.
+    """
+    first = max(0, at - BESIDE_JUMP)
+    near = steps[first : at + BESIDE_JUMP + 1]
+    behind = np.arange(near.size + 1) > at - first
+    along = np.linspace(-1.0, 1.0, behind.size)
+    shape = np.vander(along, min(4, near.size))
+    return float(np.linalg.lstsq(np.column_stack((behind, shape)), np.append(0.0, np.cumsum(near)))[0][0])
 
 
 def stuck_samples(values: Array) -> NDArray[np.bool_]:
