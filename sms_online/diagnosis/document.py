@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 from sms_online.description.schema import Effect
@@ -20,7 +21,7 @@ from sms_online.threads import one_blas_thread
 from sms_online.verdict.evidence import Evidence
 from sms_online.verdict.judge import judge, judge_diagnosis
 from sms_online.verdict.judged import JudgedEvaluation, evaluated
-from sms_online.verdict.reasons import undecided
+from sms_online.verdict.reasons import THEN_DIAGNOSE, undecided
 from sms_online.verdict.trust import Reason, Trust
 
 SCHEMA = "sms-online/diagnosis/1"
@@ -111,12 +112,13 @@ def _from_rows(diagnosis: Search) -> bool:
 
 
 def _after(diagnosis: Search, session: JudgedEvaluation) -> Trust:
-    """May the parameters after be trusted?"""
-    if not _from_rows(diagnosis):
-        return session.trust
-    # Parameters come from the rows of the diagnosis then, see `posterior`.
-    known = [p["identifiable"] for p in posterior(diagnosis.attempt, diagnosis.chosen)]
-    return judge(Evidence((sum(known), len(known)), residual=_part(diagnosis.after.fit)))
+    """May the parameters after be trusted? What to do next is no diagnosis: this is one."""
+    trust = session.trust
+    if _from_rows(diagnosis):
+        # Parameters come from the rows of the diagnosis then, see `posterior`.
+        known = [p["identifiable"] for p in posterior(diagnosis.attempt, diagnosis.chosen)]
+        trust = judge(Evidence((sum(known), len(known)), residual=_part(diagnosis.after.fit)))
+    return replace(trust, grounds=tuple(replace(r, then=r.then.removesuffix(THEN_DIAGNOSE)) for r in trust.grounds))
 
 
 def trust_of(diagnosis: Search, after: JudgedEvaluation | None = None) -> Trust:
