@@ -93,7 +93,7 @@ class HomogeneousRows:
                 information += weight[speed] * (cross + cross.T + squares[speed] * np.outer(along, along))
                 slope += weight[speed] * squares[speed] * along
             size = np.sqrt(np.diag(information))
-            root = np.linalg.cholesky(information / np.outer(size, size)).T * size
+            root = _root(information / np.outer(size, size)) * size
             aim = root @ solution + solve_triangular(root, slope, trans="T")
             found = solve_triangular(root, aim)
             return bounded(root, aim, positive) if np.any(found[positive] < 0.0) else found
@@ -106,6 +106,16 @@ class HomogeneousRows:
             squares = float(pi @ M @ pi)
             if squares > 0.0:
                 yield speed, M @ pi / squares
+
+
+def _root(information: Array) -> Array:
+    """Upper triangular root of an information matrix (n, n) of unit diagonal, which rounding may leave indefinite."""
+    try:
+        return np.asarray(np.linalg.cholesky(information).T)
+    except np.linalg.LinAlgError:
+        share, axes = np.linalg.eigh(information)
+        lost = len(share) * np.finfo(np.float64).eps * share[-1]
+        return np.asarray(np.linalg.qr(np.sqrt(np.maximum(share, lost))[:, None] * axes.T, mode="r"))
 
 
 class Scale:
