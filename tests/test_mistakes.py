@@ -162,7 +162,21 @@ def test_whole_turns_are_those_of_the_other_encoder() -> None:
     wrapped = np.stack((np.mod(link, 1.2), motor), axis=1)
     (undoing,) = shown(names, [Segment(np.arange(motor.size), wrapped)])
     assert (undoing.name, undoing.where) == ("wrapped", "q_1")
-    assert np.abs(undoing.apply(names, wrapped)[:, 0] - link).max() < 1e-3
+    assert np.abs(undoing.apply(names, wrapped)[:, 0] - link).max() < 3e-4
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("channel", ["q_2", "theta_m_2"])
+def test_the_zero_of_one_encoder_is_not_the_others(channel: str) -> None:
+    """To first order they differ by their signs alone."""
+
+    def turned(values: dict[str, Array]) -> None:
+        values[channel] += 0.02
+
+    search = diagnose(stated(), [wrong(turned)], "test", lambda estimator: None)
+    (finding,) = search.findings
+    assert finding.candidate.key == f"encoder_offset@{channel}"
+    assert not finding.ambiguous
 
 
 def test_a_stuck_encoder_is_left_out_and_one_at_rest_is_not() -> None:

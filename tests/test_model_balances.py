@@ -118,6 +118,20 @@ def test_each_sample_of_a_block_is_computed_alone(system: System) -> None:
         close(model.momentum_columns(x[one], v[one])[1], G[one], 1e-13)
 
 
+@all_systems
+def test_columns_of_some_parameters_are_those_of_all(system: System) -> None:
+    model = build_model(system)
+    x, v = random_states(model.layout, 6, seed=13)
+    wanted = model.inertial[1::2]
+    others = [k for k in model.inertial if k not in wanted]
+    flexible = {k for link in model.links for k in link.parameters}  # a link's columns come together
+    for some, every in zip(
+        model.of_parameters(wanted).momentum_columns(x, v), model.momentum_columns(x, v), strict=True
+    ):
+        close(some[..., wanted], every[..., wanted], 1e-13)
+        assert not some[..., [k for k in others if k not in flexible]].any()
+
+
 def test_internal_forces_leave_the_base_rows_clean() -> None:
     """Springs, dampers and friction act between the base's bodies: the base's momentum balance does not hold them."""
     model = build_model(SYSTEMS["planar linear"])
