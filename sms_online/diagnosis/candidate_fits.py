@@ -157,9 +157,10 @@ class CandidateFits:
         Kept until rows are whitened anew.
         """
         key = self._key(chosen, beside)
-        columns = None if key in self._solved else self._columns(chosen, beside)
-        if columns is not None and key not in self._solved:  # else `zeroed` has solved it
-            self._solved[key] = self._fitted_to(chosen, columns, self._b)
+        if key not in self._solved:
+            columns = self._columns(chosen, beside)
+            if key not in self._solved:  # `zeroed` may have solved it for its columns
+                self._solved[key] = self._fitted_to(chosen, columns, self._b)
         return self._solved[key]
 
     def _fitted_to(self, chosen: Sequence[int], columns: Array, b: Array) -> Array:

@@ -8,6 +8,7 @@ What scales everything alike leaves no residual; there the described nominal val
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -179,12 +180,11 @@ class _Search:
 
     def _likely(self, tried: Iterable[Undoing]) -> Iterator[Undoing]:
         """Those that divide what is left of the first stretch by the root of LEAST_RATIO, or all if it is too short."""
-        first = self._segments[:1]
-        try:
-            rows = RoughRows(self.session, first)
-        except np.linalg.LinAlgError:
-            rows = None
-        if len(self._segments) == 1 or rows is None or rows.for_each < LEAST_ROWS:
+        first, rows = self._segments[:1], None
+        if len(self._segments) > 1:
+            with suppress(np.linalg.LinAlgError):
+                rows = RoughRows(self.session, first)
+        if rows is None or rows.for_each < LEAST_ROWS:
             yield from tried
             return
         least = _left(rows.fit(), PHYSICS) / np.sqrt(LEAST_RATIO)
