@@ -138,9 +138,14 @@ class Correction:
     constants: list[Effect]
 
     @property
-    def excess(self) -> float:
-        """Sum of squares that is left beyond noise."""
-        return self.hypothesis.excess(self.hypothesis.everything)
+    def misfit(self) -> float:
+        """Sum of squares that is left beyond noise, and of what calibration takes over its tolerances.
+
+        Calibration that is free to explain what a constant leaves would make any two of them equal.
+        """
+        calibrated = self.hypothesis.rows.calibrated
+        taken = self.solution[self.solution.size - calibrated.count :] / calibrated.tolerance
+        return self.hypothesis.excess(self.hypothesis.everything) + float(taken @ taken)
 
     @property
     def converged(self) -> bool:

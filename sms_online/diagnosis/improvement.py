@@ -87,7 +87,7 @@ def _distinguished(case: Case, attempt: Attempt, chosen: list[int]) -> tuple[lis
                 break
             instead = [*chosen[:place], rival, *chosen[place + 1 :]]
             other = _improved(case, attempt, instead)
-            gained = best.excess - other.excess
+            gained = best.misfit - other.misfit
             if abs(gained) > DECISIVE:
                 refuted.add(candidates[chosen[place] if gained > 0.0 else rival].key)
             if gained > DECISIVE:
