@@ -104,7 +104,7 @@ class Case:
     """A capture to be diagnosed: its session with the system as described, samples, and those held out.
 
     progress: see `Progress`. stop: whether to end with what has been found. learned: whether curves are tried where no
-    law is selected. begins: of further captures, see `captures`.
+    law is selected. begins: of further captures, see `captures`. heeded: whether a search heeds the prior.
     """
 
     source: str
@@ -117,6 +117,7 @@ class Case:
     stop: Callable[[], bool] = lambda: False
     learned: bool = False
     begins: tuple[float, ...] = ()
+    heeded: bool = True
 
 
 def _noise_behind(described: Estimator, case: Case) -> SensorNoise:
@@ -179,7 +180,8 @@ class Attempt(Hypothesis):
         described = applied(system, constants)
         same = described == session.system
         estimator = session if same else Estimator(described, session.sensing.channels, case.source)
-        prior = case.prior(estimator)
+        self._known = case.prior(estimator)
+        prior = self._known if case.heeded else None
         noise = _noise_behind(estimator, case)
         span = system.windows.momentum
         length, longest = bounded(system)
@@ -228,10 +230,10 @@ class Attempt(Hypothesis):
     def by_rows(self) -> bool:
         """Whether parameters are those of these rows, and not those of a session with what was found.
 
-        So they are with a prior, and where rows without a torque leave more than noise: a session begins anew there,
-        and may end at another scale.
+        So they are with a prior that these heed; without any prior, where rows without a torque leave more than noise:
+        nothing says then at which scale a session ends.
         """
-        return self.prior is not None or self.tracing.freed
+        return self.prior is not None or (self.tracing.freed and self._known is None)
 
     def watch(self, chosen: Sequence[int]) -> bool:
         """See `Hypothesis`."""

@@ -76,10 +76,11 @@ def diagnose(
     )  # fmt: skip
     progress("tracing what it leaves", FITTED_ONCE)
     try:
-        attempt = described = Attempt(case, system)
+        case, attempt = _first(case, system)
     except np.linalg.LinAlgError as error:
         raise InputError(source, "", str(error), "the links' own markers, in their frames") from error
     followed = before
+    described = attempt
     # From one capture to the next parameters may change at once.
     if len(runs) == 1 and not before.trackers[0].learns and leaves_more(before) and may_explain(attempt.rows):
         progress("looking for parameters that drift", FITTED_ONCE)
@@ -167,6 +168,19 @@ def diagnose(
         estimator_after=estimator_after,
         unexplained=unexplained,
     )
+
+
+def _first(case: Case, system: System) -> tuple[Case, Attempt]:
+    """The system against a case's samples, and the case with what is heeded.
+
+    Rows that leave more than noise whatever is added contradict what is known beforehand, and effects that there are
+    not would reconcile the two: what they lack is searched by what they say alone.
+    """
+    alone = replace(case, heeded=False)
+    attempt = Attempt(alone, system)
+    if attempt.tracing.freed or case.prior(case.session) is None:
+        return alone, attempt
+    return case, Attempt(case, system)
 
 
 def _check_unchanged(session: Estimator, source: str) -> None:

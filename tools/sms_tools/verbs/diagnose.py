@@ -17,7 +17,6 @@ from sms_online.description.schema import System
 from sms_online.diagnosed import Diagnosis, diagnose
 from sms_online.errors import InputError
 from sms_online.pipeline.estimator import Estimator
-from sms_online.priors import base_prior, given_prior
 from sms_online.tables import json_text
 from sms_online.truth import true_values
 from sms_tools.adopted_system import added_lines, adopted_text, remarks
@@ -104,8 +103,8 @@ def _watched(args: argparse.Namespace, system: System, found: Diagnosis, capture
     after = found.search.after.system
     estimator = Estimator(after, capture.channels, str(args.captures[0]))
     estimates: dict[str, tuple[float, float]] = {}
-    if found.search.attempt.prior is not None:
-        estimator.set_prior(base_prior(after, estimator.base, given_prior(args.prior)))
+    if (known := found.search.attempt.case.prior(estimator)) is not None:
+        estimator.set_prior(known)
     if found.search.attempt.by_rows:
         # These come from the diagnosis's rows, not from a session; see `diagnosis_document`.
         estimates = {p.name: (p.value, p.std) for p in found.after.parameters.values()}
