@@ -189,6 +189,7 @@ def test_a_stuck_encoder_is_left_out_and_one_at_rest_is_not() -> None:
     stuck[2500:3500] = stuck[2500]
     (undoing,) = shown(["q_1"], one(stuck))
     assert undoing.name == "stuck"
+    assert not undoing.certain  # no other encoder says that the joint moves
     (segment,) = one(undoing.apply(("q_1",), stuck[:, None])[:, 0])
     assert [part.index.size for part in without_gaps(segment)] == [2501, 1500]
     # Slows down, is at rest, to the last bit of its encoder, and starts again.
@@ -204,7 +205,9 @@ def test_an_arm_that_stops_is_not_stuck() -> None:
     for held, found in (([0], ["q_1"]), ([0, 1], [])):
         values = moving.copy()
         values[4000:, held] = values[4000, held]
-        assert [each.where for each in shown(names, [Segment(np.arange(t.size), values)])] == found
+        stuck = list(shown(names, [Segment(np.arange(t.size), values)]))
+        assert [each.where for each in stuck] == found
+        assert all(each.certain for each in stuck)
 
 
 def test_a_held_command_is_joined_where_it_changes() -> None:

@@ -35,7 +35,7 @@ AS_STATED = 0.3
 LEAST_RATIO = 10.0
 # Where samples show it by themselves, by this; where it scales everything alike, which nominal values alone show, by
 # that.
-LEAST_SHOWN, LEAST_COMMON = 1.2, 3.0
+LEAST_SHOWN, LEAST_COMMON = 1.1, 3.0
 # A torque in its right unit or gear leaves no coordinate more than this multiple of what it left before, unless that is
 # little: else what the model lacks has only been moved from one coordinate to another.
 MOST_WORSE = 2.0
@@ -197,7 +197,7 @@ class _Search:
                 yield undoing
 
     def _samples(self, tried: Iterable[Undoing], given: RoughFit, explained: float, least: float) -> Iterator[_Tried]:
-        """Those that divide what a fit leaves by a ratio at least.
+        """Those that divide what a fit leaves by a ratio at least, and those that are certain.
 
         By least squares, which has one minimum: freed rows may get to a better one by chance where others do not.
         """
@@ -207,7 +207,7 @@ class _Search:
                 better = _left(given, explained) / _left(rows.fit(), explained) > least
             except np.linalg.LinAlgError:
                 continue  # readings that no shape of the links gives
-            if better:
+            if better or undoing.certain:
                 yield _Tried(undoing, rows.freed())
 
     def _torques(self, rows: RoughRows) -> Iterator[_Tried]:

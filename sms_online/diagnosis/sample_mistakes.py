@@ -27,7 +27,7 @@ class Undoing:
     """A mistake and what undoes it.
 
     name, where: its kind and place. sentence: what is wrong. step: what to do. apply: gives samples (B, channels)
-    without it. system: the description without it, where it is one of that.
+    without it. system: the description without it, where it is one of that. certain: whether samples leave no doubt.
     """
 
     name: str
@@ -36,6 +36,7 @@ class Undoing:
     step: str
     apply: Callable[[tuple[str, ...], Array], Array]
     system: Callable[[System], System] | None = None
+    certain: bool = False
 
 
 def shown(channels: Sequence[str], segments: Sequence[Segment]) -> Iterator[Undoing]:
@@ -234,7 +235,8 @@ def _stuck(positions: Sequence[str], channels: Sequence[str], segments: Sequence
             count = sum(int(each.sum()) for each in stuck)
             said = f"{name} is stuck at one value for {count} samples while it moves before"
             step = f"check encoder and cable of {name}; leave that time out with -ss and -to"
-            yield Undoing("stuck", name, said, step, _without_stuck(name))
+            # The joint's other encoder moves meanwhile, if there is one.
+            yield Undoing("stuck", name, said, step, _without_stuck(name), certain=bool(others))
 
 
 def _moves(when: Sequence[NDArray[np.bool_]], readings: Sequence[Array]) -> bool:
