@@ -111,6 +111,15 @@ def test_the_error_of_a_friction_law_is_no_second_effect(share: float, second: l
     assert _found(candidates, 150.0 * (sign + share * other), 1) == ["coulomb_friction", *second]
 
 
+@pytest.mark.parametrize(("size", "found"), [(30.0, ["cogging", "torque_offset"]), (2.5, [])])
+def test_rows_may_rise_on_the_way_beside_what_falls(size: float, found: list[str]) -> None:
+    """The first effect raises rows of another speed to thrice their noise, which the second one mends."""
+    own, other = np.random.default_rng(11).standard_normal((2, WINDOWS))
+    first, second = _candidate("cogging", own), _candidate("torque_offset", np.zeros(WINDOWS))
+    first.columns[:, 1, 0], second.columns[:, 1, 0] = 3.0 * other / size, other
+    assert _found([first, second], size * own, 1) == found
+
+
 def test_an_effect_hidden_by_its_noise_replaces_its_substitute() -> None:
     """An axis that sticks in a tenth of the windows: there friction takes any value, and a ripple fits it better."""
     rng = np.random.default_rng(7)

@@ -12,7 +12,7 @@ from sms_online.description.schema import System
 from sms_online.diagnosis.attempt import FITTED_ONCE, SEARCHED, TRACED, Attempt, Case, Part, PriorOf, Progress
 from sms_online.diagnosis.calibrated import sayable
 from sms_online.diagnosis.captures import begins, in_seconds, one_after_another, undone
-from sms_online.diagnosis.drifts import explained_by_drifts, following, leaves_more, may_explain
+from sms_online.diagnosis.drifts import explained_by_drifts, following, leaves_more, leaves_unexplained, may_explain
 from sms_online.diagnosis.exact_links import with_exact_links
 from sms_online.diagnosis.hypothesis import share_left, verdict
 from sms_online.diagnosis.improvement import explaining_alone, no_joint_worse, predicts_worse, with_constants
@@ -136,9 +136,9 @@ def diagnose(
     said = verdict(
         named, share_left(bare.excess, after.excess), after.test, bare.test, [each.candidate for each in findings]
     )
-    # Where the model lacks something, its rows may look like those of a change. With what was found constant parameters
-    # explain the capture; a session of it may still take what a law is inexact by for a small change.
-    if not partial and said != "named":
+    # With what was found constant parameters explain the capture, though its session may take what a law is inexact by
+    # for a change. What a change does not explain may only look like one.
+    if not partial and said != "named" and not leaves_unexplained(before):
         _check_unchanged(before, source)
     grave = said == "clean" and evaluated(before).trust.grave
     # What is left unexplained takes such numbers anywhere.

@@ -34,12 +34,18 @@ def following(system: System) -> System:
     return system.model_copy(update={"trackers": (LEARNED,)})
 
 
+def leaves_unexplained(session: Estimator) -> bool:
+    """Whether a session shows more than noise that no change of parameters explains."""
+    momentum = session.momentum
+    return momentum is not None and session.by_momentum and (momentum.test.alarm is not None or momentum.misfit)
+
+
 def leaves_more(session: Estimator) -> bool:
     """Whether a session whose parameters stay shows more than noise, a change of parameters, or one that may be."""
     momentum = session.momentum
     if momentum is None or not session.by_momentum:
         return False
-    return momentum.test.alarm is not None or momentum.misfit or bool(session.events) or bool(momentum.bank.suspected)
+    return leaves_unexplained(session) or bool(session.events) or bool(momentum.bank.suspected)
 
 
 def may_explain(rows: WeakRows) -> bool:
