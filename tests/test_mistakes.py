@@ -49,9 +49,9 @@ def wrong(change: Change, seed: int = 4) -> Block:
     return Block(block.t, block.channels, np.stack(list(values.values()), axis=1))
 
 
-def found(change: Change) -> Corrected:
-    block = wrong(change)
-    estimator, record = Estimator(stated(), block.channels, "test"), SampleRecord(stated().sample_rate)
+def found(change: Change, system: System | None = None) -> Corrected:
+    block, system = wrong(change), system or stated()
+    estimator, record = Estimator(system, block.channels, "test"), SampleRecord(system.sample_rate)
     estimator.observers.append(record)
     estimator.push(block)
     estimator.finish()
@@ -99,12 +99,26 @@ def test_a_mistake_is_named_and_nothing_else(change: Change, key: str, words: st
 
 @pytest.mark.slow
 def test_a_wrong_gear_is_corrected_in_the_system() -> None:
-    corrected = found(times(1.6, "tau_2"))
+    """The rotor's inertia acts with the square of the ratio and with the ratio itself: no factor of the torque does."""
+    joints = list(stated().joints)
+    joints[1] = joints[1].model_copy(update={"gear_ratio": 100.0})
+    corrected = found(lambda values: None, stated().model_copy(update={"joints": tuple(joints)}))
     assert [mistake.key for mistake in corrected.mistakes] == ["gear_ratio@joint_2"]
     ratio = corrected.system.joints[1].gear_ratio
-    assert ratio == pytest.approx(50.0 / 1.6, rel=0.05)
+    assert ratio == pytest.approx(50.0, rel=0.01)
     text = adopted_text("paper-planar", stated(), corrected.system, {})
     assert f"gear_ratio = {ratio:.4g} # found; the file said 50" in text
+
+
+@pytest.mark.slow
+def test_a_wrong_torque_constant_is_no_wrong_gear() -> None:
+    corrected = found(times(1.6, "tau_2"))
+    assert [mistake.key for mistake in corrected.mistakes] == ["gear_ratio@joint_2"]
+    assert corrected.mistakes[0].sentence.startswith("tau_2 is 1.6 × what the other rows give")
+    assert corrected.system == stated()
+    block = wrong(times(1.6, "tau_2"))
+    undone = corrected.samples(block.channels, block.values)
+    np.testing.assert_allclose(undone, session(4).values, rtol=0.01)
 
 
 @pytest.mark.long

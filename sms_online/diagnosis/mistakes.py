@@ -16,7 +16,7 @@ import numpy as np
 from sms_online.description.channels import drive_channel
 from sms_online.description.schema import System
 from sms_online.diagnosis.record import Segment
-from sms_online.diagnosis.rough_fit import RoughFit, RoughRows, stretches
+from sms_online.diagnosis.rough_fit import SMALLEST, RoughFit, RoughRows, stretches
 from sms_online.diagnosis.sample_mistakes import Undoing, scaled, shown, undoings, without_gaps
 from sms_online.nominal import is_geared
 from sms_online.pipeline.estimator import Estimator
@@ -49,6 +49,9 @@ LARGEST_GAIN = 1.3
 SAME_CLOCK = 20.0
 # At most so many mistakes are looked for in turn.
 MOST = 3
+# A factor of a torque that divides what is left by this may be one of the gear, which is then tried for itself; of
+# mistakes that explain all coordinates one is clearly worse that leaves as much more.
+LIKELY = 3.0
 # A gear is described as smaller or larger by less than this factor.
 LARGEST_GEAR = 30.0
 
@@ -144,10 +147,12 @@ class _Search:
                 found += self._samples(likely, given, PHYSICS, LEAST_RATIO)
         if not found:
             return False
-        left = [_left(each.fit) for each in found]
-        best = int(np.argmin(left))
-        others = [found[k] for k in range(len(found)) if k != best and left[k] < SAME_RATIO * left[best]]
-        self._take(found[best], _left(freed), tuple(each.undoing.sentence for each in others))
+        least = SAME_RATIO * min(_left(each.fit) for each in found)
+        near = sorted((each for each in found if _left(each.fit) < least), key=lambda each: _left(each.fit))
+        # All of these explain what a rough fit can; nominal values decide unless one clearly leaves least.
+        finest = min(_finely(each.fit) for each in near)
+        best, *others = (each for each in near if _finely(each.fit) < LIKELY * finest)
+        self._take(best, _left(freed), tuple(each.undoing.sentence for each in others))
         return True
 
     def _scaled(self, rows: RoughRows, given: RoughFit) -> Iterator[_Tried]:
@@ -160,10 +165,26 @@ class _Search:
             return
         most = np.maximum(MOST_WORSE * given.left, PHYSICS)
         for each in self._torques(rows):
+            if each.geared is not None and before > LIKELY * _left(each.fit):
+                each = self._in_gear(each, each.geared)
             explained = (LEAST_COMMON if each.common else LEAST_RATIO) * _left(each.fit)
             better = before > explained and np.all(each.fit.left <= most)
             if better and _left(rows.freed(start=each.fit.beta)) > explained:
                 yield each
+
+    def _in_gear(self, tried: _Tried, geared: Undoing) -> _Tried:
+        """The factor of a torque, or of the gear ratio in the description where that explains more.
+
+        A rotor's inertia acts with the square of the ratio on its own joint and with the ratio on the bodies that it
+        turns with: that distinguishes a gear from a torque constant.
+        """
+        assert geared.system is not None
+        system = geared.system(self.system)
+        try:
+            fit = RoughRows(Estimator(system, self._channels, ""), self._segments).freed()
+        except np.linalg.LinAlgError:
+            return tried
+        return _Tried(geared, fit) if _finely(fit) < _finely(tried.fit) else tried
 
     def _take(self, best: _Tried, before: float, others: tuple[str, ...]) -> None:
         u = best.undoing
@@ -236,10 +257,14 @@ class _Search:
             gained = 1.0 / LARGEST_GAIN < best < LARGEST_GAIN
             if not gained and 1.0 / LARGEST_GEAR < best < LARGEST_GEAR and likely([i], best):
                 where, ratio = f"joint_{i + 1}", gear * best
+                drive = self._drives[i]
+                said = f"{drive} is {1.0 / best:.3g} × what the other rows give: its torque constant or the gear ratio"
+                then = f"check the torque constant of {where}, then its gear ratio"
+                undoing = Undoing("gear_ratio", where, said, then, scaled([drive], best))
                 said = f"the gear ratio of {where} looks like {ratio:.3g}, described as {gear:g}"
                 then = f"check the gear ratio of {where}, then its torque constant"
-                undoing = Undoing("gear_ratio", where, said, then, _same, _geared(i, best))
-                yield _Tried(undoing, rows.freed(times([i], best)))
+                geared = Undoing("gear_ratio", where, said, then, _same, _geared(i, best))
+                yield _Tried(undoing, rows.freed(times([i], best)), geared=geared)
 
     def _causes(self, joints: Sequence[int]) -> Iterator[tuple[float, Undoing]]:
         """What torques of some joints may be in place of what they should, with the factor that undoes it."""
@@ -269,11 +294,18 @@ class _Search:
 class _Tried:
     """A fit with a mistake undone.
 
-    fit: that one, rows without a torque freed. common: whether it scales all torques alike."""
+    fit: that one, rows without a torque freed. common: whether it scales all torques alike. geared: the same factor in
+    the gear ratio that the system describes."""
 
     undoing: Undoing
     fit: RoughFit
     common: bool = False
+    geared: Undoing | None = None
+
+
+def _finely(fit: RoughFit) -> float:
+    """Product over the coordinates of all that is left, where coordinates are explained as well as a rough fit can."""
+    return float(np.exp(np.sum(np.log(np.maximum(fit.left, SMALLEST)))))
 
 
 def _left(fit: RoughFit, explained: float = EXPLAINED) -> float:

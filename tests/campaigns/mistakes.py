@@ -109,11 +109,24 @@ def joint_torque(values: Values, system: System, rng: np.random.Generator) -> st
     return f"joint_torque@{', '.join(names)}"
 
 
-def gear_ratio(values: Values, system: System, rng: np.random.Generator) -> str:
-    """What the description calls the ratio is so much too large: the shaft's torque is larger than it should be."""
+def torque_constant(values: Values, system: System, rng: np.random.Generator) -> str:
+    """The shaft's torque is larger or smaller than it should be, as with a wrong gear ratio."""
     joint = int(rng.integers(1, 3))
     _times(values, [f"tau_{joint}"], float(rng.choice([0.4, 0.6, 1.6, 2.0])))
     return f"gear_ratio@joint_{joint}"
+
+
+def gear_ratio(values: Values, system: System, rng: np.random.Generator) -> str:
+    """See `other_gear`."""
+    return f"gear_ratio@joint_{int(rng.integers(1, 3))}"
+
+
+def other_gear(system: System, key: str, rng: np.random.Generator) -> System:
+    """The system described with another gear ratio of the joint in the key of a mistake."""
+    factor, joints = float(rng.choice([0.4, 0.6, 1.6, 2.0])), list(system.joints)
+    joint = joints[i := int(key[-1]) - 1]
+    joints[i] = joint.model_copy(update={"gear_ratio": factor * joint.gear_ratio})
+    return system.model_copy(update={"joints": tuple(joints)})
 
 
 def motor_angle(values: Values, system: System, rng: np.random.Generator) -> str:
@@ -166,8 +179,8 @@ def clean(values: Values, system: System, rng: np.random.Generator) -> str:
 MISTAKES: dict[str, Callable[[Values, System, np.random.Generator], str]] = {
     make.__name__: make
     for make in (
-        torque_sign, angle_sign, swapped, degrees, millimetres, torque_unit, clock_unit, joint_torque, gear_ratio,
-        motor_angle, encoder, held_command, zero_offset, markers, clean,
+        torque_sign, angle_sign, swapped, degrees, millimetres, torque_unit, clock_unit, joint_torque, torque_constant,
+        gear_ratio, motor_angle, encoder, held_command, zero_offset, markers, clean,
     )
 }  # fmt: skip
 
@@ -190,7 +203,10 @@ def case(name: str, cache: Path, seed: int, mistake: str) -> Record:
     key = MISTAKES[mistake](values, system, rng)
     wrong = Block(values["t"], block.channels, np.stack([values[c] for c in block.channels], axis=1))
     start = process_time()
-    found = diagnose(described(system, rng), [wrong], "case", lambda _: None)
+    stated = described(system, rng)
+    if mistake == gear_ratio.__name__:
+        stated = other_gear(stated, key, rng)
+    found = diagnose(stated, [wrong], "case", lambda _: None)
     keys = [each.key for each in found.mistakes] + [finding.candidate.key for finding in found.findings]
     return {
         "true": key, "found": keys, "verdict": found.verdict,
