@@ -100,7 +100,7 @@ def diagnosis_document(
         ],
         "warnings": [
             *warnings,
-            # Those of a session are of the session's parameters, which with a prior are not those reported.
+            # Those of a session are of its parameters, which are not those reported where these come from rows.
             *(_after(diagnosis, sessions["after"]).warnings if given else sessions["after"].warnings),
         ],
     }

@@ -151,7 +151,7 @@ class _Search:
         near = sorted((each for each in found if _left(each.fit) < least), key=lambda each: _left(each.fit))
         # All of these explain what a rough fit can; nominal values decide unless one clearly leaves least.
         finest = min(_finely(each.fit) for each in near)
-        best, *others = (each for each in near if _finely(each.fit) < LIKELY * finest)
+        best, *others = (each for each in near if _finely(each.fit) < finest + np.log(LIKELY))
         self._take(best, _left(freed), tuple(each.undoing.sentence for each in others))
         return True
 
@@ -304,8 +304,8 @@ class _Tried:
 
 
 def _finely(fit: RoughFit) -> float:
-    """Product over the coordinates of all that is left, where coordinates are explained as well as a rough fit can."""
-    return float(np.exp(np.sum(np.log(np.maximum(fit.left, SMALLEST)))))
+    """Sum over the coordinates of the logarithm of what is left: the product may be below what floats hold."""
+    return float(np.sum(np.log(np.maximum(fit.left, SMALLEST))))
 
 
 def _left(fit: RoughFit, explained: float = EXPLAINED) -> float:
