@@ -75,6 +75,26 @@ def test_sums_without_a_block_are_those_of_the_others(windows: int) -> None:
         np.testing.assert_allclose(without.signal.matrices, sums(others).signal.matrices, rtol=1e-9, atol=1e-9)
 
 
+def test_products_of_blocks_are_those_of_their_rows() -> None:
+    """With a nuisance, which noise leaves as it is, and sums that were weighted anew."""
+    random, n_v = np.random.default_rng(0), 2
+    grams, w = RowGrams.none(n_v, 2, 1), np.array([3.0, *TRUE, -1.0])
+    rows, added = random.standard_normal((2, 3 * SHORTEST_BLOCK + 7, n_v, 4))
+    added[..., 0] = 0.0
+    for each, noise in zip(rows, added, strict=True):
+        grams.add(each, np.stack((each + noise, each - noise)))
+    grams.whiten_anew((np.ones(2), np.array([9.0, 9.0])), (np.ones(2), np.array([99.0, 9.0])))
+    starts = [0, SHORTEST_BLOCK, 2 * SHORTEST_BLOCK]
+    by_window = [np.einsum("kvi,kvj->kvij", each, each) for each in (rows, added[..., 1:])]
+    share = np.array([0.1, 1.0])[:, None, None]
+    for signal, diagonal, products, own in zip(
+        (share * np.add.reduceat(each, starts) for each in by_window),
+        grams.block_diagonals(), grams.block_products(w), (w, w[1:]), strict=True,
+    ):  # fmt: skip
+        np.testing.assert_allclose(products, signal @ own, rtol=1e-9, atol=1e-9)
+        np.testing.assert_allclose(diagonal, np.einsum("kvii->kvi", signal), rtol=1e-9)
+
+
 def test_blocks_count_as_the_sums_when_weights_change() -> None:
     grams = RowGrams.none(1, 2)
     for k, each in enumerate(torque_rows(0, 200)):

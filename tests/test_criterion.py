@@ -120,7 +120,7 @@ def test_a_nuisance_beyond_its_tolerance_shrinks_no_parameter() -> None:
     """Rows u (π_2 + ν π_2) = 0 of a nuisance ν of 100 tolerances, whose column was evaluated with the true π."""
     random = np.random.default_rng(0)
     offset, tolerance = 0.05, 5e-4
-    grams = RowGrams.none(2, 3)
+    grams = RowGrams.none(2, 2, 1)
     for _ in range(1000):
         x, y, u, v = random.standard_normal(4)
         exact = np.array([[0.0, x, y, TRUE @ (x, y)], [3.0 * v, u, -u * TRUE[0] / TRUE[1] - offset * v, 0.0]])

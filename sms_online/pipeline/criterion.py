@@ -61,22 +61,29 @@ class Columns:
     gains: tuple[int, ...]
     inertial: NDArray[np.bool_]
 
-    @property
-    def of_motion(self) -> NDArray[np.bool_]:
-        """Which columns (m + n + 1, m + n + 1) share their error where no torque is: those of inertial forces.
+    def sharing(self, torque: bool) -> NDArray[np.bool_]:
+        """Which columns (m + n + 1,) of rows with a torque, or of others, share their error.
 
-        All inertial forces follow from the same accelerations, and may cancel each other. Nuisances have none.
+        All inertial forces follow from the same accelerations, and may cancel each other. Where a torque is, it is all
+        that is wrong, with its gain.
         """
-        inertial = np.append(self.inertial, False)
-        forces = np.arange(inertial.size) >= self.nuisances
-        return np.asarray(np.outer(inertial, inertial) | np.diag(forces & ~inertial))
-
-    @property
-    def of_torque(self) -> NDArray[np.bool_]:
-        """The same where a torque is: it is all that is wrong, with its gain."""
+        if not torque:
+            return np.append(self.inertial, False)
         own = np.zeros(self.inertial.size + 1, dtype=np.bool_)
         own[[*self.gains, -1]] = True
-        return np.outer(own, own)
+        return own
+
+    @property
+    def apart(self) -> NDArray[np.bool_]:
+        """Which (m + n + 1,) have an error of their own in rows without a torque. Nuisances have none."""
+        forces = np.arange(self.inertial.size + 1) >= self.nuisances
+        return np.asarray(forces & ~self.sharing(torque=False))
+
+    def same(self, torque: bool) -> NDArray[np.bool_]:
+        """Which pairs (m + n + 1, m + n + 1) have the same error."""
+        sharing = self.sharing(torque)
+        pairs = np.outer(sharing, sharing)
+        return pairs if torque else pairs | np.diag(self.apart)
 
 
 @dataclass(frozen=True)
@@ -101,7 +108,7 @@ class Minimum:
 
 @dataclass(frozen=True)
 class _Point:
-    """w (n + 1,) and its products (·, n + 1) with the matrices of a criterion: linear in w."""
+    """w (m + n + 1,) and its products with the matrices of a criterion: linear in w."""
 
     w: Array
     A: Array
@@ -134,16 +141,25 @@ class Criterion:
     ) -> None:
         signal, of_noise = grams.signal.matrices, grams.noise.matrices
         self._A, self._lacking = signal, lacking
+        self._torque, self._columns = torque, columns
         self._squares = np.einsum("vii->vi", signal)
         self._count = np.where(lacking, grams.windows / OVERLAP, float(grams.windows))
         if lasting is not None:
             self._count = self._count / lasting
-        self._same = np.where(torque[lacking, None, None], columns.of_torque, columns.of_motion)
-        self._M = np.where(self._same, signal[lacking] - of_noise[lacking], 0.0)
+        m = grams.nuisances
+        self._noisy_columns = slice(m, None)
+        # What the model lacks is an error of these columns.
+        self._wrong = np.flatnonzero(columns.sharing(torque=True) | columns.sharing(torque=False) | columns.apart)
+        pairs = np.ix_(self._wrong, self._wrong)
+        kinds = np.array([columns.same(torque=kind)[pairs] for kind in (False, True)])
+        beyond = signal[lacking]
+        beyond[:, m:, m:] -= of_noise[lacking]
+        beyond = beyond[:, self._wrong[:, None], self._wrong]
+        self._M = np.where(kinds[torque[lacking].astype(int)], beyond, 0.0)
         diagonal = np.einsum("vii->vi", self._M)
         diagonal[:] = np.maximum(diagonal, 0.0)
         # Rows without noise have a constant deviation: one.
-        noise = of_noise @ start @ start
+        noise = of_noise @ start[m:] @ start[m:]
         noisy = ~lacking & ~torque & (noise > grams.windows * LEAST_NOISE)
         scale = np.where(noisy, grams.windows / np.where(noisy, noise, 1.0), np.where(lacking & ~torque, 1.0, 0.0))
         self._constant = np.where(lacking | noisy, 0.0, float(grams.windows))
@@ -151,8 +167,17 @@ class Criterion:
         self._G = scale[self._noisy, None, None] * of_noise[self._noisy]
 
     def at(self, w: Array) -> _Point:
-        """w (n + 1,) with its products."""
-        return _Point(w, self._A @ w, self._G @ w, self._M @ w)
+        """w (m + n + 1,) with its products."""
+        of_noise, of_lack = w[self._noisy_columns], w[self._wrong]
+        return _Point(w, self._A @ w, self._G @ of_noise, self._M @ of_lack)
+
+    def _noise(self, at: _Point) -> Array:
+        """Sums of squares (n_v,) of what noise adds to the residual, where they are counted."""
+        return self._spread(at.G @ at.w[self._noisy_columns], self._noisy)
+
+    def _lack(self, at: _Point) -> Array:
+        """Sums of squares (n_v,) of the columns that the model may lack a share of."""
+        return self._spread(at.M @ at.w[self._wrong], self._lacking)
 
     def _spread(self, values: Array, rows: NDArray[np.bool_]) -> Array:
         """Values of some rows (·, …) among zeros of all (n_v, …)."""
@@ -171,14 +196,14 @@ class Criterion:
 
     def errors(self, at: _Point) -> Array:
         """e² (n_v,) that explains what the residual holds beyond noise."""
-        beyond = np.maximum(self.squares(at) - self._spread(at.G @ at.w, self._noisy), 0.0)
-        size = np.maximum(self._spread(at.M @ at.w, self._lacking), self._least(at.w))
+        beyond = np.maximum(self.squares(at) - self._noise(at), 0.0)
+        size = np.maximum(self._lack(at), self._least(at.w))
         return np.where(self._lacking, beyond / size, 0.0)
 
     def predicted(self, at: _Point, errors: Array) -> Array:
         """Expected sums of squares (n_v,)."""
-        of_model = errors * self._spread(at.M @ at.w, self._lacking)
-        noise = self._spread(at.G @ at.w, self._noisy) + of_model + self._constant
+        of_model = errors * self._lack(at)
+        noise = self._noise(at) + of_model + self._constant
         return np.asarray(np.maximum(noise, self._least(at.w)))
 
     def value(self, at: _Point, errors: Array) -> float:
@@ -198,14 +223,16 @@ class Criterion:
     def slopes(self, at: _Point, errors: Array) -> tuple[Array, Array, Array]:
         """By speed: slopes (n_v, n + 1), curvature of the squares and of the whole (n + 1, n + 1)."""
         S, D, n = self.squares(at), self.predicted(at, errors), self._count
-        a, g = at.A, self._spread(at.G, self._noisy)
-        g[self._lacking] += errors[self._lacking, None] * at.M
+        a, g = at.A, np.zeros_like(at.A)
+        g[self._noisy, self._noisy_columns] = at.G
+        g[np.ix_(self._lacking, self._wrong)] += errors[self._lacking, None] * at.M
         inside = np.where(self._lacking, n / S, n / D)  # weight of the squares
         outside = np.where(self._lacking, n / D, n * S / D**2)  # and of what is expected
         slopes = inside[:, None] * a - outside[:, None] * g
         squares = np.tensordot(inside, self._A, 1)
-        whole = squares - np.tensordot(outside[self._noisy], self._G, 1)
-        whole -= np.tensordot((outside * errors)[self._lacking], self._M, 1)
+        whole = squares.copy()
+        whole[self._noisy_columns, self._noisy_columns] -= np.tensordot(outside[self._noisy], self._G, 1)
+        whole[np.ix_(self._wrong, self._wrong)] -= np.tensordot((outside * errors)[self._lacking], self._M, 1)
         log, plain = np.where(self._lacking, n, 0.0), np.where(self._lacking, 0.0, n)
         whole += (-2.0 * log / S**2 * a.T) @ a
         cross = (-2.0 * plain / D**2 * a.T) @ g
@@ -218,23 +245,35 @@ class Criterion:
         Slopes of blocks of time scatter by as much as curvature says where errors are independent. Either counts in the
         metric of all curvature, so directions that others determine count little. before (n_v,): the factors so far.
         """
-        out, blocks = before.copy(), np.diff(grams.block_ends, axis=0)
-        if len(blocks) < 2:
+        out, count = before.copy(), len(grams.marks)
+        if count < 2:
             return out
         w = np.append(found.beta, -1.0)
         at = self.at(w)
         errors = self.errors(at)[self._lacking, None]
         S, D, n = (v[self._lacking] for v in (self.squares(at), self.predicted(at, self.errors(at)), self._count))
-        A, G = blocks[:, 0][:, self._lacking], blocks[:, 1][:, self._lacking]
-        of_model = np.where(self._same, A - G, 0.0) @ w
-        slopes = (n / S)[:, None] * (A @ w) - (n / D)[:, None] * errors * of_model
+        of_rows, of_model = grams.block_products(w)[0][:, self._lacking], self._lack_of_blocks(grams, w)
+        slopes = (n / S)[:, None] * of_rows - (n / D)[:, None] * errors * of_model
         scattered = (slopes - slopes.mean(axis=0))[..., :-1] @ found.directions
-        scatter = len(blocks) / (len(blocks) - 1) * np.sum(scattered**2, axis=(0, 2))
+        scatter = count / (count - 1) * np.sum(scattered**2, axis=(0, 2))
         curvature = self._A[self._lacking][:, :-1, :-1] @ found.directions
         expected = n / S * np.einsum("kr,vkr->v", found.directions, curvature)
         share = np.divide(scatter, expected, out=np.ones_like(scatter), where=expected > 0.0)
         out[self._lacking] = np.maximum(1.0, before[self._lacking] * share)
         return out
+
+    def _lack_of_blocks(self, grams: RowGrams, w: Array) -> Array:
+        """Products (blocks, lacking rows, m + n + 1) of the matrices M of each block of time with w."""
+        columns, torque, m = self._columns, self._torque[:, None], grams.nuisances
+        signal, noise = grams.block_diagonals()
+        signal[..., m:] -= noise
+        out = np.where(~torque & columns.apart, signal * w, 0.0)
+        for kind in (True, False):
+            sharing = columns.sharing(kind)
+            signal, noise = grams.block_products(np.where(sharing, w, 0.0))
+            signal[..., m:] -= noise
+            out += np.where((torque == kind) & sharing, signal, 0.0)
+        return np.asarray(out[:, self._lacking])
 
 
 def minimum(

@@ -86,7 +86,7 @@ class FirstWeights:
         Weights that follow a least-squares fit of rows that hold more than noise would shrink π to zero.
         """
         n_v, m = held.shape[2], self._nuisances
-        grams = RowGrams.none(n_v, m + self._nominal.size)
+        grams = RowGrams.none(n_v, self._nominal.size, m)
         for rows in held:
             padded = np.pad(rows, ((0, 0), (0, 0), (m, 0)))
             grams.add(padded[0], padded[1:])
@@ -98,7 +98,7 @@ class FirstWeights:
             for _ in range(2):
                 white = whiten(joint[m:])
                 plain.judge(joint)
-            grams = RowGrams.none(n_v, m + self._nominal.size)
+            grams = RowGrams.none(n_v, self._nominal.size, m)
             for each in white:
                 grams.add(each.Y, each.noisy)
             lacking, starts = plain.misfit > 0.0, [joint]

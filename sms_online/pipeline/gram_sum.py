@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
+
 import msgspec
 import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg.blas import dspmv
 
 from sms_online.state import State
 from sms_online.stream import Array
@@ -44,3 +48,54 @@ class GramSum(State):
     def scale(self, share: Array) -> None:
         """Have the rows so far count so much, (n_v,) of their squares."""
         self.total, self.waiting = share[:, None, None] * self.matrices, []
+
+
+class PackedGrams(State):
+    """Symmetric matrices as they were at some time: their upper triangles alone, which take half the memory.
+
+    triangles (n_v, n (n + 1) / 2): by columns, as BLAS packs them. share (n_v,): what they count now.
+    """
+
+    triangles: Array
+    share: Array
+
+    @staticmethod
+    def of(matrices: Array) -> PackedGrams:
+        """Of matrices (n_v, n, n)."""
+        n_v, n, _ = matrices.shape
+        return PackedGrams(matrices.reshape(n_v, n * n)[:, _triangle(n)], np.ones(n_v))
+
+    def scaled(self, share: Array) -> PackedGrams:
+        """The same, counting so much (n_v,) of what they count now."""
+        return PackedGrams(self.triangles, self.share * share)
+
+    @property
+    def _n(self) -> int:
+        return int(np.sqrt(2 * self.triangles.shape[1]))
+
+    @property
+    def matrices(self) -> Array:
+        """(n_v, n, n)."""
+        n, scaled = self._n, self.share[:, None] * self.triangles
+        out = np.empty((len(scaled), n * n))
+        out[:, _triangle(n)] = out[:, _triangle(n, upper=True)] = scaled
+        return out.reshape(-1, n, n)
+
+    @property
+    def diagonals(self) -> Array:
+        """(n_v, n)."""
+        ends = np.cumsum(np.arange(1, self._n + 1)) - 1
+        return np.asarray(self.share[:, None] * self.triangles[:, ends])
+
+    def times(self, w: Array) -> Array:
+        """Products (n_v, n) with w (n,)."""
+        n = self._n
+        products = [dspmv(n, 1.0, each, w) for each in self.triangles]
+        return np.asarray(self.share[:, None] * np.array(products))
+
+
+@lru_cache(maxsize=8)
+def _triangle(n: int, upper: bool = False) -> NDArray[np.intp]:
+    """Where the entries of the lower triangle, or their mirror images, lie in a matrix (n, n), row by row."""
+    rows, columns = np.tril_indices(n)
+    return columns * n + rows if upper else rows * n + columns

@@ -68,7 +68,7 @@ class JointEstimate(Stage):
 
     def _new_sums(self) -> tuple[NoiseBias, RowGrams]:
         columns = len(self._nuisances) + self._n
-        return NoiseBias.none(columns, self._calibration), RowGrams.none(self._n_v, columns)
+        return NoiseBias.none(columns, self._calibration), RowGrams.none(self._n_v, self._n, len(self._nuisances))
 
     def begin_behind_event(self, known: Information, bias: NoiseBias) -> None:
         """Go on with what is known from before an event, and what noise in the columns did by then."""

@@ -139,7 +139,7 @@ class MomentumFit(Stage):
         x, v, signals = (np.empty((0, columns)) for columns in widths)
         self.state = MomentumFitState(x, v, signals)
         self._errors = RowErrors(layout.n_v)
-        self.plain = PlainRows.none(layout.n_v, self._nuisances + base.n)
+        self.plain = PlainRows.none(layout.n_v, base.n, self._nuisances)
 
     def renew(self) -> None:
         """See Stage."""
@@ -334,8 +334,6 @@ class MomentumFit(Stage):
             # Samples are corrected by the point, rows are of the whole nuisances.
             raw[..., -1] += before @ self._point()
             white[..., -1] += behind @ self._point()
-            noisy = np.pad(noisy, ((0, 0), (0, 0), (self._nuisances, 0)))
-            weights = np.pad(weights, (self._nuisances, 0))
         raw, white = np.ascontiguousarray(raw), np.ascontiguousarray(white)
         out = []
         for k, (window, each) in enumerate(zip(windows, whitened, strict=True)):

@@ -22,10 +22,10 @@ ROUNDED = 16.0
 class PlainRows(State):
     """Sums over windows, by generalized speed.
 
-    grams, noise: Gram matrices of rows [Y b] and of a sample of their noise, over their deviations with the weights of
-    then. at_weights (n_v,): what such a sample leaves with those weights. windows: how many. misfit (n_v,): excess over
-    one of the mean square of such rows' residual, zero where it may be chance. patient: excess may be a drift that is
-    yet to be learned, and is none so far.
+    grams, noise: Gram matrices of rows [N Y b], and of a sample of the noise of [Y b], over their deviations with the
+    weights of then. at_weights (n_v,): what such a sample leaves with those weights. windows: how many. misfit (n_v,):
+    excess over one of the mean square of such rows' residual, zero where it may be chance. patient: excess may be a
+    drift that is yet to be learned, and is none so far.
     """
 
     grams: GramSum
@@ -36,23 +36,25 @@ class PlainRows(State):
     patient: bool = False
 
     @staticmethod
-    def none(n_v: int, n: int) -> PlainRows:
-        """Sums of no windows, with rows of n_v speeds and n parameters."""
-        return PlainRows(GramSum.none(n_v, n + 1), GramSum.none(n_v, n + 1), *np.zeros((2, n_v)))
+    def none(n_v: int, n: int, nuisances: int = 0) -> PlainRows:
+        """Sums of no windows, with rows of n_v speeds, n parameters and m nuisances."""
+        return PlainRows(GramSum.none(n_v, nuisances + n + 1), GramSum.none(n_v, n + 1), *np.zeros((2, n_v)))
 
     @property
     def gram(self) -> Array:
-        """Gram matrices (n_v, n + 1, n + 1) of the rows."""
+        """Gram matrices (n_v, m + n + 1, m + n + 1) of the rows."""
         return self.grams.matrices
 
     def clear(self) -> None:
         """Forget the windows, not the misfit."""
-        size = self.grams.total.shape[:2]
-        self.grams, self.noise = GramSum.none(*size), GramSum.none(*size)
+        self.grams, self.noise = (GramSum.none(*each.total.shape[:2]) for each in (self.grams, self.noise))
         self.at_weights, self.windows = np.zeros_like(self.at_weights), 0
 
     def add(self, rows: Array, noise: Array, variance: Array, weights: Array) -> None:
-        """Rows [Y b] (n_v, n + 1) of a window, a sample of their noise, and its variance (n_v,) with weights (n,)."""
+        """Rows [N Y b] (n_v, m + n + 1) of a window, and what noise does to [Y b] of it.
+
+        noise (n_v, n + 1): a sample; variance (n_v,): of the rows with weights (n,).
+        """
         std = np.sqrt(variance)[:, None]
         sample = noise / std
         self.grams.add((rows / std)[:, None])
@@ -67,7 +69,8 @@ class PlainRows(State):
         # Where samples are exact nothing but rounding is left of the sum.
         rounding = np.finfo(np.float64).eps * (np.abs(gram) @ np.abs(w) @ np.abs(w))
         # The variances are those of the weights; noise grows with β.
-        noise = self.noise.matrices @ w @ w
+        own = w[-self.noise.total.shape[1] :]
+        noise = self.noise.matrices @ own @ own
         scale = np.divide(
             noise, self.at_weights, out=np.ones_like(noise), where=(noise > 0.0) & (self.at_weights > 0.0)
         )

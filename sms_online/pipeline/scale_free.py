@@ -118,13 +118,13 @@ class ScaleFree:
         Infinite where blocks are fewer than two, and where one alone determines a parameter.
         """
         found, lasting = self._found
-        without, covariance = self.grams.without_blocks(), found.covariance
-        count, w = len(without), np.append(found.beta, -1.0)
+        covariance = found.covariance
+        count, w = len(self.grams.marks), np.append(found.beta, -1.0)
         if count < 2:
             return masked_covariance(covariance, np.zeros_like(known))
         beforehand = self._penalty.derivatives(w)[1]
         fits = []
-        for grams in without:
+        for grams in self.grams.without_blocks():
             criterion = self._criterion(grams, lasting)
             at = criterion.at(w)
             curvature = criterion.slopes(at, criterion.errors(at))[1][:-1, :-1] + beforehand
