@@ -90,13 +90,13 @@ def unit_factors(system: System) -> dict[str, float]:
         f"the {drive} looks like m{unit} in place of {unit}": 1e3,
         f"the {drive} looks like k{unit} in place of {unit}": 1e-3,
         "the angles look like degrees": math.pi / 180.0,
-        f"the {drive} has the other sign": -1.0,
+        f"the sign of the {drive} looks inverted": -1.0,
     }
     gears = {joint.gear_ratio for joint in system.joints if is_geared(joint)}
     if len(gears) == 1:
         (gear,) = gears
         out["tau_i looks like the joint's torque in place of the motor shaft's"] = gear
-        out["tau_i looks divided by the gear ratio once more"] = 1.0 / gear
+        out["tau_i looks divided by the gear ratio twice"] = 1.0 / gear
     return out
 
 

@@ -20,7 +20,8 @@ def smoother_warnings(now: Statistics) -> list[str]:
     out = [f"the smoother left out {failure}" for failure in smoother.failures]
     missing = ", ".join(setup.sensing.missing)
     if now.method != "smoother":
-        text = f"{missing} are not measured, so links are bent statically: estimates are off by percents"
+        bent = "links are taken to bend quasi-statically: estimates are off by several percent"
+        text = f"{missing} are not measured, so {bent}"
         return [*out, text] if missing else out
     if missing:
         out.append(f"not measured, but estimated by the equations of motion: {missing}")
@@ -50,7 +51,7 @@ def notices(now: Statistics) -> list[str]:
     if np.isfinite(fastest) and not 0.8 < fastest / period < 1.25:
         rate = f"{1.0 / fastest:.4g}"
         said = f"the capture has {rate} samples/s, the system file says {system.sample_rate:g}"
-        out.append(f"{said}: state sample_rate = {rate}, for interpolated samples hold nothing new and take time")
+        out.append(f"{said}: state sample_rate = {rate}, for interpolated samples add no information and take time")
     late = [name for sensor in system.sensors if sensor.delay(system.sample_rate) for name in sensor.channels]
     if late and now.method == "smoother":
         out.append(f"latency of {', '.join(late)} is described but not corrected by the smoother")

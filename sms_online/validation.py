@@ -82,7 +82,8 @@ class Validation(Tabled):
             return f"The parameters hold on this run: at most {100.0 * worst.left:.2g} % of a torque is left ({name})."
         name, worst = max(failing.items(), key=lambda item: item[1].ratio)
         left = f"{100.0 * worst.left:.2g} % of the torque of {name} is left"
-        return f"The parameters do not hold on this run: {left}, {worst.ratio:.3g} times what others would leave."
+        ratio = f"{worst.ratio:.3g} times the residual of parameters fitted to it"
+        return f"The parameters do not hold on this run: {left}, {ratio}."
 
     def document(self) -> dict[str, Any]:
         """validation.json as plain dictionaries and numbers."""

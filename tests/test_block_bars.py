@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from scipy.signal import lfilter
 
-from sms_online.pipeline.beforehand import Beforehand
 from sms_online.pipeline.criterion import Columns
 from sms_online.pipeline.estimator import Estimator
+from sms_online.pipeline.prior_information import PriorInformation
 from sms_online.pipeline.row_grams import MOST_BLOCKS, SHORTEST_BLOCK, RowGrams
 from sms_online.pipeline.scale_free import ScaleFree
 from sms_online.stream import Array
@@ -41,10 +41,10 @@ def sums(rows: Array) -> RowGrams:
     return grams
 
 
-def scale_free(rows: Array, known: Beforehand | None = None) -> ScaleFree:
+def scale_free(rows: Array, known: PriorInformation | None = None) -> ScaleFree:
     n = rows.shape[2] - 1
     columns = Columns(0, (), np.zeros(n, dtype=np.bool_))
-    beforehand = Beforehand.none(n) if known is None else known
+    beforehand = PriorInformation.none(n) if known is None else known
     every = np.ones(1, dtype=np.bool_)
     return ScaleFree(sums(rows), every, every, np.ones(n), columns, beforehand, True)
 
@@ -140,7 +140,7 @@ def test_posteriors_hold_where_errors_last(lasts: float) -> None:
         true = TRUE + std * np.random.default_rng(10_000 + seed).standard_normal(2)
         rows = torque_rows(seed, lasts=lasts)
         rows[..., 2] += rows[..., :2] @ (true - TRUE)
-        known = Beforehand(np.column_stack((np.eye(2), TRUE)) / std, np.zeros((0, 3)))
+        known = PriorInformation(np.column_stack((np.eye(2), TRUE)) / std, np.zeros((0, 3)))
         estimate = estimated(replace(scale_free(rows, known), alone=False))
         bar = np.max(deviations(estimate), axis=0)
         off.append(estimate.pi - true)
@@ -193,7 +193,7 @@ def test_a_prior_keeps_its_own_bar_where_rows_say_nothing() -> None:
     rows = torque_rows(4)
     rows[..., 2] -= TRUE[1] * rows[..., 1]
     rows[..., 1] = 0.0
-    prior = Beforehand(np.array([[0.0, 10.0, 10.0 * TRUE[1]]]), np.zeros((0, 3)))
+    prior = PriorInformation(np.array([[0.0, 10.0, 10.0 * TRUE[1]]]), np.zeros((0, 3)))
     estimate = estimated(scale_free(rows, prior))
     assert estimate.pi[1] == pytest.approx(TRUE[1])
     assert deviations(estimate)[1][1] == pytest.approx(0.1, rel=1e-6)

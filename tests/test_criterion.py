@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 import sms_online as sms
-from sms_online.pipeline.beforehand import Beforehand, Penalty
 from sms_online.pipeline.criterion import Columns, minimum
 from sms_online.pipeline.estimator import Estimator
 from sms_online.pipeline.momentum_windows import OVERLAP
+from sms_online.pipeline.prior_information import Penalty, PriorInformation
 from sms_online.pipeline.row_grams import RowGrams
 from sms_online.stream import Array
 from sms_online.trackers.interface import Prior
@@ -17,9 +17,9 @@ from tests.evaluated import judged, standard_deviation
 from tests.slow_encoder import GEAR, I_L, I_M, B, F, K, bench, session
 
 
-def _alone(n: int) -> tuple[Columns, Beforehand]:
+def _alone(n: int) -> tuple[Columns, PriorInformation]:
     """n parameters, none of them inertial, of which nothing is known beside the rows."""
-    return Columns(0, (), np.zeros(n, dtype=np.bool_)), Beforehand.none(n)
+    return Columns(0, (), np.zeros(n, dtype=np.bool_)), PriorInformation.none(n)
 
 
 TORQUE = np.array([True, False])
@@ -57,7 +57,7 @@ def test_the_slope_vanishes_at_the_minimum_but_for_priors() -> None:
     size = np.sqrt(np.diag(free.covariance))
     assert np.all(np.abs(free.slopes.sum(axis=0) * size) < 1e-3)
     prior = np.array([[10.0, 0.0, 10.0 * 1.5]])  # 1.5 ± 0.1
-    held = minimum(grams, lacking, TORQUE, [TRUE], _alone(2)[0], Beforehand(prior, np.zeros((0, 3))))
+    held = minimum(grams, lacking, TORQUE, [TRUE], _alone(2)[0], PriorInformation(prior, np.zeros((0, 3))))
     pull = prior[:, :-1].T @ (prior @ np.append(held.beta, -1.0))
     np.testing.assert_allclose(held.slopes.sum(axis=0) * size, -pull * size, atol=1e-3)
     assert 1.5 < held.beta[0] < free.beta[0]
@@ -88,7 +88,7 @@ def test_a_badly_explained_torque_enlarges_no_parameter() -> None:
         np.array([True]),
         [np.array([1.0])],
         Columns(0, (), np.zeros(1, dtype=np.bool_)),
-        Beforehand.none(1),
+        PriorInformation.none(1),
     )
     assert found.beta[0] == pytest.approx(2.0, abs=0.3)
     assert found.covariance[0, 0] == pytest.approx(36.0 * OVERLAP / 4000.0, rel=0.1)
@@ -127,13 +127,13 @@ def test_a_nuisance_beyond_its_tolerance_shrinks_no_parameter() -> None:
         added = 1e-4 * random.standard_normal((2, 4)) * np.array([[0.0, 0.0, 0.0, 1.0], [0.0, 1.0, 1.0, 0.0]])
         grams.add(exact + added, np.stack((exact + 2.0 * added, exact)))
     columns = Columns(1, (), np.zeros(3, dtype=np.bool_))
-    known = Beforehand(np.zeros((0, 4)), np.array([[1.0 / tolerance, 0.0, 0.0, 0.0]]))
+    known = PriorInformation(np.zeros((0, 4)), np.array([[1.0 / tolerance, 0.0, 0.0, 0.0]]))
     found = minimum(grams, np.array([False, True]), TORQUE, [np.array([0.0, *TRUE])], columns, known)
     np.testing.assert_allclose(found.beta, [offset, *TRUE], rtol=2e-3)
 
 
 def test_the_slope_of_the_penalty_is_its_difference() -> None:
-    known = Beforehand(np.array([[0.0, 3.0, 0.0, 1.0]]), np.array([[20.0, 0.0, 0.0, 0.0]]))
+    known = PriorInformation(np.array([[0.0, 3.0, 0.0, 1.0]]), np.array([[20.0, 0.0, 0.0, 0.0]]))
     penalty = Penalty(known, 1, np.array([[1.0, 2.0, 3.0, 1.0]]), np.array([0.0, 1.0, 2.0, -1.0]))
     for w in (np.array([0.01, 1.1, 1.8, -1.0]), np.array([3.0, 0.5, 2.5, -1.0])):
         slope = penalty.derivatives(w)[0]

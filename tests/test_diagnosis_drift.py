@@ -58,7 +58,7 @@ def test_a_drift_is_named_with_rate_and_value(found: sms.Diagnosis) -> None:
     assert drift.std < 0.2 * abs(RATE)
     assert drift.value == pytest.approx(INERTIA + RATE * (SECONDS - BEGIN), abs=4.0 * drift.value_std)
     assert found.summary.startswith("Link_1.inertia drifts since")
-    assert "nothing but noise is left" in found.summary
+    assert "the residual is noise" in found.summary
 
 
 @pytest.mark.slow

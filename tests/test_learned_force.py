@@ -1,4 +1,4 @@
-"""A curve in place of a law: found where the law is struck from the catalogue, as good on data not fitted, and bounded.
+"""A curve in place of a law: found where the law is struck from the catalogue, as good on held-out data, and bounded.
 
 An elastic axis of 12 s, noise of grade B (seed 1), whose spring hardens; its description states another stiffness.
 """

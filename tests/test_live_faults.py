@@ -181,7 +181,7 @@ FAULTS: dict[Callable[[Session], None], str] = {
     unknown_ids: "drive: 200 frames skipped, no channel comes from their ids",
     error_frames: "drive: 80 error frames, the bus or its controller reports trouble",
     unplugged: "encoder: silent for more than 1 s, 1 times",
-    half_frames: "encoder: 47 stretches skipped, no frame or line is as long as they are",
+    half_frames: "encoder: 47 stretches skipped, longer than any frame or line that is described",
     not_a_number: "encoder: .* values skipped, NaN or infinite",
     stuck_sensor: "q_1: 49. samples skipped, the sensor stood still or at its limit",
     torque_saturates: "force_1: .* samples skipped, the sensor stood still or at its limit",

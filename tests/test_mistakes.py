@@ -80,7 +80,7 @@ def test_a_session_without_a_mistake_has_none() -> None:
 @pytest.mark.parametrize(
     ("change", "key", "words"),
     [
-        pytest.param(times(-1.0, "tau_2"), "torque_sign@tau_2", "the other sign", marks=pytest.mark.slow),
+        pytest.param(times(-1.0, "tau_2"), "torque_sign@tau_2", "is inverted", marks=pytest.mark.slow),
         (times(50.0, "tau_1", "tau_2"), "joint_torque@tau_1, tau_2", "everything is 50 × its description"),
         pytest.param(times(180.0 / np.pi, "q_2"), "degrees@q_2", "q_2 is in degrees", marks=pytest.mark.long),
         pytest.param(times(1e3, "r_S_x", "r_S_y"), "millimetres@r_S_*", "in mm in place of m", marks=pytest.mark.long),
@@ -126,10 +126,10 @@ def test_a_diagnosis_goes_on_with_the_mistake_undone() -> None:
     diagnosis = diagnose(stated(), [wrong(times(-1.0, "tau_2"))], "test", lambda estimator: None)
     document = diagnosis_document(diagnosis)
     assert document["verdict"] == "named"
-    assert document["summary"].startswith("Tau_2: the other sign.")
+    assert document["summary"].startswith("The sign of tau_2 is inverted.")
     assert document["effects"] == []
     assert document["judgement"]["grave"]
-    assert document["judgement"]["next_step"] == "turn the sign of tau_2"
+    assert document["judgement"]["next_step"] == "invert the sign of tau_2"
     assert max(rows["whitened"] for rows in document["after"]["fit"].values()) < 1.4
 
 
@@ -162,9 +162,9 @@ def test_stamps_in_milliseconds_are_seen() -> None:
 
 def test_a_wrapped_encoder_is_unwrapped() -> None:
     angle = 4.0 * np.sin(np.linspace(0.0, 20.0, 5000))
-    (undoing,) = shown(["q_1"], one(np.mod(angle, 2.0 * np.pi)))
-    assert undoing.name == "wrapped"
-    values = undoing.apply(("q_1",), np.mod(angle, 2.0 * np.pi)[:, None])[:, 0]
+    (found,) = shown(["q_1"], one(np.mod(angle, 2.0 * np.pi)))
+    assert found.name == "wrapped"
+    values = found.apply(("q_1",), np.mod(angle, 2.0 * np.pi)[:, None])[:, 0]
     np.testing.assert_allclose(values - values[0], angle - angle[0], atol=1e-9)
 
 
@@ -174,9 +174,9 @@ def test_whole_turns_are_those_of_the_other_encoder() -> None:
     motor = 1.5 + np.sin(np.linspace(0.0, 20.0, 5000))
     link, names = motor + 1e-4 * rng.standard_normal(motor.size), ("q_1", "theta_m_1")
     wrapped = np.stack((np.mod(link, 1.2), motor), axis=1)
-    (undoing,) = shown(names, [Segment(np.arange(motor.size), wrapped)])
-    assert (undoing.name, undoing.where) == ("wrapped", "q_1")
-    assert np.abs(undoing.apply(names, wrapped)[:, 0] - link).max() < 3e-4
+    (found,) = shown(names, [Segment(np.arange(motor.size), wrapped)])
+    assert (found.name, found.where) == ("wrapped", "q_1")
+    assert np.abs(found.apply(names, wrapped)[:, 0] - link).max() < 3e-4
 
 
 @pytest.mark.slow
@@ -201,10 +201,10 @@ def test_a_stuck_encoder_is_left_out_and_one_at_rest_is_not() -> None:
     t = np.linspace(0.0, 20.0, 5000)
     stuck = np.sin(t) + 1e-5 * rng.standard_normal(t.size)
     stuck[2500:3500] = stuck[2500]
-    (undoing,) = shown(["q_1"], one(stuck))
-    assert undoing.name == "stuck"
-    assert not undoing.certain  # no other encoder says that the joint moves
-    (segment,) = one(undoing.apply(("q_1",), stuck[:, None])[:, 0])
+    (found,) = shown(["q_1"], one(stuck))
+    assert found.name == "stuck"
+    assert not found.certain  # no other encoder says that the joint moves
+    (segment,) = one(found.apply(("q_1",), stuck[:, None])[:, 0])
     assert [part.index.size for part in without_gaps(segment)] == [2501, 1500]
     # Slows down, is at rest, to the last bit of its encoder, and starts again.
     resting = np.round(np.where(t < 5.0 * np.pi / 2.0, np.sin(t), 1.0) / 1e-4) * 1e-4
@@ -227,7 +227,7 @@ def test_an_arm_that_stops_is_not_stuck() -> None:
 def test_a_held_command_is_joined_where_it_changes() -> None:
     t = np.arange(4000) / 1000.0
     held = np.repeat(np.sin(3.0 * t)[::20], 20)
-    (undoing,) = shown(["tau_1"], one(held))
-    assert undoing.name == "held_command"
-    joined = undoing.apply(("tau_1",), held[:, None])[:, 0]
+    (found,) = shown(["tau_1"], one(held))
+    assert found.name == "held_command"
+    joined = found.apply(("tau_1",), held[:, None])[:, 0]
     assert np.abs(joined - np.sin(3.0 * t))[:-20].max() < 1e-3

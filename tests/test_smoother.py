@@ -193,7 +193,7 @@ def test_inexplicable_samples_leave_the_first_fit_and_a_warning(simulation: Simu
     document = results_document(estimator, 1.0, [])
     assert document["method"] == "energy"
     assert any("the smoother left out 0 … 3 s" in warning for warning in document["warnings"])
-    assert any("bent statically" in warning for warning in document["warnings"])
+    assert any("bend quasi-statically" in warning for warning in document["warnings"])
 
 
 @pytest.mark.long

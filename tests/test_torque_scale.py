@@ -49,7 +49,7 @@ def test_a_gain_of_one_joint_is_a_ratio_that_may_be_either_s() -> None:
     assert (effect["name"], effect["where"]) == ("torque_gain", "joint_2")
     assert effect["ambiguous_with"][0] == "torque_gain@joint_1"
     assert effect["sentence"] == (
-        "joint_2's torque reads 3 % low against joint_1's: which is right the data cannot decide"
+        "joint_2's torque reads 3 % low against joint_1's: the data cannot decide which is right"
     )
     assert "joint_2 or joint_1" in found.summary
 
@@ -59,7 +59,7 @@ def test_parameters_with_an_ambiguous_gain_are_not_trusted() -> None:
     again = sms.estimate(found.search.after.system, read_too_large(1))
     for trust in (found.trust, again.trust):
         assert trust.level == "doubt"
-        assert "which is right the data cannot decide" in trust.sentence
+        assert "the data cannot decide which is right" in trust.sentence
         assert "weigh one part" in trust.next_step
         assert not any("trust the parameters" in reason for reason in trust.reasons)
 
@@ -70,7 +70,7 @@ def test_a_common_gain_is_the_scale_that_results_rest_on() -> None:
     clean = sms.diagnose(described(), simulated())
     assert found.trust.level == clean.trust.level
     result = sms.estimate(described(), read_too_large(1, 2))
-    assert "the scale of all rests on the torque constants, ± 1 %" in result.trust.reasons
+    assert "the common scale of all parameters rests on the torque constants, ± 1 %" in result.trust.reasons
     assert result.document()["scale_tolerance"] == 0.01
 
 

@@ -56,14 +56,14 @@ def test_a_torque_that_is_mostly_noise_is_weak_data() -> None:
         (
             replace(GOOD, discrepancies=(Discrepancy("link_1", 3.0, "noticed"),)),
             "not named yet",
-            {"link_1": "more than noise"},
+            {"link_1": "exceeds noise"},
         ),
         (
             replace(GOOD, discrepancies=(Discrepancy("base", 3.0, "unexplained"),)),
             "no known effect",
-            {"base": "more than noise"},
+            {"base": "exceeds noise"},
         ),
-        (replace(GOOD, alarm="base"), "the residual of base is more than noise", {"base": "more than noise"}),
+        (replace(GOOD, alarm="base"), "the residual of base exceeds its predicted noise", {"base": "exceeds noise"}),
         (replace(GOOD, negative=("motor_2.mass",)), "motor_2.mass is negative", {"joint_2": "negative"}),
         (
             replace(GOOD, comparison=NominalComparison(50.0, "tau_i looks like X")),
@@ -167,14 +167,14 @@ def test_an_alarm_under_diagnosis_is_no_doubt_of_its_own() -> None:
 
 def test_what_explains_some_of_it_is_said_where_nothing_explains_all() -> None:
     noticed = Discrepancy("joint_2", 3.0, "noticed", ("sensor_lag@q_*",))
-    said = "more than noise in the residual of joint_2 since 3.0 s, not named yet, nearest sensor_lag@q_*"
+    said = "the residual of joint_2 exceeds its predicted noise since 3.0 s, not named yet, nearest sensor_lag@q_*"
     assert judge(replace(GOOD, discrepancies=(noticed,))).reasons[0] == said
 
 
 def test_a_prior_that_data_pull_from_is_a_grave_doubt() -> None:
     off = Dispute("joint_2.stiffness", -6.2, "link_2")
     judgement = judge(replace(GOOD, disputed=(Dispute("link_1.mass", 3.4, None), off)))
-    assert judgement.sentence == "Do not trust: joint_2.stiffness is 6 σ off its prior: rows of link_2 pull it"
+    assert judgement.sentence == "Do not trust: joint_2.stiffness is 6 σ off its prior, driven by the rows of link_2"
     assert judgement.marks == {"joint_2": "off its prior", "link_1": "off its prior"}
     assert not judge(replace(GOOD, unconverged="too few rows", disputed=(off,))).grave
 
@@ -219,18 +219,18 @@ def test_a_clean_capture_is_judged_by_its_session() -> None:
 def test_a_named_effect_puts_the_system_file_in_doubt() -> None:
     judgement = judge_diagnosis("named", ["sensor_lag@link_1.*"], None, TRUSTED)
     assert (judgement.level, judgement.grave) == ("doubt", False)
-    assert "trust the parameters with it" in judgement.sentence
+    assert "the parameters are trusted with it" in judgement.sentence
     assert judgement.marks == {"link_1.*": "sensor lag"}
     caution = judge(replace(GOOD, attenuated=("motor_2.mass",)))
     assert (
-        "trust the parameters with it but for what follows"
+        "the parameters are trusted with it, except as listed below"
         in judge_diagnosis("named", ["slosh@base"], None, caution).sentence
     )
     early = judge(replace(GOOD, unconverged="few rows"))
-    assert "trust the parameters" not in judge_diagnosis("named", ["slosh@base"], None, early).sentence
+    assert "the parameters are trusted" not in judge_diagnosis("named", ["slosh@base"], None, early).sentence
     still = judge_diagnosis("named", ["backlash@joint_1", "cogging@joint_2"], None, DOUBTED)
     assert still.grave
-    assert "trust the parameters" not in still.sentence
+    assert "the parameters are trusted" not in still.sentence
     assert still.marks == {"joint_1": "backlash", "joint_2": "cogging"}
 
 
@@ -245,7 +245,7 @@ def test_an_effect_that_does_not_explain_all_is_called_near() -> None:
     assert judgement.reasons[1] == "some of it looks like cogging@joint_1"
     judgement = judge_diagnosis("unexplained", ["cogging@joint_1"], "joint_1", TRUSTED, near=True)
     assert judgement.grave
-    assert "is near cogging@joint_1, but is more or something else" in judgement.sentence
+    assert "cogging@joint_1 explains most of what acts" in judgement.sentence
     assert "lacks" not in judgement.sentence
 
 

@@ -16,7 +16,7 @@ FAULTS = {
     "bad_frame": ("datagrams skipped", "they are no frames of the described version of NatNet"),
     "non_utf8": ("lines skipped", "they are not text"),
     "bad_number": ("lines skipped", "they are not the described numbers"),
-    "too_long": ("stretches skipped", "no frame or line is as long as they are"),
+    "too_long": ("stretches skipped", "longer than any frame or line that is described"),
     "cut_line": ("lines skipped", "their beginning was not received"),
     "repeated_counter": ("frames skipped", "their counter repeats the one before"),
     "late_counter": ("frames skipped", "their counter goes back"),

@@ -77,7 +77,8 @@ class Calibration:
             corner = 1.0 / (2.0 * np.pi * np.sqrt(self.estimate))
             return f"{self.where} behind a low-pass of {_rounded(corner, 0.5 * corner * self.std / self.estimate)} Hz"
         if self.name == "truncation":
-            return f"{self.where}: {_rounded(100.0 * self.estimate, 100.0 * self.std)} % of what more elements change"
+            share = _rounded(100.0 * self.estimate, 100.0 * self.std)
+            return f"{self.where}: {share} % of what refining its elements changes"
         positive, negative = WORDS.get(self.name, ("off", "off"))
         words = positive if self.estimate >= 0.0 else negative
         value = abs(self.estimate) if positive != negative else self.estimate

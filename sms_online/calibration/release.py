@@ -1,7 +1,7 @@
 """Heavy-tailed tolerances: a value that the samples clearly contradict is released, and biases nothing else.
 
 A description that is wrong by many tolerances in one number would otherwise be corrected in part, and π biased by
-the rest. The tails are those of Student's t, see `pipeline.beforehand`.
+the rest. The tails are those of Student's t, see `pipeline.prior_information`.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from operator import itemgetter
 import numpy as np
 
 from sms_online.calibration.nuisance import Nuisance
-from sms_online.pipeline.beforehand import TAIL
+from sms_online.pipeline.prior_information import TAIL
 from sms_online.stream import Array
 from sms_online.trackers.interface import Estimate
 

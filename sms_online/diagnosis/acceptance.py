@@ -11,7 +11,7 @@ from sms_online.diagnosis.held_out_rows import HeldOutRows
 from sms_online.stream import Array
 
 # Coefficients of effects that are correlated by more than this are those of one effect too many.
-ONE_TOO_MANY = 0.99
+LARGEST_CORRELATION = 0.99
 # Rows that hold more than this multiple of their deviation leave more than noise.
 MOST_LEFT = 2.0
 # Fewest blocks from which a coefficient's deviation is estimated.
@@ -62,7 +62,7 @@ class Acceptance(HeldOutRows):
         return fall(before[:, acts].sum(axis=1), after[:, acts].sum(axis=1))
 
     def failing(self, chosen: Sequence[int], held: Container[int] = ()) -> int | None:
-        """The least of those chosen that the joint fit cannot have, does not determine, or does without; None if none.
+        """The weakest of the effects to drop: impossible, collinear, insignificant, or no improvement; None if none.
 
         held: friction that its likelihood has chosen. It takes any value while its axis is at rest, and is asked for
         its sign alone where rows leave no more than noise.
@@ -70,7 +70,7 @@ class Acceptance(HeldOutRows):
         left = self.residual(chosen, self.solution(chosen))
         loud = np.mean(left**2, axis=0) > MOST_LEFT**2
         asked = [k for k in chosen if k not in held or np.any(loud & self._acts(k))]
-        for fails in (self._impossible, self._one_too_many, self._insignificant, self._idle):
+        for fails in (self._impossible, self._collinear, self._insignificant, self._not_improving):
             if failing := fails(chosen, asked):
                 return min(failing, key=lambda k: self.improvement([other for other in chosen if other != k], k).share)
         return None
@@ -106,8 +106,8 @@ class Acceptance(HeldOutRows):
         reported = self._laws.reported(candidate.effect, solution[: self.rows.Y.shape[2]], own)
         return candidate.traits.within(reported)
 
-    def _one_too_many(self, chosen: Sequence[int], asked: Sequence[int]) -> list[int]:
-        """Effects whose coefficients are correlated with those of another effect, declared or chosen."""
+    def _collinear(self, chosen: Sequence[int], asked: Sequence[int]) -> list[int]:
+        """Effects whose coefficients are collinear with those of another effect, declared or chosen."""
         covariance = self.covariance(chosen)
         std = np.sqrt(np.diag(covariance))
         known = np.isfinite(std) & (std > 0.0)
@@ -120,20 +120,20 @@ class Acceptance(HeldOutRows):
                 continue
             others = effects.copy()
             others[own] = False
-            if not np.all(known[own]) or np.any(np.abs(correlation[own][:, others]) > ONE_TOO_MANY):
+            if not np.all(known[own]) or np.any(np.abs(correlation[own][:, others]) > LARGEST_CORRELATION):
                 out.append(k)
         return out
 
     def _insignificant(self, chosen: Sequence[int], asked: Sequence[int]) -> list[int]:
-        """Those whose coefficients are no more than what the blocks differ by."""
+        """Effects whose coefficients are no larger than their scatter over the blocks."""
         if self.folds.parts < LEAST_FOLDS:
             return []
         solution, std = self.solution(chosen), self.spread(chosen)
         places = self._places(chosen)
         return [k for k in asked if np.all(np.abs(solution[places[k]]) < SIGNIFICANT * std[places[k]])]
 
-    def _idle(self, chosen: Sequence[int], asked: Sequence[int]) -> list[int]:
-        """Effects whose blocks are predicted as well without them, whitened as without what they do not predict."""
+    def _not_improving(self, chosen: Sequence[int], asked: Sequence[int]) -> list[int]:
+        """Effects that do not improve held-out rows, whitened as without them."""
         idle = []
         for k in asked:
             others = [other for other in chosen if other != k]

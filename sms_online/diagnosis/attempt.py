@@ -104,7 +104,7 @@ class Case:
     """A capture to be diagnosed: its session with the system as described, samples, and those held out.
 
     progress: see `Progress`. stop: whether to end with what has been found. learned: whether curves are tried where no
-    law is selected. begins: of further captures, see `captures`. heeded: whether a search heeds the prior.
+    law is selected. begins: of further captures, see `captures`. use_prior: whether a search heeds the prior.
     """
 
     source: str
@@ -117,7 +117,7 @@ class Case:
     stop: Callable[[], bool] = lambda: False
     learned: bool = False
     begins: tuple[float, ...] = ()
-    heeded: bool = True
+    use_prior: bool = True
 
 
 def _noise_behind(described: Estimator, case: Case) -> SensorNoise:
@@ -181,7 +181,7 @@ class Attempt(Hypothesis):
         same = described == session.system
         estimator = session if same else Estimator(described, session.sensing.channels, case.source)
         self._known = case.prior(estimator)
-        prior = self._known if case.heeded else None
+        prior = self._known if case.use_prior else None
         noise = _noise_behind(estimator, case)
         span = system.windows.momentum
         length, longest = bounded(system)

@@ -172,12 +172,12 @@ def diagnose(
 
 
 def _first(case: Case, system: System) -> tuple[Case, Attempt]:
-    """The system against a case's samples, and the case with what is heeded.
+    """The system against a case's samples, and the case with what is use_prior.
 
     Rows that leave more than noise whatever is added contradict what is known beforehand, and effects that there are
     not would reconcile the two: what they lack is searched by what they say alone.
     """
-    alone = replace(case, heeded=False)
+    alone = replace(case, use_prior=False)
     attempt = Attempt(alone, system)
     if attempt.tracing.freed or case.prior(case.session) is None:
         return alone, attempt

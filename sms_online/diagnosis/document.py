@@ -159,8 +159,8 @@ def _whole(diagnosis: Search) -> str:
             wrong[k] = f"{wrong[k][:-1]}, or {'; or '.join(mistake.or_else)}: these data cannot decide it."
     wrong += [f"The description is off beyond its tolerance: {each}." for each in diagnosis.calibration]
     if wrong and diagnosis.verdict == "named" and not _named(diagnosis) and not diagnosis.drifts:
-        return " ".join((*wrong, "With that undone nothing but noise is left."))
-    return " ".join((*wrong, *(["With that undone:"] if wrong else []), _of_effects(diagnosis)))
+        return " ".join((*wrong, "With that corrected the residual is noise."))
+    return " ".join((*wrong, *(["With that corrected:"] if wrong else []), _of_effects(diagnosis)))
 
 
 def _of_effects(diagnosis: Search) -> str:
@@ -168,25 +168,22 @@ def _of_effects(diagnosis: Search) -> str:
     if diagnosis.drifts:
         return summary_of(diagnosis.drifts)
     if diagnosis.verdict == "clean":
-        return "Nothing but noise is left: the model explains the capture."
+        return "The residual is noise: the model explains the capture."
     if diagnosis.verdict == "unexplained" and diagnosis.unexplained is None:
         reason = _after(diagnosis, evaluated(diagnosis.estimator_after)).reasons[0]
-        return f"No effect of the catalogue is seen in what the rows leave, but {reason}."
+        return f"No effect of the catalogue was detected in the residual, but {reason}."
     keys = [_named_in_words(diagnosis, effect) for effect in _named(diagnosis)]
     before, after = diagnosis.before.holdout.whitened, diagnosis.after.holdout.whitened
     row = max(before, key=lambda name: before[name] ** 2 - after[name] ** 2)
     fall = f"from {_times(before[row])} to {_times(after[row])} times noise"
-    falls = f"the residual of {row} falls {fall} on data not fitted"
+    falls = f"the residual of {row} falls {fall} on held-out data"
     if diagnosis.verdict == "named":
         return f"The model lacks {', '.join(keys)}: with {'them' if len(keys) > 1 else 'it'} {falls}."
     unexplained = diagnosis.unexplained
     assert unexplained is not None
     rest = f"acts on {unexplained.row} (seen in {unexplained.speed}) and depends on {unexplained.variable}"
     if _near(diagnosis):
-        return (
-            f"What the model lacks comes near {', '.join(keys)}, but is more or something else: {falls}, and "
-            f"what is left {rest}."
-        )
+        return f"{', '.join(keys)} explains most of what the model lacks, not all: {falls}, and what is left {rest}."
     tried = f" {_nearest(diagnosis, keys)}" if keys else ""
     return f"The model lacks something that no known effect explains: it {rest}.{tried}"
 
@@ -200,9 +197,9 @@ def _nearest(diagnosis: Search, keys: Sequence[str]) -> str:
         if joint in before and left < (1.0 - LEAST_FALL) * before[joint]
     ]
     if not falls:
-        left = f"{100.0 * diagnosis.left:.0f} %" if diagnosis.left < 1.0 else "all"
-        return f"The nearest known effects ({', '.join(keys)}) leave {left} of it."
-    return f"With {', '.join(keys)} what is left of the torques on data not fitted falls {', '.join(falls)}."
+        share = f"{100.0 * (1.0 - diagnosis.left):.0f} %" if diagnosis.left < 1.0 else "none"
+        return f"The nearest known effects ({', '.join(keys)}) explain {share} of it."
+    return f"With {', '.join(keys)} what is left of the torques on held-out data falls {', '.join(falls)}."
 
 
 def _near(diagnosis: Search) -> bool:
@@ -269,7 +266,7 @@ def _curve_in_words(diagnosis: Search, curve: Effect) -> str:
     over = f"this curve over the {curve.over} of {curve.where}"
     return (
         f"no known law; {over} takes what is left of the torque from {100.0 * before:.2g} % to {100.0 * after:.2g} % "
-        "on data it has not seen"
+        "on held-out data"
     )
 
 

@@ -89,7 +89,7 @@ def sentence(drift: Drift) -> str:
 def summary_of(drifts: Sequence[Drift]) -> str:
     """What a capture with these drifts holds, in a sentence."""
     each = "; ".join(map(sentence, drifts))
-    return f"{each[:1].upper()}{each[1:]}. With that followed nothing but noise is left."
+    return f"{each[:1].upper()}{each[1:]}. With that followed the residual is noise."
 
 
 def trust_with(drifts: Sequence[Drift], after: Trust) -> Trust:
@@ -98,8 +98,10 @@ def trust_with(drifts: Sequence[Drift], after: Trust) -> Trust:
     after: of the session that follows them.
     """
     names = ", ".join(drift.parameter for drift in drifts)
-    more = " but for what follows" if after.level == "doubt" else ""
-    trusted = "" if after.grave or after.level == "not yet" else f"; trust the parameters of one that does{more}"
+    more = ", except as listed below" if after.level == "doubt" else ""
+    trusted = (
+        "" if after.grave or after.level == "not yet" else f"; with one that does the parameters are trusted{more}"
+    )
     text = f"the system file's tracker does not follow {names}{trusted}"
     places = tuple(dict.fromkeys(drift.parameter.split(".")[0] for drift in drifts))
     found = Reason(text, after.grave, places, "drifts", then=FOLLOW)

@@ -46,7 +46,7 @@ class Episode:
 
 def line(episode: Episode) -> str:
     """What there is to say of an episode."""
-    where = f"more than noise in the rows of {episode.row} since {episode.noticed:.2f} s"
+    where = f"the residual of {episode.row} exceeds its predicted noise since {episode.noticed:.2f} s"
     if episode.verdict == "named":
         effects = ", ".join(_described(named) for named in episode.named)
         taken = ""
@@ -58,7 +58,7 @@ def line(episode: Episode) -> str:
     if episode.verdict == "unexplained":
         return f"{where}, which no known effect explains{_beside(_nearest(episode))}"
     if episode.verdict == "passed":
-        return f"{where}, of which the last samples show nothing"
+        return f"{where}, no longer there in the latest samples"
     if episode.drifting:
         return f"{where}: {', '.join(episode.drifting)} {'drifts' if len(episode.drifting) == 1 else 'drift'}"
     if episode.event is not None:

@@ -17,7 +17,7 @@ from sms_online.description.channels import drive_channel
 from sms_online.description.schema import System
 from sms_online.diagnosis.record import Segment
 from sms_online.diagnosis.rough_fit import SMALLEST, RoughFit, RoughRows, stretches
-from sms_online.diagnosis.sample_mistakes import Undoing, scaled, shown, undoings, without_gaps
+from sms_online.diagnosis.sample_mistakes import MistakeHypothesis, mistake_hypotheses, scaled, shown, without_gaps
 from sms_online.nominal import is_geared
 from sms_online.pipeline.estimator import Estimator
 from sms_online.sample_faults import unit_of_stamps
@@ -121,13 +121,13 @@ class _Search:
         self.found: list[Mistake] = []
         self._channels = session.sensing.channels
         self._segments = list(segments)
-        self._undone: list[Undoing] = []
+        self._undone: list[MistakeHypothesis] = []
         self._drives = [drive_channel(self.system, i) for i in range(1, len(self.system.joints) + 1)]
 
     def undo(self, channels: tuple[str, ...], values: Array) -> Array:
         """Samples without the mistakes found."""
-        for undoing in self._undone:
-            values = undoing.apply(channels, values)
+        for hypothesis in self._undone:
+            values = hypothesis.apply(channels, values)
         return values
 
     def step(self) -> bool:
@@ -143,7 +143,7 @@ class _Search:
         if not found:
             found = list(self._scaled(rows, freed))
             if _left(given, PHYSICS) > LEAST_RATIO:
-                likely = self._likely(undoings(self.system, self._channels))
+                likely = self._likely(mistake_hypotheses(self.system, self._channels))
                 found += self._samples(likely, given, PHYSICS, LEAST_RATIO)
         if not found:
             return False
@@ -152,7 +152,7 @@ class _Search:
         # All of these explain what a rough fit can; nominal values decide unless one clearly leaves least.
         finest = min(_finely(each.fit) for each in near)
         best, *others = (each for each in near if _finely(each.fit) < finest + np.log(LIKELY))
-        self._take(best, _left(freed), tuple(each.undoing.sentence for each in others))
+        self._take(best, _left(freed), tuple(each.hypothesis.sentence for each in others))
         return True
 
     def _scaled(self, rows: RoughRows, given: RoughFit) -> Iterator[_Tried]:
@@ -172,7 +172,7 @@ class _Search:
             if better and _left(rows.freed(start=each.fit.beta)) > explained:
                 yield each
 
-    def _in_gear(self, tried: _Tried, geared: Undoing) -> _Tried:
+    def _in_gear(self, tried: _Tried, geared: MistakeHypothesis) -> _Tried:
         """The factor of a torque, or of the gear ratio in the description where that explains more.
 
         A rotor's inertia acts with the square of the ratio on its own joint and with the ratio on the bodies that it
@@ -187,7 +187,7 @@ class _Search:
         return _Tried(geared, fit) if _finely(fit) < _finely(tried.fit) else tried
 
     def _take(self, best: _Tried, before: float, others: tuple[str, ...]) -> None:
-        u = best.undoing
+        u = best.hypothesis
         self._undone.append(u)
         self.found.append(Mistake(u.name, u.where, u.sentence, u.step, before, _left(best.fit), others))
         self._segments = self._corrected(u, self._segments)
@@ -195,11 +195,11 @@ class _Search:
             self.system = u.system(self.system)
             self.session = Estimator(self.system, self.session.sensing.channels, "")
 
-    def _corrected(self, undoing: Undoing, segments: Sequence[Segment]) -> list[Segment]:
-        made = (replace(each, values=undoing.apply(self._channels, each.values)) for each in segments)
+    def _corrected(self, hypothesis: MistakeHypothesis, segments: Sequence[Segment]) -> list[Segment]:
+        made = (replace(each, values=hypothesis.apply(self._channels, each.values)) for each in segments)
         return [part for each in made for part in without_gaps(each)]
 
-    def _likely(self, tried: Iterable[Undoing]) -> Iterator[Undoing]:
+    def _likely(self, tried: Iterable[MistakeHypothesis]) -> Iterator[MistakeHypothesis]:
         """Those that divide what is left of the first stretch by the root of LEAST_RATIO, or all if it is too short."""
         first, rows = self._segments[:1], None
         if len(self._segments) > 1:
@@ -209,27 +209,29 @@ class _Search:
             yield from tried
             return
         least = _left(rows.fit(), PHYSICS) / np.sqrt(LEAST_RATIO)
-        for undoing in tried:
+        for hypothesis in tried:
             try:
-                left = _left(RoughRows(self.session, self._corrected(undoing, first)).fit(), PHYSICS)
+                left = _left(RoughRows(self.session, self._corrected(hypothesis, first)).fit(), PHYSICS)
             except np.linalg.LinAlgError:
                 continue  # readings that no shape of the links gives
             if left <= least:
-                yield undoing
+                yield hypothesis
 
-    def _samples(self, tried: Iterable[Undoing], given: RoughFit, explained: float, least: float) -> Iterator[_Tried]:
+    def _samples(
+        self, tried: Iterable[MistakeHypothesis], given: RoughFit, explained: float, least: float
+    ) -> Iterator[_Tried]:
         """Those that divide what a fit leaves by a ratio at least, and those that are certain.
 
         By least squares, which has one minimum: freed rows may get to a better one by chance where others do not.
         """
-        for undoing in tried:
+        for hypothesis in tried:
             try:
-                rows = RoughRows(self.session, self._corrected(undoing, self._segments))
+                rows = RoughRows(self.session, self._corrected(hypothesis, self._segments))
                 better = _left(given, explained) / _left(rows.fit(), explained) > least
             except np.linalg.LinAlgError:
                 continue  # readings that no shape of the links gives
-            if better or undoing.certain:
-                yield _Tried(undoing, rows.freed())
+            if better or hypothesis.certain:
+                yield _Tried(hypothesis, rows.freed())
 
     def _torques(self, rows: RoughRows) -> Iterator[_Tried]:
         """Known factors of each joint's torque and of all, and the gear ratio of each that the other rows ask for."""
@@ -246,9 +248,9 @@ class _Search:
             return factors
 
         for which in dict.fromkeys(((*joints,), *((i,) for i in joints))):
-            for factor, undoing in self._causes(which):
+            for factor, hypothesis in self._causes(which):
                 if likely(which, factor):
-                    yield _Tried(undoing, rows.freed(times(which, factor)), len(which) == len(joints))
+                    yield _Tried(hypothesis, rows.freed(times(which, factor)), len(which) == len(joints))
         for i in joints:
             gear = self.system.joints[i].gear_ratio
             if len(joints) == 1 or not is_geared(self.system.joints[i]):
@@ -260,13 +262,13 @@ class _Search:
                 drive = self._drives[i]
                 said = f"{drive} is {1.0 / best:.3g} × what the other rows give: its torque constant or the gear ratio"
                 then = f"check the torque constant of {where}, then its gear ratio"
-                undoing = Undoing("gear_ratio", where, said, then, scaled([drive], best))
+                hypothesis = MistakeHypothesis("gear_ratio", where, said, then, scaled([drive], best))
                 said = f"the gear ratio of {where} looks like {ratio:.3g}, described as {gear:g}"
                 then = f"check the gear ratio of {where}, then its torque constant"
-                geared = Undoing("gear_ratio", where, said, then, _same, _geared(i, best))
-                yield _Tried(undoing, rows.freed(times([i], best)), geared=geared)
+                geared = MistakeHypothesis("gear_ratio", where, said, then, _same, _geared(i, best))
+                yield _Tried(hypothesis, rows.freed(times([i], best)), geared=geared)
 
-    def _causes(self, joints: Sequence[int]) -> Iterator[tuple[float, Undoing]]:
+    def _causes(self, joints: Sequence[int]) -> Iterator[tuple[float, MistakeHypothesis]]:
         """What torques of some joints may be in place of what they should, with the factor that undoes it."""
         names = [self._drives[i] for i in joints]
         gears = {self.system.joints[i].gear_ratio for i in joints}
@@ -274,20 +276,20 @@ class _Search:
         unit = "N" if all(self.system.joints[i].kind == "prismatic" for i in joints) else "N m"
         look, are = ("look", "are") if len(names) > 1 else ("looks", "is")
         causes = [
-            (-1.0, "torque_sign", f"{listed}: the other sign", f"turn the sign of {listed}"),
+            (-1.0, "torque_sign", f"the sign of {listed} is inverted", f"invert the sign of {listed}"),
             (1e-3, "torque_unit", f"{listed} {look} like m{unit} in place of {unit}", f"divide {listed} by 1000"),
             (1e3, "torque_unit", f"{listed} {look} like k{unit} in place of {unit}", f"multiply {listed} by 1000"),
         ]
         if len(gears) == 1 and gears != {1.0} and names[0].startswith("tau"):
             (n,) = gears
             of = "the joint's torque in place of the motor shaft's"
-            once = f"{listed} {are} divided by the gear ratio {n:g} once more"
+            once = f"{listed} {are} divided by the gear ratio {n:g} twice"
             causes.append((1.0 / n, "joint_torque", f"{listed} {look} like {of}", f"divide {listed} by {n:g}"))
             causes.append((n, "joint_torque", once, f"multiply {listed} by {n:g}"))
         for factor, name, sentence, step in causes:
             if len(joints) == len(self._drives) and factor > 0.0:
                 sentence = f"everything is {1.0 / factor:.3g} × its description: {sentence}"
-            yield factor, Undoing(name, where, sentence, step, scaled(names, factor))
+            yield factor, MistakeHypothesis(name, where, sentence, step, scaled(names, factor))
 
 
 @dataclass(frozen=True)
@@ -297,10 +299,10 @@ class _Tried:
     fit: that one, rows without a torque freed. common: whether it scales all torques alike. geared: the same factor in
     the gear ratio that the system describes."""
 
-    undoing: Undoing
+    hypothesis: MistakeHypothesis
     fit: RoughFit
     common: bool = False
-    geared: Undoing | None = None
+    geared: MistakeHypothesis | None = None
 
 
 def _finely(fit: RoughFit) -> float:

@@ -386,7 +386,7 @@ def refusal(model: Model, named: tuple[Named, ...]) -> str | None:
     """Why effects cannot be added while a session runs, None where they can: stages before the balance stay."""
     channels = [effect for effect in model.system.effects if ENTRIES[effect.name].kind == "channel"]
     if channels or model.n_states:
-        return "the samples are corrected, or internal states followed, for what the system file declares"
+        return "no update of a model that declares effects on channels or with internal states"
     for each in named:
         if is_constant(each.effect):
             return f"{each.key} is a constant of the description"

@@ -100,7 +100,7 @@ class SessionRows(WeakRows):
         added = self._noise_samples(np.random.default_rng(SEED))
         self._parts = [self._of_segment(k, *part) for k, part in enumerate(zip(self.segments, added, strict=True))]
         if not all(np.all(np.abs(part.copies) < LARGEST) for part in self._parts):
-            raise np.linalg.LinAlgError("readings that no shape of the links gives")
+            raise np.linalg.LinAlgError("marker readings that do not fit the kinematics of the links")
         windows = [(number, window) for number, part in enumerate(self._parts) for window in part.windows]
         n_v = model.layout.n_v
         stacked = np.concatenate([np.empty((0, n_v, base.n + 1)), *(part.copies[:, 0] for part in self._parts)])

@@ -23,8 +23,8 @@ AT_REST = 0.2
 
 
 @dataclass(frozen=True)
-class Undoing:
-    """A mistake and what undoes it.
+class MistakeHypothesis:
+    """The hypothesis of one mistake, and how to correct it.
 
     name, where: its kind and place. sentence: what is wrong. step: what to do. apply: gives samples (B, channels)
     without it. system: the description without it, where it is one of that. certain: whether samples leave no doubt.
@@ -39,7 +39,7 @@ class Undoing:
     certain: bool = False
 
 
-def shown(channels: Sequence[str], segments: Sequence[Segment]) -> Iterator[Undoing]:
+def shown(channels: Sequence[str], segments: Sequence[Segment]) -> Iterator[MistakeHypothesis]:
     """What samples of some channels show by themselves: encoders wrapped or stuck, steps of a held command."""
     drives = [c for c in channels if _is_drive(c)]
     positions = [c for c in channels if c not in drives]
@@ -55,7 +55,7 @@ def _is_drive(channel: str) -> bool:
     return channel.startswith(("tau_", "force_"))
 
 
-def undoings(system: System, channels: Sequence[str]) -> Iterator[Undoing]:
+def mistake_hypotheses(system: System, channels: Sequence[str]) -> Iterator[MistakeHypothesis]:
     """What may be wrong with samples of some channels, but for scales of torques."""
     positions = [c for c in channels if not _is_drive(c)]
     yield from _signs(positions)
@@ -97,7 +97,7 @@ def _groups(names: Sequence[str]) -> dict[str, list[str]]:
     return groups
 
 
-def _signs(positions: Sequence[str]) -> Iterator[Undoing]:
+def _signs(positions: Sequence[str]) -> Iterator[MistakeHypothesis]:
     single = {name: [name] for name in positions if not name.startswith("e")}
     joints: dict[str, list[str]] = {}
     for name in positions:
@@ -108,12 +108,16 @@ def _signs(positions: Sequence[str]) -> Iterator[Undoing]:
     groups = {where: names for where, names in _groups(positions).items() if len(names) > 1}
     for where, names in {**single, **both, **groups}.items():
         if not where.startswith("e"):
-            yield Undoing(
-                "angle_sign", where, f"{where}: the other sign", f"turn the sign of {where}", scaled(names, -1.0)
+            yield MistakeHypothesis(
+                "angle_sign",
+                where,
+                f"the sign of {where} is inverted",
+                f"invert the sign of {where}",
+                scaled(names, -1.0),
             )
 
 
-def _units(system: System, positions: Sequence[str]) -> Iterator[Undoing]:
+def _units(system: System, positions: Sequence[str]) -> Iterator[MistakeHypothesis]:
     angles = [name for name in positions if is_angle(system, name)]
     lengths = [name for name in positions if _is_length(system, name)]
     for name, text, factor, all_of, words in (
@@ -121,22 +125,24 @@ def _units(system: System, positions: Sequence[str]) -> Iterator[Undoing]:
         ("millimetres", "is in mm in place of m", 1e-3, lengths, "all lengths"),
     ):
         for where, names in {**{n: [n] for n in all_of}, **_groups(all_of)}.items():
-            yield Undoing(name, where, f"{where} {text}", f"multiply {where} by {factor:.4g}", scaled(names, factor))
+            yield MistakeHypothesis(
+                name, where, f"{where} {text}", f"multiply {where} by {factor:.4g}", scaled(names, factor)
+            )
         if len(all_of) > 1:
             said = f"{words} {text.replace('is', 'are', 1)}"
-            yield Undoing(name, words, said, f"multiply them by {factor:.4g}", scaled(all_of, factor))
+            yield MistakeHypothesis(name, words, said, f"multiply them by {factor:.4g}", scaled(all_of, factor))
 
 
-def _geared(system: System, channels: Sequence[str]) -> Iterator[Undoing]:
+def _geared(system: System, channels: Sequence[str]) -> Iterator[MistakeHypothesis]:
     for i, joint in enumerate(system.joints, start=1):
         name = f"theta_m_{i}"
         if name in channels and joint.gear_ratio != 1.0:
             n = joint.gear_ratio
             said = f"{name} is the motor's angle before the gear, {n:g} × the angle after it"
-            yield Undoing("motor_angle", name, said, f"divide {name} by {n:g}", scaled([name], 1.0 / n))
+            yield MistakeHypothesis("motor_angle", name, said, f"divide {name} by {n:g}", scaled([name], 1.0 / n))
 
 
-def _swaps(channels: Sequence[str]) -> Iterator[Undoing]:
+def _swaps(channels: Sequence[str]) -> Iterator[MistakeHypothesis]:
     kinds: dict[tuple[str, ...], list[str]] = {}
     for name in channels:
         stem, _, number = name.rpartition("_")
@@ -165,7 +171,9 @@ def _swaps(channels: Sequence[str]) -> Iterator[Undoing]:
         if len(one) > 1 or len(pairs) > 0:
             where = f"{_common(one)}, {_common(other)}"
             said = f"{_common(one)} and {_common(other)} are swapped"
-            yield Undoing("swapped", where, said, f"swap {_common(one)} and {_common(other)}", _swapped(one, other))
+            yield MistakeHypothesis(
+                "swapped", where, said, f"swap {_common(one)} and {_common(other)}", _swapped(one, other)
+            )
 
 
 def _common(names: Sequence[str]) -> str:
@@ -186,14 +194,18 @@ def _swapped(one: Sequence[str], other: Sequence[str]) -> Callable[[tuple[str, .
     return apply
 
 
-def _wrapped(positions: Sequence[str], channels: Sequence[str], segments: Sequence[Segment]) -> Iterator[Undoing]:
+def _wrapped(
+    positions: Sequence[str], channels: Sequence[str], segments: Sequence[Segment]
+) -> Iterator[MistakeHypothesis]:
     for name in positions:
         k = list(channels).index(name)
         wrapped = wrapped_at(np.concatenate([np.diff(each.values[:, k]) for each in segments]))
         if wrapped is not None:
             turn, times = wrapped
             said = f"{name} is wrapped at {turn:.4g}: it jumps {times} times"
-            yield Undoing("wrapped", name, said, f"state wrap for {name}, or unwrap it", _unwrapped(name, turn))
+            yield MistakeHypothesis(
+                "wrapped", name, said, f"state wrap for {name}, or unwrap it", _unwrapped(name, turn)
+            )
 
 
 def _beside(name: str, positions: Sequence[str]) -> list[str]:
@@ -226,7 +238,9 @@ def _unwrapped(name: str, turn: float) -> Callable[[tuple[str, ...], Array], Arr
     return apply
 
 
-def _stuck(positions: Sequence[str], channels: Sequence[str], segments: Sequence[Segment]) -> Iterator[Undoing]:
+def _stuck(
+    positions: Sequence[str], channels: Sequence[str], segments: Sequence[Segment]
+) -> Iterator[MistakeHypothesis]:
     for name in positions:
         k = list(channels).index(name)
         stuck = [stuck_samples(each.values[:, k]) for each in segments]
@@ -236,7 +250,7 @@ def _stuck(positions: Sequence[str], channels: Sequence[str], segments: Sequence
             said = f"{name} is stuck at one value for {count} samples while it moves before"
             step = f"check encoder and cable of {name}; leave that time out with -ss and -to"
             # The joint's other encoder moves meanwhile, if there is one.
-            yield Undoing("stuck", name, said, step, _without_stuck(name), certain=bool(others))
+            yield MistakeHypothesis("stuck", name, said, step, _without_stuck(name), certain=bool(others))
 
 
 def _moves(when: Sequence[NDArray[np.bool_]], readings: Sequence[Array]) -> bool:
@@ -266,7 +280,7 @@ def without_gaps(segment: Segment) -> list[Segment]:
     return [Segment(index, values) for index, values, fine in parts if fine[0]]
 
 
-def _held(drives: Sequence[str], channels: Sequence[str], segments: Sequence[Segment]) -> Iterator[Undoing]:
+def _held(drives: Sequence[str], channels: Sequence[str], segments: Sequence[Segment]) -> Iterator[MistakeHypothesis]:
     """A command that is held between its updates, where it should act in the middle of each hold."""
     lengths = {}
     for name in drives:
@@ -284,7 +298,7 @@ def _held(drives: Sequence[str], channels: Sequence[str], segments: Sequence[Seg
         samples = ", ".join(str(each) for each in sorted(set(lengths.values())))
         said = f"{where} changes every {samples} samples only: a command that is held, no measured torque"
         step = f"record the measured torque or current for {where}"
-        yield Undoing("held_command", where, said, step, _joined(lengths))
+        yield MistakeHypothesis("held_command", where, said, step, _joined(lengths))
 
 
 def _joined(lengths: dict[str, int]) -> Callable[[tuple[str, ...], Array], Array]:

@@ -127,7 +127,7 @@ class Tracing(Acceptance):
         if not start:
             return []
         self._take(start)
-        chosen = self._weeded(self._revised(list(start)))
+        chosen = self._without_refused(self._revised(list(start)))
         self._refused = set()  # beside others they may be of use again
         self.path = [(k, chosen[: n + 1]) for n, k in enumerate(chosen)]
         for k in chosen:
@@ -158,7 +158,7 @@ class Tracing(Acceptance):
             best = self._curve(chosen, found, eligible) if best is None else best
             if best is None:
                 break
-            law = self._holding(chosen, best, found, laws, deviances)
+            law = self._stiction_instead(chosen, best, found, laws, deviances)
             if law is None and not self.improves(chosen, best):
                 useless.add(self.candidates[best].key)
                 continue
@@ -172,7 +172,7 @@ class Tracing(Acceptance):
                 if not self.reweight([*chosen, best]):
                     break
             self._take([*chosen, best])
-            chosen = self._weeded(self._revised([*chosen, best]))
+            chosen = self._without_refused(self._revised([*chosen, best]))
             if self.candidates[best].key in self._refused:
                 found, deviances = self.gains(chosen), {}
                 continue
@@ -185,8 +185,8 @@ class Tracing(Acceptance):
             found, deviances = self.gains(chosen), {}
         return chosen
 
-    def _weeded(self, chosen: list[int]) -> list[int]:
-        """Those chosen without what, in new weights beside the others, would have to be what it cannot be, or is none.
+    def _without_refused(self, chosen: list[int]) -> list[int]:
+        """Those chosen but for effects that, with the rows whitened anew, are implausible or gain too little.
 
         These are refused from then on.
         """
@@ -199,7 +199,7 @@ class Tracing(Acceptance):
             self._take(chosen)
         return chosen
 
-    def _holding(
+    def _stiction_instead(
         self,
         chosen: Sequence[int],
         best: int,
@@ -207,7 +207,7 @@ class Tracing(Acceptance):
         allowed: Sequence[int],
         known: dict[int | None, float],
     ) -> int | None:
-        """The dry friction that holds its axis much of the time where it predicts held-out rows better than the best.
+        """The law of dry friction to take in place of the best candidate, where stiction explains the rows better.
 
         Stiction is any value up to breakaway, which many a column explains better than its law does. So these are
         compared by their likelihoods, with the covariance of what each does not determine. known: deviances beside

@@ -58,7 +58,7 @@ def describe_residual(
     }
     row = max(by_type, key=lambda name: by_type[name])
     speed = max(row_types(layout)[row], key=lambda k: excess[k])
-    aside = _taken_aside(rows, columns[..., rows.base.n :], residual[:, speed], speed)
+    aside = _speed_with_same_residual(rows, columns[..., rows.base.n :], residual[:, speed], speed)
     beside = next((name for name, speeds in row_types(layout).items() if aside in speeds), row)
     row = max(row, beside, key=lambda name: before[name].whitened)
     Q = basis((columns / rows.std[..., None]).reshape(-1, columns.shape[2]))
@@ -79,8 +79,8 @@ def describe_residual(
     return Unexplained(row, layout.speed_names[speed], name, share, at, design(at, knots) @ found.coefficients)
 
 
-def _taken_aside(rows: SessionRows, columns: Array, left: Array, speed: int) -> int | None:
-    """The speed in whose rows something took part of one force that acts there and on another speed, if there is one.
+def _speed_with_same_residual(rows: SessionRows, columns: Array, left: Array, speed: int) -> int | None:
+    """The speed whose rows have the same course of residual, where an effect explains half of one force; None if none.
 
     columns (W, n_v, c): of what was found; left (W,): residual of the other speed. A gear's error drives the motor and
     the link: what takes it for a force on the motor alone leaves the same course in the link's rows.

@@ -274,7 +274,7 @@ def in_words(effect: Effect, system: System, coefficients: Mapping[str, float]) 
     if said is None:
         return ""
     words = said(effect.where, coefficients)
-    return f"{words} against {other}'s: which is right the data cannot decide" if other else words
+    return f"{words} against {other}'s: the data cannot decide which is right" if other else words
 
 
 # Channels that come together, beside those of a link's markers.

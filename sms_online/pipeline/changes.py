@@ -23,7 +23,7 @@ from sms_online.pipeline.event_hypotheses import (
     restricted,
 )
 from sms_online.pipeline.event_instant import event_instant
-from sms_online.pipeline.event_rows import CLOCK, LARGEST_SHIFT, Behind, EventRows
+from sms_online.pipeline.event_rows import CLOCK, LARGEST_SHIFT, AfterChange, EventRows
 from sms_online.pipeline.events import REMEMBERED, ChangeDetector, ClockShift, Event, Seen
 from sms_online.pipeline.latency import wandering_clocks
 from sms_online.pipeline.momentum_balance import MARGIN
@@ -182,7 +182,7 @@ class Changes(Stage):
 
     def decide(
         self, noise: SensorNoise, start_time: float, last: bool, steps: bool = False
-    ) -> Adoption | Behind | None:
+    ) -> Adoption | AfterChange | None:
         """The event, once the windows after it suffice to decide; what they show so far where they do not.
 
         None where there is nothing new to see. Where the model lacked something before, only a jump that explains the

@@ -17,7 +17,7 @@ G is in their denominators: along columns that are little more than noise, which
 grow as fast as the residual, and π without end. ρ makes the variance of whitened rows one at the weights' own π,
 whatever else these hold as noise.
 
-What is known beside the rows enters as `beforehand` says.
+What is known beside the rows enters as `prior_information` says.
 
 Reading: the concentrated likelihood of the functional errors-in-variables model, one variance factor a row type.
 """
@@ -30,8 +30,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve, solve_triangular
 
-from sms_online.pipeline.beforehand import WIDENED, Beforehand, Penalty
 from sms_online.pipeline.momentum_windows import OVERLAP
+from sms_online.pipeline.prior_information import WIDENED, Penalty, PriorInformation
 from sms_online.pipeline.row_grams import RowGrams
 from sms_online.stream import Array
 
@@ -282,7 +282,7 @@ def minimum(
     torque: NDArray[np.bool_],
     starts: list[Array],
     columns: Columns,
-    known: Beforehand,
+    known: PriorInformation,
 ) -> Minimum:
     """The minimum of the criterion that is lowest of those next to some starts β (n,).
 

@@ -43,7 +43,7 @@ LARGEST_PROGRESS, HIDDEN = 0.2, 2.0
 
 
 @dataclass(frozen=True)
-class Behind:
+class AfterChange:
     """Samples behind a change, as the best of the steps explains them.
 
     goes_on: whether what jumped may drift. rows: of these samples, with the columns of what may begin behind those of
@@ -77,7 +77,7 @@ class EventRows:
     def explain(
         self, model: Model, base: BaseParameters, before: Seen, samples: GridSamples, between: tuple[int, int],
         noise: SensorNoise,
-    ) -> Behind:  # fmt: skip
+    ) -> AfterChange:  # fmt: skip
         """The best explanation of samples behind a change by a step.
 
         model, base: with every parameter that may jump, those of now first. before: the last window before the change.
@@ -119,20 +119,20 @@ class EventRows:
             explanation = explain(factor / left, rows / left, jumps, alike)
             clocks = self._of_clocks(factor / left, rows / left, alike)
             if clocks is not None:
-                return Behind(clocks, False, white)
+                return AfterChange(clocks, False, white)
             weights = np.zeros(base.n)
             weights[:n] = explanation.beta[m:]
             if explanation.jump is not None:
                 weights[[k - m for k in explanation.jump.columns]] += explanation.sizes
         if explanation.jump is None or not self.learns:
-            return Behind(explanation, self.learns, white)
+            return AfterChange(explanation, self.learns, white)
         onset, alarm = between
         after = [each.end / system.sample_rate - 0.5 * balance.span - alarm / system.sample_rate for each in white]
         ramp = np.concatenate([t * each.Y[:, m:-1] + each.ramp for t, each in zip(after, white, strict=True)])
         ramps = ramp[:, [k - m for k in explanation.jump.columns]]
         share = goes_on(factor / left, rows / left, ramps / left, explanation, alike)
         progress = share * max((alarm - onset) / system.sample_rate, HIDDEN)
-        return Behind(explanation, progress > LARGEST_PROGRESS, white)
+        return AfterChange(explanation, progress > LARGEST_PROGRESS, white)
 
     def _of_clocks(self, factor: Array, rows: Array, alike: float) -> Explanation | None:
         """What shifts of clocks alone leave of the rows, where that is little but noise; see `explain`."""

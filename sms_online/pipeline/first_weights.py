@@ -13,9 +13,9 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from sms_online.pipeline.beforehand import Beforehand
 from sms_online.pipeline.criterion import Columns, minimum
 from sms_online.pipeline.plain_rows import PlainRows
+from sms_online.pipeline.prior_information import PriorInformation
 from sms_online.pipeline.row_grams import RowGrams
 from sms_online.pipeline.white_rows import WhiteRows
 from sms_online.stream import Array
@@ -36,8 +36,8 @@ Whiten = Callable[[Array], list[WhiteRows]]
 class FirstWeights:
     """Finds β (n,) for m nuisances and n parameters.
 
-    nominal (n,): described values. calibration (k, m + n + 1), columns, beforehand: as in `MomentumFit`. torque (n_v,):
-    which speeds' rows hold a torque.
+    nominal (n,): described values. calibration (k, m + n + 1), columns, prior_information: as in `MomentumFit`.
+    torque (n_v,): which speeds' rows hold a torque.
     """
 
     def __init__(
@@ -46,10 +46,10 @@ class FirstWeights:
         calibration: Array,
         columns: Columns,
         torque: NDArray[np.bool_],
-        beforehand: Callable[[], Beforehand],
+        prior_information: Callable[[], PriorInformation],
     ) -> None:
         self._nominal, self._calibration = nominal, calibration
-        self._columns, self._torque, self._beforehand = columns, torque, beforehand
+        self._columns, self._torque, self._prior_information = columns, torque, prior_information
         self._nuisances = calibration.shape[1] - nominal.size - 1
 
     def of(self, held: Array, plain: PlainRows, whiten: Whiten) -> Array:
@@ -109,7 +109,7 @@ class FirstWeights:
 
         Noise that follows a parameter which rows do not determine may be any.
         """
-        found = minimum(grams, lacking, self._torque, starts, self._columns, self._beforehand())
+        found = minimum(grams, lacking, self._torque, starts, self._columns, self._prior_information())
         determined = np.abs(found.beta) > DETERMINED * np.sqrt(np.diag(found.covariance))
         determined[: self._nuisances] = True
         return np.where(determined, found.beta, np.pad(self._nominal, (self._nuisances, 0)))

@@ -14,9 +14,9 @@ from sms_online.calibration.nuisance import Nuisance, bound_rows, known_beforeha
 from sms_online.calibration.release import released
 from sms_online.model.base_parameters import BaseParameters
 from sms_online.model.model import Model
-from sms_online.pipeline.beforehand import Beforehand
 from sms_online.pipeline.errors_in_variables import NoiseBias, unbiased
 from sms_online.pipeline.momentum_fit import MomentumFit
+from sms_online.pipeline.prior_information import PriorInformation
 from sms_online.pipeline.row_grams import RowGrams
 from sms_online.pipeline.scale_free import ScaleFree
 from sms_online.pipeline.white_rows import WhiteRows
@@ -130,16 +130,16 @@ class JointEstimate(Stage):
         lacking = fit.plain.misfit > 0.0
         kept = self._kept
         if kept is None or np.any(kept.lacking != lacking) or np.any(kept.weights != weights):
-            known, unscaled = self.beforehand(), self._prior is None
+            known, unscaled = self.prior_information(), self._prior is None
             kept = ScaleFree(state_copy(self.grams), lacking, fit.torque, weights, fit.columns, known, unscaled)
             self._kept = kept
         return kept
 
-    def beforehand(self) -> Beforehand:
+    def prior_information(self) -> PriorInformation:
         """What is known of nuisances and parameters beside the rows; tolerances may be released, within bounds."""
         prior = None if self._within else self._prior
         known = np.pad(prior_factor(prior, self._n), ((0, 0), (len(self._nuisances), 0)))
         may = np.array([each.may_give_way for each in self._nuisances if np.isfinite(each.tolerance)], dtype=np.bool_)
         bounds = bound_rows(self._nuisances, self._n)
         certain = np.concatenate((self.state.known, self._calibration[~may], bounds, known))
-        return Beforehand(certain, self._calibration[may])
+        return PriorInformation(certain, self._calibration[may])

@@ -15,7 +15,7 @@ from sms_online.model.model import Model
 from sms_online.pipeline.changes import Adoption, Changes
 from sms_online.pipeline.description import nearer
 from sms_online.pipeline.drift_line import DriftLine
-from sms_online.pipeline.event_rows import Behind
+from sms_online.pipeline.event_rows import AfterChange
 from sms_online.pipeline.joint_estimate import JointEstimate
 from sms_online.pipeline.latency import Latencies, clock_groups, source_groups, wandering_clocks
 from sms_online.pipeline.momentum_balance import MomentumBalance, half_hop
@@ -117,7 +117,7 @@ class Momentum(Stage):
         self.latencies = Latencies(self._sources, base.n)
         self.fit = MomentumFit(
             model, base, self._balance, self._new_noise, self._solved, self._sources,
-            prior_rows(self.nuisances, base.n), self.joint.beforehand,
+            prior_rows(self.nuisances, base.n), self.joint.prior_information,
             [k for k, each in enumerate(self.nuisances) if each.name == "drive_gain"], self._drift_at, self.point,
         )  # fmt: skip
         self.fit.plain.patient = self.state.patient and self.bank.patient
@@ -265,7 +265,7 @@ class Momentum(Stage):
         """Where rows are held back for an event: decide on it, once there are enough of them, and go on."""
         may_drift = self._may_drift
         found = self.changes.decide(noise, self.state.start_time, last, steps=may_drift)
-        if may_drift and isinstance(found, Behind):
+        if may_drift and isinstance(found, AfterChange):
             self._decide_on_drift(found, noise, last)
             if self.bank.state.none:
                 found = self.changes.decide(noise, self.state.start_time, last)
@@ -344,7 +344,7 @@ class Momentum(Stage):
         detector, none = self.changes.detector, self.bank.learned is None or self.bank.state.none
         return detector.alarm is not None and not (detector.uncertain or none)
 
-    def _decide_on_drift(self, behind: Behind, noise: SensorNoise, last: bool) -> None:
+    def _decide_on_drift(self, behind: AfterChange, noise: SensorNoise, last: bool) -> None:
         """Where rows held back are those of a drift: go on with it."""
         detector, learned = self.changes.detector, self.bank.learned
         assert detector.alarm is not None

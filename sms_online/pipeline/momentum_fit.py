@@ -18,7 +18,6 @@ import numpy as np
 
 from sms_online.model.base_parameters import BaseParameters
 from sms_online.model.model import Model
-from sms_online.pipeline.beforehand import Beforehand, fitted
 from sms_online.pipeline.criterion import Columns
 from sms_online.pipeline.description import described
 from sms_online.pipeline.drift_line import DriftLine
@@ -33,6 +32,7 @@ from sms_online.pipeline.momentum_windows import (
     Window,
 )
 from sms_online.pipeline.plain_rows import PlainRows
+from sms_online.pipeline.prior_information import PriorInformation, fitted
 from sms_online.pipeline.second_order import RowErrors, beyond_first_order, size
 from sms_online.pipeline.sensor_noise import SensorNoise
 from sms_online.pipeline.white_rows import WhiteRows
@@ -96,9 +96,9 @@ class MomentumFit(Stage):
 
     new_noise: makes what propagates noise, for the same model, base and balance. solve: gives the estimate so far of
     nuisances and β (m + n,), which weights follow. sources: whose latencies are estimated. calibration: rows
-    [N Y b] (k, m + n + 1) of what is known of the nuisances beforehand. beforehand: gives all that is known beside the
-    rows. drift: gives the known drift in the window that ends at a grid index. point: gives the nuisances (m,) that
-    samples are corrected by, none by default. whitening: that of now.
+    [N Y b] (k, m + n + 1) of what is known of the nuisances beforehand. prior_information: gives all that is known
+    beside the rows. drift: gives the known drift in the window that ends at a grid index. point: gives the nuisances
+    (m,) that samples are corrected by, none by default. whitening: that of now.
     """
 
     def __init__(
@@ -110,7 +110,7 @@ class MomentumFit(Stage):
         solve: Callable[[], Array],
         sources: Sequence[SourceGroup] = (),
         calibration: Array | None = None,
-        beforehand: Callable[[], Beforehand] | None = None,
+        prior_information: Callable[[], PriorInformation] | None = None,
         gains: Sequence[int] = (),
         drift: Callable[[int], DriftLine | None] = lambda end: None,
         point: Callable[[], Array] | None = None,
@@ -127,10 +127,16 @@ class MomentumFit(Stage):
         self.described = described(model, base)
         self._balance = balance
         self._solve, self._drift = solve, drift
-        self._beforehand = beforehand if beforehand is not None else lambda: Beforehand.none(self._nuisances + base.n)
+        self._prior_information = (
+            prior_information
+            if prior_information is not None
+            else lambda: PriorInformation.none(self._nuisances + base.n)
+        )
         self.torque = np.isin(np.arange(model.layout.n_v), model.layout.theta_m)
         nominal = base.values(model.nominal)
-        self._first_weights = FirstWeights(nominal, self._calibration, self.columns, self.torque, self._beforehand)
+        self._first_weights = FirstWeights(
+            nominal, self._calibration, self.columns, self.torque, self._prior_information
+        )
         self._new_noise, self._sources = new_noise, sources
         self.whitening = self._new_whitening()
         self._next: WindowWhitening | None = None  # with new weights; takes over when it has received enough windows
@@ -258,7 +264,7 @@ class MomentumFit(Stage):
         Rows that were whitened as if the model lacked something determine large nuisances too roughly to show it.
         """
         m, squares = self._nuisances, np.einsum("vii->vi", self.plain.gram)[:, self._nuisances : -1]
-        found = fitted(self.plain.gram.sum(axis=0), self._beforehand(), m, joint)
+        found = fitted(self.plain.gram.sum(axis=0), self._prior_information(), m, joint)
         # Rows without a torque leave less where π shrinks.
         shrunk = np.any(squares @ found[m:] ** 2 < SHRUNK**2 * (squares @ joint[m:] ** 2))
         if not shrunk and not self.plain.excess(found).any():

@@ -25,8 +25,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import stdtrit
 
-from sms_online.pipeline.beforehand import Beforehand, Penalty
 from sms_online.pipeline.criterion import Columns, Criterion, Minimum, at_minimum, descended, minimum
+from sms_online.pipeline.prior_information import Penalty, PriorInformation
 from sms_online.pipeline.row_grams import RowGrams
 from sms_online.stream import Array
 from sms_online.trackers.factor import masked_covariance
@@ -52,7 +52,7 @@ class ScaleFree:
     torque: NDArray[np.bool_]
     weights: Array
     columns: Columns
-    known: Beforehand
+    known: PriorInformation
     alone: bool
     _robust: dict[bytes, Array] = field(default_factory=dict, init=False, repr=False, compare=False)
 

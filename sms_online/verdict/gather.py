@@ -70,11 +70,11 @@ def _unconverged(evaluation: Evaluation) -> str:
         few = estimate.dof < ROWS_A_PARAMETER * estimate.pi.size
         return "the energy balance has few rows yet" if few else ""
     if not momentum.started:
-        return f"the first fit has no weights after the motion of {now.duration:.3g} s"
+        return f"the motion of {now.duration:.3g} s is too little for the first weights"
     if momentum.tested or (now.events and now.events[-1].kind == "undecided"):
         return ""
     after = f" since the change at {now.events[-1].time:.1f} s" if now.events else ""
-    return f"the test for more than noise has seen too few rows{after}"
+    return f"the test of the residual has too few rows{after}"
 
 
 def _silent(now: Statistics) -> dict[str, float]:
@@ -118,11 +118,11 @@ def _weaknesses(now: Statistics) -> list[str]:
     if now.smoother is not None and now.smoother.level > 0.0 and by_smoother:
         out.append("samples do not agree with the equations of motion")
     if by_smoother and any(value != 0.0 for value in now.setup.system.tolerances.model_dump().values()):
-        out.append("error bars by the smoother count no tolerances of geometry and calibration")
+        out.append("the smoother's error bars do not include the tolerances of geometry and calibration")
     if now.momentum is None and not by_smoother:
         out.append("by the energy balance alone, nothing tests whether the model lacks something")
     if now.smoother is not None and not by_smoother and now.setup.sensing.missing:
-        out.append("links are taken as bent statically: estimates are off by percents")
+        out.append("links are taken to bend quasi-statically: estimates are off by several percent")
     late = None if now.momentum is None else now.momentum.latency
     if late is not None:
         whose = late.source if late.size > 0.0 else f"all sources but {late.source}"

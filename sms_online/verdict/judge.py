@@ -23,7 +23,7 @@ def judge(evidence: Evidence) -> Trust:
     """
     wrong = _wrong(evidence)
     colour = _colour(evidence)
-    # What befell the samples comes before what that may have done to the estimate.
+    # Faults of the samples come before what they may have done to the estimate.
     samples, few = reasons.of_samples(evidence), reasons.outliers(evidence.outliers, few=True)
     if wrong:
         return Trust("doubt", (*samples, *wrong, *few, *_cautions(evidence)), grave=True)
@@ -107,9 +107,9 @@ def _unexplained(effects: Sequence[str], row: str | None, near: bool) -> list[Re
     """Reasons where no known effect explains what acts, or not all of it."""
     where = "" if row is None else f" on {row}"
     like = reasons.listed(effects)
-    text = f"something acts{where} that no known effect explains"
+    text = f"a force{where} that no known effect explains"
     if near:
-        text = f"what acts{where} is near {like}, but is more or something else"
+        text = f"{like} explains most of what acts{where}, not all"
     found = [Reason(text, True, () if row is None else (row,), "unexplained")]
     # These are no findings, so they are not listed one by one.
     return found if near or not effects else [*found, Reason(f"some of it looks like {like}", True)]
@@ -122,7 +122,9 @@ def _named(effects: Sequence[str], after: Trust, either: Sequence[Reason]) -> li
     ]
     what, them = (effects[0], "it") if len(effects) == 1 else (f"{len(effects)} effects", "them")
     unsure = after.grave or after.level == "not yet" or either
-    trusted = f"; trust the parameters with {them}" + (" but for what follows" if after.level == "doubt" else "")
+    trusted = f"; the parameters are trusted with {them}" + (
+        ", except as listed below" if after.level == "doubt" else ""
+    )
     text = f"the system file lacks {what}" + ("" if unsure else trusted)
     found = [replace(each[0], text=text)] if len(each) == 1 else [Reason(text, after.grave), *each]
     return [*(replace(reason, grave=after.grave) for reason in either), *found]

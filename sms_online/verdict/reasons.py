@@ -39,7 +39,7 @@ NAMED = 2
 # Without a spring, a mass or a rigidity nobody simulates the arm: green needs them, by the ends of their names.
 VITAL = ("mass", "mass_per_length", "stiffness", "rigidity", "rigidity_y", "rigidity_z")
 # Word for what may be at either of two places.
-UNDECIDED = "this or the other"
+UNDECIDED = "ambiguous place"
 # What to do next.
 DIAGNOSE = "run `sms-online diagnose` on the recording"
 ADD_EFFECT = "run `sms-online diagnose` and replay with the system.toml that it writes, or use --adopt"
@@ -59,12 +59,12 @@ FOLLOW = "replay it with `--tracker kalman:drift=learned` (tracker = kalman, dri
 OR_DRIFTS = f"{FOLLOW}, if a parameter may have drifted; else "
 GO_ON = "record for longer: a drift is followed once it is certain; then run `sms-online diagnose`"
 CHECK_DEVICE = "look at power, cable and address of what is silent, and at its table in the system file"
-CHECK_TROUBLE = "see to the devices, the recording and the machine first"
+CHECK_TROUBLE = "mend the device, the recording or the machine that is reported first"
 MOVE = "move all joints, faster and over a larger range, and long enough"
 
 
 def of_samples(evidence: Evidence) -> list[Reason]:
-    """What befell the samples themselves, but for a few outliers."""
+    """Faults of the samples: loss, many outliers, low rates, jitter and coloured noise."""
     out = [*_lost(evidence.lost), *outliers(evidence.outliers, few=False), *_slow(evidence.slow)]
     return [*out, *_jittering(evidence.jitters), *_coloured(evidence.coloured)]
 
@@ -161,21 +161,21 @@ def lacking(discrepancies: Iterable[Discrepancy]) -> list[Reason]:
 
 
 def unnamed(discrepancies: Iterable[Discrepancy]) -> list[Reason]:
-    """Rows that leave more than noise, of which nobody knows why."""
+    """Residuals that exceed their predicted noise, for a reason that is not known."""
     out = []
     for each in discrepancies:
         if each.verdict in ("noticed", "unexplained"):
             why = "not named yet" if each.verdict == "noticed" else "no known effect explains it"
             why += f", nearest {listed(each.effects)}" if each.effects else ""
-            text = f"more than noise in the residual of {each.row} since {each.noticed:.1f} s, {why}"
-            out.append(Reason(text, True, (each.row,), "more than noise", then=DIAGNOSE))
+            text = f"the residual of {each.row} exceeds its predicted noise since {each.noticed:.1f} s, {why}"
+            out.append(Reason(text, True, (each.row,), "exceeds noise", then=DIAGNOSE))
     return out
 
 
 def passed(discrepancies: Iterable[Discrepancy]) -> list[Reason]:
-    """Rows that left more than noise for a time."""
+    """Residuals that exceeded their predicted noise for a time."""
     return [
-        Reason(f"the residual of {each.row} was more than noise for a time", False)
+        Reason(f"the residual of {each.row} exceeded its predicted noise for a time", False)
         for each in discrepancies
         if each.verdict == "passed"
     ]
@@ -217,8 +217,8 @@ def beyond_limit(residual: Residuals) -> list[Reason]:
     if worst is None or noise <= LARGEST_WHITENED:
         return []
     full = (
-        f"rows of {worst} hold {noise:.0f} times what the sensors' noise explains: the model or the samples are wrong "
-        "there, by more than error bars can express"
+        f"the residual of {worst} is {noise:.0f} times its predicted noise: the model or the samples are wrong there, "
+        "by more than error bars can express"
     )
     mark = f"{noise:.0f} × noise"
     return [Reason(f"the residual of {worst} is {mark}", True, (worst,), mark, full, CHECK_ROWS)]
@@ -254,11 +254,11 @@ def _worst(residual: Residuals) -> tuple[str | None, float]:
 
 def more_than_noise(row: str, coloured: Mapping[str, float]) -> Reason:
     """The alarm of a sequential test, which takes windows for independent; coloured noise makes them less so."""
-    text = f"the residual of {row} is more than noise"
+    text = f"the residual of {row} exceeds its predicted noise"
     if not coloured:
-        return Reason(text, True, (row,), "more than noise", then=DIAGNOSE)
+        return Reason(text, True, (row,), "exceeds noise", then=DIAGNOSE)
     channel = max(coloured, key=lambda name: coloured[name])
-    text += f", where that of {channel} is correlated over {1e3 * coloured[channel]:.2g} ms"
+    text += f", and the noise of {channel} is correlated over {1e3 * coloured[channel]:.2g} ms"
     return Reason(text, False, (row,), "coloured noise", then=CHECK_COLOUR)
 
 
@@ -276,7 +276,7 @@ def disputed(disputes: Sequence[Dispute]) -> list[Reason]:
     """Parameters that the data pull away from their prior, the furthest first."""
     out = []
     for dispute in sorted(disputes, key=lambda each: -abs(each.deviations)):
-        by = "" if dispute.row is None else f": rows of {dispute.row} pull it"
+        by = "" if dispute.row is None else f", driven by the rows of {dispute.row}"
         off = f"{dispute.parameter} is {abs(dispute.deviations):.0f} σ off its prior"
         full = f"{off}{by}; the prior, the model or the samples are wrong there"
         out.append(Reason(off + by, True, place_of(dispute.parameter), "off its prior", full, CHECK_PRIOR))
@@ -316,7 +316,10 @@ def attenuated(names: Sequence[str]) -> list[Reason]:
 
 def undecided_changes(times: Sequence[float]) -> list[Reason]:
     """Changes, at times in s, that the session ended too early to decide on."""
-    return [Reason(f"a change at {t:.1f} s came too late: values of before", False) for t in times]
+    return [
+        Reason(f"a change at {t:.1f} s came too late to be decided on: the estimates are from before it", False)
+        for t in times
+    ]
 
 
 def undecided(said: str, where: str, other: str) -> Reason:
@@ -345,7 +348,8 @@ def unwatched(duration: float) -> list[Reason]:
     """A long session, of a duration in s, in which a drift would show nowhere."""
     if duration < LONGEST_UNWATCHED:
         return []
-    text = f"a parameter may have drifted in {duration:.0f} s: clocks of several devices wander as drifts do"
+    why = "nothing tests for drifts, which clocks of several devices mimic"
+    text = f"a parameter may have drifted in {duration:.0f} s: {why}"
     return [Reason(text, False, then=FOLLOW)]
 
 
@@ -371,7 +375,12 @@ def grounds(evidence: Evidence) -> list[Reason]:
     if evidence.undetermined:
         out.append(Reason(f"not determined: {listed(evidence.undetermined)}", False))
     if evidence.scale:
-        out.append(Reason(f"the scale of all rests on the torque constants, ± {100.0 * evidence.scale:.2g} %", False))
+        out.append(
+            Reason(
+                f"the common scale of all parameters rests on the torque constants, ± {100.0 * evidence.scale:.2g} %",
+                False,
+            )
+        )
     return out
 
 

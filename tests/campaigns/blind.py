@@ -53,7 +53,7 @@ PLANAR = [name for name, entry in ENTRIES.items() if name in _POSSIBLE and entry
 # Columns nearer than this, rad, are ambiguous.
 SAME_ANGLE = np.deg2rad(10.0)
 
-# Asked of the residual on data not fitted, over what noise alone leaves.
+# Asked of the residual on held-out data, over what noise alone leaves.
 MOST_OVER_FLOOR = 1.2
 # A session of 20 s that leaves more than this multiple of the predicted noise leaves more than noise.
 MOST_IN_A_SESSION = 1.25

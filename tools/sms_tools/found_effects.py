@@ -31,7 +31,7 @@ def look_alikes(effect: Mapping[str, Any]) -> str:
 def why(effect: Mapping[str, Any]) -> str:
     """Why an effect was found; empty where it was not compared.
 
-    The finding in words, or what it improves of data not fitted beside the next best.
+    The finding in words, or what it improves of held-out data beside the next best.
     """
     if effect["sentence"]:
         return str(effect["sentence"])

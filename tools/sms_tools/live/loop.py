@@ -212,7 +212,7 @@ class LiveSession:
             who, when = self._away
             # As long as the latencies remember.
             recent = self._clock() - when < 2.0 * RECENT
-            why = f" because {who} had been away" if recent else ": the machine is too slow"
+            why = f" after {who} had reconnected" if recent else ": the machine is too slow"
             found.append(f"estimates come {behind:.1f} s late{why}")
         return found
 

@@ -175,4 +175,4 @@ def _residuals(document: Document) -> Table:
         whitened, relative = ([part[row][measure] for part in parts] for measure in ("whitened", "relative"))
         rows.append([row, *(f"{w:.3g}" for w in whitened), *("" if r is None else f"{r:.3g}" for r in relative)])
     headings = ("rows", "× noise before", "after", "share of torque before", "after")
-    return table(headings, rows, left=("rows",), title="residual of data not fitted")
+    return table(headings, rows, left=("rows",), title="residual on held-out data")

@@ -53,7 +53,7 @@ def run(args: argparse.Namespace) -> int:
     # As in what a running session writes: the values of its effects are for the estimator to find.
     effects = build_model(described).effects
     idle = [e for e in effects if e.parameters and not any(nominal[p.name] for p in e.parameters)]
-    lines += [f"warning: {e.key} does nothing, for {args.system} states no size of it" for e in idle]
+    lines += [f"warning: {e.key} has no effect: {args.system} states no coefficient of it" for e in idle]
     lines += [f"warning: {said}" for said in simulation.beyond]
     say(args, *lines, document=document)
     return OK

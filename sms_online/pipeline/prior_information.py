@@ -32,8 +32,8 @@ PASSES, RANK_TOLERANCE = 6, 1e-12
 
 
 @dataclass(frozen=True)
-class Beforehand:
-    """Rows [N Y b] of m nuisances and n parameters, each of unit variance, that no sample is behind.
+class PriorInformation:
+    """Rows [N Y b] of m nuisances and n parameters, each of unit variance, that do not come from samples.
 
     certain (k, m + n + 1): what rows before an event said, and priors. doubtful (j, m + n + 1): tolerances of nuisances
     whose columns scale with π, one a row.
@@ -43,9 +43,9 @@ class Beforehand:
     doubtful: Array
 
     @staticmethod
-    def none(n: int) -> Beforehand:
+    def none(n: int) -> PriorInformation:
         """Nothing is known of n parameters."""
-        return Beforehand(np.zeros((0, n + 1)), np.zeros((0, n + 1)))
+        return PriorInformation(np.zeros((0, n + 1)), np.zeros((0, n + 1)))
 
 
 class Penalty:
@@ -55,7 +55,9 @@ class Penalty:
     (m + n + 1,): w with the π behind the columns of calibration. widened: factor to all tolerances and priors.
     """
 
-    def __init__(self, known: Beforehand, nuisances: int, squares: Array, weights: Array, widened: float = 1.0) -> None:
+    def __init__(
+        self, known: PriorInformation, nuisances: int, squares: Array, weights: Array, widened: float = 1.0
+    ) -> None:
         self._certain = known.certain
         self._rows = known.doubtful / widened
         self._units = np.zeros_like(known.doubtful)
@@ -95,7 +97,7 @@ class Penalty:
         return rows.T @ residual, rows.T @ rows
 
 
-def fitted(gram: Array, known: Beforehand, nuisances: int, start: Array) -> Array:
+def fitted(gram: Array, known: PriorInformation, nuisances: int, start: Array) -> Array:
     """Least squares (m + n,) of rows with a Gram matrix (m + n + 1, m + n + 1) of [N Y b], their variance as stated.
 
     start (m + n,): holds the π behind the columns of calibration.
