@@ -70,6 +70,8 @@ def notices(now: Statistics) -> list[str]:
     for shift in () if now.momentum is None else now.momentum.shifts:
         size = f"{1e6 * shift.size:+.0f} ± {1e6 * shift.std:.0f} µs"
         out.append(f"{shift.device}: its clock shifted by {size} against the others' at {shift.time:.1f} s")
+    if system.scale_tolerance is not None and (system.known or system.priors):
+        out.append("what is known does not fix the scale: it acts as parameters do that are unknown")
     if now.setup.unused:
         out.append(f"unused channels: {', '.join(now.setup.unused)}")
     return out

@@ -325,10 +325,14 @@ class System(Record):
     def scale_tolerance(self) -> float | None:
         """1σ of the scale common to all parameters, that of the torques, which no residual shows.
 
-        None where a parameter that is known, or has a prior, fixes it.
+        None where parameters that are known, or have a prior, fix it.
         """
-        stated = [*self.known.values(), *(prior.value for prior in self.priors.values())]
-        return None if any(stated) else self.tolerances.drive_gain
+        if not self.known and not self.priors:
+            return self.tolerances.drive_gain
+        # Whether they do follows from the model, which is made of a description.
+        from sms_online.effects.build import scale_is_fixed
+
+        return None if scale_is_fixed(self) else self.tolerances.drive_gain
 
     @property
     def nominal(self) -> dict[str, float]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable
+from functools import lru_cache
 
 import numpy as np
 
@@ -13,6 +14,7 @@ from sms_online.description.tree import index_of
 from sms_online.effects.base import Site
 from sms_online.effects.catalogue import FORCE_CLASSES, GEOMETRIC_STIFFENING, INERTIA_CLASSES, check_effect, with_shapes
 from sms_online.errors import InputError
+from sms_online.model.base_parameters import fixes_scale
 from sms_online.model.chain import Chain
 from sms_online.model.effect import ForceEffect, InertiaEffect
 from sms_online.model.model import Model
@@ -29,6 +31,16 @@ def build_model(system: System, reference: Array | None = None) -> Model:
     name, place or coefficient of an effect.
     """
     return Model(with_kinematics(system), build_effects, reference)
+
+
+def scale_is_fixed(system: System) -> bool:
+    """Whether values that a system states as known or as priors fix the scale common to all parameters."""
+    return _scale_is_fixed(system.model_dump_json())
+
+
+@lru_cache(maxsize=16)
+def _scale_is_fixed(described: str) -> bool:
+    return fixes_scale(build_model(System.model_validate_json(described)))
 
 
 def refuse_unknown_masses(model: Model) -> None:

@@ -121,16 +121,12 @@ def find_base_parameters(model: Model) -> BaseParameters:
     known = tuple((names.index(name), value) for name, value in model.system.known.items())
     if model.wrenches is not None:
         known += tuple((names.index(p.name), p.nominal) for p in model.wrenches.parameters)
-    rng = np.random.default_rng(RANDOM_SEED)
-    x, v = random_states(model, STATES_PER_PARAMETER * model.n_pi, rng)
-    inputs = random_inputs(model, len(x), rng)
-    Y = _columns(model, x, v, inputs)
+    Y, drawn = _drawn(model)
     scale = np.linalg.norm(Y, axis=0)
     known_indices = {index for index, _ in known}
     largest = float(scale.max())
     absent = tuple(k for k in range(model.n_pi) if scale[k] <= RANK_TOLERANCE * largest or k in known_indices)
     candidates = [k for k in range(model.n_pi) if k not in absent]
-    drawn = [_columns(model.of_geometry(perturbed(model.system, rng)), x, v, inputs) for _ in range(DRAWS)]
     changes = [(other - Y)[:, candidates] / scale[candidates] for other in drawn]
     kept = _independent(Y[:, candidates] / scale[candidates], changes)
     independent = tuple(candidates[k] for k in kept)
@@ -147,6 +143,41 @@ def find_base_parameters(model: Model) -> BaseParameters:
         for k, exact, shown in zip(independent, mixture, printed, strict=True)
     )
     return BaseParameters(model.parameters, parameters, independent, dependent, absent, mixture, known)
+
+
+@one_blas_thread()
+def fixes_scale(model: Model) -> bool:
+    """Whether values that the system file states, as known or as priors, fix the scale common to all parameters.
+
+    They do where together they act as no other parameters can. The mass of a link that turns about a fixed axis acts as
+    its inertia does: whatever it is, that takes up the rest.
+    """
+    names = [p.name for p in model.parameters]
+    stated = {**{name: prior.value for name, prior in model.system.priors.items()}, **model.system.known}
+    value = np.array([stated.get(name, 0.0) for name in names])
+    if not value.any():
+        return False
+    Y, drawn = _drawn(model)
+    others = [k for k, name in enumerate(names) if name not in stated]
+
+    def beside(columns: Array) -> Array:
+        return np.column_stack((columns[:, others], columns @ value))
+
+    all_of = beside(Y)
+    size = np.linalg.norm(all_of, axis=0)
+    seen = size > RANK_TOLERANCE * float(size.max())
+    changes = [((beside(other) - all_of) / np.where(seen, size, 1.0))[:, seen] for other in drawn]
+    kept = _independent(all_of[:, seen] / size[seen], changes)
+    return bool(seen[-1]) and int(np.count_nonzero(seen)) - 1 in kept
+
+
+def _drawn(model: Model) -> tuple[Array, list[Array]]:
+    """Columns (rows, n_pi) at random states, and the same of geometries drawn from the tolerances."""
+    rng = np.random.default_rng(RANDOM_SEED)
+    x, v = random_states(model, STATES_PER_PARAMETER * model.n_pi, rng)
+    inputs = random_inputs(model, len(x), rng)
+    drawn = [_columns(model.of_geometry(perturbed(model.system, rng)), x, v, inputs) for _ in range(DRAWS)]
+    return _columns(model, x, v, inputs), drawn
 
 
 def _columns(model: Model, x: Array, v: Array, inputs: Inputs) -> Array:

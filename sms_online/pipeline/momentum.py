@@ -26,6 +26,7 @@ from sms_online.pipeline.residual_test import SequentialTest
 from sms_online.pipeline.sensing import Sensing
 from sms_online.pipeline.sensor_noise import SensorNoise
 from sms_online.pipeline.synchronise import GridSamples
+from sms_online.pipeline.torque_gains import gain_columns
 from sms_online.pipeline.tracker_bank import Change, Reading, TrackerBank
 from sms_online.pipeline.white_rows import WhiteRows
 from sms_online.pipeline.window_noise import WindowNoise
@@ -118,7 +119,7 @@ class Momentum(Stage):
         self.fit = MomentumFit(
             model, base, self._balance, self._new_noise, self._solved, self._sources,
             prior_rows(self.nuisances, base.n), self.joint.prior_information,
-            [k for k, each in enumerate(self.nuisances) if each.name == "drive_gain"], self._drift_at, self.point,
+            gain_columns(model, base, self.nuisances), self._drift_at, self.point,
         )  # fmt: skip
         self.fit.plain.patient = self.state.patient and self.bank.patient
         self.test = self._new_test()

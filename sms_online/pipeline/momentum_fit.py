@@ -35,6 +35,7 @@ from sms_online.pipeline.plain_rows import PlainRows
 from sms_online.pipeline.prior_information import PriorInformation, fitted
 from sms_online.pipeline.second_order import RowErrors, beyond_first_order, size
 from sms_online.pipeline.sensor_noise import SensorNoise
+from sms_online.pipeline.torque_gains import fixed_torques
 from sms_online.pipeline.white_rows import WhiteRows
 from sms_online.pipeline.window_noise import WindowNoise
 from sms_online.pipeline.window_whitening import WhitenedWindow, WindowWhitening
@@ -132,7 +133,7 @@ class MomentumFit(Stage):
             if prior_information is not None
             else lambda: PriorInformation.none(self._nuisances + base.n)
         )
-        self.torque = np.isin(np.arange(model.layout.n_v), model.layout.theta_m)
+        self.torque = fixed_torques(model)
         nominal = base.values(model.nominal)
         self._first_weights = FirstWeights(
             nominal, self._calibration, self.columns, self.torque, self._prior_information
