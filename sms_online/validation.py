@@ -12,15 +12,17 @@ from sms_online.capture import check_channels
 from sms_online.cramer_rao import MotionRecord
 from sms_online.data import Data, recorded_session
 from sms_online.description.channels import channels as known_channels
-from sms_online.description.schema import System
+from sms_online.description.schema import Effect, System
 from sms_online.diagnosis.evidence import RANK_TOLERANCE
+from sms_online.effects.catalogue import ENTRIES
 from sms_online.errors import InputError
 from sms_online.linearised import Motion
 from sms_online.model.base_parameters import BaseParameters
 from sms_online.model.model import Model
 from sms_online.pipeline.estimator import Estimator
 from sms_online.pipeline.joint_balance import SquaredResidual
-from sms_online.result import Parameters
+from sms_online.pipeline.torque_gains import GAIN, gain_columns
+from sms_online.result import Parameters, Result
 from sms_online.row_types import joint_rows
 from sms_online.stream import Array
 from sms_online.tables import Tabled
@@ -103,13 +105,19 @@ class Validation(Tabled):
         return ["joint", "share of torque left", "fitted to this run", "ratio"], cells
 
 
-def validate(system: System, data: Data, parameters: Parameters | Mapping[str, float] | None = None) -> Validation:
+def validate(
+    system: System, data: Data, parameters: Result | Parameters | Mapping[str, float] | None = None
+) -> Validation:
     """Predict the torques of recorded data with fixed parameters, and measure the error.
 
-    data: as for `estimate`. parameters: values by name, or those of a `Result`; the nominal ones of the system file
-    unless given. Nothing is estimated from the data but for comparison.
+    data: as for `estimate`. parameters: values by name, or a `Result`, whose gains of torques hold as its parameters
+    do; the nominal ones of the system file unless given. Nothing is estimated from the data but for comparison.
     Raises InputError where the data do not fit the system, a parameter is missing, or there is no torque to predict.
     """
+    if isinstance(parameters, Result):
+        gains = {each.where: each.estimate for each in parameters.calibration if each.name == GAIN}
+        values = {name: each.value for name, each in parameters.parameters.items()}
+        system, parameters = with_gains(system, values, gains)
     recorded = recorded_session(system, data)
     check_channels(tuple(recorded.source.channels), known_channels(system), recorded.name)
     # The rows of the joints' torques depend on no estimate; without a momentum balance no event changes the model.
@@ -123,10 +131,26 @@ def validate(system: System, data: Data, parameters: Parameters | Mapping[str, f
     sums = {joint_rows(i): each for i, each in enumerate(session.energy.joint_residuals) if each.signal > 0.0}
     if not sums:
         raise InputError(recorded.name, "", "no torque, or too few samples", "a run with measured torques")
-    fitted = _fitted(list(sums.values()), beta.size)
+    fitted = _fitted(list(sums.values()), beta, gain_columns(session.model, session.base, ()))
     joints = {name: Predicted(_share(each, beta), _share(each, fitted)) for name, each in sums.items()}
     warnings = (*recorded.source.warnings, *beyond(session.model, motion.motions))
     return Validation(system.name, session.duration, joints, warnings)
+
+
+def with_gains(
+    system: System, values: Mapping[str, float], gains: Mapping[str, float]
+) -> tuple[System, dict[str, float]]:
+    """System and values by name, with gains of torques that a session has found, by joint: declared as effects."""
+    declared, held = [], {effect.key for effect in system.effects}
+    (entry,) = (each for each in ENTRIES.values() if GAIN in each.traits.calibrates)
+    (coefficient,) = entry.coefficients
+    for where, gain in gains.items():
+        # A measured torque is too large by its gain; an effect says what it has to be multiplied by.
+        effect = Effect(name=entry.name, where=where, coefficients={coefficient: -gain})
+        if effect.key not in held:
+            declared.append(effect)
+    added = {f"{effect.key}.{name}": value for effect in declared for name, value in effect.coefficients.items()}
+    return system.model_copy(update={"effects": (*system.effects, *declared)}), {**values, **added}
 
 
 def beyond(model: Model, motions: Sequence[Motion]) -> list[str]:
@@ -154,10 +178,17 @@ def _values(base: BaseParameters, system: System, parameters: Parameters | Mappi
     return np.array([values[parameter.name] for parameter in base.parameters])
 
 
-def _fitted(sums: list[SquaredResidual], n: int) -> Array:
-    """β (n,) that leaves least of all joints' torques, each relative to its own."""
-    gram = np.sum([each.gram / each.signal for each in sums], axis=0)
-    size = np.sqrt(np.diag(gram))[:n]
+def _fitted(sums: list[SquaredResidual], beta: Array, held: Sequence[int]) -> Array:
+    """β (n,) that leaves least of all joints' torques, each relative to its own.
+
+    held: gains of torques, which stay those of beta (n,): a free one would make a torque vanish.
+    """
+    gram, n = np.sum([each.gram / each.signal for each in sums], axis=0), beta.size
+    free = np.setdiff1d(np.arange(n), held)
+    size = np.sqrt(np.diag(gram))[free]
     size[size == 0.0] = 1.0
-    scaled = gram[:n, :n] / np.outer(size, size)
-    return np.asarray(np.linalg.lstsq(scaled, gram[:n, -1] / size, rcond=RANK_TOLERANCE)[0] / size)
+    scaled = gram[np.ix_(free, free)] / np.outer(size, size)
+    known = gram[free, -1] - gram[np.ix_(free, np.array(held, dtype=int))] @ beta[list(held)]
+    out = beta.copy()
+    out[free] = np.linalg.lstsq(scaled, known / size, rcond=RANK_TOLERANCE)[0] / size
+    return out

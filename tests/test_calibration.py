@@ -195,7 +195,15 @@ def test_a_camera_later_than_its_tolerance_is_not_trusted(exact: Block) -> None:
         ("clock", "markers", "", "s", 4.8e-5, 1e-6, "markers 48.0 ± 1.0 µs late"),
         ("clock", "base", "", "s", -4e-3, 1e-5, "base 4.000 ± 0.010 ms early"),
         ("tracked_point", "base", "x", "m", -9e-4, 2e-4, "base: tracked point (x) -900 ± 200 µm off"),
-        ("drive_gain", "joint_2", "", "", 1e-3, 4e-5, "joint_2: gain of the torque 0.1000 ± 0.0040 % off"),
+        (
+            "drive_gain",
+            "joint_2",
+            "against joint_1",
+            "",
+            1e-3,
+            4e-5,
+            "joint_2: gain of the torque (against joint_1) 0.1000 ± 0.0040 % off",
+        ),
     ],
 )
 def test_calibration_is_said_in_units_of_the_workshop(

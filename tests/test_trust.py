@@ -84,7 +84,7 @@ def test_what_error_bars_do_not_know_of_is_a_grave_doubt(evidence: Evidence, sai
     [
         (replace(GOOD, attenuated=("motor_2.mass",)), "noise biases motor_2.mass beyond the error bar"),
         (replace(GOOD, undecided=(19.2,)), "a change at 19.2 s"),
-        (replace(GOOD, discrepancies=(Discrepancy("base", 3.0, "passed"),)), "more than noise for a time"),
+        (replace(GOOD, discrepancies=(Discrepancy("base", 3.0, "passed"),)), "exceeded its predicted noise for a time"),
         (replace(GOOD, distance=39.0), "the estimate violates physical consistency by 39 standard deviations"),
         (replace(GOOD, lost=0.2), "20 % of the samples are lost"),
         (replace(GOOD, jitters={"encoders": 5e-4}), "stamps of encoders jitter by 0.5 ms"),
@@ -275,7 +275,7 @@ def test_results_hold_the_judgement_and_warn_of_the_reasons() -> None:
     estimator.finish()
     document = results_document(estimator, 0.0, [])
     assert document["verdict"] == judged(estimator).document()
-    assert any(warning.startswith("rows of joint_1 hold") for warning in document["warnings"])
+    assert any(warning.startswith("the residual of joint_1 is") for warning in document["warnings"])
 
 
 def test_a_judgement_is_plain_data_in_results() -> None:

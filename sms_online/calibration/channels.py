@@ -85,11 +85,12 @@ def torque_families(sensing: Sensing, tolerances: Tolerances) -> list[TorqueFami
     offset = np.inf if tolerances.drive_offset is None else tolerances.drive_offset
     # Unless a parameter is known, a gain that is common to all torques is that of all parameters.
     first = 1 if sensing.model.system.scale_tolerance is not None else 0
+    part = "against joint_1" if first else ""
     gained = [i for i in joints if i >= first and ("drive_gain", f"joint_{i + 1}") not in declared]
     shifted = [i for i in joints if ("drive_offset", f"joint_{i + 1}") not in declared]
     every = [
         TorqueFamily(
-            tuple(Nuisance("drive_gain", f"joint_{i + 1}", "", tolerances.drive_gain) for i in gained),
+            tuple(Nuisance("drive_gain", f"joint_{i + 1}", "", tolerances.drive_gain, part) for i in gained),
             partial(_of_torque, gained),
         ),
         TorqueFamily(

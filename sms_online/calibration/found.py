@@ -50,8 +50,9 @@ class Calibration:
     """A number of the description that the samples determine better than its tolerance; estimates are corrected by it.
 
     name: of a tolerance in the system file. where: `base`, `joint_i`, `link_i`, a channel or a device; part: an axis,
-    or the sine or cosine of an error once per turn. estimate: by how much the description is off, unit; std: its
-    standard deviation; tolerance: that of the system file, None where nothing was known.
+    the sine or cosine of an error once per turn, or what a gain is relative to. estimate: by how much the
+    description is off, unit; std: its standard deviation; tolerance: that of the system file, None where nothing was
+    known.
     """
 
     name: str
@@ -94,9 +95,13 @@ class Calibration:
         if self.name == "gauge_low_pass" and self.estimate > 0.0:
             return "record them unfiltered, or declare their low-pass as an effect with this corner"
         if self.name == "clock" and self.estimate > 0.0:
-            return f"state latency = {self.estimate:.2g} of it, or a larger tolerances.clock"
+            return f"state latency = {self.estimate:.2g} for it, or a larger tolerances.clock"
         if self.name == "truncation":
             return f"describe {self.where} with more elements"
+        if self.name == "drive_gain" and self.part:
+            return (
+                "measure a torque constant, or weigh one part and state it under [known]: either joint's may be wrong"
+            )
         return f"correct the system file or the sensor, or state a larger tolerances.{self.name}"
 
     def document(self) -> dict[str, str | float | None]:

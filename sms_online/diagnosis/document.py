@@ -21,7 +21,7 @@ from sms_online.threads import one_blas_thread
 from sms_online.verdict.evidence import Evidence
 from sms_online.verdict.judge import judge, judge_diagnosis
 from sms_online.verdict.judged import JudgedEvaluation, evaluated
-from sms_online.verdict.reasons import THEN_DIAGNOSE, undecided
+from sms_online.verdict.reasons import DIAGNOSE, THEN_DIAGNOSE, undecided
 from sms_online.verdict.trust import Reason, Trust
 
 SCHEMA = "sms-online/diagnosis/1"
@@ -118,7 +118,9 @@ def _after(diagnosis: Search, session: JudgedEvaluation) -> Trust:
         # Parameters come from the rows of the diagnosis then, see `posterior`.
         known = [p["identifiable"] for p in posterior(diagnosis.attempt, diagnosis.chosen)]
         trust = judge(Evidence((sum(known), len(known)), residual=_part(diagnosis.after.fit)))
-    return replace(trust, grounds=tuple(replace(r, then=r.then.removesuffix(THEN_DIAGNOSE)) for r in trust.grounds))
+    steps = [reason.then.removesuffix(THEN_DIAGNOSE).removesuffix(DIAGNOSE) for reason in trust.grounds]
+    grounds = zip(trust.grounds, steps, strict=True)
+    return replace(trust, grounds=tuple(replace(reason, then=step) for reason, step in grounds))
 
 
 def trust_of(diagnosis: Search, after: JudgedEvaluation | None = None) -> Trust:

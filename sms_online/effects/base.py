@@ -34,6 +34,11 @@ CHANGES = ("stiffness", "friction", "offset", "damping")
 DIFFERENCE = 1e-6
 
 
+def beyond_zero(offset: float) -> str:
+    """By how much a sensor reads too much or too little, in words."""
+    return f"{abs(offset):.3g} too {'much' if offset > 0.0 else 'little'}"
+
+
 def joints_of(where: str) -> tuple[int, ...]:
     """Indices, from 0, of the joint or the two joints of a place, `joint_i` or `joint_i+joint_j`; none of another."""
     return tuple(index_of(each) for each in where.split("+") if each.startswith("joint_"))

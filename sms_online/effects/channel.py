@@ -11,7 +11,7 @@ from typing import ClassVar, Literal, NamedTuple
 
 import numpy as np
 
-from sms_online.effects.base import Constant, Entry
+from sms_online.effects.base import Constant, Entry, beyond_zero
 from sms_online.effects.traits import Traits
 from sms_online.stream import Array
 
@@ -82,7 +82,7 @@ class EncoderOffset(ChannelEffect):
         traits=Traits(
             signed=True, most=LARGEST_OFFSET, calibrates=("encoder_zero", "marker_zero", "marker_zero_angle")
         ),
-        said=lambda where, given: f"{where} reads {given['offset']:.3g} too much: set its zero anew",
+        said=lambda where, given: f"{where} reads {beyond_zero(given['offset'])}: set its zero anew",
     )  # fmt: skip
     linear = (Linear("offset", "rad", "one", -1.0),)
 

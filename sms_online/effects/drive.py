@@ -9,7 +9,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from sms_online.effects.base import Entry, Shape, Site, position
+from sms_online.effects.base import Entry, Shape, Site, beyond_zero, position
 from sms_online.effects.friction import MotorSide
 from sms_online.effects.harmonic import amplitude_and_phase, nominal_parts, phase_columns
 from sms_online.effects.traits import Curve, Traits
@@ -94,7 +94,7 @@ class TorqueOffset(MotorSide):
     entry = Entry(
         "torque_offset", "force", "driven joint", {"torque": "N m"}, "standstill under a known torque",
         traits=Traits(signed=True, curve=Curve("motor speed"), begins=True, calibrates=("drive_offset",)),
-        said=lambda where, given: f"the torque of {where} reads {given['torque']:.3g} too much: set its zero anew",
+        said=lambda where, given: f"the torque of {where} reads {beyond_zero(given['torque'])}: set its zero anew",
     )  # fmt: skip
 
     def __init__(self, site: Site, given: Mapping[str, float]) -> None:

@@ -37,7 +37,7 @@ class FirstWeights:
     """Finds β (n,) for m nuisances and n parameters.
 
     nominal (n,): described values. calibration (k, m + n + 1), columns, prior_information: as in `MomentumFit`.
-    torque (n_v,): which speeds' rows hold a torque.
+    torque, gained (n_v,): which speeds' rows hold a torque of known gain, and of unknown.
     """
 
     def __init__(
@@ -46,15 +46,19 @@ class FirstWeights:
         calibration: Array,
         columns: Columns,
         torque: NDArray[np.bool_],
+        gained: NDArray[np.bool_],
         prior_information: Callable[[], PriorInformation],
     ) -> None:
         self._nominal, self._calibration = nominal, calibration
-        self._columns, self._torque, self._prior_information = columns, torque, prior_information
+        self._columns, self._prior_information = columns, prior_information
+        self._torque, self._gained = torque, gained
         self._nuisances = calibration.shape[1] - nominal.size - 1
 
     def of(self, held: Array, plain: PlainRows, whiten: Whiten) -> Array:
         """β (n,) of windows' rows [Y b] (W, copies, n_v, n + 1); plain: sums that `whiten` makes of them anew."""
         unweighted, _ = _least_squares(np.concatenate(held[:, 0]))
+        if self._gained.any():
+            return self._scale_free(held, plain, whiten, [self._nominal, unweighted])
         weights = self._iterated(unweighted, plain, whiten, PASSES, partly=False)
         if plain.misfit.any():
             misfit = plain.misfit
@@ -101,7 +105,7 @@ class FirstWeights:
             grams = RowGrams.none(n_v, self._nominal.size, m)
             for each in white:
                 grams.add(each.Y, each.noisy)
-            lacking, starts = plain.misfit > 0.0, [joint]
+            lacking, starts = (plain.misfit > 0.0) | self._gained, [joint]
         return self._least(grams, lacking, starts)[m:]
 
     def _least(self, grams: RowGrams, lacking: NDArray[np.bool_], starts: list[Array]) -> Array:

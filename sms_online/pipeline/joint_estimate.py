@@ -123,12 +123,11 @@ class JointEstimate(Stage):
 
         The same until rows come, for its minimum and its covariance take time.
         """
-        if not fit.plain.misfit.any() or self.grams.windows == 0:
+        if not fit.lacking.any() or self.grams.windows == 0:
             return None
         assert fit.weights is not None
         weights = np.pad(fit.weights, (len(self._nuisances), 0))
-        lacking = fit.plain.misfit > 0.0
-        kept = self._kept
+        kept, lacking = self._kept, fit.lacking
         if kept is None or np.any(kept.lacking != lacking) or np.any(kept.weights != weights):
             known, unscaled = self.prior_information(), self._prior is None
             kept = ScaleFree(state_copy(self.grams), lacking, fit.torque, weights, fit.columns, known, unscaled)

@@ -15,6 +15,7 @@ from collections.abc import Callable, Sequence
 
 import msgspec
 import numpy as np
+from numpy.typing import NDArray
 
 from sms_online.model.base_parameters import BaseParameters
 from sms_online.model.model import Model
@@ -35,7 +36,7 @@ from sms_online.pipeline.plain_rows import PlainRows
 from sms_online.pipeline.prior_information import PriorInformation, fitted
 from sms_online.pipeline.second_order import RowErrors, beyond_first_order, size
 from sms_online.pipeline.sensor_noise import SensorNoise
-from sms_online.pipeline.torque_gains import fixed_torques
+from sms_online.pipeline.torque_gains import gained
 from sms_online.pipeline.white_rows import WhiteRows
 from sms_online.pipeline.window_noise import WindowNoise
 from sms_online.pipeline.window_whitening import WhitenedWindow, WindowWhitening
@@ -99,7 +100,8 @@ class MomentumFit(Stage):
     nuisances and β (m + n,), which weights follow. sources: whose latencies are estimated. calibration: rows
     [N Y b] (k, m + n + 1) of what is known of the nuisances beforehand. prior_information: gives all that is known
     beside the rows. drift: gives the known drift in the window that ends at a grid index. point: gives the nuisances
-    (m,) that samples are corrected by, none by default. whitening: that of now.
+    (m,) that samples are corrected by, none by default. whitening: that of now. torque (n_v,): which speeds' rows hold
+    a torque of known gain.
     """
 
     def __init__(
@@ -133,10 +135,11 @@ class MomentumFit(Stage):
             if prior_information is not None
             else lambda: PriorInformation.none(self._nuisances + base.n)
         )
-        self.torque = fixed_torques(model)
+        self._gained = gained(model)
+        self.torque = np.isin(np.arange(model.layout.n_v), model.layout.theta_m) & ~self._gained
         nominal = base.values(model.nominal)
         self._first_weights = FirstWeights(
-            nominal, self._calibration, self.columns, self.torque, self._prior_information
+            nominal, self._calibration, self.columns, self.torque, self._gained, self._prior_information
         )
         self._new_noise, self._sources = new_noise, sources
         self.whitening = self._new_whitening()
@@ -294,6 +297,11 @@ class MomentumFit(Stage):
         """Pass the states of the instants on to what propagates noise."""
         for whitening in self._whitenings:
             whitening.noise.extend(self.state.first, self.state.x, self.state.v, self.state.signals)
+
+    @property
+    def lacking(self) -> NDArray[np.bool_]:
+        """Which speeds' rows (n_v,) are weighted by what they leave: more than noise, or any share of a torque."""
+        return np.asarray((self.plain.misfit > 0.0) | self._gained)
 
     @property
     def _whitenings(self) -> list[WindowWhitening]:

@@ -1,4 +1,4 @@
-"""Which rows hold a torque that fixes the scale of their parameters, and which columns are torques times a gain."""
+"""Which rows hold a torque of unknown gain, and which columns are torques times a gain."""
 
 from __future__ import annotations
 
@@ -23,16 +23,14 @@ def gain_columns(model: Model, base: BaseParameters, nuisances: Sequence[Nuisanc
     return calibrated + [len(nuisances) + k for k, place in enumerate(base.independent) if place in places]
 
 
-def fixed_torques(model: Model) -> NDArray[np.bool_]:
-    """Which speeds' rows (n_v,) hold a torque whose gain is known to a tolerance.
+def gained(model: Model) -> NDArray[np.bool_]:
+    """Which speeds' rows (n_v,) hold a torque whose gain is an unknown of the model.
 
-    Where a gain is an unknown of the model, a row is homogeneous in it and in the other parameters: as in the rows of a
-    link, all of them shrinking together lowers what is left.
+    Such a row is homogeneous in the gain and in the other parameters: as in the rows of a link, all of them shrinking
+    together lowers what is left.
     """
-    layout = model.layout
-    unknown = [layout.theta_m[i] for joints, _ in _declared(model) for i in joints]
-    speeds = np.arange(layout.n_v)
-    return np.isin(speeds, layout.theta_m) & ~np.isin(speeds, unknown)
+    unknown = [model.layout.theta_m[i] for joints, _ in _declared(model) for i in joints]
+    return np.isin(np.arange(model.layout.n_v), unknown)
 
 
 def _declared(model: Model) -> list[tuple[Sequence[int], slice]]:

@@ -75,7 +75,8 @@ def ambiguous_effects(evaluation: Evaluation) -> list[Reason]:
     """Effects of the description, larger than their tolerance, that may as well be the other way elsewhere."""
     system, out = evaluation.model.system, []
     scale = system.scale_tolerance
-    estimates = dict(zip((p.name for p in evaluation.parameters), evaluation.estimate.pi.tolist(), strict=True))
+    determined = zip(evaluation.parameters, evaluation.estimate.pi.tolist(), evaluation.determined, strict=True)
+    estimates = {parameter.name: value for parameter, value, known in determined if known}
     for effect in system.effects:
         other = either(effect, system)
         key = f"{effect.key}."

@@ -115,7 +115,7 @@ def torque_gain(by: float) -> Samples:
     def distort(system: System, block: Block, random: np.random.Generator) -> dict[Key, float]:
         gain = by * _sign(random)
         block.values[:, block.channels.index("tau_2")] *= 1.0 + gain
-        return {("drive_gain", "joint_2", ""): gain}
+        return {("drive_gain", "joint_2", "against joint_1"): gain}
 
     return distort
 

@@ -5,10 +5,13 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
+from sms_adapters.runs import NAME as RESULTS
 from sms_adapters.runs import read_results
+from sms_adapters.session_log import SYSTEM
 from sms_online.description.schema import System
+from sms_online.pipeline.torque_gains import GAIN
 from sms_online.recorded import Recorded
-from sms_online.validation import validate
+from sms_online.validation import validate, with_gains
 from sms_tools.exit_codes import OK
 from sms_tools.report import say, table
 from sms_tools.results_file import results_directory, write_document
@@ -34,9 +37,14 @@ def run(args: argparse.Namespace) -> int:
 def _described(args: argparse.Namespace) -> tuple[System, dict[str, float] | None, Path | None]:
     """System and parameters of a results.json or of the folder of a run; of a system file its nominal values."""
     path = Path(args.system)
+    if path.is_dir() and (path / SYSTEM).exists() and not (path / RESULTS).exists():
+        # The folder of a diagnosis.
+        path = path / SYSTEM
+        args.system = str(path)
     if path.suffix != ".json" and not path.is_dir():
         system, folder = described_system(args)
         return system, None, folder
     document = read_results(path)
     values = {parameter["name"]: float(parameter["estimate"]) for parameter in document["parameters"]}
-    return System.model_validate(document["system"]), values, None
+    gains = {each["where"]: float(each["estimate"]) for each in document["calibration"] if each["name"] == GAIN}
+    return *with_gains(System.model_validate(document["system"]), values, gains), None
