@@ -109,7 +109,7 @@ def _unexplained(effects: Sequence[str], row: str | None, near: bool) -> list[Re
     like = reasons.listed(effects)
     text = f"a force{where} that no known effect explains"
     if near:
-        text = f"{like} explains most of what acts{where}, not all"
+        text = f"{like} explain{'s' * (len(effects) == 1)} most of what acts{where}, not all"
     found = [Reason(text, True, () if row is None else (row,), "unexplained", then=reasons.DESCRIBE)]
     # These are no findings, so they are not listed one by one.
     return found if near or not effects else [*found, Reason(f"some of it looks like {like}", True)]
