@@ -243,4 +243,4 @@ def test_an_effect_without_a_size_is_warned_of(tmp_path: Path, capsys: pytest.Ca
     assert main(["simulate", "--system", str(file), "--capture", capture, "--duration", "0.05"]) == 0
     warnings = [line for line in capsys.readouterr().out.splitlines() if line.startswith("warning")]
     assert len(warnings) == 1
-    assert "coulomb_friction@joint_2 does nothing" in warnings[0]
+    assert "coulomb_friction@joint_2 has no effect" in warnings[0]

@@ -185,7 +185,8 @@ def _of_effects(diagnosis: Search) -> str:
     assert unexplained is not None
     rest = f"acts on {unexplained.row} (seen in {unexplained.speed}) and depends on {unexplained.variable}"
     if _near(diagnosis):
-        return f"{', '.join(keys)} explains most of what the model lacks, not all: {falls}, and what is left {rest}."
+        explain = f"explain{'s' * (len(keys) == 1)} most of what the model lacks, not all"
+        return f"{', '.join(keys)} {explain}: {falls}, and what is left {rest}."
     tried = f" {_nearest(diagnosis, keys)}" if keys else ""
     return f"The model lacks something that no known effect explains: it {rest}.{tried}"
 
