@@ -78,8 +78,8 @@ def test_the_line_of_a_young_drift_is_renewed_sooner() -> None:
                 lines.append(line)
     holds = [line.due - line.t for line in lines]
     assert holds[0] < 0.5 * LOOKED
-    assert holds == sorted(holds)
-    assert holds[-1] <= LOOKED
+    assert holds[0] == min(holds)
+    assert max(holds) <= LOOKED
 
 
 @pytest.mark.slow

@@ -143,7 +143,8 @@ def test_reported_coefficients_are_those_that_were_injected(session: tuple[Syste
                 assert std == 0.0
             elif injected is not None:
                 assert value == pytest.approx(injected, rel=0.01), (effect.name, name)
-                assert 0.0 < std < 0.01 * abs(value)
+                # Rows of a torque of unknown gain are weighted by what they leave, windows counted as they overlap.
+                assert 0.0 < std < 0.015 * abs(value)
 
 
 @pytest.mark.long

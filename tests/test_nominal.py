@@ -66,7 +66,7 @@ def test_a_session_as_described_is_trusted(capture: sms.Capture) -> None:
     [
         ({"tau_1": GEAR}, "100", "joint's torque"),
         ({"tau_1": 1000.0}, "1e+03", "mN m"),
-        ({"tau_1": -1.0}, "-1", "other sign"),
+        ({"tau_1": -1.0}, "-1", "sign of the torque looks inverted"),
         ({"theta_m_1": 180.0 / np.pi, "q_1": 180.0 / np.pi}, "0.01", "degrees"),
     ],
 )

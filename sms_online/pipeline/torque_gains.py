@@ -35,5 +35,7 @@ def gained(model: Model) -> NDArray[np.bool_]:
 
 def _declared(model: Model) -> list[tuple[Sequence[int], slice]]:
     """Joints and places in π of declared gains."""
+    # Measured wrenches are forces of the model as well, and none of the catalogue's.
+    names = {name for name, entry in ENTRIES.items() if GAIN in entry.traits.calibrates}
     effects = zip(model.effects, model.effect_slices, strict=True)
-    return [(joints_of(e.where), columns) for e, columns in effects if GAIN in ENTRIES[e.name].traits.calibrates]
+    return [(joints_of(effect.where), columns) for effect, columns in effects if effect.name in names]
