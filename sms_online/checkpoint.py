@@ -99,15 +99,10 @@ class Checkpoint:
             raise InputError(self.name, "", *_difference(self.head, here))
         self._put(ESTIMATOR, estimator)
 
-    def put_into_source(self, source: Stage) -> None:
-        """Have a source of the same system go on from here, if one was saved; InputError where it does not fit."""
-        if SOURCE in self.states:
-            self._put(SOURCE, source)
-
-    def put_into_history(self, history: Stage) -> None:
-        """Have a history of the same session go on from here, if one was saved; InputError where it does not fit."""
-        if HISTORY in self.states:
-            self._put(HISTORY, history)
+    def put_beside(self, name: str, stage: Stage) -> None:
+        """Have a SOURCE or HISTORY of the same session go on from here, if saved; InputError where it does not fit."""
+        if name in self.states:
+            self._put(name, stage)
 
     def _put(self, name: str, stage: Stage) -> None:
         try:

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from sms_online.capture import check_channels
-from sms_online.checkpoint import Checkpoint
+from sms_online.checkpoint import HISTORY, Checkpoint
 from sms_online.cramer_rao import MotionRecord, session_bound
 from sms_online.data import Data, recorded_session
 from sms_online.description.channels import channels as known_channels
@@ -87,7 +87,7 @@ class Session:
         self.estimator.observers.append(self.recorder)
         if checkpoint is not None:
             checkpoint.put_into(self.estimator)
-            checkpoint.put_into_history(self.recorder)
+            checkpoint.put_beside(HISTORY, self.recorder)
         if searcher is None:
             # A live session has its searches made by another process, and does not import them.
             from sms_online.diagnosis.online_search import Immediate

@@ -385,8 +385,9 @@ def test_the_status_line_says_what_matters() -> None:
     for part in ("12.0 s", "1,234 samples/s", "p99 120 ms", "lost 3", "residual 2 %", "1 of 2 determined",
                  f"Doubt: {gone}", "link_1.inertia 0.3 ± 0.02 kg m²"):  # fmt: skip
         assert part in said
-    *_, last = screen(news, 80).splitlines()
-    assert f"Doubt: {gone}" in last
+    *_, verdict, step = screen(news, 80).splitlines()
+    assert f"Doubt: {gone}" in verdict
+    assert "next: mend the device" in step
 
 
 @pytest.fixture(autouse=True)

@@ -15,7 +15,7 @@ from sms_adapters.recording import tick_time
 from sms_adapters.session_log import CHECKPOINT as RESUMED_FROM
 from sms_adapters.session_log import SessionHeader
 from sms_adapters.sources import open_source
-from sms_online.checkpoint import Checkpoint
+from sms_online.checkpoint import SOURCE, Checkpoint
 from sms_online.description.schema import System
 from sms_online.pipeline.estimator import Estimator
 from sms_online.stream import Array, Block
@@ -73,7 +73,7 @@ def bench(tmp_path: Path) -> Bench:
 
 def test_an_encoder_keeps_its_turn_with_a_checkpoint(bench: Bench) -> None:
     fresh, resumed = (merger(bench.system, bench.folder) for _ in range(2))
-    bench.checkpoint.put_into_source(resumed)
+    bench.checkpoint.put_beside(SOURCE, resumed)
     off = []
     for ours in (fresh, resumed):
         blocks = bench.pushed(ours, bench.half, len(bench.items) + 1)

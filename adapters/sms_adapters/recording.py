@@ -12,7 +12,7 @@ from sms_adapters.clock_lanes import merger
 from sms_adapters.clock_merge import TICK, TICK_MICROSECONDS
 from sms_adapters.raw import CanFrames, Raw
 from sms_adapters.session_log import CHECKPOINT, RULES, SYSTEM, RecordedItems, from_microseconds, read_header
-from sms_online.checkpoint import Checkpoint
+from sms_online.checkpoint import SOURCE, Checkpoint
 from sms_online.description.schema import System
 from sms_online.errors import InputError
 from sms_online.stream import Block
@@ -105,7 +105,7 @@ class Recording:
         ]
         self._merger = ours = merger(self._system, self._system_directory, self._header.start)
         if (resumed := resumed_from(self._directory)) is not None:
-            resumed.put_into_source(ours)
+            resumed.put_beside(SOURCE, ours)
         recorded = [iter(items) for items in self._items]
         waiting: list[list[Raw]] = [[] for _ in recorded]
         number = 0

@@ -168,12 +168,8 @@ def _swaps(channels: Sequence[str]) -> Iterator[MistakeHypothesis]:
         if len(first) == len(second):
             pairs.append((first, second))
     for one, other in pairs:
-        if len(one) > 1 or len(pairs) > 0:
-            where = f"{_common(one)}, {_common(other)}"
-            said = f"{_common(one)} and {_common(other)} are swapped"
-            yield MistakeHypothesis(
-                "swapped", where, said, f"swap {_common(one)} and {_common(other)}", _swapped(one, other)
-            )
+        where, both = f"{_common(one)}, {_common(other)}", f"{_common(one)} and {_common(other)}"
+        yield MistakeHypothesis("swapped", where, f"{both} are swapped", f"swap {both}", _swapped(one, other))
 
 
 def _common(names: Sequence[str]) -> str:

@@ -21,8 +21,8 @@ def judge(evidence: Evidence) -> Trust:
     What has been shown to be wrong counts from when it is shown. Residuals of an estimate that has not converged show
     nothing: it was made of other, poorer rows.
     """
-    wrong = _wrong(evidence)
-    colour = _colour(evidence)
+    alarmed = _alarmed(evidence)
+    wrong = _wrong(evidence, alarmed)
     # Faults of the samples come before what they may have done to the estimate.
     samples, few = reasons.of_samples(evidence), reasons.outliers(evidence.outliers, few=True)
     if wrong:
@@ -35,12 +35,13 @@ def judge(evidence: Evidence) -> Trust:
         first = [*reasons.silenced(evidence.silent), *reasons.troubled(evidence.troubles)]
         rest = _cautions(replace(evidence, troubles=()))
         return Trust("not yet", (*first, reasons.unconverged(evidence.unconverged), *samples, *rest))
-    cautions = (*samples, *colour, *reasons.moving(evidence.suspected), *_cautions(evidence))
+    # An alarm that is not grave is one that coloured noise may have caused.
+    cautions = (*samples, *alarmed, *reasons.moving(evidence.suspected), *_cautions(evidence))
     cautions = (*(cautions or reasons.inconsistent(evidence.consistency)), *reasons.unwatched(evidence.unwatched))
     return Trust("doubt", cautions) if cautions else Trust("trust", tuple(reasons.grounds(evidence)))
 
 
-def _wrong(evidence: Evidence) -> list[Reason]:
+def _wrong(evidence: Evidence, alarmed: Sequence[Reason]) -> list[Reason]:
     """Reasons why the numbers are wrong by more than any error bar says, the strongest first."""
     converged = not evidence.unconverged
     out = [*reasons.scaled(evidence.comparison), *reasons.lacking(evidence.discrepancies)]
@@ -49,7 +50,7 @@ def _wrong(evidence: Evidence) -> list[Reason]:
         out += reasons.or_drifting(rows) if evidence.still else rows
         out += [each for each in evidence.miscalibrated if each.grave]
     out += reasons.unnamed(evidence.discrepancies)
-    out += [each for each in _alarmed(evidence) if each.grave]
+    out += [each for each in alarmed if each.grave]
     if converged:
         out += [*reasons.negative(evidence.negative), *reasons.disputed(evidence.disputed)]
     return out
@@ -62,16 +63,11 @@ def _alarmed(evidence: Evidence) -> list[Reason]:
     return [reasons.more_than_noise(evidence.alarm, evidence.coloured)]
 
 
-def _colour(evidence: Evidence) -> list[Reason]:
-    """An alarm that coloured noise may have caused."""
-    return [each for each in _alarmed(evidence) if not each.grave]
-
-
 def _cautions(evidence: Evidence) -> list[Reason]:
     """What makes some of the numbers, or their error bars, worse than they look."""
     out = reasons.weak_torques(evidence.residual)
     out += [each for each in evidence.miscalibrated if not each.grave]
-    out += [Reason(text, False) for text in (*evidence.troubles, *evidence.weaknesses)]
+    out += [*reasons.troubled(evidence.troubles), *(Reason(text, False) for text in evidence.weaknesses)]
     out += [*reasons.beyond_noise(evidence.residual), *reasons.apart(evidence.comparison)]
     out += [*reasons.undetermined(evidence.undetermined), *reasons.attenuated(evidence.attenuated)]
     out += reasons.undecided_changes(evidence.undecided)

@@ -15,6 +15,7 @@ from sms_adapters.recorder import Recorder
 from sms_adapters.session_log import CHECKPOINT as RESUMED_FROM
 from sms_adapters.session_log import MICROSECOND, SYSTEM, SessionHeader, read_header
 from sms_adapters.system_file import system_text
+from sms_online.checkpoint import SOURCE
 from sms_online.description.given import given_system
 from sms_online.description.parse import shipped_systems
 from sms_online.description.schema import System
@@ -90,7 +91,7 @@ def open_testbed(
     feeds = [Feed(make_reader(source, clock, interpreter.await_free), recorder) for source in system.devices]
     merged = merger(system, folder, start)
     if checkpoint is not None:
-        checkpoint.put_into_source(merged)
+        checkpoint.put_beside(SOURCE, merged)
     live = LiveSession(clock, feeds, merged, session, start, directory, recorder, status, interpreter)
     return live, session, merged
 
