@@ -40,7 +40,7 @@ from sms_online.stream import Array
 RANK_TOLERANCE = 1e-13
 # Half the square of the Newton step in standard deviations at which the minimum is found, and steps at most.
 CONVERGED, MOST_STEPS = 1e-6, 100
-# Curvature of the criterion is no less than this share of that of its squares, for the length of a step.
+# Newton's step is taken where the criterion's curvature is no less than this share of that of its squares.
 LEAST_CURVATURE = 1e-2
 # Noise in whitened rows below this share of their variance is none: their weights follow from the rest of it.
 LEAST_NOISE = 0.1
@@ -329,17 +329,20 @@ def _unit_scale(information: Array) -> Array:
 
 
 def _newton_step(information: Array, curvature: Array, slope: Array) -> Array:
-    """Step (n,) downhill where there is information, no curvature taken for less than the least share of that."""
+    """Step (n,) downhill where there is information: Newton's, or one of the squares where the criterion is concave.
+
+    The latter is a step of iteratively reweighted least squares, which goes on where Newton's would have to be halved.
+    """
     scale = _unit_scale(information)
     both = np.outer(scale, scale)
     scaled, curved = information * both, curvature * both
-    rank_is_full = _all_above(scaled, RANK_TOLERANCE * scale.size * np.eye(scale.size))
-    if rank_is_full and _all_above(curved, LEAST_CURVATURE * scaled):
-        return np.asarray(scale * cho_solve(cho_factor(curved, lower=True), -scale * slope))
+    if _all_above(scaled, RANK_TOLERANCE * scale.size * np.eye(scale.size)):
+        used = curved if _all_above(curved, LEAST_CURVATURE * scaled) else scaled
+        return np.asarray(scale * cho_solve(cho_factor(used, lower=True), -scale * slope))
     directions = _basis(information)
     values, vectors = np.linalg.eigh(directions.T @ curvature @ directions)
     axes = directions @ vectors
-    return np.asarray(-axes @ ((axes.T @ slope) / np.maximum(np.abs(values), LEAST_CURVATURE)))
+    return np.asarray(-axes @ ((axes.T @ slope) / (values if values[0] > LEAST_CURVATURE else 1.0)))
 
 
 def _all_above(matrix: Array, least: Array) -> bool:

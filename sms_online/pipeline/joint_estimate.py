@@ -19,6 +19,7 @@ from sms_online.pipeline.momentum_fit import MomentumFit
 from sms_online.pipeline.prior_information import PriorInformation
 from sms_online.pipeline.row_grams import RowGrams
 from sms_online.pipeline.scale_free import ScaleFree
+from sms_online.pipeline.torque_gains import plausible_gains
 from sms_online.pipeline.white_rows import WhiteRows
 from sms_online.state import Stage, State, state_copy
 from sms_online.stream import Array
@@ -58,6 +59,7 @@ class JointEstimate(Stage):
         self._nuisances, self._prior, self._within = tuple(nuisances), prior, within
         self._n, self._n_v = base.n, model.layout.n_v
         self._calibration = prior_rows(self._nuisances, base.n)
+        self._gains = plausible_gains(model, base, len(self._nuisances))
         self.tracker: Tracker = session_tracker(base.n, prior, len(self._nuisances), within)
         if self._nuisances:
             self.tracker.begin(known_beforehand(self._nuisances, base.n))
@@ -140,5 +142,5 @@ class JointEstimate(Stage):
         known = np.pad(prior_factor(prior, self._n), ((0, 0), (len(self._nuisances), 0)))
         may = np.array([each.may_give_way for each in self._nuisances if np.isfinite(each.tolerance)], dtype=np.bool_)
         bounds = bound_rows(self._nuisances, self._n)
-        certain = np.concatenate((self.state.known, self._calibration[~may], bounds, known))
+        certain = np.concatenate((self.state.known, self._calibration[~may], bounds, known, self._gains))
         return PriorInformation(certain, self._calibration[may])
