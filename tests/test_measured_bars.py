@@ -99,7 +99,6 @@ def test_halves_of_quanser_runs_agree_within_bars(tmp_path: Path, unit: str) -> 
 
 
 @pytest.mark.long
-@pytest.mark.xfail(strict=True, reason="without priors the criterion has several minima")
 def test_two_axes_of_a_robot_are_not_determined() -> None:
     """Their friction has memory, and the torque of axis 1 alone gives any stiffness; axis 3 has 5.5 to 5.7e6 N m/rad
     by least squares of three runs."""
